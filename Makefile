@@ -1,0 +1,41 @@
+# Two commands do everything on a fresh machine with Python 3.11, make and git: `make hold` and `make test`.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: hold test lint types unit bench campaign generate clean
+.DEFAULT_GOAL := test
+
+$(STAMP): pyproject.toml requirements.lock
+	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint requirements.lock --editable '.[dev]'
+	touch $@
+
+hold: $(STAMP)  ## hold the simulated mirror for two minutes, with the live screen
+	$(BIN)/membrane-ctrl hold --twin --duration 2m --name demo
+
+test: lint types unit  ## everything CI runs
+
+lint: $(STAMP)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+
+types: $(STAMP)
+	$(BIN)/mypy
+
+unit: $(STAMP)
+	$(BIN)/pytest -m "not campaign"
+
+bench: $(STAMP)  ## measured figures, each against a reference of the same run
+	$(BIN)/python -m benchmarks
+
+campaign: $(STAMP)
+	$(BIN)/pytest -m campaign
+
+generate: $(STAMP)  ## the files made from firmware_iface/registers.toml
+	$(BIN)/python -m firmware_iface.generate
+
+clean:
+	rm -rf $(VENV) .mypy_cache .ruff_cache

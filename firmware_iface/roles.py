@@ -1,0 +1,131 @@
+"""What the controller needs of devices: the roles, and the values that cross.
+
+A driver converts to these units at its edge; nothing behind it knows registers, counts or byte orders.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class LinkError(Exception):
+    """A device did not give a valid answer. The message says what, where and what to do."""
+
+
+class LinkDownError(LinkError):
+    """The connection is gone (not merely one late or bad answer)."""
+
+
+class DeviceRefusedError(LinkError):
+    """The device is reachable but not usable: wrong kind, unknown map version, refused write."""
+
+
+@dataclass(frozen=True, slots=True)
+class BenchReading:
+    """One consistent sample of all sensors.
+
+    `sample_counter` and `device_time_s` advance with every sample of the device, so that a frozen value is seen.
+    A quantity the bench does not have is NaN. `displacement_quality` is 0 when good (else the laser's error code).
+    """
+
+    displacement_um: float
+    displacement_quality: int
+    gauge_pressure_pa: float
+    ambient_pressure_pa: float
+    air_temperature_c: float
+    gas_temperature_c: float
+    pump_fraction: float
+    vent_fraction: float
+    sample_counter: int
+    device_time_s: float
+    watchdog_tripped: bool
+    latched_faults: int
+
+
+@dataclass(frozen=True, slots=True)
+class BenchCommand:
+    """What a completed tick writes; the write also feeds the device's watchdog."""
+
+    pump_fraction: float
+    vent_fraction: float
+
+
+@dataclass(frozen=True, slots=True)
+class BenchIdentity:
+    """Who answered, and how its watchdog is set (read back)."""
+
+    kind: str
+    map_version: int
+    firmware: str
+    watchdog_s: float
+
+
+class Bench(Protocol):
+    """Displacement sensor, pressure sensors, thermometers, pump and vent, however many devices fill the roles."""
+
+    async def open(self) -> BenchIdentity:
+        """Connect, check the identity, arm the watchdog and read it back. Raises LinkError."""
+        ...
+
+    async def read(self) -> BenchReading:
+        """One sample. Raises LinkError; never returns an old or invented value."""
+        ...
+
+    async def write(self, command: BenchCommand) -> None:
+        """Write pump and vent, and feed the watchdog. Raises LinkError."""
+        ...
+
+    async def close(self) -> None:
+        """Close the link; the caller has written the safe state before. Never raises."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """One image on the screen: role "sin" (index k of N, shift_rad), "gray" (bit from 1), "white" or "black"."""
+
+    role: str
+    axis: str = ""
+    index: int = 0
+    shift_rad: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """The name used for files and Rerun paths: `x_sin_0`, `y_gray_1`, `white`."""
+        return f"{self.axis}_{self.role}_{self.index}" if self.axis else self.role
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One exposure: `pixels` (height, width) uint8 or uint16, `time_s` the start of exposure on the run's clock."""
+
+    pixels: NDArray[np.uint8] | NDArray[np.uint16]
+    time_s: float
+
+
+class Screen(Protocol):
+    """Shows patterns."""
+
+    def show(self, pattern: Pattern) -> None:
+        """Show the pattern; returns when it is lit and settled."""
+        ...
+
+    def close(self) -> None:
+        """Give the screen back."""
+        ...
+
+
+class Camera(Protocol):
+    """Takes frames."""
+
+    def grab(self) -> Frame:
+        """Trigger one exposure and return it. Raises LinkError."""
+        ...
+
+    def close(self) -> None:
+        """Give the camera back."""
+        ...

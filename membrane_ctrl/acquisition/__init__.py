@@ -1,0 +1,1 @@
+"""The process that owns screen and camera and runs the measurement cycle."""

@@ -1,0 +1,1 @@
+"""The recorder process: run folder, Rerun streams, blueprint, summary."""

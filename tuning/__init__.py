@@ -1,0 +1,1 @@
+"""Tuning sessions: identify the plant, design the gains, verify them."""
