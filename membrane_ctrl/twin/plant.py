@@ -1,0 +1,160 @@
+"""The simulated bench: films, gas, pump, vent, leak, surroundings and sensors, advanced in fixed steps.
+
+Plain floats in a plain loop: a step is some 30 operations, which NumPy would make slower, and a compiled kernel
+would add its start-up to every process for a plant that is already 1000 times faster than real time.
+What does not depend on the state (surroundings, creep) is made with NumPy for a block of steps ahead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from membrane_ctrl.config import PumpConfig, TwinConfig
+from membrane_ctrl.twin.disturbance import Disturbance
+from membrane_ctrl.twin.events import Event
+from membrane_ctrl.twin.film import BACK_FILM, MIRROR_FILM, NOMINAL_PRESSURE_PA, NOMINAL_SAG_MM, SETTLED_S
+from membrane_ctrl.twin.gas import GAS_FOLLOWS_AIR_S, REFERENCE_K, STANDARD_AMBIENT_PA, Gas, filled
+from membrane_ctrl.twin.pump import Pump
+from membrane_ctrl.twin.sensors import PlantSample, Sensors
+from membrane_ctrl.twin.truth import Truth
+
+STEP_S = 0.005  # a thirtieth of the pump's lag, a fifteenth of its transport
+ZERO_C_K = 273.15
+VENT_OPEN_UM_PER_S = 100.0  # fully open at the nominal pressure (assumed): down by the whole sag within minutes
+_BLOCK_STEPS = 2000
+
+_NOMINAL_VOLUME = float(MIRROR_FILM.volume_m3_per_root_pa(SETTLED_S) + BACK_FILM.volume_m3_per_root_pa(SETTLED_S))
+_NOMINAL_GAS = filled(NOMINAL_PRESSURE_PA, REFERENCE_K, STANDARD_AMBIENT_PA, _NOMINAL_VOLUME)
+NOMINAL_UM_PER_ML = (
+    1e3
+    * float(MIRROR_FILM.sag_mm_per_root_pa(SETTLED_S))
+    * _NOMINAL_GAS.root_pa_per_ml(STANDARD_AMBIENT_PA, _NOMINAL_VOLUME)
+)
+
+
+def gas_compliance_ml_per_pa() -> float:
+    """C = dV_gas/dp = V/(3p) + V/P of the nominal mirror: what the leak's time constant refers to."""
+    volume_ml = 1e6 * _NOMINAL_VOLUME * _NOMINAL_GAS.root_pa
+    return volume_ml / (3 * NOMINAL_PRESSURE_PA) + volume_ml / (STANDARD_AMBIENT_PA + NOMINAL_PRESSURE_PA)
+
+
+class Plant:
+    """The bench without its protocol; equal seeds and equal calls give equal samples.
+
+    It starts inflated, `start_error_um` off its nominal sag, films settled for a day and the pump just holding;
+    or flat and fresh, the pump off (`from_flat`). Commands hold until the next `actuate`. Truth does not depend
+    on how often it is sampled, nor on how time is cut into calls of `advance`.
+
+    Parameters
+    ----------
+    twin : TwinConfig
+        Scenario, seed, noise, start.
+    pump : PumpConfig
+        Flow against command.
+    events : sequence of Event
+        What happens when, in plant time.
+    """
+
+    def __init__(self, twin: TwinConfig, pump: PumpConfig, events: Sequence[Event] = ()) -> None:
+        chance, noise = np.random.default_rng(twin.seed).spawn(2)
+        self._sensors = Sensors(twin, noise)
+        self._disturbance = Disturbance(twin, events, STEP_S, chance)
+        self._leak_ml_per_s_per_pa = gas_compliance_ml_per_pa() / twin.leak_time_constant_s
+        self._vent_ml_per_s_per_pa = VENT_OPEN_UM_PER_S / NOMINAL_UM_PER_ML / NOMINAL_PRESSURE_PA
+        self._pump = Pump(pump, pump.flow_full_um_per_s / NOMINAL_UM_PER_ML, STEP_S)
+        self._loaded_s = 0.0 if twin.from_flat else SETTLED_S
+        self._steps = 0
+        self._rest = 0.0
+        self._pump_fraction = self._vent_fraction = self._inflow_ml_per_s = 0.0
+        self._load_block()
+        self._index = 0
+        if twin.from_flat:
+            self._gas = Gas(0.0, self._air_k[0], 0.0)
+            return
+        gauge_pa = ((NOMINAL_SAG_MM + 1e-3 * twin.start_error_um) / self._sag[0]) ** 3
+        self._gas = filled(gauge_pa, self._air_k[0], self._ambient_pa[0], self._volume[0])
+        self._inflow_ml_per_s = self._leak_ml_per_s_per_pa * self._leak[0] * gauge_pa
+        self._pump_fraction = self._pump.hold(self._inflow_ml_per_s)
+
+    @property
+    def time_s(self) -> float:
+        """Plant time."""
+        return self._steps * STEP_S
+
+    def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
+        """Set the commands. Raises ValueError unless both are 0..1."""
+        if not (0 <= pump_fraction <= 1 and 0 <= vent_fraction <= 1):
+            raise ValueError(f"pump {pump_fraction:g} and vent {vent_fraction:g} must be fractions 0..1")
+        self._pump_fraction = pump_fraction
+        self._vent_fraction = vent_fraction
+
+    def advance(self, duration_s: float) -> None:
+        """Let time pass, in whole steps; what is left of a step is kept for the next call."""
+        due = self._rest + duration_s / STEP_S
+        steps = math.floor(due + 1e-6)  # 0.02 s is four steps, whatever 0.02 is in binary
+        self._rest = due - steps
+        while steps > 0:
+            if self._index + 1 == _BLOCK_STEPS:
+                self._load_block()
+            now = min(steps, _BLOCK_STEPS - 1 - self._index)
+            self._run(self._index + 1, self._index + 1 + now)
+            steps -= now
+
+    def sample(self) -> PlantSample:
+        """What the sensors say now, with noise of its own in each call."""
+        return self._sensors.read(self.truth(), self._pump_fraction, self._vent_fraction)
+
+    def truth(self) -> Truth:
+        """What really is."""
+        i = self._index
+        gas, ambient_pa = self._gas, self._ambient_pa[i]
+        gauge_pa = gas.gauge_pressure_pa
+        sag_mm = self._sag[i] * gas.root_pa
+        um_per_ml = 1e3 * self._sag[i] * gas.root_pa_per_ml(ambient_pa, self._volume[i])
+        return Truth(
+            time_s=self.time_s,
+            displacement_um=1e3 * (sag_mm - NOMINAL_SAG_MM),
+            sag_mm=sag_mm,
+            back_sag_mm=self._back_sag[i] * gas.root_pa,
+            gauge_pressure_pa=gauge_pa,
+            ambient_pressure_pa=ambient_pa,
+            air_temperature_c=self._air_k[i] - ZERO_C_K,
+            gas_temperature_c=gas.temperature_k - ZERO_C_K,
+            laser_bias_um=self._laser_bias_um[i],
+            laser_lost=self._laser_lost[i],
+            leak_um_per_s=um_per_ml * self._leak_ml_per_s_per_pa * self._leak[i] * gauge_pa,
+            pump_um_per_s=um_per_ml * self._inflow_ml_per_s,
+            vent_um_per_s=um_per_ml * self._vent_ml_per_s_per_pa * self._vent_fraction * gauge_pa,
+        )
+
+    def _run(self, start: int, stop: int) -> None:
+        """Steps `start` to `stop` of the block."""
+        gas_step, gas, pump_step, pump = self._gas.step, self._gas, self._pump.step, self._pump_fraction
+        leak, vent = self._leak_ml_per_s_per_pa, self._vent_ml_per_s_per_pa * self._vent_fraction
+        follow = -math.expm1(-STEP_S / GAS_FOLLOWS_AIR_S)
+        inflow = self._inflow_ml_per_s
+        for i in range(start, stop):
+            inflow = pump_step(pump)
+            outflow = (leak * self._leak[i] + vent) * gas.root_pa**3
+            gas_step((inflow - outflow) * STEP_S, follow, self._ambient_pa[i], self._air_k[i], self._volume[i])
+        self._inflow_ml_per_s = inflow
+        self._steps += stop - start
+        self._index = stop - 1
+
+    def _load_block(self) -> None:
+        """Surroundings and creep of the next block, as lists: indexing them gives plain floats."""
+        block = self._disturbance.block(_BLOCK_STEPS)
+        age_s = self._loaded_s + block.time_s
+        self._ambient_pa: list[float] = block.ambient_pa.tolist()
+        self._air_k: list[float] = block.air_k.tolist()
+        self._leak: list[float] = block.leak_factor.tolist()
+        self._laser_bias_um: list[float] = block.laser_bias_um.tolist()
+        self._laser_lost: list[float] = block.laser_lost.tolist()
+        self._sag: list[float] = MIRROR_FILM.sag_mm_per_root_pa(age_s).tolist()
+        self._back_sag: list[float] = BACK_FILM.sag_mm_per_root_pa(age_s).tolist()
+        volume = MIRROR_FILM.volume_m3_per_root_pa(age_s) + BACK_FILM.volume_m3_per_root_pa(age_s)
+        self._volume: list[float] = volume.tolist()
+        self._index = -1
