@@ -72,6 +72,21 @@ class LimitsConfig(Section):
     band_um: Positive = 2.0
 
 
+class StatesConfig(Section):
+    """How long states and rungs may last."""
+
+    check_s: Annotated[float, Field(ge=0.1, le=600)] = 1.0  # of good readings before the pump may run
+    check_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
+    inflate_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 14_400.0  # a fill from flat takes two hours
+    settle_s: Annotated[float, Field(ge=0.1, le=3600)] = 2.0  # inside the band before the state is `hold`
+    settle_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 600.0
+    # 10 s of laser loss cost 1.6 um on average (PHYSICS, inner loop); longer is no glitch
+    hold_flow_max_s: Annotated[float, Field(gt=0, le=600)] = 12.0
+    ramp_down_s: Annotated[float, Field(gt=0, le=600)] = 10.0
+    pump_off_max_s: Annotated[float, Field(gt=0, le=1e6)] = 3600.0
+    lower_timeout_s: Annotated[float, Field(gt=0, le=600)] = 3.0
+
+
 class ShapeConfig(Section):
     """The measurement cycle and the outer loop."""
 
@@ -212,6 +227,7 @@ class Config(Section):
     loop: LoopConfig = LoopConfig()
     pump: PumpConfig = PumpConfig()
     limits: LimitsConfig = LimitsConfig()
+    states: StatesConfig = StatesConfig()
     shape: ShapeConfig = ShapeConfig()
     optics: OpticsConfig = OpticsConfig()
     devices: DevicesConfig | None = None

@@ -1,0 +1,216 @@
+"""One tick of control: observe, judge, act. Pure of I/O and clock, so that a run, a replay and a test are the same.
+
+The order is fixed: what the bench shows becomes an observation; the safety table judges it; only then the state's
+handler runs, and what it wants is overruled wherever the ladder says so. Every path through a tick ends here.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.roles import BenchCommand
+from membrane_ctrl.config import Config
+from membrane_ctrl.control.inner_loop import InnerLoop
+from membrane_ctrl.control.shape_loop import ShapeLoop, ShapeOutput
+from membrane_ctrl.errors import Exit
+from membrane_ctrl.ladder import Ladder
+from membrane_ctrl.names import Rung, State
+from membrane_ctrl.observer import Observer
+from membrane_ctrl.safety import MOVING, Observation, Rule, SafetyTable, Verdict
+from membrane_ctrl.states import HANDLERS, Scene
+from membrane_ctrl.telemetry import TelemetryRow
+from membrane_ctrl.tick import Command, Event, TickInputs, TickOutputs
+
+# dt outside this range of the nominal one is no time step a loop was designed for; what is beyond is a missed
+# tick, which safety sees by its lateness
+_DT_RANGE = (0.2, 5.0)
+
+
+class Controller:
+    """Owns the state machine, the safety table and both loops.
+
+    Parameters
+    ----------
+    config : Config
+        The run's configuration.
+    sag_sensitivity : (36,) array
+        Zernike coefficients of a Hencky bowl per sag, in um per um, for the outer loop.
+    """
+
+    def __init__(self, config: Config, sag_sensitivity: NDArray[np.float64]) -> None:
+        self._config = config
+        self._safety = SafetyTable(config.limits)
+        self._shape = ShapeLoop(config.shape, sag_sensitivity)
+        observer = Observer(config.limits)
+        self._scene = Scene(config, InnerLoop(config.loop, config.pump), observer, Ladder(config.states))
+        self._shape_wanted = config.shape.enabled
+        self._tick_error = ""
+        self._ticks = 0
+        self._state_since_s = math.nan
+        self._said_why = ""
+        self._shape_was: tuple[int, str] = (-1, "")
+        self.state = State.STANDBY
+        self.fault: Rule | None = None
+
+    def tick(self, inputs: TickInputs) -> TickOutputs:
+        """Run one tick. Never raises: what a handler raises is a fault of the next judgement."""
+        scene = self._scene
+        events: list[Event] = []
+        self._begin(inputs, events)
+        error_um = scene.output.error_um if scene.output is not None and self.state in MOVING else math.nan
+        observation = scene.observer.observe(inputs, error_um, self._tick_error, scene.overdue)
+        verdict = self._safety.judge(self.state, observation)
+        self._apply(verdict, events)
+        shape = self._step_shape(inputs, events)
+        self._act(events)
+        command = BenchCommand(scene.pump_fraction, scene.vent_fraction)
+        scene.observer.wrote(command)
+        scene.last_pump_fraction = scene.pump_fraction
+        self._tell_why(events)
+        return TickOutputs(command, self._row(inputs, observation, shape), tuple(events), scene.finished)
+
+    def _begin(self, inputs: TickInputs, events: list[Event]) -> None:
+        scene = self._scene
+        self._ticks += 1
+        nominal_s = 1.0 / self._config.loop.rate_hz
+        scene.now_s = inputs.now_s
+        scene.dt_s = min(max(inputs.dt_s, _DT_RANGE[0] * nominal_s), _DT_RANGE[1] * nominal_s)
+        if math.isnan(self._state_since_s):
+            self._state_since_s = inputs.now_s
+            self._shape.switch(self._shape_wanted, inputs.now_s)
+        scene.state_age_s = inputs.now_s - self._state_since_s
+        for command in inputs.commands:
+            self._obey(command, events)
+
+    def _obey(self, command: Command, events: list[Event]) -> None:
+        scene = self._scene
+        events.append({"kind": "command", "command": command.kind, "who": command.who, "why": command.why})
+        match command.kind:
+            case "hold":
+                scene.hold_wanted = True
+            case "stop":
+                scene.stop_wanted = True
+                scene.stop_exit = Exit.DONE if command.who == "duration" else Exit.INTERRUPTED
+            case "shape_on" | "shape_off":
+                self._shape.switch(command.kind == "shape_on", scene.now_s)
+
+    def _apply(self, verdict: Verdict, events: list[Event]) -> None:
+        """Put the verdict on the ladder; whatever goes below HOLD_FLOW latches as the run's fault."""
+        scene, ladder = self._scene, self._scene.ladder
+        rule = verdict.rule
+        if rule is None:
+            if ladder.rung == Rung.HOLD_FLOW:
+                ladder.clear()
+                events.append({"kind": "cleared", "name": self.fault.name if self.fault else ""})
+                self.fault = None
+            return
+        if self.fault is None or (rule.rung > Rung.HOLD_FLOW >= ladder.rung):
+            self.fault = rule
+            events.append(_fault_event(verdict))
+        ladder.enter(rule.rung, scene.now_s)
+        if ladder.step(scene.now_s) > Rung.HOLD_FLOW and self.state != State.FAULT:
+            self._go(State.FAULT, f"{self.fault.name}: {self.fault.cause}", events)
+
+    def _step_shape(self, inputs: TickInputs, events: list[Event]) -> ShapeOutput:
+        scene = self._scene
+        settled = self.state == State.HOLD and scene.ladder.rung == Rung.NONE
+        shape = self._shape.step(inputs.now_s, scene.dt_s, inputs.estimate, scene.observer.displacement_um, settled)
+        scene.trim_um = shape.trim_um if self.state in MOVING else 0.0
+        if (shape.state, shape.reason) != self._shape_was:
+            self._shape_was = (shape.state, shape.reason)
+            events.append({"kind": "shape", "state": shape.state.name.lower(), "reason": shape.reason})
+        return shape
+
+    def _act(self, events: list[Event]) -> None:
+        """Run the state's handler with everything off unless it says otherwise."""
+        scene = self._scene
+        scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, 0.0
+        try:
+            wanted = HANDLERS[self.state](scene)
+        except Exception as error:
+            self._tick_error = f"{type(error).__name__}: {error}"
+            scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, 0.0
+            if self.state == State.FAULT:  # nothing is left that could judge it
+                scene.finished = Exit.SAFETY_TRIP
+            return
+        if not (math.isfinite(scene.pump_fraction) and 0.0 <= scene.pump_fraction <= 1.0):
+            self._tick_error = f"pump command {scene.pump_fraction} from state {self.state.name.lower()}"
+            scene.pump_fraction = 0.0
+        if wanted != self.state:
+            self._go(wanted, scene.why, events)
+
+    def _go(self, state: State, why: str, events: list[Event]) -> None:
+        scene = self._scene
+        events.append({"kind": "state", "state": state.name.lower(), "from": self.state.name.lower(), "why": why})
+        self.state = state
+        self._state_since_s = scene.now_s
+        scene.state_age_s = 0.0
+        scene.good_since_s = math.nan
+        scene.overdue = ""
+
+    def _tell_why(self, events: list[Event]) -> None:
+        """The one line of the operator, as an event whenever its words (not its numbers) change."""
+        words = "".join(c for c in self._scene.why if not c.isdigit())
+        if words != self._said_why:
+            self._said_why = words
+            events.append({"kind": "why", "why": self._scene.why})
+
+    def _row(self, inputs: TickInputs, observation: Observation, shape: ShapeOutput) -> TelemetryRow:
+        scene, reading, out = self._scene, inputs.reading, self._scene.output
+        nan = math.nan
+        return TelemetryRow(
+            mono_s=inputs.now_s,
+            tick=self._ticks,
+            dt_s=scene.dt_s,
+            lateness_ms=inputs.lateness_ms,
+            missed_ticks=inputs.missed_ticks,
+            state=self.state,
+            shape_state=shape.state,
+            rung=scene.ladder.rung,
+            fault=self.fault.code if self.fault else 0,
+            target_um=self._config.loop.setpoint_um,
+            setpoint_um=out.setpoint_um if out else nan,
+            displacement_um=observation.displacement_um,
+            filtered_um=out.filtered_um if out else nan,
+            error_um=out.error_um if out else nan,
+            p_um_per_s=out.p_um_per_s if out else nan,
+            i_um_per_s=out.i_um_per_s if out else nan,
+            d_um_per_s=out.d_um_per_s if out else nan,
+            feedforward_um_per_s=out.feedforward_um_per_s if out else nan,
+            flow_wanted_um_per_s=out.flow_wanted_um_per_s if out else nan,
+            flow_um_per_s=out.flow_um_per_s if out else nan,
+            pump_fraction=scene.pump_fraction,
+            vent_fraction=scene.vent_fraction,
+            pump_readback_fraction=reading.pump_fraction if reading else nan,
+            vent_readback_fraction=reading.vent_fraction if reading else nan,
+            gauge_pressure_pa=observation.gauge_pressure_pa,
+            ambient_pressure_pa=reading.ambient_pressure_pa if reading else nan,
+            air_temperature_c=reading.air_temperature_c if reading else nan,
+            gas_temperature_c=reading.gas_temperature_c if reading else nan,
+            displacement_quality=reading.displacement_quality if reading else nan,
+            sample_counter=reading.sample_counter if reading else nan,
+            device_time_s=reading.device_time_s if reading else nan,
+            leak_um_per_s=out.leak_um_per_s if out else nan,
+            trim_um=shape.trim_um,
+            truth_displacement_um=inputs.truth_displacement_um,
+            truth_laser_bias_um=inputs.truth_laser_bias_um,
+        )
+
+
+def _fault_event(verdict: Verdict) -> Event:
+    rule = verdict.rule
+    assert rule is not None
+    return {
+        "kind": "fault",
+        "code": rule.code,
+        "name": rule.name,
+        "cause": rule.cause,
+        "seen": verdict.seen,
+        "limit": rule.limit,
+        "rung": rule.rung.name.lower(),
+        "latching": rule.latching,
+        "remedy": rule.remedy,
+    }

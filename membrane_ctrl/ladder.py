@@ -1,0 +1,45 @@
+"""The ladder of safe actions: hold the last mean flow -> ramp down -> pump off -> vent.
+
+A fault chooses the rung to enter at; each rung times out into the next; nothing but a clear observation on the
+first rung leads back up.
+"""
+
+from __future__ import annotations
+
+from membrane_ctrl.config import StatesConfig
+from membrane_ctrl.names import Rung
+
+
+class Ladder:
+    """Which safe action is in force, and since when."""
+
+    def __init__(self, config: StatesConfig) -> None:
+        self._limit_s = {
+            Rung.HOLD_FLOW: config.hold_flow_max_s,
+            Rung.RAMP_DOWN: config.ramp_down_s,
+            Rung.PUMP_OFF: config.pump_off_max_s,
+        }
+        self.rung = Rung.NONE
+        self._since_s = 0.0
+
+    def enter(self, rung: Rung, now_s: float) -> None:
+        """Go to a rung, if it is further down than the present one."""
+        if rung > self.rung:
+            self.rung = rung
+            self._since_s = now_s
+
+    def clear(self) -> None:
+        """Leave the ladder; only from HOLD_FLOW, as everything below is latched."""
+        assert self.rung <= Rung.HOLD_FLOW, self.rung
+        self.rung = Rung.NONE
+
+    def age_s(self, now_s: float) -> float:
+        """Time on the present rung."""
+        return now_s - self._since_s
+
+    def step(self, now_s: float) -> Rung:
+        """The rung in force now: a rung whose time is over gives way to the next."""
+        limit_s = self._limit_s.get(self.rung)
+        if limit_s is not None and self.age_s(now_s) > limit_s:
+            self.enter(Rung(self.rung + 1), now_s)
+        return self.rung

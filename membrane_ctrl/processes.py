@@ -1,0 +1,88 @@
+"""Child processes: started with `spawn`, out of reach of Ctrl-C, and never left behind.
+
+Ctrl-C on a terminal reaches every process of the foreground group; only the control process may act on it, as
+the safe state comes first. So SIGINT is ignored from before the children's first instruction.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+_CONTEXT = multiprocessing.get_context("spawn")
+
+
+class Child:
+    """One child process.
+
+    Parameters
+    ----------
+    name : str
+        What it is called in messages and in the process list.
+    target : str
+        "package.module:function". Imported in the child, after its priority is set, so that heavy imports do
+        not compete with the tick.
+    args : tuple
+        Picklable arguments of the function.
+    nice : int
+        How much the child steps back behind the control process.
+    """
+
+    def __init__(self, name: str, target: str, args: tuple[Any, ...], nice: int) -> None:
+        self.name = name
+        self._process = _CONTEXT.Process(target=_main, args=(target, args, nice), name=name, daemon=True)
+
+    def start(self) -> None:
+        """Start it; returns at once."""
+        with _interrupts_ignored():
+            self._process.start()
+
+    @property
+    def alive(self) -> bool:
+        """It has not ended."""
+        return self._process.is_alive()
+
+    @property
+    def exit_code(self) -> int | None:
+        """Exit code, negative for a signal, None while it runs."""
+        return self._process.exitcode
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for its own end; True if it came."""
+        self._process.join(timeout_s)
+        return not self.alive
+
+    def stop(self, timeout_s: float) -> None:
+        """SIGTERM, and SIGKILL if that does not end it in time."""
+        if self._process.pid is None:
+            return
+        self._process.terminate()
+        if not self.join(timeout_s):
+            self._process.kill()
+            self._process.join()
+
+
+def _main(target: str, args: tuple[Any, ...], nice: int) -> None:
+    os.nice(nice)
+    module, function = target.split(":")
+    getattr(importlib.import_module(module), function)(*args)
+
+
+@contextlib.contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """An ignored signal stays ignored across exec: the child has it from its first instruction on."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def pipe() -> Any:
+    """Both ends of a two-way pipe between this process and a child."""
+    return _CONTEXT.Pipe()

@@ -1,0 +1,173 @@
+"""The tick: asyncio, absolute deadlines, one device exchange, one pure function, one write.
+
+Nothing here may take longer than a tick: no image, no Rerun, no file. What is recorded goes into shared-memory
+rings, which never wait. A missed deadline is skipped and counted, never made up in a burst.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import pickle
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from firmware_iface.roles import Bench, BenchCommand, BenchReading, LinkDownError, LinkError
+from membrane_ctrl.clock import RunClock
+from membrane_ctrl.controller import Controller
+from membrane_ctrl.errors import Exit
+from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.ipc.ring import RingReader, RingWriter
+from membrane_ctrl.processes import Child
+from membrane_ctrl.tick import Command, Event, TickInputs
+
+SAFE = BenchCommand(pump_fraction=0.0, vent_fraction=0.0)
+# Looking after a child costs a system call; half a second late is soon enough, the loop does not need them
+_CHILD_WATCH_S = 0.5
+
+
+@dataclass(slots=True)
+class Wiring:
+    """Everything the tick is connected to."""
+
+    bench: Bench
+    telemetry: RingWriter
+    events: RingWriter
+    shapes: RingReader | None = None
+    truth: Callable[[], tuple[float, float]] | None = None  # (displacement_um, laser_bias_um) of the twin
+    children: Sequence[Child] = ()
+    tasks: dict[str, asyncio.Task[None]] = field(default_factory=dict)
+
+
+class Supervisor:
+    """Runs the ticks of one run, from the first one to the exit code.
+
+    Parameters
+    ----------
+    controller : Controller
+        The pure tick.
+    wiring : Wiring
+        Devices, rings and children.
+    clock : RunClock
+        The run's clock.
+    rate_hz : float
+        Tick rate.
+    """
+
+    def __init__(self, controller: Controller, wiring: Wiring, clock: RunClock, rate_hz: float) -> None:
+        self._controller = controller
+        self._wiring = wiring
+        self._clock = clock
+        self._period_s = 1.0 / rate_hz
+        self._pending: list[Command] = []
+        self._link_up = True
+        self._link_error = ""
+        self._dead: set[str] = set()
+        self._next_watch_s = 0.0
+        self.ticks = 0
+        self.missed_ticks = 0
+
+    def ask(self, command: Command) -> None:
+        """Hand a command to the next tick."""
+        self._pending.append(command)
+
+    def tell(self, event: Event) -> None:
+        """Put an event on record, now."""
+        now_s = self._clock.now()
+        stamped = {"time_utc": self._clock.utc(now_s).isoformat(), "mono_s": round(now_s, 6), **event}
+        self._wiring.events.put(json.dumps(stamped, allow_nan=False, default=str).encode())
+
+    async def run(self, duration_s: float | None) -> Exit:
+        """Tick until a tick says that the run is over; the pump is off by then, or cannot be reached."""
+        deadline_s = last_s = self._clock.now()
+        ends_s = math.inf if duration_s is None else deadline_s + duration_s
+        try:
+            while True:
+                deadline_s += self._period_s
+                await asyncio.sleep(max(0.0, deadline_s - self._clock.now()))
+                now_s = self._clock.now()
+                late_s = now_s - deadline_s
+                skipped = max(0, int(late_s / self._period_s))
+                self.missed_ticks += skipped
+                deadline_s += skipped * self._period_s
+                if now_s >= ends_s:
+                    self.ask(Command("stop", "duration"))
+                    ends_s = math.inf
+                finished = await self._tick(now_s, now_s - last_s, late_s)
+                last_s = now_s
+                if finished is not None:
+                    return finished
+        finally:
+            await self._write(SAFE)
+
+    async def _tick(self, now_s: float, dt_s: float, late_s: float) -> Exit | None:
+        wiring = self._wiring
+        self.ticks += 1
+        reading = await self._read()
+        if now_s >= self._next_watch_s:
+            self._next_watch_s = now_s + _CHILD_WATCH_S
+            self._watch()
+        truth_um, bias_um = wiring.truth() if wiring.truth else (math.nan, math.nan)
+        commands, self._pending = tuple(self._pending), []
+        outputs = self._controller.tick(
+            TickInputs(
+                now_s=now_s,
+                dt_s=dt_s,
+                reading=reading,
+                lateness_ms=1e3 * late_s,
+                missed_ticks=self.missed_ticks,
+                link_up=self._link_up,
+                estimate=self._newest_shape(),
+                commands=commands,
+                dead_tasks=tuple(name for name, task in wiring.tasks.items() if task.done()),
+                truth_displacement_um=truth_um,
+                truth_laser_bias_um=bias_um,
+            )
+        )
+        await self._write(outputs.command)
+        wiring.telemetry.put(outputs.row.pack())
+        for event in outputs.events:
+            self.tell(event)
+        return outputs.finished
+
+    async def _read(self) -> BenchReading | None:
+        try:
+            reading = await self._wiring.bench.read()
+        except LinkError as error:
+            self._link_failed(error)
+            return None
+        return reading
+
+    async def _write(self, command: BenchCommand) -> None:
+        """The write that ends a tick and feeds the board's watchdog."""
+        if not self._link_up:
+            return
+        try:
+            await self._wiring.bench.write(command)
+        except LinkError as error:
+            self._link_failed(error)
+
+    def _link_failed(self, error: LinkError) -> None:
+        if isinstance(error, LinkDownError):
+            self._link_up = False
+        if str(error) != self._link_error:
+            self._link_error = str(error)
+            self.tell({"kind": "link", "message": str(error)})
+
+    def _newest_shape(self) -> ShapeEstimate | None:
+        if self._wiring.shapes is None:
+            return None
+        messages = self._wiring.shapes.drain()
+        if not messages:
+            return None
+        estimate = pickle.loads(messages[-1])
+        assert isinstance(estimate, ShapeEstimate)
+        return estimate
+
+    def _watch(self) -> None:
+        """The hold goes on without its children, and says so."""
+        for child in self._wiring.children:
+            if not child.alive and child.name not in self._dead:
+                self._dead.add(child.name)
+                self.tell({"kind": "child_ended", "child": child.name, "exit_code": child.exit_code})
