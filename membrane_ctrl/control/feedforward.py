@@ -1,0 +1,45 @@
+"""Flow that answers the weather before the laser sees it.
+
+Ambient pressure moves the centre by g_p (um/Pa) at once, gas temperature by g_T (um/K), and the gas follows the air
+with a lag T_g. The speed that cancels them is
+
+    v = -g_p d/dt lag(p, T_f) - g_T d/dt lag(T_air, T_g)
+
+T_f is only there to keep the barometer's noise from the pump; T_g is the physics itself and needs no more filter.
+"""
+
+from __future__ import annotations
+
+import math
+
+from membrane_ctrl.config import LoopConfig
+from membrane_ctrl.control.filters import LagRate
+
+
+class FeedForward:
+    """Feed-forward from barometer and air thermometer; either may be switched off, or come and go (NaN), at any time.
+
+    Parameters
+    ----------
+    loop : LoopConfig
+    """
+
+    def __init__(self, loop: LoopConfig) -> None:
+        self._pressure = LagRate(loop.feedforward_filter_s)
+        self._temperature = LagRate(loop.gas_follows_air_s)
+        self.set_gains(loop)
+
+    def set_gains(self, loop: LoopConfig) -> None:
+        """Take new gains, switches and time constants; a channel switched off dies away like a lost sensor."""
+        self._loop = loop
+        self._pressure.time_constant_s = loop.feedforward_filter_s
+        self._temperature.time_constant_s = loop.gas_follows_air_s
+
+    def update(self, ambient_pressure_pa: float, air_temperature_c: float, dt_s: float) -> float:
+        """Flow in um/s; NaN for a quantity that is not there."""
+        loop = self._loop
+        pressure_pa = ambient_pressure_pa if loop.feedforward_barometer else math.nan
+        temperature_c = air_temperature_c if loop.feedforward_temperature else math.nan
+        pressure_um_per_s = loop.barometer_gain_um_per_pa * self._pressure.update(pressure_pa, dt_s)
+        temperature_um_per_s = loop.temperature_gain_um_per_k * self._temperature.update(temperature_c, dt_s)
+        return -(pressure_um_per_s + temperature_um_per_s)

@@ -1,0 +1,249 @@
+"""The inner loop: holds the laser reading at the setpoint with the pump's flow. Pure: no I/O, no clock.
+
+Order of a tick: setpoint ramp and trim -> measurement filter -> P, I, D -> feed-forward -> limits -> back-calculation
+-> pump curve. The measurement filter stands before the limits: noise that meets a one-sided limit becomes a bias.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from membrane_ctrl.config import LoopConfig, PumpConfig
+from membrane_ctrl.control.feedforward import FeedForward
+from membrane_ctrl.control.filters import LowPass
+from membrane_ctrl.control.leak import LeakEstimate
+from membrane_ctrl.control.limiter import FlowLimiter
+from membrane_ctrl.control.pid import Pid, PidGains, PidTerms
+from membrane_ctrl.control.pump_curve import PumpCurve
+from membrane_ctrl.control.setpoint import SetpointRamp, SetpointWeight
+
+
+@dataclass(frozen=True, slots=True)
+class LoopInput:
+    """What one tick knows.
+
+    Attributes
+    ----------
+    target_um : float
+        Where the setpoint is to go, without the trim.
+    trim_um : float
+        The shape loop's share of the setpoint; it changes slowly and is added behind the ramp.
+    displacement_um : float
+        Laser reading, as read.
+    ambient_pressure_pa, air_temperature_c : float
+        NaN without a sensor.
+    """
+
+    target_um: float
+    trim_um: float
+    displacement_um: float
+    ambient_pressure_pa: float
+    air_temperature_c: float
+
+
+@dataclass(frozen=True, slots=True)
+class LoopOutput:
+    """What one tick decided, and from what.
+
+    Attributes
+    ----------
+    setpoint_um : float
+        Ramp and trim.
+    filtered_um, error_um : float
+        Filtered reading; setpoint minus it.
+    p_um_per_s, i_um_per_s, d_um_per_s, feedforward_um_per_s : float
+        The terms of the flow; the feed-forward holds the ramp's own speed too.
+    flow_wanted_um_per_s, flow_um_per_s : float
+        Before the limits; what the command gives.
+    pump_fraction : float
+        Command, 0..1.
+    saturated : bool
+        Range or rate took something away.
+    leak_um_per_s : float
+        Estimated loss of gas, NaN until there is an estimate.
+    too_tight : bool
+        The mirror loses too little gas to be held within the band.
+    """
+
+    setpoint_um: float
+    filtered_um: float
+    error_um: float
+    p_um_per_s: float
+    i_um_per_s: float
+    d_um_per_s: float
+    feedforward_um_per_s: float
+    flow_wanted_um_per_s: float
+    flow_um_per_s: float
+    pump_fraction: float
+    saturated: bool
+    leak_um_per_s: float
+    too_tight: bool
+
+
+class InnerLoop:
+    """Two-degree-of-freedom PI(D) with feed-forward, on flow as a speed of the mirror's centre.
+
+    Call exactly one of `step`, `stale` and `follow` a tick; any may follow any other without a bump.
+
+    Parameters
+    ----------
+    loop : LoopConfig
+    pump : PumpConfig
+    """
+
+    def __init__(self, loop: LoopConfig, pump: PumpConfig) -> None:
+        self._loop = loop
+        self._flow_full_um_per_s = pump.flow_full_um_per_s
+        flow_max_um_per_s = min(loop.flow_max_um_per_s, pump.flow_full_um_per_s)
+        self._measured = LowPass(loop.measurement_filter_s)
+        # The setpoint passes the same lag as the measurement: a ramp is then no error of its own.
+        self._matched = LowPass(loop.measurement_filter_s)
+        self._ramp = SetpointRamp(loop.setpoint_ramp_um_per_s, flow_max_um_per_s)
+        self._weight = SetpointWeight(loop.setpoint_weight, loop.ti_s)
+        self._pid = Pid(_gains(loop), flow_max_um_per_s)
+        self._feedforward = FeedForward(loop)
+        self._limiter = FlowLimiter(flow_max_um_per_s, loop.flow_rate_limit_um_per_s2)
+        self._curve = PumpCurve(pump)
+        self._leak = LeakEstimate()
+        self._setpoint_um = math.nan
+        self._shaped_um = math.nan
+
+    def start(self, displacement_um: float, flow_um_per_s: float) -> None:
+        """Begin at a reading: the setpoint ramps from there, the integrator stands at the flow.
+
+        Parameters
+        ----------
+        displacement_um : float
+            Laser reading now.
+        flow_um_per_s : float
+            What the pump gives now, or the mean it is known to need.
+        """
+        self._measured.reset(displacement_um)
+        self._stand_at(displacement_um)
+        self._ramp.value_um = math.nan  # placed by the first step, which knows the trim
+        self._pid.place(self._limiter.place(flow_um_per_s))
+        self._curve.stopped()
+        self._leak.pause()
+
+    def step(self, given: LoopInput, dt_s: float) -> LoopOutput:
+        """One automatic tick; a reading that is not finite is a missing one (`stale`).
+
+        Parameters
+        ----------
+        given : LoopInput
+        dt_s : float
+            True time since the last tick, > 0, clamped by the caller.
+        """
+        if not math.isfinite(given.displacement_um):
+            return self.stale(dt_s)
+        before_um = self._measured.value
+        filtered_um = self._measured.update(given.displacement_um, dt_s)
+        error_um, ramp_um_per_s = self._follow_setpoint(given, filtered_um, dt_s)
+        rate_um_per_s = 0.0 if math.isnan(before_um) else (filtered_um - before_um) / dt_s
+        terms = self._pid.terms(error_um, rate_um_per_s)
+        weather_um_per_s = self._feedforward.update(given.ambient_pressure_pa, given.air_temperature_c, dt_s)
+        wanted_um_per_s = terms.sum_um_per_s + weather_um_per_s + ramp_um_per_s
+        limited_um_per_s = self._limiter.limit(wanted_um_per_s, dt_s)
+        self._pid.integrate(limited_um_per_s - wanted_um_per_s, dt_s)
+        fraction = self._curve.command(limited_um_per_s, dt_s)
+        self._leak.update(self._curve.flow(fraction), weather_um_per_s, filtered_um, dt_s)
+        return self._output(terms, weather_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction)
+
+    def stale(self, dt_s: float) -> LoopOutput:
+        """One tick without a fresh reading: the integrator is frozen and put out, for it is the mean flow.
+
+        Repeating the last reading instead would integrate its error: 5 times the excursion (PHYSICS, inner loop).
+        """
+        self._feedforward.update(math.nan, math.nan, dt_s)
+        self._leak.pause()
+        mean_um_per_s = self._pid.integral_um_per_s
+        self._limiter.limit(mean_um_per_s, dt_s)
+        fraction = self._curve.command(self._limiter.flow_um_per_s, dt_s)
+        return self._output(PidTerms(0.0, mean_um_per_s, 0.0), 0.0, mean_um_per_s, fraction)
+
+    def follow(self, given: LoopInput, flow_um_per_s: float, dt_s: float) -> LoopOutput:
+        """One tick in which somebody else gives the flow (manual, tuning, ramp-down).
+
+        The setpoint stands at the reading and the integrator at the flow, so that `step` goes on from there.
+
+        Parameters
+        ----------
+        given : LoopInput
+            The target is not used; a reading that is not finite leaves the last one.
+        flow_um_per_s : float
+            Put out as it is, within the pump's range.
+        dt_s : float
+        """
+        if math.isfinite(given.displacement_um):
+            self._measured.update(given.displacement_um, dt_s)
+        if not math.isnan(self._measured.value):
+            self._stand_at(self._measured.value)
+            self._ramp.value_um = self._measured.value - given.trim_um
+        weather_um_per_s = self._feedforward.update(given.ambient_pressure_pa, given.air_temperature_c, dt_s)
+        placed_um_per_s = self._limiter.place(flow_um_per_s)
+        self._pid.place(placed_um_per_s - weather_um_per_s)
+        fraction = self._curve.command(placed_um_per_s, dt_s)
+        if math.isfinite(given.displacement_um):
+            self._leak.update(self._curve.flow(fraction), weather_um_per_s, self._measured.value, dt_s)
+        else:
+            self._leak.pause()
+        terms = PidTerms(0.0, self._pid.integral_um_per_s, 0.0)
+        return self._output(terms, weather_um_per_s, flow_um_per_s, fraction)
+
+    def set_gains(self, loop: LoopConfig) -> None:
+        """Take new settings without a bump in the flow."""
+        flow_max_um_per_s = min(loop.flow_max_um_per_s, self._flow_full_um_per_s)
+        self._loop = loop
+        self._measured.time_constant_s = self._matched.time_constant_s = loop.measurement_filter_s
+        self._ramp.rate_um_per_s, self._ramp.flow_max_um_per_s = loop.setpoint_ramp_um_per_s, flow_max_um_per_s
+        self._weight = SetpointWeight(loop.setpoint_weight, loop.ti_s)
+        self._weight.reset(self._shaped_um)
+        self._limiter.flow_max_um_per_s = self._pid.flow_max_um_per_s = flow_max_um_per_s
+        self._limiter.rate_um_per_s2 = loop.flow_rate_limit_um_per_s2
+        self._feedforward.set_gains(loop)
+        self._pid.set_gains(_gains(loop))
+
+    def _stand_at(self, setpoint_um: float) -> None:
+        """Let all that follows the setpoint stand still at it."""
+        self._setpoint_um = self._shaped_um = setpoint_um
+        self._weight.reset(setpoint_um)
+        self._matched.reset(setpoint_um)
+
+    def _follow_setpoint(self, given: LoopInput, filtered_um: float, dt_s: float) -> tuple[float, float]:
+        """Advance the setpoint; the loop's error in um and the ramp's own speed in um/s."""
+        if math.isnan(self._setpoint_um):
+            self._stand_at(filtered_um)
+        if math.isnan(self._ramp.value_um):
+            self._ramp.value_um = self._setpoint_um - given.trim_um
+        base_um = self._ramp.advance(given.target_um, self._pid.integral_um_per_s, dt_s)
+        self._setpoint_um = base_um + given.trim_um
+        shaped_um = self._weight.update(self._setpoint_um, dt_s)
+        # An integrating mirror follows a ramp with a flow equal to the ramp's speed. Bounded, for the trim's
+        # steps are in it too.
+        limit_um_per_s = self._loop.setpoint_ramp_um_per_s
+        speed_um_per_s = min(max((shaped_um - self._shaped_um) / dt_s, -limit_um_per_s), limit_um_per_s)
+        self._shaped_um = shaped_um
+        return self._matched.update(shaped_um, dt_s) - filtered_um, speed_um_per_s
+
+    def _output(self, terms: PidTerms, feedforward: float, wanted: float, fraction: float) -> LoopOutput:
+        """The tick as it is told; flows in um/s."""
+        return LoopOutput(
+            setpoint_um=self._setpoint_um,
+            filtered_um=self._measured.value,
+            error_um=self._setpoint_um - self._measured.value,
+            p_um_per_s=terms.p_um_per_s,
+            i_um_per_s=terms.i_um_per_s,
+            d_um_per_s=terms.d_um_per_s,
+            feedforward_um_per_s=feedforward,
+            flow_wanted_um_per_s=wanted,
+            flow_um_per_s=self._curve.flow(fraction),
+            pump_fraction=fraction,
+            saturated=abs(self._limiter.flow_um_per_s - wanted) > 1e-9,
+            leak_um_per_s=self._leak.leak_um_per_s,
+            too_tight=self._leak.too_tight,
+        )
+
+
+def _gains(loop: LoopConfig) -> PidGains:
+    return PidGains(loop.kp_per_s, loop.ti_s, loop.td_s)

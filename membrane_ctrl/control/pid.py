@@ -1,0 +1,82 @@
+"""PI(D) on a filtered measurement, with back-calculation and a clamped integrator.
+
+    P = K (r - y)          D = -K Td dy/dt          u = P + I + D + feed-forward
+    dI/dt = K / Ti (r - y) + (v - u) / Tt,    Tt = Ti,    0 <= I <= v_max
+
+v is what the limits left of u. Source: Astrom and Hagglund, Advanced PID Control (2006), sections 3.4, 3.5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class PidGains:
+    """Gains: K in 1/s (um/s of flow per um), times in s."""
+
+    kp_per_s: float
+    ti_s: float
+    td_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class PidTerms:
+    """The three terms of one step, um/s."""
+
+    p_um_per_s: float
+    i_um_per_s: float
+    d_um_per_s: float
+
+    @property
+    def sum_um_per_s(self) -> float:
+        """P + I + D."""
+        return self.p_um_per_s + self.i_um_per_s + self.d_um_per_s
+
+
+class Pid:
+    """The controller's memory: the integrator and the last error and measurement rate (for bumpless changes).
+
+    Parameters
+    ----------
+    gains : PidGains
+    flow_max_um_per_s : float
+        Upper end of the integrator; the lower end is 0, for the pump takes no gas away.
+    """
+
+    def __init__(self, gains: PidGains, flow_max_um_per_s: float) -> None:
+        self.gains = gains
+        self.flow_max_um_per_s = flow_max_um_per_s
+        self.integral_um_per_s = 0.0
+        self._error_um = 0.0
+        self._rate_um_per_s = 0.0
+
+    def place(self, integral_um_per_s: float) -> None:
+        """Set the integrator, within its range, and forget the last error."""
+        self.integral_um_per_s = self._clamped(integral_um_per_s)
+        self._error_um = self._rate_um_per_s = 0.0
+
+    def terms(self, error_um: float, measured_rate_um_per_s: float) -> PidTerms:
+        """P, I and D for the (filtered) error and the rate of the filtered measurement."""
+        self._error_um, self._rate_um_per_s = error_um, measured_rate_um_per_s
+        return self._terms()
+
+    def integrate(self, dropped_um_per_s: float, dt_s: float) -> None:
+        """Advance the integrator; `dropped_um_per_s` is the limited minus the wanted flow."""
+        drive_um_per_s = self.gains.kp_per_s * self._error_um + dropped_um_per_s
+        self.integral_um_per_s = self._clamped(self.integral_um_per_s + drive_um_per_s * dt_s / self.gains.ti_s)
+
+    def set_gains(self, gains: PidGains) -> None:
+        """Change the gains and let the integrator take up the difference, so that the sum does not jump."""
+        before = self._terms()
+        self.gains = gains
+        self.integral_um_per_s = self._clamped(
+            self.integral_um_per_s + before.sum_um_per_s - self._terms().sum_um_per_s
+        )
+
+    def _terms(self) -> PidTerms:
+        kp, td_s = self.gains.kp_per_s, self.gains.td_s
+        return PidTerms(kp * self._error_um, self.integral_um_per_s, -kp * td_s * self._rate_um_per_s)
+
+    def _clamped(self, flow_um_per_s: float) -> float:
+        return min(max(flow_um_per_s, 0.0), self.flow_max_um_per_s)
