@@ -1,0 +1,80 @@
+"""The acquisition's line to the process that started it: commands in, small reports out, and whether it lives."""
+
+from __future__ import annotations
+
+import os
+import select
+from multiprocessing.connection import Connection
+from typing import Literal
+
+AcquisitionState = Literal["preparing", "running", "paused", "retrying", "failed", "stopped"]
+
+_PARENT_CHECK_S = 0.2  # how soon a dead parent is noticed
+
+
+class Remote:
+    """Commands "pause", "resume", "full" and "stop" over a Connection; reports as dicts.
+
+    Attributes
+    ----------
+    stop, paused : bool
+        What was last asked for. `stop` is also set when the parent has died.
+
+    Parameters
+    ----------
+    control : Connection
+        Both ways.
+    parent_pid : int
+        The process whose end is ours.
+    """
+
+    def __init__(self, control: Connection, parent_pid: int) -> None:
+        self._control = control
+        self._parent_pid = parent_pid
+        self._full = False
+        self.stop = False
+        self.paused = False
+
+    def listen(self, timeout_s: float = 0.0) -> None:
+        """Take what has been sent; without anything to take, wait for it up to `timeout_s` (at most 0.2 s)."""
+        if os.getppid() != self._parent_pid:
+            self.stop = True
+            return
+        try:
+            while self._control.poll(min(timeout_s, _PARENT_CHECK_S)):
+                self._obey(self._control.recv())
+                timeout_s = 0.0
+        except (EOFError, OSError):  # the other end is closed
+            self.stop = True
+
+    def interrupts(self) -> bool:
+        """Whether a running cycle should end now."""
+        self.listen()
+        return self.stop or self.paused
+
+    def take_full(self) -> bool:
+        """Whether a full cycle was asked for since the last call."""
+        wanted, self._full = self._full, False
+        return wanted
+
+    def report(self, state: AcquisitionState, message: str = "", **details: object) -> None:
+        """Send a report; it is dropped when the other end does not read, as the cycle must never wait for it."""
+        status = {"kind": "acquisition", "state": state, "message": message, **details}
+        try:
+            if select.select([], [self._control.fileno()], [], 0)[1]:
+                self._control.send(status)
+        except OSError:
+            self.stop = True
+
+    def _obey(self, command: object) -> None:
+        match command:
+            case "pause":
+                self.paused = True
+            case "resume":
+                self.paused = False
+            case "full":
+                self._full = True
+            case "stop":
+                self.stop = True
+            case _:
+                self.report("running", f"unknown command {command!r}: use pause, resume, full or stop")

@@ -1,0 +1,74 @@
+"""The loop of the acquisition process: a cycle at each deadline, its estimate to the ring, its troubles reported."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable
+
+from membrane_ctrl.acquisition.cycle import CycleClock, CycleDone, CycleFailed, ShapeCycle
+from membrane_ctrl.acquisition.remote import Remote
+from membrane_ctrl.estimate import ShapeEstimate
+
+
+def keep_cycling(
+    cycle: ShapeCycle,
+    remote: Remote,
+    publish: Callable[[ShapeEstimate], None],
+    clock: CycleClock,
+    period_s: float,
+) -> None:
+    """Take cycles until told to stop.
+
+    Parameters
+    ----------
+    cycle : ShapeCycle
+        Must end early when `remote.interrupts()`.
+    remote : Remote
+        Commands and reports.
+    publish : callable
+        Gets every estimate, whatever its verdict.
+    clock : CycleClock
+        The run's clock.
+    period_s : float
+        From deadline to deadline. A cycle that takes longer costs the deadlines it covers; they are not made up.
+    """
+    due_s = clock.now()
+    while not remote.stop:
+        if remote.paused:
+            remote.report("paused", "until told to resume")
+            while remote.paused and not remote.stop:
+                remote.listen(math.inf)
+            due_s = clock.now()
+            continue
+        remaining_s = due_s - clock.now()
+        if remaining_s > 0:
+            remote.listen(remaining_s)
+            continue
+        if remote.take_full():
+            cycle.want_full()
+        result = cycle.take()
+        _tell(result, remote, publish)
+        pause_s = result.pause_s if result is not None else 0.0
+        due_s = next_deadline_s(due_s, period_s, clock.now() + pause_s)
+
+
+def next_deadline_s(last_s: float, period_s: float, earliest_s: float) -> float:
+    """The first moment of `last_s + k period_s`, k >= 1, that is not before `earliest_s`."""
+    return last_s + max(1, math.ceil((earliest_s - last_s) / period_s)) * period_s
+
+
+def estimate_message(estimate: ShapeEstimate) -> bytes:
+    """An estimate as it crosses in the ring of shapes (pickled)."""
+    return pickle.dumps(estimate, pickle.HIGHEST_PROTOCOL)
+
+
+def _tell(result: CycleDone | CycleFailed | None, remote: Remote, publish: Callable[[ShapeEstimate], None]) -> None:
+    match result:
+        case CycleDone(estimate, pause_s):
+            publish(estimate)
+            later = f"; next in {pause_s:g} s" if pause_s else ""
+            verdict = f"{estimate.verdict}: {estimate.reason}{later}" if estimate.reason else estimate.verdict
+            remote.report("running", verdict, cycle=estimate.cycle)
+        case CycleFailed(number, stage, message, pause_s):
+            remote.report("retrying", f"{stage}: {message}; again in {pause_s:g} s", cycle=number)

@@ -1,0 +1,173 @@
+"""Deadlines, commands and reports of the acquisition loop."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+
+import pytest
+from bench_fakes import VirtualClock, estimate
+
+from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed
+from membrane_ctrl.acquisition.remote import Remote
+from membrane_ctrl.acquisition.worker import keep_cycling, next_deadline_s
+from membrane_ctrl.estimate import ShapeEstimate
+
+
+class ScriptedRemote(Remote):
+    """Waits on the virtual clock and gets its commands at given moments."""
+
+    def __init__(self, clock: VirtualClock, script: dict[float, str]) -> None:
+        self.clock = clock
+        self.script = sorted(script.items())
+        self.told: list[tuple[str, str]] = []
+        self.stop = self.paused = self._full = False
+
+    def listen(self, timeout_s: float = 0.0) -> None:
+        assert self.script, "nothing more will happen"
+        moment_s, command = self.script[0]
+        if self.clock.now_s + timeout_s < moment_s:
+            self.clock.now_s += timeout_s
+            return
+        self.clock.now_s = max(self.clock.now_s, moment_s)
+        self.script.pop(0)
+        self._obey(command)
+
+    def report(self, state: str, message: str = "", **details: object) -> None:
+        self.told.append((state, message))
+
+
+class ScriptedCycle:
+    """Takes `duration_s` a cycle and gives the results it was told, then good ones."""
+
+    def __init__(self, clock: VirtualClock, duration_s: float = 0.5) -> None:
+        self.clock = clock
+        self.duration_s = duration_s
+        self.started_s: list[float] = []
+        self.results: list[CycleDone | CycleFailed | None] = []
+        self.full_wanted_at_s: list[float] = []
+
+    def take(self) -> CycleDone | CycleFailed | None:
+        self.started_s.append(self.clock.now_s)
+        self.clock.sleep(self.duration_s)
+        return self.results.pop(0) if self.results else CycleDone(estimate(cycle=len(self.started_s)), 0.0)
+
+    def want_full(self) -> None:
+        self.full_wanted_at_s.append(self.clock.now_s)
+
+
+class Loop:
+    def __init__(self, script: dict[float, str], duration_s: float = 0.5) -> None:
+        self.clock = VirtualClock()
+        self.remote = ScriptedRemote(self.clock, script)
+        self.cycle = ScriptedCycle(self.clock, duration_s)
+        self.published: list[ShapeEstimate] = []
+
+    def run(self) -> None:
+        keep_cycling(self.cycle, self.remote, self.published.append, self.clock, 2.0)  # type: ignore[arg-type]
+
+
+def test_cycles_start_on_absolute_deadlines() -> None:
+    loop = Loop({9.0: "stop"})
+    loop.run()
+    assert loop.cycle.started_s == [0, 2, 4, 6, 8]
+    assert len(loop.published) == 5
+
+
+def test_slow_cycle_skips_deadlines_and_makes_none_up() -> None:
+    loop = Loop({9.0: "stop"}, duration_s=2.5)
+    loop.run()
+    assert loop.cycle.started_s == [0, 4, 8]
+
+
+def test_pause_and_resume() -> None:
+    loop = Loop({1.0: "pause", 7.3: "resume", 8.0: "stop"})
+    loop.run()
+    assert loop.cycle.started_s == [0, 7.3]
+    assert ("paused", "until told to resume") in loop.remote.told
+
+
+def test_full_on_request_goes_to_the_next_cycle() -> None:
+    loop = Loop({1.0: "full", 5.0: "stop"})
+    loop.run()
+    assert loop.cycle.full_wanted_at_s == [2]
+
+
+def test_failure_is_reported_and_waits_out_its_pause() -> None:
+    loop = Loop({9.0: "stop"})
+    loop.cycle.results = [CycleFailed(1, "camera", "LinkError: no trigger", 4.0)]
+    loop.run()
+    assert loop.cycle.started_s == [0, 6, 8]
+    assert loop.remote.told[0] == ("retrying", "camera: LinkError: no trigger; again in 4 s")
+
+
+def test_rejected_estimate_is_published_and_reported_with_its_reason() -> None:
+    loop = Loop({1.0: "stop"})
+    loop.cycle.results = [CycleDone(estimate("full", verdict="rejected", reason="no mirror"), 1.0)]
+    loop.run()
+    assert [e.verdict for e in loop.published] == ["rejected"]
+    assert loop.remote.told == [("running", "rejected: no mirror; next in 1 s")]
+
+
+def test_interrupted_cycle_publishes_nothing() -> None:
+    loop = Loop({1.0: "stop"})
+    loop.cycle.results = [None]
+    loop.run()
+    assert loop.published == []
+    assert loop.remote.told == []
+
+
+@pytest.mark.parametrize(
+    ("now_s", "due_s"), [(10.0, 12.0), (11.9, 12.0), (12.0, 12.0), (12.1, 14.0), (1e6 + 1, 1e6 + 2)]
+)
+def test_next_deadline(now_s: float, due_s: float) -> None:
+    assert next_deadline_s(10.0, 2.0, now_s) == due_s
+
+
+@pytest.fixture
+def line() -> Iterator[tuple[Connection, Connection]]:
+    ours, theirs = multiprocessing.Pipe()
+    yield ours, theirs
+    ours.close()
+    theirs.close()
+
+
+def test_commands_over_a_real_connection(line: tuple[Connection, Connection]) -> None:
+    ours, theirs = line
+    remote = Remote(theirs, os.getppid())
+    for command in ("pause", "full"):
+        ours.send(command)
+    assert remote.interrupts()
+    assert remote.paused
+    assert [remote.take_full(), remote.take_full()] == [True, False]
+    ours.send("resume")
+    assert not remote.interrupts()
+    ours.send("stop")
+    assert remote.interrupts()
+    assert remote.stop
+
+
+def test_unknown_command_is_answered(line: tuple[Connection, Connection]) -> None:
+    ours, theirs = line
+    ours.send("dance")
+    Remote(theirs, os.getppid()).listen()
+    assert "unknown command 'dance'" in ours.recv()["message"]
+
+
+def test_closed_line_and_dead_parent_stop_the_process(line: tuple[Connection, Connection]) -> None:
+    ours, theirs = line
+    orphan = Remote(theirs, parent_pid=-1)
+    assert orphan.interrupts()
+    ours.close()
+    assert Remote(theirs, os.getppid()).interrupts()
+
+
+def test_reports_never_wait_for_a_reader(line: tuple[Connection, Connection]) -> None:
+    ours, theirs = line
+    remote = Remote(theirs, os.getppid())
+    for _ in range(3000):  # far more than the line holds
+        remote.report("running", "x" * 200, cycle=1)
+    assert not remote.stop
+    assert ours.recv() == {"kind": "acquisition", "state": "running", "message": "x" * 200, "cycle": 1}
