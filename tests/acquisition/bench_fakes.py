@@ -95,7 +95,7 @@ class FakeReconstructor:
     clock: VirtualClock
     verdicts: list[tuple[Verdict, str]] = field(default_factory=list)
     calls: list[Call] = field(default_factory=list)
-    error: Exception | None = None
+    singular: bool = False
 
     def full(
         self, frames: Sequence[Pixels], time_s: NDArray[np.float64], displacement_um: NDArray[np.float64]
@@ -116,8 +116,8 @@ class FakeReconstructor:
     ) -> ShapeEstimate:
         self.calls.append(Call(kind, [int(frame[0, 0]) for frame in frames], time_s, displacement_um))
         self.clock.sleep(0.05)
-        if self.error is not None:
-            raise self.error
+        if self.singular:
+            raise np.linalg.LinAlgError("singular matrix")
         verdict, reason = self.verdicts.pop(0) if self.verdicts else ("ok", "")
         return estimate(kind, time_s=float(np.mean(time_s)), verdict=verdict, reason=reason)
 

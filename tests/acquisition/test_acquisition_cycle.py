@@ -152,7 +152,7 @@ def test_broken_camera_keeps_the_kind_of_the_cycle(bench: Bench) -> None:
 
 
 def test_numerics_that_raise_are_an_event(bench: Bench) -> None:
-    bench.reconstructor.error = np.linalg.LinAlgError("singular matrix")
+    bench.reconstructor.singular = True
     failure = bench.failed()
     assert (failure.stage, failure.message) == ("reconstruction", "LinAlgError: singular matrix")
 
