@@ -1,0 +1,1 @@
+"""Emulators: devices that answer in bytes, each with faults that can be switched on."""

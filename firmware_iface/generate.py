@@ -1,0 +1,120 @@
+"""Writes what is made from the register map: `docs/registers.md` and `membrane_board.h`.
+
+Run `python -m firmware_iface.generate` after a change of the map; with `--check` it writes nothing and exits with 1
+when a file is out of date.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from firmware_iface.register_map import I32_NO_VALUE, Block, Register, RegisterMap, default_map
+
+_HERE = Path(__file__).resolve().parent
+HEADER_PATH = _HERE / "membrane_board.h"
+DOCS_PATH = _HERE.parent / "docs" / "registers.md"
+_SOURCE = "firmware_iface/registers.toml by python -m firmware_iface.generate"
+
+
+def markdown(registers: RegisterMap) -> str:
+    """The map as a page for people."""
+    lines = [
+        "# Registers of the membrane pump board",
+        "",
+        f"Made from {_SOURCE}; do not edit.",
+        "",
+        f"Map version {registers.map_version}, device kind {registers.device_kind} (0x{registers.device_kind:04X}).",
+        "",
+        "Modbus holding registers, function codes 3 (read), 6 and 16 (write) and 23 (write, then read); addresses",
+        "count from 0; 32-bit values have the big word first. value = raw / counts per unit.",
+        f"An `i32` of {I32_NO_VALUE} means that there is no value. A write outside the limits is answered with",
+        "exception 3 and changes nothing; one to a read-only or unknown address, or to half a value, with 2.",
+    ]
+    for block in registers.blocks:
+        lines += ["", *_markdown_block(block)]
+    lines += ["", "## Faults", "", "Bits of `latched_faults` and `clear_faults`.", ""]
+    lines += ["| bit | name | meaning |", "|---|---|---|"]
+    lines += [f"| {fault.bit} | `{fault.name}` | {fault.meaning} |" for fault in registers.faults]
+    return "\n".join(lines) + "\n"
+
+
+def _markdown_block(block: Block) -> list[str]:
+    last = block.address + block.count - 1
+    return [
+        f"## {block.name}: {block.address}..{last}, {block.access}",
+        "",
+        block.meaning,
+        "",
+        "| address | name | type | unit | counts per unit | limits | access | meaning |",
+        "|---|---|---|---|---|---|---|---|",
+        *(_markdown_row(register) for register in block.registers),
+    ]
+
+
+def _markdown_row(register: Register) -> str:
+    limits = f"{register.minimum:g} .. {register.maximum:g}" if register.access == "rw" else ""
+    return (
+        f"| {register.address} | `{register.name}` | {register.type} | {register.unit} | "
+        f"{register.counts_per_unit} | {limits} | {register.access} | {register.meaning} |"
+    )
+
+
+def c_header(registers: RegisterMap) -> str:
+    """The map as a C header (C89 and later, preprocessor only) for authors of firmware."""
+    lines = [
+        f"/* Registers of the membrane pump board. Made from {_SOURCE}; do not edit.",
+        " * Modbus holding registers, addresses from 0, big word first. value = raw / COUNTS_PER_UNIT. */",
+        "#ifndef MEMBRANE_BOARD_H",
+        "#define MEMBRANE_BOARD_H",
+        "",
+        _define("MAP_VERSION", f"{registers.map_version}u"),
+        _define("DEVICE_KIND", f"0x{registers.device_kind:04X}u"),
+        _define("I32_NO_VALUE", f"({I32_NO_VALUE + 1} - 1)", "there is no value"),
+    ]
+    for block in registers.blocks:
+        lines += ["", f"/* {block.name} ({block.access}): {block.meaning} */"]
+        lines += [_define(f"BLOCK_{block.name}_ADDRESS", f"{block.address}u")]
+        lines += [_define(f"BLOCK_{block.name}_WORDS", f"{block.count}u")]
+        for register in block.registers:
+            lines += _c_register(register)
+    lines += ["", "/* bits of latched_faults and clear_faults */"]
+    lines += [_define(f"FAULT_{fault.name}", f"0x{fault.mask:04X}u", fault.meaning) for fault in registers.faults]
+    return "\n".join([*lines, "", "#endif"]) + "\n"
+
+
+def _c_register(register: Register) -> list[str]:
+    lines = [_define(f"{register.name}_ADDRESS", f"{register.address}u", f"{register.type}: {register.meaning}")]
+    if register.counts_per_unit != 1:
+        lines.append(_define(f"{register.name}_COUNTS_PER_UNIT", str(register.counts_per_unit)))
+    if register.access == "rw":
+        lines.append(_define(f"{register.name}_MIN_RAW", f"{register.to_raw(register.minimum):.0f}"))
+        lines.append(_define(f"{register.name}_MAX_RAW", f"{register.to_raw(register.maximum):.0f}"))
+    return lines
+
+
+def _define(name: str, value: str, comment: str = "") -> str:
+    return f"#define MEMBRANE_{name.upper()} {value}" + (f" /* {comment} */" if comment else "")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Write the files, or say which are out of date; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m firmware_iface.generate", description=__doc__)
+    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 when a file is out of date")
+    check = parser.parse_args(arguments).check
+    registers = default_map()
+    stale = False
+    for path, text in ((DOCS_PATH, markdown(registers)), (HEADER_PATH, c_header(registers))):
+        if path.exists() and path.read_text(encoding="utf-8") == text:
+            continue
+        stale = True
+        if check:
+            print(f"{path} is out of date: run python -m firmware_iface.generate", file=sys.stderr)
+        else:
+            path.write_text(text, encoding="utf-8")
+    return 1 if check and stale else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,280 @@
+"""The register map: loaded from `registers.toml`, checked, and used to turn registers into values and back."""
+
+from __future__ import annotations
+
+import math
+import struct
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+DEFAULT_PATH = Path(__file__).with_name("registers.toml")
+SCHEMA = "membrane-registers/1"
+
+# struct code and length in 16-bit words; big-endian structs give the big word first
+_TYPES = {"u16": ("H", 1), "u32": ("I", 2), "i32": ("i", 2), "f32": ("f", 2)}
+_RANGES = {"u16": (0, 2**16 - 1), "u32": (0, 2**32 - 1), "i32": (-(2**31) + 1, 2**31 - 1)}
+# an integer has no NaN; the most negative one has no positive twin and is the customary stand-in
+I32_NO_VALUE = -(2**31)
+_SUFFIXES = {"s": "_s", "um": "_um", "Pa": "_pa", "degC": "_c", "fraction": "_fraction", "1": ""}
+_ADDRESSES = 2**16
+_READ_MAX_WORDS = 125  # Modbus application protocol 1.1b3, function code 3
+_REGISTER_KEYS = {"name", "address", "type", "unit", "counts_per_unit", "min", "max", "meaning"}
+
+
+class RegisterMapError(ValueError):
+    """The map file is not usable; the message names the register and what would be right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Register:
+    """One quantity of the device.
+
+    Attributes
+    ----------
+    name : str
+        Ends in its unit.
+    address : int
+        Of its first word.
+    type : str
+        "u16", "u32", "i32" or "f32".
+    unit : str
+        "1" for a pure number.
+    counts_per_unit : int
+        value = raw / counts_per_unit.
+    minimum, maximum : float
+        Limits of a write, in the unit; infinite where nothing may be written.
+    access : str
+        "ro" or "rw".
+    meaning : str
+        One line for people.
+    """
+
+    name: str
+    address: int
+    type: str
+    unit: str
+    counts_per_unit: int
+    minimum: float
+    maximum: float
+    access: str
+    meaning: str
+
+    @property
+    def words(self) -> int:
+        """Its length in 16-bit registers."""
+        return _TYPES[self.type][1]
+
+    def allows(self, value: float) -> bool:
+        """Whether a write of this value is within the limits; NaN is not."""
+        return self.minimum <= value <= self.maximum
+
+    def to_raw(self, value: float) -> float:
+        """The number on the wire. Raises ValueError if the type cannot hold the value."""
+        if self.type == "f32":
+            return value
+        if math.isnan(value) and self.type == "i32":
+            return I32_NO_VALUE
+        low, high = _RANGES[self.type]
+        if not low <= value * self.counts_per_unit <= high:  # also False for NaN
+            raise ValueError(f"{self.name} = {value:g} {self.unit} does not fit its {self.type}")
+        return round(value * self.counts_per_unit)
+
+    def to_value(self, raw: float) -> float:
+        """The value in the register's unit; NaN for "no value"."""
+        if self.type == "i32" and raw == I32_NO_VALUE:
+            return math.nan
+        return raw / self.counts_per_unit
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Registers without a gap between them, moved in one transaction."""
+
+    name: str
+    access: str
+    meaning: str
+    registers: tuple[Register, ...]
+    layout: struct.Struct
+
+    @property
+    def address(self) -> int:
+        """Of its first word."""
+        return self.registers[0].address
+
+    @property
+    def count(self) -> int:
+        """Its length in words."""
+        return self.layout.size // 2
+
+    def encode(self, values: Mapping[str, float]) -> list[int]:
+        """Values by name to words, big word first. Raises ValueError if one does not fit its type."""
+        packed = self.layout.pack(*(register.to_raw(values[register.name]) for register in self.registers))
+        return list(struct.unpack(f">{self.count}H", packed))
+
+    def decode(self, words: Sequence[int]) -> dict[str, float]:
+        """Words, big word first, to values by name. Raises ValueError if there are not `count` of them."""
+        if len(words) != self.count:
+            raise ValueError(f"block {self.name} has {self.count} registers, not {len(words)}")
+        raws = self.layout.unpack(struct.pack(f">{self.count}H", *words))
+        return {register.name: register.to_value(raw) for register, raw in zip(self.registers, raws, strict=True)}
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One bit of `latched_faults`."""
+
+    bit: int
+    name: str
+    meaning: str
+
+    @property
+    def mask(self) -> int:
+        """The bit as a number."""
+        return 1 << self.bit
+
+
+@dataclass(frozen=True, slots=True)
+class RegisterMap:
+    """The whole map."""
+
+    map_version: int
+    device_kind: int
+    blocks: tuple[Block, ...]
+    faults: tuple[Fault, ...]
+
+    def __iter__(self) -> Iterator[Register]:
+        """All registers by address."""
+        return (register for block in self.blocks for register in block.registers)
+
+    def block(self, name: str) -> Block:
+        """The block of that name. Raises KeyError."""
+        return {block.name: block for block in self.blocks}[name]
+
+    def register(self, name: str) -> Register:
+        """The register of that name. Raises KeyError."""
+        return {register.name: register for register in self}[name]
+
+    def fault_mask(self, name: str) -> int:
+        """The bit of the fault of that name, as a number. Raises KeyError."""
+        return {fault.name: fault.mask for fault in self.faults}[name]
+
+
+def make_block(name: str, access: str, meaning: str, registers: Sequence[Register]) -> Block:
+    """A block from registers that follow each other."""
+    layout = struct.Struct(">" + "".join(_TYPES[register.type][0] for register in registers))
+    return Block(name, access, meaning, tuple(registers), layout)
+
+
+@cache
+def default_map() -> RegisterMap:
+    """The map that comes with this package."""
+    return load(DEFAULT_PATH)
+
+
+def load(path: Path) -> RegisterMap:
+    """Read and check a map.
+
+    Raises
+    ------
+    RegisterMapError
+        For a file that is no such map, and for overlaps, gaps, wrong order, unknown types or keys, missing
+        limits and names that do not end in their unit.
+    """
+    try:
+        return parse(tomllib.loads(path.read_text(encoding="utf-8")))
+    except (OSError, tomllib.TOMLDecodeError, RegisterMapError) as error:
+        raise RegisterMapError(f"{path}: {error}") from error
+
+
+def parse(table: Mapping[str, Any]) -> RegisterMap:
+    """A map from its TOML table. Raises RegisterMapError."""
+    if table.get("schema") != SCHEMA:
+        raise RegisterMapError(f'schema is {table.get("schema")!r}, wanted "{SCHEMA}"')
+    try:
+        blocks = tuple(_parse_block(entry) for entry in table["block"])
+        faults = tuple(Fault(entry["bit"], entry["name"], entry["meaning"]) for entry in table["fault"])
+        found = RegisterMap(table["map_version"], table["device_kind"], blocks, faults)
+    except KeyError as error:
+        raise RegisterMapError(f"{error.args[0]} is missing") from error
+    _check_order(found)
+    return found
+
+
+def _parse_block(entry: Mapping[str, Any]) -> Block:
+    name, access = entry["name"], entry["access"]
+    if access not in ("ro", "rw"):
+        raise RegisterMapError(f'block {name}: access is {access!r}, wanted "ro" or "rw"')
+    registers = [_parse_register(register, access) for register in entry["registers"]]
+    if not registers:
+        raise RegisterMapError(f"block {name} has no registers")
+    block = make_block(name, access, entry["meaning"], registers)
+    if block.count > _READ_MAX_WORDS:
+        raise RegisterMapError(f"block {name} has {block.count} words; one transaction carries {_READ_MAX_WORDS}")
+    for before, after in pairwise(registers):
+        if after.address > before.address + before.words:
+            raise RegisterMapError(f"block {name}: gap between {before.name} and {after.name}")
+    return block
+
+
+def _parse_register(entry: Mapping[str, Any], access: str) -> Register:
+    name = entry["name"]
+    if unknown := set(entry) - _REGISTER_KEYS:
+        raise RegisterMapError(f"{name}: unknown key {sorted(unknown)[0]}")
+    for key in ("address", "type", "meaning"):
+        if key not in entry:
+            raise RegisterMapError(f"{name}: {key} is missing")
+    register = Register(
+        name=name,
+        address=entry["address"],
+        type=entry["type"],
+        unit=entry.get("unit", "1"),
+        counts_per_unit=entry.get("counts_per_unit", 1),
+        minimum=entry.get("min", math.inf),
+        maximum=entry.get("max", -math.inf),
+        access=access,
+        meaning=entry["meaning"],
+    )
+    _check_register(register)
+    return register
+
+
+def _check_register(register: Register) -> None:
+    name = register.name
+    if register.type not in _TYPES:
+        raise RegisterMapError(f"{name}: type {register.type!r} is none of {', '.join(_TYPES)}")
+    if register.unit not in _SUFFIXES:
+        raise RegisterMapError(f"{name}: unit {register.unit!r} is none of {', '.join(_SUFFIXES)}")
+    if not name.endswith(_SUFFIXES[register.unit]):
+        raise RegisterMapError(f"{name}: the name must end in {_SUFFIXES[register.unit]}")
+    if not 0 <= register.address <= _ADDRESSES - register.words:
+        raise RegisterMapError(f"{name}: address {register.address} is outside 0..{_ADDRESSES - register.words}")
+    if register.counts_per_unit <= 0 or (register.type == "f32" and register.counts_per_unit != 1):
+        raise RegisterMapError(f"{name}: counts_per_unit must be above 0, and 1 for an f32")
+    has_limits = register.minimum <= register.maximum
+    if has_limits != (register.access == "rw"):
+        raise RegisterMapError(f"{name}: a rw register needs min <= max, a ro one has no limits")
+    if has_limits:
+        try:
+            register.to_raw(register.minimum), register.to_raw(register.maximum)
+        except ValueError as error:
+            raise RegisterMapError(f"{name}: a limit is out of its type: {error}") from error
+
+
+def _check_order(found: RegisterMap) -> None:
+    registers = list(found)
+    for before, after in pairwise(registers):
+        if after.address < before.address:
+            raise RegisterMapError(f"{after.name} (address {after.address}) comes after {before.name}: order them")
+        if after.address < before.address + before.words:
+            raise RegisterMapError(f"{after.name} (address {after.address}) overlaps {before.name}")
+    names = [register.name for register in registers]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise RegisterMapError(f"{sorted(twice)[0]} is there twice")
+    bits = [fault.bit for fault in found.faults]
+    if len(set(bits)) != len(bits) or not all(0 <= bit <= 15 for bit in bits):
+        raise RegisterMapError("fault bits must be different and within 0..15")
