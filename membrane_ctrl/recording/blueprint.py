@@ -1,0 +1,132 @@
+"""How a run opens in the viewer: one tab a question."""
+
+from __future__ import annotations
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from membrane_ctrl.config import Config
+
+
+def run_blueprint(config: Config) -> rrb.Blueprint:
+    """The arrangement for a run; the shape tab is there only when the shape is measured."""
+    tabs = [_overview(), _loop(), _environment(), _timing(), _long_review()]
+    if config.shape.enabled:
+        tabs.insert(2, _shape(config))
+    return rrb.Blueprint(
+        rrb.Tabs(*tabs, active_tab=0),
+        rrb.TimePanel(state="collapsed", timeline="run_time"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        auto_views=False,
+    )
+
+
+def _whole_run() -> rrb.TimeAxis:
+    """The whole run on the axis, and one zoom for all plots; without it a plot shows half a minute."""
+    everything = rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
+    return rrb.TimeAxis(view_range=everything, link="LinkToGlobal")
+
+
+def _plot(name: str, *paths: str) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        name=name,
+        origin="/",
+        contents=[f"+ {path}" for path in paths],
+        axis_x=_whole_run(),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+    )
+
+
+def _lanes() -> rrb.StateTimelineView:
+    contents = ["+ /state/controller", "+ /state/shape_loop", "+ /state/verdict", "+ /state/rung", "+ /state/fault"]
+    return rrb.StateTimelineView(name="States", origin="/state", contents=contents, time_view=_whole_run())
+
+
+def _text_log() -> rrb.TextLogView:
+    return rrb.TextLogView(
+        name="Events",
+        origin="/events",
+        columns=rrb.TextLogColumns(timeline_columns=["run_time"], text_log_columns=["loglevel", "body"]),
+    )
+
+
+def _overview() -> rrb.Vertical:
+    return rrb.Vertical(
+        _plot("Error and band, um", "/loop/error", "/truth/error", "/loop/band"),
+        _plot("Setpoint, reading and true centre, um", "/loop/position", "/truth/displacement"),
+        rrb.Horizontal(_lanes(), _text_log(), column_shares=[3, 2]),
+        rrb.Horizontal(_plot("Pump", "/pump/drive"), _plot("Flow and leak, um/s", "/loop/flow")),
+        row_shares=[3, 3, 2, 2],
+        name="Overview",
+    )
+
+
+def _loop() -> rrb.Vertical:
+    return rrb.Vertical(
+        _plot("Error and band, um", "/loop/error", "/truth/error", "/loop/band"),
+        _plot("P, I, D and feed-forward, um/s", "/loop/terms"),
+        _plot("Flow wanted, flow and leak, um/s", "/loop/flow"),
+        _plot("Pump and vent", "/pump/drive"),
+        name="Loop",
+    )
+
+
+def _environment() -> rrb.Vertical:
+    return rrb.Vertical(
+        _plot("Ambient pressure, Pa", "/ambient/pressure"),
+        _plot("Gauge pressure, Pa", "/gas/pressure"),
+        _plot("Temperatures, C", "/ambient/temperature", "/gas/temperature"),
+        _plot("Error, um", "/loop/error", "/truth/error", "/loop/band"),
+        name="Environment",
+    )
+
+
+def _shape(config: Config) -> rrb.Vertical:
+    maps = [
+        rrb.Spatial2DView(name=name, origin=f"/shape/map/{kind}")
+        for kind, name in (
+            ("height", "Height"),
+            ("difference", "Difference to the first"),
+            ("uncertainty", "Uncertainty, 1 sigma"),
+        )
+    ]
+    pictures = [rrb.TextDocumentView(name="Colours", origin="/shape/legend")]
+    rows = [
+        rrb.Horizontal(*maps, *pictures, column_shares=[1, 1, 1, 1]),
+        rrb.Horizontal(
+            _plot("Sag change by the camera and by the laser, um", "/shape/sag_change", "/shape/trim"),
+            _plot("Low orders, change since the first, um", "/shape/change"),
+            rrb.BarChartView(name="Change of Z2..Z36, um", origin="/shape/change_bars"),
+        ),
+        rrb.Horizontal(
+            _plot("Slope residual, urad", "/shape/residual"),
+            _plot("Fringe quality", "/shape/quality"),
+            _plot("Last frame to result, ms", "/shape/latency"),
+        ),
+    ]
+    if config.recording.thumbnails:
+        names = [f"{axis}_sin_{k}" for axis in "xy" for k in (0, 1)]
+        rows.append(rrb.Horizontal(*(rrb.Spatial2DView(name=name, origin=f"/frames/{name}") for name in names)))
+    return rrb.Vertical(*rows, row_shares=[4, 3, 2, 3][: len(rows)], name="Shape")
+
+
+def _timing() -> rrb.Vertical:
+    return rrb.Vertical(
+        _plot("Lateness of the tick, ms", "/tick/lateness"),
+        _plot("Time between ticks, s", "/tick/dt"),
+        _plot("Ticks missed so far", "/tick/missed"),
+        _plot("Device sample counter and time", "/device/sample"),
+        _plot("Last frame to result, ms", "/shape/latency"),
+        name="Timing",
+    )
+
+
+def _long_review() -> rrb.Vertical:
+    return rrb.Vertical(
+        _plot("Error: least, mean and greatest of each second, um", "/overview/error", "/loop/band"),
+        _plot("Trim, um", "/shape/trim"),
+        _lanes(),
+        _text_log(),
+        name="Long review",
+    )

@@ -1,0 +1,76 @@
+"""`events.jsonl`: one JSON object a line, on the disk as soon as it is known."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl.recording import plain_json
+
+Event = dict[str, Any]
+
+# Synced at once: what must survive the power cut that may follow.
+_SYNCED = frozenset({"fault", "end"})
+# While the disk is full events wait here; a fault campaign makes some hundred.
+_WAITING_MAX = 10_000
+
+
+def parse(message: bytes) -> Event:
+    """The event of a ring message; one that is not a JSON object becomes an event that says so."""
+    try:
+        event = json.loads(message)
+    except ValueError:
+        event = None
+    return event if isinstance(event, dict) else {"kind": "unreadable_event", "message": repr(message[:200])}
+
+
+class EventsFile:
+    """Appends events; after a failed write nothing is lost or torn, the next call goes on where it stopped.
+
+    Attributes
+    ----------
+    lost : int
+        Events given up because too many waited for a full disk.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._waiting: deque[bytes] = deque()
+        self._sync = False
+        self._descriptor: int | None = None
+        self.lost = 0
+
+    def append(self, events: Sequence[Event]) -> None:
+        """Write events, and those still waiting from before. Raises OSError (full disk)."""
+        for event in events:
+            self._waiting.append(plain_json.dumps(event).encode() + b"\n")
+            self._sync |= event.get("kind") in _SYNCED
+        while len(self._waiting) > _WAITING_MAX:
+            # the front line may be half on the disk already: it stays, the one behind it goes
+            del self._waiting[1]
+            self.lost += 1
+        self._write()
+
+    def _write(self) -> None:
+        if self._waiting and self._descriptor is None:
+            self._descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        while self._waiting and self._descriptor is not None:
+            written = os.write(self._descriptor, self._waiting[0])
+            rest = self._waiting[0][written:]
+            if rest:
+                self._waiting[0] = rest
+            else:
+                self._waiting.popleft()
+        if self._sync and self._descriptor is not None:
+            os.fsync(self._descriptor)
+            self._sync = False
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None

@@ -1,0 +1,149 @@
+"""The recorder's process: started with `spawn`, fed by rings, ended by the run's "end" event.
+
+Rerun is imported here only after the process has started: the control process must not load it, and a stream
+that a forked child inherited loses what the child logs.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from threading import Event as Flag
+from typing import Any
+
+from membrane_ctrl.acquisition.frame_address import FrameAddress
+from membrane_ctrl.clock import RunClock
+from membrane_ctrl.config import Config
+from membrane_ctrl.ipc.ring import RingAddress, RingReader
+
+# Rings are emptied this often: the telemetry ring has to hold a few of these.
+_POLL_S = 0.25
+# Below the control process, above the acquisition: a late recorder drops rows, a late tick moves the mirror.
+_NICE = 5
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderSpec:
+    """What the recorder's process needs; picklable.
+
+    Attributes
+    ----------
+    run_dir : Path
+        From `run_folder.create_run_folder`.
+    run_name : str
+        Name of the `.rrd` segments.
+    clock : RunClock
+    config : Config
+    telemetry : RingAddress
+        Packed `TelemetryRow`s.
+    events : RingAddress
+        JSON objects with `time_utc`, `mono_s`, `kind`, ...; the one of kind "end" (with `exit`) is the last.
+    shapes : RingAddress or None
+        Pickled `ShapeEstimate`s.
+    frames : FrameAddress or None
+        Shared camera frames, for thumbnails.
+    flush_s : float
+        What a killed recorder may lose.
+    """
+
+    run_dir: Path
+    run_name: str
+    clock: RunClock
+    config: Config
+    telemetry: RingAddress
+    events: RingAddress
+    shapes: RingAddress | None = None
+    frames: FrameAddress | None = None
+    flush_s: float = 1.0
+
+
+def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
+    """Record until the "end" event, until SIGTERM, or until the parent has died; then close and summarise.
+
+    Parameters
+    ----------
+    spec : RecorderSpec
+        What to record and where.
+    status : Connection or None
+        Gets small dicts {"kind": "recorder_error" | "recorder_recovered" | "disk_low" | "recorder_done", "message":
+        ...}; one that cannot be taken at once is given up.
+    """
+    asked = Flag()
+    # ctrl-C reaches the whole terminal group: the supervisor decides when the run is over, with the "end" event
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: asked.set())
+    os.nice(_NICE)
+    os.environ["RUST_LOG"] = "off"  # Rerun's own log would write over the live screen; its errors come as exceptions
+    _record(spec, reporter(status), asked.is_set, parent_died)
+
+
+def _record(
+    spec: RecorderSpec,
+    report: Callable[[dict[str, Any]], None],
+    asked: Callable[[], bool],
+    orphan: Callable[[], bool],
+) -> None:
+    from membrane_ctrl.recording.recorder import Recorder
+    from membrane_ctrl.recording.sink import Recording
+    from membrane_ctrl.recording.thumbnails import Thumbnails
+
+    addresses = {"telemetry": spec.telemetry, "events": spec.events, "shapes": spec.shapes}
+    rings = {name: RingReader(address) for name, address in addresses.items() if address is not None}
+    recording = Recording(spec.run_dir, spec.run_name, spec.clock, spec.config)
+    wanted = spec.frames is not None and spec.config.recording.thumbnails
+    thumbnails = Thumbnails(recording, spec.frames) if wanted and spec.frames is not None else None
+    recorder = Recorder(spec.run_dir, spec.clock, spec.config, rings, recording, thumbnails, report)
+    next_write_s = 0.0
+    while not recorder.ended:
+        # asked before draining: what a parent put before it died is then seen in this round
+        exit_word = "killed" if orphan() else "terminated" if asked() else ""
+        recorder.drain()
+        if exit_word and not recorder.ended:
+            recorder.take_events([_end_event(spec.clock, exit_word)])
+        elif time.monotonic() >= next_write_s:
+            next_write_s = time.monotonic() + spec.flush_s
+            recorder.write()
+        if not recorder.ended:
+            time.sleep(_POLL_S)
+    recorder.finish()
+    if thumbnails is not None:
+        thumbnails.close()
+    for ring in rings.values():
+        ring.close()
+
+
+def _end_event(clock: RunClock, exit_word: str) -> dict[str, Any]:
+    now_s = clock.now()
+    return {"time_utc": clock.utc(now_s).isoformat(), "mono_s": now_s, "kind": "end", "exit": exit_word}
+
+
+def parent_died() -> bool:
+    """Whether the process that started this one is gone: its children get another parent."""
+    started_by = multiprocessing.parent_process()
+    return started_by is not None and os.getppid() != started_by.pid
+
+
+def reporter(status: Connection | None) -> Callable[[dict[str, Any]], None]:
+    """A function that sends a dict over `status` if there is room for it now, and otherwise lets it go."""
+    if status is None:
+        return lambda message: None
+    os.set_blocking(status.fileno(), False)
+
+    def report(message: dict[str, Any]) -> None:
+        try:
+            status.send({key: _short(value) for key, value in message.items()})
+        except OSError:  # full, or nobody at the other end: recording goes on
+            return
+
+    return report
+
+
+def _short(value: Any) -> Any:
+    """A message this short goes into a pipe whole or not at all, so that the other end never sees half of one."""
+    return value[:1000] if isinstance(value, str) else value
