@@ -1,0 +1,115 @@
+"""What a pattern puts on the screen, as the light level (0..1) at each place along one axis.
+
+s is measured from the low edge of the pattern region, a square centred on O'; outside it the screen is dark.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.roles import Pattern
+from membrane_ctrl.config import PatternConfig
+
+_GRAY_BITS = 4
+# linear interpolation of a cosine in this many cells is 2e-8 off at most: below a thousandth of a 16-bit count
+_SINE_CELLS = 16384
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """From the pattern's level to the camera's counts.
+
+    Attributes
+    ----------
+    dark_fraction : float
+        Counts without light, of full scale.
+    white_fraction : float
+        Counts of a white screen in the middle of the picture, of full scale.
+    leak : float
+        Light of a black screen, of a white one.
+    gamma : float
+        The screen's light is level**gamma; 1 is a linear screen.
+    vignetting : float
+        Loss of light at the picture's corner, growing with the square of the distance from its middle.
+    """
+
+    dark_fraction: float = 0.02
+    white_fraction: float = 0.80
+    leak: float = 0.02
+    gamma: float = 1.0
+    vignetting: float = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class LevelTable:
+    """Light along an axis in cells `cell_mm` wide.
+
+    A smooth table is one period, repeated and interpolated, with one value more than cells so that the last cell has
+    an end; the other is one value a cell over the whole region.
+    """
+
+    values: NDArray[np.float64]
+    cell_mm: float
+    smooth: bool
+
+
+def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelTable:
+    """Light of a pattern along its axis.
+
+    - "sin": (1 + cos(phi + shift)) / 2 with phi = 2 pi s / T - pi, over one period, to be repeated;
+    - "gray": bit `index` (1 is the most significant of 4) of gray(V2), V2 = floor(2 s / T), over the region;
+    - "white" and "black": 1 and 0 over the region.
+
+    Raises
+    ------
+    ValueError
+        If the pattern's role or Gray bit is unknown.
+    """
+    if pattern.role == "sin":
+        phi = np.linspace(0.0, 2.0 * pi, _SINE_CELLS + 1) - pi
+        levels = 0.5 + 0.5 * np.cos(phi + pattern.shift_rad)
+        return LevelTable(_lit(levels, light), config.period_mm / _SINE_CELLS, smooth=True)
+    half_periods = np.arange(2 * config.periods)
+    if pattern.role == "gray" and 1 <= pattern.index <= _GRAY_BITS:
+        codes = half_periods ^ (half_periods >> 1)
+        levels = ((codes >> (_GRAY_BITS - pattern.index)) & 1).astype(np.float64)
+    elif pattern.role in ("white", "black"):
+        levels = np.full(half_periods.shape, 1.0 if pattern.role == "white" else 0.0)
+    else:
+        raise ValueError(f"pattern {pattern.name!r}: role must be sin, gray (bit 1..4), white or black")
+    return LevelTable(_lit(levels, light), config.period_mm / 2.0, smooth=False)
+
+
+def pattern_sequence(kind: str, config: PatternConfig, shifts_rad: tuple[float, ...] = ()) -> list[Pattern]:
+    """The patterns of a set in the order they are shown: x and y sinusoids and Gray bits, white, black.
+
+    Parameters
+    ----------
+    kind : str
+        "full" or "fringes" (sinusoids alone).
+    shifts_rad : tuple of floats
+        One a step; empty: 2 pi k / N.
+
+    Raises
+    ------
+    ValueError
+        If the kind is unknown.
+    """
+    if kind not in ("full", "fringes"):
+        raise ValueError(f"kind = {kind!r} must be full or fringes")
+    shifts = shifts_rad or tuple(2.0 * pi * k / config.steps for k in range(config.steps))
+    patterns: list[Pattern] = []
+    for axis in ("x", "y"):
+        patterns += [Pattern("sin", axis, k, shift) for k, shift in enumerate(shifts)]
+        if kind == "full":
+            patterns += [Pattern("gray", axis, bit) for bit in range(1, _GRAY_BITS + 1)]
+    return patterns + ([Pattern("white"), Pattern("black")] if kind == "full" else [])
+
+
+def _lit(levels: NDArray[np.float64], light: Light) -> NDArray[np.float64]:
+    """Share of a white screen's light: gamma, and what leaks through a black screen."""
+    return np.asarray(light.leak + (1.0 - light.leak) * np.clip(levels, 0.0, 1.0) ** light.gamma)

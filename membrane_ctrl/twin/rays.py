@@ -1,0 +1,107 @@
+"""Camera and screen of the twin as exact poses: rays out of the pinhole, and the plane they end on.
+
+World: origin at the mirror's vertex, x horizontal, y up, z out of the reflective side; mm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import cos, radians, sin
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.config import CameraConfig, GeometryConfig
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraPose:
+    """Pinhole `position_mm` (3,); rows of `rotation` (3, 3): camera x (right), y (down), z (forward) in world."""
+
+    position_mm: FloatArray
+    rotation: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class ScreenPose:
+    """O' as `origin_mm` and the unit vectors of `s_x` and `s_y`, each (3,), in world; `bow_per_mm` is the bow.
+
+    The face stands off the plane by bow_per_mm (s_x^2 + s_y^2) towards s_x x s_y, which points at the mirror.
+    """
+
+    origin_mm: FloatArray
+    s_x: FloatArray
+    s_y: FloatArray
+    bow_per_mm: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class ScreenError:
+    """What a screen does that its nominal pose does not say.
+
+    `tilt_about_x_deg` and `tilt_about_y_deg` turn it about its own s_x and s_y axes (right-handed); `bow_mm` is how
+    far the face stands towards the mirror 200 mm away from O' (paraboloid; s_x and s_y count along the flat plane).
+    """
+
+    tilt_about_x_deg: float = 0.0
+    tilt_about_y_deg: float = 0.0
+    bow_mm: float = 0.0
+
+
+_BOW_RADIUS_MM = 200.0  # half side of the paper's pattern region, rounded
+
+
+def camera_pose(geometry: GeometryConfig) -> CameraPose:
+    """Pose of the camera: as given, or F = a (cos alpha, 0, sin alpha) looking at O without roll."""
+    if geometry.camera is not None:
+        return CameraPose(np.array(geometry.camera.position_mm), np.array(geometry.camera.rotation))
+    a_mm, _, alpha = _short(geometry)
+    forward = np.array([-cos(alpha), 0.0, -sin(alpha)])
+    right = np.array([sin(alpha), 0.0, -cos(alpha)])  # world +x as far as it is across the axis
+    return CameraPose(-a_mm * forward, np.stack([right, np.cross(forward, right), forward]))
+
+
+def screen_pose(geometry: GeometryConfig, error: ScreenError | None = None) -> ScreenPose:
+    """Pose of the screen: as given, or O' = b (-cos alpha, 0, sin alpha) and perpendicular to OO'; then the error."""
+    if geometry.screen is not None:
+        pose = ScreenPose(
+            *(np.array(v) for v in (geometry.screen.origin_mm, geometry.screen.s_x, geometry.screen.s_y))
+        )
+    else:
+        _, b_mm, alpha = _short(geometry)
+        origin = b_mm * np.array([-cos(alpha), 0.0, sin(alpha)])
+        pose = ScreenPose(origin, np.array([-sin(alpha), 0.0, -cos(alpha)]), np.array([0.0, 1.0, 0.0]))
+    if error is None:
+        return pose
+    s_y = _turned(pose.s_y, pose.s_x, radians(error.tilt_about_x_deg))
+    s_x = _turned(pose.s_x, s_y, radians(error.tilt_about_y_deg))
+    return ScreenPose(pose.origin_mm, s_x, s_y, error.bow_mm / _BOW_RADIUS_MM**2)
+
+
+def pixel_directions(camera: CameraConfig, pose: CameraPose, columns: FloatArray, rows: FloatArray) -> FloatArray:
+    """Unit vectors in world (N, 3) of the rays through the given pixel positions (N,), lens distortion undone."""
+    focal_px = camera.focal_mm * 1000.0 / camera.pixel_um
+    c0, r0 = camera.principal
+    normalised = np.stack([(columns - c0) / focal_px, (rows - r0) / focal_px], axis=1)
+    if camera.distortion:
+        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
+        coeffs = np.array(camera.distortion)
+        normalised = cv2.undistortPointsIter(normalised[:, None, :], np.eye(3), coeffs, None, None, stop)[:, 0, :]
+    in_camera = np.concatenate([normalised, np.ones((len(normalised), 1))], axis=1)
+    in_world = in_camera @ pose.rotation
+    return np.asarray(in_world / np.linalg.norm(in_world, axis=1, keepdims=True), dtype=np.float64)
+
+
+def _short(geometry: GeometryConfig) -> tuple[float, float, float]:
+    """a in mm, b in mm, alpha in rad; the configuration has made sure that one of the two forms is complete."""
+    if geometry.a_mm is None or geometry.b_mm is None or geometry.alpha_deg is None:
+        raise ValueError("geometry: neither a_mm, b_mm, alpha_deg nor camera and screen poses")
+    return geometry.a_mm, geometry.b_mm, radians(geometry.alpha_deg)
+
+
+def _turned(vector: FloatArray, axis: FloatArray, angle_rad: float) -> FloatArray:
+    """A vector across the unit `axis`, turned about it (Rodrigues, whose third term vanishes here)."""
+    return vector * cos(angle_rad) + np.cross(axis, vector) * sin(angle_rad)

@@ -1,0 +1,176 @@
+"""Pictures that the camera takes of the screen in the moving film."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.roles import Pattern
+from membrane_ctrl.config import OpticsConfig
+from membrane_ctrl.twin.film_shape import FilmShape
+from membrane_ctrl.twin.illumination import Light, level_table
+from membrane_ctrl.twin.rays import ScreenError, camera_pose, pixel_directions, screen_pose
+from membrane_ctrl.twin.shade import cubic_weights, node_positions, normal_quantiles, shade
+from membrane_ctrl.twin.trace import Trace, trace
+
+FloatArray = NDArray[np.float64]
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+# Nodes this far apart on the mirror put a typical film's phase < 1e-4 rad off the exact trace (asserted in the tests)
+_NODE_MM = 4.6
+# Displacements traced; a parabola through three of them is exact to 1e-6 rad, a straight line only to 2e-5 rad
+_CELL_UM = 100.0
+_KEPT_TRACES = 8
+
+
+@dataclass
+class OpticsRenderer:
+    """Renders the camera's picture of any pattern at any displacement of the film.
+
+    The film is traced at nodes (see `shade`) and, unless `exact`, at displacements _CELL_UM apart: a parabola through
+    the three nearest gives the maps at any other, so that a moving film costs nothing until it leaves its cell.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The true geometry, camera, pattern and rim.
+    film : FilmShape
+        Its sag belongs to displacement 0.
+    light : Light
+        Screen and camera as light.
+    reference_um : float
+        Displacement at which the vertex stands at the origin of the geometry.
+    screen_error : ScreenError or None
+        What the screen does beside its pose.
+    exact : bool
+        Trace every pixel at every displacement: slow, for sets that must be true to the last bit.
+    seed : int
+        Of the pixel noise (`camera.noise_adu`); each picture has its own.
+
+    Raises
+    ------
+    ValueError
+        If the film's rim is not the configured one.
+    """
+
+    optics: OpticsConfig
+    film: FilmShape
+    light: Light = Light()
+    reference_um: float = 0.0
+    screen_error: ScreenError | None = None
+    exact: bool = False
+    seed: int = 0
+    _traces: OrderedDict[float, FloatArray] = field(default_factory=OrderedDict, init=False, repr=False)
+    _pictures: int = field(default=0, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.film.radius_mm != self.optics.mirror.radius_mm:
+            raise ValueError(
+                f"film radius {self.film.radius_mm:g} mm is not mirror.radius_mm = {self.optics.mirror.radius_mm:g}"
+            )
+        camera = self.optics.camera
+        self._camera_pose = camera_pose(self.optics.geometry)
+        self._screen_pose = screen_pose(self.optics.geometry, self.screen_error)
+        pixel_mm = camera.pixel_um / 1000.0 / camera.focal_mm * float(np.linalg.norm(self._camera_pose.position_mm))
+        self._step = 1 if self.exact else max(1, int(_NODE_MM / pixel_mm + 0.5))
+        self._weights = cubic_weights(self._step)
+        self._columns = node_positions(camera.width_px, self._step)
+        self._rows = node_positions(camera.height_px, self._step)
+        columns, rows = np.meshgrid(self._columns, self._rows)
+        self._directions = pixel_directions(camera, self._camera_pose, columns.ravel(), rows.ravel())
+        self._loss = _vignetting(camera.width_px, camera.height_px, self.light.vignetting)
+
+    @property
+    def dtype(self) -> type[np.uint8] | type[np.uint16]:
+        """Of the pictures: 8 bit, or 16 for any deeper camera."""
+        return np.uint8 if self.optics.camera.bits == 8 else np.uint16
+
+    def render(
+        self, pattern: Pattern, displacement_um: float, out: Pixels | None = None, gain: float = 1.0
+    ) -> Pixels:
+        """The picture of one pattern, (H, W).
+
+        Parameters
+        ----------
+        pattern : Pattern
+            What the screen shows.
+        displacement_um : float
+            Where the film is at the moment of the exposure.
+        out : (H, W) array of `dtype`, optional
+            Filled and returned (frames in shared memory); otherwise a new one is made.
+        gain : float
+            Exposure against the nominal one.
+
+        Raises
+        ------
+        ValueError
+            If the pattern is unknown or `out` has another shape or type.
+        """
+        camera, config = self.optics.camera, self.optics.pattern
+        shape = (camera.height_px, camera.width_px)
+        if out is None:
+            out = np.empty(shape, self.dtype)
+        elif out.shape != shape or out.dtype != self.dtype:
+            raise ValueError(f"out is {out.shape} {out.dtype}, not {shape} {np.dtype(self.dtype)}")
+        table = level_table(pattern, config, self.light)
+        full = float(2**camera.bits - 1)
+        dark = self.light.dark_fraction * full
+        self._pictures += 1
+        shade(
+            self._nodes(displacement_um),
+            self._weights,
+            1 if pattern.axis == "y" else 0,
+            self.film.radius_mm,
+            table.values,
+            table.cell_mm,
+            table.smooth,
+            config.periods * config.period_mm,
+            np.array([dark, gain * (self.light.white_fraction * full - dark), self.light.leak, full]),
+            self._loss,
+            (normal_quantiles(), camera.noise_adu, (self.seed << 32) + self._pictures),
+            out,
+        )
+        return out
+
+    def trace_pixels(self, displacement_um: float) -> Trace:
+        """Exact s_x, s_y and place on the film of every pixel, each (H * W,), row by row: no interpolation, no light."""
+        camera = self.optics.camera
+        columns, rows = np.meshgrid(np.arange(float(camera.width_px)), np.arange(float(camera.height_px)))
+        directions = pixel_directions(camera, self._camera_pose, columns.ravel(), rows.ravel())
+        return self._trace(directions, displacement_um)
+
+    def _trace(self, directions: FloatArray, displacement_um: float) -> Trace:
+        vertex_z_mm = -(displacement_um - self.reference_um) / 1000.0
+        sag_mm = self.film.sag_at_mm(displacement_um)
+        return trace(self._camera_pose, directions, self.film.terms, sag_mm, vertex_z_mm, self._screen_pose)
+
+    def _nodes(self, displacement_um: float) -> FloatArray:
+        """Traced maps at the nodes, (3, rows, columns), at this displacement (Lagrange through the nearest three)."""
+        if self.exact:
+            return self._traced(displacement_um)
+        nearest = float(np.floor(displacement_um / _CELL_UM + 0.5))
+        f = displacement_um / _CELL_UM - nearest
+        below, here, above = (self._traced((nearest + k) * _CELL_UM) for k in (-1, 0, 1))
+        return 0.5 * f * (f - 1.0) * below + (1.0 - f) * (1.0 + f) * here + 0.5 * f * (f + 1.0) * above
+
+    def _traced(self, displacement_um: float) -> FloatArray:
+        if displacement_um in self._traces:
+            self._traces.move_to_end(displacement_um)
+            return self._traces[displacement_um]
+        found = self._trace(self._directions, displacement_um)
+        half_side_mm = self.optics.pattern.periods * self.optics.pattern.period_mm / 2.0
+        maps = np.stack([found.s_x_mm + half_side_mm, found.s_y_mm + half_side_mm, found.x_mm**2 + found.y_mm**2])
+        self._traces[displacement_um] = maps.reshape(3, len(self._rows), len(self._columns))
+        while len(self._traces) > (1 if self.exact else _KEPT_TRACES):
+            self._traces.popitem(last=False)
+        return self._traces[displacement_um]
+
+
+def _vignetting(width_px: int, height_px: int, corner_loss: float) -> tuple[FloatArray, FloatArray]:
+    """Loss by column and by row; their sum is corner_loss (distance from the middle / distance of the corner)^2."""
+    columns, rows = np.arange(width_px) - (width_px - 1) / 2.0, np.arange(height_px) - (height_px - 1) / 2.0
+    per_px2 = corner_loss / (columns[0] ** 2 + rows[0] ** 2)
+    return per_px2 * columns**2, per_px2 * rows**2

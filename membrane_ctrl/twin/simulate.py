@@ -1,0 +1,151 @@
+"""Capture sets with known truth: the twin's pictures in the files that a real bench writes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.roles import Pattern
+from membrane_ctrl.twin.capture_writer import write_capture_toml, write_truth
+from membrane_ctrl.twin.render import OpticsRenderer
+from membrane_ctrl.twin.simulation_spec import SimulationSpec
+
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+_PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # noise does not compress: harder levels cost time and save nothing
+
+
+@dataclass(frozen=True, slots=True)
+class _Exposure:
+    """What truly happened for one file."""
+
+    pattern: Pattern
+    displacement_um: float
+    gain: float = 1.0
+
+
+def simulate_set(folder: Path, spec: SimulationSpec) -> None:
+    """Write one capture set and its truth.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if it is not there.
+    spec : SimulationSpec
+        The set.
+
+    Raises
+    ------
+    OSError
+        If the folder or a file cannot be written.
+    """
+    _write_set(folder, spec, _renderer(spec))
+
+
+def simulate_run(
+    folder: Path,
+    spec: SimulationSpec,
+    sets: int,
+    interval_s: float = 4.0,
+    on_set: Callable[[int], None] | None = None,
+) -> None:
+    """Write a run: `0000` is the full set, the others are fringes that lean on it; one clock and one motion for all.
+
+    Parameters
+    ----------
+    folder : Path
+        Gets a folder a set.
+    spec : SimulationSpec
+        The first set; its motion runs on through the others, its faults stay its own.
+    sets : int
+        How many.
+    interval_s : float
+        From the start of one set to the start of the next.
+    on_set : callable, optional
+        Told the number of sets written, after each.
+
+    Raises
+    ------
+    ValueError
+        If the first set is not full, lists its displacements, or the sets overlap in time.
+    """
+    if spec.kind != "full" or spec.displacements_um:
+        raise ValueError("kind: the first set of a run must be full, and move by motion, not displacements_um")
+    if sets < 1:
+        raise ValueError(f"sets = {sets} must be 1 or more")
+    if interval_s < len(spec.patterns) * spec.frame_interval_s:
+        raise ValueError(
+            f"interval_s = {interval_s:g} is shorter than the {len(spec.patterns)} frames of the first set"
+        )
+    spec = _anchored(spec)
+    renderer = _renderer(spec)
+    for number in range(sets):
+        if number == 0:
+            this = spec
+        else:
+            start_s, seed = spec.start_s + number * interval_s, spec.seed + number
+            this = replace(spec, kind="fringes", reference="../0000", start_s=start_s, seed=seed, faults=())
+        _write_set(folder / f"{number:04d}", this, renderer)
+        if on_set is not None:
+            on_set(number + 1)
+
+
+def _anchored(spec: SimulationSpec) -> SimulationSpec:
+    """The same with the geometry's reference displacement written out, so that all sets of a run share it."""
+    stated = spec.stated_geometry or spec.optics.geometry
+    return replace(spec, stated_geometry=stated.model_copy(update={"reference_displacement_um": spec.reference_um}))
+
+
+def _renderer(spec: SimulationSpec) -> OpticsRenderer:
+    return OpticsRenderer(
+        spec.optics, spec.film, spec.light, spec.reference_um, spec.screen_error, exact=spec.exact, seed=spec.seed
+    )
+
+
+def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    noise = np.random.default_rng(spec.seed).normal(0.0, spec.laser_noise_um, len(spec.patterns))
+    readings_um = noise + [spec.displacement_um(frame) for frame in range(len(spec.patterns))]
+    faults = {(fault.kind, fault.frame) for fault in spec.faults}
+    before: Pixels | None = None
+    for pattern, exposure in zip(spec.patterns, _exposures(spec), strict=True):
+        if ("stale", pattern.name) in faults and before is not None:
+            picture = before
+        else:
+            picture = renderer.render(exposure.pattern, exposure.displacement_um, gain=exposure.gain)
+        before = picture
+        if ("wrong_size", pattern.name) in faults:
+            picture = picture[:-1]
+        if ("wrong_depth", pattern.name) in faults:
+            picture = (
+                (picture >> 8).astype(np.uint8) if picture.dtype == np.uint16 else picture.astype(np.uint16) << 8
+            )
+        if ("missing", pattern.name) not in faults:
+            _write_png(folder / f"{pattern.name}.png", picture)
+    write_capture_toml(folder, spec, readings_um)
+    write_truth(folder, spec)
+
+
+def _exposures(spec: SimulationSpec) -> list[_Exposure]:
+    """What was truly shown, where the film truly was and how long the exposure truly took, frame by frame."""
+    exposures = [_Exposure(pattern, spec.displacement_um(frame)) for frame, pattern in enumerate(spec.patterns)]
+    place = {pattern.name: frame for frame, pattern in enumerate(spec.patterns)}
+    for fault in spec.faults:
+        frame = place[fault.frame]
+        this = exposures[frame]
+        if fault.kind in ("saturated", "dark", "flicker"):
+            exposures[frame] = replace(this, gain=fault.strength)
+        elif fault.kind == "moved":
+            exposures[frame] = replace(this, displacement_um=this.displacement_um + fault.strength)
+        elif fault.kind == "swapped":
+            exposures[frame], exposures[frame + 1] = exposures[frame + 1], this
+    return exposures
+
+
+def _write_png(path: Path, picture: Pixels) -> None:
+    if not cv2.imwrite(str(path), picture, _PNG_SPEED):
+        raise OSError(f"{path}: cannot be written")
