@@ -86,7 +86,8 @@ def inflate(scene: Scene) -> State:
     output = _drive(scene)
     to_go_um = scene.config.loop.setpoint_um - output.filtered_um
     scene.why = f"inflating: {to_go_um:.0f} um to go"
-    if output.setpoint_um - scene.trim_um == scene.config.loop.setpoint_um and abs(to_go_um) < _settle_band_um(scene):
+    ramp_left_um = scene.config.loop.setpoint_um + scene.trim_um - output.setpoint_um
+    if abs(ramp_left_um) < 1e-6 and abs(to_go_um) < _settle_band_um(scene):
         return State.SETTLE
     if scene.state_age_s > scene.config.states.inflate_timeout_s:
         scene.overdue = f"still {to_go_um:.0f} um from the setpoint"

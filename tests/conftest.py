@@ -1,0 +1,31 @@
+"""What every test must leave behind: no asyncio task, no child process."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import multiprocessing
+from collections.abc import AsyncIterator, Iterator
+
+import pytest
+
+
+@pytest.fixture
+async def leaves_no_task() -> AsyncIterator[None]:
+    before = asyncio.all_tasks()
+    yield
+    left = {task for task in asyncio.all_tasks() - before if not task.done()} - {asyncio.current_task()}
+    assert not left, f"left running: {left}"
+
+
+@pytest.fixture(autouse=True)
+def leaves_nothing_behind(request: pytest.FixtureRequest) -> Iterator[None]:
+    function = getattr(request, "function", None)
+    if function is not None and inspect.iscoroutinefunction(function):
+        request.getfixturevalue("leaves_no_task")
+    yield
+    left = multiprocessing.active_children()
+    for process in left:
+        process.kill()
+        process.join()
+    assert not left, f"left running: {left}"
