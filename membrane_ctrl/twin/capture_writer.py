@@ -32,6 +32,8 @@ def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, An
     if spec.laser:
         geometry["reference_displacement_um"] = spec.reference_um
     camera = _written(spec.optics.camera)
+    if spec.optics.camera.bits == 8:
+        del camera["bits"]  # what a reader takes for granted
     camera["principal_px"] = list(spec.optics.camera.principal)
     table: dict[str, Any] = {"schema": "membrane-capture/1", "kind": spec.kind}
     if spec.reference:
@@ -69,7 +71,7 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
     inside = x_mm**2 + y_mm**2 <= radius_mm**2
     h_mm = np.where(inside, spec.film.height_mm(x_mm, y_mm, mean_um), np.nan)
     deeper_mm = np.where(inside, spec.film.height_mm(x_mm, y_mm, mean_um + 1000.0), np.nan)
-    maps = {"x_mm": axis_mm, "y_mm": axis_mm, "h_mm": h_mm, "h_per_sag": deeper_mm - h_mm}
+    maps: dict[str, Any] = {"x_mm": axis_mm, "y_mm": axis_mm, "h_mm": h_mm, "h_per_sag": deeper_mm - h_mm}
     if coeffs_um is not None:
         maps["coeffs_um"] = coeffs_um
     np.savez_compressed(folder / "truth.npz", displacement_um=displacement_um, **maps)

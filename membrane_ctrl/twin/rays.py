@@ -8,13 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import cos, radians, sin
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from membrane_ctrl.config import CameraConfig, GeometryConfig
 
 FloatArray = NDArray[np.float64]
+_UNDISTORT_STEPS = 200  # each gains a digit or so on a usual lens
+_UNDISTORT_TOLERANCE = 1e-14  # tangent of the ray's angle
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +68,8 @@ def camera_pose(geometry: GeometryConfig) -> CameraPose:
 def screen_pose(geometry: GeometryConfig, error: ScreenError | None = None) -> ScreenPose:
     """Pose of the screen: as given, or O' = b (-cos alpha, 0, sin alpha) and perpendicular to OO'; then the error."""
     if geometry.screen is not None:
-        pose = ScreenPose(
-            *(np.array(v) for v in (geometry.screen.origin_mm, geometry.screen.s_x, geometry.screen.s_y))
-        )
+        given = geometry.screen
+        pose = ScreenPose(np.array(given.origin_mm), np.array(given.s_x), np.array(given.s_y))
     else:
         _, b_mm, alpha = _short(geometry)
         origin = b_mm * np.array([-cos(alpha), 0.0, sin(alpha)])
@@ -85,14 +85,27 @@ def pixel_directions(camera: CameraConfig, pose: CameraPose, columns: FloatArray
     """Unit vectors in world (N, 3) of the rays through the given pixel positions (N,), lens distortion undone."""
     focal_px = camera.focal_mm * 1000.0 / camera.pixel_um
     c0, r0 = camera.principal
-    normalised = np.stack([(columns - c0) / focal_px, (rows - r0) / focal_px], axis=1)
-    if camera.distortion:
-        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
-        coeffs = np.array(camera.distortion)
-        normalised = cv2.undistortPointsIter(normalised[:, None, :], np.eye(3), coeffs, None, None, stop)[:, 0, :]
-    in_camera = np.concatenate([normalised, np.ones((len(normalised), 1))], axis=1)
-    in_world = in_camera @ pose.rotation
+    x, y = _undistorted((columns - c0) / focal_px, (rows - r0) / focal_px, camera.distortion)
+    in_world = np.stack([x, y, np.ones_like(x)], axis=1) @ pose.rotation
     return np.asarray(in_world / np.linalg.norm(in_world, axis=1, keepdims=True), dtype=np.float64)
+
+
+def _undistorted(x_d: FloatArray, y_d: FloatArray, distortion: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    """Undo OpenCV's lens model, x_d = x radial(r^2) + tangential(x, y), by fixed-point iteration to the last bit."""
+    if not distortion:
+        return x_d, y_d
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *[0.0] * 8)[:8]
+    x, y = x_d, y_d
+    for _ in range(_UNDISTORT_STEPS):
+        r2 = x * x + y * y
+        radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        x_next = (x_d - 2.0 * p1 * x * y - p2 * (r2 + 2.0 * x * x)) / radial
+        y_next = (y_d - p1 * (r2 + 2.0 * y * y) - 2.0 * p2 * x * y) / radial
+        change = max(float(np.abs(x_next - x).max()), float(np.abs(y_next - y).max()))
+        x, y = x_next, y_next
+        if change < _UNDISTORT_TOLERANCE:
+            return x, y
+    raise ValueError(f"camera.distortion = {distortion} folds the picture: it cannot be undone at its edge")
 
 
 def _short(geometry: GeometryConfig) -> tuple[float, float, float]:

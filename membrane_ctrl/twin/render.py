@@ -58,7 +58,7 @@ class OpticsRenderer:
 
     optics: OpticsConfig
     film: FilmShape
-    light: Light = Light()
+    light: Light = field(default_factory=Light)
     reference_um: float = 0.0
     screen_error: ScreenError | None = None
     exact: bool = False
@@ -83,10 +83,12 @@ class OpticsRenderer:
         self._directions = pixel_directions(camera, self._camera_pose, columns.ravel(), rows.ravel())
         self._loss = _vignetting(camera.width_px, camera.height_px, self.light.vignetting)
 
-    @property
-    def dtype(self) -> type[np.uint8] | type[np.uint16]:
-        """Of the pictures: 8 bit, or 16 for any deeper camera."""
-        return np.uint8 if self.optics.camera.bits == 8 else np.uint16
+    def blank(self) -> Pixels:
+        """An empty picture, (H, W): uint8 for an 8-bit camera, uint16 for any deeper one."""
+        shape = (self.optics.camera.height_px, self.optics.camera.width_px)
+        if self.optics.camera.bits == 8:
+            return np.empty(shape, np.uint8)
+        return np.empty(shape, np.uint16)
 
     def render(
         self, pattern: Pattern, displacement_um: float, out: Pixels | None = None, gain: float = 1.0
@@ -99,7 +101,7 @@ class OpticsRenderer:
             What the screen shows.
         displacement_um : float
             Where the film is at the moment of the exposure.
-        out : (H, W) array of `dtype`, optional
+        out : (H, W) array as of `blank`, optional
             Filled and returned (frames in shared memory); otherwise a new one is made.
         gain : float
             Exposure against the nominal one.
@@ -110,11 +112,12 @@ class OpticsRenderer:
             If the pattern is unknown or `out` has another shape or type.
         """
         camera, config = self.optics.camera, self.optics.pattern
-        shape = (camera.height_px, camera.width_px)
-        if out is None:
-            out = np.empty(shape, self.dtype)
-        elif out.shape != shape or out.dtype != self.dtype:
-            raise ValueError(f"out is {out.shape} {out.dtype}, not {shape} {np.dtype(self.dtype)}")
+        picture = self.blank() if out is None else out
+        depth = np.dtype(np.uint8 if camera.bits == 8 else np.uint16)
+        if picture.shape != (camera.height_px, camera.width_px) or picture.dtype != depth:
+            raise ValueError(
+                f"out is {picture.shape} {picture.dtype}, not ({camera.height_px}, {camera.width_px}) {depth}"
+            )
         table = level_table(pattern, config, self.light)
         full = float(2**camera.bits - 1)
         dark = self.light.dark_fraction * full
@@ -131,12 +134,12 @@ class OpticsRenderer:
             np.array([dark, gain * (self.light.white_fraction * full - dark), self.light.leak, full]),
             self._loss,
             (normal_quantiles(), camera.noise_adu, (self.seed << 32) + self._pictures),
-            out,
+            picture,
         )
-        return out
+        return picture
 
     def trace_pixels(self, displacement_um: float) -> Trace:
-        """Exact s_x, s_y and place on the film of every pixel, each (H * W,), row by row: no interpolation, no light."""
+        """Exact s_x, s_y and place on the film of every pixel, each (H * W,), row by row; nothing interpolated."""
         camera = self.optics.camera
         columns, rows = np.meshgrid(np.arange(float(camera.width_px)), np.arange(float(camera.height_px)))
         directions = pixel_directions(camera, self._camera_pose, columns.ravel(), rows.ravel())

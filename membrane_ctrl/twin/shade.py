@@ -60,10 +60,10 @@ def _level(s_mm: float, values: FloatArray, cell_mm: float, side_mm: float, smoo
     place = s_mm / cell_mm
     cell = int(place)
     if not smooth:
-        return values[min(cell, len(values) - 1)]
+        return float(values[min(cell, len(values) - 1)])
     fraction = place - cell
     cell %= len(values) - 1
-    return values[cell] + fraction * (values[cell + 1] - values[cell])
+    return float(values[cell] + fraction * (values[cell + 1] - values[cell]))
 
 
 @njit(cache=True)

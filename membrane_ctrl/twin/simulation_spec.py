@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isfinite, pi, sin
 from typing import Literal
 
@@ -81,7 +81,7 @@ class SimulationSpec:
     laser: bool = True
     laser_noise_um: float = 0.0
     stated_geometry: GeometryConfig | None = None
-    light: Light = Light()
+    light: Light = field(default_factory=Light)
     screen_error: ScreenError | None = None
     exact: bool = False
     seed: int = 1
@@ -101,13 +101,13 @@ class SimulationSpec:
             raise ValueError(f"displacements_um: {len(self.displacements_um)} values for {len(names)} frames")
         if not all(isfinite(d) for d in self.displacements_um):
             raise ValueError("displacements_um: every value must be a number")
-        for field, value in (
+        for name, value in (
             ("frame_interval_s", self.frame_interval_s),
             ("laser_noise_um", self.laser_noise_um),
             ("seed", self.seed),
         ):
             if not (isfinite(value) and value >= 0):
-                raise ValueError(f"{field} = {value} must be 0 or more")
+                raise ValueError(f"{name} = {value} must be 0 or more")
         for fault in self.faults:
             if fault.frame not in names:
                 raise ValueError(f"faults: no frame {fault.frame!r} in this set ({names[0]} .. {names[-1]})")

@@ -81,8 +81,8 @@ def _film_distance(
         step = miss / (direction[2] - hx * direction[0] - hy * direction[1])
         t -= step
         if abs(step) < _TOLERANCE_MM:
-            return t
-    return np.nan
+            return float(t)
+    return float(np.nan)
 
 
 @njit(cache=True)
