@@ -145,7 +145,7 @@ class InnerLoop:
         weather_um_per_s = self._feedforward.update(given.ambient_pressure_pa, given.air_temperature_c, dt_s)
         wanted_um_per_s = terms.sum_um_per_s + weather_um_per_s + ramp_um_per_s
         limited_um_per_s = self._limiter.limit(wanted_um_per_s, dt_s)
-        self._pid.integrate(limited_um_per_s - wanted_um_per_s, dt_s)
+        self._pid.integrate(dt_s)
         fraction = self._curve.command(limited_um_per_s, dt_s)
         self._leak.update(self._curve.flow(fraction), weather_um_per_s, filtered_um, dt_s)
         return self._output(terms, weather_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction)

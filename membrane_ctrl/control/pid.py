@@ -1,9 +1,13 @@
 """PI(D) on a filtered measurement, with back-calculation and a clamped integrator.
 
-    P = K (r - y)          D = -K Td dy/dt          u = P + I + D + feed-forward
+    P = K (r - y)          D = -K Td dy/dt          u = P + I + D
     dI/dt = K / Ti (r - y) + (v - u) / Tt,    Tt = Ti,    0 <= I <= v_max
 
-v is what the limits left of u. Source: Astrom and Hagglund, Advanced PID Control (2006), sections 3.4, 3.5.
+v is u within the pump's range [0, v_max]. Source: Astrom and Hagglund, Advanced PID Control (2006), sections 3.4, 3.5.
+
+The feed-forward is added behind, and what the limits cut from it is not told to the integrator. Gusts are cut on one
+side only, for the pump takes no gas away. In the steady state dI/dt = 0, so back-calculation would turn a mean cut
+(v - u) into a mean error -(v - u) / K: measured, 0.18 um with gusts, and 0.00 without it.
 """
 
 from __future__ import annotations
@@ -61,9 +65,11 @@ class Pid:
         self._error_um, self._rate_um_per_s = error_um, measured_rate_um_per_s
         return self._terms()
 
-    def integrate(self, dropped_um_per_s: float, dt_s: float) -> None:
-        """Advance the integrator; `dropped_um_per_s` is the limited minus the wanted flow."""
-        drive_um_per_s = self.gains.kp_per_s * self._error_um + dropped_um_per_s
+    def integrate(self, dt_s: float) -> None:
+        """Advance the integrator by the last error, back-calculated where the terms leave the pump's range."""
+        wanted_um_per_s = self._terms().sum_um_per_s
+        back_um_per_s = self._clamped(wanted_um_per_s) - wanted_um_per_s
+        drive_um_per_s = self.gains.kp_per_s * self._error_um + back_um_per_s
         self.integral_um_per_s = self._clamped(self.integral_um_per_s + drive_um_per_s * dt_s / self.gains.ti_s)
 
     def set_gains(self, gains: PidGains) -> None:

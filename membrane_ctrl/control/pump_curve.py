@@ -4,8 +4,8 @@
 
 Between rest and the least running flow there is nothing: a wanted flow in that gap goes to the nearer end, so that
 the error of the gap has no sign of its own. (Always running on would add gas that nothing takes away, always stopping
-would leave the least flow missing: each is a bias.) What remains is left to the integrator: it is not told of the
-gap, for back-calculation turns every one-sided difference into a bias of (mean difference) / K.
+would leave the least flow missing: each is a bias.) What remains is left to the integrator, which is not told of
+the gap: it sees the error that follows.
 """
 
 from __future__ import annotations

@@ -1,0 +1,198 @@
+"""The outer loop: moves the setpoint so that the figure stays although the laser's mount drifts. Pure.
+
+The laser reads y = d + b: the mirror's centre d and the drift b of its mount. The camera sees the sag, and the ring
+stays where it is, so the change of sag is the change of d. Against a reference taken at lock
+
+    b = (change of the laser) - (change of sag),    both at the time of the exposures.
+
+With the trim at b the inner loop holds y = target + b, that is d = target. b does not depend on the setpoint, so a
+setpoint moved by the user is never taken for drift, and the trim feeds nothing back: there is no loop to become
+unstable, only a tracker to tune.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.config import ShapeConfig
+from membrane_ctrl.control.drift import DriftTracker
+from membrane_ctrl.control.reference import ReferenceMean
+from membrane_ctrl.control.sag_change import SagChange, sag_change
+from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.names import ShapeState
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeOutput:
+    """What the shape loop does, and why.
+
+    Attributes
+    ----------
+    state : ShapeState
+    reason : str
+        Why it is not tracking, or what holds it back; empty when there is nothing to say.
+    trim_um : float
+        To be added to the setpoint.
+    sag_change_um, sigma_um : float
+        Change of sag since lock as last admitted, and its standard deviation; NaN until there is one.
+    age_s : float
+        Age of the last admitted estimate; NaN until there is one.
+    """
+
+    state: ShapeState
+    reason: str
+    trim_um: float
+    sag_change_um: float
+    sigma_um: float
+    age_s: float
+
+
+class ShapeLoop:
+    """Trim from shape estimates; off until switched on.
+
+    Parameters
+    ----------
+    config : ShapeConfig
+    sensitivity : (36,) array
+        Change of the Zernike coefficients per um of sag.
+    """
+
+    def __init__(self, config: ShapeConfig, sensitivity: NDArray[np.float64]) -> None:
+        self._config = config
+        self._sensitivity = sensitivity
+        self._state = ShapeState.OFF
+        self._reason = "switched off"
+        self._trim_um = 0.0
+        self._base_um = 0.0
+        self._reference = ReferenceMean()
+        self._drift = DriftTracker(config.time_constant_s)
+        self._change = SagChange(math.nan, math.nan)
+        self._admitted_s = math.nan
+        self._seen_s = math.nan
+        self._settled_since_s = math.inf
+
+    def switch(self, on: bool, now_s: float) -> None:
+        """On: a new reference is taken, from the trim as it stands. Off: the trim is held."""
+        if on and self._state == ShapeState.OFF:
+            self.lock(now_s)
+        elif not on:
+            self._state, self._reason = ShapeState.OFF, "switched off"
+
+    def lock(self, now_s: float) -> None:
+        """Take the figure from now on as the reference; the trim stands meanwhile."""
+        self._state, self._reason = ShapeState.WAITING, "waiting for the first shape"
+        self._reference = ReferenceMean()
+        self._change = SagChange(math.nan, math.nan)
+        self._admitted_s, self._seen_s = math.nan, now_s
+
+    def step(
+        self, now_s: float, dt_s: float, estimate: ShapeEstimate | None, displacement_um: float, settled: bool
+    ) -> ShapeOutput:
+        """One tick.
+
+        Parameters
+        ----------
+        now_s, dt_s : float
+            The run's clock, and the time since the last tick.
+        estimate : ShapeEstimate or None
+            Only when it is new.
+        displacement_um : float
+            Laser reading now.
+        settled : bool
+            Whether the inner loop holds its setpoint.
+        """
+        if not settled:
+            self._settled_since_s = math.inf
+        elif math.isinf(self._settled_since_s):
+            self._settled_since_s = now_s
+        if self._state != ShapeState.OFF:
+            if estimate is not None:
+                self._seen_s = estimate.time_s
+            refusal = self._refusal(now_s, estimate, displacement_um, settled)
+            if refusal:
+                self._refuse(refusal)
+            elif estimate is not None:
+                self._admit(estimate)
+            if self._state == ShapeState.TRACKING:
+                self._move_trim(now_s, dt_s)
+        return ShapeOutput(
+            self._state,
+            self._reason,
+            self._trim_um,
+            self._change.change_um,
+            self._change.sigma_um,
+            now_s - self._admitted_s,
+        )
+
+    def _refusal(self, now_s: float, estimate: ShapeEstimate | None, displacement_um: float, settled: bool) -> str:
+        """Why nothing may be learnt in this tick; empty if it may."""
+        config = self._config
+        if not settled:
+            return "the inner loop is not settled"
+        if now_s - self._seen_s > config.fresh_s:
+            return f"no shape younger than {config.fresh_s:g} s"
+        if estimate is None:
+            return ""
+        if estimate.verdict == "rejected":
+            return f"shape rejected: {estimate.reason}"
+        if estimate.time_s < self._settled_since_s:
+            return "the shape was taken while the inner loop was not settled"
+        if estimate.time_s <= self._admitted_s:
+            return "the shape is not newer than the last one"
+        if not np.isfinite(estimate.coeffs_um).all() or not np.isfinite(estimate.covariance_um2).all():
+            return "the shape is not finite"
+        moved_um = abs(displacement_um - estimate.displacement_um)
+        if not moved_um <= config.disagreement_max_um:  # NaN is a refusal too
+            return f"the laser has moved by {moved_um:.1f} um since the exposures"
+        return self._disagreement(estimate)
+
+    def _disagreement(self, estimate: ShapeEstimate) -> str:
+        """Whether camera and laser tell different stories; empty without a reference."""
+        if not self._reference.complete:
+            return ""
+        _, drift_um = self._seen_drift(estimate)
+        apart_um = drift_um - self._drift.at(estimate.time_s)
+        if abs(apart_um) <= self._config.disagreement_max_um:
+            return ""
+        return f"camera and laser disagree by {apart_um:+.1f} um: check the laser's mount, or lock anew"
+
+    def _refuse(self, reason: str) -> None:
+        """Hold the trim and say why."""
+        if self._state != ShapeState.WAITING:
+            self._state = ShapeState.SUSPENDED
+        self._reason = reason
+
+    def _admit(self, estimate: ShapeEstimate) -> None:
+        """Learn from an estimate: the reference first, the drift then."""
+        self._admitted_s = estimate.time_s
+        if self._state == ShapeState.WAITING:
+            self._reference.take(estimate)
+            self._reason = f"reference: shape {self._reference.count} of {self._reference.wanted}"
+            if self._reference.complete:
+                self._state, self._reason = ShapeState.TRACKING, ""
+                self._base_um = self._trim_um
+                self._drift.begin(self._reference.time_s)
+            return
+        self._change, drift_um = self._seen_drift(estimate)
+        self._drift.take(drift_um, estimate.time_s)
+        self._state, self._reason = ShapeState.TRACKING, ""
+
+    def _seen_drift(self, estimate: ShapeEstimate) -> tuple[SagChange, float]:
+        """Change of sag since lock, and the drift of the laser that follows from it, um."""
+        reference = self._reference
+        change = sag_change(estimate.coeffs_um, reference.coeffs_um, estimate.covariance_um2, self._sensitivity)
+        return change, estimate.displacement_um - reference.displacement_um - change.change_um
+
+    def _move_trim(self, now_s: float, dt_s: float) -> None:
+        """Bring the trim to the drift, bounded in rate and range."""
+        config = self._config
+        goal_um = self._base_um + self._drift.at(now_s)
+        bounded_um = min(max(goal_um, -config.trim_max_um), config.trim_max_um)
+        step_um = config.trim_rate_max_um_per_s * dt_s
+        self._trim_um += min(max(bounded_um - self._trim_um, -step_um), step_um)
+        at_limit = bounded_um != goal_um
+        self._reason = f"trim at its limit of {config.trim_max_um:g} um" if at_limit else ""
