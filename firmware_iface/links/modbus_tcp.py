@@ -42,9 +42,9 @@ _UNANSWERED_MAX = 3
 class GuardedModbusTcp:
     """One Modbus TCP device.
 
-    One request is in flight at a time. A request whose caller is cancelled still runs to its reply or timeout, so that
-    nothing is ever abandoned on the wire. Nothing is sent twice, and nothing reconnects by itself: the owner calls
-    `connect`, which refuses to try before its back-off (0.1 s, doubling to 5 s) is over.
+    One request is in flight at a time. A request whose caller is cancelled still runs to its reply or timeout, so
+    that nothing is ever abandoned on the wire. Nothing is sent twice, and nothing reconnects by itself: the owner
+    calls `connect`, which refuses to try before its back-off (0.1 s, doubling to 5 s) is over.
 
     Parameters
     ----------
@@ -103,15 +103,18 @@ class GuardedModbusTcp:
             raise LinkDownError(f"{self.name}: next attempt to connect in {wait_s:.1f} s")
         await self.close()
         self._back_off.attempted(self._clock())
+
+        def changed(connected: bool) -> None:
+            if not connected:
+                _fail_in_flight(client, f"{self.name}: connection lost")
+
         client = AsyncModbusTcpClient(
             self._host,
             port=self._port,
             timeout=self._timeout_s,
             retries=0,
             reconnect_delay=0,
-            trace_connect=lambda connected: (
-                None if connected else _fail_in_flight(client, f"{self.name}: connection lost")
-            ),
+            trace_connect=changed,
         )
         client.set_max_no_responses(_UNANSWERED_MAX)
         if not await client.connect():
@@ -216,6 +219,6 @@ def _check(reply: ModbusPDU, function_code: int, transaction_id: int, what: str)
 
 def _fail_in_flight(client: AsyncModbusTcpClient, message: str) -> None:
     """End the wait for a reply that cannot come any more."""
-    waiting = client.ctx.response_future
+    waiting = client.ctx.response_future  # before the first request there is one that nobody awaits
     if not waiting.done() and client.ctx.request_transaction_id:
         waiting.set_exception(LinkDownError(message))
