@@ -121,9 +121,7 @@ def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> 
         if ("wrong_size", pattern.name) in faults:
             picture = picture[:-1]
         if ("wrong_depth", pattern.name) in faults:
-            picture = (
-                (picture >> 8).astype(np.uint8) if picture.dtype == np.uint16 else picture.astype(np.uint16) << 8
-            )
+            picture = _other_depth(picture)
         if ("missing", pattern.name) not in faults:
             _write_png(folder / f"{pattern.name}.png", picture)
     write_capture_toml(folder, spec, readings_um)
@@ -144,6 +142,12 @@ def _exposures(spec: SimulationSpec) -> list[_Exposure]:
         elif fault.kind == "swapped":
             exposures[frame], exposures[frame + 1] = exposures[frame + 1], this
     return exposures
+
+
+def _other_depth(picture: Pixels) -> Pixels:
+    if picture.dtype == np.uint8:
+        return picture.astype(np.uint16)
+    return picture.astype(np.uint8)
 
 
 def _write_png(path: Path, picture: Pixels) -> None:
