@@ -1,6 +1,6 @@
 """The nitrogen between the films: how much there is, how warm it is, and the pressure that follows.
 
-Amounts and flows are in mL at reference conditions (nominal absolute pressure, 20 deg C), as a mass-flow meter
+Amounts and flows are in mL at reference conditions (nominal absolute pressure, 23 deg C), as a mass-flow meter
 counts them: one mL is always the same number of molecules.
 """
 
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from membrane_ctrl.twin.film import NOMINAL_PRESSURE_PA
 
 STANDARD_AMBIENT_PA = 101_325.0
-REFERENCE_K = 293.15
-JOULE_PER_ML = (STANDARD_AMBIENT_PA + NOMINAL_PRESSURE_PA) * 1e-6  # P V of a reference mL at 20 deg C
+REFERENCE_K = 296.15  # 23 deg C, the standard laboratory atmosphere (ISO 291); 123 um/K holds there
+JOULE_PER_ML = (STANDARD_AMBIENT_PA + NOMINAL_PRESSURE_PA) * 1e-6  # P V of a reference mL at 23 deg C
 GAS_FOLLOWS_AIR_S = 12.0  # through 10 um of PET (PHYSICS: film and gas, estimate)
 
 

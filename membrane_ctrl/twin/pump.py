@@ -22,9 +22,16 @@ class Pump:
         Flow at command 1.
     step_s : float
         Time step.
+
+    Raises
+    ------
+    ValueError
+        If the pump delivers nothing at any command.
     """
 
     def __init__(self, config: PumpConfig, flow_full_ml_per_s: float, step_s: float) -> None:
+        if config.dead_fraction >= 1:
+            raise ValueError("pump.dead_fraction = 1: a pump that never delivers; it must be below 1")
         self._dead = config.dead_fraction
         self._start = config.start_fraction
         self._stall = config.stall_fraction

@@ -1,0 +1,208 @@
+"""The simulated bench as a process: the plant in real time behind the pump board's own protocol."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+
+from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import PumpBoardEmulator
+from membrane_ctrl.clock import RunClock
+from membrane_ctrl.config import PumpConfig, TwinConfig
+from membrane_ctrl.ipc.ring import RingAddress, RingWriter
+from membrane_ctrl.twin.events import Event
+from membrane_ctrl.twin.plant import STEP_S, Plant
+
+_PERIOD_S = 0.004  # below the sensors' 5 ms, so that each of their samples is out on time
+_STEPS_AT_ONCE = 4000  # some 10 ms of work: after a stall, clients are answered while the plant catches up
+
+
+@dataclass(frozen=True, slots=True)
+class BenchSpec:
+    """What a bench process needs to know; picklable.
+
+    Attributes
+    ----------
+    twin, pump : TwinConfig, PumpConfig
+        The plant.
+    clock : RunClock
+        The run's clock, on which the truth is stamped.
+    port : int
+        Where to listen; 0: any free port.
+    host : str
+        Address to listen on.
+    speed : float
+        Plant seconds a second.
+    truth : RingAddress or None
+        Where to publish `Truth.pack()` with every sample.
+    linger_s : float
+        How long the bench outlives the process that started it, so that the tripped watchdog can be seen.
+    events : tuple of Event
+        What happens when, in plant time (0 at the start).
+    """
+
+    twin: TwinConfig
+    pump: PumpConfig
+    clock: RunClock
+    port: int
+    host: str = "127.0.0.1"
+    speed: float = 1.0
+    truth: RingAddress | None = None
+    linger_s: float = 5.0
+    events: tuple[Event, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class BenchReport:
+    """What a bench process says once: the port it serves, or one line why it does not."""
+
+    port: int = 0
+    error: str = ""
+
+
+def serve(spec: BenchSpec, ready: Connection | None = None) -> None:
+    """Serve the bench until SIGTERM; in a spawned process at most until `linger_s` after the parent's end.
+
+    A spawned bench ignores SIGINT: Ctrl-C goes to the whole terminal, and the bench must outlive the controller's
+    safe stop. One that stands alone ends on it.
+
+    Parameters
+    ----------
+    spec : BenchSpec
+        The bench.
+    ready : Connection or None
+        Gets one BenchReport; a bench that cannot listen then ends without an exception.
+
+    Raises
+    ------
+    OSError
+        If it cannot listen and nobody waits for a report.
+    """
+    if _spawned():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    asyncio.run(_serve(spec, ready))
+
+
+async def _serve(spec: BenchSpec, ready: Connection | None) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    loop.add_signal_handler(signal.SIGTERM, stop.set)
+    if not _spawned():
+        loop.add_signal_handler(signal.SIGINT, stop.set)
+    with _truth_writer(spec.truth) as writer:
+        bench = LiveBench(spec, writer)
+        board = PumpBoardEmulator(bench, spec.host, spec.port)
+        try:
+            await board.start()
+        except OSError as error:
+            if ready is None:
+                raise
+            reason = os.strerror(error.errno) if error.errno else str(error)
+            ready.send(BenchReport(error=f"twin.port = {spec.port} on {spec.host}: {reason}; 0 takes any free port"))
+            return
+        if ready is not None:
+            ready.send(BenchReport(port=board.port))
+        try:
+            await _keep_running(bench, spec, stop)
+        finally:
+            await board.stop()
+
+
+async def _keep_running(bench: LiveBench, spec: BenchSpec, stop: asyncio.Event) -> None:
+    """Step the bench on absolute deadlines until told to stop."""
+    orphaned_s: float | None = None
+    deadline_s = time.monotonic()
+    while not stop.is_set():
+        bench.catch_up()
+        now_s = time.monotonic()
+        if orphaned_s is None and _orphaned():
+            orphaned_s = now_s
+        if orphaned_s is not None and now_s - orphaned_s > spec.linger_s:
+            return
+        deadline_s = max(deadline_s + _PERIOD_S, now_s)  # a missed deadline is not made up: catch_up has done it
+        await asyncio.sleep(deadline_s - now_s)
+
+
+def _spawned() -> bool:
+    return multiprocessing.parent_process() is not None
+
+
+def _orphaned() -> bool:
+    """The process that spawned this one is gone (then its number is no longer the parent's)."""
+    parent = multiprocessing.parent_process()
+    return parent is not None and os.getppid() != parent.pid
+
+
+@contextlib.contextmanager
+def _truth_writer(address: RingAddress | None) -> Iterator[RingWriter | None]:
+    if address is None:
+        yield None
+        return
+    writer = RingWriter(address)
+    try:
+        yield writer
+    finally:
+        writer.close()
+
+
+class LiveBench:
+    """The plant on the run's clock, sampled by its device every 5 ms of plant time.
+
+    Parameters
+    ----------
+    spec : BenchSpec
+        Plant, clock, speed.
+    truth : RingWriter or None
+        Where the truth of every sample goes.
+    """
+
+    def __init__(self, spec: BenchSpec, truth: RingWriter | None) -> None:
+        self._plant = Plant(spec.twin, spec.pump, spec.events)
+        self._now = spec.clock.now
+        self._start_s = spec.clock.now()
+        self._speed = spec.speed
+        self._truth = truth
+        self._sample = self._take_sample()
+
+    def sample(self) -> BoardSample:
+        """The device's newest sample."""
+        return self._sample
+
+    def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
+        """Drive pump and vent."""
+        self._plant.actuate(pump_fraction, vent_fraction)
+
+    def catch_up(self) -> None:
+        """Bring the plant to the clock, after a long stall in several calls.
+
+        Of several samples that are due, only the last could be seen by a client; the counter counts all.
+        """
+        due_s = (self._now() - self._start_s) * self._speed - self._plant.time_s
+        steps = min(int(due_s / STEP_S), _STEPS_AT_ONCE)
+        if steps > 0:
+            self._plant.advance(steps * STEP_S)
+            self._sample = self._take_sample()
+
+    def _take_sample(self) -> BoardSample:
+        plant = self._plant
+        if self._truth is not None:
+            truth = plant.truth()
+            self._truth.put(replace(truth, time_s=self._start_s + truth.time_s / self._speed).pack())
+        sample = plant.sample()
+        return BoardSample(
+            displacement_um=sample.displacement_um,
+            displacement_quality=sample.displacement_quality,
+            gauge_pressure_pa=sample.gauge_pressure_pa,
+            ambient_pressure_pa=sample.ambient_pressure_pa,
+            air_temperature_c=sample.air_temperature_c,
+            gas_temperature_c=sample.gas_temperature_c,
+            sample_counter=round(sample.device_time_s / STEP_S) + 1,
+            device_time_s=sample.device_time_s,
+        )
