@@ -10,7 +10,7 @@ from membrane_ctrl.config import Config
 
 def run_blueprint(config: Config) -> rrb.Blueprint:
     """The arrangement for a run; the shape tab is there only when the shape is measured."""
-    tabs = [_overview(), _loop(), _environment(), _timing(), _long_review()]
+    tabs = [_overview(config), _loop(config), _environment(config), _timing(), _long_review()]
     if config.shape.enabled:
         tabs.insert(2, _shape(config))
     return rrb.Blueprint(
@@ -23,19 +23,26 @@ def run_blueprint(config: Config) -> rrb.Blueprint:
 
 
 def _whole_run() -> rrb.TimeAxis:
-    """The whole run on the axis, and one zoom for all plots; without it a plot shows half a minute."""
+    """The whole run on the axis; without it, or with plots linked to one axis, half a minute about the cursor."""
     everything = rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
-    return rrb.TimeAxis(view_range=everything, link="LinkToGlobal")
+    return rrb.TimeAxis(view_range=everything)
 
 
-def _plot(name: str, *paths: str) -> rrb.TimeSeriesView:
+def _plot(name: str, *paths: str, span: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         name=name,
         origin="/",
         contents=[f"+ {path}" for path in paths],
         axis_x=_whole_run(),
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+        axis_y=None if span is None else rrb.ScalarAxis(range=span),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightBottom),
     )
+
+
+def _error(config: Config) -> rrb.TimeSeriesView:
+    """Twice the band high: where the run began, tens of um off, would leave nothing to see of the hold."""
+    span = (-2 * config.limits.band_um, 2 * config.limits.band_um)
+    return _plot("Error and band, um", "/loop/error", "/truth/error", "/loop/band", span=span)
 
 
 def _lanes() -> rrb.StateTimelineView:
@@ -51,20 +58,20 @@ def _text_log() -> rrb.TextLogView:
     )
 
 
-def _overview() -> rrb.Vertical:
+def _overview(config: Config) -> rrb.Vertical:
     return rrb.Vertical(
-        _plot("Error and band, um", "/loop/error", "/truth/error", "/loop/band"),
+        _error(config),
         _plot("Setpoint, reading and true centre, um", "/loop/position", "/truth/displacement"),
         rrb.Horizontal(_lanes(), _text_log(), column_shares=[3, 2]),
         rrb.Horizontal(_plot("Pump", "/pump/drive"), _plot("Flow and leak, um/s", "/loop/flow")),
-        row_shares=[3, 3, 2, 2],
+        row_shares=[3, 2.5, 2.5, 2],
         name="Overview",
     )
 
 
-def _loop() -> rrb.Vertical:
+def _loop(config: Config) -> rrb.Vertical:
     return rrb.Vertical(
-        _plot("Error and band, um", "/loop/error", "/truth/error", "/loop/band"),
+        _error(config),
         _plot("P, I, D and feed-forward, um/s", "/loop/terms"),
         _plot("Flow wanted, flow and leak, um/s", "/loop/flow"),
         _plot("Pump and vent", "/pump/drive"),
@@ -72,12 +79,12 @@ def _loop() -> rrb.Vertical:
     )
 
 
-def _environment() -> rrb.Vertical:
+def _environment(config: Config) -> rrb.Vertical:
     return rrb.Vertical(
         _plot("Ambient pressure, Pa", "/ambient/pressure"),
         _plot("Gauge pressure, Pa", "/gas/pressure"),
         _plot("Temperatures, C", "/ambient/temperature", "/gas/temperature"),
-        _plot("Error, um", "/loop/error", "/truth/error", "/loop/band"),
+        _error(config),
         name="Environment",
     )
 
@@ -116,7 +123,6 @@ def _timing() -> rrb.Vertical:
         _plot("Lateness of the tick, ms", "/tick/lateness"),
         _plot("Time between ticks, s", "/tick/dt"),
         _plot("Ticks missed so far", "/tick/missed"),
-        _plot("Device sample counter and time", "/device/sample"),
         _plot("Last frame to result, ms", "/shape/latency"),
         name="Timing",
     )

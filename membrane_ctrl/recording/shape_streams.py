@@ -24,9 +24,10 @@ from membrane_ctrl.recording.streams import (
     Stream,
 )
 
-# Sets of maps (3 x 66 kB) are this far apart: 1.7 GB a day, and a figure that drifts over minutes loses nothing;
-# the coefficients of every cycle are there, from which any map can be made again.
-MAP_INTERVAL_S = 10.0
+# A map is 66 kB. The difference every 10 s and the two that hardly change every minute are 0.8 GB a day; nothing is
+# lost, as the coefficients of every cycle are there, from which any map can be made again.
+DIFFERENCE_INTERVAL_S = 10.0
+MAP_INTERVAL_S = 60.0
 # The colours of the difference map span at least this, so that noise does not look like a figure.
 _DIFFERENCE_LEAST_UM = 0.5
 
@@ -38,11 +39,14 @@ class ShapeStreams:
         self._recording = recording
         self._reference: ShapeEstimate | None = None
         self._next_map_s = -math.inf
+        self._next_difference_s = -math.inf
+        self._colours: dict[str, tuple[float, float]] = {}
         self._verdict = ""
 
     def start_segment(self) -> None:
         """Say again in a new file what holds until it changes."""
         self._next_map_s = -math.inf
+        self._next_difference_s = -math.inf
         self._verdict = ""
 
     def send(self, estimate: ShapeEstimate) -> None:
@@ -61,35 +65,47 @@ class ShapeStreams:
         change_um = (estimate.coeffs_um - self._reference.coeffs_um)[1:]
         bars = rr.BarChart(change_um, abscissa=np.arange(2, 37))
         self._recording.log("/shape/change_bars", estimate.time_s, bars)
-        if estimate.time_s >= self._next_map_s:
-            self._next_map_s = estimate.time_s + MAP_INTERVAL_S
-            self._send_maps(estimate, self._reference)
+        self._send_maps(estimate, self._reference)
 
     def _send_maps(self, estimate: ShapeEstimate, reference: ShapeEstimate) -> None:
-        height_mm = height_map_mm(estimate.coeffs_um)
-        difference_um = difference_map_um(estimate.coeffs_um, reference.coeffs_um)
-        sigma_um = uncertainty_map_um(estimate.covariance_um2)
-        span_um = max(_DIFFERENCE_LEAST_UM, float(np.nanmax(np.abs(difference_um))))
-        sigma_max_um = max(1e-6, float(np.nanmax(sigma_um)))
-        low_mm, high_mm = float(np.nanmin(height_mm)), float(np.nanmax(height_mm))
-        self._send_map("height", estimate.time_s, height_mm, (low_mm, high_mm))
-        self._send_map("difference", estimate.time_s, difference_um, (-span_um, span_um))
-        self._send_map("uncertainty", estimate.time_s, sigma_um, (0.0, sigma_max_um))
-        legend = (
-            "| map | blue | red |\n|---|---|---|\n"
-            f"| height, mm | {low_mm:.3f} | {high_mm:.3f} |\n"
-            f"| difference to the first, um | {-span_um:.3f} | {span_um:.3f} |\n"
-            f"| uncertainty (1 sigma), um | 0 | {sigma_max_um:.4f} |\n\n"
-            f"cycle {estimate.cycle} ({estimate.kind}): sag {estimate.sag_um / 1e3:.4f} mm "
-            f"± {estimate.sag_sigma_um:.3f} um, slope residual {estimate.slope_residual_urad:.2f} urad, "
-            f"{100 * estimate.valid_fraction:.1f} % valid, {estimate.verdict} {estimate.reason}"
-        )
-        self._recording.log("/shape/legend", estimate.time_s, rr.TextDocument(legend, media_type="text/markdown"))
+        time_s = estimate.time_s
+        if time_s >= self._next_map_s:
+            self._next_map_s = time_s + MAP_INTERVAL_S
+            height_mm = height_map_mm(estimate.coeffs_um)
+            sigma_um = uncertainty_map_um(estimate.covariance_um2)
+            self._send_map("height", time_s, height_mm, "mm", _span(height_mm))
+            self._send_map("uncertainty", time_s, sigma_um, "um, 1 sigma", (0.0, _span(sigma_um)[1]))
+        if time_s >= self._next_difference_s:
+            self._next_difference_s = time_s + DIFFERENCE_INTERVAL_S
+            difference_um = difference_map_um(estimate.coeffs_um, reference.coeffs_um)
+            most_um = max(_DIFFERENCE_LEAST_UM, *(abs(end) for end in _span(difference_um)))
+            self._send_map("difference", time_s, difference_um, "um", (-most_um, most_um))
+            legend = _legend(estimate, self._colours)
+            self._recording.log("/shape/legend", time_s, rr.TextDocument(legend, media_type="text/markdown"))
 
-    def _send_map(self, kind: str, time_s: float, values: NDArray[np.float32], span: tuple[float, float]) -> None:
+    def _send_map(
+        self, kind: str, time_s: float, values: NDArray[np.float32], unit: str, span: tuple[float, float]
+    ) -> None:
         # NaN is drawn like the lowest value: a mask lies over it (`outside`, sent once a file)
         picture = rr.DepthImage(values, colormap="turbo", depth_range=span)
         self._recording.log(f"/shape/map/{kind}", time_s, picture)
+        self._colours[f"{kind}, {unit}"] = span
+
+
+def _span(values: NDArray[np.float32]) -> tuple[float, float]:
+    return float(np.nanmin(values)), float(np.nanmax(values))
+
+
+def _legend(estimate: ShapeEstimate, colours: dict[str, tuple[float, float]]) -> str:
+    """Markdown: what the maps' colours mean, and the cycle in one line each."""
+    rows = "\n".join(f"| {name} | {low:.4g} | {high:.4g} |" for name, (low, high) in colours.items())
+    reason = f" ({estimate.reason})" if estimate.reason else ""
+    return (
+        f"| map | blue | red |\n|---|---|---|\n{rows}\n\n"
+        f"- cycle {estimate.cycle}, {estimate.kind}: {estimate.verdict}{reason}\n"
+        f"- sag {estimate.sag_um / 1e3:.4f} mm ± {estimate.sag_sigma_um:.3f} um\n"
+        f"- slope residual {estimate.slope_residual_urad:.2f} urad, {100 * estimate.valid_fraction:.1f} % valid\n"
+    )
 
 
 def _quality(estimate: ShapeEstimate) -> dict[Stream, list[float]]:

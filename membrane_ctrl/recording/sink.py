@@ -86,9 +86,13 @@ class Recording:
             stream.log(block.path, _style(block), static=True)
         for lane in LANES:
             words = list(lane.colours)
-            colours = [lane.colours[word] for word in words]
+            colours = np.array([lane.colours[word] for word in words], dtype=np.uint32)
             stream.log(lane.path, rr.StateConfiguration(values=words, labels=words, colors=colours), static=True)
-        stream.log("/shape", rr.AnnotationContext([(OUTSIDE_CLASS, "", (24, 24, 24))]), static=True)
+        stream.log(
+            "/shape",
+            rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (OUTSIDE_CLASS, "", (24, 24, 24, 255))]),
+            static=True,
+        )
         outside = rr.SegmentationImage(outside_disc() * OUTSIDE_CLASS, opacity=1.0, draw_order=1.0)
         for kind in ("height", "difference", "uncertainty"):
             stream.log(f"/shape/map/{kind}/outside", outside, static=True)
