@@ -18,7 +18,7 @@ WINDOW_S = 60.0
 FIRST_S = 10.0
 
 # The loop moves the flow by 0.15 um/s (standard deviation) and the pump's least running flow is 0.3 um/s: with less
-# than this to make up for, the pump stops and starts, and the band of 2 um is lost (0.12 um/s: 3.3 um; 0.037: 8.7 um).
+# than this to make up for, the pump stops and starts, and in the end the band of 2 um is lost (docs/control.md).
 TOO_TIGHT_UM_PER_S = 0.4
 
 # A warning that is given is kept until the leak is clearly above the limit again.

@@ -3,7 +3,8 @@
     P = K (r - y)          D = -K Td dy/dt          u = P + I + D
     dI/dt = K / Ti (r - y) + (v - u) / Tt,    Tt = Ti,    0 <= I <= v_max
 
-v is u within the pump's range [0, v_max]. Source: Astrom and Hagglund, Advanced PID Control (2006), sections 3.4, 3.5.
+v is u within the pump's range [0, v_max].
+Source: Astrom and Hagglund, Advanced PID Control (2006), sections 3.4 and 3.5.
 
 The feed-forward is added behind, and what the limits cut from it is not told to the integrator. Gusts are cut on one
 side only, for the pump takes no gas away. In the steady state dI/dt = 0, so back-calculation would turn a mean cut
