@@ -79,6 +79,10 @@ class Bench(Protocol):
         """Write pump and vent, and feed the watchdog. Raises LinkError."""
         ...
 
+    async def clear_faults(self) -> None:
+        """Clear what the devices have latched: only ever because a person said so. Raises LinkError."""
+        ...
+
     async def close(self) -> None:
         """Close the link; the caller has written the safe state before. Never raises."""
         ...

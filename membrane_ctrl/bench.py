@@ -2,11 +2,39 @@
 
 from __future__ import annotations
 
+import asyncio
+
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.roles import Bench
+from firmware_iface.roles import Bench, BenchIdentity, DeviceRefusedError, LinkError
 from membrane_ctrl.config import DevicesConfig
+from membrane_ctrl.errors import DeviceError
+
+# A board that boots or a network that comes up is given this long before the command gives up
+_PATIENCE_S = 5.0
+_PAUSE_S = 0.25
 
 
 def open_bench(devices: DevicesConfig) -> Bench:
     """The bench that the configuration names, not yet connected."""
     return PumpBoard(devices.board, devices.unit_id, devices.timeout_s, devices.watchdog_s)
+
+
+async def connect(bench: Bench, devices: DevicesConfig) -> BenchIdentity:
+    """Connect, with patience for a device that is not there yet and none for one that is the wrong one.
+
+    Raises
+    ------
+    DeviceError
+        One line that names the device and what is wrong.
+    """
+    loop = asyncio.get_running_loop()
+    give_up_s = loop.time() + _PATIENCE_S
+    while True:
+        try:
+            return await bench.open()
+        except DeviceRefusedError as error:
+            raise DeviceError(f"{devices.board}: {error}") from None
+        except LinkError as error:
+            if loop.time() > give_up_s:
+                raise DeviceError(f"{devices.board}: {error}") from None
+        await asyncio.sleep(_PAUSE_S)

@@ -52,6 +52,9 @@ def hold(
     duration: Annotated[str | None, typer.Option(help="Stop after this long, e.g. 90s, 3m, 2h30m.")] = None,
     name: Annotated[str, typer.Option(help="Name of the run folder.")] = "hold",
     logs: Annotated[Path | None, typer.Option(help="Where run folders go.")] = None,
+    clear_faults: Annotated[
+        bool, typer.Option("--clear-faults", help="Clear what the board has latched, once you know why.")
+    ] = False,
     json: JsonOption = False,
 ) -> int:
     """Hold the mirror until told to stop: the main job."""
@@ -64,6 +67,7 @@ def hold(
         duration_s=None if duration is None else parse_duration_s(duration),
         name=name,
         logs_dir=logs,
+        clear_faults=clear_faults,
         json=json,
     )
     return hold_mirror(options)

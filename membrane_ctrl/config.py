@@ -30,11 +30,11 @@ class LoopConfig(Section):
     kp_per_s: Annotated[float, Field(ge=0, le=20)] = 0.61
     ti_s: Annotated[float, Field(gt=0.05, le=3600)] = 6.5
     td_s: Annotated[float, Field(ge=0, le=10)] = 0.0
-    setpoint_weight: Fraction = 0.0
+    setpoint_weight: Fraction = 1.0  # the setpoint only ever ramps, with its speed fed forward
     measurement_filter_s: Annotated[float, Field(ge=0, le=10)] = 0.2
     flow_max_um_per_s: Annotated[float, Field(gt=0, le=100)] = 5.3
     flow_rate_limit_um_per_s2: Annotated[float, Field(gt=0, le=1000)] = 20.0
-    setpoint_ramp_um_per_s: Annotated[float, Field(gt=0, le=100)] = 3.0
+    setpoint_ramp_um_per_s: Annotated[float, Field(gt=0, le=100)] = 3.5
     feedforward_barometer: bool = True
     feedforward_temperature: bool = True
     barometer_gain_um_per_pa: Annotated[float, Field(ge=-10, le=10)] = -0.358
@@ -75,7 +75,7 @@ class LimitsConfig(Section):
 class StatesConfig(Section):
     """How long states and rungs may last."""
 
-    check_s: Annotated[float, Field(ge=0.1, le=600)] = 1.0  # of good readings before the pump may run
+    check_s: Annotated[float, Field(ge=0.1, le=600)] = 2.0  # of good readings before the pump may run
     check_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
     inflate_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 14_400.0  # a fill from flat takes two hours
     settle_s: Annotated[float, Field(ge=0.1, le=3600)] = 2.0  # inside the band before the state is `hold`

@@ -46,7 +46,6 @@ class Controller:
         self._shape = ShapeLoop(config.shape, sag_sensitivity)
         observer = Observer(config.limits)
         self._scene = Scene(config, InnerLoop(config.loop, config.pump), observer, Ladder(config.states))
-        self._shape_wanted = config.shape.enabled
         self._tick_error = ""
         self._ticks = 0
         self._state_since_s = math.nan
@@ -65,6 +64,8 @@ class Controller:
         verdict = self._safety.judge(self.state, observation)
         self._apply(verdict, events)
         shape = self._step_shape(inputs, events)
+        if math.isnan(self._state_since_s):  # the verdict has just changed the state
+            self._state_since_s, scene.state_age_s = inputs.now_s, 0.0
         self._act(events)
         command = BenchCommand(scene.pump_fraction, scene.vent_fraction)
         scene.observer.wrote(command)
@@ -78,9 +79,10 @@ class Controller:
         nominal_s = 1.0 / self._config.loop.rate_hz
         scene.now_s = inputs.now_s
         scene.dt_s = min(max(inputs.dt_s, _DT_RANGE[0] * nominal_s), _DT_RANGE[1] * nominal_s)
-        if math.isnan(self._state_since_s):
+        if self._ticks == 1:
+            self._shape.switch(self._config.shape.enabled, inputs.now_s)
+        if math.isnan(self._state_since_s):  # the state's first tick
             self._state_since_s = inputs.now_s
-            self._shape.switch(self._shape_wanted, inputs.now_s)
         scene.state_age_s = inputs.now_s - self._state_since_s
         for command in inputs.commands:
             self._obey(command, events)
@@ -146,8 +148,7 @@ class Controller:
         scene = self._scene
         events.append({"kind": "state", "state": state.name.lower(), "from": self.state.name.lower(), "why": why})
         self.state = state
-        self._state_since_s = scene.now_s
-        scene.state_age_s = 0.0
+        self._state_since_s = math.nan
         scene.good_since_s = math.nan
         scene.overdue = ""
 

@@ -8,14 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from membrane_ctrl.config import Config
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput, LoopOutput
+from membrane_ctrl.control.slope import Slope
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.ladder import Ladder
 from membrane_ctrl.names import Rung, State
 from membrane_ctrl.observer import Observer
+
+# a pump that someone left running has run down by then: lag 0.15 s, transport 0.1 s (PHYSICS, inner loop)
+_PUMP_STANDS_S = 0.5
 
 
 @dataclass(slots=True)
@@ -36,6 +40,7 @@ class Scene:
     stop_exit: Exit = Exit.DONE
     # memory of the states
     good_since_s: float = math.nan
+    sinking: Slope = field(default_factory=Slope)  # of the mirror with the pump off, seen in `check`
     ramp_from_fraction: float = 0.0
     last_pump_fraction: float = 0.0
     # decisions of this tick
@@ -65,9 +70,11 @@ def standby(scene: Scene) -> State:
 
 
 def check(scene: Scene) -> State:
-    """Every sensor must have been good for a while before the pump may run."""
+    """Every sensor must have been good for a while before the pump may run; how fast the mirror sinks is the leak."""
     if scene.stop_wanted:
         return State.LOWER
+    if scene.state_age_s > _PUMP_STANDS_S:
+        scene.sinking.add(scene.now_s, scene.observer.displacement_um)
     missing = _missing(scene)
     scene.why = f"checking the sensors: {missing}" if missing else "checking the sensors: all good so far"
     if scene.stay_good(not missing) >= scene.config.states.check_s:
@@ -82,12 +89,13 @@ def inflate(scene: Scene) -> State:
     if scene.stop_wanted:
         return State.LOWER
     if scene.state_age_s == 0:
-        scene.loop.start(scene.observer.displacement_um, 0.0)  # the pump stood still in `check`
+        # the flow that balances the leak, so that the integrator need not find it first
+        scene.loop.start(scene.observer.displacement_um, max(0.0, -scene.sinking.per_s))
     output = _drive(scene)
     to_go_um = scene.config.loop.setpoint_um - output.filtered_um
     scene.why = f"inflating: {to_go_um:.0f} um to go"
     ramp_left_um = scene.config.loop.setpoint_um + scene.trim_um - output.setpoint_um
-    if abs(ramp_left_um) < 1e-6 and abs(to_go_um) < _settle_band_um(scene):
+    if max(abs(ramp_left_um), abs(to_go_um)) < scene.config.limits.band_um:
         return State.SETTLE
     if scene.state_age_s > scene.config.states.inflate_timeout_s:
         scene.overdue = f"still {to_go_um:.0f} um from the setpoint"
@@ -99,13 +107,13 @@ def settle(scene: Scene) -> State:
     if scene.stop_wanted:
         return State.LOWER
     output = _drive(scene)
-    inside = abs(output.error_um) < _settle_band_um(scene)
+    inside = abs(output.error_um) < scene.config.limits.band_um
     settled_s = scene.stay_good(inside)
     scene.why = f"settling: inside the band for {settled_s:.0f} s"
     if settled_s >= scene.config.states.settle_s:
         return State.HOLD
     if scene.state_age_s > scene.config.states.settle_timeout_s:
-        scene.overdue = f"not inside +-{_settle_band_um(scene):g} um for {scene.config.states.settle_s:g} s"
+        scene.overdue = f"not inside +-{scene.config.limits.band_um:g} um for {scene.config.states.settle_s:g} s"
     return State.SETTLE
 
 
@@ -174,10 +182,6 @@ def _given(scene: Scene) -> LoopInput:
         ambient_pressure_pa=reading.ambient_pressure_pa if reading else math.nan,
         air_temperature_c=reading.air_temperature_c if reading else math.nan,
     )
-
-
-def _settle_band_um(scene: Scene) -> float:
-    return scene.config.limits.band_um
 
 
 def _missing(scene: Scene) -> str:

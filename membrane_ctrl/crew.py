@@ -1,0 +1,99 @@
+"""The processes beside the control process, and the rings between them."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from membrane_ctrl.acquisition.frame_address import FrameAddress
+from membrane_ctrl.clock import RunClock
+from membrane_ctrl.config import Config
+from membrane_ctrl.ipc.ring import RingAddress, ring
+from membrane_ctrl.processes import Child, pipe
+from membrane_ctrl.telemetry import ROW_BYTES
+
+# A recorder that is busy for a minute (a slow disk, a big flush) loses nothing
+_TELEMETRY_KEPT_S = 60.0
+_EVENTS_KEPT, _EVENT_BYTES = 1024, 4096
+_SHAPES_KEPT, _SHAPE_BYTES = 64, 1 << 16  # a 36 x 36 covariance is 10 kB
+_RECORDER_CLOSES_S = 30.0
+_CHILD_STOPS_S = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Rings:
+    """The shared memory of a run (docs/architecture.md)."""
+
+    telemetry: RingAddress
+    events: RingAddress
+    shapes: RingAddress | None
+    frames: FrameAddress | None
+    truth: RingAddress | None
+
+
+def rings_for(config: Config, truth: RingAddress | None, stack: ExitStack) -> Rings:
+    """Make the rings; the stack gives their memory back."""
+    telemetry = stack.enter_context(ring(round(_TELEMETRY_KEPT_S * config.loop.rate_hz), ROW_BYTES))
+    events = stack.enter_context(ring(_EVENTS_KEPT, _EVENT_BYTES))
+    if truth is None or not config.shape.enabled:  # no camera but the twin's is known yet
+        return Rings(telemetry, events, None, None, truth)
+    shapes = stack.enter_context(ring(_SHAPES_KEPT, _SHAPE_BYTES))
+    return Rings(telemetry, events, shapes, _frames(config, stack), truth)
+
+
+def _frames(config: Config, stack: ExitStack) -> FrameAddress:
+    from membrane_ctrl.acquisition.frames import FrameRing
+
+    camera = config.optics.camera
+    slots = 2 * (config.optics.pattern.steps + 4) + 2 + 1  # a full cycle, and the frame that is being taken
+    owner = FrameRing(slots, camera.height_px, camera.width_px, "uint8" if camera.bits == 8 else "uint16")
+    stack.callback(owner.close)
+    return owner.address
+
+
+class Crew:
+    """Recorder, live screen and acquisition of one run.
+
+    Attributes
+    ----------
+    children : list of Child
+        For the supervisor to look after.
+    """
+
+    def __init__(
+        self, config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str, duration_s: float | None
+    ) -> None:
+        from membrane_ctrl.acquisition.process import AcquisitionSpec
+        from membrane_ctrl.recording.process import RecorderSpec
+        from membrane_ctrl.screen.process import ScreenSpec
+
+        recorder_spec = RecorderSpec(
+            run_dir, name, clock, config, rings.telemetry, rings.events, rings.shapes, rings.frames
+        )
+        screen_spec = ScreenSpec(clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s)
+        self._recorder = Child("recorder", "membrane_ctrl.recording.process:recorder_main", (recorder_spec,), nice=5)
+        self._screen = Child("screen", "membrane_ctrl.screen.process:screen_main", (screen_spec,), nice=5)
+        self.children = [self._recorder, self._screen]
+        if rings.shapes is not None and rings.frames is not None:
+            ours, theirs = pipe()
+            self._control = ours
+            spec = AcquisitionSpec(config, clock, rings.telemetry, rings.shapes, rings.truth, rings.frames)
+            acquisition = Child(
+                "acquisition", "membrane_ctrl.acquisition.process:acquisition_main", (spec, theirs), nice=10
+            )
+            self.children.append(acquisition)
+
+    def start(self, stack: ExitStack) -> None:
+        """Start all; the stack ends whatever `take_down` has not."""
+        for child in self.children:
+            child.start()
+            stack.callback(child.stop, _CHILD_STOPS_S)
+
+    def take_down(self) -> None:
+        """Stop the acquisition, then let recorder and screen finish by themselves: the "end" event is their sign."""
+        for child in self.children:
+            if child not in (self._recorder, self._screen):
+                child.stop(_CHILD_STOPS_S)
+        self._recorder.join(_RECORDER_CLOSES_S)
+        self._screen.join(_CHILD_STOPS_S)

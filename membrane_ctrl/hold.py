@@ -1,0 +1,185 @@
+"""`hold`: everything around the ticks. Starts the processes, wires them, and takes them down in the right order.
+
+On the way in, what can be refused is refused before anything exists: configuration, port, devices, folder. On the
+way out: the safe state first, then the recording, then the rest.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import json
+import math
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from firmware_iface.roles import Bench, LinkError
+from membrane_ctrl.bench import connect, open_bench
+from membrane_ctrl.clock import RunClock
+from membrane_ctrl.config import Config, DevicesConfig
+from membrane_ctrl.controller import Controller
+from membrane_ctrl.crew import Crew, Rings, rings_for
+from membrane_ctrl.errors import DeviceError, Exit, InputError
+from membrane_ctrl.ipc.ring import RingReader, RingWriter
+from membrane_ctrl.recording.run_folder import create_run_folder
+from membrane_ctrl.simulated import TwinProcess
+from membrane_ctrl.supervisor import Supervisor, Wiring
+from membrane_ctrl.tick import Command
+
+
+@dataclass(frozen=True, slots=True)
+class HoldOptions:
+    """What the command line asked for."""
+
+    config: Config
+    source: str  # where the configuration came from, for messages
+    twin: bool
+    duration_s: float | None
+    name: str
+    logs_dir: Path | None
+    clear_faults: bool
+    json: bool
+
+
+def hold_mirror(options: HoldOptions) -> int:
+    """Hold the mirror until the duration is over, a signal comes, or a safety trip ends it.
+
+    Returns the exit code. Raises InputError or DeviceError (one line) for what fails before the first tick.
+    """
+    if options.config.devices is None and not options.twin:
+        raise InputError(f"{options.source}: devices: missing; name the pump board in [devices], or use --twin")
+    clock = RunClock.start()
+    with ExitStack() as stack:
+        twin = TwinProcess.started(options.config, clock, stack) if options.twin else None
+        config = twin.config if twin else options.config
+        assert config.devices is not None
+        bench = open_bench(config.devices)
+        asyncio.run(_identify(bench, config.devices, options.clear_faults))
+        logs_dir = options.logs_dir or Path(config.recording.logs_dir)
+        run_dir = create_run_folder(logs_dir, options.name, clock.origin_utc, config)
+        rings = rings_for(config, twin.truth if twin else None, stack)
+        crew = Crew(config, clock, rings, run_dir, options.name, options.duration_s)
+        crew.start(stack)
+        exit_code = asyncio.run(_run(bench, config, options.duration_s, clock, rings, crew, twin))
+        crew.take_down()
+    _report(run_dir, options.json)
+    return exit_code
+
+
+async def _identify(bench: Bench, devices: DevicesConfig, clear_faults: bool) -> None:
+    """Who is there, and is it fit to run, before a run folder exists. Raises DeviceError."""
+    try:
+        await connect(bench, devices)
+        if clear_faults:
+            await bench.clear_faults()
+        reading = await bench.read()
+        if reading.latched_faults:
+            raise DeviceError(
+                f"{devices.board}: the board has latched faults {reading.latched_faults:#x} (docs/registers.md); "
+                "find out why, then start with --clear-faults"
+            )
+    except LinkError as error:
+        raise DeviceError(f"{devices.board}: {error}") from None
+    finally:
+        await bench.close()
+
+
+async def _run(
+    bench: Bench,
+    config: Config,
+    duration_s: float | None,
+    clock: RunClock,
+    rings: Rings,
+    crew: Crew,
+    twin: TwinProcess | None,
+) -> Exit:
+    from membrane_ctrl.metrology.hencky import zernike_projection
+
+    with _open(rings) as (telemetry, events, shapes):
+        wiring = Wiring(bench, telemetry, events, shapes, twin.truth_reader() if twin else None, crew.children)
+        controller = Controller(config, zernike_projection())
+        supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
+        supervisor.tell({"kind": "start", "devices": config.devices.board if config.devices else ""})
+        exit_code = Exit.DEVICE_FAILED
+        try:
+            assert config.devices is not None
+            await connect(bench, config.devices)
+            supervisor.ask(Command("hold", "command line"))
+            gc.collect()
+            gc.freeze()  # what lives for the whole run need not be looked at again between two ticks
+            with _signals(supervisor):
+                exit_code = await supervisor.run(duration_s)
+        except LinkError as error:
+            supervisor.tell({"kind": "link", "message": str(error)})
+            raise DeviceError(str(error)) from None
+        finally:
+            await bench.close()
+            supervisor.tell(
+                {
+                    "kind": "end",
+                    "exit": exit_code.name.lower(),
+                    "exit_code": int(exit_code),
+                    "ticks": supervisor.ticks,
+                    "missed_ticks": supervisor.missed_ticks,
+                }
+            )
+    return exit_code
+
+
+@contextlib.contextmanager
+def _open(rings: Rings) -> Iterator[tuple[RingWriter, RingWriter, RingReader | None]]:
+    telemetry, events = RingWriter(rings.telemetry), RingWriter(rings.events)
+    shapes = RingReader(rings.shapes) if rings.shapes else None
+    try:
+        yield telemetry, events, shapes
+    finally:
+        for ring in (telemetry, events, shapes):
+            if ring is not None:
+                ring.close()
+
+
+@contextlib.contextmanager
+def _signals(supervisor: Supervisor) -> Iterator[None]:
+    """SIGINT and SIGTERM ask for a clean stop; the safe state comes before anything else."""
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, supervisor.ask, Command("stop", signal.Signals(number).name))
+    try:
+        yield
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(number)
+
+
+def _report(run_dir: Path, as_json: bool) -> None:
+    """What the run was, and where it is."""
+    summary_path = run_dir / "summary.json"
+    if as_json:
+        print(summary_path.read_text(encoding="utf-8") if summary_path.exists() else "{}")
+        return
+    if summary_path.exists():
+        for line in _headline(json.loads(summary_path.read_text(encoding="utf-8"))):
+            print(line, file=sys.stderr)
+    else:
+        print("the recorder left no summary.json; what it had recorded is still readable", file=sys.stderr)
+    print(f"run folder: {run_dir}", file=sys.stderr)
+    print(f"open it:    rerun {run_dir}/*.rrd", file=sys.stderr)
+
+
+def _headline(summary: dict[str, object]) -> Iterator[str]:
+    labels: dict[str, tuple[str, Callable[[float], str]]] = {
+        "true_std_um": ("true centre, standard deviation", lambda v: f"{v:.3f} um"),
+        "true_bias_um": ("true centre, bias", lambda v: f"{v:+.3f} um"),
+        "in_band_1s_fraction": ("1 s means inside the band", lambda v: f"{100 * v:.1f} %"),
+        "cycles": ("shape cycles", lambda v: f"{v:.0f}"),
+        "missed_ticks": ("missed ticks", lambda v: f"{v:.0f}"),
+    }
+    for key, (label, show) in labels.items():
+        value = summary.get(key)
+        if isinstance(value, (int, float)) and math.isfinite(value):
+            yield f"{label + ':':34}{show(value)}"

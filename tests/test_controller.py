@@ -1,0 +1,181 @@
+"""The whole tick on the twin in virtual time: states, safe actions, and what a person is told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from firmware_iface.roles import BenchReading
+from membrane_ctrl.config import Config, LimitsConfig, LoopConfig, StatesConfig, TwinConfig
+from membrane_ctrl.errors import Exit
+from membrane_ctrl.metrology.hencky import zernike_projection
+from membrane_ctrl.names import Rung, State
+from membrane_ctrl.tick import Event
+from membrane_ctrl.twin.plant import Plant
+from membrane_ctrl.virtual_run import VirtualTick, run_virtual
+
+CALM = Config(twin=TwinConfig(scenario="calm", laser_noise_um=0.3))
+Alter = Callable[[float, BenchReading], BenchReading | None]
+
+
+class Run:
+    """A virtual run, kept whole."""
+
+    def __init__(self, config: Config = CALM, duration_s: float = 40.0, alter: Alter | None = None) -> None:
+        plant = Plant(config.twin, config.pump)
+        self.ticks: list[VirtualTick] = list(
+            run_virtual(config, plant, duration_s, zernike_projection(), alter=alter)
+        )
+        self.rows = [tick.row for tick in self.ticks]
+        self.events: list[Event] = [
+            {**event, "mono_s": tick.row.mono_s} for tick in self.ticks for event in tick.events
+        ]
+        self.finished = self.ticks[-1].finished
+
+    def of(self, kind: str) -> list[Event]:
+        return [event for event in self.events if event["kind"] == kind]
+
+    @property
+    def states(self) -> list[str]:
+        return [event["state"] for event in self.of("state")]
+
+    def value(self, field: str) -> Any:
+        return np.array([getattr(row, field) for row in self.rows])
+
+
+def after(start_s: float, until_s: float, change: Callable[[BenchReading], BenchReading | None]) -> Alter:
+    return lambda now_s, reading: change(reading) if start_s <= now_s < until_s else reading
+
+
+def test_a_good_run_goes_through_its_states_and_ends_with_the_pump_off() -> None:
+    run = Run(Config(), 40.0)
+    assert run.states == ["check", "inflate", "settle", "hold", "lower"]
+    assert run.of("state")[3]["mono_s"] <= 15.0
+    assert run.finished == Exit.DONE
+    assert run.rows[-1].pump_fraction == 0.0
+    assert not run.of("fault")
+    held = run.value("state") == State.HOLD
+    assert np.std(run.value("truth_displacement_um")[held]) < 0.3
+
+
+@pytest.mark.parametrize("state", [State.STANDBY, State.CHECK, State.LOWER])
+def test_the_pump_stands_in_states_that_do_not_hold(state: State) -> None:
+    run = Run()
+    pump = run.value("pump_fraction")[run.value("state") == state]
+    assert np.all(pump == 0.0)
+
+
+def test_ten_seconds_without_a_laser_are_held_on_the_mean_flow_and_forgiven() -> None:
+    lost = after(25.0, 35.0, lambda r: replace(r, displacement_um=math.nan, displacement_quality=1))
+    run = Run(CALM, 45.0, lost)
+    assert [f["name"] for f in run.of("fault")] == ["displacement_missing"]
+    assert run.of("fault")[0]["mono_s"] == pytest.approx(25.0, abs=0.021)
+    assert len(run.of("cleared")) == 1
+    assert run.finished == Exit.DONE
+    gone = (run.value("mono_s") > 25.1) & (run.value("mono_s") < 34.9)
+    assert np.ptp(run.value("pump_fraction")[gone]) < 0.02  # the mean flow, and nothing else
+    assert np.max(np.abs(run.value("truth_displacement_um")[gone])) < 4.0
+
+
+def test_a_laser_that_stays_away_leads_down_the_ladder() -> None:
+    lost = after(25.0, math.inf, lambda r: replace(r, displacement_um=math.nan, displacement_quality=1))
+    config = CALM.model_copy(update={"states": StatesConfig(hold_flow_max_s=2.0, ramp_down_s=3.0)})
+    run = Run(config, 60.0, lost)
+    assert run.finished == Exit.SAFETY_TRIP
+    rungs = [Rung(rung) for rung in dict.fromkeys(run.value("rung"))]
+    assert rungs == [Rung.NONE, Rung.HOLD_FLOW, Rung.RAMP_DOWN, Rung.PUMP_OFF]
+    ramp = run.value("pump_fraction")[run.value("rung") == Rung.RAMP_DOWN]
+    assert np.all(np.diff(ramp) <= 0)
+    assert run.rows[-1].pump_fraction == 0.0
+    assert [f["name"] for f in run.of("fault")] == ["displacement_missing"]  # the first cause, once
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "rung"),
+    [
+        ("over_pressure", lambda r: replace(r, gauge_pressure_pa=900.0), Rung.VENT),
+        ("over_displacement", lambda r: replace(r, displacement_um=600.0), Rung.VENT),
+        ("device_silent", lambda r: None, Rung.PUMP_OFF),
+        ("watchdog_tripped", lambda r: replace(r, watchdog_tripped=True), Rung.PUMP_OFF),
+        ("board_fault", lambda r: replace(r, latched_faults=2), Rung.PUMP_OFF),
+        ("pump_mismatch", lambda r: replace(r, pump_fraction=0.9), Rung.PUMP_OFF),
+        ("pressure_missing", lambda r: replace(r, gauge_pressure_pa=math.nan), Rung.RAMP_DOWN),
+    ],
+)
+def test_each_latching_fault_enters_its_rung_within_two_ticks_of_its_window(
+    name: str, change: Callable[[BenchReading], BenchReading | None], rung: Rung
+) -> None:
+    run = Run(CALM, 60.0, after(25.0, math.inf, change))
+    assert run.finished == Exit.SAFETY_TRIP
+    latched = [f for f in run.of("fault") if f["latching"]]
+    assert [f["name"] for f in latched] == [name]
+    fault_s = latched[0]["mono_s"]
+    entered = next(row for row in run.rows if row.rung == rung)
+    assert entered.mono_s - fault_s <= 0.041
+    if rung >= Rung.PUMP_OFF:
+        assert entered.pump_fraction == 0.0
+    assert entered.vent_fraction == (1.0 if rung == Rung.VENT else 0.0)
+
+
+def test_a_frozen_sensor_is_seen_although_it_answers() -> None:
+    frozen: list[BenchReading] = []
+
+    def freeze(now_s: float, reading: BenchReading) -> BenchReading:
+        if now_s < 25.0:
+            frozen[:] = [reading]
+            return reading
+        return frozen[0]
+
+    run = Run(CALM, 60.0, freeze)
+    assert {"displacement_missing", "displacement_frozen"} & {f["name"] for f in run.of("fault")}
+    assert run.finished == Exit.SAFETY_TRIP
+
+
+def test_one_wild_reading_is_passed_over() -> None:
+    wild = after(25.0, 25.02, lambda r: replace(r, displacement_um=r.displacement_um + 300.0))
+    run = Run(CALM, 40.0, wild)
+    assert run.finished == Exit.DONE
+    after_it = run.value("mono_s") > 25.0
+    assert np.max(np.abs(run.value("filtered_um")[after_it & (run.value("state") == State.HOLD)])) < 2.0
+
+
+def test_missing_sensors_never_start_the_pump() -> None:
+    run = Run(CALM, 60.0, lambda now_s, r: replace(r, displacement_quality=3))
+    assert run.finished == Exit.SAFETY_TRIP
+    assert np.all(run.value("pump_fraction") == 0.0)
+    fault = run.of("fault")[-1]
+    assert fault["name"] == "overdue"
+    assert "quality 3" in fault["seen"]
+
+
+def test_an_error_in_the_control_code_stops_the_pump(monkeypatch: pytest.MonkeyPatch) -> None:
+    from membrane_ctrl import states
+
+    def broken(scene: states.Scene) -> State:
+        raise ZeroDivisionError("x / 0")
+
+    monkeypatch.setitem(states.HANDLERS, State.HOLD, broken)
+    run = Run()
+    assert run.finished == Exit.SAFETY_TRIP
+    assert [(f["name"], f["seen"]) for f in run.of("fault")] == [("tick_error", "ZeroDivisionError: x / 0")]
+    first_error = 1 + next(i for i, row in enumerate(run.rows) if row.state == State.HOLD)
+    assert np.all(run.value("pump_fraction")[first_error:] == 0.0)
+
+
+def test_a_mirror_that_cannot_follow_is_given_up() -> None:
+    config = CALM.model_copy(update={"limits": LimitsConfig(following_error_max_um=5.0)})
+    moved = after(25.0, math.inf, lambda r: replace(r, displacement_um=r.displacement_um - 20.0))
+    run = Run(config, 60.0, moved)
+    assert [f["name"] for f in run.of("fault")] == ["following_error"]
+
+
+def test_the_same_seed_gives_the_same_run() -> None:
+    config = Config(loop=LoopConfig(rate_hz=25.0))
+    first, second = Run(config, 20.0), Run(config, 20.0)
+    assert [row.pack() for row in first.rows] == [row.pack() for row in second.rows]
+    assert first.events == second.events
