@@ -55,15 +55,35 @@ def _random_64(state: np.uint64) -> np.uint64:
 
 
 @njit(cache=True)
-def _level(s_mm: float, values: FloatArray, cell_mm: float, side_mm: float, smooth: bool) -> float:
+def _level(s_mm: float, values: FloatArray, cell_mm: float, smooth: bool) -> float:
     """Light of the screen at s from the region's low edge; the caller has made sure that 0 <= s < side."""
     place = s_mm / cell_mm
-    cell = int(place)
+    cell = np.int64(place)
     if not smooth:
         return float(values[min(cell, len(values) - 1)])
     fraction = place - cell
     cell %= len(values) - 1
     return float(values[cell] + fraction * (values[cell + 1] - values[cell]))
+
+
+@njit(cache=True)
+def _between(line: FloatArray, cell: int, w: FloatArray, k: int) -> float:
+    """Value of a cubic through the nodes cell .. cell + 3, at the k-th of the places between."""
+    return float(
+        w[k, 0] * line[cell] + w[k, 1] * line[cell + 1] + w[k, 2] * line[cell + 2] + w[k, 3] * line[cell + 3]
+    )
+
+
+@njit(cache=True)
+def _row_of_nodes(nodes: FloatArray, k: int, node: int, w: FloatArray, line: FloatArray) -> None:
+    """Map k at one row of the picture, at the nodes' columns."""
+    for c in range(nodes.shape[2]):
+        line[c] = (
+            w[0] * nodes[k, node, c]
+            + w[1] * nodes[k, node + 1, c]
+            + w[2] * nodes[k, node + 2, c]
+            + w[3] * nodes[k, node + 3, c]
+        )
 
 
 @njit(cache=True)
@@ -102,39 +122,34 @@ def shade(
     noise : tuple
         `normal_quantiles()`, standard deviation in counts, seed of this picture.
     """
-    step, columns = weights.shape[0], nodes.shape[2]
+    step = weights.shape[0]
+    height, width = out.shape
     dark, white, leak, full = scale
     column_loss, row_loss = loss
     quantiles, sigma, seed = noise
-    line = np.empty((3, columns))
-    state = np.uint64(seed) * _MIX_1
-    bits, left = np.uint64(0), 0
-    for row in range(out.shape[0]):
-        node, w = row // step, weights[row % step]
-        for k in range(3):
-            for c in range(columns):
-                line[k, c] = (
-                    w[0] * nodes[k, node, c]
-                    + w[1] * nodes[k, node + 1, c]
-                    + w[2] * nodes[k, node + 2, c]
-                    + w[3] * nodes[k, node + 3, c]
-                )
-        for column in range(out.shape[1]):
-            c, v = column // step, weights[column % step]
-            counts = dark
-            r2 = v[0] * line[2, c] + v[1] * line[2, c + 1] + v[2] * line[2, c + 2] + v[3] * line[2, c + 3]
-            if r2 <= radius_mm * radius_mm:
-                s0 = v[0] * line[0, c] + v[1] * line[0, c + 1] + v[2] * line[0, c + 2] + v[3] * line[0, c + 3]
-                s1 = v[0] * line[1, c] + v[1] * line[1, c + 1] + v[2] * line[1, c + 2] + v[3] * line[1, c + 3]
-                light = leak
-                if 0.0 <= s0 < side_mm and 0.0 <= s1 < side_mm:
-                    light = _level(s1 if axis == 1 else s0, values, cell_mm, side_mm, smooth)
-                counts += white * light * (1.0 - column_loss[column] - row_loss[row])
-            if sigma > 0.0:
-                if left == 0:
-                    state += _GOLDEN
-                    bits, left = _random_64(state), 4
-                counts += sigma * quantiles[bits & _LOW_16]
-                bits >>= np.uint64(16)
-                left -= 1
-            out[row, column] = min(max(counts + 0.5, 0.0), full)
+    radius2_mm2 = radius_mm * radius_mm
+    # three arrays and not rows of one: a view taken per pixel costs more than the pixel
+    line_x, line_y, line_r2 = np.empty(nodes.shape[2]), np.empty(nodes.shape[2]), np.empty(nodes.shape[2])
+    state, bits = np.uint64(seed) * _MIX_1, np.uint64(0)
+    for row in range(height):
+        _row_of_nodes(nodes, 0, row // step, weights[row % step], line_x)
+        _row_of_nodes(nodes, 1, row // step, weights[row % step], line_y)
+        _row_of_nodes(nodes, 2, row // step, weights[row % step], line_r2)
+        for cell in range((width + step - 1) // step):
+            for k in range(min(step, width - cell * step)):
+                column = cell * step + k
+                counts = dark
+                if _between(line_r2, cell, weights, k) <= radius2_mm2:
+                    s_x_mm = _between(line_x, cell, weights, k)
+                    s_y_mm = _between(line_y, cell, weights, k)
+                    light = leak
+                    if 0.0 <= s_x_mm < side_mm and 0.0 <= s_y_mm < side_mm:
+                        light = _level(s_y_mm if axis == 1 else s_x_mm, values, cell_mm, smooth)
+                    counts += white * light * (1.0 - column_loss[column] - row_loss[row])
+                if sigma > 0.0:
+                    if column & 3 == 0:  # four 16-bit numbers from each 64-bit one
+                        state += _GOLDEN
+                        bits = _random_64(state)
+                    counts += sigma * quantiles[bits & _LOW_16]
+                    bits >>= np.uint64(16)
+                out[row, column] = min(max(counts + 0.5, 0.0), full)
