@@ -67,49 +67,39 @@ class BenchReport:
     error: str = ""
 
 
-def serve(spec: BenchSpec, ready: Connection | None = None) -> None:
-    """Serve the bench until SIGTERM; in a spawned process at most until `linger_s` after the parent's end.
+def serve(spec: BenchSpec, ready: Connection) -> None:
+    """Serve the bench in a spawned process until SIGTERM, or until `linger_s` after the parent's end.
 
-    A spawned bench ignores SIGINT: Ctrl-C goes to the whole terminal, and the bench must outlive the controller's
-    safe stop. One that stands alone ends on it.
+    SIGINT is ignored: Ctrl-C goes to the whole terminal, and the bench must outlive the controller's safe stop.
 
     Parameters
     ----------
     spec : BenchSpec
         The bench.
-    ready : Connection or None
-        Gets one BenchReport; a bench that cannot listen then ends without an exception.
-
-    Raises
-    ------
-    OSError
-        If it cannot listen and nobody waits for a report.
+    ready : Connection
+        Gets one BenchReport; a bench that cannot be built or cannot listen says so there and ends.
     """
-    if _spawned():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     asyncio.run(_serve(spec, ready))
 
 
-async def _serve(spec: BenchSpec, ready: Connection | None) -> None:
+async def _serve(spec: BenchSpec, ready: Connection) -> None:
     stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    loop.add_signal_handler(signal.SIGTERM, stop.set)
-    if not _spawned():
-        loop.add_signal_handler(signal.SIGINT, stop.set)
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
     with _truth_writer(spec.truth) as writer:
-        bench = LiveBench(spec, writer)
-        board = PumpBoardEmulator(bench, spec.host, spec.port)
         try:
+            bench = LiveBench(spec, writer)
+            board = PumpBoardEmulator(bench, spec.host, spec.port)
             await board.start()
+        except ValueError as error:
+            ready.send(BenchReport(error=str(error)))
+            return
         except OSError as error:
-            if ready is None:
-                raise
             reason = os.strerror(error.errno) if error.errno else str(error)
             ready.send(BenchReport(error=f"twin.port = {spec.port} on {spec.host}: {reason}; 0 takes any free port"))
             return
-        if ready is not None:
-            ready.send(BenchReport(port=board.port))
         try:
+            ready.send(BenchReport(port=board.port))
             await _keep_running(bench, spec, stop)
         finally:
             await board.stop()
@@ -128,10 +118,6 @@ async def _keep_running(bench: LiveBench, spec: BenchSpec, stop: asyncio.Event) 
             return
         deadline_s = max(deadline_s + _PERIOD_S, now_s)  # a missed deadline is not made up: catch_up has done it
         await asyncio.sleep(deadline_s - now_s)
-
-
-def _spawned() -> bool:
-    return multiprocessing.parent_process() is not None
 
 
 def _orphaned() -> bool:

@@ -141,6 +141,14 @@ def test_a_busy_port_is_one_line_and_an_end() -> None:
             assert process.exitcode == 0
 
 
+def test_an_impossible_plant_is_one_line_and_an_end() -> None:
+    with bench(spec(pump=PumpConfig(dead_fraction=1.0))) as (process, report):
+        assert "dead_fraction" in report.error
+        assert report.port == 0
+        process.join(5.0)
+        assert process.exitcode == 0
+
+
 def test_ctrl_c_is_for_the_controller() -> None:
     with bench(spec()) as (process, report):
         assert process.pid is not None
