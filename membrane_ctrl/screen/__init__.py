@@ -1,0 +1,1 @@
+"""The live screen: what a person sees while the mirror is held."""

@@ -1,0 +1,83 @@
+"""One line that answers "why is the pump where it is" and "why is it not holding"."""
+
+from __future__ import annotations
+
+import math
+
+from membrane_ctrl.config import Config
+from membrane_ctrl.names import Rung, State
+from membrane_ctrl.telemetry import TelemetryRow
+
+_RUNGS = {
+    Rung.HOLD_FLOW: "pump keeps its last mean flow",
+    Rung.RAMP_DOWN: "pump is ramped down",
+    Rung.PUMP_OFF: "pump is off",
+    Rung.VENT: "pump is off and the vent is open",
+}
+_STATES = {
+    State.STANDBY: "pump is off: nobody has asked to hold the mirror",
+    State.CHECK: "pump is off until every sensor has been good for a while",
+    State.MANUAL: "pump is where a person has put it",
+    State.TUNE: "pump is driven by a tuning session",
+    State.LOWER: "pump is being stopped: the run is ending",
+    State.FAULT: "pump is off: a fault is latched until a person clears it",
+}
+# Below this share of the flow that holds the mirror a contribution is not worth naming.
+_WORTH_NAMING = 0.03
+
+
+def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
+    """The line.
+
+    Parameters
+    ----------
+    row : TelemetryRow
+        The newest tick.
+    told : str
+        What the controller itself last gave as its reason in this state; empty if nothing.
+    fault : str
+        The fault that stands, in words; empty if none.
+    config : Config
+        For band, flow limit and target.
+    """
+    state, rung = State(int(row.state)), Rung(int(row.rung))
+    if rung != Rung.NONE:
+        return f"{_RUNGS[rung]}: {fault or told or 'a fault is not named'}"
+    if state in _STATES:
+        return told or _STATES[state]
+    if not math.isfinite(row.displacement_um):
+        return f"{_RUNGS[Rung.HOLD_FLOW]}: {told or fault or 'there is no valid laser reading'}"
+    if state == State.INFLATE:
+        to_go_um = row.target_um - row.filtered_um
+        return f"{_flow(row)}: {'filling' if to_go_um > 0 else 'waiting for the leak'}, {abs(to_go_um):.1f} um to go"
+    if abs(row.error_um) > config.limits.band_um:
+        return f"outside the band: {_outside(row)}"
+    return _balance(row) if state == State.HOLD else f"settling: {_balance(row)}"
+
+
+def _outside(row: TelemetryRow) -> str:
+    """Which way the mirror is off and what the pump does about it (error = setpoint - reading)."""
+    if row.error_um > 0:
+        at_limit = row.flow_wanted_um_per_s > row.flow_um_per_s + 1e-6
+        return f"bowl {row.error_um:.1f} um too shallow, {_flow(row)}{', all it may give' if at_limit else ''}"
+    waits = row.flow_um_per_s <= 0
+    return f"bowl {-row.error_um:.1f} um too deep, {_flow(row)}{', only the leak lets it down' if waits else ''}"
+
+
+def _balance(row: TelemetryRow) -> str:
+    """What the flow is made of, the largest first."""
+    parts = {
+        "what leaks": row.i_um_per_s,
+        "the error": row.p_um_per_s,
+        "its speed": row.d_um_per_s,
+        "the weather": row.feedforward_um_per_s,
+    }
+    least = _WORTH_NAMING * max(abs(row.flow_um_per_s), abs(row.i_um_per_s))
+    named = sorted(((v, k) for k, v in parts.items() if abs(v) > least), key=lambda part: -abs(part[0]))
+    return f"{_flow(row)}: " + ", ".join(f"{value:+.2f} for {name}" for value, name in named)
+
+
+def _flow(row: TelemetryRow) -> str:
+    if row.flow_um_per_s <= 0:
+        return "pump is at 0"
+    return f"pump gives {row.flow_um_per_s:.2f} um/s"
