@@ -95,6 +95,7 @@ class Controller:
                 scene.hold_wanted = True
             case "stop":
                 scene.stop_wanted = True
+                scene.stop_asked_by = command.who
                 scene.stop_exit = Exit.DONE if command.who == "duration" else Exit.INTERRUPTED
             case "shape_on" | "shape_off":
                 self._shape.switch(command.kind == "shape_on", scene.now_s)

@@ -64,7 +64,6 @@ class Crew:
     def __init__(
         self, config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str, duration_s: float | None
     ) -> None:
-        from membrane_ctrl.acquisition.process import AcquisitionSpec
         from membrane_ctrl.recording.process import RecorderSpec
         from membrane_ctrl.screen.process import ScreenSpec
 
@@ -76,8 +75,9 @@ class Crew:
         self._screen = Child("screen", "membrane_ctrl.screen.process:screen_main", (screen_spec,), nice=5)
         self.children = [self._recorder, self._screen]
         if rings.shapes is not None and rings.frames is not None:
-            ours, theirs = pipe()
-            self._control = ours
+            from membrane_ctrl.acquisition.process import AcquisitionSpec
+
+            self._control, theirs = pipe()
             spec = AcquisitionSpec(config, clock, rings.telemetry, rings.shapes, rings.truth, rings.frames)
             acquisition = Child(
                 "acquisition", "membrane_ctrl.acquisition.process:acquisition_main", (spec, theirs), nice=10

@@ -38,6 +38,7 @@ class Scene:
     hold_wanted: bool = False
     stop_wanted: bool = False
     stop_exit: Exit = Exit.DONE
+    stop_asked_by: str = ""
     # memory of the states
     good_since_s: float = math.nan
     sinking: Slope = field(default_factory=Slope)  # of the mirror with the pump off, seen in `check`
@@ -63,21 +64,27 @@ class Scene:
 
 def standby(scene: Scene) -> State:
     """Pump off until someone wants the mirror held."""
-    scene.why = "standby: nobody has asked to hold the mirror"
     if scene.stop_wanted:
-        return State.LOWER
-    return State.CHECK if scene.hold_wanted else State.STANDBY
+        return _stop(scene)
+    if scene.hold_wanted:
+        scene.why = "asked to hold the mirror"
+        return State.CHECK
+    scene.why = "standby: nobody has asked to hold the mirror"
+    return State.STANDBY
 
 
 def check(scene: Scene) -> State:
     """Every sensor must have been good for a while before the pump may run; how fast the mirror sinks is the leak."""
     if scene.stop_wanted:
-        return State.LOWER
+        return _stop(scene)
     if scene.state_age_s > _PUMP_STANDS_S:
         scene.sinking.add(scene.now_s, scene.observer.displacement_um)
     missing = _missing(scene)
     scene.why = f"checking the sensors: {missing}" if missing else "checking the sensors: all good so far"
     if scene.stay_good(not missing) >= scene.config.states.check_s:
+        scene.why = (
+            f"all sensors good for {scene.config.states.check_s:g} s; the mirror sinks by {_leak(scene):.2f} um/s"
+        )
         return State.INFLATE
     if scene.state_age_s > scene.config.states.check_timeout_s:
         scene.overdue = f"sensors not good after {scene.config.states.check_timeout_s:g} s: {missing}"
@@ -87,13 +94,13 @@ def check(scene: Scene) -> State:
 def inflate(scene: Scene) -> State:
     """Ramp from where the mirror is to the setpoint."""
     if scene.stop_wanted:
-        return State.LOWER
+        return _stop(scene)
     if scene.state_age_s == 0:
         # the flow that balances the leak, so that the integrator need not find it first
-        scene.loop.start(scene.observer.displacement_um, max(0.0, -scene.sinking.per_s))
+        scene.loop.start(scene.observer.displacement_um, _leak(scene))
     output = _drive(scene)
     to_go_um = scene.config.loop.setpoint_um - output.filtered_um
-    scene.why = f"inflating: {to_go_um:.0f} um to go"
+    scene.why = f"inflating: {to_go_um:.1f} um to go"
     ramp_left_um = scene.config.loop.setpoint_um + scene.trim_um - output.setpoint_um
     if max(abs(ramp_left_um), abs(to_go_um)) < scene.config.limits.band_um:
         return State.SETTLE
@@ -105,12 +112,13 @@ def inflate(scene: Scene) -> State:
 def settle(scene: Scene) -> State:
     """Stay inside the band for a while before the state is called hold."""
     if scene.stop_wanted:
-        return State.LOWER
+        return _stop(scene)
     output = _drive(scene)
     inside = abs(output.error_um) < scene.config.limits.band_um
     settled_s = scene.stay_good(inside)
     scene.why = f"settling: inside the band for {settled_s:.0f} s"
     if settled_s >= scene.config.states.settle_s:
+        scene.why = f"inside +-{scene.config.limits.band_um:g} um for {settled_s:.1f} s"
         return State.HOLD
     if scene.state_age_s > scene.config.states.settle_timeout_s:
         scene.overdue = f"not inside +-{scene.config.limits.band_um:g} um for {scene.config.states.settle_s:g} s"
@@ -120,7 +128,7 @@ def settle(scene: Scene) -> State:
 def hold(scene: Scene) -> State:
     """The main job."""
     if scene.stop_wanted:
-        return State.LOWER
+        return _stop(scene)
     scene.why = _why_hold(scene, _drive(scene))
     return State.HOLD
 
@@ -159,6 +167,16 @@ HANDLERS: dict[State, Callable[[Scene], State]] = {
     State.LOWER: lower,
     State.FAULT: fault,
 }
+
+
+def _stop(scene: Scene) -> State:
+    scene.why = f"stop asked for by {scene.stop_asked_by}"
+    return State.LOWER
+
+
+def _leak(scene: Scene) -> float:
+    """How fast the mirror sank in `check`, in um/s."""
+    return max(0.0, -scene.sinking.per_s)
 
 
 def _drive(scene: Scene) -> LoopOutput:
