@@ -216,6 +216,7 @@ def _parse_block(entry: Mapping[str, Any]) -> Block:
     if block.count > _READ_MAX_WORDS:
         raise RegisterMapError(f"block {name} has {block.count} words; one transaction carries {_READ_MAX_WORDS}")
     for before, after in pairwise(registers):
+        _check_sequence(before, after)
         if after.address > before.address + before.words:
             raise RegisterMapError(f"block {name}: gap between {before.name} and {after.name}")
     return block
@@ -268,13 +269,17 @@ def _check_register(register: Register) -> None:
 def _check_order(found: RegisterMap) -> None:
     registers = list(found)
     for before, after in pairwise(registers):
-        if after.address < before.address:
-            raise RegisterMapError(f"{after.name} (address {after.address}) comes after {before.name}: order them")
-        if after.address < before.address + before.words:
-            raise RegisterMapError(f"{after.name} (address {after.address}) overlaps {before.name}")
+        _check_sequence(before, after)
     names = [register.name for register in registers]
     if twice := {name for name in names if names.count(name) > 1}:
         raise RegisterMapError(f"{sorted(twice)[0]} is there twice")
     bits = [fault.bit for fault in found.faults]
     if len(set(bits)) != len(bits) or not all(0 <= bit <= 15 for bit in bits):
         raise RegisterMapError("fault bits must be different and within 0..15")
+
+
+def _check_sequence(before: Register, after: Register) -> None:
+    if after.address < before.address:
+        raise RegisterMapError(f"{after.name} (address {after.address}) comes after {before.name}: order them")
+    if after.address < before.address + before.words:
+        raise RegisterMapError(f"{after.name} (address {after.address}) overlaps {before.name}")
