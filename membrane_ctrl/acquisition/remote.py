@@ -52,6 +52,10 @@ class Remote:
         self.listen()
         return self.stop or self.paused
 
+    def end(self) -> None:
+        """Stop, as if told to."""
+        self.stop = True
+
     def take_full(self) -> bool:
         """Whether a full cycle was asked for since the last call."""
         wanted, self._full = self._full, False

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import os
 
-KERNEL_THREADS = 2  # the live cycle's kernels are written for two cores
-_LIBRARY_THREADS = "1"  # linear algebra here is 36 x 36: more threads only spin
+# The kernels split their work over two threads by themselves (metrology.threads). Linear algebra is 36 x 36 here:
+# more than one thread would only spin.
+_LIMITS = {
+    "NUMBA_NUM_THREADS": "2",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENCV_FOR_THREADS_NUM": "1",
+}
 
 
 def limit_threads() -> None:
-    """Limit BLAS, OpenCV and numba. Call it before NumPy is imported: BLAS reads its limit when it is loaded."""
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[variable] = _LIBRARY_THREADS
-    import cv2
-    import numba
-
-    cv2.setNumThreads(int(_LIBRARY_THREADS))
-    numba.set_num_threads(min(KERNEL_THREADS, numba.get_num_threads()))
+    """Set the limits. Must come before NumPy, OpenCV and numba are imported: they look once, when they are loaded."""
+    os.environ.update(_LIMITS)
