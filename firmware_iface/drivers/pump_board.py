@@ -54,6 +54,7 @@ class PumpBoard:
         self._settings = registers.block("settings")
         self._command = registers.block("command")
         self._reset = registers.block("reset")
+        self._heartbeat_echo = registers.register("heartbeat_echo")
         period = registers.register("watchdog_period_s")
         if not period.allows(watchdog_s):
             raise ValueError(
@@ -88,9 +89,8 @@ class PumpBoard:
         await self._link.connect()
         try:
             firmware = await self._identify()
-            # go on from the board's own heartbeat: the first write is to differ from the last one it saw
-            command = self._command.decode(await self._link.read_holding(self._command.address, self._command.count))
-            self._heartbeat = int(command["heartbeat"])
+            # go on from the heartbeat that the board was fed last: the first write has to differ from it
+            (self._heartbeat,) = await self._link.read_holding(self._heartbeat_echo.address, 1)
             period_s = await self._arm()
         except LinkError:
             await self._link.close()

@@ -148,7 +148,6 @@ class BoardState:
         cleared = int(self._settable["clear_faults"]) & self._faults
         if cleared:
             self._faults &= ~cleared
-        if cleared or self._faults:
             self._settable["pump_command_fraction"] = 0.0
         self._settable["clear_faults"] = 0.0
         if arms or feeds or cleared & self._watchdog_mask:

@@ -42,9 +42,9 @@ _UNANSWERED_MAX = 3
 class GuardedModbusTcp:
     """One Modbus TCP device.
 
-    One request is in flight at a time. A request whose caller is cancelled still runs to its reply or timeout, so
-    that nothing is ever abandoned on the wire. Nothing is sent twice, and nothing reconnects by itself: the owner
-    calls `connect`, which refuses to try before its back-off (0.1 s, doubling to 5 s) is over.
+    One request is in flight at a time. One that was sent when its caller is cancelled still runs to its reply or
+    timeout, so that nothing is ever abandoned on the wire. Nothing is sent twice, and nothing reconnects by itself:
+    the owner calls `connect`, which refuses to try before its back-off (0.1 s, doubling to 5 s) is over.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class GuardedModbusTcp:
         self._timeout_s = timeout_s
         self._clock = clock
         self._client: AsyncModbusTcpClient | None = None
-        self._lock = asyncio.Lock()
+        self._turn = asyncio.Lock()  # released when the request has ended, whatever became of its caller
         self._in_flight: asyncio.Task[ModbusPDU] | None = None
         self._back_off = BackOff()
         self._connections = 0
@@ -181,11 +181,10 @@ class GuardedModbusTcp:
     async def _exchange(
         self, send: Callable[[AsyncModbusTcpClient], Awaitable[ModbusPDU]], function_code: int, what: str
     ) -> ModbusPDU:
-        async with self._lock:
-            if self._in_flight is not None and not self._in_flight.done():
-                await asyncio.wait([self._in_flight])  # its caller was cancelled
-            self._in_flight = asyncio.create_task(self._transact(send, function_code, what))
-            return await asyncio.shield(self._in_flight)
+        await self._turn.acquire()  # cancelled while waiting here, a request is never sent
+        self._in_flight = asyncio.create_task(self._transact(send, function_code, what))
+        self._in_flight.add_done_callback(lambda _: self._turn.release())
+        return await asyncio.shield(self._in_flight)
 
     async def _transact(
         self, send: Callable[[AsyncModbusTcpClient], Awaitable[ModbusPDU]], function_code: int, what: str

@@ -234,13 +234,39 @@ async def test_a_cancelled_request_is_finished_before_the_next(setup: Setup) -> 
     cancelled.cancel()
     with pytest.raises(asyncio.CancelledError):
         await cancelled
+    setup.server.asked.clear()
     following = asyncio.create_task(link.read_holding(8, 1))
-    await asyncio.sleep(0)
-    await asyncio.sleep(0)
-    assert len(setup.server.requests) == 1
+    with pytest.raises(TimeoutError):
+        await asyncio.wait_for(setup.server.asked.wait(), 0.05)  # it is not sent yet
     setup.server.reply = lambda transaction, unit, pdu: [frame(transaction, unit, good_read([22]))]
     setup.server.transports[-1].write(frame(1, 1, good_read([11])))
     assert await following == [22]
+
+
+async def test_a_request_cancelled_before_its_turn_is_never_sent(setup: Setup) -> None:
+    link = await setup.connected()
+    first = asyncio.create_task(link.read_holding(7, 1))
+    await setup.server.asked.wait()
+    waiting = asyncio.create_task(link.write_registers(8, [1]))
+    await asyncio.sleep(0)
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
+    setup.server.reply = lambda transaction, unit, pdu: [frame(transaction, unit, good_read([transaction]))]
+    setup.server.transports[-1].write(frame(1, 1, good_read([1])))
+    assert await first == [1]
+    assert await link.read_holding(9, 1) == [2]
+    assert [request[7] for request in setup.server.requests] == [3, 3]
+
+
+async def test_a_cancelled_request_leaves_nothing_behind_a_close(setup: Setup) -> None:
+    link = await setup.connected()
+    cancelled = asyncio.create_task(link.read_holding(7, 1))
+    await setup.server.asked.wait()
+    cancelled.cancel()
+    await asyncio.wait([cancelled])
+    await link.close()
+    assert asyncio.all_tasks() == {asyncio.current_task()}
 
 
 async def test_a_silent_peer_is_given_up_after_some_requests(setup: Setup) -> None:
