@@ -23,8 +23,9 @@ _X, _Y, _SX, _SY = range(4)  # columns of the result
 class Trace:
     """Where rays met film and screen, each (N,), in mm.
 
-    `x_mm`, `y_mm`: on the film, or on the plane of its rim for rays that pass outside it (or were never traced);
-    `s_x_mm`, `s_y_mm`: on the screen, 0 for rays not traced, NaN for rays that never reach the screen.
+    `x_mm`, `y_mm`: on the film, or on the plane of its rim for rays far outside it, which are not traced; NaN for
+    rays that never come down on that plane. `s_x_mm`, `s_y_mm`: on the screen; 0 for rays that are not traced, NaN for
+    those that never reach the screen.
     """
 
     x_mm: FloatArray
@@ -125,16 +126,16 @@ def _trace(
     normal, p = np.empty(3), np.empty(3)
     for n in range(directions.shape[0]):
         d = directions[n]
-        to_rim_mm = (rim_z_mm - start[2]) / d[2]
-        x, y = start[0] + to_rim_mm * d[0], start[1] + to_rim_mm * d[1]
-        hits[0, n], hits[1, n] = x, y
-        if to_rim_mm <= 0.0:
-            hits[0, n], hits[1, n] = np.inf, np.inf
+        if d[2] >= 0.0 or start[2] <= rim_z_mm:  # never comes down on the film
+            hits[:, n] = np.nan
             continue
-        if x * x + y * y > beyond:
+        to_rim_mm = (rim_z_mm - start[2]) / d[2]
+        hits[0, n], hits[1, n] = start[0] + to_rim_mm * d[0], start[1] + to_rim_mm * d[1]
+        if hits[0, n] ** 2 + hits[1, n] ** 2 > beyond:
             continue
         t = _film_distance(start, d, film, sag_mm, vertex_z_mm, to_rim_mm)
         if np.isnan(t):
+            hits[2, n], hits[3, n] = np.nan, np.nan
             continue
         for axis in range(3):
             p[axis] = start[axis] + t * d[axis]

@@ -205,6 +205,13 @@ def test_rays_beside_the_film_are_not_on_it() -> None:
     assert not hits.on_film(500.0)[0]
 
 
+def test_rays_that_look_up_never_meet_the_film() -> None:
+    up = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    hits = trace(camera_pose(GEOMETRY), up, FilmShape(37.1).terms, 37.1, 0.0, screen_pose(GEOMETRY))
+    assert np.isnan(hits.x_mm).all()
+    assert not hits.on_film(500.0).any()
+
+
 def test_a_bowed_screen_stands_off_towards_the_mirror() -> None:
     pose = screen_pose(GEOMETRY, ScreenError(bow_mm=2.0))
     assert pose.bow_per_mm * 200.0**2 == pytest.approx(2.0)
