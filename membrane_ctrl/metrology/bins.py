@@ -1,0 +1,66 @@
+"""The sensor as a grid of bins: rays of their centres, and what averaging over a bin does to a curved phase."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.config import CameraConfig
+from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.reconstruct import Points, Tracer
+from membrane_ctrl.metrology.surface import Surface
+
+FloatArray = NDArray[np.float64]
+
+
+class BinGrid:
+    """Bins of `bin_px` x `bin_px` pixels over a sensor, in row order.
+
+    Attributes
+    ----------
+    column_px, row_px : (bins,) arrays
+        Centres of the bins in pixels.
+    rays : (3, bins) array
+        Unit vectors in world.
+    """
+
+    def __init__(self, geometry: Geometry, camera: CameraConfig, bin_px: int) -> None:
+        self._geometry = geometry
+        self._bin_px = bin_px
+        middle = (bin_px - 1) / 2
+        columns = np.arange(camera.width_px // bin_px) * bin_px + middle
+        rows = np.arange(camera.height_px // bin_px) * bin_px + middle
+        grid_columns, grid_rows = np.meshgrid(columns, rows)
+        self.column_px, self.row_px = grid_columns.ravel(), grid_rows.ravel()
+        self.rays = geometry.rays(self.column_px, self.row_px)
+
+    def near_mirror(self, radius_mm: float) -> NDArray[np.bool_]:
+        """Bins whose ray meets the plane z = 0 within a radius."""
+        f = self._geometry.pinhole_mm
+        t = -f[2] / self.rays[2]
+        return np.asarray((f[0] + t * self.rays[0]) ** 2 + (f[1] + t * self.rays[1]) ** 2 <= radius_mm**2)
+
+    def solid_angle(self, index: NDArray[np.int64]) -> FloatArray:
+        """Solid angle of bins: (side / focal length)^2 cos^3 of the angle to the axis."""
+        cosine = self._geometry.rotation[2] @ self.rays[:, index]
+        return np.asarray((self._bin_px / self._geometry.focal_px) ** 2 * cosine**3)
+
+    def averaging_bias_mm(
+        self, tracer: Tracer, points: Points, surface: Surface, index: NDArray[np.int64]
+    ) -> FloatArray:
+        """Mean of s over a bin's pixels minus s at its centre, (2, n).
+
+        A bin's phase is the mean over its pixels: s + sigma^2 / 2 (s_uu + s_vv), sigma^2 = (m^2 - 1) / 12. That is
+        the mean of the four values at a distance h with h^2 = 2 sigma^2, so four traces of the model give it.
+        """
+        centre = tracer.predict_screen(points, surface)
+        h = math.sqrt((self._bin_px**2 - 1) / 6)
+        total = np.zeros_like(centre)
+        for right, down in ((h, 0.0), (-h, 0.0), (0.0, h), (0.0, -h)):
+            rays = self._geometry.rays(self.column_px[index] + right, self.row_px[index] + down)
+            moved = Points(rays, centre, points.weights, points.t_mm.copy())
+            tracer.intersect(moved, surface, newton=3)
+            total += tracer.predict_screen(moved, surface)
+        return total / 4 - centre

@@ -1,0 +1,122 @@
+"""Camera and screen in world coordinates: the one form the code behind knows (INTERFACES section 1).
+
+The short form is turned into it on loading. With the camera at F = a (cos alpha, 0, sin alpha) looking at O
+without roll, image down is world -y and image right is forward x ... the one unit vector normal to both that
+points towards +x: (sin alpha, 0, -cos alpha).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from membrane_ctrl.config import GeometryConfig, OpticsConfig
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Where camera and screen stand and how the lens maps.
+
+    Attributes
+    ----------
+    pinhole_mm : (3,) array
+        Camera pinhole F in world.
+    rotation : (3, 3) array
+        Rows are the camera's x (right), y (down) and z (forward) in world.
+    focal_px : float
+        Focal length in pixels.
+    principal_px : (column, row)
+        Principal point.
+    distortion : tuple of float
+        OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for a pinhole.
+    screen_origin_mm : (3,) array
+        O' in world.
+    screen_s_x, screen_s_y : (3,) arrays
+        Unit vectors of s_x and s_y in world.
+    """
+
+    pinhole_mm: FloatArray
+    rotation: FloatArray
+    focal_px: float
+    principal_px: tuple[float, float]
+    distortion: tuple[float, ...]
+    screen_origin_mm: FloatArray
+    screen_s_x: FloatArray
+    screen_s_y: FloatArray
+
+    def __post_init__(self) -> None:
+        """Refuse poses that are no rotations: they would bend every ray without a word."""
+        if not np.allclose(self.rotation @ self.rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(self.rotation) < 0:
+            raise ValueError("geometry.camera.rotation is not a rotation (rows: right, down, forward in world)")
+        axes = np.stack([self.screen_s_x, self.screen_s_y])
+        if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-6):
+            raise ValueError("geometry.screen.s_x and s_y are not two unit vectors at a right angle")
+
+    @classmethod
+    def from_config(cls, optics: OpticsConfig) -> Geometry:
+        """The geometry a configuration describes. Raises ValueError for poses that are no rotations."""
+        camera = optics.camera
+        pinhole, rotation, origin, s_x, s_y = _poses(optics.geometry)
+        return cls(
+            pinhole_mm=pinhole,
+            rotation=rotation,
+            focal_px=camera.focal_mm / (camera.pixel_um * 1e-3),
+            principal_px=camera.principal,
+            distortion=camera.distortion,
+            screen_origin_mm=origin,
+            screen_s_x=s_x,
+            screen_s_y=s_y,
+        )
+
+    def rays(self, columns_px: ArrayLike, rows_px: ArrayLike) -> FloatArray:
+        """Unit vectors in world, (3, ...), from the pinhole through image points (pixel centres are integers)."""
+        columns, rows = np.broadcast_arrays(np.asarray(columns_px, float), np.asarray(rows_px, float))
+        x = (columns - self.principal_px[0]) / self.focal_px
+        y = (rows - self.principal_px[1]) / self.focal_px
+        if any(self.distortion):
+            x, y = _undistort(x, y, self.distortion)
+        camera = np.stack([x, y, np.ones_like(x)])
+        camera /= np.linalg.norm(camera, axis=0)
+        return np.asarray(np.tensordot(self.rotation.T, camera, axes=1))
+
+    def screen_points(self, screen_mm: FloatArray) -> FloatArray:
+        """World points (3, ...) of screen coordinates (2, ...) in mm from O'."""
+        return (
+            np.multiply.outer(self.screen_s_x, screen_mm[0])
+            + np.multiply.outer(self.screen_s_y, screen_mm[1])
+            + self.screen_origin_mm.reshape(3, *[1] * (screen_mm.ndim - 1))
+        )
+
+
+def _poses(config: GeometryConfig) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Pinhole, rotation, O', s_x, s_y in world from either form."""
+    if config.camera is not None and config.screen is not None:
+        camera, screen = config.camera, config.screen
+        general = (camera.position_mm, camera.rotation, screen.origin_mm, screen.s_x, screen.s_y)
+        pinhole, rotation, origin, s_x, s_y = (np.array(value, float) for value in general)
+        return pinhole, rotation, origin, s_x, s_y
+    if config.a_mm is None or config.b_mm is None or config.alpha_deg is None:
+        raise ValueError("geometry has neither a_mm, b_mm, alpha_deg nor both poses")
+    cosine, sine = math.cos(math.radians(config.alpha_deg)), math.sin(math.radians(config.alpha_deg))
+    rotation = np.array([[sine, 0.0, -cosine], [0.0, -1.0, 0.0], [-cosine, 0.0, -sine]])
+    return (
+        config.a_mm * np.array([cosine, 0.0, sine]),
+        rotation,
+        config.b_mm * np.array([-cosine, 0.0, sine]),
+        np.array([-sine, 0.0, -cosine]),
+        np.array([0.0, 1.0, 0.0]),
+    )
+
+
+def _undistort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    """Normalised pinhole coordinates of distorted ones; iterated until the last digit stands still."""
+    points = np.stack([x.ravel(), y.ravel()], axis=1)[:, None, :]
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-15)
+    straight = cv2.undistortPoints(points, np.eye(3), np.array(distortion), None, None, None, criteria)
+    return straight[:, 0, 0].reshape(x.shape), straight[:, 0, 1].reshape(x.shape)

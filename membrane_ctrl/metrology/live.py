@@ -1,0 +1,267 @@
+"""The live cycle: frames in memory to the figure with its covariance, the last cycle's solution as the start.
+
+A full cycle finds the fringe orders and the points that see the pattern. A fringes-only cycle follows each point's
+phase from the last accepted one, which is unambiguous while no phase moved by half a period (4.34 mrad of slope),
+and needs one or two Gauss-Newton steps with the normal matrix of the full cycle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from membrane_ctrl.config import OpticsConfig
+from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.metrology import hencky
+from membrane_ctrl.metrology.bins import BinGrid
+from membrane_ctrl.metrology.covariance import parameter_covariance, pixel_sigma_adu, slope_per_screen
+from membrane_ctrl.metrology.decode import FRINGE_SHARE, FullSlots, decode_full
+from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.motion import combine_steps, worth_correcting
+from membrane_ctrl.metrology.phase import equal_shifts, phase_sigma_rad
+from membrane_ctrl.metrology.phasor import Binner, Image, track
+from membrane_ctrl.metrology.quality import Quality, judge
+from membrane_ctrl.metrology.reconstruct import Fit, Tracer, solve
+from membrane_ctrl.metrology.surface import Surface, parameter_to_coeffs, sag_gradient
+from membrane_ctrl.metrology.tracking import TrackedPoints, establish
+from membrane_ctrl.metrology.zernike import TERMS
+
+FloatArray = NDArray[np.float64]
+Kind = Literal["full", "fringes"]
+
+# Beyond this change of phase a point may have been taken for its neighbour a period away. 0.9 of half a period, so
+# that a field which passes half a period anywhere shows points in the band before it.
+GUARD_RAD = 0.9 * math.pi
+LOST_SHARE = 0.002  # more points than dust and glints beyond the guard
+# With this share of its points the full cycle's normal matrix still contracts a hundredfold a step.
+MATRIX_KEPT_SHARE = 0.99
+
+
+class LiveReconstructor:
+    """Figure of the mirror from cycles of frames.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        Geometry, camera, pattern and mirror.
+    bin_px : int
+        Side of the bins whose phasors are used.
+    laser_noise_um : float
+        Noise of one displacement reading; motion below twice that is not corrected.
+    """
+
+    def __init__(self, optics: OpticsConfig, bin_px: int = 4, *, laser_noise_um: float = 1.0) -> None:
+        self._optics = optics
+        self._geometry = Geometry.from_config(optics)
+        self._bin_px = bin_px
+        self._laser_noise_um = laser_noise_um
+        self._shifts_rad = equal_shifts(optics.pattern.steps)
+        self._slots = FullSlots(optics.pattern.steps)
+        self._full_scale_adu = 2**optics.camera.bits - 1
+        size = (optics.camera.height_px, optics.camera.width_px)
+        self._binner = Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
+        self._grid = BinGrid(self._geometry, optics.camera, bin_px)
+        self._reference_um = optics.geometry.reference_displacement_um
+        self._mm_per_rad = optics.pattern.period_mm / (2 * math.pi)
+        self._pixel_sigma_adu = pixel_sigma_adu(optics.camera.noise_adu)
+        self._tracked: TrackedPoints | None = None
+
+    def full(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
+        """One full cycle.
+
+        Parameters
+        ----------
+        frames : sequence of (height, width) uint8 or uint16 arrays
+            In the order of `patterns.full_sequence`.
+        time_s, displacement_um : (frames,) arrays
+            Of each exposure; NaN where there is no laser reading.
+
+        Returns
+        -------
+        ShapeEstimate
+            Verdict "rejected" with the reason when the images do not carry a figure.
+
+        Raises
+        ------
+        ValueError
+            For a wrong number, size or type of frames.
+        """
+        times, readings = _per_frame(frames, time_s, displacement_um, self._slots.count, "full")
+        sinusoids = np.r_[self._slots.sinusoids]
+        if self._reference_um is None and np.isfinite(readings[0]):
+            self._reference_um = float(readings[0])
+        self._binner.clear()
+        for slot, frame in enumerate(frames):
+            self._binner.add(frame, slot, watch_saturation=slot in sinusoids)
+        decoded = decode_full(self._binner.sums / self._bin_px**2, self._optics.pattern)
+        phase_rad = np.where(self._binner.saturated > 0, np.nan, decoded.phase_rad).reshape(2, -1)
+        times, readings = times[sinusoids], readings[sinusoids]
+        self._tracked = None  # until this cycle is accepted
+        analysis_mm = self._optics.mirror.analysis_radius_mm
+        try:
+            state = establish(self._grid, self._tracer(readings), phase_rad, self._mm_per_rad, analysis_mm)
+        except ValueError as error:
+            return _rejected("full", times, readings, str(error))
+        return self._follow("full", state, times, readings)
+
+    def fringes(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
+        """One fringes-only cycle of 2 N frames, in the order of `patterns.fringe_sequence`; else as `full`.
+
+        Verdict "rejected" with a reason that starts with "tracking lost" asks for a full cycle.
+        """
+        steps = self._slots.steps
+        times, readings = _per_frame(frames, time_s, displacement_um, 2 * steps, "fringes")
+        if self._tracked is None:
+            return _rejected("fringes", times, readings, "tracking lost: no accepted full cycle to follow")
+        self._binner.clear()
+        for axis, slots in enumerate(self._slots.sinusoids):
+            for k in range(steps):
+                self._binner.add(frames[axis * steps + k], slots.start + k)
+        return self._follow("fringes", self._tracked, times, readings)
+
+    def height_map(
+        self, coeffs_um: FloatArray, hencky_um: float, n: int = 256
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """A figure as a picture: x_mm (n,), y_mm (n,), h_mm (n, n) with rows along y; NaN outside the analysis."""
+        mirror = self._optics.mirror
+        axis = np.linspace(-mirror.radius_mm, mirror.radius_mm, n)
+        x, y = np.meshgrid(axis, axis)
+        h = Surface(np.asarray(coeffs_um) / 1e3, hencky_um / 1e3, mirror.radius_mm).height(x, y)
+        h[x**2 + y**2 > mirror.analysis_radius_mm**2] = np.nan
+        return axis, axis.copy(), h
+
+    def sag_sensitivity(self) -> FloatArray:
+        """Change of the 36 coefficients (um) per um of sag of a Hencky bowl."""
+        return hencky.zernike_projection().copy()
+
+    def _tracer(self, readings_um: FloatArray) -> Tracer:
+        """The bench with the vertex where the laser saw it, on average over the frames."""
+        mean = _finite_mean(readings_um)
+        known = self._reference_um is not None and math.isfinite(mean)
+        z = -(mean - self._reference_um) * 1e-3 if known and self._reference_um is not None else 0.0
+        return Tracer(self._geometry, self._optics.mirror.radius_mm, z)
+
+    def _follow(self, kind: Kind, state: TrackedPoints, times: FloatArray, readings: FloatArray) -> ShapeEstimate:
+        """Phases of the points against the last accepted ones, and the figure from them."""
+        self._track_phases(state, readings)
+        modulation_adu = float(
+            np.median(state.fresh[:, 4, ::16])
+        )  # every 16th point: the median costs more than the fit
+        saturated = self._binner.saturated.ravel()[state.index] > 0
+        usable = ~saturated & (state.fresh[:, 4].min(axis=0) > FRINGE_SHARE * modulation_adu)
+        seen = max(1, int(np.count_nonzero(usable)))
+        beyond = int(np.count_nonzero(usable & (np.abs(state.fresh[:, 3]).max(axis=0) > GUARD_RAD)))
+        if beyond > LOST_SHARE * seen:
+            reason = f"tracking lost: the phase moved by half a period at {beyond / seen:.1%} of the points"
+            return _rejected(kind, times, readings, reason)
+        fit = self._fit(state, usable, readings)
+        area = math.pi * self._optics.mirror.analysis_radius_mm**2
+        quality = Quality(
+            modulation_share=modulation_adu / self._full_scale_adu,
+            saturated_fraction=float(np.mean(saturated)),
+            valid_fraction=min(1.0, float(np.sum(state.area_mm2[usable])) / area),
+            residual_urad=1e6 * math.hypot(fit.residual_x, fit.residual_y) / math.sqrt(2),
+            converged=fit.converged,
+        )
+        estimate = self._estimate(kind, fit, quality, times, readings)
+        if estimate.verdict == "rejected":
+            self._tracer(readings).start(state.points, state.surface.height)  # back onto the last good surface
+        else:
+            state.accept(fit.surface, usable)
+            self._tracked = state
+        return estimate
+
+    def _track_phases(self, state: TrackedPoints, readings: FloatArray) -> None:
+        """Fresh phases from the bin sums, with the film's motion between the frames taken out."""
+        motion_um = None
+        if worth_correcting(readings, self._laser_noise_um):
+            motion_um = readings - np.mean(readings)
+        steps = self._slots.steps
+        for axis, slots in enumerate(self._slots.sinusoids):
+            part = None if motion_um is None else motion_um[axis * steps : (axis + 1) * steps]
+            track(
+                self._binner.sums[slots].reshape(steps, -1),
+                state.index,
+                combine_steps(self._shifts_rad, self._bin_px, part),
+                state.sensitivity_rad_per_um[axis],
+                state.accepted[axis],
+                state.fresh[axis],
+            )
+
+    def _fit(self, state: TrackedPoints, usable: NDArray[np.bool_], readings: FloatArray) -> Fit:
+        """One or two steps from the last surface; the full cycle's normal matrix while its points are there."""
+        state.points.weights[:] = usable
+        np.multiply(state.fresh[:, 0], self._mm_per_rad, out=state.points.screen_mm)
+        state.points.screen_mm -= state.bias_mm
+        complete = np.count_nonzero(usable) > MATRIX_KEPT_SHARE * usable.size
+        normal = state.normal if complete else None
+        return solve(self._tracer(readings), state.points, state.surface, normal=normal)
+
+    def _estimate(
+        self, kind: Kind, fit: Fit, quality: Quality, times: FloatArray, readings: FloatArray
+    ) -> ShapeEstimate:
+        """The result in micrometres, with its covariance and verdict."""
+        modulation_adu = quality.modulation_share * self._full_scale_adu
+        sigma_mm = self._mm_per_rad * phase_sigma_rad(self._shifts_rad, self._pixel_sigma_adu, modulation_adu)
+        gain = slope_per_screen(self._geometry, fit.surface.radius_mm, fit.surface.sag_mm)
+        covariance = parameter_covariance(fit, gain.sum(axis=1) * (sigma_mm / self._bin_px) ** 2)
+        to_coeffs = parameter_to_coeffs()
+        gradient = sag_gradient()
+        verdict, reason = judge(quality)
+        return ShapeEstimate(
+            time_s=_finite_mean(times),
+            kind=kind,
+            coeffs_um=1e3 * fit.surface.coeffs_mm,
+            hencky_um=1e3 * fit.surface.hencky_mm,
+            covariance_um2=1e6 * to_coeffs @ covariance @ to_coeffs.T,
+            sag_um=1e3 * fit.surface.sag_mm,
+            sag_sigma_um=1e3 * math.sqrt(gradient @ covariance @ gradient),
+            displacement_um=_finite_mean(readings),
+            slope_residual_urad=quality.residual_urad,
+            valid_fraction=quality.valid_fraction,
+            modulation_median_adu=modulation_adu,
+            saturated_fraction=quality.saturated_fraction,
+            verdict=verdict,
+            reason=reason,
+        )
+
+
+def _per_frame(
+    frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike, count: int, kind: Kind
+) -> tuple[FloatArray, FloatArray]:
+    """Times and readings as arrays. Raises ValueError unless there is one of each for each of `count` frames."""
+    times, readings = np.asarray(time_s, float), np.asarray(displacement_um, float)
+    if not len(frames) == times.size == readings.size == count:
+        found = f"{len(frames)} frames, {times.size} times and {readings.size} displacements"
+        raise ValueError(f"a {kind} cycle has {count} frames with a time and a displacement each; got {found}")
+    return times, readings
+
+
+def _finite_mean(values: FloatArray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else float("nan")
+
+
+def _rejected(kind: Kind, times: FloatArray, readings: FloatArray, reason: str) -> ShapeEstimate:
+    """A cycle without a figure."""
+    nan = float("nan")
+    return ShapeEstimate(
+        time_s=_finite_mean(times),
+        kind=kind,
+        coeffs_um=np.full(TERMS, nan),
+        hencky_um=nan,
+        covariance_um2=np.full((TERMS, TERMS), nan),
+        sag_um=nan,
+        sag_sigma_um=nan,
+        displacement_um=_finite_mean(readings),
+        slope_residual_urad=nan,
+        valid_fraction=0.0,
+        modulation_median_adu=nan,
+        saturated_fraction=nan,
+        verdict="rejected",
+        reason=reason,
+    )
