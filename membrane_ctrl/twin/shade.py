@@ -58,7 +58,7 @@ def _random_64(state: np.uint64) -> np.uint64:
 def _level(s_mm: float, values: FloatArray, cell_mm: float, smooth: bool) -> float:
     """Light of the screen at s from the region's low edge; the caller has made sure that 0 <= s < side."""
     place = s_mm / cell_mm
-    cell = np.int64(place)
+    cell = int(place)
     if not smooth:
         return float(values[min(cell, len(values) - 1)])
     fraction = place - cell

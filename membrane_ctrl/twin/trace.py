@@ -24,8 +24,8 @@ class Trace:
     """Where rays met film and screen, each (N,), in mm.
 
     `x_mm`, `y_mm`: on the film, or on the plane of its rim for rays far outside it, which are not traced; NaN for
-    rays that never come down on that plane. `s_x_mm`, `s_y_mm`: on the screen; 0 for rays that are not traced, NaN for
-    those that never reach the screen.
+    rays that never come down on that plane. `s_x_mm`, `s_y_mm`: on the screen; 0 for rays that are not traced,
+    NaN for those that never reach the screen.
     """
 
     x_mm: FloatArray
