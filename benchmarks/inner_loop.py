@@ -75,7 +75,7 @@ def hold(
 
 def _configs(sensors: str, scenario: str, seed: int, **twin: Any) -> tuple[LoopConfig, TwinConfig]:
     barometer, thermometer = SENSORS[sensors]
-    loop = LoopConfig(setpoint_weight=1.0, feedforward_barometer=barometer, feedforward_temperature=thermometer)
+    loop = LoopConfig(feedforward_barometer=barometer, feedforward_temperature=thermometer)
     return loop, TwinConfig(**({"scenario": scenario, "seed": seed, "start_error_um": 0.0} | twin))
 
 

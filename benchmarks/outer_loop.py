@@ -24,7 +24,8 @@ SENSITIVITY[[0, 3, 10, 21]] = 0.5, 0.2887, -0.012, 0.001
 
 EXPOSURES_S = 0.8  # 8 frames
 LATENCY_S = 0.2  # last frame to estimate
-LOOP = LoopConfig(setpoint_weight=1.0)
+ON_S = 20.0  # the inner loop has settled, the shape loop is switched on
+LOOP = LoopConfig()
 SHAPE = ShapeConfig(time_constant_s=60.0)
 
 
@@ -85,16 +86,16 @@ class EstimateMaker:
 
 
 def track(twin: TwinConfig, duration_s: float, sag_noise_um: float = 0.2, shape: ShapeConfig = SHAPE) -> Tracked:
-    """Hold the mirror with both loops, the outer one switched on after 20 s if it is enabled."""
+    """Hold the mirror with both loops, for `duration_s` from when the outer one is switched on (if it is enabled)."""
     plant, inner = Plant(twin, PumpConfig()), InnerLoop(LOOP, PumpConfig())
     outer, maker = ShapeLoop(shape, SENSITIVITY), EstimateMaker(shape.period_s, sag_noise_um, twin.seed)
     dt_s = 1 / LOOP.rate_hz
     inner.start(plant.sample().displacement_um, plant.truth().leak_um_per_s)
     out = ShapeOutput(ShapeState.OFF, "", 0.0, np.nan, np.nan, np.nan)
     rows = []
-    for _ in range(round(duration_s * LOOP.rate_hz)):
+    for _ in range(round((ON_S + duration_s) * LOOP.rate_hz)):
         now_s, sample, truth = plant.time_s, plant.sample(), plant.truth()
-        settled = now_s >= 20.0
+        settled = now_s >= ON_S
         outer.switch(shape.enabled and settled, now_s)
         estimate = maker.tick(now_s, truth.displacement_um, sample.displacement_um)
         out = outer.step(now_s, dt_s, estimate, sample.displacement_um, settled)
@@ -114,7 +115,7 @@ def run(duration_s: float = 600.0) -> dict[str, dict[str, float]]:
     for name, noise_um, enabled in (("on, 0.1 um", 0.1, True), ("on, 0.3 um", 0.3, True), ("off", 0.1, False)):
         shape = SHAPE.model_copy(update={"enabled": enabled})
         run_ = track(drifting, duration_s, noise_um, shape)
-        means_um = run_.true_um.reshape(-1, round(10 * LOOP.rate_hz)).mean(axis=1)
+        means_um = run_.true_um[run_.time_s >= ON_S].reshape(-1, round(10 * LOOP.rate_hz)).mean(axis=1)
         still = track(TwinConfig(start_error_um=0.0), duration_s, noise_um, shape)
         figures[name] = {
             "sag_moved_um": float(np.ptp(means_um)),

@@ -43,8 +43,8 @@ class DriftTracker:
         self._value_um = self._rate_um_per_s = 0.0
 
     def at(self, time_s: float) -> float:
-        """Value in um expected at a time (not before the last reading's)."""
-        return self._value_um + self._rate_um_per_s * (time_s - self._time_s)
+        """Value in um expected at a time (not before the last reading's); a rate is believed for one memory."""
+        return self._value_um + self._rate_um_per_s * min(time_s - self._time_s, self._memory_s)
 
     def take(self, reading_um: float, time_s: float) -> None:
         """Take a reading, later than the last one, into the memory."""

@@ -146,7 +146,9 @@ class ShapeLoop:
         if not np.isfinite(estimate.coeffs_um).all() or not np.isfinite(estimate.covariance_um2).all():
             return "the shape is not finite"
         moved_um = abs(displacement_um - estimate.displacement_um)
-        if not moved_um <= config.disagreement_max_um:  # NaN is a refusal too
+        if math.isnan(moved_um):
+            return "no laser reading to compare the shape with"
+        if moved_um > config.disagreement_max_um:
             return f"the laser has moved by {moved_um:.1f} um since the exposures"
         return self._disagreement(estimate)
 

@@ -1,0 +1,59 @@
+"""First-order filters at unequal steps."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from membrane_ctrl.control.filters import LagRate, LowPass, smoothing
+
+
+def test_smoothing_composes_over_steps() -> None:
+    """Two steps leave what one step of their sum leaves."""
+    assert (1 - smoothing(0.3, 2.0)) * (1 - smoothing(0.5, 2.0)) == pytest.approx(1 - smoothing(0.8, 2.0))
+
+
+def test_no_lag_passes_through() -> None:
+    assert LowPass(0.0).update(3.0, 0.02) == 3.0
+
+
+def test_low_pass_starts_at_its_first_input() -> None:
+    low_pass = LowPass(1.0)
+    assert low_pass.update(5.0, 0.02) == 5.0
+    assert low_pass.update(6.0, 1.0) == pytest.approx(6.0 - math.exp(-1.0))
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.2, 12.0])
+def test_rate_of_a_ramp(lag_s: float) -> None:
+    rate = LagRate(lag_s)
+    for k in range(6000):
+        rate.update(2.0 * k * 0.02, 0.02)
+    assert rate.rate_per_s == pytest.approx(2.0, rel=1e-3)
+
+
+def test_rate_integrates_to_the_step() -> None:
+    """A feed-forward made of it moves the centre by exactly the disturbance."""
+    rate = LagRate(0.2)
+    rate.update(0.0, 0.02)
+    assert sum(rate.update(20.0, 0.02) * 0.02 for _ in range(500)) == pytest.approx(20.0)
+
+
+def test_first_value_is_no_rate() -> None:
+    assert LagRate(0.2).update(101_325.0, 0.02) == 0.0
+
+
+def test_absence_dies_away_and_return_is_no_bump() -> None:
+    rate = LagRate(0.2)
+    for k in range(100):
+        rate.update(0.02 * k, 0.02)
+    before = rate.rate_per_s
+    gone = [rate.update(math.nan, 0.02) for _ in range(20)]
+    assert gone[0] < before
+    assert gone == sorted(gone, reverse=True)
+    assert 0 < gone[-1] < 0.2 * before
+    assert rate.update(500.0, 0.02) == pytest.approx(gone[-1])
+
+
+def test_never_seen_is_no_rate() -> None:
+    assert LagRate(0.2).update(math.nan, 0.02) == 0.0

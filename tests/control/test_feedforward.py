@@ -1,0 +1,67 @@
+"""Feed-forward: sign, size, and coming and going."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.config import LoopConfig
+from membrane_ctrl.control.feedforward import FeedForward
+
+DT_S = 0.02
+
+
+def answered(loop: LoopConfig, pressure_pa: np.ndarray, air_c: np.ndarray) -> np.ndarray:
+    feedforward = FeedForward(loop)
+    return np.array([feedforward.update(p, t, DT_S) for p, t in zip(pressure_pa, air_c, strict=True)])
+
+
+def test_pressure_step_is_made_good() -> None:
+    """+20 Pa press the bowl flat by 7.16 um; the pump is told to add as much."""
+    pressure_pa = np.where(np.arange(1000) < 10, 101_325.0, 101_345.0)
+    flow = answered(LoopConfig(), pressure_pa, np.full(1000, 20.0))
+    assert flow.sum() * DT_S == pytest.approx(20 * 0.358)
+
+
+def test_temperature_step_is_made_good_as_the_gas_follows() -> None:
+    """+0.1 K swells the gas by 12.3 um, 63 % of it within the gas's lag."""
+    air_c = np.where(np.arange(10_000) < 1, 20.0, 20.1)
+    given = np.cumsum(answered(LoopConfig(), np.full(10_000, math.nan), air_c)) * DT_S
+    assert given[-1] == pytest.approx(-12.3, rel=1e-3)
+    assert given[600] == pytest.approx(-12.3 * (1 - math.exp(-1)), rel=0.01)
+
+
+def test_nothing_without_sensors() -> None:
+    nothing = np.full(10, math.nan)
+    assert not answered(LoopConfig(), nothing, nothing).any()
+
+
+def test_switched_off() -> None:
+    loop = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
+    assert not answered(loop, np.linspace(1e5, 1.1e5, 10), np.linspace(20, 30, 10)).any()
+
+
+@pytest.mark.parametrize("lost", ["pressure", "temperature"])
+def test_sensor_that_comes_and_goes_is_no_bump(lost: str) -> None:
+    """However far the value went while nobody saw it."""
+    ramp = np.arange(600) * DT_S
+    pressure_pa, air_c = 101_325.0 + 1.0 * ramp, 20.0 + 0.01 * ramp
+    series = pressure_pa if lost == "pressure" else air_c
+    series[200:400] = math.nan
+    series[400:] += 50.0
+    jumps = np.abs(np.diff(answered(LoopConfig(), pressure_pa, air_c)))
+    steady = 0.358 * DT_S / 0.2 * 1.01
+    assert jumps.max() < steady
+
+
+def test_switching_at_run_time_is_no_bump() -> None:
+    feedforward, ramp = FeedForward(LoopConfig()), iter(range(10_000))
+    flows = []
+    for barometer in (True, False, True):
+        feedforward.set_gains(LoopConfig(feedforward_barometer=barometer))
+        flows += [feedforward.update(101_325.0 + 0.1 * next(ramp), math.nan, DT_S) for _ in range(200)]
+    assert np.abs(np.diff(flows)).max() < 0.358 * 5.0 * DT_S / 0.2 * 1.01
+    assert flows[399] == pytest.approx(0.0, abs=1e-6)
+    assert flows[599] == pytest.approx(0.358 * 5.0, rel=1e-3)

@@ -1,0 +1,173 @@
+"""The inner loop tick by tick: limits, bumpless changes, missing readings."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from membrane_ctrl.config import LoopConfig, PumpConfig
+from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput, LoopOutput
+
+DT_S = 0.02
+LOOP = LoopConfig()
+PUMP = PumpConfig()
+
+
+def given_at(displacement_um: float, target_um: float = 0.0, trim_um: float = 0.0) -> LoopInput:
+    return LoopInput(target_um, trim_um, displacement_um, math.nan, math.nan)
+
+
+def settled(
+    loop: LoopConfig = LOOP, displacement_um: float = 0.0, flow: float = 1.24
+) -> tuple[InnerLoop, LoopOutput]:
+    """A loop that stands at its setpoint and needs this flow."""
+    inner = InnerLoop(loop, PUMP)
+    inner.start(displacement_um, flow)
+    for _ in range(100):
+        out = inner.step(given_at(displacement_um, displacement_um), DT_S)
+    return inner, out
+
+
+def test_start_is_at_the_reading_and_the_flow() -> None:
+    inner = InnerLoop(LOOP, PUMP)
+    inner.start(-25.0, 1.24)
+    out = inner.step(given_at(-25.0, target_um=-25.0), DT_S)
+    assert (out.setpoint_um, out.filtered_um, out.error_um) == (-25.0, -25.0, 0.0)
+    assert out.i_um_per_s == out.flow_wanted_um_per_s == 1.24
+    assert not out.saturated
+
+
+def test_start_with_a_trim_is_at_the_reading_too() -> None:
+    """After a restart of the loop the held trim is part of where the mirror stands."""
+    inner = InnerLoop(LOOP, PUMP)
+    inner.start(7.0, 1.24)
+    out = inner.step(given_at(7.0, target_um=0.0, trim_um=7.0), DT_S)
+    assert out.setpoint_um == pytest.approx(7.0)
+    assert out.flow_wanted_um_per_s == pytest.approx(1.24)
+
+
+def test_trim_is_added_behind_the_ramp() -> None:
+    inner, _ = settled()
+    out = inner.step(given_at(0.0, 0.0, trim_um=0.002), DT_S)
+    assert out.setpoint_um == pytest.approx(0.002)
+
+
+def test_ramp_feeds_its_speed_forward() -> None:
+    inner, _ = settled()
+    before_um = inner.step(given_at(0.0), DT_S).setpoint_um
+    out = inner.step(given_at(0.0, target_um=100.0), DT_S)
+    assert out.feedforward_um_per_s == pytest.approx((out.setpoint_um - before_um) / DT_S)
+    assert out.feedforward_um_per_s > 2.0
+
+
+@pytest.mark.parametrize("missing", [math.nan, math.inf, -math.inf])
+def test_missing_reading_puts_out_the_mean_flow(missing: float) -> None:
+    inner, _ = settled()
+    for _ in range(50):
+        out = inner.step(given_at(missing), DT_S)
+    assert out.flow_wanted_um_per_s == out.i_um_per_s == pytest.approx(1.24)
+    assert (out.p_um_per_s, out.d_um_per_s, out.feedforward_um_per_s) == (0.0, 0.0, 0.0)
+
+
+def test_reading_that_comes_back_goes_on_from_the_mean_flow() -> None:
+    inner, _ = settled()
+    for _ in range(500):
+        inner.stale(DT_S)
+    out = inner.step(given_at(0.0), DT_S)
+    assert out.flow_wanted_um_per_s == pytest.approx(1.24)
+
+
+def test_manual_puts_out_what_it_is_given() -> None:
+    inner, _ = settled()
+    assert inner.follow(given_at(0.0), 2.5, DT_S).flow_um_per_s == pytest.approx(2.5)
+    assert inner.follow(given_at(0.0), 99.0, DT_S).pump_fraction == pytest.approx(1.0)
+    assert inner.follow(given_at(0.0), -1.0, DT_S).pump_fraction == 0.0
+
+
+def test_ramp_down_works_without_a_reading() -> None:
+    inner = InnerLoop(LOOP, PUMP)
+    out = inner.follow(given_at(math.nan), 1.0, DT_S)
+    assert out.flow_um_per_s == pytest.approx(1.0)
+    assert math.isnan(out.filtered_um)
+
+
+@given(st.floats(0.3, 5.3), st.floats(-500, 500), st.floats(-50, 50), st.floats(-0.3, 0.3))
+def test_manual_to_automatic_is_bumpless(flow: float, displacement: float, trim: float, slope: float) -> None:
+    """In moving air too; the setpoint then starts where the mirror is."""
+    inner, _ = settled(displacement_um=displacement)
+    for k in range(100):
+        reading = LoopInput(0.0, trim, displacement, 101_325.0 + slope * k * DT_S, 20.0)
+        out = inner.follow(reading, flow, DT_S)
+    there = LoopInput(out.filtered_um - trim, trim, displacement, 101_325.0 + slope * 100 * DT_S, 20.0)
+    assert inner.step(there, DT_S).flow_wanted_um_per_s == pytest.approx(flow, abs=1e-3)
+
+
+def test_automatic_to_manual_at_the_present_flow_is_bumpless() -> None:
+    inner, before = settled()
+    after = inner.follow(given_at(0.0), before.flow_um_per_s, DT_S)
+    assert after.pump_fraction == pytest.approx(before.pump_fraction)
+
+
+def test_gain_change_is_bumpless_off_the_setpoint() -> None:
+    inner, _ = settled()
+    for _ in range(20):
+        before = inner.step(given_at(0.3, 0.0), DT_S)
+    inner.set_gains(LOOP.model_copy(update={"kp_per_s": 1.2, "ti_s": 3.0, "td_s": 0.2, "setpoint_weight": 0.5}))
+    after = inner.step(given_at(0.3, 0.0), DT_S)
+    assert after.flow_wanted_um_per_s == pytest.approx(before.flow_wanted_um_per_s, abs=0.05)
+
+
+def test_new_limits_are_obeyed_at_once() -> None:
+    inner, _ = settled(flow=3.0)
+    inner.set_gains(LOOP.model_copy(update={"flow_max_um_per_s": 2.0, "flow_rate_limit_um_per_s2": 1000.0}))
+    out = inner.step(given_at(0.0), DT_S)
+    assert out.flow_um_per_s <= 2.0 + 1e-12
+    assert out.i_um_per_s <= 2.0
+
+
+@pytest.mark.parametrize("loop", [LOOP.model_copy(update={"setpoint_weight": b}) for b in (0.0, 0.5, 1.0)])
+def test_large_standing_displacement_needs_no_integrator(loop: LoopConfig) -> None:
+    """The zero of the laser is arbitrary: far from it nothing is different."""
+    _, out = settled(loop, displacement_um=-1900.0)
+    assert out.i_um_per_s == pytest.approx(1.24)
+    assert out.flow_wanted_um_per_s == pytest.approx(1.24)
+
+
+readings = st.one_of(st.floats(-3000, 3000), st.just(math.nan))
+pressures = st.one_of(st.floats(80_000, 110_000), st.just(math.nan))
+temperatures = st.one_of(st.floats(-20, 60), st.just(math.nan))
+inputs = st.builds(LoopInput, st.floats(-2000, 500), st.floats(-100, 100), readings, pressures, temperatures)
+calls = st.tuples(st.sampled_from(["step", "step", "step", "stale", "follow", "start"]), inputs, st.floats(1e-3, 1.0))
+
+
+@settings(max_examples=60)
+@given(st.lists(calls, max_size=80))
+def test_whatever_comes_the_command_is_sane(run: list[tuple[str, LoopInput, float]]) -> None:
+    inner = InnerLoop(LoopConfig(td_s=0.3), PUMP)
+    for call, reading, dt_s in run:
+        if call == "start":
+            inner.start(reading.displacement_um, reading.trim_um)
+            continue
+        if call == "step":
+            out = inner.step(reading, dt_s)
+        elif call == "stale":
+            out = inner.stale(dt_s)
+        else:
+            out = inner.follow(reading, reading.trim_um, dt_s)
+        assert out.pump_fraction == 0.0 or PUMP.stall_fraction < out.pump_fraction <= 1.0
+        assert 0.0 <= out.flow_um_per_s <= PUMP.flow_full_um_per_s + 1e-9
+        assert 0.0 <= out.i_um_per_s <= LOOP.flow_max_um_per_s
+        assert math.isfinite(out.flow_wanted_um_per_s)
+
+
+@settings(max_examples=40)
+@given(st.lists(st.tuples(inputs, st.floats(1e-3, 0.1)), min_size=2, max_size=50))
+def test_flow_changes_no_faster_than_told(run: list[tuple[LoopInput, float]]) -> None:
+    inner, _ = settled(flow=2.0)
+    for reading, dt_s in run:
+        before = inner._limiter.flow_um_per_s
+        inner.step(reading, dt_s)
+        assert abs(inner._limiter.flow_um_per_s - before) <= LOOP.flow_rate_limit_um_per_s2 * dt_s + 1e-9

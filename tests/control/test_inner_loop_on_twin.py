@@ -1,0 +1,108 @@
+"""The inner loop on the twin: what the mirror's centre truly does, in virtual time.
+
+The bounds are the project's requirements, not what is reached (docs/control.md has that).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.inner_loop import answer, hold, lost_reading, start_up, steady
+from membrane_ctrl.config import LoopConfig, TwinConfig
+from membrane_ctrl.twin.events import AmbientChange, LeakChange
+
+SEEDS = (1, 2, 3)
+ALL = "barometer and thermometer"
+
+
+@pytest.mark.parametrize(("sensors", "std_um"), [("laser", 0.25), (ALL, 0.15)])
+def test_typical_weather(sensors: str, std_um: float) -> None:
+    figures = steady(sensors, "typical", SEEDS, 200.0)
+    assert figures["worst_std_um"] <= std_um
+    assert figures["worst_bias_um"] <= 0.1
+    assert figures["in_band_1s_fraction"] == 1.0
+    assert figures["least_std_um"] < figures["std_um"]
+
+
+def test_gusts_bring_no_bias() -> None:
+    """The pump cuts them on one side only."""
+    figures = steady(ALL, "gusty", SEEDS, 200.0)
+    assert figures["worst_bias_um"] <= 0.1
+    assert figures["worst_std_um"] <= 0.4
+    assert figures["in_band_1s_fraction"] == 1.0
+
+
+def test_start_does_not_overshoot_the_band() -> None:
+    figures = start_up(SEEDS)
+    assert figures["within_2um_s"] < 12.0
+    assert figures["overshoot_um"] < 1.5
+
+
+def test_doubled_leak_stays_in_the_band() -> None:
+    figures = answer(ALL, LeakChange(60.0), SEEDS, 0.5)
+    assert figures["worst_peak_um"] < 2.0
+    assert figures["back_s"] < 15.0
+
+
+@pytest.mark.parametrize("change_pa", [20.0, -20.0])
+def test_door(change_pa: float) -> None:
+    """7 um at once, which nothing prevents; then back as fast as pump or leak allow, without wind-up."""
+    figures = answer(ALL, AmbientChange(60.0, change_pa), SEEDS, 2.0)
+    assert 6.5 < figures["worst_peak_um"] < 8.0
+    assert figures["back_s"] < 8.0
+
+
+def test_ten_seconds_without_a_reading() -> None:
+    figures = lost_reading(ALL, range(1, 13))
+    assert figures["mean_um"] < 1.6
+    assert figures["worst_um"] < 3.9
+
+
+def test_setpoint_change_down_is_as_fast_as_the_leak() -> None:
+    held = hold(
+        LoopConfig(),
+        TwinConfig(start_error_um=0.0),
+        70.0,
+        target_um=lambda time_s: 0.0 if time_s < 20 else -20.0,
+    )
+    assert np.min(held.true_um) > -21.5
+    assert np.abs(held.after(60.0) + 20.0).max() < 1.0
+    assert np.abs(held.true_um - held.setpoint_um)[held.time_s > 5].max() < 2.0
+
+
+def test_tight_mirror_is_warned_of() -> None:
+    tight = steady(ALL, "typical", (1, 2), 60.0, leak_time_constant_s=5e4)
+    sound = steady(ALL, "typical", (1, 2), 60.0)
+    assert (tight["too_tight_fraction"], sound["too_tight_fraction"]) == (1.0, 0.0)
+
+
+def test_leak_estimate_finds_the_truth() -> None:
+    held = hold(LoopConfig(), TwinConfig(start_error_um=0.0), 150.0, [LeakChange(0.0, 2.0)])
+    assert held.leak_um_per_s[-1] == pytest.approx(2 * 1.235, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"rate_hz": 20.0},
+        {"rate_hz": 100.0},
+        {"feedforward_filter_s": 0.0},
+        {"measurement_filter_s": 0.0},
+        {"td_s": 0.1},
+    ],
+    ids=str,
+)
+def test_other_settings_hold_too(change: dict[str, float]) -> None:
+    """A loop this mild must not depend on its fine print."""
+    held = hold(LoopConfig(**change), TwinConfig(start_error_um=0.0), 100.0)
+    assert held.after(40.0).std() < 0.35
+    assert abs(held.after(40.0).mean()) < 0.1
+
+
+@pytest.mark.parametrize("gain", [0.7, 1.4])
+def test_plant_it_was_not_designed_for(gain: float) -> None:
+    """A pump with 30-40 % other flow than configured: the integrator makes it good."""
+    loop = LoopConfig(kp_per_s=0.61 * gain, flow_max_um_per_s=5.3)
+    held = hold(loop, TwinConfig(start_error_um=0.0, leak_time_constant_s=1e4 / gain), 100.0)
+    assert held.after(40.0).std() < 0.25

@@ -1,0 +1,62 @@
+"""Leak from flow and movement."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.control.leak import FIRST_S, JUDGE_S, LeakEstimate
+
+DT_S = 0.02
+
+
+def run(estimate: LeakEstimate, leak: float, seconds: float, flow: float = 1.0, weather: float = 0.0) -> None:
+    """A mirror that moves by what flow, leak and weather (um/s) leave, read with the filtered noise of the laser."""
+    estimate.pause()  # the centre of each run starts at 0
+    rng, centre_um = np.random.default_rng(3), 0.0
+    for _ in range(round(seconds / DT_S)):
+        centre_um += (flow - leak + weather) * DT_S
+        estimate.update(flow, -weather, centre_um + 0.2 * rng.standard_normal(), DT_S)
+
+
+@pytest.mark.parametrize(("flow", "weather"), [(1.24, 0.0), (0.0, 0.0), (3.0, 0.2)])
+def test_leak_is_found_whatever_the_pump_does(flow: float, weather: float) -> None:
+    estimate = LeakEstimate()
+    run(estimate, 1.24, 60.0, flow, weather)
+    assert estimate.leak_um_per_s == pytest.approx(1.24, abs=0.02)
+
+
+def test_no_estimate_at_first() -> None:
+    estimate = LeakEstimate()
+    run(estimate, 1.24, FIRST_S - 1.0)
+    assert math.isnan(estimate.leak_um_per_s)
+
+
+def test_change_is_followed_within_minutes() -> None:
+    estimate = LeakEstimate()
+    run(estimate, 1.24, 120.0)
+    run(estimate, 2.48, 180.0)
+    assert estimate.leak_um_per_s == pytest.approx(2.48, abs=0.1)
+
+
+def test_too_tight_is_judged_late_and_with_hysteresis() -> None:
+    estimate = LeakEstimate()
+    run(estimate, 0.2, JUDGE_S - 1.0)
+    assert not estimate.too_tight
+    run(estimate, 0.2, 60.0)
+    assert estimate.too_tight
+    run(estimate, 0.42, 600.0)
+    assert estimate.too_tight
+    run(estimate, 0.6, 600.0)
+    assert not estimate.too_tight
+
+
+def test_gap_is_left_out() -> None:
+    """What the centre did while nobody looked is no rate."""
+    estimate = LeakEstimate()
+    run(estimate, 1.0, 60.0)
+    estimate.pause()
+    estimate.update(1.0, 0.0, 500.0, DT_S)
+    assert estimate.leak_um_per_s == pytest.approx(1.0, abs=0.02)
