@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import cos, pi, radians, sin, sqrt
+from math import cos, isfinite, pi, radians, sin, sqrt
 from typing import Literal
 
 import numpy as np
@@ -32,6 +32,10 @@ class Ripple:
     direction_deg: float = 0.0
     phase_rad: float = 0.0
 
+    def __post_init__(self) -> None:
+        if not self.wavelength_mm > 0:
+            raise ValueError(f"ripple wavelength_mm = {self.wavelength_mm} must be above 0")
+
 
 @dataclass(frozen=True, slots=True)
 class Wrinkle:
@@ -40,6 +44,10 @@ class Wrinkle:
     amplitude_um: float
     lobes: int
     phase_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.lobes < 1:
+            raise ValueError(f"wrinkle lobes = {self.lobes} must be 1 or more")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +58,10 @@ class Bump:
     x_mm: float
     y_mm: float
     sigma_mm: float
+
+    def __post_init__(self) -> None:
+        if not self.sigma_mm > 0:
+            raise ValueError(f"bump sigma_mm = {self.sigma_mm} must be above 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +80,11 @@ class FilmShape:
         Noll j = 1.., orthonormal over `radius_mm`, added to the bowl (piston is without effect).
     ripples, wrinkles, bumps : tuples
         What the 36 terms cannot carry.
+
+    Raises
+    ------
+    ValueError
+        On construction, naming the field and what would be right.
     """
 
     sag_mm: float
@@ -80,6 +97,14 @@ class FilmShape:
     terms: FilmTerms = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        if not isfinite(self.sag_mm):
+            raise ValueError(f"sag_mm = {self.sag_mm} must be a number")
+        if not self.radius_mm > 0:
+            raise ValueError(f"radius_mm = {self.radius_mm} must be above 0")
+        if self.bowl not in ("hencky", "paraboloid"):
+            raise ValueError(f"bowl = {self.bowl!r} must be hencky or paraboloid")
+        if not all(isfinite(c) for c in self.zernike_um):
+            raise ValueError("zernike_um: every value must be a number")
         if len(self.zernike_um) > MAX_ZERNIKE:
             raise ValueError(f"zernike_um holds {len(self.zernike_um)} terms; at most {MAX_ZERNIKE} are known")
         object.__setattr__(self, "terms", _terms(self))

@@ -35,6 +35,11 @@ class Light:
         The screen's light is level**gamma; 1 is a linear screen.
     vignetting : float
         Loss of light at the picture's corner, growing with the square of the distance from its middle.
+
+    Raises
+    ------
+    ValueError
+        On construction, naming the field and what would be right.
     """
 
     dark_fraction: float = 0.02
@@ -42,6 +47,18 @@ class Light:
     leak: float = 0.02
     gamma: float = 1.0
     vignetting: float = 0.15
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.dark_fraction < self.white_fraction <= 1:
+            raise ValueError(
+                f"dark_fraction = {self.dark_fraction} and white_fraction = {self.white_fraction} must be"
+                " 0 or more, at most 1, and the white above the dark"
+            )
+        for name, value in (("leak", self.leak), ("vignetting", self.vignetting)):
+            if not 0 <= value < 1:
+                raise ValueError(f"{name} = {value} must be 0 or more and below 1")
+        if not 0.1 <= self.gamma <= 10:
+            raise ValueError(f"gamma = {self.gamma} must be 0.1 .. 10; 1 is a linear screen")
 
 
 @dataclass(frozen=True, slots=True)

@@ -99,8 +99,8 @@ class SimulationSpec:
         names = [pattern.name for pattern in self.patterns]
         if self.displacements_um and len(self.displacements_um) != len(names):
             raise ValueError(f"displacements_um: {len(self.displacements_um)} values for {len(names)} frames")
-        if not all(isfinite(d) for d in self.displacements_um):
-            raise ValueError("displacements_um: every value must be a number")
+        if not all(isfinite(self.displacement_um(frame)) for frame in range(len(names))):
+            raise ValueError("motion, displacements_um: every value must be a number")
         for name, value in (
             ("frame_interval_s", self.frame_interval_s),
             ("laser_noise_um", self.laser_noise_um),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -97,9 +98,22 @@ def test_what_36_terms_cannot_carry_has_no_coefficients() -> None:
     assert FilmShape(37.1, bowl="paraboloid", ripples=(Ripple(1.0, 50.0),)).coeffs_um() is None
 
 
-def test_too_many_terms_are_refused() -> None:
-    with pytest.raises(ValueError, match="zernike_um holds 37"):
-        FilmShape(37.1, zernike_um=(0.0,) * 37)
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: FilmShape(37.1, zernike_um=(0.0,) * 37), "zernike_um holds 37"),
+        (lambda: FilmShape(37.1, zernike_um=(float("nan"),)), "zernike_um: every value"),
+        (lambda: FilmShape(float("inf")), "sag_mm = inf"),
+        (lambda: FilmShape(37.1, radius_mm=0.0), "radius_mm = 0"),
+        (lambda: FilmShape(37.1, bowl="cone"), "bowl = 'cone' must be hencky or paraboloid"),  # type: ignore[arg-type]
+        (lambda: Ripple(1.0, 0.0), "wavelength_mm = 0"),
+        (lambda: Wrinkle(1.0, 0), "lobes = 0"),
+        (lambda: Bump(1.0, 0.0, 0.0, -1.0), "sigma_mm = -1"),
+    ],
+)
+def test_films_that_cannot_be_are_refused_by_their_field(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
 
 
 def test_a_typical_film_is_drawn_from_its_seed() -> None:

@@ -184,6 +184,21 @@ def test_unknown_patterns_are_refused(small_optics: OpticsConfig, film: FilmShap
         OpticsRenderer(small_optics, film).render(pattern, 0.0)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"white_fraction": 1.2}, "white_fraction = 1.2"),
+        ({"dark_fraction": 0.9}, "dark_fraction = 0.9"),
+        ({"leak": -0.1}, "leak = -0.1"),
+        ({"vignetting": 1.0}, "vignetting = 1.0"),
+        ({"gamma": 0.0}, "gamma = 0.0"),
+    ],
+)
+def test_light_that_cannot_be_is_refused_by_its_field(change: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Light(**change)
+
+
 def test_the_sets_have_their_patterns_in_order() -> None:
     full = [p.name for p in pattern_sequence("full", PatternConfig())]
     assert full[:8] == [f"x_sin_{k}" for k in range(4)] + [f"x_gray_{bit}" for bit in range(1, 5)]

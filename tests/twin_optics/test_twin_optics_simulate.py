@@ -190,6 +190,7 @@ def test_the_same_seed_writes_the_same_set(tmp_path: Path, small_optics: OpticsC
         ({"shifts_rad": (0.0, 1.0)}, "shifts_rad: 2 shifts for steps = 4"),
         ({"displacements_um": (0.0,)}, "displacements_um: 1 values for 18 frames"),
         ({"displacements_um": (float("nan"),) * 18}, "displacements_um: every value"),
+        ({"motion": Motion(float("inf"))}, "motion, displacements_um: every value"),
         ({"displacements_um": (0.0,) * 18, "motion": Motion(1.0)}, "displacements_um: give these or motion"),
         ({"frame_interval_s": -1.0}, "frame_interval_s = -1.0 must be 0 or more"),
         ({"laser_noise_um": float("inf")}, "laser_noise_um = inf"),
