@@ -12,6 +12,7 @@ from membrane_ctrl.config import Config
 from membrane_ctrl.ipc.ring import RingAddress, ring
 from membrane_ctrl.processes import Child, pipe
 from membrane_ctrl.telemetry import ROW_BYTES
+from membrane_ctrl.tick import Event
 
 # A recorder that is busy for a minute (a slow disk, a big flush) loses nothing
 _TELEMETRY_KEPT_S = 60.0
@@ -71,13 +72,18 @@ class Crew:
             run_dir, name, clock, config, rings.telemetry, rings.events, rings.shapes, rings.frames
         )
         screen_spec = ScreenSpec(clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s)
-        self._recorder = Child("recorder", "membrane_ctrl.recording.process:recorder_main", (recorder_spec,), nice=5)
+        status, theirs = pipe()
+        self._recorder = Child(
+            "recorder", "membrane_ctrl.recording.process:recorder_main", (recorder_spec, theirs), nice=5
+        )
         self._screen = Child("screen", "membrane_ctrl.screen.process:screen_main", (screen_spec,), nice=5)
         self.children = [self._recorder, self._screen]
+        self._lines = [status]
         if rings.shapes is not None and rings.frames is not None:
             from membrane_ctrl.acquisition.process import AcquisitionSpec
 
-            self._control, theirs = pipe()
+            control, theirs = pipe()
+            self._lines.append(control)
             spec = AcquisitionSpec(config, clock, rings.telemetry, rings.shapes, rings.truth, rings.frames)
             acquisition = Child(
                 "acquisition", "membrane_ctrl.acquisition.process:acquisition_main", (spec, theirs), nice=10
@@ -89,6 +95,17 @@ class Crew:
         for child in self.children:
             child.start()
             stack.callback(child.stop, _CHILD_STOPS_S)
+
+    def reports(self) -> list[Event]:
+        """What the children have said since the last call; never waits."""
+        said: list[Event] = []
+        for line in self._lines:
+            try:
+                while line.poll():
+                    said.append(line.recv())
+            except (EOFError, OSError):  # the child has ended; `children` shows it
+                continue
+        return said
 
     def take_down(self) -> None:
         """Stop the acquisition, then let recorder and screen finish by themselves: the "end" event is their sign."""

@@ -101,7 +101,9 @@ async def _run(
     from membrane_ctrl.metrology.hencky import zernike_projection
 
     with _open(rings) as (telemetry, events, shapes):
-        wiring = Wiring(bench, telemetry, events, shapes, twin.truth_reader() if twin else None, crew.children)
+        wiring = Wiring(
+            bench, telemetry, events, shapes, twin.truth_reader() if twin else None, crew.children, crew.reports
+        )
         controller = Controller(config, zernike_projection())
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         supervisor.tell({"kind": "start", "devices": config.devices.board if config.devices else ""})

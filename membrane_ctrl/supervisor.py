@@ -37,6 +37,7 @@ class Wiring:
     shapes: RingReader | None = None
     truth: Callable[[], tuple[float, float]] | None = None  # (displacement_um, laser_bias_um) of the twin
     children: Sequence[Child] = ()
+    reports: Callable[[], list[Event]] = list  # what the children have said since the last call
     tasks: dict[str, asyncio.Task[None]] = field(default_factory=dict)
 
 
@@ -171,3 +172,5 @@ class Supervisor:
             if not child.alive and child.name not in self._dead:
                 self._dead.add(child.name)
                 self.tell({"kind": "child_ended", "child": child.name, "exit_code": child.exit_code})
+        for report in self._wiring.reports():
+            self.tell(report)
