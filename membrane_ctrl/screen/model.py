@@ -13,6 +13,7 @@ from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.names import ShapeState, State
 from membrane_ctrl.screen.trend import Trend
 from membrane_ctrl.screen.why import why
+from membrane_ctrl.screen.words import duration
 from membrane_ctrl.telemetry import TelemetryRow
 
 # The tick runs at 50 Hz, the screen at 5: a row this old means that the control process stands still.
@@ -51,7 +52,7 @@ class View:
     silent_s : float
         Age of the row if that is worth a warning, else 0.
     state_age_s, elapsed_s, left_s : float
-        Times; `left_s` is infinite for a run without an end.
+        Times; `left_s` counts from the first tick and is infinite for a run without an end.
     trend_um : tuple of 60 float
         Mean error of each of the last 60 s.
     error_mean_um, error_std_um, in_band_fraction : float
@@ -62,6 +63,8 @@ class View:
         The fault that stands, and what to do about it.
     faults : int
         Faults so far in the run.
+    last_fault : str
+        The newest of them, with its time.
     too_tight : bool
         The leak is too small for the band.
     """
@@ -81,6 +84,7 @@ class View:
     fault: str
     remedy: str
     faults: int
+    last_fault: str
     too_tight: bool
     shape: ShapeView
 
@@ -98,11 +102,13 @@ class ScreenModel:
         self._config = config
         self._duration_s = math.inf if duration_s is None else duration_s
         self._row: TelemetryRow | None = None
+        self._started_s = math.nan
         self._since_s = 0.0
         self._told = ""
         self._fault = ""
         self._remedy = ""
         self._faults = 0
+        self._last_fault = ""
         self._error = Trend()
         self._lateness = Trend()
         self._estimate: ShapeEstimate | None = None
@@ -115,6 +121,8 @@ class ScreenModel:
 
     def take_row(self, row: TelemetryRow) -> None:
         """One tick."""
+        if self._row is None:
+            self._started_s = row.mono_s
         if self._row is None or row.state != self._row.state:
             self._since_s = row.mono_s
         self._row = row
@@ -131,6 +139,7 @@ class ScreenModel:
                 self._faults += 1
                 self._fault = words or "unnamed"
                 self._remedy = event.get("remedy", "")
+                self._last_fault = f"{self._fault} at {duration(event.get('mono_s', math.nan))}"
             case "cleared":
                 self._fault = self._remedy = ""
             case "shape":
@@ -163,7 +172,7 @@ class ScreenModel:
             state=State(int(row.state)) if row else State.STANDBY,
             state_age_s=max(0.0, now_s - self._since_s),
             elapsed_s=now_s,
-            left_s=max(0.0, self._duration_s - now_s),
+            left_s=max(0.0, self._duration_s - (now_s - self._started_s if row else 0.0)),
             trend_um=self._error.means(),
             error_mean_um=fmean(errors) if errors else math.nan,
             error_std_um=pstdev(errors) if errors else math.nan,
@@ -172,6 +181,7 @@ class ScreenModel:
             fault=self._fault,
             remedy=self._remedy,
             faults=self._faults,
+            last_fault=self._last_fault,
             too_tight=self._too_tight(now_s),
             shape=self._shape(now_s),
         )
@@ -190,7 +200,7 @@ class ScreenModel:
         estimate, row = self._estimate, self._row
         state = ShapeState(int(row.shape_state)) if row else ShapeState.OFF
         reason = estimate.reason if estimate and estimate.verdict != "ok" else ""
-        loop = self._shape_told if state == ShapeState.SUSPENDED else ""
+        loop = self._shape_told if state in (ShapeState.WAITING, ShapeState.SUSPENDED) else ""
         return ShapeView(
             state=state,
             estimate=estimate,

@@ -7,8 +7,7 @@ import math
 from membrane_ctrl.screen.model import Event, View, text
 from membrane_ctrl.screen.words import duration, number, percent
 
-# Events that nobody should have to wait a second for.
-AT_ONCE = frozenset({"fault", "cleared", "state", "link", "child_ended", "end"})
+_AT_ONCE = frozenset({"fault", "cleared", "state", "link", "child_ended", "end"})
 
 
 def line(view: View) -> str:
@@ -30,6 +29,12 @@ def line(view: View) -> str:
     if math.isfinite(view.left_s):
         parts.append(f"{duration(view.left_s)} left")
     return "  ".join(parts)
+
+
+def at_once(event: Event) -> bool:
+    """Whether nobody should have to wait a second for the event."""
+    kind = event.get("kind")
+    return kind in _AT_ONCE or (kind == "acquisition" and event.get("state") != "running")
 
 
 def event_line(event: Event) -> str:

@@ -22,7 +22,7 @@ from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.ipc.ring import RingAddress, RingReader
 from membrane_ctrl.screen.model import Event, ScreenModel
-from membrane_ctrl.screen.plain import AT_ONCE, event_line, line
+from membrane_ctrl.screen.plain import at_once, event_line, line
 from membrane_ctrl.screen.view import screen
 from membrane_ctrl.telemetry import FIELDS, TelemetryRow
 
@@ -124,7 +124,7 @@ def _plain(spec: ScreenSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
 
     def show() -> None:
         nonlocal due_s
-        lines = [event_line(event) for event in feed.update() if event.get("kind") in AT_ONCE]
+        lines = [event_line(event) for event in feed.update() if at_once(event)]
         now_s = spec.clock.now()
         if now_s >= due_s:
             lines.append(line(feed.model.view(now_s)))

@@ -137,9 +137,9 @@ def _shape(shape: ShapeView) -> list[tuple[str, RenderableType]]:
     state = Text(shape.state.name.lower(), style=_SHAPE_STYLES.get(shape.state, "default"))
     state.append(f"  trim {number(shape.trim_um, 2, 'um', sign=True)}", style="default")
     estimate = shape.estimate
-    change = number(shape.sag_change_um, 2, sign=True)
+    change = number(shape.sag_change_um, 3, sign=True)
     if estimate is not None and change != NONE:
-        state.append(f"  sag change {change} ± {number(estimate.sag_sigma_um, 2)} um", style="default")
+        state.append(f"  sag change {change} ± {number(estimate.sag_sigma_um, 3)} um", style="default")
     if shape.note:
         state.append(f"  {shape.note}", style="yellow")
     if estimate is None:
@@ -163,4 +163,6 @@ def _faults(view: View) -> Text:
     if view.fault:
         text = Text(view.fault, style="bold red")
         return text.append(f"; {view.remedy}", style="default") if view.remedy else text
-    return Text(f"none now, {view.faults} in this run" if view.faults else "none", style="default")
+    if not view.faults:
+        return Text("none")
+    return Text(f"none now, {view.faults} in this run; last: {view.last_fault}")

@@ -45,7 +45,7 @@ def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
         return f"{_RUNGS[rung]}: {fault or told or 'a fault is not named'}"
     if state in _STATES:
         return told or _STATES[state]
-    if not math.isfinite(row.displacement_um):
+    if not (math.isfinite(row.displacement_um) and math.isfinite(row.filtered_um)):
         return f"{_RUNGS[Rung.HOLD_FLOW]}: {told or fault or 'there is no valid laser reading'}"
     if state == State.INFLATE:
         to_go_um = row.target_um - row.filtered_um
@@ -67,14 +67,14 @@ def _outside(row: TelemetryRow) -> str:
 def _balance(row: TelemetryRow) -> str:
     """What the flow is made of, the largest first."""
     parts = {
-        "what leaks": row.i_um_per_s,
-        "the error": row.p_um_per_s,
+        "leak": row.i_um_per_s,  # in the mean the integrator's part is what leaks
+        "error": row.p_um_per_s,
         "its speed": row.d_um_per_s,
-        "the weather": row.feedforward_um_per_s,
+        "feed-forward": row.feedforward_um_per_s,
     }
     least = _WORTH_NAMING * max(abs(row.flow_um_per_s), abs(row.i_um_per_s))
     named = sorted(((v, k) for k, v in parts.items() if abs(v) > least), key=lambda part: -abs(part[0]))
-    return f"{_flow(row)}: " + ", ".join(f"{value:+.2f} for {name}" for value, name in named)
+    return f"{_flow(row)}: " + ", ".join(f"{value:+.2f} {name}" for value, name in named)
 
 
 def _flow(row: TelemetryRow) -> str:

@@ -66,7 +66,8 @@ def test_time_in_the_state_and_time_left() -> None:
     given.take_row(replace(HOLDING, mono_s=10.0))
     given.take_row(replace(HOLDING, mono_s=15.0))
     view = given.view(15.5)
-    assert (view.state, view.state_age_s, view.left_s) == (State.HOLD, 5.5, 104.5)
+    # the run's 120 s count from its first tick
+    assert (view.state, view.state_age_s, view.left_s) == (State.HOLD, 5.5, 107.5)
     assert given.view(130.0).left_s == 0.0
 
 
@@ -88,6 +89,7 @@ def test_fault_stands_until_it_is_cleared_and_is_counted() -> None:
     given.take_event(event(1.0, "cleared", name="link_lost"))
     view = given.view(1.0)
     assert (view.fault, view.remedy, view.faults) == ("", "", 1)
+    assert view.last_fault == "link lost: the link to the pump board is down (link down) at 0 s"
 
 
 def test_told_reason_is_that_of_the_newest_state_or_why() -> None:

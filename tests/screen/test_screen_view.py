@@ -40,12 +40,12 @@ def test_everything_a_person_wants_is_there() -> None:
     page = "\n".join(drawn(held()))
     for words in (
         "hold for 1:15",
-        "pump gives 1.14 um/s: +1.24 for what leaks",
+        "pump gives 1.14 um/s: +1.24 leak, -0.11 feed-forward",
         "within ±2",
         "truth +0.03 um (laser +0.10)",
         "29 %, 1.14 of 5.3 um/s",
         "leak 1.24 um/s  gauge 600.0 Pa  air 1013.25 hPa 20.01 °C",
-        "tracking  trim +0.12 um  sag change +0.03 ± 0.01 um",
+        "tracking  trim +0.12 um  sag change +0.030 ± 0.012 um",
         "ok  1 s ago, fringes, residual 3.1 urad, in 31 ms  0/2 rejected",
         "worst of the minute",
         "faults none",

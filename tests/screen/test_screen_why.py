@@ -21,10 +21,8 @@ def line(told: str = "", fault: str = "", **changes: float) -> str:
 
 
 def test_hold_names_what_the_flow_is_made_of_largest_first() -> None:
-    assert line() == "pump gives 1.14 um/s: +1.24 for what leaks, -0.11 for the weather"
-    assert line(p_um_per_s=-2.0, flow_um_per_s=0.0) == (
-        "pump is at 0: -2.00 for the error, +1.24 for what leaks, -0.11 for the weather"
-    )
+    assert line() == "pump gives 1.14 um/s: +1.24 leak, -0.11 feed-forward"
+    assert line(p_um_per_s=-2.0, flow_um_per_s=0.0) == ("pump is at 0: -2.00 error, +1.24 leak, -0.11 feed-forward")
 
 
 def test_settle_says_so() -> None:
@@ -59,7 +57,9 @@ def test_ladder_names_its_fault() -> None:
 
 
 def test_without_a_reading_the_pump_keeps_its_flow() -> None:
-    assert line(displacement_um=math.nan) == "pump keeps its last mean flow: there is no valid laser reading"
+    said = "pump keeps its last mean flow: there is no valid laser reading"
+    assert line(displacement_um=math.nan) == said
+    assert line(state=State.INFLATE, filtered_um=math.nan) == said  # nothing has been filtered yet
 
 
 @pytest.mark.parametrize("state", [State.STANDBY, State.CHECK, State.LOWER, State.FAULT, State.MANUAL, State.TUNE])
