@@ -16,7 +16,8 @@ from membrane_ctrl.twin.render import OpticsRenderer
 from membrane_ctrl.twin.simulation_spec import SimulationSpec
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
-_PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # noise does not compress: harder levels cost time and save nothing
+# noise does not compress: harder levels cost time and save nothing
+_PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 
 
 @dataclass(frozen=True, slots=True)
