@@ -50,9 +50,10 @@ def hold(
     events: Sequence[Event] = (),
     lost_s: tuple[float, float] = (np.inf, np.inf),
     target_um: Callable[[float], float] = lambda time_s: 0.0,
+    true_pump: PumpConfig = PumpConfig(),  # noqa: B008 (frozen)
 ) -> Held:
-    """Hold the simulated mirror; `lost_s` is a span without readings."""
-    plant, controller = Plant(twin, PumpConfig(), events), InnerLoop(loop, PumpConfig())
+    """Hold the simulated mirror; `lost_s` is a span without readings, `true_pump` one the loop does not know of."""
+    plant, controller = Plant(twin, true_pump, events), InnerLoop(loop, PumpConfig())
     dt_s = 1 / loop.rate_hz
     controller.start(plant.sample().displacement_um, plant.truth().leak_um_per_s)
     rows = []
@@ -76,7 +77,7 @@ def hold(
 def _configs(sensors: str, scenario: str, seed: int, **twin: Any) -> tuple[LoopConfig, TwinConfig]:
     barometer, thermometer = SENSORS[sensors]
     loop = LoopConfig(feedforward_barometer=barometer, feedforward_temperature=thermometer)
-    return loop, TwinConfig(**({"scenario": scenario, "seed": seed, "start_error_um": 0.0} | twin))
+    return loop, TwinConfig.model_validate({"scenario": scenario, "seed": seed, "start_error_um": 0.0} | twin)
 
 
 def steady(sensors: str, scenario: str, seeds: Sequence[int], duration_s: float, **twin: Any) -> dict[str, float]:

@@ -59,7 +59,7 @@ class LoopOutput:
     pump_fraction : float
         Command, 0..1.
     saturated : bool
-        Range or rate took something away.
+        More was wanted than the pump has, or less than nothing.
     leak_um_per_s : float
         Estimated loss of gas, NaN until there is an estimate.
     too_tight : bool
@@ -239,7 +239,7 @@ class InnerLoop:
             flow_wanted_um_per_s=wanted,
             flow_um_per_s=self._curve.flow(fraction),
             pump_fraction=fraction,
-            saturated=abs(self._limiter.flow_um_per_s - wanted) > 1e-9,
+            saturated=not 0.0 <= wanted <= self._limiter.flow_max_um_per_s,
             leak_um_per_s=self._leak.leak_um_per_s,
             too_tight=self._leak.too_tight,
         )
