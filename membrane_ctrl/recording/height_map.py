@@ -1,12 +1,15 @@
-"""Maps of a shape estimate for the timeline: height, difference to the first map, 1-sigma uncertainty."""
+"""Maps of a shape estimate for the timeline: height, difference to the first, 1-sigma uncertainty."""
 
 from __future__ import annotations
 
-from functools import lru_cache
-from math import factorial, sqrt
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+
+from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.metrology import zernike
+from membrane_ctrl.metrology.surface import Surface
 
 Map = NDArray[np.float32]
 
@@ -14,78 +17,61 @@ Map = NDArray[np.float32]
 MAP_PX = 128
 
 
-def height_map_mm(coeffs_um: NDArray[np.float64], n_px: int = MAP_PX) -> Map:
-    """Height over the disc, from the vertex.
-
-    Parameters
-    ----------
-    coeffs_um : (36,) array
-        Noll j = 1..36 over the mirror's radius.
+def height_map_mm(estimate: ShapeEstimate) -> Map:
+    """Height over the mirror's disc, from the vertex.
 
     Returns
     -------
-    (n_px, n_px) float32
+    (MAP_PX, MAP_PX) float32
         mm; row 0 on top (+y), NaN outside the disc.
     """
-    return _spread(_basis(n_px) @ coeffs_um * 1e-3, n_px)
+    return _spread(_surface(estimate).height(*_points()))
 
 
-def difference_map_um(coeffs_um: NDArray[np.float64], reference_um: NDArray[np.float64], n_px: int = MAP_PX) -> Map:
-    """Height now minus height of the reference, both from their vertex; um, as `height_map_mm`."""
-    return _spread(_basis(n_px) @ (coeffs_um - reference_um), n_px)
+def difference_map_um(estimate: ShapeEstimate, reference: ShapeEstimate) -> Map:
+    """Height now minus height of the reference, each from its own vertex; um, as `height_map_mm`."""
+    now, before = _surface(estimate), _surface(reference)
+    change = Surface(now.coeffs_mm - before.coeffs_mm, now.hencky_mm - before.hencky_mm, 1.0)
+    return _spread(change.height(*_points()) * 1e3)
 
 
-def uncertainty_map_um(covariance_um2: NDArray[np.float64], n_px: int = MAP_PX) -> Map:
-    """One standard deviation of the height: sqrt of z C z' for each point's row z of basis values; um."""
-    basis = _basis(n_px)
-    variance = np.einsum("ij,ij->i", basis @ covariance_um2, basis)
-    return _spread(np.sqrt(np.maximum(variance, 0.0)), n_px)
+def uncertainty_map_um(covariance_um2: NDArray[np.float64]) -> Map:
+    """One standard deviation of the height, um: sqrt of z C z' with the row z of the 36 terms at each point."""
+    terms = zernike.values(*_points())
+    variance = np.einsum("jp,jp->p", terms, covariance_um2 @ terms)
+    return _spread(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def outside_disc(n_px: int = MAP_PX) -> NDArray[np.uint8]:
-    """1 where a map has no value, (n_px, n_px)."""
-    return (~_inside(n_px)).astype(np.uint8)
+def outside_disc() -> NDArray[np.uint8]:
+    """1 where a map has no value, (MAP_PX, MAP_PX)."""
+    return (~_inside()).astype(np.uint8)
 
 
-def _spread(values: NDArray[np.float64], n_px: int) -> Map:
-    picture = np.full((n_px, n_px), np.nan, dtype=np.float32)
-    picture[_inside(n_px)] = values
+def _surface(estimate: ShapeEstimate) -> Surface:
+    """Over the unit disc: a map does not ask how large the mirror is."""
+    return Surface(estimate.coeffs_um * 1e-3, estimate.hencky_um * 1e-3, 1.0)
+
+
+def _spread(values: NDArray[np.float64]) -> Map:
+    picture = np.full((MAP_PX, MAP_PX), np.nan, dtype=np.float32)
+    picture[_inside()] = values
     return picture
 
 
-@lru_cache(maxsize=2)
-def _axis(n_px: int) -> NDArray[np.float64]:
-    return (np.arange(n_px) + 0.5) * 2 / n_px - 1
+@cache
+def _inside() -> NDArray[np.bool_]:
+    x, y = _grid()
+    return np.asarray(np.hypot(x, y) <= 1.0)
 
 
-@lru_cache(maxsize=2)
-def _inside(n_px: int) -> NDArray[np.bool_]:
-    x = _axis(n_px)
-    return np.asarray(np.hypot(x[np.newaxis, :], x[::-1, np.newaxis]) <= 1.0)
+@cache
+def _points() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    x, y = _grid()
+    return x[_inside()], y[_inside()]
 
 
-@lru_cache(maxsize=2)
-def _basis(n_px: int) -> NDArray[np.float64]:
-    """(points inside, 36) values of Noll j = 1..36."""
-    axis = _axis(n_px)
-    x, y = np.meshgrid(axis, axis[::-1])
-    inside = _inside(n_px)
-    rho, theta = np.hypot(x, y)[inside], np.arctan2(y, x)[inside]
-    return np.stack([_noll(j, rho, theta) for j in range(1, 37)], axis=1)
-
-
-def _noll(j: int, rho: NDArray[np.float64], theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    n = 0
-    while (n + 1) * (n + 2) // 2 < j:
-        n += 1
-    rest = j - n * (n + 1) // 2 - 1
-    m = 2 * ((rest + 1) // 2) if n % 2 == 0 else 2 * (rest // 2) + 1
-    radial = sum(
-        (-1) ** k
-        * factorial(n - k)
-        / (factorial(k) * factorial((n + m) // 2 - k) * factorial((n - m) // 2 - k))
-        * rho ** (n - 2 * k)
-        for k in range((n - m) // 2 + 1)
-    )
-    angular = 1.0 if m == 0 else sqrt(2) * (np.cos(m * theta) if j % 2 == 0 else np.sin(m * theta))
-    return np.asarray(sqrt(n + 1) * radial * angular)
+def _grid() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixel centres on the unit disc's square."""
+    axis = (np.arange(MAP_PX) + 0.5) * 2 / MAP_PX - 1
+    x, y = np.meshgrid(axis, -axis)
+    return x, y

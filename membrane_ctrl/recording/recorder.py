@@ -175,7 +175,7 @@ class Recorder:
         """Last drain, close the recording with its footer, write `summary.json`."""
         self.drain()
         self.write()
-        self._recording.close()
+        self._guarded("recording", self._recording.close)
         dropped = {name: ring.dropped for name, ring in self._rings.items()}
         account = {
             "segments": self._recording.segments,
@@ -192,7 +192,7 @@ class Recorder:
         """Do it; what goes wrong is reported, and the rest of the recorder goes on."""
         try:
             action()
-        except OSError as error:
+        except (OSError, RecordingError) as error:
             self._complain(what, f"{what}: {error}")
         except Exception as error:
             place = traceback.extract_tb(error.__traceback__)[-1]

@@ -71,13 +71,13 @@ class ShapeStreams:
         time_s = estimate.time_s
         if time_s >= self._next_map_s:
             self._next_map_s = time_s + MAP_INTERVAL_S
-            height_mm = height_map_mm(estimate.coeffs_um)
+            height_mm = height_map_mm(estimate)
             sigma_um = uncertainty_map_um(estimate.covariance_um2)
             self._send_map("height", time_s, height_mm, "mm", _span(height_mm))
             self._send_map("uncertainty", time_s, sigma_um, "um, 1 sigma", (0.0, _span(sigma_um)[1]))
         if time_s >= self._next_difference_s:
             self._next_difference_s = time_s + DIFFERENCE_INTERVAL_S
-            difference_um = difference_map_um(estimate.coeffs_um, reference.coeffs_um)
+            difference_um = difference_map_um(estimate, reference)
             most_um = max(_DIFFERENCE_LEAST_UM, *(abs(end) for end in _span(difference_um)))
             self._send_map("difference", time_s, difference_um, "um", (-most_um, most_um))
             legend = _legend(estimate, self._colours)

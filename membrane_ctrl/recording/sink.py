@@ -8,12 +8,14 @@ recording in the viewer.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+from rerun.chunk import RrdReader
 
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
@@ -63,6 +65,7 @@ class Recording:
         self._origin = np.datetime64(clock.origin_utc.replace(tzinfo=None), "ns")
         self._config = config
         self._stream = rr.RecordingStream(APPLICATION, recording_id=run_dir.name)
+        self._path: Path | None = None
         self.segments = 0
 
     def next_segment(self) -> None:
@@ -75,6 +78,7 @@ class Recording:
         except (RuntimeError, OSError) as error:
             path.unlink(missing_ok=True)
             raise RecordingError(f"{path}: {error}") from None
+        self._path = path
         self.segments += 1
 
     def _send_statics(self) -> None:
@@ -125,8 +129,27 @@ class Recording:
             raise RecordingError(str(error)) from None
 
     def close(self) -> None:
-        """Write the footer and close the file."""
+        """Write the footer and close the file.
+
+        Raises
+        ------
+        RecordingError
+            If the file has no footer: then it is slow to open, and its last second may be missing.
+        """
         self._stream.disconnect()
+        if self._path is not None and not _is_whole(self._path):
+            raise RecordingError(f"{self._path}: closed without its footer; `rerun rrd optimize` mends it")
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a closed file has its footer: `disconnect` does not say."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the reader's own way to say that there is none
+        try:
+            RrdReader(path).store()
+        except (RuntimeError, ValueError, OSError):
+            return False
+    return True
 
 
 def _style(stream: Stream) -> rr.SeriesLines:

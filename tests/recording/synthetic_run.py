@@ -2,44 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields
 from datetime import UTC, datetime
 
 import numpy as np
-import pytest
 
-from membrane_ctrl.clock import RunClock
-from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.estimate import ShapeEstimate, Verdict
 from membrane_ctrl.names import Rung, ShapeState, State
 from membrane_ctrl.telemetry import TelemetryRow
 
 RATE_HZ = 50.0
 STARTED_UTC = datetime(2026, 11, 21, 1, 23, 45, tzinfo=UTC)
 
-MakeRows = Callable[..., list[TelemetryRow]]
-MakeShape = Callable[..., ShapeEstimate]
 
-
-@pytest.fixture
-def clock() -> RunClock:
-    """A clock whose run starts now."""
-    return RunClock.start()
-
-
-@pytest.fixture
-def make_rows() -> MakeRows:
-    """`make_rows(seconds, seed=0, truth=True)`: standby 1 s, settle to 6 s, then hold at target 10 um."""
-    return _rows
-
-
-@pytest.fixture
-def make_shape() -> MakeShape:
-    """`make_shape(time_s, cycle, verdict="ok", seed=0)`: a bowl 37 mm deep with a slowly growing astigmatism."""
-    return _shape
-
-
-def _rows(seconds: float, seed: int = 0, truth: bool = True) -> list[TelemetryRow]:
+def rows_of(seconds: float, seed: int = 0, truth: bool = True) -> list[TelemetryRow]:
+    """Standby for 1 s, settle until 6 s, then hold at a target of 10 um."""
     rng = np.random.default_rng(seed)
     return [_row(k, rng, truth) for k in range(round(seconds * RATE_HZ))]
 
@@ -87,7 +64,8 @@ def _row(k: int, rng: np.random.Generator, truth: bool) -> TelemetryRow:
     return TelemetryRow(**values)
 
 
-def _shape(time_s: float, cycle: int, verdict: str = "ok", seed: int = 0) -> ShapeEstimate:
+def shape_of(time_s: float, cycle: int, verdict: Verdict = "ok", seed: int = 0) -> ShapeEstimate:
+    """A paraboloid 37 mm deep with an astigmatism that grows by 0.02 um/s."""
     rng = np.random.default_rng(seed + cycle)
     coeffs_um = np.zeros(36)
     # a paraboloid of 37 mm sag, 0 at the vertex: sag rho^2 = sag (Z4 / sqrt(3) + 1) / 2
@@ -98,7 +76,7 @@ def _shape(time_s: float, cycle: int, verdict: str = "ok", seed: int = 0) -> Sha
         time_s=time_s,
         kind="full" if cycle == 0 else "fringes",
         coeffs_um=coeffs_um,
-        hencky_um=37_000.0,
+        hencky_um=0.0,
         covariance_um2=np.diag(np.linspace(0.02, 0.005, 36) ** 2),
         sag_um=37_000.0 + 0.1 * rng.normal(),
         sag_sigma_um=0.1,

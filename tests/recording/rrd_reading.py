@@ -1,0 +1,53 @@
+"""Reads a recording back."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+from rerun.chunk import RrdReader
+
+
+def scalars(path: Path, entity: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times in s of the run (n,) and values (n, m) of one entity, sorted by time."""
+    times, values = [], []
+    for chunk in RrdReader(path).stream().filter(content=entity):
+        batch = chunk.to_record_batch()
+        if "Scalars:scalars" in batch.schema.names and "run_time" in batch.schema.names:
+            times += nanoseconds(batch)
+            values += batch.column("Scalars:scalars").to_pylist()
+    order = np.argsort(np.array(times, dtype=np.int64), kind="stable")
+    return np.array(times, dtype=np.int64)[order] * 1e-9, np.array(values)[order]
+
+
+def nanoseconds(batch: object) -> list[int]:
+    """Ticks of the run's time axis."""
+    return batch.column("run_time").cast("int64").to_pylist()  # type: ignore[attr-defined]
+
+
+def strings(path: Path, entity: str, component: str) -> list[tuple[float, str]]:
+    """(time in s, text) of a text component, sorted by time."""
+    found = []
+    for chunk in RrdReader(path).stream().filter(content=entity):
+        batch = chunk.to_record_batch()
+        if component in batch.schema.names and "run_time" in batch.schema.names:
+            texts = [cell[0] for cell in batch.column(component).to_pylist()]
+            found += list(zip((tick * 1e-9 for tick in nanoseconds(batch)), texts, strict=True))
+    return sorted(found)
+
+
+def entities(path: Path) -> set[str]:
+    """Paths of all entities with data."""
+    return {chunk.entity_path for chunk in RrdReader(path).stream()}
+
+
+def has_footer(path: Path) -> bool:
+    """Whether the file was closed in order."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            RrdReader(path).store()
+        except (RuntimeError, ValueError):
+            return False
+    return True
