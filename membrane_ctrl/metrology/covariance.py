@@ -64,5 +64,4 @@ def parameter_covariance(fit: Fit, slope_variance: FloatArray) -> FloatArray:
     seen = np.array([fit.residual_x**2, fit.residual_y**2]) * fit.weight_sum / free
     variance_x, variance_y = np.maximum(slope_variance, seen)
     normal = fit.normal
-    inverse = normal.solve(np.eye(PARAMETERS))
-    return np.asarray(inverse @ (variance_x * normal.x + variance_y * normal.y) @ inverse)
+    return np.asarray(normal.inverse @ (variance_x * normal.x + variance_y * normal.y) @ normal.inverse)

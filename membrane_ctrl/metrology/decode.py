@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from membrane_ctrl.config import PatternConfig
 from membrane_ctrl.metrology.patterns import GRAY_BITS
 from membrane_ctrl.metrology.phase import equal_shifts, modulation, phasors, wrapped_phase
-from membrane_ctrl.metrology.unwrap import absolute_phase, gray_orders, inside_pattern, relative_to_centre
+from membrane_ctrl.metrology.unwrap import absolute_phase, gray_orders, inside_pattern
 
 FloatArray = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class Decoded:
     Attributes
     ----------
     phase_rad : (2, ...) array
-        x and y, relative to O'; NaN where not valid.
+        x and y, counted from the low edge's -pi (see `unwrap`); NaN where not valid.
     modulation_adu : (2, ...) array
         Fringe amplitude.
     valid : (...) bool array
@@ -88,11 +88,11 @@ def decode_full(images: FloatArray, pattern: PatternConfig) -> Decoded:
     for sinusoids, gray in zip(slots.sinusoids, slots.gray, strict=True):
         z = phasors(images[sinusoids], equal_shifts(pattern.steps))
         k1, k2 = gray_orders(images[gray], white, black)
-        centred = relative_to_centre(absolute_phase(wrapped_phase(z), k1, k2), pattern)
+        phase = absolute_phase(wrapped_phase(z), k1, k2)
         swing = modulation(z)
-        valid &= (swing > FRINGE_SHARE * contrast) & inside_pattern(centred, pattern)
-        phases.append(centred)
+        valid &= (swing > FRINGE_SHARE * contrast) & inside_pattern(phase, pattern)
+        phases.append(phase)
         swings.append(swing)
-    phase = np.stack(phases)
-    phase[:, ~valid] = np.nan
-    return Decoded(phase, np.stack(swings), valid)
+    absolute = np.stack(phases)
+    absolute[:, ~valid] = np.nan
+    return Decoded(absolute, np.stack(swings), valid)

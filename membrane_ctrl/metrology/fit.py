@@ -13,7 +13,7 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from membrane_ctrl.metrology import kernels
 from membrane_ctrl.metrology.surface import PARAMETERS
@@ -43,31 +43,34 @@ def _product_index() -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class NormalMatrix:
-    """D^T W D, apart for x and y slopes, and its factor.
+    """D^T W D, apart for x and y slopes, and its inverse.
 
     Attributes
     ----------
     x, y : (36, 36) arrays
         Shares of the x and of the y slopes, in 1/mm^2 times weight.
+    inverse : (36, 36) array
+        Of their sum. Kept because a product with it takes microseconds, where a call of the solver may wait for the
+        library's threads; the condition number is below 1000, and what rounding is left the next step takes out.
     """
 
     x: FloatArray
     y: FloatArray
-    factor: tuple[FloatArray, bool]
+    inverse: FloatArray
 
     @classmethod
     def from_products(cls, products: FloatArray, radius_mm: float) -> NormalMatrix:
         """From the moments of `kernels.product_sums`. Raises ValueError if the points do not determine a surface."""
         x, y = _assemble(products, radius_mm)
         try:
-            factor = cho_factor(x + y, lower=True)
-        except np.linalg.LinAlgError:
+            inverse = cho_solve(cho_factor(x + y), np.eye(PARAMETERS))
+        except LinAlgError:
             raise ValueError("the measured points do not determine the 36 parameters of the surface") from None
-        return cls(x, y, factor)
+        return cls(x, y, np.asarray(inverse))
 
     def solve(self, right: FloatArray) -> FloatArray:
         """(D^T W D)^-1 times `right`."""
-        return np.asarray(cho_solve(self.factor, right))
+        return np.asarray(self.inverse @ right)
 
     def condition(self) -> float:
         """Condition number of D^T W D."""

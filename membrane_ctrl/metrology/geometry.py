@@ -87,11 +87,9 @@ class Geometry:
 
     def screen_points(self, screen_mm: FloatArray) -> FloatArray:
         """World points (3, ...) of screen coordinates (2, ...) in mm from O'."""
-        return (
-            np.multiply.outer(self.screen_s_x, screen_mm[0])
-            + np.multiply.outer(self.screen_s_y, screen_mm[1])
-            + self.screen_origin_mm.reshape(3, *[1] * (screen_mm.ndim - 1))
-        )
+        origin = self.screen_origin_mm.reshape(3, *[1] * (screen_mm.ndim - 1))
+        across = np.multiply.outer(self.screen_s_x, screen_mm[0]) + np.multiply.outer(self.screen_s_y, screen_mm[1])
+        return np.asarray(origin + across)
 
 
 def _poses(config: GeometryConfig) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -118,5 +116,6 @@ def _undistort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> t
     """Normalised pinhole coordinates of distorted ones; iterated until the last digit stands still."""
     points = np.stack([x.ravel(), y.ravel()], axis=1)[:, None, :]
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-15)
-    straight = cv2.undistortPoints(points, np.eye(3), np.array(distortion), None, None, None, criteria)
+    solved = cv2.undistortPoints(points, np.eye(3), np.array(distortion), None, None, None, criteria)
+    straight: FloatArray = np.asarray(solved, np.float64)
     return straight[:, 0, 0].reshape(x.shape), straight[:, 0, 1].reshape(x.shape)

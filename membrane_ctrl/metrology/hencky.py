@@ -87,9 +87,9 @@ def excess() -> FloatArray:
 @cache
 def excess_rms() -> float:
     """RMS over the disc of the excess of a bowl of unit sag."""
-    degrees = np.arange(EXCESS_TERMS)
-    tail = profile_legendre().coef ** 2 / (2 * degrees + 1)
-    return float(np.sqrt(np.sum(np.delete(tail, list(_CARRIED)))))
+    coef: FloatArray = np.asarray(profile_legendre().coef).astype(np.float64)
+    squares = coef**2 / (2 * np.arange(EXCESS_TERMS) + 1)
+    return float(np.sqrt(np.sum(np.delete(squares, list(_CARRIED)))))
 
 
 def profile(rho: FloatArray) -> FloatArray:

@@ -7,11 +7,20 @@ from typing import Any
 
 from numba import njit
 
+# Sums may be reordered, which vector units need; NaN and infinity keep their meaning.
+_OPTIONS: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"reassoc", "contract", "nsz", "arcp"},
+}
+
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile a loop; the result is cached on disk and runs without the interpreter lock.
+    """Compile a loop; the result is cached on disk and runs without the interpreter lock."""
+    return njit(**_OPTIONS)(function)
 
-    Sums may be reordered, which vector units need; NaN and infinity keep their meaning.
-    """
-    fast = {"reassoc", "contract", "nsz", "arcp"}
-    return njit(cache=True, nogil=True, error_model="numpy", fastmath=fast)(function)
+
+def step(function: Callable[..., Any]) -> Any:
+    """Compile what a loop does to one point. Inlined by force: a loop with a call in it uses no vector units."""
+    return njit(forceinline=True, **_OPTIONS)(function)

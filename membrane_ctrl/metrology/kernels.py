@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from membrane_ctrl.metrology.hencky import EXCESS_TERMS
-from membrane_ctrl.metrology.jit import kernel
+from membrane_ctrl.metrology.jit import kernel, step
 from membrane_ctrl.metrology.zernike import DEGREE
 
 _BLOCK = 256  # points whose intermediate values stay in the first-level cache
@@ -28,7 +28,7 @@ PRODUCT_MONOMIALS = (PRODUCT_DEGREE + 1) * (PRODUCT_DEGREE + 2) // 2  # p + q <=
 PRODUCTS = PRODUCT_MONOMIALS + 2 * SLOPE_MONOMIALS + 2
 
 
-@kernel
+@step
 def evaluate(poly, excess, amplitude, x, y):  # type: ignore[no-untyped-def]
     """Height, dh/dx, dh/dy and the excess' own d/dv at a point in radii (Horner's rule in x and y)."""
     h = 0.0
@@ -53,22 +53,40 @@ def evaluate(poly, excess, amplitude, x, y):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def intersect(rays, t, pinhole, poly, excess, amplitude, radius, vertex_z, newton, start, stop):  # type: ignore[no-untyped-def]
-    """Newton steps on F_z + t d_z = vertex_z + h(x, y), in place in `t`.
-
-    The derivative along the ray is d_z - h_x d_x - h_y d_y: never 0 for a ray that is steeper than the film.
-    """
-    for _ in range(newton):
-        for p in range(start, stop):
-            dx, dy, dz = rays[0, p], rays[1, p], rays[2, p]
-            x = (pinhole[0] + t[p] * dx) / radius
-            y = (pinhole[1] + t[p] * dy) / radius
-            h, hx, hy, _ev = evaluate(poly, excess, amplitude, x, y)
-            above = pinhole[2] + t[p] * dz - vertex_z - h
-            t[p] -= above / (dz - (hx * dx + hy * dy) / radius)
+def _load(rays, t, first, count, block):  # type: ignore[no-untyped-def]
+    for p in range(count):
+        block[0, p] = rays[0, first + p]
+        block[1, p] = rays[1, first + p]
+        block[2, p] = rays[2, first + p]
+        block[3, p] = t[first + p]
 
 
 @kernel
+def _newton(block, count, pinhole, poly, excess, amplitude, radius, vertex_z):  # type: ignore[no-untyped-def]
+    """One Newton step on F_z + t d_z = vertex_z + h(x, y); rows of `block` are d_x, d_y, d_z, t.
+
+    The derivative along the ray is d_z - h_x d_x - h_y d_y: never 0 for a ray that is steeper than the film.
+    """
+    fx, fy, fz = pinhole[0], pinhole[1], pinhole[2]
+    for p in range(count):
+        dx, dy, dz, t = block[0, p], block[1, p], block[2, p], block[3, p]
+        h, hx, hy, _ev = evaluate(poly, excess, amplitude, (fx + t * dx) / radius, (fy + t * dy) / radius)
+        block[3, p] = t - (fz + t * dz - vertex_z - h) / (dz - (hx * dx + hy * dy) / radius)
+
+
+@kernel
+def intersect(rays, t, pinhole, poly, excess, amplitude, radius, vertex_z, newton, start, stop):  # type: ignore[no-untyped-def]
+    """Newton steps towards the surface, in place in `t`."""
+    block = np.empty((4, _BLOCK))
+    for first in range(start, stop, _BLOCK):
+        count = min(_BLOCK, stop - first)
+        _load(rays, t, first, count, block)
+        for _ in range(newton):
+            _newton(block, count, pinhole, poly, excess, amplitude, radius, vertex_z)
+        t[first : first + count] = block[3, :count]
+
+
+@step
 def bisector(dx, dy, dz, qx, qy, qz):  # type: ignore[no-untyped-def]
     """Slopes of the mirror that turns the ray d towards q: its normal halves the angle between -d and q."""
     scale = 1 / math.sqrt(qx * qx + qy * qy + qz * qz)
@@ -76,7 +94,7 @@ def bisector(dx, dy, dz, qx, qy, qz):  # type: ignore[no-untyped-def]
     return -(qx * scale - dx) / nz, -(qy * scale - dy) / nz
 
 
-@kernel
+@step
 def measured_slope(rays, t, screen, pinhole, plane, p):  # type: ignore[no-untyped-def]
     """x, y and both measured slopes at point p, from exact vectors."""
     dx, dy, dz = rays[0, p], rays[1, p], rays[2, p]

@@ -22,12 +22,13 @@ from membrane_ctrl.metrology.covariance import parameter_covariance, pixel_sigma
 from membrane_ctrl.metrology.decode import FRINGE_SHARE, FullSlots, decode_full
 from membrane_ctrl.metrology.geometry import Geometry
 from membrane_ctrl.metrology.motion import combine_steps, worth_correcting
-from membrane_ctrl.metrology.phase import equal_shifts, phase_sigma_rad
+from membrane_ctrl.metrology.phase import equal_shifts, phase_sigma_rad, step_weights
 from membrane_ctrl.metrology.phasor import Binner, Image, track
 from membrane_ctrl.metrology.quality import Quality, judge
 from membrane_ctrl.metrology.reconstruct import Fit, Tracer, solve
 from membrane_ctrl.metrology.surface import Surface, parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.tracking import TrackedPoints, establish
+from membrane_ctrl.metrology.unwrap import mm_per_rad
 from membrane_ctrl.metrology.zernike import TERMS
 
 FloatArray = NDArray[np.float64]
@@ -60,13 +61,14 @@ class LiveReconstructor:
         self._bin_px = bin_px
         self._laser_noise_um = laser_noise_um
         self._shifts_rad = equal_shifts(optics.pattern.steps)
+        self._weights = step_weights(self._shifts_rad)
         self._slots = FullSlots(optics.pattern.steps)
         self._full_scale_adu = 2**optics.camera.bits - 1
         size = (optics.camera.height_px, optics.camera.width_px)
         self._binner = Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
         self._grid = BinGrid(self._geometry, optics.camera, bin_px)
         self._reference_um = optics.geometry.reference_displacement_um
-        self._mm_per_rad = optics.pattern.period_mm / (2 * math.pi)
+        self._mm_per_rad = mm_per_rad(optics.pattern)
         self._pixel_sigma_adu = pixel_sigma_adu(optics.camera.noise_adu)
         self._tracked: TrackedPoints | None = None
 
@@ -91,19 +93,19 @@ class LiveReconstructor:
             For a wrong number, size or type of frames.
         """
         times, readings = _per_frame(frames, time_s, displacement_um, self._slots.count, "full")
-        sinusoids = np.r_[self._slots.sinusoids]
+        sinusoids = np.r_[self._slots.sinusoids].tolist()
         if self._reference_um is None and np.isfinite(readings[0]):
             self._reference_um = float(readings[0])
         self._binner.clear()
-        for slot, frame in enumerate(frames):
-            self._binner.add(frame, slot, watch_saturation=slot in sinusoids)
+        self._binner.add(frames, range(len(frames)), watched=sinusoids)
         decoded = decode_full(self._binner.sums / self._bin_px**2, self._optics.pattern)
         phase_rad = np.where(self._binner.saturated > 0, np.nan, decoded.phase_rad).reshape(2, -1)
         times, readings = times[sinusoids], readings[sinusoids]
         self._tracked = None  # until this cycle is accepted
-        analysis_mm = self._optics.mirror.analysis_radius_mm
+        optics = self._optics
+        analysis_mm = optics.mirror.analysis_radius_mm
         try:
-            state = establish(self._grid, self._tracer(readings), phase_rad, self._mm_per_rad, analysis_mm)
+            state = establish(self._grid, self._tracer(readings), phase_rad, optics.pattern, analysis_mm)
         except ValueError as error:
             return _rejected("full", times, readings, str(error))
         return self._follow("full", state, times, readings)
@@ -113,14 +115,11 @@ class LiveReconstructor:
 
         Verdict "rejected" with a reason that starts with "tracking lost" asks for a full cycle.
         """
-        steps = self._slots.steps
-        times, readings = _per_frame(frames, time_s, displacement_um, 2 * steps, "fringes")
+        times, readings = _per_frame(frames, time_s, displacement_um, 2 * self._slots.steps, "fringes")
         if self._tracked is None:
             return _rejected("fringes", times, readings, "tracking lost: no accepted full cycle to follow")
         self._binner.clear()
-        for axis, slots in enumerate(self._slots.sinusoids):
-            for k in range(steps):
-                self._binner.add(frames[axis * steps + k], slots.start + k)
+        self._binner.add(frames, np.r_[self._slots.sinusoids].tolist())
         return self._follow("fringes", self._tracked, times, readings)
 
     def height_map(
@@ -177,26 +176,21 @@ class LiveReconstructor:
 
     def _track_phases(self, state: TrackedPoints, readings: FloatArray) -> None:
         """Fresh phases from the bin sums, with the film's motion between the frames taken out."""
-        motion_um = None
-        if worth_correcting(readings, self._laser_noise_um):
-            motion_um = readings - np.mean(readings)
+        moved = worth_correcting(readings, self._laser_noise_um)
+        motion_um = np.reshape(readings - np.mean(readings), (2, -1)) if moved else None
         steps = self._slots.steps
+        sums, combined = [], []
         for axis, slots in enumerate(self._slots.sinusoids):
-            part = None if motion_um is None else motion_um[axis * steps : (axis + 1) * steps]
-            track(
-                self._binner.sums[slots].reshape(steps, -1),
-                state.index,
-                combine_steps(self._shifts_rad, self._bin_px, part),
-                state.sensitivity_rad_per_um[axis],
-                state.accepted[axis],
-                state.fresh[axis],
-            )
+            sums.append(self._binner.sums[slots].reshape(steps, -1))
+            part = None if motion_um is None else motion_um[axis]
+            combined.append(combine_steps(self._weights, self._shifts_rad, self._bin_px, part))
+        track(sums, state.index, combined, state.sensitivity_rad_per_um, state.accepted, state.fresh)
 
     def _fit(self, state: TrackedPoints, usable: NDArray[np.bool_], readings: FloatArray) -> Fit:
         """One or two steps from the last surface; the full cycle's normal matrix while its points are there."""
         state.points.weights[:] = usable
         np.multiply(state.fresh[:, 0], self._mm_per_rad, out=state.points.screen_mm)
-        state.points.screen_mm -= state.bias_mm
+        state.points.screen_mm -= state.offset_mm
         complete = np.count_nonzero(usable) > MATRIX_KEPT_SHARE * usable.size
         normal = state.normal if complete else None
         return solve(self._tracer(readings), state.points, state.surface, normal=normal)

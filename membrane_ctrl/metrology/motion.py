@@ -17,7 +17,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.metrology.phase import step_weights
 from membrane_ctrl.metrology.phasor import StepCombination
 from membrane_ctrl.metrology.reconstruct import Points, Tracer
 from membrane_ctrl.metrology.surface import Surface
@@ -25,15 +24,25 @@ from membrane_ctrl.metrology.surface import Surface
 FloatArray = NDArray[np.float64]
 
 
-def combine_steps(shifts_rad: FloatArray, bin_px: int, motion_um: FloatArray | None = None) -> StepCombination:
-    """Weights of the frames of one axis for bins of `bin_px`, with motion relative to one d0 if it is known."""
-    _, cosine, sine = step_weights(shifts_rad)
+def combine_steps(
+    weights: FloatArray, shifts_rad: FloatArray, bin_px: int, motion_um: FloatArray | None = None
+) -> StepCombination:
+    """How the frames of one axis combine, for bin sums.
+
+    Parameters
+    ----------
+    weights : (3, N) array
+        `phase.step_weights(shifts_rad)`.
+    motion_um : (N,) array, optional
+        Displacement of each frame relative to one d0 for both axes.
+    """
+    _, cosine, sine = weights / bin_px**2
     if motion_um is None:
-        return StepCombination(cosine / bin_px**2, sine / bin_px**2)
-    weights = (cosine + 1j * sine) * motion_um / 2
-    turn = complex(weights @ np.exp(1j * shifts_rad))
-    mirror = complex(weights @ np.exp(-1j * shifts_rad))
-    return StepCombination(cosine / bin_px**2, sine / bin_px**2, turn, mirror)
+        return StepCombination(cosine, sine)
+    # of a phasor per pixel: the bin's area cancels
+    moved = (weights[1] + 1j * weights[2]) * motion_um / 2
+    turn, mirror = (complex(moved @ np.exp(sign * 1j * shifts_rad)) for sign in (1, -1))
+    return StepCombination(cosine, sine, turn, mirror)
 
 
 def worth_correcting(displacement_um: FloatArray, noise_um: float) -> bool:

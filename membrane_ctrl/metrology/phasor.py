@@ -8,12 +8,13 @@ is lost by 4 x 4 bins. Colour filters do no harm: a pixel's gain scales its phas
 from __future__ import annotations
 
 import math
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.metrology.jit import kernel
+from membrane_ctrl.metrology.jit import kernel, step
 from membrane_ctrl.metrology.threads import split
 
 FloatArray = NDArray[np.float64]
@@ -24,29 +25,70 @@ _NEVER = np.uint32(2**32 - 1)  # above any pixel
 FOLLOWED_ROWS = 5  # of `track`: absolute phase, its cosine and sine, change (rad), modulation (ADU)
 
 
+# One small loop a function: the compiler finds vector instructions for each of these, and for none of their union.
+
+
 @kernel
-def _bin_rows(frame, bin_px, full_scale, sums, saturated, start, stop):  # type: ignore[no-untyped-def]
-    """Sums and counts of saturated pixels of the bin rows [start, stop), into `sums` and onto `saturated`."""
-    width = sums.shape[1] * bin_px
-    line = np.empty(width, np.uint32)
-    hits = np.empty(width, np.uint32)
+def _add_lines(frame, first, last, line):  # type: ignore[no-untyped-def]
+    for c in range(line.size):
+        line[c] = frame[first, c]
+    for row in range(first + 1, last):
+        for c in range(line.size):
+            line[c] += frame[row, c]
+
+
+@kernel
+def _peak(frame, first, last, width):  # type: ignore[no-untyped-def]
+    top = frame[first, 0]
+    for row in range(first, last):
+        for c in range(width):
+            value = frame[row, c]
+            top = value if value > top else top
+    return top
+
+
+@kernel
+def _fold_four(line, quarter, size):  # type: ignore[no-untyped-def]
+    for c in range(size):
+        quarter[c] = line[4 * c] + line[4 * c + 1] + line[4 * c + 2] + line[4 * c + 3]
+
+
+@kernel
+def _fold(line, bin_px, out):  # type: ignore[no-untyped-def]
+    for b in range(out.size):
+        total = np.uint32(0)
+        for c in range(b * bin_px, b * bin_px + bin_px):
+            total += np.uint32(line[c])
+        out[b] = total
+
+
+@kernel
+def _count_saturated(frame, first, last, bin_px, full_scale, out):  # type: ignore[no-untyped-def]
+    for row in range(first, last):
+        for b in range(out.size):
+            for c in range(b * bin_px, b * bin_px + bin_px):
+                if frame[row, c] >= full_scale:
+                    out[b] += np.uint32(1)
+
+
+@kernel
+def _bin_rows(frame, bin_px, full_scale, line, sums, saturated, start, stop):  # type: ignore[no-untyped-def]
+    """Sums of the bin rows [start, stop) into `sums`; their saturated pixels are added to `saturated`.
+
+    `line` (2, width) is memory of a type that holds the sum of `bin_px` pixels.
+    """
+    width = line.shape[1]
     for row in range(start, stop):
-        for column in range(width):
-            line[column] = 0
-            hits[column] = 0
-        for k in range(row * bin_px, row * bin_px + bin_px):
-            for column in range(width):
-                value = np.uint32(frame[k, column])
-                line[column] += value
-                hits[column] += np.uint32(value >= full_scale)
-        for b in range(sums.shape[1]):
-            total = np.uint32(0)
-            hit = np.uint32(0)
-            for column in range(b * bin_px, b * bin_px + bin_px):
-                total += line[column]
-                hit += hits[column]
-            sums[row, b] = total
-            saturated[row, b] += hit
+        first, last = row * bin_px, row * bin_px + bin_px
+        _add_lines(frame, first, last, line[0])
+        if bin_px == 4:
+            _fold_four(line[0], line[1], sums.shape[1])
+            for b in range(sums.shape[1]):
+                sums[row, b] = line[1, b]
+        else:
+            _fold(line[0], bin_px, sums[row])
+        if _peak(frame, first, last, width) >= full_scale:
+            _count_saturated(frame, first, last, bin_px, full_scale, saturated[row])
 
 
 class Binner:
@@ -83,23 +125,37 @@ class Binner:
         """Forget the saturation counts, at the start of a cycle."""
         self.saturated[:] = 0
 
-    def add(self, frame: Image, slot: int, *, watch_saturation: bool = True) -> None:
-        """Sum one frame into a slot. Raises ValueError for a wrong size or type of pixel.
+    def add(self, frames: Sequence[Image], slots: Sequence[int], watched: Container[int] | None = None) -> None:
+        """Sum frames into slots.
 
-        Saturation is watched in sinusoids only: a white or Gray frame loses nothing by it.
+        Parameters
+        ----------
+        frames, slots : sequences of the same length
+            Frame k goes to slots[k].
+        watched : container of slots, optional
+            Only these are watched for saturation; all if not given. A white or Gray frame loses nothing by it.
+
+        Raises
+        ------
+        ValueError
+            For a frame of wrong size or type of pixel; nothing is summed then.
         """
-        if frame.shape != self._size:
-            raise ValueError(f"frame is {frame.shape[::-1]} pixels (width, height), not {self._size[::-1]}")
-        if frame.dtype not in (np.uint8, np.uint16):
-            raise ValueError(f"frame has {frame.dtype} pixels, not uint8 or uint16")
-        pixels = np.ascontiguousarray(frame)
-        sums = self.sums[slot]
-        full_scale = self._full_scale if watch_saturation else _NEVER
+        for frame in frames:
+            if frame.shape != self._size:
+                raise ValueError(f"frame is {frame.shape[::-1]} pixels (width, height), not {self._size[::-1]}")
+            if frame.dtype not in (np.uint8, np.uint16):
+                raise ValueError(f"frame has {frame.dtype} pixels, not uint8 or uint16")
+        limits = [self._full_scale if watched is None or slot in watched else _NEVER for slot in slots]
+        width = self.sums.shape[2] * self.bin_px
 
         def run(start: int, stop: int) -> None:
-            _bin_rows(pixels, self.bin_px, full_scale, sums, self.saturated, start, stop)
+            for frame, slot, limit in zip(frames, slots, limits, strict=True):
+                # 16 rows of 8 bits fit 16 bits
+                line = np.empty((2, width), np.uint16 if frame.dtype == np.uint8 else np.uint32)
+                pixels = np.ascontiguousarray(frame)
+                _bin_rows(pixels, self.bin_px, limit, line, self.sums[slot], self.saturated, start, stop)
 
-        split(run, sums.shape[0])
+        split(run, self.sums.shape[1])
 
 
 @dataclass(frozen=True)
@@ -120,7 +176,7 @@ class StepCombination:
     mirror: complex = 0j
 
 
-@kernel
+@step
 def arctan2(y, x):  # type: ignore[no-untyped-def]
     """Angle in [-pi, pi] without a branch, so that loops over it use vector units; (0, 0) gives 0.
 
@@ -142,61 +198,80 @@ def arctan2(y, x):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _combine(sums, index, weights, first, out):  # type: ignore[no-untyped-def]
+    """out[p] = sum over frames of weight times bin sum."""
+    for p in range(out.size):
+        out[p] = 0.0
+    for k in range(weights.size):
+        weight = weights[k]
+        for p in range(out.size):
+            out[p] += weight * sums[k, index[first + p]]
+
+
+@kernel
+def _still(c, s, slope, turn_real, turn_imag, mirror_real, mirror_imag):  # type: ignore[no-untyped-def]
+    """z - i q (turn z - mirror conj z) in place: the film's motion taken out to first order (see `motion`)."""
+    for p in range(c.size):
+        u = turn_real * c[p] - turn_imag * s[p] - mirror_real * c[p] - mirror_imag * s[p]
+        v = turn_real * s[p] + turn_imag * c[p] - mirror_imag * c[p] + mirror_real * s[p]
+        c[p], s[p] = c[p] + slope[p] * v, s[p] - slope[p] * u
+
+
+@kernel
+def _angle(c, s, last_cos, last_sin, change, size):  # type: ignore[no-untyped-def]
+    """Angle of c + is against the last phase, and its length; c + is is left with length 1."""
+    for p in range(c.size):
+        length = math.sqrt(c[p] * c[p] + s[p] * s[p])
+        scale = 1 / (length + 1e-300)
+        x, y = c[p] * scale, s[p] * scale
+        change[p] = arctan2(y * last_cos[p] - x * last_sin[p], x * last_cos[p] + y * last_sin[p])
+        size[p] = length
+        c[p] = x
+        s[p] = y
+
+
+@kernel
 def _track(sums, index, cosine, sine, turn, mirror, slope, last, out, start, stop):  # type: ignore[no-untyped-def]
-    """Phase of each point, counted from the last one."""
-    block = np.empty((2, _BLOCK))
+    """Phase of each point, counted from the last one, in blocks that stay in the first-level cache."""
     for first in range(start, stop, _BLOCK):
-        count = min(_BLOCK, stop - first)
-        for p in range(count):
-            block[0, p] = 0.0
-            block[1, p] = 0.0
-        for k in range(cosine.size):
-            for p in range(count):
-                value = float(sums[k, index[first + p]])
-                block[0, p] += cosine[k] * value
-                block[1, p] += sine[k] * value
-        for p in range(count):
-            n = first + p
-            c0, s0 = block[0, p], block[1, p]
-            # z - i q (turn z - mirror conj z), the film's motion taken out to first order
-            ur = turn.real * c0 - turn.imag * s0 - (mirror.real * c0 + mirror.imag * s0)
-            ui = turn.real * s0 + turn.imag * c0 - (mirror.imag * c0 - mirror.real * s0)
-            c = c0 + slope[n] * ui
-            s = s0 - slope[n] * ur
-            size = math.sqrt(c * c + s * s)
-            scale = 1 / (size + 1e-300)
-            change = arctan2(s * last[1, n] - c * last[2, n], c * last[1, n] + s * last[2, n])
-            out[0, n] = last[0, n] + change
-            out[1, n] = c * scale
-            out[2, n] = s * scale
-            out[3, n] = change
-            out[4, n] = size
+        end = min(first + _BLOCK, stop)
+        c, s = out[1, first:end], out[2, first:end]
+        _combine(sums, index, cosine, first, c)
+        _combine(sums, index, sine, first, s)
+        if turn != 0 or mirror != 0:
+            _still(c, s, slope[first:end], turn.real, turn.imag, mirror.real, mirror.imag)
+        _angle(c, s, last[1, first:end], last[2, first:end], out[3, first:end], out[4, first:end])
+        for p in range(first, end):
+            out[0, p] = last[0, p] + out[3, p]
 
 
 def track(
-    sums: NDArray[np.uint32],
+    sums: Sequence[NDArray[np.uint32]],
     index: NDArray[np.int64],
-    steps: StepCombination,
+    combined: Sequence[StepCombination],
     sensitivity_rad_per_um: FloatArray,
     last: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Phases of the points against their reference.
+    """Phases of the points against the last ones, for x and y.
 
     Parameters
     ----------
-    sums : (N, bins) uint32 array
-        Bin sums of the N frames of one axis.
+    sums : two (N, bins) uint32 arrays
+        Bin sums of the N frames of each axis.
     index : (n,) int array
         Bin of each point.
-    sensitivity_rad_per_um : (n,) array
+    combined : two StepCombination
+        How the frames of each axis combine.
+    sensitivity_rad_per_um : (2, n) array
         Change of phase per um of displacement.
-    last, out : (FOLLOWED_ROWS, n) arrays
+    last, out : (2, FOLLOWED_ROWS, n) arrays
         Rows of the cycle before, from which the change is counted (unambiguous below pi), and of this one.
     """
-    fixed = (sums, index, steps.cosine, steps.sine, steps.turn, steps.mirror, sensitivity_rad_per_um, last, out)
 
     def run(start: int, stop: int) -> None:
-        _track(*fixed, start, stop)
+        for k, steps in enumerate(combined):
+            weights = (steps.cosine, steps.sine, steps.turn, steps.mirror)
+            _track(sums[k], index, *weights, sensitivity_rad_per_um[k], last[k], out[k], start, stop)
 
     split(run, index.size)

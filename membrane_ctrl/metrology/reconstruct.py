@@ -123,15 +123,17 @@ class Tracer:
 
         split(run, points.t_mm.size)
 
-    def residual_sums(self, points: Points, surface: Surface) -> FloatArray:
-        """Moments of the slope residual (see `kernels.residual_sums`)."""
+    def residual_sums(self, points: Points, surface: Surface, newton: int = 0) -> FloatArray:
+        """Moments of the slope residual (see `kernels.residual_sums`), after Newton steps towards the surface."""
         shape = self._shape(surface)
 
         def run(start: int, stop: int) -> FloatArray:
-            fixed = (points.rays, points.t_mm, points.screen_mm, points.weights, self._pinhole, self._plane)
+            rays, t = points.rays, points.t_mm
+            kernels.intersect(rays, t, self._pinhole, *shape, self.vertex_z_mm, newton, start, stop)
+            fixed = (rays, t, points.screen_mm, points.weights, self._pinhole, self._plane)
             return np.asarray(kernels.residual_sums(*fixed, *shape, start, stop))
 
-        return np.sum(split(run, points.t_mm.size), axis=0)
+        return np.asarray(np.sum(split(run, points.t_mm.size), axis=0))
 
     def normal_matrix(self, points: Points) -> NormalMatrix:
         """D^T W D where the points stand."""
@@ -223,10 +225,8 @@ def solve(
     changes: list[float] = []
     step = None
     while len(changes) < max_iterations:
-        if not placed:
-            tracer.intersect(points, surface)
+        step = _step(tracer, points, surface, normal, newton=0 if placed else 1)
         placed = False
-        step = _step(tracer, points, surface, normal)
         surface = Surface.from_parameters(surface.parameters + step.delta, tracer.radius_mm)
         changes.append(float(np.max(np.abs(height_probe() @ step.delta))))
         if not changes[-1] * CONTRACTION > tolerance_mm:  # also ends on NaN
@@ -246,9 +246,9 @@ class _Step:
     delta: FloatArray
 
 
-def _step(tracer: Tracer, points: Points, surface: Surface, normal: NormalMatrix | None) -> _Step:
-    """One Gauss-Newton step where the points stand."""
+def _step(tracer: Tracer, points: Points, surface: Surface, normal: NormalMatrix | None, newton: int) -> _Step:
+    """One Gauss-Newton step, after moving the points onto the surface by Newton steps (0: where they stand)."""
+    sums = tracer.residual_sums(points, surface, newton)
     matrix = normal or tracer.normal_matrix(points)
-    sums = tracer.residual_sums(points, surface)
     right = right_side(sums, tracer.radius_mm)
     return _Step(sums, right, matrix, matrix.solve(right.sum(axis=0)))

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from membrane_ctrl.config import PatternConfig
 from membrane_ctrl.metrology.bins import BinGrid
 from membrane_ctrl.metrology.fit import NormalMatrix
 from membrane_ctrl.metrology.motion import sensitivity_mm_per_um
 from membrane_ctrl.metrology.phasor import FOLLOWED_ROWS
 from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola, solve
 from membrane_ctrl.metrology.surface import Surface
+from membrane_ctrl.metrology.unwrap import centre_phase_rad, mm_per_rad, screen_mm
 
 FloatArray = NDArray[np.float64]
 
@@ -33,8 +35,8 @@ class TrackedPoints:
         Bin of each point.
     points : Points
         Rays, screen points, weights.
-    bias_mm : (2, n) array
-        What averaging over a bin adds to s.
+    offset_mm : (2, n) array
+        To be taken from T phi / (2 pi): the phase at O', and what averaging over a bin adds.
     sensitivity_rad_per_um : (2, n) array
         Change of phase per um of displacement.
     area_mm2 : (n,) array
@@ -47,7 +49,7 @@ class TrackedPoints:
 
     index: NDArray[np.int64]
     points: Points
-    bias_mm: FloatArray
+    offset_mm: FloatArray
     sensitivity_rad_per_um: FloatArray
     area_mm2: FloatArray
     surface: Surface
@@ -64,16 +66,14 @@ class TrackedPoints:
 
 
 def establish(
-    grid: BinGrid, tracer: Tracer, phase_rad: FloatArray, mm_per_rad: float, analysis_radius_mm: float
+    grid: BinGrid, tracer: Tracer, phase_rad: FloatArray, pattern: PatternConfig, analysis_radius_mm: float
 ) -> TrackedPoints:
     """Choose the points of a full cycle, fit their surface and work out what must be known of each.
 
     Parameters
     ----------
     phase_rad : (2, bins) array
-        Absolute phases relative to O'; NaN where a bin is not usable.
-    mm_per_rad : float
-        Period / 2 pi.
+        Absolute phases; NaN where a bin is not usable.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def establish(
     index = np.flatnonzero(np.isfinite(phase_rad).all(axis=0) & near)
     if index.size < _MIN_POINTS:
         raise ValueError(f"only {index.size} bins see the pattern in the mirror")
-    points = Points.of(grid.rays[:, index], phase_rad[:, index] * mm_per_rad)
+    points = Points.of(grid.rays[:, index], screen_mm(phase_rad[:, index], pattern))
     fit = solve(tracer, points, parabola(_START_SAG_MM, tracer.radius_mm))
     for wanted in (_inside_radius, _without_outliers):
         keep = wanted(tracer, points, fit.surface, analysis_radius_mm)
@@ -96,14 +96,15 @@ def establish(
     field = tracer.slope_field(points, fit.surface)
     # area of the mirror, seen from above, in a bundle of rays: solid angle t^2 / |d . (-h_x, -h_y, 1)|
     facing = np.abs(points.rays[2] - field[4] * points.rays[0] - field[5] * points.rays[1])
+    scale = mm_per_rad(pattern)
     accepted = np.zeros((2, FOLLOWED_ROWS, index.size))
     accepted[:, 0] = phase_rad[:, index]
     accepted[:, 1], accepted[:, 2] = np.cos(accepted[:, 0]), np.sin(accepted[:, 0])
     return TrackedPoints(
         index=index,
         points=points,
-        bias_mm=grid.averaging_bias_mm(tracer, points, fit.surface, index),
-        sensitivity_rad_per_um=sensitivity_mm_per_um(tracer, points, fit.surface) / mm_per_rad,
+        offset_mm=grid.averaging_bias_mm(tracer, points, fit.surface, index) + centre_phase_rad(pattern) * scale,
+        sensitivity_rad_per_um=sensitivity_mm_per_um(tracer, points, fit.surface) / scale,
         area_mm2=grid.solid_angle(index) * points.t_mm**2 / facing,
         surface=fit.surface,
         normal=fit.normal,

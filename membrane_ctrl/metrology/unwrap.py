@@ -46,16 +46,21 @@ def absolute_phase(wrapped_rad: FloatArray, k1: NDArray[np.int64], k2: NDArray[n
     return wrapped_rad + 2 * math.pi * order
 
 
-def relative_to_centre(absolute_rad: FloatArray, pattern: PatternConfig) -> FloatArray:
-    """Phase relative to O': there s is half the region, where phi = 2 pi s / T - pi gives pi (periods - 1)."""
-    return absolute_rad - math.pi * (pattern.periods - 1)
+def centre_phase_rad(pattern: PatternConfig) -> float:
+    """Absolute phase at O': there s is half the region, where phi = 2 pi s / T - pi gives pi (periods - 1)."""
+    return math.pi * (pattern.periods - 1)
 
 
-def screen_mm(centred_rad: FloatArray, pattern: PatternConfig) -> FloatArray:
-    """Distance from O' on the screen, the paper's O'A = T phi / (2 pi)."""
-    return centred_rad * (pattern.period_mm / (2 * math.pi))
+def mm_per_rad(pattern: PatternConfig) -> float:
+    """T / (2 pi)."""
+    return pattern.period_mm / (2 * math.pi)
 
 
-def inside_pattern(centred_rad: FloatArray, pattern: PatternConfig) -> NDArray[np.bool_]:
+def screen_mm(absolute_rad: FloatArray, pattern: PatternConfig) -> FloatArray:
+    """Distance from O' on the screen, the paper's O'A = T phi / (2 pi) with phi relative to O'."""
+    return (absolute_rad - centre_phase_rad(pattern)) * mm_per_rad(pattern)
+
+
+def inside_pattern(absolute_rad: FloatArray, pattern: PatternConfig) -> NDArray[np.bool_]:
     """Whether the phase is one the pattern has; a wrong Gray bit at its rim is not."""
-    return np.abs(centred_rad) <= math.pi * pattern.periods
+    return np.abs(absolute_rad - centre_phase_rad(pattern)) <= math.pi * pattern.periods
