@@ -6,8 +6,18 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from bench_fakes import FRINGES, FULL, HEIGHT_PX, PLAN, WIDTH_PX, FakeCamera, FakeLaser, FakeReconstructor, FakeScreen
-from bench_fakes import VirtualClock as Clock
+from acquisition_fakes import (
+    FRINGES,
+    FULL,
+    HEIGHT_PX,
+    PLAN,
+    WIDTH_PX,
+    FakeCamera,
+    FakeLaser,
+    FakeReconstructor,
+    FakeScreen,
+)
+from acquisition_fakes import VirtualClock as Clock
 
 from membrane_ctrl.acquisition.cycle import (
     LONGEST_PAUSE_S,

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from multiprocessing.connection import Connection
 
 import pytest
-from bench_fakes import VirtualClock, estimate
+from acquisition_fakes import VirtualClock, estimate
 
 from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed
 from membrane_ctrl.acquisition.remote import Remote

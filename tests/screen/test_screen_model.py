@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from synthetic_run import FAULT, HOLDING, event, rows, shape
+from screen_feed import FAULT, HOLDING, event, rows, shape
 
 from membrane_ctrl.config import Config
 from membrane_ctrl.names import Rung, ShapeState, State

@@ -14,7 +14,7 @@ from contextlib import ExitStack, closing, redirect_stderr
 from pathlib import Path
 
 import pytest
-from synthetic_run import FAULT, event, packed, rows, shape
+from screen_feed import FAULT, event, packed, rows, shape
 
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config

@@ -8,13 +8,13 @@ from dataclasses import replace
 
 import pytest
 from rich.console import Console
-from synthetic_run import FAULT, HOLDING, NOTHING, event, rows, shape
+from screen_feed import FAULT, HOLDING, NOTHING, event, rows, shape
 
 from membrane_ctrl.config import Config
 from membrane_ctrl.names import Rung, ShapeState, State
 from membrane_ctrl.screen.bars import full_scale, level_bar, signed_bars
 from membrane_ctrl.screen.model import ScreenModel
-from membrane_ctrl.screen.plain import event_line, line
+from membrane_ctrl.screen.plain import at_once, event_line, line
 from membrane_ctrl.screen.view import screen
 from membrane_ctrl.screen.words import duration, number, percent
 
@@ -117,6 +117,14 @@ def test_plain_events() -> None:
     )
     assert event_line(event(1.0, "state", state="hold", why="settled")) == "      1.0 s  STATE hold settled"
     assert event_line({"kind": "end", "exit": 5}) == "        – s  END 5"
+
+
+def test_what_cannot_wait_a_second() -> None:
+    kinds = ("fault", "cleared", "state", "link", "child_ended", "end")
+    assert all(at_once({"kind": kind}) for kind in kinds)
+    assert not any(at_once({"kind": kind}) for kind in ("why", "shape", "command", "start"))
+    assert at_once({"kind": "acquisition", "state": "retrying"})
+    assert not at_once({"kind": "acquisition", "state": "running"})
 
 
 def test_bars_stand_and_hang() -> None:

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from synthetic_run import HOLDING
+from screen_feed import HOLDING
 
 from membrane_ctrl.config import Config
 from membrane_ctrl.names import Rung, State
