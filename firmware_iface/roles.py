@@ -89,6 +89,115 @@ class Bench(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class DeviceIdentity:
+    """Who answered: kind ("optoNCDT 1420"), serial number and firmware as the device says them."""
+
+    kind: str
+    serial: str
+    firmware: str
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class DisplacementSample:
+    """The newest sample; of a streaming sensor the median of all that came since the last one.
+
+    `quality` is 0 when good, else the device's error code, and then `displacement_um` is NaN. Counter and time
+    advance with new data only; the driver makes them where the device has none (valid messages so far, time of
+    arrival).
+    """
+
+    displacement_um: float
+    quality: int
+    sample_counter: int
+    device_time_s: float
+
+
+class Device(Protocol):
+    """One instrument; it fills one role or several.
+
+    A quantity that is read more slowly than the tick (a barometer at 4800 baud) is refreshed by a task of the driver,
+    which serves the newest value and NaN once that is older than a stated limit.
+    """
+
+    async def open(self) -> DeviceIdentity:
+        """Connect, check the identity, apply the settings and read them back; again after every lost link.
+
+        Raises
+        ------
+        LinkError
+            No valid answer; LinkDownError without a connection.
+        DeviceRefusedError
+            Another device than the configuration names, or one that does not take its settings.
+        """
+        ...
+
+    async def close(self) -> None:
+        """Leave the device safe and close the link. Never raises."""
+        ...
+
+    def describe(self) -> dict[str, str]:
+        """For people: port, settings, manual."""
+        ...
+
+
+class DisplacementSensor(Device, Protocol):
+    """The laser behind the mirror."""
+
+    async def displacement(self) -> DisplacementSample:
+        """The newest sample. Raises LinkError."""
+        ...
+
+
+class PressureSensor(Device, Protocol):
+    """Gas between the films against the room."""
+
+    async def gauge_pressure_pa(self) -> float:
+        """The newest value, NaN for none. Raises LinkError."""
+        ...
+
+
+class Barometer(Device, Protocol):
+    """Air pressure in the room."""
+
+    async def ambient_pressure_pa(self) -> float:
+        """The newest value, NaN for none. Raises LinkError."""
+        ...
+
+
+class Thermometer(Device, Protocol):
+    """Air temperature beside the mirror."""
+
+    async def air_temperature_c(self) -> float:
+        """The newest value, NaN for none. Raises LinkError."""
+        ...
+
+
+class Pump(Device, Protocol):
+    """What adds gas: a pump, or a flow controller on a bottle."""
+
+    async def set_pump(self, fraction: float) -> None:
+        """Command it, 0..1 of full scale. Raises LinkError: the device may or may not have it."""
+        ...
+
+    async def pump_fraction(self) -> float:
+        """What the device says it was commanded (or gives). Raises LinkError."""
+        ...
+
+
+class Vent(Device, Protocol):
+    """What lets gas out."""
+
+    async def set_vent(self, fraction: float) -> None:
+        """Open it, 0..1. Raises LinkError: the device may or may not have it."""
+        ...
+
+    async def vent_fraction(self) -> float:
+        """What the device says it was commanded (or gives). Raises LinkError."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
 class Pattern:
     """One image on the screen: role "sin" (index k of N, shift_rad), "gray" (bit from 1), "white" or "black"."""
 
