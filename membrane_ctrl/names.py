@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class State(IntEnum):
-    """States of the controller (DESIGN: states)."""
+    """States of the controller (docs/architecture.md)."""
 
     STANDBY = 0
     CHECK = 1
