@@ -1,0 +1,88 @@
+"""Reader of SOFAST files: what is wrong with a file is said in one line that names it."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.metrology import sofast
+
+h5py = pytest.importorskip("h5py")
+
+
+def write(path, **items):
+    with h5py.File(path, "w") as file:
+        for name, value in items.items():
+            file[name.replace("__", "/")] = value
+    return path
+
+
+def measurement(path, frames=32):
+    return write(
+        path,
+        MeasurementSofastFringe__fringe_images=np.arange(frames, dtype=np.uint8) * np.ones((3, 5, 1), np.uint8),
+        MeasurementSofastFringe__mask_images=np.array([1, 200], np.uint8) * np.ones((3, 5, 1), np.uint8),
+        MeasurementSofastFringe__fringe_periods_x=[0.9, 3.9, 15.9, 63.9],
+        MeasurementSofastFringe__fringe_periods_y=[0.9, 3.9, 15.9, 63.9],
+        MeasurementSofastFringe__dist_optic_screen=np.array([10.5]),
+    )
+
+
+def test_frames_are_sorted_by_axis_frequency_and_step(tmp_path):
+    read = sofast.read_measurement(measurement(tmp_path / "m.h5"))
+    assert read.frames_y.shape == read.frames_x.shape == (4, 4, 3, 5)
+    assert read.frames_y[1, 2, 0, 0] == 6  # y comes first in the file
+    assert read.frames_x[1, 2, 0, 0] == 22
+    assert (read.black[0, 0], read.white[0, 0]) == (1, 200)
+    assert read.distance_mm == 10_500
+
+
+def test_a_missing_frame_is_counted(tmp_path):
+    with pytest.raises(ValueError, match=r"m\.h5: .*fringe_images has 31 frames"):
+        sofast.read_measurement(measurement(tmp_path / "m.h5", frames=31))
+
+
+def test_a_missing_item_a_missing_file_and_a_wrong_file_are_named(tmp_path):
+    with pytest.raises(ValueError, match=r"e\.h5: Camera/intrinsic_mat is missing"):
+        sofast.read_camera(write(tmp_path / "e.h5", other=1))
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        sofast.read_camera(tmp_path / "none.h5")
+    (tmp_path / "text.h5").write_text("not HDF5")
+    with pytest.raises(ValueError, match=r"text\.h5: not an HDF5 file"):
+        sofast.read_camera(tmp_path / "text.h5")
+
+
+def test_screens_of_both_models_in_mm_and_no_other(tmp_path):
+    screen = write(
+        tmp_path / "r.h5",
+        DisplayShape__screen_model="rectangular2D",
+        DisplayShape__screen_x=8.0,
+        DisplayShape__screen_y=3.0,
+    )
+    assert sofast.read_screen(screen).screen_mm(np.array([[1.0], [0.0]])).tolist() == [[4000], [-1500]]
+    corners = np.array([[0.0, 1, 0, 1], [0, 0, 1, 1]])
+    screen = write(
+        tmp_path / "d.h5",
+        DisplayShape__screen_model="distorted2D",
+        DisplayShape__xy_screen_fraction=corners,
+        DisplayShape__xy_screen_coords=2 * corners,
+    )
+    np.testing.assert_allclose(sofast.read_screen(screen).screen_mm(np.array([[0.5], [0.25]])), [[1000], [500]])
+    with pytest.raises(ValueError, match="distorted3D"):
+        sofast.read_screen(write(tmp_path / "3.h5", DisplayShape__screen_model="distorted3D"))
+
+
+def test_oblong_pixels_become_square_ones_of_the_same_rays(tmp_path):
+    path = write(
+        tmp_path / "c.h5",
+        Camera__intrinsic_mat=np.array([[700.0, 0, 100], [0, 350, 75], [0, 0, 0.125]]),
+        Camera__distortion_coef=np.zeros(5),
+    )
+    camera = sofast.read_camera(path)
+    assert (camera.square_rows(np.array([85.0])) - 75) / camera.focal_px[0] == pytest.approx(10 / 350)
+
+
+def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(ImportError, match=r"membrane-ctrl\[sofast\]"):
+        sofast.read_camera(tmp_path / "c.h5")
