@@ -34,7 +34,7 @@ def small(optics: OpticsConfig) -> OpticsConfig:
 def warm_up(
     reconstructor: Reconstructor, optics: OpticsConfig, plan: CyclePlan, position: FilmPosition, clock: CycleClock
 ) -> None:
-    """A full cycle and one of fringes only, of a film that stands still.
+    """A full cycle and two of fringes only, with and without known motion, of a film that stands still.
 
     Parameters
     ----------
@@ -58,8 +58,13 @@ def warm_up(
             taken.append(bench.camera.grab().pixels)
         return taken
 
-    for patterns, reconstruct in ((plan.full, reconstructor.full), (plan.fringes, reconstructor.fringes)):
+    # displacements that differ by more than noise let the kernels run that take the film's motion out
+    still, moving = np.zeros(1), np.array([-10.0, 10.0])
+    for patterns, reconstruct, motion_um in (
+        (plan.full, reconstructor.full, moving),
+        (plan.fringes, reconstructor.fringes, moving),
+        (plan.fringes, reconstructor.fringes, still),
+    ):
         frames = exposures(patterns)
-        # displacements that differ, so that the kernels which take the film's motion out run as well
-        moved_um = np.linspace(-1.0, 1.0, len(frames), dtype=np.float64) + position.displacement_um
-        reconstruct(frames, 0.1 * np.arange(len(frames), dtype=np.float64), moved_um)
+        displacement_um = position.displacement_um + np.resize(motion_um, len(frames))
+        reconstruct(frames, 0.1 * np.arange(len(frames), dtype=np.float64), displacement_um)
