@@ -166,8 +166,6 @@ def test_a_stale_frame_put_into_it_is_named(measurement, mask, axis, index, step
     found = named(frames, periods, index)
     assert found.suspect == step
     assert found.gain > 5
-    others = [k for k in range(4) if k != index]
-    assert all(closure(frames[k], SHIFTS_RAD).rms_adu < 2.5 for k in others)
 
 
 def test_unwrapping_alone_does_not_notice_a_stale_frame_of_the_finest_fringe(measurement, mask):
