@@ -17,23 +17,18 @@ from pymodbus.exceptions import ConnectionException, ModbusIOException
 from pymodbus.pdu import ExceptionResponse, ModbusPDU
 
 from firmware_iface.links.backoff import BackOff
-from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from firmware_iface.links.modbus_rules import (
+    READ_HOLDING,
+    READ_INPUT,
+    WRITE_MULTIPLE,
+    WRITE_SINGLE,
+    exception_error,
+)
+from firmware_iface.roles import LinkDownError, LinkError
 
 # the library reports in its log what is raised here as well; without a handler it would write into the live screen
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
-_READ_HOLDING, _WRITE_MULTIPLE = 3, 16
-_EXCEPTIONS = {
-    1: "illegal function",
-    2: "illegal address",
-    3: "illegal value",
-    4: "device failure",
-    5: "acknowledged, not done",
-    6: "device busy",
-    10: "gateway path unavailable",
-    11: "no device behind the gateway",
-}
-_REFUSALS = (1, 2, 3)  # the request itself is wrong for this device; the others may pass
 # a peer that lost its power sends no end of connection: after this many unanswered requests in a row, and one more
 # that finds the count used up, the connection is given up (the count is the library's)
 _UNANSWERED_MAX = 3
@@ -135,16 +130,21 @@ class GuardedModbusTcp:
         DeviceRefusedError
             The device does not have these registers.
         """
-        what = f"{self.name}: reading {address}..{address + count - 1}"
+        return await self._read(READ_HOLDING, address, count)
+
+    async def read_input(self, address: int, count: int) -> list[int]:
+        """Read `count` input registers (function code 4). Raises as `read_holding`."""
+        return await self._read(READ_INPUT, address, count)
+
+    async def write_register(self, address: int, word: int) -> None:
+        """Write one holding register (function code 6) and check the echo. Raises as `write_registers`."""
+        what = f"{self.name}: writing {address}"
         reply = await self._exchange(
-            lambda client: client.read_holding_registers(address, count=count, device_id=self._unit_id),
-            _READ_HOLDING,
-            what,
+            lambda client: client.write_register(address, word, device_id=self._unit_id), WRITE_SINGLE, what
         )
-        if len(reply.registers) != count:
-            raise LinkError(f"{what}: {len(reply.registers)} registers came instead of {count}")
+        if (reply.address, list(reply.registers)) != (address, [word]):
+            raise LinkError(f"{what}: the reply confirms {list(reply.registers)} in {reply.address}")
         self._back_off.succeeded()
-        return list(reply.registers)
 
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         """Write holding registers (function code 16) and check the echo.
@@ -161,12 +161,25 @@ class GuardedModbusTcp:
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
         reply = await self._exchange(
             lambda client: client.write_registers(address, list(words), device_id=self._unit_id),
-            _WRITE_MULTIPLE,
+            WRITE_MULTIPLE,
             what,
         )
         if (reply.address, reply.count) != (address, len(words)):
             raise LinkError(f"{what}: the reply confirms {reply.count} registers from {reply.address}")
         self._back_off.succeeded()
+
+    async def _read(self, function_code: int, address: int, count: int) -> list[int]:
+        what = f"{self.name}: reading {address}..{address + count - 1}"
+
+        def send(client: AsyncModbusTcpClient) -> Awaitable[ModbusPDU]:
+            read = client.read_input_registers if function_code == READ_INPUT else client.read_holding_registers
+            return read(address, count=count, device_id=self._unit_id)
+
+        reply = await self._exchange(send, function_code, what)
+        if len(reply.registers) != count:
+            raise LinkError(f"{what}: {len(reply.registers)} registers came instead of {count}")
+        self._back_off.succeeded()
+        return list(reply.registers)
 
     async def close(self) -> None:
         """Close the connection; a request in flight fails at once."""
@@ -211,9 +224,7 @@ def _check(reply: ModbusPDU, function_code: int, transaction_id: int, what: str)
     if reply.function_code & 0x7F != function_code:
         raise LinkError(f"{what}: answer has function code {reply.function_code}, asked was {function_code}")
     if isinstance(reply, ExceptionResponse):
-        kind = DeviceRefusedError if reply.exception_code in _REFUSALS else LinkError
-        meaning = _EXCEPTIONS.get(reply.exception_code, "unknown")
-        raise kind(f"{what}: exception {reply.exception_code} ({meaning})")
+        raise exception_error(what, reply.exception_code)
 
 
 def _fail_in_flight(client: AsyncModbusTcpClient, message: str) -> None:

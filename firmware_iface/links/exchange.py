@@ -1,0 +1,201 @@
+"""Question and answer over a line that has no transaction numbers, so that an answer is never another question's.
+
+A device that answers late is the danger: its answer to the question that was given up looks like the answer to the
+next one. Three rules keep them apart.
+
+1. One question is on the wire at a time and stays there until it is answered or its time is over, whatever became of
+   the caller: a cancelled caller leaves nothing behind.
+2. After any loss (no answer, a wrong one, bytes that nobody asked for) nothing is sent until the line was quiet for
+   `quiet_s`.
+3. Then a *fence* is asked first: a harmless question whose answer cannot be mistaken for any other. Devices answer in
+   order, so when the fence is answered, whatever was owed before has come (and was thrown away) or never will.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from firmware_iface.links.serial_port import BytePort
+from firmware_iface.roles import LinkDownError, LinkError
+
+_SHOWN_BYTES = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What is sent, and how its answer is known.
+
+    Attributes
+    ----------
+    data : bytes
+        Sent as it is.
+    take : callable
+        Of all bytes heard so far: the answer, None while more must come. Raises LinkError when they are no answer.
+    answer_bytes : int
+        Length of the longest answer: its time on the wire comes on top of the device's own.
+    what : str
+        For messages: device and what is asked.
+    """
+
+    data: bytes
+    take: Callable[[bytes], bytes | None]
+    answer_bytes: int
+    what: str
+
+
+class SerialExchange:
+    """Questions and answers on one line, for one device or several that take turns.
+
+    Parameters
+    ----------
+    port : BytePort
+        The line; this object is its only user.
+    gap_s : float
+        Silence that the devices want between an answer and the next question.
+    quiet_s : float
+        Silence after a loss. As long as devices are usually late at most; the fence covers the rest.
+    """
+
+    def __init__(self, port: BytePort, gap_s: float, quiet_s: float) -> None:
+        self._port = port
+        self._gap_s = gap_s
+        self._quiet_s = quiet_s
+        self._key_turns: defaultdict[int, asyncio.Lock] = defaultdict(asyncio.Lock)
+        self._turn = asyncio.Lock()  # released when the question has ended, whatever became of its caller
+        self._in_flight: asyncio.Task[bytes] | None = None
+        self._sure: set[int] = set()  # devices that owe no answer
+        self._noisy = False
+        self._last_byte_s = 0.0
+        self._heard = b""
+        self._take: Callable[[bytes], bytes | None] | None = None
+        self._answer: asyncio.Future[bytes] | None = None
+
+    @property
+    def port(self) -> BytePort:
+        """The line."""
+        return self._port
+
+    def connect(self) -> None:
+        """Open the line; what devices may still owe to an earlier user is not believed. Raises LinkDownError."""
+        self._port.open(self)
+        self._start_anew()
+
+    def _start_anew(self) -> None:
+        self._sure.clear()
+        self._noisy = True
+        self._last_byte_s = asyncio.get_running_loop().time()
+
+    async def close(self) -> None:
+        """Close the line; a question in flight fails at once."""
+        self._port.close()
+        self.lost(LinkDownError(f"{self._port.name}: closed"))
+        if self._in_flight is not None:
+            await asyncio.wait([self._in_flight])
+
+    async def ask(self, question: Question, timeout_s: float, fence: Question | None, key: int = 0) -> bytes:
+        """The answer to a question.
+
+        Devices that wait are served in turn, each with one question.
+
+        Parameters
+        ----------
+        question : Question
+            Asked once; nothing is ever sent again by itself.
+        timeout_s : float
+            For the device; the time on the wire comes on top.
+        fence : Question or None
+            See the module; None for a device that has none, which `quiet_s` alone then protects.
+        key : int
+            Which device of the line.
+
+        Raises
+        ------
+        LinkError
+            No valid answer.
+        LinkDownError
+            The line is closed or went away.
+        """
+        async with self._key_turns[key]:
+            await self._turn.acquire()  # cancelled while waiting here, a question is never sent
+            self._in_flight = asyncio.create_task(self._transact(question, timeout_s, fence, key))
+            self._in_flight.add_done_callback(lambda _: self._turn.release())
+            return await asyncio.shield(self._in_flight)
+
+    async def _transact(self, question: Question, timeout_s: float, fence: Question | None, key: int) -> bytes:
+        try:
+            self._require_open(question.what)
+            await self._settle(question.what, timeout_s)
+            if key not in self._sure and fence is not None:
+                await self._ask(fence, timeout_s)
+                await self._settle(question.what, timeout_s)
+            answer = await self._ask(question, timeout_s)
+        except LinkDownError:
+            raise
+        except LinkError:
+            self._sure.discard(key)
+            self._noisy = True
+            self._last_byte_s = asyncio.get_running_loop().time()
+            raise
+        self._sure.add(key)
+        self._port.succeeded()
+        return answer
+
+    async def _settle(self, what: str, timeout_s: float) -> None:
+        """Wait for the silence that is due."""
+        loop = asyncio.get_running_loop()
+        give_up_s = loop.time() + 2 * self._quiet_s + timeout_s
+        while True:
+            due_s = self._last_byte_s + (self._quiet_s if self._noisy else self._gap_s)
+            if (wait_s := due_s - loop.time()) <= 0:
+                self._noisy = False
+                return
+            if due_s > give_up_s:
+                raise LinkError(f"{what}: the line is never quiet; wrong baud rate, or someone else talks on it")
+            await asyncio.sleep(wait_s)
+
+    async def _ask(self, question: Question, timeout_s: float) -> bytes:
+        self._require_open(question.what)
+        self._heard, self._take = b"", question.take
+        self._answer = asyncio.get_running_loop().create_future()
+        wire_s = (len(question.data) + question.answer_bytes) * self._port.settings.char_s
+        try:
+            async with asyncio.timeout(timeout_s + wire_s):
+                self._port.write(question.data)
+                return await self._answer
+        except TimeoutError:
+            raise LinkError(f"{question.what}: {self._missing(timeout_s)}") from None
+        finally:
+            self._answer = None
+
+    def _require_open(self, what: str) -> None:
+        if not self._port.is_open:
+            raise LinkDownError(f"{what}: not connected")
+
+    def _missing(self, timeout_s: float) -> str:
+        if not self._heard:
+            return f"no answer within {timeout_s:g} s"
+        shown = self._heard[:_SHOWN_BYTES].hex(" ")
+        return f"no whole answer within {timeout_s:g} s, only {len(self._heard)} bytes ({shown}); wrong baud rate?"
+
+    def received(self, data: bytes) -> None:
+        """Bytes came (called by the port)."""
+        self._last_byte_s = asyncio.get_running_loop().time()
+        if self._answer is None or self._answer.done() or self._take is None:
+            self._noisy = True  # nobody asked
+            return
+        self._heard += data
+        try:
+            answer = self._take(self._heard)
+        except LinkError as error:
+            self._answer.set_exception(error)
+        else:
+            if answer is not None:
+                self._answer.set_result(answer)
+
+    def lost(self, error: LinkDownError) -> None:
+        """The line is gone (called by the port)."""
+        if self._answer is not None and not self._answer.done():
+            self._answer.set_exception(error)

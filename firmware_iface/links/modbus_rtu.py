@@ -1,0 +1,252 @@
+"""Modbus RTU that can be believed: several devices on one serial bus, each with the interface of the TCP link.
+
+RTU has no transaction numbers. What keeps a late answer from being taken for the next one is in `exchange`; the fence
+is "return query data" (function 8, sub-function 0) with a number that counts up: it comes back as sent, or as an
+exception of function 8, and neither can be taken for anything else.
+
+Source: Modbus over serial line 1.02, sections 2.5.1 (RTU framing) and 6.2.2 (CRC); application protocol 1.1b3.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from urllib.parse import parse_qsl, urlsplit
+
+from firmware_iface.links.exchange import Question, SerialExchange
+from firmware_iface.links.modbus_rules import (
+    DIAGNOSTICS,
+    EXCEPTION_FLAG,
+    READ_HOLDING,
+    READ_INPUT,
+    WRITE_MULTIPLE,
+    WRITE_SINGLE,
+    exception_error,
+)
+from firmware_iface.links.serial_port import BytePort, SerialPort, SerialSettings
+from firmware_iface.roles import LinkError
+
+DEFAULT_BAUD = 19_200  # section 2.5.1: the default of the standard
+_FAST_BAUD = 19_200
+_FAST_GAP_S = 1.75e-3  # above 19200 baud the standard fixes the silence between frames
+_EXCEPTION_BYTES, _WRITE_BYTES = 5, 8
+_TOKENS = 2**16
+
+
+def crc16(data: bytes) -> int:
+    """The CRC of Modbus: polynomial 0xA001 (reflected 0x8005), start 0xFFFF; sent low byte first."""
+    crc = 0xFFFF
+    for byte in data:
+        crc = (crc >> 8) ^ _CRC_TABLE[(crc ^ byte) & 0xFF]
+    return crc
+
+
+def _table_entry(index: int) -> int:
+    for _ in range(8):
+        index = (index >> 1) ^ (0xA001 if index & 1 else 0)
+    return index
+
+
+_CRC_TABLE = tuple(_table_entry(index) for index in range(256))
+
+
+def rtu_frame(unit_id: int, pdu: bytes) -> bytes:
+    """Unit, PDU and CRC."""
+    body = bytes([unit_id]) + pdu
+    return body + struct.pack("<H", crc16(body))
+
+
+def parse_rtu_url(url: str) -> tuple[str, SerialSettings]:
+    """Port and settings of `rtu://PORT[?baud=..&parity=..&data_bits=..&stop_bits=..]`.
+
+    PORT is a path (`rtu:///dev/ttyUSB0`) or a USB identity (`rtu://usb:0403:6001:A50285BI`). Raises ValueError.
+    """
+    parts = urlsplit(url)
+    options = dict(parse_qsl(parts.query, strict_parsing=True)) if parts.query else {}
+    port = parts.netloc + parts.path
+    if parts.scheme != "rtu" or not port or not options.keys() <= {"baud", "parity", "data_bits", "stop_bits"}:
+        raise ValueError(f"{url}: wanted rtu:///dev/ttyUSB0?baud=19200&parity=E")
+    try:
+        numbers = {key: int(value) for key, value in options.items() if key != "parity"}
+    except ValueError as error:
+        raise ValueError(f"{url}: {error}") from error
+    numbers.setdefault("baud", DEFAULT_BAUD)
+    return port, SerialSettings(**numbers, parity=options.get("parity", "E"))
+
+
+class RtuBus:
+    """A serial bus with any number of Modbus devices, served in turn.
+
+    Parameters
+    ----------
+    port : BytePort
+        The line.
+    quiet_s : float
+        Silence after a loss, before the next request: as long as devices are usually late at most.
+    """
+
+    def __init__(self, port: BytePort, quiet_s: float = 0.2) -> None:
+        baud = port.settings.baud
+        gap_s = _FAST_GAP_S if baud > _FAST_BAUD else 3.5 * port.settings.char_s
+        self.exchange = SerialExchange(port, gap_s, quiet_s)
+        self._tokens = 0
+
+    @classmethod
+    def from_url(cls, url: str) -> RtuBus:
+        """The bus at `rtu://...`. Raises ValueError."""
+        port, settings = parse_rtu_url(url)
+        return cls(SerialPort(port, settings))
+
+    def device(self, unit_id: int, timeout_s: float, fence: bool = True) -> GuardedModbusRtu:
+        """The device with this unit id (1..247). Raises ValueError."""
+        return GuardedModbusRtu(self, unit_id, timeout_s, fence)
+
+    def next_token(self) -> int:
+        """A number that no fence had before it lately."""
+        self._tokens = (self._tokens + 1) % _TOKENS
+        return self._tokens
+
+
+class GuardedModbusRtu:
+    """One Modbus RTU device of a bus.
+
+    Parameters
+    ----------
+    bus : RtuBus
+        Shared by all devices of the line: whoever connects first opens it, whoever closes it closes it for all.
+    unit_id : int
+        1..247.
+    timeout_s : float
+        For the device to answer; the time on the wire comes on top.
+    fence : bool
+        False for a device that is silent on function 8 instead of refusing it.
+    """
+
+    def __init__(self, bus: RtuBus, unit_id: int, timeout_s: float, fence: bool = True) -> None:
+        if not 1 <= unit_id <= 247:
+            raise ValueError(f"unit_id = {unit_id}: Modbus RTU has 1..247")
+        self._bus = bus
+        self._unit_id = unit_id
+        self._timeout_s = timeout_s
+        self._fence = fence
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return f"rtu://{self._bus.exchange.port.name}#{self._unit_id}"
+
+    @property
+    def connected(self) -> bool:
+        """Whether the bus is open."""
+        return self._bus.exchange.port.is_open
+
+    @property
+    def reconnects(self) -> int:
+        """Times the bus was opened after the first."""
+        return self._bus.exchange.port.reconnects
+
+    @property
+    def retry_in_s(self) -> float:
+        """Time until `connect` will try."""
+        return 0.0 if self.connected else self._bus.exchange.port.retry_in_s
+
+    async def connect(self) -> None:
+        """Open the bus, if no other of its devices has. Raises LinkDownError."""
+        if not self.connected:
+            self._bus.exchange.connect()
+
+    async def close(self) -> None:
+        """Close the bus for all its devices; a request in flight fails at once."""
+        await self._bus.exchange.close()
+
+    async def read_holding(self, address: int, count: int) -> list[int]:
+        """Read holding registers (function code 3). Raises LinkError, LinkDownError, DeviceRefusedError."""
+        return await self._read(READ_HOLDING, address, count)
+
+    async def read_input(self, address: int, count: int) -> list[int]:
+        """Read input registers (function code 4). Raises as `read_holding`."""
+        return await self._read(READ_INPUT, address, count)
+
+    async def write_register(self, address: int, word: int) -> None:
+        """Write one holding register (function code 6) and check the echo. Raises as `read_holding`."""
+        what = f"{self.name}: writing {address}"
+        pdu = struct.pack(">BHH", WRITE_SINGLE, address, word)
+        if (await self._transact(pdu, _WRITE_BYTES, what)) != pdu:
+            raise LinkError(f"{what}: the reply confirms something else")
+
+    async def write_registers(self, address: int, words: Sequence[int]) -> None:
+        """Write holding registers (function code 16) and check the echo.
+
+        Raises
+        ------
+        LinkError
+            No valid reply in time: the device may or may not have carried it out.
+        LinkDownError
+            The port is gone; the same holds.
+        DeviceRefusedError
+            The device refused and changed nothing.
+        """
+        what = f"{self.name}: writing {address}..{address + len(words) - 1}"
+        pdu = struct.pack(f">BHHB{len(words)}H", WRITE_MULTIPLE, address, len(words), 2 * len(words), *words)
+        reply = await self._transact(pdu, _WRITE_BYTES, what)
+        if reply != pdu[:5]:
+            raise LinkError(f"{what}: the reply confirms something else")
+
+    async def _read(self, function_code: int, address: int, count: int) -> list[int]:
+        what = f"{self.name}: reading {address}..{address + count - 1}"
+        reply = await self._transact(struct.pack(">BHH", function_code, address, count), 5 + 2 * count, what)
+        return list(struct.unpack(f">{count}H", reply[2:]))
+
+    async def _transact(self, pdu: bytes, answer_bytes: int, what: str) -> bytes:
+        question = self._question(pdu, answer_bytes, what)
+        reply = await self._bus.exchange.ask(question, self._timeout_s, self._fence_question(), self._unit_id)
+        if reply[0] & EXCEPTION_FLAG:
+            raise exception_error(what, reply[1])
+        return reply
+
+    def _fence_question(self) -> Question | None:
+        if not self._fence:
+            return None
+        pdu = struct.pack(">BHH", DIAGNOSTICS, 0, self._bus.next_token())
+        return self._question(pdu, _WRITE_BYTES, f"{self.name}: echo test after a loss (function 8)", pdu)
+
+    def _question(self, pdu: bytes, answer_bytes: int, what: str, exactly: bytes = b"") -> Question:
+        def take(heard: bytes) -> bytes | None:
+            reply = take_reply(heard, self._unit_id, pdu[0], answer_bytes, what)
+            if exactly and reply is not None and reply != exactly and not reply[0] & EXCEPTION_FLAG:
+                raise LinkError(f"{what}: another echo came back than was sent")
+            return reply
+
+        return Question(rtu_frame(self._unit_id, pdu), take, answer_bytes, what)
+
+
+def take_reply(heard: bytes, unit_id: int, function_code: int, answer_bytes: int, what: str) -> bytes | None:
+    """The PDU of a whole reply, None while bytes are missing.
+
+    The length is known beforehand: silences between bytes, by which RTU frames are delimited on the wire, do not
+    survive the buffers of adapters and kernels.
+
+    Raises
+    ------
+    LinkError
+        Another unit, function, length or CRC.
+    """
+    if heard[0] != unit_id:
+        raise LinkError(f"{what}: answer of unit {heard[0]}, asked was {unit_id}")
+    if len(heard) < 3:
+        return None
+    if heard[1] == function_code | EXCEPTION_FLAG:
+        length = _EXCEPTION_BYTES
+    elif heard[1] == function_code:
+        length = answer_bytes
+    else:
+        raise LinkError(f"{what}: answer has function code {heard[1]}, asked was {function_code}")
+    if function_code in (READ_HOLDING, READ_INPUT) and length == answer_bytes and heard[2] != answer_bytes - 5:
+        raise LinkError(f"{what}: {heard[2] / 2:g} registers came instead of {(answer_bytes - 5) // 2}")
+    if len(heard) < length:
+        return None
+    if len(heard) > length:
+        raise LinkError(f"{what}: {len(heard)} bytes came instead of {length}")
+    if crc16(heard):  # over a frame with its own CRC the sum is 0
+        raise LinkError(f"{what}: wrong checksum; noise on the line, or wrong baud rate")
+    return heard[1:-2]

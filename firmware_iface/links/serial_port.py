@@ -1,0 +1,295 @@
+"""A serial port on the event loop: bytes in as they come, link-down as soon as the kernel knows.
+
+Through `loop.add_reader` on the port's own descriptor: no thread, no polling, and a pulled plug makes the descriptor
+readable at once. pyserial opens and configures the port, nothing more.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import os
+import termios
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import serial
+
+from firmware_iface.links.backoff import BackOff
+from firmware_iface.links.usb_ports import check_port_name, port_path
+from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+
+_READ_BYTES = 65_536
+# a port that is not there costs one look-up: no reason to back off, and a replug is to be found at once
+_ABSENT_S = 0.1
+_REMEDIES = {
+    errno.EACCES: "no permission; add yourself to the port's group (dialout) and log in again",
+    errno.EPERM: "no permission; add yourself to the port's group (dialout) and log in again",
+    errno.EAGAIN: "in use by another program; close that one first",
+    errno.EBUSY: "in use by another program; close that one first",
+    errno.ENOENT: "there is no such port; is the adapter plugged in?",
+    errno.ENODEV: "there is no such port; is the adapter plugged in?",
+    errno.ENXIO: "there is no such port; is the adapter plugged in?",
+    errno.ENOTTY: "this is not a serial port",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SerialSettings:
+    """Of the line: `parity` is "N", "E" or "O"; with E or O, bytes of wrong parity are dropped by the kernel."""
+
+    baud: int
+    data_bits: int = 8
+    parity: str = "N"
+    stop_bits: int = 1
+
+    def __post_init__(self) -> None:
+        if self.baud not in serial.Serial.BAUDRATES:
+            raise ValueError(f"baud = {self.baud}: not a rate that serial ports have")
+        if self.data_bits not in (7, 8) or self.parity not in ("N", "E", "O") or self.stop_bits not in (1, 2):
+            raise ValueError(f"{self}: wanted 7 or 8 data bits, parity N, E or O, 1 or 2 stop bits")
+
+    @property
+    def char_s(self) -> float:
+        """How long one character takes, start bit included."""
+        return (1 + self.data_bits + (self.parity != "N") + self.stop_bits) / self.baud
+
+    def __str__(self) -> str:
+        return f"{self.baud} {self.data_bits}{self.parity}{self.stop_bits}"
+
+
+class Receiver(Protocol):
+    """What a port tells its user, from within the event loop."""
+
+    def received(self, data: bytes) -> None:
+        """Bytes came."""
+        ...
+
+    def lost(self, error: LinkDownError) -> None:
+        """The port is gone and closed."""
+        ...
+
+
+class BytePort(Protocol):
+    """A two-way stream of bytes that is opened, lost and opened again."""
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        ...
+
+    @property
+    def settings(self) -> SerialSettings:
+        """Of the line."""
+        ...
+
+    @property
+    def is_open(self) -> bool:
+        """Whether bytes can flow."""
+        ...
+
+    @property
+    def reconnects(self) -> int:
+        """Times it was opened after the first."""
+        ...
+
+    @property
+    def retry_in_s(self) -> float:
+        """Time until `open` will try."""
+        ...
+
+    def open(self, receiver: Receiver) -> None:
+        """Open anew. Raises LinkDownError or DeviceRefusedError."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Hand over bytes for sending. Raises LinkDownError or LinkError."""
+        ...
+
+    def succeeded(self) -> None:
+        """A valid answer came: the next `open` may be at once."""
+        ...
+
+    def close(self) -> None:
+        """Close; never raises."""
+        ...
+
+
+class SerialPort:
+    """A serial port of this machine.
+
+    Parameters
+    ----------
+    port : str
+        A path, or `usb:VID:PID[:SERIAL]`, looked up at every `open` so that a replug in another socket is found.
+    settings : SerialSettings
+        Of the line.
+    clock : callable
+        Seconds on any axis that does not go back; for the back-off.
+
+    Raises
+    ------
+    ValueError
+        The name is neither.
+    """
+
+    def __init__(self, port: str, settings: SerialSettings, clock: Callable[[], float] = time.monotonic) -> None:
+        self._port = check_port_name(port)
+        self._settings = settings
+        self._clock = clock
+        self._back_off = BackOff()
+        self._absent_until_s = float("-inf")
+        self._opened = 0
+        self._serial: serial.Serial | None = None
+        self._receiver: Receiver | None = None
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return self._port
+
+    @property
+    def settings(self) -> SerialSettings:
+        """Of the line."""
+        return self._settings
+
+    @property
+    def is_open(self) -> bool:
+        """Whether bytes can flow."""
+        return self._serial is not None
+
+    @property
+    def reconnects(self) -> int:
+        """Times it was opened after the first."""
+        return max(0, self._opened - 1)
+
+    @property
+    def retry_in_s(self) -> float:
+        """Time until `open` will try."""
+        now_s = self._clock()
+        return max(self._back_off.remaining_s(now_s), self._absent_until_s - now_s, 0.0)
+
+    def open(self, receiver: Receiver) -> None:
+        """Open anew, as the only user of the port.
+
+        Raises
+        ------
+        LinkDownError
+            Not there, busy, not permitted, or not yet time for the next attempt.
+        DeviceRefusedError
+            Several adapters have this USB identity.
+        """
+        if (wait_s := self.retry_in_s) > 0:
+            raise LinkDownError(f"{self._port}: next attempt to open in {wait_s:.1f} s")
+        self.close()
+        path = self._locate()
+        self._back_off.attempted(self._clock())
+        self._serial = _opened(path, self._port, self._settings)
+        self._receiver = receiver
+        self._opened += 1
+        asyncio.get_running_loop().add_reader(self._serial.fileno(), self._readable)
+
+    def write(self, data: bytes) -> None:
+        """Hand over bytes for sending.
+
+        Raises
+        ------
+        LinkDownError
+            The port is closed or just went away.
+        LinkError
+            The kernel's buffer is full: nothing is being sent.
+        """
+        if self._serial is None:
+            raise LinkDownError(f"{self._port}: not open")
+        try:
+            written = os.write(self._serial.fileno(), data)
+        except BlockingIOError:
+            written = 0
+        except OSError as error:
+            raise self._gone() from error
+        if written != len(data):
+            raise LinkError(f"{self._port}: only {written} of {len(data)} bytes could be sent; is the line held?")
+
+    def succeeded(self) -> None:
+        """A valid answer came: the next `open` may be at once."""
+        self._back_off.succeeded()
+
+    def close(self) -> None:
+        """Close; never raises."""
+        if self._serial is None:
+            return
+        port, self._serial, self._receiver = self._serial, None, None
+        asyncio.get_running_loop().remove_reader(port.fileno())
+        with contextlib.suppress(OSError, termios.error):
+            # closing a tty waits for its output to drain, up to 30 s when the line is held
+            termios.tcflush(port.fileno(), termios.TCOFLUSH)
+        with contextlib.suppress(OSError):
+            port.close()
+
+    def _locate(self) -> str:
+        try:
+            path = port_path(self._port)
+        except LinkDownError:
+            self._absent_until_s = self._clock() + _ABSENT_S
+            raise
+        if not Path(path).exists():
+            self._absent_until_s = self._clock() + _ABSENT_S
+            raise LinkDownError(f"{self._port}: {_REMEDIES[errno.ENOENT]}")
+        return path
+
+    def _readable(self) -> None:
+        if self._serial is None or self._receiver is None:
+            return
+        try:
+            data = os.read(self._serial.fileno(), _READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if data:
+            self._receiver.received(data)
+        else:  # the end of a tty is a hang-up
+            self._gone()
+
+    def _gone(self) -> LinkDownError:
+        receiver = self._receiver
+        self.close()
+        error = LinkDownError(f"{self._port}: the port is gone; is the adapter unplugged?")
+        if receiver is not None:
+            receiver.lost(error)
+        return error
+
+
+def _opened(path: str, name: str, settings: SerialSettings) -> Any:
+    try:
+        port = serial.Serial(
+            path,
+            baudrate=settings.baud,
+            bytesize=settings.data_bits,
+            parity=settings.parity,
+            stopbits=settings.stop_bits,
+            timeout=0,
+            exclusive=True,
+        )
+    except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
+        code = getattr(error, "errno", None) or (error.args[0] if error.args else None)
+        remedy = _REMEDIES.get(code, str(error)) if isinstance(code, int) else str(error)
+        if code == errno.ENOTTY:
+            raise DeviceRefusedError(f"{name}: {remedy}") from error
+        raise LinkDownError(f"{name}: {remedy}") from error
+    with contextlib.suppress(ValueError, OSError):
+        port.set_low_latency_mode(True)  # FTDI adapters otherwise hold bytes back for 16 ms; others do not have it
+    if settings.parity != "N":
+        _drop_wrong_parity(port.fileno())
+    return port
+
+
+def _drop_wrong_parity(descriptor: int) -> None:
+    """Have the kernel check the parity of what comes in, which pyserial leaves off: a hit byte is a missing byte."""
+    attributes = termios.tcgetattr(descriptor)
+    attributes[0] |= termios.INPCK | termios.IGNPAR
+    termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
