@@ -16,6 +16,7 @@ _PAUSE_S = 0.25
 
 def open_bench(devices: DevicesConfig) -> Bench:
     """The bench that the configuration names, not yet connected."""
+    assert devices.board is not None
     return PumpBoard(devices.board, devices.unit_id, devices.timeout_s, devices.watchdog_s)
 
 
@@ -33,8 +34,8 @@ async def connect(bench: Bench, devices: DevicesConfig) -> BenchIdentity:
         try:
             return await bench.open()
         except DeviceRefusedError as error:
-            raise DeviceError(f"{devices.board}: {error}") from None
+            raise DeviceError(f"{devices.name}: {error}") from None
         except LinkError as error:
             if loop.time() > give_up_s:
-                raise DeviceError(f"{devices.board}: {error}") from None
+                raise DeviceError(f"{devices.name}: {error}") from None
         await asyncio.sleep(_PAUSE_S)

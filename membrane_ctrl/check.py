@@ -44,7 +44,7 @@ async def _probe(config: Config) -> tuple[BenchIdentity, BenchReading]:
         identity = await bench.open()
         return identity, await bench.read()
     except LinkError as error:
-        raise DeviceError(f"{config.devices.board}: {error}") from None
+        raise DeviceError(f"{config.devices.name}: {error}") from None
     finally:
         await bench.close()
 
@@ -57,7 +57,7 @@ def _what_would_happen(config: Config) -> dict[str, str]:
         if on
     ]
     return {
-        "devices": config.devices.board if config.devices else "none: only `hold --twin` would run",
+        "devices": config.devices.name if config.devices else "none: only `hold --twin` would run",
         "hold": f"{loop.setpoint_um:g} um at {loop.rate_hz:g} Hz, limits {limits.displacement_min_um:g} .. "
         f"{limits.displacement_max_um:g} um and {limits.gauge_pressure_max_pa:g} Pa",
         "gains": f"Kp {loop.kp_per_s:g} 1/s, Ti {loop.ti_s:g} s, Td {loop.td_s:g} s",

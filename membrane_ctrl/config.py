@@ -8,17 +8,14 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from membrane_ctrl.device_config import DevicesConfig as DevicesConfig
+from membrane_ctrl.section import Section as Section
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Vector3 = tuple[float, float, float]
-
-
-class Section(BaseModel):
-    """A configuration table: immutable, no unknown keys, no NaN or infinity."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class LoopConfig(Section):
@@ -186,15 +183,6 @@ class OpticsConfig(Section):
     camera: CameraConfig = CameraConfig()
     pattern: PatternConfig = PatternConfig()
     mirror: MirrorConfig = MirrorConfig()
-
-
-class DevicesConfig(Section):
-    """Which device fills which role."""
-
-    board: str = "tcp://127.0.0.1:5020"  # the pump board: tcp://HOST:PORT
-    unit_id: Annotated[int, Field(ge=1, le=247)] = 1
-    timeout_s: Annotated[float, Field(gt=0, le=5)] = 0.2
-    watchdog_s: Annotated[float, Field(ge=0.1, le=10)] = 0.5
 
 
 class TwinConfig(Section):

@@ -26,6 +26,7 @@ from membrane_ctrl.controller import Controller
 from membrane_ctrl.crew import Crew, Rings, rings_for
 from membrane_ctrl.errors import DeviceError, Exit, InputError
 from membrane_ctrl.ipc.ring import RingReader, RingWriter
+from membrane_ctrl.priority import raise_priority
 from membrane_ctrl.recording.run_folder import create_run_folder
 from membrane_ctrl.simulated import TwinProcess
 from membrane_ctrl.supervisor import Supervisor, Wiring
@@ -80,11 +81,11 @@ async def _identify(bench: Bench, devices: DevicesConfig, clear_faults: bool) ->
         reading = await bench.read()
         if reading.latched_faults:
             raise DeviceError(
-                f"{devices.board}: the board has latched faults {reading.latched_faults:#x} (docs/registers.md); "
+                f"{devices.name}: the board has latched faults {reading.latched_faults:#x} (docs/registers.md); "
                 "find out why, then start with --clear-faults"
             )
     except LinkError as error:
-        raise DeviceError(f"{devices.board}: {error}") from None
+        raise DeviceError(f"{devices.name}: {error}") from None
     finally:
         await bench.close()
 
@@ -106,7 +107,7 @@ async def _run(
         )
         controller = Controller(config, zernike_projection())
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
-        supervisor.tell({"kind": "start", "devices": config.devices.board if config.devices else ""})
+        supervisor.tell({"kind": "start", "devices": config.devices.name if config.devices else ""})
         exit_code = Exit.DEVICE_FAILED
         try:
             assert config.devices is not None

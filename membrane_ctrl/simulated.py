@@ -46,9 +46,8 @@ class TwinProcess:
         report = ours.recv() if ours.poll(_READY_S) else BenchReport(error="the twin did not start")
         if report.error:
             raise DeviceError(report.error)
-        devices = (config.devices or DevicesConfig()).model_copy(
-            update={"board": f"tcp://127.0.0.1:{report.port}", "unit_id": 1}
-        )
+        watchdog = {} if config.devices is None else config.devices.model_dump(include={"timeout_s", "watchdog_s"})
+        devices = DevicesConfig(board=f"tcp://127.0.0.1:{report.port}", **watchdog)
         return cls(config.model_copy(update={"devices": devices}), truth)
 
     def truth_reader(self) -> Callable[[], tuple[float, float]]:
