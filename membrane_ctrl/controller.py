@@ -28,6 +28,9 @@ from membrane_ctrl.tick import Command, Event, TickInputs, TickOutputs
 # tick, which safety sees by its lateness
 _DT_RANGE = (0.2, 5.0)
 
+# a reason that comes and goes faster (a pump that touches its limit) tells nobody anything
+_WHY_STANDS_S = 1.0
+
 
 class Controller:
     """Owns the state machine, the safety table and both loops.
@@ -49,7 +52,8 @@ class Controller:
         self._tick_error = ""
         self._ticks = 0
         self._state_since_s = math.nan
-        self._said_why = ""
+        self._said_why = self._why_words = ""
+        self._why_since_s = 0.0
         self._shape_was: tuple[int, str] = (-1, "")
         self.state = State.STANDBY
         self.fault: Rule | None = None
@@ -154,11 +158,14 @@ class Controller:
         scene.overdue = ""
 
     def _tell_why(self, events: list[Event]) -> None:
-        """The one line of the operator, as an event whenever its words (not its numbers) change."""
-        words = "".join(c for c in self._scene.why if not c.isdigit())
-        if words != self._said_why:
+        """The one line of the operator, as an event when its words (not its numbers) have changed for good."""
+        scene = self._scene
+        words = "".join(c for c in scene.why if not c.isdigit())
+        if words != self._why_words:
+            self._why_words, self._why_since_s = words, scene.now_s
+        if words != self._said_why and scene.now_s - self._why_since_s >= _WHY_STANDS_S:
             self._said_why = words
-            events.append({"kind": "why", "why": self._scene.why})
+            events.append({"kind": "why", "why": scene.why})
 
     def _row(self, inputs: TickInputs, observation: Observation, shape: ShapeOutput) -> TelemetryRow:
         scene, reading, out = self._scene, inputs.reading, self._scene.output

@@ -46,9 +46,7 @@ def rings_for(config: Config, truth: RingAddress | None, stack: ExitStack) -> Ri
 def _frames(config: Config, stack: ExitStack) -> FrameAddress:
     from membrane_ctrl.acquisition.frames import FrameRing
 
-    camera = config.optics.camera
-    slots = 2 * (config.optics.pattern.steps + 4) + 2 + 1  # a full cycle, and the frame that is being taken
-    owner = FrameRing(slots, camera.height_px, camera.width_px, "uint8" if camera.bits == 8 else "uint16")
+    owner = FrameRing.for_optics(config.optics)
     stack.callback(owner.close)
     return owner.address
 

@@ -107,7 +107,8 @@ async def _run(
         )
         controller = Controller(config, zernike_projection())
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
-        supervisor.tell({"kind": "start", "devices": config.devices.name if config.devices else ""})
+        devices = config.devices.name if config.devices else ""
+        supervisor.tell({"kind": "start", "devices": devices, "priority": raise_priority()})
         exit_code = Exit.DEVICE_FAILED
         try:
             assert config.devices is not None

@@ -81,10 +81,12 @@ def check(scene: Scene) -> State:
         scene.sinking.add(scene.now_s, scene.observer.displacement_um)
     missing = _missing(scene)
     scene.why = f"checking the sensors: {missing}" if missing else "checking the sensors: all good so far"
-    if scene.stay_good(not missing) >= scene.config.states.check_s:
-        scene.why = (
-            f"all sensors good for {scene.config.states.check_s:g} s; the mirror sinks by {_leak(scene):.2f} um/s"
-        )
+    check_s = scene.config.states.check_s
+    if scene.stay_good(not missing) >= check_s:
+        # the flow that balances the leak, so that the integrator need not find it first
+        leak_um_per_s = max(0.0, -scene.sinking.per_s)
+        scene.loop.start(scene.observer.displacement_um, leak_um_per_s)
+        scene.why = f"all sensors good for {check_s:g} s; the mirror sinks by {leak_um_per_s:.2f} um/s"
         return State.INFLATE
     if scene.state_age_s > scene.config.states.check_timeout_s:
         scene.overdue = f"sensors not good after {scene.config.states.check_timeout_s:g} s: {missing}"
@@ -95,9 +97,6 @@ def inflate(scene: Scene) -> State:
     """Ramp from where the mirror is to the setpoint."""
     if scene.stop_wanted:
         return _stop(scene)
-    if scene.state_age_s == 0:
-        # the flow that balances the leak, so that the integrator need not find it first
-        scene.loop.start(scene.observer.displacement_um, _leak(scene))
     output = _drive(scene)
     to_go_um = scene.config.loop.setpoint_um - output.filtered_um
     scene.why = f"inflating: {to_go_um:.1f} um to go"
@@ -172,11 +171,6 @@ HANDLERS: dict[State, Callable[[Scene], State]] = {
 def _stop(scene: Scene) -> State:
     scene.why = f"stop asked for by {scene.stop_asked_by}"
     return State.LOWER
-
-
-def _leak(scene: Scene) -> float:
-    """How fast the mirror sank in `check`, in um/s."""
-    return max(0.0, -scene.sinking.per_s)
 
 
 def _drive(scene: Scene) -> LoopOutput:

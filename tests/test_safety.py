@@ -108,9 +108,9 @@ def test_the_first_row_of_the_table_wins() -> None:
 def test_not_a_number_is_never_fine() -> None:
     table = SafetyTable(LIMITS)
     lost = replace(GOOD, displacement_um=math.nan, displacement_valid=False)
-    rule = table.judge(State.HOLD, lost).rule
-    assert rule is not None
-    assert rule.rung == Rung.HOLD_FLOW
+    rules = [table.judge(State.HOLD, lost).rule for _ in range(3)]
+    assert rules[-1] is not None
+    assert rules[-1].rung == Rung.HOLD_FLOW
 
 
 def test_what_the_operator_is_told_carries_the_value() -> None:
