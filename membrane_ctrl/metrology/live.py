@@ -52,10 +52,11 @@ class LiveReconstructor:
     bin_px : int
         Side of the bins whose phasors are used.
     laser_noise_um : float
-        Noise of one displacement reading; motion below twice that is not corrected.
+        Noise of one displacement as given (an average over an exposure has less than a sample); motion that is not
+        clearly above it is not corrected.
     """
 
-    def __init__(self, optics: OpticsConfig, bin_px: int = 4, *, laser_noise_um: float = 1.0) -> None:
+    def __init__(self, optics: OpticsConfig, bin_px: int = 4, *, laser_noise_um: float = 0.3) -> None:
         self._optics = optics
         self._geometry = Geometry.from_config(optics)
         self._bin_px = bin_px

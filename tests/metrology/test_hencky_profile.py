@@ -1,0 +1,52 @@
+"""The Hencky bowl against its differential equation and its published constants."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from metrology_truth import hencky_depth
+
+from membrane_ctrl.metrology import hencky, zernike
+from membrane_ctrl.metrology.surface import Surface
+
+RHO = np.linspace(0, 1, 101)
+
+
+def test_profile_solves_the_equation() -> None:
+    assert hencky.profile(RHO) == pytest.approx(hencky_depth(RHO), abs=1e-11)
+
+
+def test_published_constants() -> None:
+    """Centre coefficient 0.65344 and volume factor 0.5214 for nu = 0.3 (Fichter, NASA TP-3658)."""
+    v = np.linspace(0, 1, 20001)
+    assert np.trapezoid(1 / (4 * hencky.stress()(v)), v) == pytest.approx(0.65344, abs=1e-5)
+    assert 1 - np.trapezoid(hencky.profile(np.sqrt(v)), v) == pytest.approx(0.5214, abs=1e-4)
+
+
+def test_excess_is_orthogonal_to_all_terms() -> None:
+    v = np.linspace(0, 1, 20001)
+    excess = np.polynomial.polynomial.polyval(v, hencky.excess())
+    terms = zernike.values(np.sqrt(v), np.zeros_like(v))[[0, 3, 10, 21]]
+    assert np.trapezoid(terms * excess, v, axis=1) == pytest.approx(0, abs=1e-10)
+    assert np.sqrt(np.trapezoid(excess**2, v)) == pytest.approx(hencky.excess_rms(), rel=1e-4)
+
+
+def test_36_terms_alone_miss_micrometres_of_the_bowl() -> None:
+    assert 1e3 * 37.1 * hencky.excess_rms() == pytest.approx(2.2, abs=0.1)
+
+
+def test_surface_is_bowl_with_its_vertex_at_zero() -> None:
+    bowl = Surface.hencky_bowl(37.1, 500.0)
+    r = 500 * RHO
+    assert bowl.height(r, 0 * r) == pytest.approx(37.1 * hencky_depth(RHO), abs=1e-9)
+    assert bowl.sag_mm == pytest.approx(37.1, abs=1e-10)
+
+
+def test_parameters_make_the_round_trip() -> None:
+    parameters = np.random.default_rng(5).normal(size=36)
+    surface = Surface.from_parameters(parameters, 500.0)
+    assert surface.parameters == pytest.approx(parameters, abs=1e-12)
+    assert surface.height(np.zeros(1), np.zeros(1)) == pytest.approx(0, abs=1e-12)
+    theta = 2 * np.pi * np.arange(64) / 64
+    rim = surface.height(500 * np.cos(theta), 500 * np.sin(theta))
+    assert surface.sag_mm == pytest.approx(rim.mean(), abs=1e-11)

@@ -1,0 +1,266 @@
+"""The live cycle on frames that the twin renders: an exact forward model that shares no code with the inverse."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import pytest
+from metrology_truth import SMALL
+
+from membrane_ctrl.config import OpticsConfig, PatternConfig
+from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.metrology.live import LiveReconstructor
+from membrane_ctrl.metrology.patterns import fringe_sequence, full_sequence
+from membrane_ctrl.twin.film_shape import FilmShape
+from membrane_ctrl.twin.illumination import Light
+from membrane_ctrl.twin.render import OpticsRenderer
+
+OPTICS = OpticsConfig(camera=SMALL)
+ZERNIKE_UM = (0, 0, 0, 0, 800, -500, 300, 0, 400, 0, 0, 0, 50, *[0] * 23)
+FILM = FilmShape(37.1, 500.0, "hencky", ZERNIKE_UM)
+Frames = list[np.ndarray]
+
+
+@cache
+def _renderer(optics: OpticsConfig = OPTICS, light: Light = Light()) -> OpticsRenderer:  # noqa: B008 (frozen)
+    return OpticsRenderer(optics, FILM, light, seed=5)
+
+
+def _render(
+    kind: str,
+    displacement_um: float | Sequence[float] = 0.0,
+    optics: OpticsConfig = OPTICS,
+    light: Light | None = None,
+) -> tuple[Frames, np.ndarray, np.ndarray]:
+    """Frames, times (10 a second) and true displacements of one cycle."""
+    patterns = full_sequence(optics.pattern) if kind == "full" else fringe_sequence(optics.pattern)
+    where = np.broadcast_to(np.asarray(displacement_um, float), len(patterns)).copy()
+    renderer = _renderer(optics, light or Light())
+    frames = [renderer.render(pattern, d).copy() for pattern, d in zip(patterns, where, strict=True)]
+    return frames, 0.1 * np.arange(len(patterns)), where
+
+
+def _live(optics: OpticsConfig = OPTICS, light: Light | None = None, bin_px: int = 1) -> LiveReconstructor:
+    """A reconstructor after its first full cycle at displacement 0."""
+    live = LiveReconstructor(optics, bin_px)
+    first = live.full(*_render("full", 0.0, optics, light))
+    assert first.verdict == "ok", first.reason
+    return live
+
+
+def _error_um(live: LiveReconstructor, estimate: ShapeEstimate, displacement_um: float) -> tuple[float, float]:
+    """RMS and largest error of the height inside the analysis radius."""
+    x, y, h = live.height_map(estimate.coeffs_um, estimate.hencky_um, 96)
+    truth = FilmShape(37.1 + displacement_um / 1e3, 500.0, "hencky", ZERNIKE_UM).height_mm(*np.meshgrid(x, y), 0.0)
+    error = 1e3 * (h - truth)[np.isfinite(h)]
+    return float(np.sqrt(np.mean(error**2))), float(np.abs(error).max())
+
+
+@pytest.mark.parametrize("bin_px", [1, 2])
+def test_full_cycle(bin_px: int) -> None:
+    live = LiveReconstructor(OPTICS, bin_px)
+    frames, times, where = _render("full")
+    estimate = live.full(frames, times, where)
+    assert (estimate.verdict, estimate.reason, estimate.kind) == ("ok", "", "full")
+    rms, worst = _error_um(live, estimate, 0.0)
+    assert rms <= 0.05  # 0.4 ADU of noise on 1/64 of the real sensor's pixels: 8 times the 3 nm there
+    assert worst <= 0.3
+    assert estimate.sag_um == pytest.approx(37100, abs=5 * estimate.sag_sigma_um)
+    assert estimate.valid_fraction == pytest.approx(1, abs=0.02)
+    assert estimate.time_s == pytest.approx(np.mean([*times[:4], *times[8:12]]))
+    assert estimate.saturated_fraction == 0
+
+
+@pytest.mark.parametrize("displacement_um", [1.0, -30.0, 300.0])
+def test_fringes_follow_the_film(displacement_um: float) -> None:
+    live = _live()
+    estimate = live.fringes(*_render("fringes", displacement_um))
+    assert (estimate.verdict, estimate.kind) == ("ok", "fringes")
+    assert _error_um(live, estimate, displacement_um)[0] <= 0.05
+    assert estimate.displacement_um == pytest.approx(displacement_um)
+
+
+def test_fringe_orders_are_carried_on_from_cycle_to_cycle() -> None:
+    """1.2 mm in steps of 300 um: more than a fringe in all, less than half of one at a time."""
+    live = _live()
+    for displacement_um in (300.0, 600.0, 900.0, 1200.0):
+        estimate = live.fringes(*_render("fringes", displacement_um))
+        assert estimate.verdict == "ok", estimate.reason
+    assert _error_um(live, estimate, 1200.0)[0] <= 0.05
+
+
+@pytest.mark.parametrize("jump_um", [1100.0, -1500.0, 3000.0])
+def test_jump_beyond_half_a_fringe_asks_for_a_full_cycle(jump_um: float) -> None:
+    live = _live()
+    lost = live.fringes(*_render("fringes", jump_um))
+    assert lost.verdict == "rejected"
+    assert lost.reason.startswith("tracking lost")
+    assert np.isnan(lost.coeffs_um).all()
+    assert live.fringes(*_render("fringes", 0.0)).verdict == "ok"  # the old orders are still good there
+    again = live.full(*_render("full", jump_um))
+    assert again.verdict == "ok"
+    assert _error_um(live, again, jump_um)[0] <= 0.05
+
+
+def test_fringes_before_any_full_cycle() -> None:
+    lost = LiveReconstructor(OPTICS, 1).fringes(*_render("fringes"))
+    assert (lost.verdict, lost.reason[:13]) == ("rejected", "tracking lost")
+
+
+def test_dark_cycle_is_rejected_and_the_next_one_is_fine() -> None:
+    live = _live()
+    frames, times, where = _render("fringes", 2.0)
+    dark = live.fringes([frame // 64 for frame in frames], times, where)
+    assert dark.verdict == "rejected"
+    estimate = live.fringes(frames, times, where)
+    assert estimate.verdict == "ok"
+    assert _error_um(live, estimate, 2.0)[0] <= 0.05
+
+
+def test_full_cycle_of_black_frames_is_rejected() -> None:
+    frames, times, where = _render("full")
+    black = LiveReconstructor(OPTICS, 1).full([0 * frame for frame in frames], times, where)
+    assert (black.verdict, black.reason) == ("rejected", "only 0 bins see the pattern in the mirror")
+
+
+def test_failed_full_cycle_leaves_nothing_to_follow() -> None:
+    live = _live()
+    frames, times, where = _render("full")
+    live.full([0 * frame for frame in frames], times, where)
+    assert live.fringes(*_render("fringes")).reason.startswith("tracking lost")
+
+
+def test_overexposed_pixels_are_left_out_and_told() -> None:
+    live = _live()
+    frames, times, where = _render("fringes")
+    frames = [frame.copy() for frame in frames]
+    for frame in frames:
+        frame[100:140, 120:160] = 255  # a lamp's reflection: 5 % of the mirror
+    estimate = live.fringes(frames, times, where)
+    assert estimate.verdict == "degraded"
+    assert "saturated" in estimate.reason
+    assert estimate.saturated_fraction == pytest.approx(1600 / 33000, rel=0.05)
+    assert _error_um(live, estimate, 0.0)[0] <= 0.05
+    assert live.fringes(*_render("fringes")).verdict == "ok"  # its points kept their orders
+
+
+def test_half_a_mirror_is_rejected() -> None:
+    frames, times, where = _render("full")
+    frames = [frame.copy() for frame in frames]
+    for frame in frames:
+        frame[:, :160] = 3
+    estimate = LiveReconstructor(OPTICS, 1).full(frames, times, where)
+    assert estimate.verdict == "rejected"
+    assert "of the area" in estimate.reason
+
+
+@pytest.mark.parametrize(("steps", "bits"), [(3, 8), (7, 12), (4, 16)])
+def test_other_steps_and_depths(steps: int, bits: int) -> None:
+    camera = SMALL.model_copy(update={"bits": bits, "noise_adu": 0.4 * 2 ** (bits - 8)})
+    optics = OpticsConfig(camera=camera, pattern=PatternConfig(steps=steps))
+    live = _live(optics)
+    estimate = live.fringes(*_render("fringes", 5.0, optics))
+    assert estimate.verdict == "ok"
+    assert _error_um(live, estimate, 5.0)[0] <= 0.06
+
+
+def test_without_a_laser() -> None:
+    """Displacement unknown: the vertex is taken to stand still, which costs nothing while it does."""
+    live = LiveReconstructor(OPTICS, 1)
+    frames, times, where = _render("full")
+    estimate = live.full(frames, times, where * np.nan)
+    assert estimate.verdict == "ok"
+    assert np.isnan(estimate.displacement_um)
+    frames, times, where = _render("fringes", 10.0)
+    assert _error_um(live, live.fringes(frames, times, where * np.nan), 10.0)[0] <= 0.1
+
+
+def test_first_reading_is_the_reference() -> None:
+    live = LiveReconstructor(OPTICS, 1)
+    frames, times, where = _render("full")
+    live.full(frames, times, where + 1234.0)
+    frames, times, where = _render("fringes", 500.0)
+    assert _error_um(live, live.fringes(frames, times, where + 1234.0), 500.0)[0] <= 0.05
+
+
+def _moving(amplitude_um: float) -> np.ndarray:
+    return amplitude_um * np.sin(2 * np.pi * 0.3 * 0.1 * np.arange(8) + 0.4)
+
+
+def test_motion_during_the_frames_is_taken_out() -> None:
+    """The film swings by 5 um at 0.3 Hz; the figure is that of the mean position."""
+    live = _live()
+    where = _moving(5.0)
+    frames, times, _ = _render("fringes", where)
+    corrected = _error_um(live, live.fringes(frames, times, where), float(where.mean()))[0]
+    blind = _error_um(live, live.fringes(frames, times, np.full(8, where.mean())), float(where.mean()))[0]
+    assert corrected <= 0.1
+    assert blind > 5 * corrected > 0
+
+
+def test_noisy_laser_still_helps() -> None:
+    live = _live()
+    where = _moving(5.0)
+    frames, times, _ = _render("fringes", where)
+    readings = where + np.random.default_rng(3).normal(0, 1.0, 8)
+    assert _error_um(live, live.fringes(frames, times, readings), float(where.mean()))[0] <= 0.5
+
+
+def test_predicted_sigma_is_the_scatter_of_cycles() -> None:
+    live = _live(bin_px=2)
+    estimates = [live.fringes(*_render("fringes")) for _ in range(60)]
+    sags = np.array([e.sag_um for e in estimates])
+    assert sags.std() == pytest.approx(estimates[0].sag_sigma_um, rel=0.3)  # 60 cycles tell a sigma to 9 %
+    coeffs = np.array([e.coeffs_um for e in estimates])
+    ratio = coeffs.std(axis=0) / np.sqrt(np.diag(estimates[0].covariance_um2))
+    assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1, abs=0.15)
+
+
+def test_same_frames_give_the_same_bits() -> None:
+    cycles = [_render("full"), *(_render("fringes", d) for d in (1.0, -2.0))]
+    runs = []
+    for _ in range(2):
+        live = LiveReconstructor(OPTICS, 1)
+        runs.append([live.full(*cycles[0]), live.fringes(*cycles[1]), live.fringes(*cycles[2])])
+    for first, second in zip(*runs, strict=True):
+        assert np.array_equal(first.coeffs_um, second.coeffs_um)
+        assert np.array_equal(first.covariance_um2, second.covariance_um2)
+
+
+def test_covariance_is_a_covariance() -> None:
+    live = _live()
+    estimate = live.fringes(*_render("fringes"))
+    assert estimate.covariance_um2 == pytest.approx(estimate.covariance_um2.T)
+    assert np.linalg.eigvalsh(estimate.covariance_um2).min() > -1e-15
+    assert 0 < estimate.sag_sigma_um < 0.1
+
+
+def test_sag_sensitivity_is_the_change_seen() -> None:
+    live = _live()
+    low, high = (live.fringes(*_render("fringes", d)) for d in (0.0, 200.0))
+    assert (high.coeffs_um - low.coeffs_um) / 200 == pytest.approx(live.sag_sensitivity(), abs=1e-3)
+
+
+def test_height_map_is_nan_outside_the_analysis() -> None:
+    live = LiveReconstructor(OPTICS, 1)
+    x, y, h = live.height_map(live.sag_sensitivity() * 37100, 37100, 101)
+    radius = np.hypot(*np.meshgrid(x, y))
+    assert np.array_equal(np.isnan(h), radius > 475)
+    assert h[50, 50] == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["full", "fringes"])
+def test_wrong_number_of_frames(kind: str) -> None:
+    live = LiveReconstructor(OPTICS, 1)
+    frames, times, where = _render(kind)
+    with pytest.raises(ValueError, match=f"{kind} cycle has {len(frames)} frames"):
+        getattr(live, kind)(frames[:-1], times, where)
+
+
+def test_wrong_size_of_frame() -> None:
+    live = _live()
+    frames, times, where = _render("fringes")
+    with pytest.raises(ValueError, match="305, 256"):
+        live.fringes([frame[:, :-1] for frame in frames], times, where)

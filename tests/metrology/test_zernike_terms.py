@@ -1,0 +1,51 @@
+"""Zernike terms against prysm, and their derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from prysm.polynomials import noll_to_nm, zernike_nm
+
+from membrane_ctrl.metrology import zernike
+
+RNG = np.random.default_rng(3)
+RHO, THETA = np.sqrt(RNG.uniform(0, 1, 200)), RNG.uniform(-np.pi, np.pi, 200)
+X, Y = RHO * np.cos(THETA), RHO * np.sin(THETA)
+
+
+@pytest.mark.parametrize("j", range(1, 37))
+def test_term_is_prysms(j: int) -> None:
+    n, m = noll_to_nm(j)
+    assert zernike.noll(j) == (n, m)
+    assert zernike.values(X, Y)[j - 1] == pytest.approx(zernike_nm(n, m, RHO, THETA, norm=True), abs=1e-12)
+
+
+def test_the_36_terms_are_all_of_radial_order_7() -> None:
+    assert [zernike.noll(j)[0] for j in (1, 36, 37)] == [0, 7, 8]
+    assert np.linalg.matrix_rank(zernike.monomial_table().reshape(36, 64)) == 36
+
+
+def test_terms_are_orthonormal_over_the_disc() -> None:
+    nodes, weights = np.polynomial.legendre.leggauss(10)
+    rho, theta = np.sqrt((nodes + 1) / 2), 2 * np.pi * np.arange(32) / 32
+    z = zernike.values(np.outer(rho, np.cos(theta)), np.outer(rho, np.sin(theta)))
+    gram = np.einsum("jab,kab,a->jk", z, z, weights / 64)
+    assert gram == pytest.approx(np.eye(36), abs=1e-12)
+
+
+def test_gradients_are_those_of_the_values() -> None:
+    h = 1e-4
+    gx, gy = zernike.gradients(X, Y)
+    assert gx == pytest.approx((zernike.values(X + h, Y) - zernike.values(X - h, Y)) / (2 * h), abs=1e-4)
+    assert gy == pytest.approx((zernike.values(X, Y + h) - zernike.values(X, Y - h)) / (2 * h), abs=1e-4)
+
+
+def test_vertex_and_rim_means() -> None:
+    theta = 2 * np.pi * np.arange(64) / 64
+    assert zernike.at_vertex() == pytest.approx(zernike.values(np.zeros(1), np.zeros(1))[:, 0])
+    assert zernike.at_rim() == pytest.approx(zernike.values(np.cos(theta), np.sin(theta)).mean(axis=1), abs=1e-12)
+
+
+def test_index_below_one_is_refused() -> None:
+    with pytest.raises(ValueError, match="starts at 1"):
+        zernike.noll(0)
