@@ -1,0 +1,48 @@
+"""An event loop whose clock jumps to the next timer instead of waiting for it.
+
+For emulated devices on a `MemoryWire`: an hour of late answers and timeouts takes seconds, and is the same every
+time. Nothing in it may wait for the outside world.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import selectors
+from collections.abc import Coroutine
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+class VirtualLoop(asyncio.SelectorEventLoop):
+    """Starts at 0 s."""
+
+    def __init__(self) -> None:
+        self._now_s = 0.0
+        super().__init__(_Jump(self))
+
+    def time(self) -> float:
+        """Virtual seconds."""
+        return self._now_s
+
+    def jump(self, seconds: float) -> None:
+        """Let time pass."""
+        self._now_s += seconds
+
+
+class _Jump(selectors.SelectSelector):
+    def __init__(self, loop: VirtualLoop) -> None:
+        super().__init__()
+        self._loop = loop
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        if timeout is None:
+            raise RuntimeError("everything waits and no timer is set: this would wait forever")
+        self._loop.jump(max(0.0, timeout))
+        return []
+
+
+def run_virtual(main: Coroutine[Any, Any, T]) -> T:
+    """Run to the end in virtual time."""
+    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+        return runner.run(main)
