@@ -80,7 +80,8 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
     signal.signal(signal.SIGTERM, lambda *_: asked.set())
     os.nice(_NICE)
     os.environ["RUST_LOG"] = "off"  # Rerun's own log would write over the live screen; its errors come as exceptions
-    _record(spec, reporter(status), asked.is_set, parent_died)
+    if not _record(spec, reporter(status), asked.is_set, parent_died):
+        os._exit(0)  # everything is written; Rerun's exit handler would wait for a dead writer
 
 
 def _record(
@@ -88,7 +89,8 @@ def _record(
     report: Callable[[dict[str, Any]], None],
     asked: Callable[[], bool],
     orphan: Callable[[], bool],
-) -> None:
+) -> bool:
+    """Record until the end; whether the process may end in the ordinary way."""
     from membrane_ctrl.recording.recorder import Recorder
     from membrane_ctrl.recording.sink import Recording
     from membrane_ctrl.recording.thumbnails import Thumbnails
@@ -116,6 +118,7 @@ def _record(
         thumbnails.close()
     for ring in rings.values():
         ring.close()
+    return not recording.stuck
 
 
 def _end_event(clock: RunClock, exit_word: str) -> dict[str, Any]:

@@ -1,9 +1,11 @@
 """The Rerun file: segments, time axes, statics, and a flush that says when the writer has died.
 
 Rerun facts behind this module (0.41, all reproduced): on a full disk `log` and `send_columns` go on without a
-word, only `flush` raises; `save` on the same stream starts a new file at once and loses no row; statics,
+word, only `flush` raises; `save` on a healthy stream starts a new file at once and loses no row; statics,
 properties and blueprint have to be sent again after each `save`; segments with the same recording id are one
-recording in the viewer.
+recording in the viewer. When the writer died between taking a flush and answering it, `flush` times out, and then
+`save`, `disconnect`, the stream's destructor and Rerun's own exit handler wait for it for ever: such a stream is
+kept and left alone, and the process has to end without exit handlers.
 """
 
 from __future__ import annotations
@@ -35,6 +37,10 @@ SEGMENT_S = 6 * 3600.0
 _FLUSH_TIMEOUT_S = 5.0
 
 
+# Held by the module, so that no destructor ever runs.
+_abandoned: list[rr.RecordingStream] = []
+
+
 class RecordingError(Exception):
     """The writer behind the Rerun stream is dead or could not be started; the message is Rerun's."""
 
@@ -57,6 +63,8 @@ class Recording:
     ----------
     segments : int
         Files begun so far.
+    stuck : bool
+        A stream was abandoned: Rerun's exit handler may wait for it for ever.
     """
 
     def __init__(self, run_dir: Path, run_name: str, clock: RunClock, config: Config) -> None:
@@ -64,7 +72,8 @@ class Recording:
         self._run_name = run_name
         self._origin = np.datetime64(clock.origin_utc.replace(tzinfo=None), "ns")
         self._config = config
-        self._stream = rr.RecordingStream(APPLICATION, recording_id=run_dir.name)
+        self._stream = self._new_stream()
+        self.stuck = False
         self._path: Path | None = None
         self.segments = 0
 
@@ -77,9 +86,20 @@ class Recording:
             self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except (RuntimeError, OSError) as error:
             path.unlink(missing_ok=True)
+            self._abandon()
             raise RecordingError(f"{path}: {error}") from None
         self._path = path
         self.segments += 1
+
+    def _new_stream(self) -> rr.RecordingStream:
+        return rr.RecordingStream(APPLICATION, recording_id=self._run_dir.name)
+
+    def _abandon(self) -> None:
+        """Go on with another stream and never touch the old one again (see the module's facts)."""
+        _abandoned.append(self._stream)
+        self.stuck = True
+        self._stream = self._new_stream()
+        self._path = None
 
     def _send_statics(self) -> None:
         stream = self._stream
@@ -126,6 +146,7 @@ class Recording:
         try:
             self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except (RuntimeError, OSError) as error:
+            self._abandon()
             raise RecordingError(str(error)) from None
 
     def close(self) -> None:
@@ -136,6 +157,7 @@ class Recording:
         RecordingError
             If the file has no footer: then it is slow to open, and its last second may be missing.
         """
+        self.flush()
         self._stream.disconnect()
         if self._path is not None and not _is_whole(self._path):
             raise RecordingError(f"{self._path}: closed without its footer; `rerun rrd optimize` mends it")

@@ -12,7 +12,7 @@ from rerun.chunk import RrdReader
 def scalars(path: Path, entity: str) -> tuple[np.ndarray, np.ndarray]:
     """Times in s of the run (n,) and values (n, m) of one entity, sorted by time."""
     times, values = [], []
-    for chunk in RrdReader(path).stream().filter(content=entity):
+    for chunk in reader(path).stream().filter(content=entity):
         batch = chunk.to_record_batch()
         if "Scalars:scalars" in batch.schema.names and "run_time" in batch.schema.names:
             times += nanoseconds(batch)
@@ -29,7 +29,7 @@ def nanoseconds(batch: object) -> list[int]:
 def strings(path: Path, entity: str, component: str) -> list[tuple[float, str]]:
     """(time in s, text) of a text component, sorted by time."""
     found = []
-    for chunk in RrdReader(path).stream().filter(content=entity):
+    for chunk in reader(path).stream().filter(content=entity):
         batch = chunk.to_record_batch()
         if component in batch.schema.names and "run_time" in batch.schema.names:
             texts = [cell[0] for cell in batch.column(component).to_pylist()]
@@ -39,15 +39,20 @@ def strings(path: Path, entity: str, component: str) -> list[tuple[float, str]]:
 
 def entities(path: Path) -> set[str]:
     """Paths of all entities with data."""
-    return {chunk.entity_path for chunk in RrdReader(path).stream()}
+    return {chunk.entity_path for chunk in reader(path).stream()}
+
+
+def reader(path: Path) -> RrdReader:
+    """A reader that takes a file without footer in silence."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return RrdReader(path)
 
 
 def has_footer(path: Path) -> bool:
     """Whether the file was closed in order."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            RrdReader(path).store()
-        except (RuntimeError, ValueError):
-            return False
+    try:
+        reader(path).store()
+    except (RuntimeError, ValueError):
+        return False
     return True
