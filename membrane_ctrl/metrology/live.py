@@ -40,6 +40,8 @@ GUARD_RAD = 0.9 * math.pi
 LOST_SHARE = 0.002  # more points than dust and glints beyond the guard
 # With this share of its points the full cycle's normal matrix still contracts a hundredfold a step.
 MATRIX_KEPT_SHARE = 0.99
+# the plane z = 0 is crossed this far at most from where a ray meets the film
+_FILM_BESIDE_PLANE_MM = 25.0
 
 
 class LiveReconstructor:
@@ -68,6 +70,7 @@ class LiveReconstructor:
         size = (optics.camera.height_px, optics.camera.width_px)
         self._binner = Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
         self._grid = BinGrid(self._geometry, optics.camera, bin_px)
+        self._near = np.flatnonzero(self._grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM))
         self._reference_um = optics.geometry.reference_displacement_um
         self._mm_per_rad = mm_per_rad(optics.pattern)
         self._pixel_sigma_adu = pixel_sigma_adu(optics.camera.noise_adu)
@@ -99,14 +102,15 @@ class LiveReconstructor:
             self._reference_um = float(readings[0])
         self._binner.clear()
         self._binner.add(frames, range(len(frames)), watched=sinusoids)
-        decoded = decode_full(self._binner.sums / self._bin_px**2, self._optics.pattern)
-        phase_rad = np.where(self._binner.saturated > 0, np.nan, decoded.phase_rad).reshape(2, -1)
+        optics = self._optics
+        images = self._binner.sums.reshape(self._slots.count, -1)[:, self._near] / self._bin_px**2
+        phase_rad = decode_full(images, optics.pattern).phase_rad
+        phase_rad[:, self._binner.saturated.ravel()[self._near] > 0] = np.nan
         times, readings = times[sinusoids], readings[sinusoids]
         self._tracked = None  # until this cycle is accepted
-        optics = self._optics
-        analysis_mm = optics.mirror.analysis_radius_mm
+        tracer, analysis_mm = self._tracer(readings), optics.mirror.analysis_radius_mm
         try:
-            state = establish(self._grid, self._tracer(readings), phase_rad, optics.pattern, analysis_mm)
+            state = establish(self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm)
         except ValueError as error:
             return _rejected("full", times, readings, str(error))
         return self._follow("full", state, times, readings)

@@ -21,8 +21,6 @@ FloatArray = NDArray[np.float64]
 _START_SAG_MM = 40.0  # the paper's starting parabola; any other leads to the same end
 _OUTLIER_SIGMAS = 8.0  # of the slopes' robust scatter: dust and glints, never noise
 _MIN_POINTS = 1000  # far more than 36 unknowns, far fewer than any real view of the mirror
-# the ring's plane is crossed this far at most from where the ray meets the film
-_FILM_BESIDE_PLANE_MM = 25.0
 
 
 @dataclass
@@ -66,29 +64,36 @@ class TrackedPoints:
 
 
 def establish(
-    grid: BinGrid, tracer: Tracer, phase_rad: FloatArray, pattern: PatternConfig, analysis_radius_mm: float
+    grid: BinGrid,
+    tracer: Tracer,
+    candidates: NDArray[np.int64],
+    phase_rad: FloatArray,
+    pattern: PatternConfig,
+    analysis_radius_mm: float,
 ) -> TrackedPoints:
     """Choose the points of a full cycle, fit their surface and work out what must be known of each.
 
     Parameters
     ----------
-    phase_rad : (2, bins) array
-        Absolute phases; NaN where a bin is not usable.
+    candidates : (n,) int array
+        Bins that may see the mirror.
+    phase_rad : (2, n) array
+        Their absolute phases; NaN where a bin is not usable.
 
     Raises
     ------
     ValueError
         If too few bins see the pattern in the mirror to fit a surface.
     """
-    near = grid.near_mirror(analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
-    index = np.flatnonzero(np.isfinite(phase_rad).all(axis=0) & near)
+    finite = np.isfinite(phase_rad).all(axis=0)
+    index, phase_rad = candidates[finite], phase_rad[:, finite]
     if index.size < _MIN_POINTS:
         raise ValueError(f"only {index.size} bins see the pattern in the mirror")
-    points = Points.of(grid.rays[:, index], screen_mm(phase_rad[:, index], pattern))
+    points = Points.of(grid.rays[:, index], screen_mm(phase_rad, pattern))
     fit = solve(tracer, points, parabola(_START_SAG_MM, tracer.radius_mm))
     for wanted in (_inside_radius, _without_outliers):
         keep = wanted(tracer, points, fit.surface, analysis_radius_mm)
-        points, index = points.subset(keep), index[keep]
+        points, index, phase_rad = points.subset(keep), index[keep], phase_rad[:, keep]
         if index.size < _MIN_POINTS:
             raise ValueError(f"only {index.size} bins see the pattern inside the analysis radius")
         fit = solve(tracer, points, fit.surface)
@@ -98,7 +103,7 @@ def establish(
     facing = np.abs(points.rays[2] - field[4] * points.rays[0] - field[5] * points.rays[1])
     scale = mm_per_rad(pattern)
     accepted = np.zeros((2, FOLLOWED_ROWS, index.size))
-    accepted[:, 0] = phase_rad[:, index]
+    accepted[:, 0] = phase_rad
     accepted[:, 1], accepted[:, 2] = np.cos(accepted[:, 0]), np.sin(accepted[:, 0])
     return TrackedPoints(
         index=index,

@@ -78,9 +78,10 @@ def differentiate(table: FloatArray, axis: int) -> FloatArray:
 
 
 def _evaluate(table: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    p, q = np.array([(p, q) for p in range(DEGREE + 1) for q in range(DEGREE + 1 - p)]).T
     powers_x = np.stack([x**k for k in range(DEGREE + 1)])
     powers_y = np.stack([y**k for k in range(DEGREE + 1)])
-    return np.asarray(np.einsum("jpq,p...,q...->j...", table, powers_x, powers_y, optimize=True))
+    return np.asarray(np.tensordot(table[:, p, q], powers_x[p] * powers_y[q], axes=1))
 
 
 def at_vertex() -> FloatArray:

@@ -121,11 +121,13 @@ def test_any_pose_with_a_distorting_lens() -> None:
     axes = np.stack([GEOMETRY.screen_s_x, GEOMETRY.screen_s_y]) @ turn.T
     config = GeometryConfig(
         camera=CameraPoseConfig(
-            position_mm=tuple(GEOMETRY.pinhole_mm + [30.0, -40.0, 25.0]),
+            position_mm=tuple(GEOMETRY.pinhole_mm + np.array([30.0, -40.0, 25.0])),
             rotation=tuple(tuple(row) for row in GEOMETRY.rotation @ turn),
         ),
         screen=ScreenPoseConfig(
-            origin_mm=tuple(GEOMETRY.screen_origin_mm + [-20.0, 15.0, 60.0]), s_x=tuple(axes[0]), s_y=tuple(axes[1])
+            origin_mm=tuple(GEOMETRY.screen_origin_mm + np.array([-20.0, 15.0, 60.0])),
+            s_x=tuple(axes[0]),
+            s_y=tuple(axes[1]),
         ),
     )
     camera = SMALL.model_copy(update={"distortion": (-0.15, 0.03, 1e-3, -5e-4)})
