@@ -1,0 +1,251 @@
+"""A `Bench` composed of single devices, one a role.
+
+The loop's two ends decide whether the bench is there. Without the pump (and the vent, if there is one) nothing can be
+made safe, so their errors are raised, and a lost link of theirs is a lost link of the bench. A sensor that fails is
+a missing value: NaN, on which the controller holds the flow, ramps down or does without, and the sensor is opened
+again in the background, so that a cable put back is a good reading within its back-off.
+
+Watchdog: only the pump board has one of its own. An instrument keeps the last setpoint it was given, so this bench
+watches itself: no `write` within `watchdog_s` and it sets the pump to 0 and says so. That covers a controller that
+hangs in a tick, not one that is killed: then the last flow stays until the gas is shut off by hand or by a relief
+valve. docs/devices.md and `check` say so.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import time
+from collections.abc import Awaitable, Callable, Iterable
+from dataclasses import dataclass, replace
+
+from firmware_iface.roles import (
+    Barometer,
+    BenchCommand,
+    BenchIdentity,
+    BenchReading,
+    Device,
+    DeviceIdentity,
+    DisplacementSample,
+    DisplacementSensor,
+    LinkDownError,
+    LinkError,
+    PressureSensor,
+    Pump,
+    Thermometer,
+    Vent,
+)
+
+WATCHDOG_BIT = 0  # in latched_faults, as on the pump board
+NO_ANSWER = 0xFFFF  # displacement_quality when the sensor itself does not answer; no instrument's code
+_RETRY_S = 0.1  # between two attempts to open a lost sensor; its link has the longer back-off
+
+
+@dataclass(frozen=True, slots=True)
+class RoleDevices:
+    """Which device fills which role; None where the bench has none."""
+
+    displacement: DisplacementSensor
+    pump: Pump
+    gauge_pressure: PressureSensor
+    vent: Vent | None = None
+    barometer: Barometer | None = None
+    thermometer: Thermometer | None = None
+
+    def by_role(self) -> dict[str, Device]:
+        """The filled roles, the actuators last: nothing may move gas before the sensors are there."""
+        roles: dict[str, Device | None] = {
+            "displacement": self.displacement,
+            "gauge_pressure": self.gauge_pressure,
+            "barometer": self.barometer,
+            "thermometer": self.thermometer,
+            "vent": self.vent,
+            "pump": self.pump,
+        }
+        return {role: device for role, device in roles.items() if device is not None}
+
+
+class RoleBench:
+    """Reads all sensors at once and drives pump and vent.
+
+    Parameters
+    ----------
+    devices : RoleDevices
+        Not yet open.
+    watchdog_s : float
+        The pump is set to 0 when no `write` came for this long.
+    clock : callable
+        Seconds on any axis that does not go back.
+    """
+
+    def __init__(
+        self, devices: RoleDevices, watchdog_s: float = 0.5, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._devices = devices
+        self._watchdog_s = watchdog_s
+        self._clock = clock
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._last_sample = DisplacementSample(math.nan, NO_ANSWER, 0, 0.0)
+        self._fed_s = math.inf
+        self._commanded = 0.0
+        self._tripped = False
+        self.identities: dict[str, DeviceIdentity] = {}
+
+    async def open(self) -> BenchIdentity:
+        """Open every device, sensors first, and start the watchdog.
+
+        Raises
+        ------
+        LinkError
+            The first device that is not there or not as the configuration says, with its role.
+        """
+        await self._stop_tasks()
+        for role, device in self._devices.by_role().items():
+            try:
+                self.identities[role] = await device.open()
+            except LinkError as error:
+                await self.close()
+                raise type(error)(f"{role}: {error}") from error
+        self._fed_s, self._commanded, self._tripped = self._clock(), 0.0, False
+        self._tasks["watchdog"] = asyncio.create_task(self._watch(), name="software watchdog")
+        kinds = ", ".join(f"{role} {identity.kind}" for role, identity in self.identities.items())
+        firmware = ", ".join(dict.fromkeys(i.firmware for i in self.identities.values() if i.firmware))
+        return BenchIdentity(f"composed of {kinds}", 0, firmware, self._watchdog_s)
+
+    async def read(self) -> BenchReading:
+        """All sensors at once; what a sensor cannot say is NaN.
+
+        Raises
+        ------
+        LinkError
+            Pump or vent gave no valid answer; LinkDownError when its link is gone.
+        """
+        sensors = asyncio.ensure_future(self._sensors())  # never raises
+        try:
+            pump, vent = await self._actuators()
+        finally:
+            sample, gauge_pa, ambient_pa, air_c = await sensors
+        return BenchReading(
+            displacement_um=sample.displacement_um,
+            displacement_quality=sample.quality,
+            gauge_pressure_pa=gauge_pa,
+            ambient_pressure_pa=ambient_pa,
+            air_temperature_c=air_c,
+            gas_temperature_c=math.nan,
+            pump_fraction=pump,
+            vent_fraction=vent,
+            sample_counter=sample.sample_counter,
+            device_time_s=sample.device_time_s,
+            watchdog_tripped=self._tripped,
+            latched_faults=int(self._tripped) << WATCHDOG_BIT,
+        )
+
+    async def write(self, command: BenchCommand) -> None:
+        """Command pump and vent at once, and feed the watchdog; after a trip the pump stays off.
+
+        Raises
+        ------
+        ValueError
+            A fraction that is not within 0..1, or NaN; nothing is sent.
+        LinkError
+            The device may or may not have it; the other one was commanded all the same.
+        """
+        for name, fraction in (("pump", command.pump_fraction), ("vent", command.vent_fraction)):
+            if not 0.0 <= fraction <= 1.0:
+                raise ValueError(f"{name}_fraction = {fraction} is not within 0..1")
+        pump = 0.0 if self._tripped else command.pump_fraction
+        self._commanded = max(self._commanded, pump)  # it may have the new one before it has answered
+        actions = [self._devices.pump.set_pump(pump)]
+        if self._devices.vent is not None:
+            actions.append(self._devices.vent.set_vent(command.vent_fraction))
+        _raise_first(await asyncio.gather(*actions, return_exceptions=True))
+        self._commanded = pump
+        self._fed_s = self._clock()
+
+    async def clear_faults(self) -> None:
+        """Forget a trip of the watchdog; only ever because a person said so."""
+        self._tripped = False
+        self._fed_s = self._clock()
+
+    async def close(self) -> None:
+        """Close every device, the pump first. Never raises."""
+        await self._stop_tasks()
+        for device in reversed(self._devices.by_role().values()):
+            await device.close()
+
+    async def _sensors(self) -> tuple[DisplacementSample, float, float, float]:
+        devices = self._devices
+        return await asyncio.gather(
+            self._sample(),
+            self._value("gauge_pressure", devices.gauge_pressure.gauge_pressure_pa),
+            self._value("barometer", devices.barometer.ambient_pressure_pa if devices.barometer else None),
+            self._value("thermometer", devices.thermometer.air_temperature_c if devices.thermometer else None),
+        )
+
+    async def _actuators(self) -> tuple[float, float]:
+        """Read-back of pump and vent; NaN for a vent that the bench does not have."""
+        vent = self._devices.vent
+        if vent is None:
+            return await self._devices.pump.pump_fraction(), math.nan
+        found = await asyncio.gather(self._devices.pump.pump_fraction(), vent.vent_fraction(), return_exceptions=True)
+        _raise_first(found)
+        pump_fraction, vent_fraction = (value for value in found if isinstance(value, float))
+        return pump_fraction, vent_fraction
+
+    async def _sample(self) -> DisplacementSample:
+        """The newest sample; without one the last counter and time, which then stand still."""
+        last = self._last_sample
+        self._last_sample = replace(last, displacement_um=math.nan, quality=NO_ANSWER)
+        if "displacement" not in self._tasks:
+            try:
+                self._last_sample = await self._devices.displacement.displacement()
+            except LinkError as error:
+                self._failed("displacement", error)
+        return self._last_sample
+
+    async def _value(self, role: str, read: Callable[[], Awaitable[float]] | None) -> float:
+        if read is None or role in self._tasks:
+            return math.nan
+        try:
+            return await read()
+        except LinkError as error:
+            self._failed(role, error)
+            return math.nan
+
+    def _failed(self, role: str, error: LinkError) -> None:
+        if isinstance(error, LinkDownError) and role not in self._tasks:
+            self._tasks[role] = asyncio.create_task(self._reopen(role), name=f"open {role} again")
+
+    async def _reopen(self, role: str) -> None:
+        """Open a lost sensor again, until the same one is back; another in its place is a person's to put right."""
+        device = self._devices.by_role()[role]
+        while True:
+            with contextlib.suppress(LinkError):
+                if await device.open() == self.identities[role]:
+                    break
+            await asyncio.sleep(_RETRY_S)
+        del self._tasks[role]
+
+    async def _watch(self) -> None:
+        """The software watchdog."""
+        while True:
+            await asyncio.sleep(self._watchdog_s / 4)
+            if self._commanded > 0 and self._clock() - self._fed_s > self._watchdog_s:
+                self._tripped = True
+                with contextlib.suppress(LinkError):  # tried again a quarter of a period later
+                    await self._devices.pump.set_pump(0.0)
+                    self._commanded = 0.0
+
+    async def _stop_tasks(self) -> None:
+        tasks, self._tasks = list(self._tasks.values()), {}
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _raise_first(results: Iterable[object]) -> None:
+    """Raise the first result that is an error."""
+    for result in results:
+        if isinstance(result, BaseException):
+            raise result
