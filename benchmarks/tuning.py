@@ -1,0 +1,285 @@
+"""Tuning on the simulated bench, in virtual time, seed by seed: what is identified, proposed and then achieved.
+
+`run()` gives the figures, `python -m benchmarks.tuning` prints them as the tables of docs/tuning.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from benchmarks.minimum_variance import least_std_um
+from membrane_ctrl.config import LoopConfig, PumpConfig, TwinConfig
+from membrane_ctrl.twin import pump as twin_pump
+from membrane_ctrl.twin.events import Event
+from membrane_ctrl.twin.plant import Plant
+from tuning.candidates import amigo, simc, ziegler_nichols
+from tuning.design import propose, relay_ultimate
+from tuning.disturbance_model import observe
+from tuning.experiments import Finished, Patterned
+from tuning.identify import Identified, identify
+from tuning.patterns import doublets
+from tuning.quality import judge, validate
+from tuning.records import Measurement, Record
+from tuning.relay import Relay
+from tuning.rig import Rig
+
+SETTLE_S = 40.0
+OBSERVE_S = 600.0
+VERIFY_S = 600.0
+# the vent that lets out as much as the leak, 1.24 um/s at 100 um/s fully open
+BLEED_FRACTION = 0.0124
+# what a ramp comes late by on the nominal twin: tube, lag, less half a step of the simulation
+TRUE_DELAY_S = 0.2225
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A bench: weather, laser, sensors, and what differs from the nominal plant, as factors."""
+
+    scenario: str = "typical"
+    laser_noise_um: float = 1.0
+    feedforward: bool = False
+    bleed: float = 0.0
+    leak: float = 1.0
+    pump: float = 1.0
+    delay: float = 1.0
+
+    @property
+    def holding_flow_um_per_s(self) -> float:
+        """What the commanded flow will settle at."""
+        return 1.24 * (self.leak + self.bleed) / self.pump
+
+    def loop(self) -> LoopConfig:
+        """The loop before tuning."""
+        return LoopConfig(
+            feedforward_barometer=self.feedforward,
+            feedforward_temperature=self.feedforward,
+            bleed_fraction=self.bleed * BLEED_FRACTION,
+        )
+
+    def twin(self, seed: int) -> TwinConfig:
+        """The twin's settings."""
+        return TwinConfig.model_validate(
+            {
+                "scenario": self.scenario,
+                "seed": seed,
+                "laser_noise_um": self.laser_noise_um,
+                "start_error_um": 0.0,
+                "leak_time_constant_s": 1e4 / self.leak,
+            }
+        )
+
+
+class TwinBench:
+    """The twin's plant in ticks; without weather sensors unless the case has them."""
+
+    def __init__(self, case: Case, seed: int, events: Sequence[Event] = ()) -> None:
+        delays = {name: getattr(twin_pump, name) * case.delay for name in ("TRANSPORT_S", "LAG_S")}
+        with patch.multiple(twin_pump, **delays):
+            self.plant = Plant(case.twin(seed), PumpConfig(flow_full_um_per_s=5.3 * case.pump), events)
+        self._sensors = case.feedforward
+        self._dt_s = 1 / case.loop().rate_hz
+        self.true_um: list[float] = []
+
+    def exchange(self, pump_fraction: float, vent_fraction: float) -> Measurement:
+        """One tick."""
+        self.plant.actuate(pump_fraction, vent_fraction)
+        self.plant.advance(self._dt_s)
+        self.true_um.append(self.plant.truth().displacement_um)
+        sample = self.plant.sample()
+        if not self._sensors:
+            return Measurement(sample.displacement_um)
+        return Measurement(sample.displacement_um, sample.ambient_pressure_pa, sample.air_temperature_c)
+
+
+@dataclass(frozen=True, slots=True)
+class Characterised:
+    """The experiments of one session: relay, a short hold, doublets."""
+
+    relay: Record
+    doublets: Record
+    whole: Record
+    ended: tuple[Finished, Finished]
+    excursion_um: float
+
+
+def characterise(rig: Rig, bench: TwinBench) -> Characterised:
+    """Hold, relay, hold, doublets; `excursion_um` is the true one in the experiments."""
+    around = rig.around(rig.hold(60.0).part(20.0, 60.0))
+    start = len(bench.true_um)
+    relay, relay_end = rig.run(Relay(around, 0.0), around, 0.0)
+    excursion_um = max(abs(x) for x in bench.true_um[start:])
+    between = rig.hold(15.0)
+    start = len(bench.true_um)
+    gain = identify(relay).model.gain
+    pulses, pulses_end = rig.run(Patterned(around, doublets(around, gain), 60.0, 0.0), around, 0.0)
+    excursion_um = max(excursion_um, *(abs(x) for x in bench.true_um[start:]))
+    whole = relay.followed_by(between, pulses)
+    return Characterised(relay, pulses, whole, (relay_end, pulses_end), excursion_um)
+
+
+def identified(case: Case, seed: int) -> dict[str, float]:
+    """One session's identification against the truth."""
+    bench = TwinBench(case, seed)
+    rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
+    done = characterise(rig, bench)
+    return _identified(case, done, identify(done.whole))
+
+
+def _identified(case: Case, done: Characterised, found: Identified) -> dict[str, float]:
+    model, sigma = found.model, found.sigma
+    delay_error_s = model.delay_s - TRUE_DELAY_S * case.delay
+    dead_error_s = model.dead_time_s - (TRUE_DELAY_S - twin_pump.LAG_S) * case.delay
+    return {
+        "gain_error": model.gain / case.pump - 1,
+        "gain_sigma": sigma.gain / model.gain,
+        "gain_z": (model.gain - case.pump) / sigma.gain,
+        "dead_time_error_s": dead_error_s,
+        "dead_time_sigma_s": sigma.dead_time_s,
+        "dead_time_z": dead_error_s / sigma.dead_time_s,
+        "delay_error_s": delay_error_s,
+        "delay_sigma_s": sigma.delay_s,
+        "delay_z": delay_error_s / sigma.delay_s,
+        "excursion_um": done.excursion_um,
+        "completed": float(all(end.completed for end in done.ended)),
+    }
+
+
+def session(case: Case, seed: int, rules: bool = False) -> dict[str, float]:
+    """A whole session on one twin, then the true centre in fresh weather; with `rules` also the textbook's gains."""
+    bench, before = TwinBench(case, seed), case.loop()
+    rig = Rig(bench, before, PumpConfig(), case.holding_flow_um_per_s)
+    done = characterise(rig, bench)
+    found = identify(done.whole)
+    rig.hold(SETTLE_S)
+    disturbance = observe(rig.hold(OBSERVE_S), found.model, before)
+    quality = judge(done.whole, found, validate(identify(done.relay), done.doublets))
+    proposal = propose(found, disturbance, before, PumpConfig(), quality)
+    least_um = least_std_um(before, case.twin(seed))
+    assert proposal.chosen.predicted is not None
+    figures = _identified(case, done, found) | {
+        "predicted_um": proposal.chosen.predicted.std_um,
+        "preview_um": proposal.preview.std_um,
+        "bound_said_um": proposal.least_std_um,
+        "least_um": least_um,
+        "kp_per_s": proposal.loop.kp_per_s,
+        "ti_s": proposal.loop.ti_s,
+        "filter_s": proposal.loop.measurement_filter_s,
+        "ms": proposal.chosen.margins.ms,
+        "degraded": float(quality.verdict == "degraded"),
+    }
+    figures |= achieved("ours", proposal.loop, case, seed, least_um)
+    figures["predicted_over_achieved"] = figures["predicted_um"] / figures["ours_um"]
+    if rules:
+        dt_s = 1 / before.rate_hz
+        for name, gains in (
+            ("default", None),
+            ("simc", simc(found.model, dt_s, 0.2)),
+            ("amigo", amigo(found.model, dt_s, 0.2)),
+            ("zn", ziegler_nichols(*relay_ultimate(found.model, dt_s))),
+        ):
+            figures |= achieved(name, gains.applied_to(before) if gains else before, case, seed, least_um)
+    return figures
+
+
+def achieved(name: str, loop: LoopConfig, case: Case, seed: int, least_um: float) -> dict[str, float]:
+    """True centre under a loop in weather that no session has seen."""
+    bench = TwinBench(case, 1000 + seed)
+    Rig(bench, loop, PumpConfig(), case.holding_flow_um_per_s).hold(SETTLE_S + VERIFY_S)
+    true_um = np.array(bench.true_um)[round(SETTLE_S * loop.rate_hz) :]
+    std_um = float(true_um.std())
+    return {f"{name}_um": std_um, f"{name}_bias_um": float(true_um.mean()), f"{name}_ratio": std_um / least_um}
+
+
+SESSIONS = {
+    "quiet, 1 um": Case("quiet"),
+    "typical, 1 um": Case(),
+    "gusty, 1 um": Case("gusty"),
+    "quiet, 0.3 um": Case("quiet", 0.3),
+    "typical, 0.3 um": Case(laser_noise_um=0.3),
+    "typical, 1 um, barometer, thermometer, bleed doubled": Case(feedforward=True, bleed=1.0),
+}
+PLANTS = {
+    "leak x 3": Case(leak=3.0),
+    "leak / 3, with bleed": Case(leak=1 / 3, bleed=1.0),
+    "pump x 3, with bleed": Case(pump=3.0, bleed=1.0),
+    "pump / 3": Case(pump=1 / 3),
+    "delay x 3": Case(delay=3.0),
+    "delay / 3": Case(delay=1 / 3),
+}
+
+
+def summary(rows: Iterable[dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Mean, smallest, largest of each figure."""
+    listed = list(rows)
+    columns = {key: np.array([row[key] for row in listed]) for key in listed[0]}
+    found = {k: {"mean": float(v.mean()), "min": float(v.min()), "max": float(v.max())} for k, v in columns.items()}
+    for key in ("gain_z", "dead_time_z", "delay_z"):
+        found[key]["within_2_sigma"] = float(np.mean(np.abs(columns[key]) <= 2))
+    return found
+
+
+def run(seeds: int = 16) -> dict[str, Any]:
+    """All figures over `seeds` twins a case."""
+    chosen = range(1, seeds + 1)
+    return {
+        "cases": {name: asdict(case) for name, case in (SESSIONS | PLANTS).items()},
+        "sessions": {
+            name: summary(session(case, seed, rules=name == "typical, 1 um") for seed in chosen)
+            for name, case in SESSIONS.items()
+        },
+        "plants": {name: summary(identified(case, seed) for seed in chosen) for name, case in PLANTS.items()},
+    }
+
+
+def _print(figures: dict[str, Any]) -> None:
+    print(
+        "| bench | k error: mean, worst | 2 sigma | dead time error s: mean, worst | 2 sigma "
+        "| delay error s: mean, worst | within 2 sigma (k, dead time, delay) | excursion um, worst |\n|---"
+        + "|---" * 7
+        + "|"
+    )
+    for name, case in (figures["sessions"] | figures["plants"]).items():
+        k, dead, delay = case["gain_error"], case["dead_time_error_s"], case["delay_error_s"]
+        cover = ", ".join(f"{case[key]['within_2_sigma']:.0%}" for key in ("gain_z", "dead_time_z", "delay_z"))
+        print(
+            f"| {name} | {k['mean']:+.1%}, {_worst(k):.1%} | {2 * case['gain_sigma']['mean']:.1%} "
+            f"| {dead['mean']:+.3f}, {_worst(dead):.3f} | {2 * case['dead_time_sigma_s']['mean']:.3f} "
+            f"| {delay['mean']:+.3f}, {_worst(delay):.3f} | {cover} | {case['excursion_um']['max']:.1f} |"
+        )
+    print(
+        "\n| bench | least um | achieved um | / least: mean, worst | predicted / achieved: min, max "
+        "| bias um, worst | K 1/s | Ti s | filter s | Ms |\n|---" + "|---" * 9 + "|"
+    )
+    for name, case in figures["sessions"].items():
+        ratio, said = case["ours_ratio"], case["predicted_over_achieved"]
+        print(
+            f"| {name} | {case['least_um']['mean']:.3f} | {case['ours_um']['mean']:.3f} "
+            f"| {ratio['mean']:.2f}, {ratio['max']:.2f} | {said['min']:.2f}, {said['max']:.2f} "
+            f"| {_worst(case['ours_bias_um']):.3f} | {case['kp_per_s']['mean']:.2f} | {case['ti_s']['mean']:.1f} "
+            f"| {case['filter_s']['mean']:.2f} | {case['ms']['mean']:.2f} |"
+        )
+    print("\n| typical, 1 um, laser only | std um: mean, worst | / least | bias um, worst |\n|---|---|---|---|")
+    case = figures["sessions"]["typical, 1 um"]
+    for key in ("ours", "default", "simc", "amigo", "zn"):
+        std = case[f"{key}_um"]
+        print(
+            f"| {key} | {std['mean']:.3f}, {std['max']:.3f} | {case[f'{key}_ratio']['mean']:.2f} "
+            f"| {_worst(case[f'{key}_bias_um']):.3f} |"
+        )
+
+
+def _worst(figure: dict[str, float]) -> float:
+    return max(abs(figure["min"]), abs(figure["max"]))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=16)
+    _print(run(parser.parse_args().seeds))

@@ -1,0 +1,168 @@
+"""What the pump does at low commands, measured on the mirror: leak, start, stall, and flow against command.
+
+The mirror is the flow meter: its speed is the flow less the leak. A probe is a few seconds of one command, from rest or
+from running; between probes the mirror is brought back to where it stood. Start and stall are found by bisection, the
+leak with the pump off, the curve from two probes above.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from membrane_ctrl.config import PumpConfig
+from membrane_ctrl.control.leak import TOO_TIGHT_UM_PER_S
+from membrane_ctrl.control.slope import Slope
+from tuning.experiments import Finished, Motion
+from tuning.records import Measurement
+
+_PREPARE_S = 1.0  # seven lags of the pump: it stands, or runs
+_PROBE_S = 2.5
+_SKIP_S = 0.8  # of a probe: transport and five lags
+_NEAR_UM = 1.0
+_RETURN_MAX_S = 60.0
+_RUN_FRACTION = 0.45  # surely running
+_BISECTIONS = 5  # of a range of 0.35: to 0.01
+_LOWEST, _HIGHEST = 0.05, 0.40
+# Share of the flow a running pump would give at the command, from which on it counts as running.
+_RUNS_SHARE = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class PumpMap:
+    """What was measured.
+
+    Attributes
+    ----------
+    leak_um_per_s : float
+        Speed at which the mirror sinks with the pump off; the bleed counts.
+    leak_sigma_um_per_s : float
+        Its standard error for 1 um of laser noise at the rate used.
+    start_fraction, stall_fraction : float
+        Where a standing pump starts and a running one stalls, within 0.01; NaN if it never did.
+    dead_fraction, flow_full_um_per_s : float
+        Of q = q_full (d - dead) / (1 - dead).
+    too_tight : bool
+        The mirror loses too little gas to be held: open the bleed.
+    """
+
+    leak_um_per_s: float
+    leak_sigma_um_per_s: float
+    start_fraction: float
+    stall_fraction: float
+    dead_fraction: float
+    flow_full_um_per_s: float
+    too_tight: bool
+
+    @property
+    def sticks_by(self) -> float:
+        """Stiction: the command between stalling and starting."""
+        return self.start_fraction - self.stall_fraction
+
+    def applied_to(self, pump: PumpConfig) -> PumpConfig:
+        """The pump's configuration with what was measured. Raises pydantic.ValidationError if it is no pump's."""
+        measured = {
+            "flow_full_um_per_s": self.flow_full_um_per_s,
+            "dead_fraction": self.dead_fraction,
+            "start_fraction": self.start_fraction,
+            "stall_fraction": self.stall_fraction,
+        }
+        return PumpConfig.model_validate(pump.model_dump() | measured)
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """One command after a preparation at another: 0 (standing) or running."""
+
+    prepare_fraction: float
+    fraction: float
+
+
+class PumpMapper:
+    """Step machine of the pump map; its answers are pump commands, 0..1.
+
+    Parameters
+    ----------
+    centre_um : float
+        Where the mirror is brought back to.
+    holding_fraction : float
+        Command that about holds it.
+    laser_um : float
+        Standard deviation of a reading.
+    """
+
+    def __init__(self, centre_um: float, holding_fraction: float, laser_um: float) -> None:
+        self._centre_um = centre_um
+        self._holding_fraction = holding_fraction
+        self._laser_um = laser_um
+        self._motion = Motion()
+        self._plan = self._probes()
+        self._probe = next(self._plan)
+        self._returning, self._in_phase_s = True, 0.0
+        self._speed = Slope()
+        self._speed_um_per_s = math.nan
+        self.result: PumpMap | None = None
+
+    def step(self, measurement: Measurement, dt_s: float) -> float | Finished:
+        """One tick: the command until the next reading, or the end."""
+        self._motion.update(measurement.displacement_um, dt_s)
+        self._in_phase_s += dt_s
+        if self._returning:
+            return self._return()
+        since_s = self._in_phase_s - _PREPARE_S
+        if since_s <= 0:
+            return self._probe.prepare_fraction
+        if since_s > _SKIP_S:
+            self._speed.add(since_s, measurement.displacement_um)
+        if since_s < _PROBE_S:
+            return self._probe.fraction
+        self._speed_um_per_s = self._speed.per_s
+        self._returning, self._in_phase_s = True, 0.0
+        try:
+            self._probe = next(self._plan)
+        except StopIteration:
+            return Finished(True, "pump mapped")
+        return self._return()
+
+    def _return(self) -> float | Finished:
+        """Bring the mirror to where the next probe will take it through the middle of its way."""
+        off_um = self._motion.position_um - self._centre_um
+        if abs(off_um) < _NEAR_UM:
+            self._returning, self._in_phase_s, self._speed = False, 0.0, Slope()
+            return self._probe.prepare_fraction
+        if self._in_phase_s > _RETURN_MAX_S:
+            way = "sink" if off_um > 0 else "rise"
+            return Finished(False, f"the mirror did not {way} back in {_RETURN_MAX_S:g} s: too tight, or no pump")
+        return 0.0 if off_um > 0 else max(_RUN_FRACTION, self._holding_fraction)
+
+    def _probes(self) -> Iterator[Probe]:
+        """The plan, as a coroutine: each probe's speed is there when the next one is asked for."""
+        yield Probe(0.0, 0.0)
+        leak = -self._speed_um_per_s
+        low = self._holding_fraction + 0.05
+        flows = []
+        for fraction in (low, low + 0.15):
+            yield Probe(_RUN_FRACTION, fraction)
+            flows.append(self._speed_um_per_s + leak)
+        slope = (flows[1] - flows[0]) / 0.15
+        dead = low - flows[0] / slope if slope > 0 else math.nan
+        found = []
+        for prepare in (0.0, _RUN_FRACTION):
+            off, on = _LOWEST, _HIGHEST
+            for _ in range(_BISECTIONS):
+                middle = (off + on) / 2
+                yield Probe(prepare, middle)
+                runs = self._speed_um_per_s + leak > _RUNS_SHARE * max(slope * (middle - dead), 0.1 * leak)
+                off, on = (off, middle) if runs else (middle, on)
+            found.append(on if on < _HIGHEST else math.nan)
+        span_s = _PROBE_S - _SKIP_S
+        self.result = PumpMap(
+            leak_um_per_s=leak,
+            leak_sigma_um_per_s=self._laser_um * math.sqrt(12 / (span_s * 50.0)) / span_s,
+            start_fraction=found[0],
+            stall_fraction=found[1],
+            dead_fraction=dead,
+            flow_full_um_per_s=slope * (1 - dead),
+            too_tight=leak < TOO_TIGHT_UM_PER_S,
+        )
