@@ -1,10 +1,8 @@
-"""The membrane pump board over Modbus TCP as a `Bench`."""
+"""The membrane pump board over Modbus TCP or RTU as a `Bench`."""
 
 from __future__ import annotations
 
-from urllib.parse import urlsplit
-
-from firmware_iface.links.modbus_tcp import GuardedModbusTcp
+from firmware_iface.links.modbus_links import ModbusLinks
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import (
     BenchCommand,
@@ -15,7 +13,6 @@ from firmware_iface.roles import (
     LinkError,
 )
 
-DEFAULT_PORT = 502
 _KIND = "membrane pump board"
 _HEARTBEATS = 2**16
 
@@ -30,7 +27,7 @@ class PumpBoard:
     Parameters
     ----------
     url : str
-        `tcp://HOST:PORT`; port 502 when left out.
+        `tcp://HOST:PORT` (502 when left out) or `rtu:///dev/ttyUSB0?baud=115200`.
     unit_id : int
         Modbus unit.
     timeout_s : float
@@ -45,7 +42,7 @@ class PumpBoard:
     """
 
     def __init__(self, url: str, unit_id: int = 1, timeout_s: float = 0.2, watchdog_s: float = 0.5) -> None:
-        host, port = parse_url(url)
+        link = ModbusLinks().link(url, unit_id, timeout_s)
         registers = default_map()
         self._map_version = registers.map_version
         self._device_kind = registers.device_kind
@@ -62,7 +59,7 @@ class PumpBoard:
             )
         self._watchdog_s = watchdog_s
         self._heartbeat = 0
-        self._link = GuardedModbusTcp(host, port, unit_id, timeout_s)
+        self._link = link
 
     @property
     def reconnects(self) -> int:
@@ -190,15 +187,3 @@ class PumpBoard:
             except LinkError:
                 pass  # the watchdog then does what it is for
         await self._link.close()
-
-
-def parse_url(url: str) -> tuple[str, int]:
-    """Host and port of `tcp://HOST[:PORT]`. Raises ValueError."""
-    try:
-        parts = urlsplit(url)
-        host, port = parts.hostname, parts.port
-    except ValueError as error:  # a port that is no number, or above 65535
-        raise ValueError(f"{url}: {error}") from error
-    if parts.scheme != "tcp" or not host or parts.path or parts.query or parts.fragment or parts.username:
-        raise ValueError(f"{url}: wanted tcp://HOST:PORT")
-    return host, DEFAULT_PORT if port is None else port

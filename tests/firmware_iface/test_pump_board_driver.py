@@ -11,8 +11,9 @@ import pytest
 from counting_plant import CountingPlant, ManualClock
 from pymodbus.client import AsyncModbusTcpClient
 
-from firmware_iface.drivers.pump_board import PumpBoard, parse_url
+from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.pump_board import Faults, PumpBoardEmulator
+from firmware_iface.links.modbus_links import parse_tcp_url
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import (
     BenchCommand,
@@ -89,11 +90,11 @@ async def test_an_impossible_command_never_reaches_the_wire(
     ("url", "target"), [("tcp://bench.local:5020", ("bench.local", 5020)), ("tcp://127.0.0.1", ("127.0.0.1", 502))]
 )
 def test_urls(url: str, target: tuple[str, int]) -> None:
-    assert parse_url(url) == target
+    assert parse_tcp_url(url) == target
 
 
 @pytest.mark.parametrize(
-    "url", ["127.0.0.1:5020", "rtu:///dev/ttyUSB0", "tcp://", "tcp://h:x", "tcp://h:70000", "tcp://h/p"]
+    "url", ["127.0.0.1:5020", "http://h", "tcp://", "tcp://h:x", "tcp://h:70000", "tcp://h/p"]
 )
 def test_a_wrong_url_is_named(url: str) -> None:
     with pytest.raises(ValueError, match=url):
