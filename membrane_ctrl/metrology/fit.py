@@ -13,7 +13,6 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from membrane_ctrl.metrology import kernels
 from membrane_ctrl.metrology.surface import PARAMETERS
@@ -50,8 +49,7 @@ class NormalMatrix:
     x, y : (36, 36) arrays
         Shares of the x and of the y slopes, in 1/mm^2 times weight.
     inverse : (36, 36) array
-        Of their sum. Kept because a product with it takes microseconds, where a call of the solver may wait for the
-        library's threads; the condition number is below 1000, and what rounding is left the next step takes out.
+        Of their sum. The condition number is below 1000, and what rounding leaves the next step takes out.
     """
 
     x: FloatArray
@@ -62,11 +60,10 @@ class NormalMatrix:
     def from_products(cls, products: FloatArray, radius_mm: float) -> NormalMatrix:
         """From the moments of `kernels.product_sums`. Raises ValueError if the points do not determine a surface."""
         x, y = _assemble(products, radius_mm)
-        try:
-            inverse = cho_solve(cho_factor(x + y), np.eye(PARAMETERS))
-        except LinAlgError:
-            raise ValueError("the measured points do not determine the 36 parameters of the surface") from None
-        return cls(x, y, np.asarray(inverse))
+        inverse = x + y
+        if not kernels.invert(inverse):
+            raise ValueError("the measured points do not determine the 36 parameters of the surface")
+        return cls(x, y, inverse)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """(D^T W D)^-1 times `right`."""

@@ -217,6 +217,32 @@ def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # typ
 
 
 @kernel
+def invert(matrix):  # type: ignore[no-untyped-def]
+    """Inverse of a symmetric positive matrix in place by Gauss-Jordan; False, with nothing of use, if it is not one.
+
+    36 x 36 takes some 20 us here; the linear algebra library may keep it waiting for its threads a thousand times
+    longer on a busy machine. A positive matrix needs no pivoting: each pivot is a Schur complement, and one below
+    1e-13 of its diagonal element means that rounding is all that is left of it.
+    """
+    size = matrix.shape[0]
+    diagonal = np.diag(matrix).copy()
+    for k in range(size):
+        pivot = matrix[k, k]
+        if not pivot > 1e-13 * diagonal[k]:
+            return False
+        matrix[k, k] = 1.0
+        for j in range(size):
+            matrix[k, j] /= pivot
+        for i in range(size):
+            if i != k:
+                factor = matrix[i, k]
+                matrix[i, k] = 0.0
+                for j in range(size):
+                    matrix[i, j] -= factor * matrix[k, j]
+    return True
+
+
+@kernel
 def slope_field(rays, t, screen, pinhole, plane, poly, excess, amplitude, radius, out, start, stop):  # type: ignore[no-untyped-def]
     """x, y, measured g_x, g_y and fitted h_x, h_y of each point into `out` (6, n)."""
     for p in range(start, stop):

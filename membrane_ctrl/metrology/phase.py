@@ -54,7 +54,10 @@ def phasors(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> NDAr
     """Phasor C + iS per pixel from a stack of frames (N, ...)."""
     stack = np.asarray(frames, float)
     _, cosine, sine = step_weights(shifts_rad)
-    return np.asarray(np.tensordot(cosine + 1j * sine, stack, axes=1))
+    out = np.empty(stack.shape[1:], np.complex128)
+    out.real = np.einsum("k,k...->...", cosine, stack)
+    out.imag = np.einsum("k,k...->...", sine, stack)
+    return out
 
 
 def wrapped_phase(phasor: NDArray[np.complex128]) -> FloatArray:

@@ -12,6 +12,7 @@ from membrane_ctrl.config import CameraPoseConfig, GeometryConfig, OpticsConfig,
 from membrane_ctrl.metrology.covariance import parameter_covariance, slope_per_screen
 from membrane_ctrl.metrology.fit import NormalMatrix
 from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.kernels import invert
 from membrane_ctrl.metrology.reconstruct import Fit, Points, Tracer, cone, parabola, solve, v_fold
 from membrane_ctrl.metrology.surface import Surface, sag_gradient
 from membrane_ctrl.metrology.zernike import gradients
@@ -216,3 +217,15 @@ def test_covariance_is_the_scatter_of_noisy_sets() -> None:
     assert sag == pytest.approx(1, abs=0.15)  # 200 sets tell a sigma to 5 %
     from_residual = parameter_covariance(noisy, np.zeros(2))
     assert np.sqrt(np.diag(from_residual)) == pytest.approx(np.sqrt(np.diag(predicted)), rel=0.1)
+
+
+def test_inverse_is_numpys_and_refuses_what_is_not_positive() -> None:
+    rng = np.random.default_rng(6)
+    root = rng.normal(size=(36, 50))
+    matrix = root @ root.T
+    inverse = matrix.copy()
+    assert invert(inverse)
+    assert inverse == pytest.approx(np.linalg.inv(matrix), rel=1e-9, abs=1e-12)
+    deficient = root[:, :20] @ root[:, :20].T
+    assert not invert(deficient)
+    assert not invert(np.full((2, 2), np.nan))
