@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 
 from firmware_iface.drivers.pump_board import PumpBoard
+from firmware_iface.role_bench import RoleBench
 from firmware_iface.roles import Bench, BenchIdentity, DeviceRefusedError, LinkError
 from membrane_ctrl.config import DevicesConfig
-from membrane_ctrl.errors import DeviceError
+from membrane_ctrl.errors import DeviceError, InputError
+from membrane_ctrl.role_devices import role_devices
 
 # A board that boots or a network that comes up is given this long before the command gives up
 _PATIENCE_S = 5.0
@@ -15,9 +17,13 @@ _PAUSE_S = 0.25
 
 
 def open_bench(devices: DevicesConfig) -> Bench:
-    """The bench that the configuration names, not yet connected."""
-    assert devices.board is not None
-    return PumpBoard(devices.board, devices.unit_id, devices.timeout_s, devices.watchdog_s)
+    """The bench that the configuration names, not yet connected. Raises InputError for what no device can be."""
+    if devices.board is None:
+        return RoleBench(role_devices(devices), devices.watchdog_s)
+    try:
+        return PumpBoard(devices.board, devices.unit_id, devices.timeout_s, devices.watchdog_s)
+    except ValueError as error:
+        raise InputError(f"devices.board: {error}") from None
 
 
 async def connect(bench: Bench, devices: DevicesConfig) -> BenchIdentity:

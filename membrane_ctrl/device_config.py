@@ -11,6 +11,8 @@ from membrane_ctrl.section import Section
 
 UnitId = Annotated[int, Field(ge=1, le=247)]
 Timeout = Annotated[float, Field(gt=0, le=5)]
+Baud = Annotated[int, Field(ge=300, le=1_000_000)]
+Direction = Literal[-1, 1]  # -1: the laser is behind the mirror, a deeper bowl comes nearer to it
 Word = Annotated[int, Field(ge=0, le=0xFFFF)]
 Port = Annotated[str, Field(min_length=1)]  # /dev/ttyUSB0, or usb:VID:PID[:SERIAL]
 ModbusUrl = Annotated[str, Field(pattern=r"^(tcp|rtu)://")]  # tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200
@@ -21,11 +23,13 @@ class Optoncdt1420(Section):
 
     driver: Literal["optoncdt1420"]
     port: Port
-    baud: Annotated[int, Field(ge=9600, le=1_000_000)] = 921_600
-    range_mm: Annotated[float, Field(gt=0, le=500)]
-    measuring_rate_khz: Annotated[float, Field(gt=0, le=4)] = 4.0
-    # the laser stands behind the mirror: its distance shrinks when the bowl deepens
-    deeper_is_nearer: bool = True
+    baud: Baud = 921_600
+    rate_khz: Annotated[float, Field(gt=0, le=4)] = 4.0
+    range_mm: Annotated[float, Field(gt=0, le=500)] | None = None  # refuse a sensor of another range
+    zero_mm: float | None = None  # where displacement 0 is; the middle of the range when absent
+    direction: Direction = -1
+    step_max_um: Annotated[float, Field(gt=0, le=10_000)] = 50.0
+    timeout_s: Timeout = 0.2
 
 
 class KeyenceDlRs1a(Section):
@@ -33,9 +37,13 @@ class KeyenceDlRs1a(Section):
 
     driver: Literal["keyence_dl_rs1a"]
     port: Port
-    baud: Annotated[int, Field(ge=2400, le=38_400)] = 9600
-    head: Annotated[int, Field(ge=0, le=15)] = 0
-    deeper_is_nearer: bool = True
+    baud: Baud = 9600
+    parity: Literal["N", "E", "O"] = "N"
+    amplifier: Annotated[int, Field(ge=0, le=14)] = 0
+    zero_mm: float = 0.0
+    direction: Direction = -1
+    step_max_um: Annotated[float, Field(gt=0, le=10_000)] = 10.0
+    timeout_s: Timeout = 0.1
 
 
 class VaisalaPtb330(Section):
@@ -43,7 +51,10 @@ class VaisalaPtb330(Section):
 
     driver: Literal["vaisala_ptb330"]
     port: Port
-    baud: Annotated[int, Field(ge=300, le=115_200)] = 4800
+    baud: Baud = 4800
+    period_s: Annotated[float, Field(gt=0, le=60)] = 0.2
+    age_max_s: Annotated[float, Field(gt=0, le=600)] = 3.0
+    timeout_s: Timeout = 0.3
 
 
 class Ventus(Section):
@@ -51,8 +62,8 @@ class Ventus(Section):
 
     driver: Literal["ventus"]
     port: Port
-    baud: Annotated[int, Field(ge=9600, le=1_000_000)] = 115_200
-    power_full_mw: Annotated[float, Field(gt=0, le=5000)] = 1000.0
+    power_max_mw: Annotated[float, Field(gt=0, le=5000)] = 1000.0
+    timeout_s: Timeout = 0.1
 
 
 class BronkhorstModbus(Section):
@@ -70,7 +81,7 @@ class BronkhorstPropar(Section):
 
     driver: Literal["bronkhorst_propar"]
     port: Port
-    baud: Annotated[int, Field(ge=9600, le=460_800)] = 38_400
+    baud: Baud = 38_400
     node: Annotated[int, Field(ge=1, le=128)] = 128  # 128: whatever is at the end of the cable
     serial: str = ""
     timeout_s: Timeout = 0.2
