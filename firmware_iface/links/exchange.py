@@ -22,6 +22,9 @@ from firmware_iface.links.serial_port import BytePort
 from firmware_iface.roles import LinkDownError, LinkError
 
 _SHOWN_BYTES = 24
+# so many questions in a row without a valid answer, and the line is closed: its owner then opens it again, which also
+# applies the settings that a device loses with its power
+_FAILURES_MAX = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +70,7 @@ class SerialExchange:
         self._turn = asyncio.Lock()  # released when the question has ended, whatever became of its caller
         self._in_flight: asyncio.Task[bytes] | None = None
         self._sure: set[int] = set()  # devices that owe no answer
+        self._failures = 0
         self._noisy = False
         self._last_byte_s = 0.0
         self._heard = b""
@@ -78,15 +82,26 @@ class SerialExchange:
         """The line."""
         return self._port
 
-    def connect(self) -> None:
-        """Open the line; what devices may still owe to an earlier user is not believed. Raises LinkDownError."""
-        self._port.open(self)
-        self._start_anew()
+    def connect(self, greeting: bytes = b"") -> None:
+        """Open the line; what devices may still owe to an earlier user is not believed.
 
-    def _start_anew(self) -> None:
+        Parameters
+        ----------
+        greeting : bytes
+            Sent at once, and whatever comes back is thrown away: for a device that talks unasked until told to stop.
+
+        Raises
+        ------
+        LinkDownError
+            The port does not open.
+        """
+        self._port.open(self)
         self._sure.clear()
+        self._failures = 0
         self._noisy = True
         self._last_byte_s = asyncio.get_running_loop().time()
+        if greeting:
+            self._port.write(greeting)
 
     async def close(self) -> None:
         """Close the line; a question in flight fails at once."""
@@ -134,11 +149,16 @@ class SerialExchange:
             answer = await self._ask(question, timeout_s)
         except LinkDownError:
             raise
-        except LinkError:
+        except LinkError as error:
             self._sure.discard(key)
             self._noisy = True
             self._last_byte_s = asyncio.get_running_loop().time()
-            raise
+            self._failures += 1
+            if self._failures < _FAILURES_MAX:
+                raise
+            self._port.close()
+            raise LinkDownError(f"{error}; the {_FAILURES_MAX}th failure in a row, connection given up") from error
+        self._failures = 0
         self._sure.add(key)
         self._port.succeeded()
         return answer
@@ -177,8 +197,8 @@ class SerialExchange:
     def _missing(self, timeout_s: float) -> str:
         if not self._heard:
             return f"no answer within {timeout_s:g} s"
-        shown = self._heard[:_SHOWN_BYTES].hex(" ")
-        return f"no whole answer within {timeout_s:g} s, only {len(self._heard)} bytes ({shown}); wrong baud rate?"
+        shown = self._heard[:_SHOWN_BYTES]
+        return f"no whole answer within {timeout_s:g} s, but {len(self._heard)} bytes ({shown!r}); wrong baud rate?"
 
     def received(self, data: bytes) -> None:
         """Bytes came (called by the port)."""

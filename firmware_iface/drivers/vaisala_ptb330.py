@@ -1,0 +1,193 @@
+"""Vaisala PTB330 barometer on RS-232.
+
+Manual: PTB330 user's guide M210855EN; FORM and its modifiers pages 70-72, UNIT, ECHO page 83, `?` and ERRS pages
+87-88. Its factory setting is 4800 7E1.
+
+Each message is made to carry pressure, unit, the modules' error flags, the running counter of measurements (a frozen
+value is seen) and a checksum (sum of all bytes before it modulo 65536): `FORM 4.3 P U3 ERR MCTR CS4`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+from dataclasses import dataclass
+
+from firmware_iface.links.lines import LineFence, LineLink
+from firmware_iface.links.serial_port import BytePort, SerialSettings, as_port
+from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
+
+MANUAL = "PTB330 user's guide M210855EN, pages 70-88"
+FORMAT = '4.3 P " " U3 " " ERR " " MCTR " " CS4 #r #n'
+PA_PER_HPA = 100.0
+RANGE_PA = (50_000.0, 110_000.0)  # of the instrument
+_MESSAGE = re.compile(r"(( *\d{3,4}\.\d{3}|\*+) hPa ([01]{1,3}) * *(\d+) )([0-9A-F]{4})\r\n")
+_IDENTITY = re.compile(r".*?(PTB330) / (\S+).*?Serial number\s*: *(\S+).*?Module 4\s*:[^\r\n]*\r\n", re.DOTALL)
+# the echo may still be on when it is asked first
+_VERSION = re.compile(r"(?:.*\r\n)?>? *\S+ / \S+ *\r\n>?", re.DOTALL)
+_UNIT = re.compile(r"P\s*: hPa *\r\n(?:[^\r\n]*\r\n)*")  # other quantities follow
+_OK = re.compile(r"(?:OK|Output format\s*:[^\r\n]*)\s*\r\n")
+_FORM = re.compile(r"Output format\s*:([^\r\n]*)\r\n")
+_ERRORS = re.compile(r"(?:(?:PASS|FAIL)\s*\r\n)?([^\r\n]+)\r\n")
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One measurement: `pressure_pa` NaN when the instrument has none, `counter` its running number."""
+
+    pressure_pa: float
+    counter: int
+
+
+class VaisalaPtb330:
+    """A `Barometer`. A task of its own asks as fast as `period_s` says and serves the newest value.
+
+    Parameters
+    ----------
+    port : str or BytePort
+        A path or `usb:VID:PID[:SERIAL]`.
+    baud : int
+        As the instrument is set.
+    period_s : float
+        Between two questions; at 4800 baud a message alone takes 80 ms.
+    age_max_s : float
+        A value that did not change its running number for this long is none any more (NaN).
+    timeout_s : float
+        For an answer.
+    """
+
+    def __init__(
+        self,
+        port: str | BytePort,
+        baud: int = 4800,
+        period_s: float = 0.2,
+        age_max_s: float = 3.0,
+        timeout_s: float = 0.3,
+    ) -> None:
+        self._settings = SerialSettings(baud, data_bits=7, parity="E")
+        self._link = LineLink(as_port(port, self._settings), "\r\n", timeout_s, LineFence("VERS", _VERSION))
+        self._period_s, self._age_max_s = period_s, age_max_s
+        self._task: asyncio.Task[None] | None = None
+        self._newest = Message(math.nan, -1)
+        self._newest_s = -math.inf
+        self._down: LinkDownError | None = None
+
+    @property
+    def reconnects(self) -> int:
+        """Times the port was opened after the first."""
+        return self._link.reconnects
+
+    @property
+    def retry_in_s(self) -> float:
+        """Time until `open` will try."""
+        return self._link.retry_in_s
+
+    async def open(self) -> DeviceIdentity:
+        """Open the port, stop what it sends by itself, check who it is, set unit and format, start to ask.
+
+        Raises
+        ------
+        LinkError
+            No valid answer; LinkDownError without a port.
+        DeviceRefusedError
+            Another instrument, or a format that is not taken.
+        """
+        await self.close()
+        self._newest, self._newest_s, self._down = Message(math.nan, -1), -math.inf, None
+        self._link.connect("\r\nS\r\nECHO OFF\r\n")
+        try:
+            identity = await self._identify()
+            await self._apply_settings()
+            await self._refresh()
+        except LinkError:
+            await self._link.close()
+            raise
+        self._task = asyncio.create_task(self._run(), name="barometer")
+        return identity
+
+    async def _identify(self) -> DeviceIdentity:
+        try:
+            about = await self._link.query("?", _IDENTITY, 1000)
+        except LinkDownError:
+            raise
+        except LinkError as error:
+            raise DeviceRefusedError(f"{error}: not a PTB330") from error
+        errors = await self._link.query("ERRS", _ERRORS, 400)
+        return DeviceIdentity(f"Vaisala {about[1]}", about[3], about[2], errors[1].strip())
+
+    async def _apply_settings(self) -> None:
+        await self._link.query("UNIT P hPa", _UNIT, 600)
+        await self._link.query(f"FORM {FORMAT}", _OK, 200)
+        found = (await self._link.query("FORM ?", _FORM, 200))[1]
+        # it is shown with backslashes for what was given as hash signs
+        if found.replace("\\", "#").casefold().split() != FORMAT.casefold().split():
+            raise DeviceRefusedError(f"{self._link.name}: FORM set to {FORMAT!r}, read back {found.strip()!r}")
+
+    async def _run(self) -> None:
+        while True:
+            await asyncio.sleep(self._period_s)
+            try:
+                await self._refresh()
+            except LinkDownError as error:
+                self._down = error
+                return
+            except LinkError:
+                pass  # the age of the newest value says so
+
+    async def _refresh(self) -> None:
+        answer = await self._link.query("SEND", _MESSAGE)
+        message = decode_message(answer, self._link.name)
+        if message.counter == self._newest.counter:
+            return
+        self._newest, self._newest_s = message, asyncio.get_running_loop().time()
+
+    async def ambient_pressure_pa(self) -> float:
+        """The newest value, NaN when it is too old or the instrument has none.
+
+        Raises
+        ------
+        LinkDownError
+            The port is gone: open it again.
+        """
+        if self._down is not None:
+            raise self._down
+        if not self._link.connected:
+            raise LinkDownError(f"{self._link.name}: not connected")
+        fresh = asyncio.get_running_loop().time() - self._newest_s <= self._age_max_s
+        return self._newest.pressure_pa if fresh else math.nan
+
+    async def close(self) -> None:
+        """Stop asking and close the port. Never raises."""
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
+        await self._link.close()
+
+    def describe(self) -> dict[str, str]:
+        """For people: port, settings, manual."""
+        return {
+            "port": f"{self._link.name}, {self._settings}",
+            "settings": f"asked every {self._period_s:g} s, NaN when older than {self._age_max_s:g} s",
+            "manual": MANUAL,
+        }
+
+
+def decode_message(message: re.Match[str], name: str) -> Message:
+    """Check and convert a message that has the form of `FORMAT`.
+
+    Raises
+    ------
+    LinkError
+        Wrong checksum, or a pressure that the instrument cannot measure.
+    """
+    checked, pressure, flags, counter, checksum = message.groups()
+    if sum(checked.encode("ascii")) % 2**16 != int(checksum, 16):
+        raise LinkError(f"{name}: wrong checksum; noise on the line")
+    if "*" in pressure or "1" in flags:
+        return Message(math.nan, int(counter))
+    pressure_pa = float(pressure) * PA_PER_HPA
+    if not RANGE_PA[0] <= pressure_pa <= RANGE_PA[1]:
+        raise LinkError(f"{name}: {pressure_pa:.0f} Pa is outside of {RANGE_PA[0]:.0f} .. {RANGE_PA[1]:.0f} Pa")
+    return Message(pressure_pa, int(counter))

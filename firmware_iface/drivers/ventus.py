@@ -1,0 +1,190 @@
+"""Lee (TTP) Ventus disc pump with a GP driver or smart pump module, on a UART.
+
+Source: Technical Note TN003, Communications Guide (registers), and the vendor's python-control-Development-Kit.
+`#W<register>,<value>` LF writes and is not answered, `#R<register>` LF is answered `#R<register>,<value>`.
+
+The pump has no watchdog: it runs on at its last power when the host is gone, and after power-up it is enabled at what
+its analogue input says, until it is told otherwise. Where gas must stop by itself, something else has to see to it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+
+from firmware_iface.links.lines import LineFence, LineLink
+from firmware_iface.links.serial_port import BytePort, SerialSettings, as_port
+from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
+
+MANUAL = "TN003 Communications Guide; no watchdog: the pump runs on when the host is gone"
+ENABLE, POWER_LIMIT_MW, STREAM, MODE, MANUAL_SOURCE, SET_VALUE, ERROR = 0, 1, 2, 10, 11, 23, 31
+FIRMWARE, DEVICE_TYPE, FIRMWARE_MINOR = 36, 37, 38
+DEVICE_TYPES = {2: "general purpose driver", 3: "smart pump module"}
+POWER_MAX_MW = 1400.0  # the most that any of these pumps is made for
+_MODE_MANUAL, _SOURCE_SET_VALUE, _OFF, _ON = 0, 0, 0, 1
+_NUMBER = r"-?\d+(?:\.\d+)?"
+_STEP_MW = 0.0011  # values are written with three decimals
+
+
+class Ventus:
+    """A `Pump`: the fraction is that of `power_max_mw`.
+
+    Parameters
+    ----------
+    port : str or BytePort
+        A path or `usb:VID:PID[:SERIAL]`.
+    power_max_mw : float
+        Full drive.
+    timeout_s : float
+        For an answer.
+
+    Raises
+    ------
+    ValueError
+        More power than these pumps are made for.
+    """
+
+    def __init__(self, port: str | BytePort, power_max_mw: float = 1000.0, timeout_s: float = 0.1) -> None:
+        if not 0 < power_max_mw <= POWER_MAX_MW:
+            raise ValueError(f"power_max_mw = {power_max_mw:g}: wanted more than 0, at most {POWER_MAX_MW:g}")
+        self._power_max_mw = power_max_mw
+        # streamed lines may be on their way when the stream is switched off
+        fence = LineFence(f"#R{DEVICE_TYPE}", re.compile(rf"(?:#S[^\n]*\n)*#R{DEVICE_TYPE},({_NUMBER})\r?\n"))
+        self._settings = SerialSettings(115_200)
+        self._link = LineLink(as_port(port, self._settings), "\n", timeout_s, fence)
+        self._state = _registers(ENABLE, SET_VALUE, ERROR)
+        self._commanded_mw = 0.0
+
+    @property
+    def reconnects(self) -> int:
+        """Times the port was opened after the first."""
+        return self._link.reconnects
+
+    @property
+    def retry_in_s(self) -> float:
+        """Time until `open` will try."""
+        return self._link.retry_in_s
+
+    async def open(self) -> DeviceIdentity:
+        """Open the port, stop the pump, check who it is, apply the settings and read them back.
+
+        Raises
+        ------
+        LinkError
+            No valid answer; LinkDownError without a port.
+        DeviceRefusedError
+            Another device, or a setting that is not taken.
+        """
+        await self._link.close()
+        # off at once, also when nothing else works; a stream would never leave the line quiet
+        self._link.connect(f"\n#W{ENABLE},{_OFF}\n#W{STREAM},0\n")
+        try:
+            identity = await self._identify()
+            await self._apply_settings()
+            await self.set_pump(0.0)
+        except LinkError:
+            await self._link.close()
+            raise
+        return identity
+
+    async def _identify(self) -> DeviceIdentity:
+        kind, major, minor = await self._read(DEVICE_TYPE, FIRMWARE, FIRMWARE_MINOR)
+        if int(kind) not in DEVICE_TYPES:
+            raise DeviceRefusedError(f"{self._link.name}: device type {kind:g} is no Ventus driver (2 or 3)")
+        return DeviceIdentity(f"Ventus {DEVICE_TYPES[int(kind)]}", "", f"{major:g}.{minor:g}")
+
+    async def _apply_settings(self) -> None:
+        wanted = {
+            STREAM: 0.0,
+            MODE: float(_MODE_MANUAL),
+            MANUAL_SOURCE: float(_SOURCE_SET_VALUE),
+            POWER_LIMIT_MW: float(round(self._power_max_mw)),
+        }
+        found = await self._write_and_read(wanted, *wanted)
+        if found != tuple(wanted.values()):
+            raise DeviceRefusedError(f"{self._link.name}: registers set to {wanted}, read back {found}")
+
+    async def set_pump(self, fraction: float) -> None:
+        """Command the pump and read it back.
+
+        Raises
+        ------
+        ValueError
+            Not within 0..1; nothing is sent.
+        LinkError
+            No valid answer: the pump may or may not have it.
+        LinkDownError
+            The port is gone, or the pump does not have what was written: open it again.
+        """
+        if not 0.0 <= fraction <= 1.0:
+            raise ValueError(f"pump fraction = {fraction} is not within 0..1")
+        power_mw = fraction * self._power_max_mw
+        writes = {SET_VALUE: power_mw, ENABLE: float(_ON if fraction > 0 else _OFF)}
+        self._commanded_mw = power_mw
+        await self._check(await self._write_and_read(writes, ENABLE, SET_VALUE, ERROR))
+
+    async def pump_fraction(self) -> float:
+        """Read back what the pump is set to.
+
+        Raises
+        ------
+        LinkError
+            No valid answer, or the pump reports an error.
+        LinkDownError
+            The port is gone, or the pump is set to something that it was not told: open it again.
+        """
+        return await self._check(await self._read(ENABLE, SET_VALUE, ERROR)) / self._power_max_mw
+
+    async def _check(self, state: tuple[float, ...]) -> float:
+        """Power in mW, when it is what was commanded; asked once more before anything else is believed."""
+        if not self._as_commanded(state):
+            state = await self._read(ENABLE, SET_VALUE, ERROR)
+        enabled, power_mw, error = state
+        if not self._as_commanded(state):
+            await self._link.close()
+            raise LinkDownError(
+                f"{self._link.name}: told {self._commanded_mw:.3f} mW, it has {power_mw:g} mW and is "
+                f"{'on' if enabled else 'off'}; noise on the line, or it restarted: open it again"
+            )
+        if error:
+            raise LinkError(f"{self._link.name}: the pump reports error {error:g}; see its manual")
+        return power_mw if enabled else 0.0
+
+    def _as_commanded(self, state: tuple[float, ...]) -> bool:
+        enabled, power_mw, _ = state
+        return abs(power_mw - self._commanded_mw) < _STEP_MW and bool(enabled) == (self._commanded_mw > 0)
+
+    async def _read(self, *registers: int) -> tuple[float, ...]:
+        return await self._write_and_read({}, *registers)
+
+    async def _write_and_read(self, writes: dict[int, float], *registers: int) -> tuple[float, ...]:
+        """Writes and reads in one go: a write has no answer of its own."""
+        lines = [f"#W{register},{_text(register, value)}" for register, value in writes.items()]
+        lines += [f"#R{register}" for register in registers]
+        answer = await self._link.query("\n".join(lines), _registers(*registers), 24 * len(registers))
+        return tuple(float(value) for value in answer.groups())
+
+    async def close(self) -> None:
+        """Switch the pump off and close the port. Never raises."""
+        if self._link.connected:
+            with contextlib.suppress(LinkError):  # out of reach: what then stops the gas is not this program
+                await self.set_pump(0.0)
+        await self._link.close()
+
+    def describe(self) -> dict[str, str]:
+        """For people: port, settings, manual."""
+        return {
+            "port": f"{self._link.name}, {self._settings}",
+            "settings": f"full drive {self._power_max_mw:g} mW",
+            "manual": MANUAL,
+        }
+
+
+def _registers(*registers: int) -> re.Pattern[str]:
+    """The form of the answers to `#R` of these, in order."""
+    return re.compile("".join(rf"#R{register},({_NUMBER})\r?\n" for register in registers))
+
+
+def _text(register: int, value: float) -> str:
+    """Power values are floats and written with three decimals, the others are integers."""
+    return f"{value:.3f}" if register == SET_VALUE else f"{value:.0f}"

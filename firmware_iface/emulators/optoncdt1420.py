@@ -1,0 +1,175 @@
+"""An optoNCDT 1420 that answers commands and streams bytes (manual 7.5.2 and appendix A 3)."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable
+
+from firmware_iface.emulators.serial_device import LineDevice
+from firmware_iface.links.serial_port import SerialSettings
+
+NO_PEAK = 262_076
+RANGES_MM = (10, 25, 50, 100, 200, 500)
+_PERIOD_S = 0.0025  # between two portions of the stream, as an adapter hands them over
+# what the sensor has after power-up, unless it was stored otherwise
+_DEFAULTS = {
+    "OUTPUT": "ANALOG",
+    "MEASRATE": "2",
+    "LASERPOW": "FULL",
+    "OUTREDUCEDEVICE": "NONE",
+    "OUTHOLD": "NONE",
+    "OUTADD_RS422": "NONE",
+}
+_CHOICES = {
+    "OUTPUT": ("NONE", "RS422", "ANALOG"),
+    "MEASRATE": ("0.25", "0.5", "1", "2", "4"),
+    "LASERPOW": ("FULL", "OFF"),
+    "OUTREDUCEDEVICE": ("NONE", "RS422"),
+    "OUTHOLD": ("NONE", "INFINITE"),
+    "OUTADD_RS422": ("NONE", "COUNTER"),
+}
+
+
+class Optoncdt1420Emulator(LineDevice):
+    """Sees the mirror from behind.
+
+    Parameters
+    ----------
+    displacement_um : callable
+        What it measures; NaN when nothing is in sight.
+    range_mm : int
+        Measuring range; displacement 0 is in its middle.
+    direction : int
+        -1: a deeper bowl is nearer.
+    baud : int
+        As stored in the sensor.
+    noise_um : float
+        Standard deviation of a single value.
+    name : str
+        What it says it is.
+    seed : int
+        For faults.
+
+    Attributes
+    ----------
+    lose_bytes_every : int
+        One byte in so many is lost from the stream; 0: off.
+    """
+
+    def __init__(
+        self,
+        displacement_um: Callable[[], float],
+        range_mm: int = 50,
+        direction: int = -1,
+        baud: int = 921_600,
+        noise_um: float = 0.0,
+        name: str = "",
+        seed: int = 0,
+    ) -> None:
+        super().__init__(SerialSettings(baud), seed)
+        self.lose_bytes_every = 0
+        self._displacement_um = displacement_um
+        self._range_mm = range_mm
+        self._direction = direction
+        self._noise_um = noise_um
+        self._name = name or f"ILD1420-{range_mm}"
+        self._register = dict(_DEFAULTS)
+        self._counter = 0
+        self._raw = NO_PEAK
+        self._stream: asyncio.TimerHandle | None = None
+        self._streamed_s = 0.0
+        self._owed = 0.0
+
+    def restart(self) -> None:
+        """Settings that were not stored are lost: it does not stream."""
+        super().restart()
+        self._stop()
+        self._register = dict(_DEFAULTS)
+        self._counter = 0
+
+    def detach(self) -> None:
+        """The wire is pulled."""
+        self._stop()
+        super().detach()
+
+    def attach(self, transmit: Callable[[bytes], None]) -> None:
+        """The wire is plugged in; it goes on streaming if it was."""
+        super().attach(transmit)
+        if self._register["OUTPUT"] == "RS422":
+            self._start()
+
+    def line(self, text: str) -> None:
+        """One command."""
+        name, _, value = text.partition(" ")
+        if name == "GETINFO":
+            answer = self._about()
+        elif name not in self._register:
+            answer = "E210 Unknown command\r\n"
+        elif not value:
+            answer = f"{name} {self._register[name]}\r\n"
+        elif value not in _CHOICES[name]:
+            answer = "E236 Value is out of range or the format is invalid\r\n"
+        else:
+            self._register[name] = value
+            self._stop()
+            answer = "\r\n"
+        self.say(answer.encode("ascii") + b"->")
+        if self._register["OUTPUT"] == "RS422" and self._stream is None:
+            self._start()
+
+    def _about(self) -> str:
+        return (
+            f"Name:             {self._name}\r\nSerial:           15030002\r\nOption:           000\r\n"
+            f"Article:          4120212\r\nCable head:       Wire\r\nMeasuring range:  {self._range_mm:.2f}mm\r\n"
+            "Version:          001.010\r\nHardware-rev:     00\r\nBoot-version:     001.000\r\n"
+        )
+
+    def _start(self) -> None:
+        loop = asyncio.get_running_loop()
+        self._streamed_s = loop.time()
+        self._stream = loop.call_later(_PERIOD_S, self._portion)
+
+    def _stop(self) -> None:
+        if self._stream is not None:
+            self._stream.cancel()
+            self._stream = None
+
+    def _portion(self) -> None:
+        """Send what was measured since the last portion."""
+        loop = asyncio.get_running_loop()
+        self._owed += (loop.time() - self._streamed_s) * 1000 * float(self._register["MEASRATE"])
+        self._streamed_s = loop.time()
+        count, self._owed = int(self._owed), self._owed % 1
+        displacement_um = self._displacement_um() if count else math.nan
+        data = b"".join(self._measurement(displacement_um) for _ in range(count))
+        if self.lose_bytes_every:
+            data = bytes(byte for byte in data if self._random.randrange(self.lose_bytes_every))
+        if data:
+            self.say(data)
+        self._stream = loop.call_later(_PERIOD_S, self._portion)
+
+    def _digital(self, displacement_um: float) -> int:
+        """Page 65, without mastering: x = (d / range + 0.01) 65520 / 1.02; page 66 for what has no value."""
+        if math.isnan(displacement_um):
+            return NO_PEAK
+        distance_mm = self._range_mm / 2 + self._direction * displacement_um / 1000
+        digital = round((distance_mm / self._range_mm + 0.01) * 65_520 / 1.02)
+        if digital < 0:
+            return NO_PEAK + 1  # peak before the range
+        return digital if digital <= 65_520 else NO_PEAK + 2  # peak behind it
+
+    def _measurement(self, displacement_um: float) -> bytes:
+        if not self.faults.frozen:
+            self._raw = self._digital(displacement_um + self._random.gauss(0.0, self._noise_um))
+            self._counter = (self._counter + 1) % 2**18
+        data = three_bytes(self._raw, first=True)
+        if self._register["OUTADD_RS422"] == "COUNTER":
+            data += three_bytes(self._counter, first=False)
+        return data
+
+
+def three_bytes(value: int, first: bool) -> bytes:
+    """18 bits as low, middle and high byte with their marks (page 67)."""
+    low, middle, high = value & 0x3F, value >> 6 & 0x3F, value >> 12 & 0x3F
+    return bytes([low, 0x40 | middle, (0x80 if first else 0xC0) | high])
