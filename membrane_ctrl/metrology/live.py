@@ -38,6 +38,9 @@ Kind = Literal["full", "fringes"]
 # that a field which passes half a period anywhere shows points in the band before it.
 GUARD_RAD = 0.9 * math.pi
 LOST_SHARE = 0.002  # more points than dust and glints beyond the guard
+# A film that changes its shape moves as many phases up as down. All of them moving one way is a knock against the
+# mount, which may have been a whole period: nobody can tell a tilt of 7 mrad from one of -1.7 by phase alone.
+TILT_GUARD_RAD = 0.3 * math.pi
 # With this share of its points the full cycle's normal matrix still contracts a hundredfold a step.
 MATRIX_KEPT_SHARE = 0.99
 # the plane z = 0 is crossed this far at most from where a ray meets the film
@@ -157,10 +160,7 @@ class LiveReconstructor:
         )  # every 16th point: the median costs more than the fit
         saturated = self._binner.saturated.ravel()[state.index] > 0
         usable = ~saturated & (state.fresh[:, 4].min(axis=0) > FRINGE_SHARE * modulation_adu)
-        seen = max(1, int(np.count_nonzero(usable)))
-        beyond = int(np.count_nonzero(usable & (np.abs(state.fresh[:, 3]).max(axis=0) > GUARD_RAD)))
-        if beyond > LOST_SHARE * seen:
-            reason = f"tracking lost: the phase moved by half a period at {beyond / seen:.1%} of the points"
+        if reason := _lost(state.fresh[:, 3], usable):
             return _rejected(kind, times, readings, reason)
         fit = self._fit(state, usable, readings)
         area = math.pi * self._optics.mirror.analysis_radius_mm**2
@@ -238,6 +238,17 @@ def _per_frame(
         found = f"{len(frames)} frames, {times.size} times and {readings.size} displacements"
         raise ValueError(f"a {kind} cycle has {count} frames with a time and a displacement each; got {found}")
     return times, readings
+
+
+def _lost(change_rad: FloatArray, usable: NDArray[np.bool_]) -> str:
+    """Why the phases (2, n) cannot be followed; empty if they can."""
+    seen = max(1, int(np.count_nonzero(usable)))
+    beyond = int(np.count_nonzero(usable & (np.abs(change_rad).max(axis=0) > GUARD_RAD)))
+    if beyond > LOST_SHARE * seen:
+        return f"tracking lost: the phase moved by half a period at {beyond / seen:.1%} of the points"
+    if np.abs(np.median(change_rad[:, ::16], axis=1)).max() > TILT_GUARD_RAD:
+        return "tracking lost: the whole mirror tilted"
+    return ""
 
 
 def _finite_mean(values: FloatArray) -> float:

@@ -104,6 +104,16 @@ def test_jump_beyond_half_a_fringe_asks_for_a_full_cycle(jump_um: float) -> None
     assert _error_um(live, again, jump_um)[0] <= 0.05
 
 
+def test_knock_that_looks_like_a_small_tilt_the_other_way() -> None:
+    """5.5 mrad of tilt move every phase by 1.27 half periods: seen as -0.73, below the guard at every point."""
+    live = _live()
+    tilted = FilmShape(37.1, 500.0, "hencky", (0, 5.5e-3 * 500e3 / 2, *ZERNIKE_UM[2:]))
+    renderer = OpticsRenderer(OPTICS, tilted, seed=6)
+    frames = [renderer.render(pattern, 0.0).copy() for pattern in fringe_sequence(OPTICS.pattern)]
+    estimate = live.fringes(frames, np.arange(8.0), np.zeros(8))
+    assert (estimate.verdict, estimate.reason) == ("rejected", "tracking lost: the whole mirror tilted")
+
+
 def test_fringes_before_any_full_cycle() -> None:
     lost = LiveReconstructor(OPTICS, 1).fringes(*_render("fringes"))
     assert (lost.verdict, lost.reason[:13]) == ("rejected", "tracking lost")
