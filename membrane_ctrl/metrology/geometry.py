@@ -1,8 +1,8 @@
 """Camera and screen in world coordinates: the one form the code behind knows (INTERFACES section 1).
 
 The short form is turned into it on loading. With the camera at F = a (cos alpha, 0, sin alpha) looking at O
-without roll, image down is world -y and image right is forward x ... the one unit vector normal to both that
-points towards +x: (sin alpha, 0, -cos alpha).
+without roll, image down is world -y, forward is -F / a, and image right is the unit vector normal to both that points
+towards +x: (sin alpha, 0, -cos alpha).
 """
 
 from __future__ import annotations

@@ -101,8 +101,8 @@ class LiveReconstructor:
         """
         times, readings = _per_frame(frames, time_s, displacement_um, self._slots.count, "full")
         sinusoids = np.r_[self._slots.sinusoids].tolist()
-        if self._reference_um is None and np.isfinite(readings[0]):
-            self._reference_um = float(readings[0])
+        if self._reference_um is None and np.isfinite(readings).any():
+            self._reference_um = float(readings[np.isfinite(readings)][0])
         self._binner.clear()
         self._binner.add(frames, range(len(frames)), watched=sinusoids)
         optics = self._optics

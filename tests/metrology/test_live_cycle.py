@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Sequence
 from functools import cache
 
@@ -237,6 +238,23 @@ def test_same_frames_give_the_same_bits() -> None:
     for first, second in zip(*runs, strict=True):
         assert np.array_equal(first.coeffs_um, second.coeffs_um)
         assert np.array_equal(first.covariance_um2, second.covariance_um2)
+
+
+def test_memory_does_not_grow_with_cycles() -> None:
+    live = _live()
+    cycles = [_render("fringes", d) for d in (0.5, -0.5)]
+    for k in range(4):
+        live.fringes(*cycles[k % 2])
+    tracemalloc.start()
+    try:
+        live.fringes(*cycles[0])
+        before = tracemalloc.get_traced_memory()[0]
+        for k in range(10):
+            live.fringes(*cycles[k % 2])
+        grown = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    assert grown < 20_000  # one point's arrays alone are 1.3 MB
 
 
 def test_covariance_is_a_covariance() -> None:
