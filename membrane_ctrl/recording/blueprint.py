@@ -94,16 +94,22 @@ def _shape(config: Config) -> rrb.Vertical:
         rrb.Spatial2DView(name=name, origin=f"/shape/map/{kind}")
         for kind, name in (
             ("height", "Height"),
-            ("difference", "Difference to the first"),
+            ("difference", "Difference to the first of hold"),
             ("uncertainty", "Uncertainty, 1 sigma"),
         )
     ]
+    band = config.limits.band_um
     pictures = [rrb.TextDocumentView(name="Colours", origin="/shape/legend")]
     rows = [
         rrb.Horizontal(*maps, *pictures, column_shares=[1, 1, 1, 1]),
         rrb.Horizontal(
-            _plot("Sag change by the camera and by the laser, um", "/shape/sag_change", "/shape/trim"),
-            _plot("Low orders, change since the first, um", "/shape/change"),
+            _plot(
+                "Sag change by the camera and by the laser, um",
+                "/shape/sag_change",
+                "/shape/trim",
+                span=(-band, band),
+            ),
+            _plot("Low orders, change since hold began, um", "/shape/change", span=(-band / 4, band / 4)),
             rrb.BarChartView(name="Change of Z2..Z36, um", origin="/shape/change_bars"),
         ),
         rrb.Horizontal(

@@ -24,8 +24,6 @@ from membrane_ctrl.ipc.ring import RingAddress, RingReader
 
 # Rings are emptied this often: the telemetry ring has to hold a few of these.
 _POLL_S = 0.25
-# Below the control process, above the acquisition: a late recorder drops rows, a late tick moves the mirror.
-_NICE = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +76,6 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
     # ctrl-C reaches the whole terminal group: the supervisor decides when the run is over, with the "end" event
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: asked.set())
-    os.nice(_NICE)
     os.environ["RUST_LOG"] = "off"  # Rerun's own log would write over the live screen; its errors come as exceptions
     if not _record(spec, reporter(status), asked.is_set, parent_died):
         os._exit(0)  # everything is written; Rerun's exit handler would wait for a dead writer

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 import traceback
 from collections.abc import Callable
@@ -13,11 +14,12 @@ from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.ipc.ring import RingReader
+from membrane_ctrl.names import State
 from membrane_ctrl.recording import events, plain_json
 from membrane_ctrl.recording.atomic import write_text_atomic
 from membrane_ctrl.recording.event_streams import send_events
 from membrane_ctrl.recording.events import Event, EventsFile
-from membrane_ctrl.recording.rows import Rows, unpack
+from membrane_ctrl.recording.rows import Rows, changes, column, unpack
 from membrane_ctrl.recording.run_folder import free_mb
 from membrane_ctrl.recording.shape_streams import ShapeStreams
 from membrane_ctrl.recording.sink import SEGMENT_S, Recording, RecordingError
@@ -83,6 +85,7 @@ class Recorder:
         self._shapes: list[ShapeEstimate] = []
         self._events: list[Event] = []
         self._alive = False
+        self._state = math.nan
         self._segment_until_s = 0.0
         self._retry_s = 0.0
         self._trouble: dict[str, str] = {}
@@ -118,6 +121,7 @@ class Recorder:
         self._messages = []
         self._guarded("summary", lambda: self._summary.add_rows(rows))
         self._guarded("disk check", self._watch_disk)
+        self._guarded("shape reference", lambda: self._watch_hold(rows))
         sent = self._send(now_s, rows)
         if not sent:
             self._rows_lost += len(rows)
@@ -163,6 +167,15 @@ class Recorder:
         self._telemetry_streams.start_segment()
         self._shape_streams.start_segment()
         return True
+
+    def _watch_hold(self, rows: Rows) -> None:
+        """Changes of the figure are against the first of the hold: before it they only show the way there."""
+        if not len(rows):
+            return
+        state = column(rows, "state")
+        if any(code == State.HOLD for _, code in changes(state, self._state)):
+            self._shape_streams.rebase()
+        self._state = float(state[-1])
 
     def _watch_disk(self) -> None:
         if free_mb(self._run_dir) < self._least_free_mb:

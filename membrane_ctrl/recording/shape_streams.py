@@ -33,7 +33,7 @@ _DIFFERENCE_LEAST_UM = 0.5
 
 
 class ShapeStreams:
-    """Sends estimates to a recording. Changes are against the first estimate that was not rejected."""
+    """Sends estimates to a recording. Changes are against the first estimate since `rebase` that was not rejected."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -48,6 +48,11 @@ class ShapeStreams:
         self._next_map_s = -math.inf
         self._next_difference_s = -math.inf
         self._verdict = ""
+
+    def rebase(self) -> None:
+        """Take the next estimate as the reference, and show the maps against it at once."""
+        self._reference = None
+        self._next_difference_s = -math.inf
 
     def send(self, estimate: ShapeEstimate) -> None:
         """Send one estimate at the middle of its exposures; of a rejected one only quality and verdict."""

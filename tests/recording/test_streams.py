@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rrd_reading import entities
-from synthetic_run import rows_of
+from rrd_reading import entities, scalars
+from synthetic_run import rows_of, shape_of
 
 from membrane_ctrl.acquisition.frames import FrameRing, FrameWriter
 from membrane_ctrl.clock import RunClock
@@ -16,6 +17,7 @@ from membrane_ctrl.config import Config
 from membrane_ctrl.recording.event_streams import event_text
 from membrane_ctrl.recording.lanes import FAULT, STATE
 from membrane_ctrl.recording.rows import changes, unpack
+from membrane_ctrl.recording.shape_streams import ShapeStreams
 from membrane_ctrl.recording.sink import Recording
 from membrane_ctrl.recording.streams import DERIVED, SHAPE_STREAMS, STREAMS, overview_um
 from membrane_ctrl.recording.thumbnails import THUMBNAIL_INTERVAL_S, Thumbnails
@@ -58,6 +60,19 @@ def test_an_event_is_one_line() -> None:
     event = {"time_utc": "x", "mono_s": 1.0, "kind": "state", "to": "hold", "error_um": 1 / 3, "why": None}
     assert event_text(event) == "state: to hold, error_um 0.333333"
     assert event_text({"kind": "end"}) == "end"
+
+
+def test_changes_of_the_figure_are_against_the_first_since_rebase(tmp_path: Path) -> None:
+    recording = Recording(tmp_path, "test", RunClock.start(), Config())
+    recording.next_segment()
+    shapes = ShapeStreams(recording)
+    for cycle in range(4):
+        if cycle == 2:
+            shapes.rebase()
+        shapes.send(replace(shape_of(float(cycle), cycle), sag_um=100.0 * cycle))
+    recording.close()
+    _, values = scalars(tmp_path / "test-000.rrd", "/shape/sag_change")
+    assert values[:, 0] == pytest.approx([0.0, 100.0, 0.0, 100.0])
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
