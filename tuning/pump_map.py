@@ -1,15 +1,17 @@
 """What the pump does at low commands, measured on the mirror: leak, start, stall, and flow against command.
 
-The mirror is the flow meter: its speed is the flow less the leak. A probe is a few seconds of one command, from rest or
-from running; between probes the mirror is brought back to where it stood. Start and stall are found by bisection, the
-leak with the pump off, the curve from two probes above.
+The mirror is the flow meter: its speed is the flow less the leak. A probe is a few seconds of one command, from
+rest or from running; between probes the mirror is brought back to where it stood. Start and stall
+are found by bisection, the leak with the pump off, the curve from two commands above.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Generator
+from dataclasses import dataclass
+
+import numpy as np
 
 from membrane_ctrl.config import PumpConfig
 from membrane_ctrl.control.leak import TOO_TIGHT_UM_PER_S
@@ -18,9 +20,12 @@ from tuning.experiments import Finished, Motion
 from tuning.records import Measurement
 
 _PREPARE_S = 1.0  # seven lags of the pump: it stands, or runs
-_PROBE_S = 2.5
+_PROBE_MIN_S, _PROBE_MAX_S = 1.5, 5.0
+_TRAVEL_UM = 6.0  # of a probe in which the mirror sinks
 _SKIP_S = 0.8  # of a probe: transport and five lags
 _NEAR_UM = 1.0
+_REPEATS = 3  # of the curve, which start and stall are judged by
+_CURVE_STEP = 0.2  # between the two commands that give the curve: flows of about one and two leaks
 _RETURN_MAX_S = 60.0
 _RUN_FRACTION = 0.45  # surely running
 _BISECTIONS = 5  # of a range of 0.35: to 0.01
@@ -38,7 +43,7 @@ class PumpMap:
     leak_um_per_s : float
         Speed at which the mirror sinks with the pump off; the bleed counts.
     leak_sigma_um_per_s : float
-        Its standard error for 1 um of laser noise at the rate used.
+        Its standard error, from the scatter of the probes.
     start_fraction, stall_fraction : float
         Where a standing pump starts and a running one stalls, within 0.01; NaN if it never did.
     dead_fraction, flow_full_um_per_s : float
@@ -88,14 +93,20 @@ class PumpMapper:
         Where the mirror is brought back to.
     holding_fraction : float
         Command that about holds it.
-    laser_um : float
-        Standard deviation of a reading.
+    holding_flow_um_per_s : float
+        Flow of that command as configured: how fast the mirror will sink without it, to a factor.
     """
 
-    def __init__(self, centre_um: float, holding_fraction: float, laser_um: float) -> None:
+    def __init__(
+        self,
+        centre_um: float,
+        holding_fraction: float,
+        holding_flow_um_per_s: float,
+    ) -> None:
         self._centre_um = centre_um
         self._holding_fraction = holding_fraction
-        self._laser_um = laser_um
+        self._probe_s = min(max(_TRAVEL_UM / holding_flow_um_per_s - _PREPARE_S, _PROBE_MIN_S), _PROBE_MAX_S)
+        self._sinking_um_per_s: list[float] = []
         self._motion = Motion()
         self._plan = self._probes()
         self._probe = next(self._plan)
@@ -115,7 +126,7 @@ class PumpMapper:
             return self._probe.prepare_fraction
         if since_s > _SKIP_S:
             self._speed.add(since_s, measurement.displacement_um)
-        if since_s < _PROBE_S:
+        if since_s < self._probe_s:
             return self._probe.fraction
         self._speed_um_per_s = self._speed.per_s
         self._returning, self._in_phase_s = True, 0.0
@@ -127,7 +138,8 @@ class PumpMapper:
 
     def _return(self) -> float | Finished:
         """Bring the mirror to where the next probe will take it through the middle of its way."""
-        off_um = self._motion.position_um - self._centre_um
+        sinks = self._probe.fraction < self._holding_fraction
+        off_um = self._motion.position_um - self._centre_um - (_TRAVEL_UM / 2 if sinks else -_TRAVEL_UM / 2)
         if abs(off_um) < _NEAR_UM:
             self._returning, self._in_phase_s, self._speed = False, 0.0, Slope()
             return self._probe.prepare_fraction
@@ -136,33 +148,47 @@ class PumpMapper:
             return Finished(False, f"the mirror did not {way} back in {_RETURN_MAX_S:g} s: too tight, or no pump")
         return 0.0 if off_um > 0 else max(_RUN_FRACTION, self._holding_fraction)
 
-    def _probes(self) -> Iterator[Probe]:
-        """The plan, as a coroutine: each probe's speed is there when the next one is asked for."""
+    def _flow(self, prepare_fraction: float, fraction: float) -> Generator[Probe, None, float]:
+        """Flow at a command: speed with it less speed without the pump, one right after the other.
+
+        So the leak and the slow weather, which is as large as the flows in question, are in both.
+        """
         yield Probe(0.0, 0.0)
-        leak = -self._speed_um_per_s
-        low = self._holding_fraction + 0.05
+        self._sinking_um_per_s.append(-self._speed_um_per_s)
+        yield Probe(prepare_fraction, fraction)
+        return self._speed_um_per_s + self._sinking_um_per_s[-1]
+
+    def _probes(self) -> Generator[Probe, None, None]:
+        """The plan, as a coroutine: each probe's speed is there when the next one is asked for."""
+        low = self._holding_fraction + 0.02
         flows = []
-        for fraction in (low, low + 0.15):
-            yield Probe(_RUN_FRACTION, fraction)
-            flows.append(self._speed_um_per_s + leak)
-        slope = (flows[1] - flows[0]) / 0.15
+        for fraction in (low, low + _CURVE_STEP):
+            total = 0.0
+            for _ in range(_REPEATS):
+                total += yield from self._flow(_RUN_FRACTION, fraction)
+            flows.append(total / _REPEATS)
+        slope = (flows[1] - flows[0]) / _CURVE_STEP
         dead = low - flows[0] / slope if slope > 0 else math.nan
-        found = []
-        for prepare in (0.0, _RUN_FRACTION):
-            off, on = _LOWEST, _HIGHEST
-            for _ in range(_BISECTIONS):
-                middle = (off + on) / 2
-                yield Probe(prepare, middle)
-                runs = self._speed_um_per_s + leak > _RUNS_SHARE * max(slope * (middle - dead), 0.1 * leak)
-                off, on = (off, middle) if runs else (middle, on)
-            found.append(on if on < _HIGHEST else math.nan)
-        span_s = _PROBE_S - _SKIP_S
+        start = yield from self._edge(0.0, slope, dead)
+        stall = yield from self._edge(_RUN_FRACTION, slope, dead)
+        leak = float(np.mean(self._sinking_um_per_s))
         self.result = PumpMap(
             leak_um_per_s=leak,
-            leak_sigma_um_per_s=self._laser_um * math.sqrt(12 / (span_s * 50.0)) / span_s,
-            start_fraction=found[0],
-            stall_fraction=found[1],
+            leak_sigma_um_per_s=float(np.std(self._sinking_um_per_s, ddof=1))
+            / math.sqrt(len(self._sinking_um_per_s)),
+            start_fraction=start,
+            stall_fraction=stall,
             dead_fraction=dead,
             flow_full_um_per_s=slope * (1 - dead),
             too_tight=leak < TOO_TIGHT_UM_PER_S,
         )
+
+    def _edge(self, prepare_fraction: float, slope: float, dead: float) -> Generator[Probe, None, float]:
+        """Lowest command at which a standing (or running) pump runs; NaN if none in the range does."""
+        off, on = _LOWEST, _HIGHEST
+        for _ in range(_BISECTIONS):
+            middle = (off + on) / 2
+            flow = yield from self._flow(prepare_fraction, middle)
+            runs = flow > _RUNS_SHARE * max(slope * (middle - dead), 0.0)
+            off, on = (off, middle) if runs and middle > dead else (middle, on)
+        return on if on < _HIGHEST else math.nan

@@ -1,0 +1,90 @@
+"""Intensities and weather gains from synthetic series of known truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tuning.disturbance import fit_noise
+from tuning.feedforward_fit import WeatherGain, fit_weather, lagged
+from tuning.plant_model import PlantModel
+from tuning.records import Record
+
+DT_S = 0.02
+N = 30_000
+
+
+def walk(rng: np.random.Generator, per_s: float) -> np.ndarray:
+    return np.cumsum(rng.standard_normal(N)) * np.sqrt(per_s * DT_S)
+
+
+def test_noise_and_both_walks_are_told_apart() -> None:
+    rng = np.random.default_rng(2)
+    series = walk(rng, 0.05) + lagged(walk(rng, 1.0), 12.0, DT_S) + 0.5 * rng.standard_normal(N)
+    found = fit_noise(series, DT_S, 12.0)
+    assert found.white == pytest.approx(0.5, rel=0.02)
+    assert abs(found.fast / 0.05 - 1) < 3 * found.fast_sigma < 1
+    assert abs(found.slow / 1.0 - 1) < 3 * found.slow_sigma
+
+
+def test_a_trend_is_no_disturbance() -> None:
+    rng = np.random.default_rng(3)
+    series = walk(rng, 0.01) + rng.standard_normal(N)
+    plain, tilted = (fit_noise(s, DT_S, 12.0) for s in (series, series + 0.5 * DT_S * np.arange(N)))
+    assert tilted.fast == pytest.approx(plain.fast, rel=0.05, abs=1e-4)
+    assert tilted.white == pytest.approx(plain.white, rel=1e-3)
+
+
+def test_the_spectrum_is_that_of_a_random_walk() -> None:
+    found = fit_noise(walk(np.random.default_rng(4), 0.04), DT_S, 0.0)
+    assert found.moving_psd(np.array([2.0]))[0] == pytest.approx(0.04 / 4.0, rel=0.15)
+
+
+def test_a_short_hold_is_refused() -> None:
+    with pytest.raises(ValueError, match="too short"):
+        fit_noise(np.zeros(5000), DT_S, 12.0)
+
+
+def weather_record(seed: int, sensor_pa: float) -> Record:
+    rng = np.random.default_rng(seed)
+    pressure, air = walk(rng, 0.1), walk(rng, 2e-5)
+    y = -0.36 * pressure + 120.0 * lagged(air, 12.0, DT_S) + walk(rng, 1e-4) + rng.standard_normal(N)
+    return Record(
+        DT_S,
+        np.full(N, 1.2),
+        y + 1.2 * DT_S * np.arange(N),
+        101_325.0 + pressure + sensor_pa * rng.standard_normal(N),
+        23.0 + air + 0.002 * rng.standard_normal(N),
+    )
+
+
+@pytest.mark.parametrize("sensor_pa", [0.02, 1.0])
+def test_weather_gains_also_behind_a_noisy_barometer(sensor_pa: float) -> None:
+    """The noisy barometer's gain would come out at a third without the correction."""
+    found = fit_weather(weather_record(1, sensor_pa), PlantModel(1.0, 0.1, 0.15, 1.2), 12.0)
+    assert found.barometer is not None
+    assert found.air is not None
+    assert found.barometer.gain == pytest.approx(-0.36, abs=max(0.02, 3 * found.barometer.sigma))
+    assert abs(found.barometer.gain) > 0.25
+    assert found.air.gain == pytest.approx(120.0, abs=3 * found.air.sigma + 2.0)
+    assert found.barometer.walk == pytest.approx(0.1, rel=0.2)
+    assert found.barometer.noise == pytest.approx(sensor_pa, rel=0.1)
+
+
+def test_without_sensors_everything_is_left_as_rest() -> None:
+    whole = weather_record(1, 0.05)
+    absent = np.full(N, np.nan)
+    blind = Record(DT_S, whole.flow_um_per_s, whole.displacement_um, absent, absent)
+    found = fit_weather(blind, PlantModel(1.0, 0.1, 0.15, 1.2), 12.0)
+    assert found.barometer is None
+    assert found.air is None
+    assert found.rest_um.size == N
+
+
+@pytest.mark.parametrize(
+    ("gain", "sigma", "expected"),
+    [(-0.30, 0.01, -0.30), (-0.30, 0.05, -0.358), (-0.10, 0.05, -0.10)],
+    ids=["known well: taken", "known badly, agrees: configured", "known badly, contradicts: taken"],
+)
+def test_which_gain_is_used(gain: float, sigma: float, expected: float) -> None:
+    assert WeatherGain(gain, sigma, 0.1, 0.05, 0.0).agreed(-0.358) == expected

@@ -1,0 +1,179 @@
+"""Experiments on the twin: bounded on any plant, stopped by name when something is wrong, and the mirror stays held."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.tuning import Case, TwinBench, characterise
+from membrane_ctrl.config import PumpConfig
+from membrane_ctrl.twin.events import AmbientChange, LaserDropout
+from tuning.experiments import Around, Finished, Patterned
+from tuning.patterns import doublets, multisine, steps
+from tuning.pump_map import PumpMapper
+from tuning.records import Measurement, Record
+from tuning.relay import Relay
+from tuning.rig import Rig, laser_noise_um
+
+AROUND = Around(1.24, 0.32, 5.3, 1.0)
+
+
+class StuckPump(TwinBench):
+    """From a time on the pump delivers its holding flow whatever it is told."""
+
+    stuck_from_s = math.inf
+
+    def exchange(self, pump_fraction: float, vent_fraction: float) -> Measurement:
+        stuck = self.plant.time_s >= self.stuck_from_s
+        return super().exchange(0.31 if stuck else pump_fraction, vent_fraction)
+
+
+def relay_after_hold(bench: TwinBench, case: Case) -> tuple[Rig, Record, Finished, float]:
+    """Hold for 60 s, then the relay; with the largest true excursion in it."""
+    rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
+    around = rig.around(rig.hold(60.0).part(20.0, 60.0))
+    start = len(bench.true_um)
+    record, end = rig.run(Relay(around, 0.0), around, 0.0)
+    return rig, record, end, max(abs(x) for x in bench.true_um[start:])
+
+
+def held_again(rig: Rig, bench: TwinBench) -> bool:
+    """After 40 s of hold the mirror stays within the band."""
+    rig.hold(40.0)
+    start = len(bench.true_um)
+    rig.hold(10.0)
+    return max(abs(x) for x in bench.true_um[start:]) < 2.0
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        Case("gusty"),
+        Case("gusty", leak=3.0),
+        Case("gusty", leak=1 / 3, bleed=1.0),
+        Case("gusty", pump=3.0, bleed=1.0),
+        Case("gusty", pump=1 / 3),
+        Case("gusty", delay=3.0),
+        Case("gusty", delay=1 / 3),
+    ],
+    ids=["nominal", "leak x3", "leak /3", "pump x3", "pump /3", "delay x3", "delay /3"],
+)
+def test_excursion_stays_bounded_on_any_plant(case: Case) -> None:
+    bench = TwinBench(case, 7)
+    rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
+    done = characterise(rig, bench)
+    assert done.excursion_um < 10.0
+    assert done.ended[0].completed, done.ended[0].reason
+
+
+def test_a_door_slammed_in_the_relay_ends_it_and_the_mirror_is_held() -> None:
+    case = Case("quiet")
+    bench = TwinBench(case, 1, [AmbientChange(90.0, -30.0)])
+    rig, record, end, _ = relay_after_hold(bench, case)
+    assert not end.completed
+    assert "something else moved the mirror" in end.reason
+    assert record.duration_s == pytest.approx(30.0, abs=1.0)
+    assert held_again(rig, bench)
+
+
+def test_a_lost_laser_ends_it_and_the_mirror_is_held() -> None:
+    case = Case("quiet")
+    bench = TwinBench(case, 1, [LaserDropout(80.0, 3.0)])
+    rig, record, end, _ = relay_after_hold(bench, case)
+    assert not end.completed
+    assert "laser" in end.reason
+    assert record.duration_s == pytest.approx(20.3, abs=0.1)
+    assert held_again(rig, bench)
+
+
+def test_a_stuck_pump_never_crosses_and_is_named() -> None:
+    case = Case("calm", laser_noise_um=0.3)
+    bench = StuckPump(case, 1)
+    bench.stuck_from_s = 60.0
+    _, _, end, excursion_um = relay_after_hold(bench, case)
+    assert not end.completed
+    assert "did not" in end.reason
+    assert excursion_um < 10.0
+
+
+def test_a_mirror_that_is_too_tight_is_told_to_open_the_bleed() -> None:
+    case = Case("calm", laser_noise_um=0.3, leak=0.2)
+    rig = Rig(TwinBench(case, 1), case.loop(), PumpConfig(), case.holding_flow_um_per_s)
+    around = rig.around(rig.hold(60.0).part(20.0, 60.0))
+    with pytest.raises(ValueError, match="open the bleed"):
+        doublets(around, 1.0)
+
+
+@pytest.mark.parametrize("make", [steps, doublets, multisine])
+@pytest.mark.parametrize("gain", [1 / 3, 1.0, 3.0])
+def test_patterns_stay_in_the_pump_and_near_the_centre(make: object, gain: float) -> None:
+    assert callable(make)
+    pattern = make(AROUND, gain)
+    flow = np.array([pattern(0.02 * i) for i in range(3000)])
+    assert (flow + AROUND.holding_flow_um_per_s).min() >= AROUND.least_flow_um_per_s - 1e-9
+    assert (flow + AROUND.holding_flow_um_per_s).max() <= AROUND.full_flow_um_per_s + 1e-9
+    way_um = np.cumsum(flow - flow.mean()) * 0.02 * gain
+    assert np.ptp(way_um) < AROUND.limit_um
+    assert np.ptp(flow) > 0.2
+
+
+@pytest.mark.parametrize("make", [steps, multisine])
+def test_patterns_run_on_the_twin_within_the_limit(make: object) -> None:
+    assert callable(make)
+    case = Case()
+    bench = TwinBench(case, 3)
+    rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
+    around = rig.around(rig.hold(60.0).part(20.0, 60.0))
+    start = len(bench.true_um)
+    record, end = rig.run(Patterned(around, make(around, 1.0), 40.0, 0.0), around, 0.0)
+    assert end.completed, end.reason
+    assert record.duration_s == pytest.approx(40.0)
+    assert max(abs(x) for x in bench.true_um[start:]) < 10.0
+
+
+def test_laser_noise_is_measured_while_the_weather_moves_the_mirror() -> None:
+    case = Case("gusty", laser_noise_um=0.7)
+    rig = Rig(TwinBench(case, 2), case.loop(), PumpConfig(), case.holding_flow_um_per_s)
+    assert laser_noise_um(rig.hold(40.0)) == pytest.approx(0.7, rel=0.05)
+
+
+def test_handing_over_between_loop_and_experiment_is_bumpless() -> None:
+    """In still air, the flow jumps by no more than the loop's own ripple when the loop takes over again."""
+    case = Case("calm", laser_noise_um=0.0)
+    bench = TwinBench(case, 1)
+    rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
+    around = rig.around(rig.hold(60.0).part(20.0, 60.0))
+    rig.run(Patterned(around, lambda time_s: 0.0, 5.0, 0.0), around, 0.0)
+    after = rig.hold(5.0)
+    assert np.abs(after.flow_um_per_s - around.holding_flow_um_per_s).max() < 0.05
+
+
+def test_pump_map_finds_start_stall_leak_and_curve() -> None:
+    bench = TwinBench(Case("quiet"), 2)
+    mapper = PumpMapper(0.0, 0.31, 1.24)
+    measurement = bench.exchange(0.31, 0.0)
+    while not isinstance(command := mapper.step(measurement, 0.02), Finished):
+        measurement = bench.exchange(command, 0.0)
+    found = mapper.result
+    assert command.completed
+    assert found is not None
+    assert found.start_fraction == pytest.approx(0.22, abs=0.02)
+    assert found.stall_fraction == pytest.approx(0.15, abs=0.02)
+    assert found.sticks_by > 0.03
+    assert found.leak_um_per_s == pytest.approx(1.24, abs=max(4 * found.leak_sigma_um_per_s, 0.05))
+    assert found.flow_full_um_per_s == pytest.approx(5.3, rel=0.1)
+    assert not found.too_tight
+    assert max(abs(x) for x in bench.true_um) < 10.0
+    assert found.applied_to(PumpConfig()).start_fraction == found.start_fraction
+
+
+def test_pump_map_says_when_there_is_no_pump() -> None:
+    bench = TwinBench(Case("calm", laser_noise_um=0.3), 1)
+    mapper = PumpMapper(0.0, 0.31, 1.24)
+    measurement = bench.exchange(0.0, 0.0)
+    while not isinstance(command := mapper.step(measurement, 0.02), Finished):
+        measurement = bench.exchange(0.0, 0.0)
+    assert not command.completed
+    assert "no pump" in command.reason

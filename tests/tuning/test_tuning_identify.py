@@ -1,0 +1,102 @@
+"""Identification against known truth, its error bars, and what it says of bad data."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import record
+
+from tuning.identify import identify, independence, whiteness
+from tuning.plant_model import PlantModel
+from tuning.quality import judge, validate
+
+TRUTH = PlantModel(0.8, 0.09, 0.15, 1.1)
+
+
+def test_recovers_a_plant_from_nearly_clean_data() -> None:
+    found = identify(record(TRUTH, laser_um=0.02, walk_um2_per_s=1e-6))
+    assert found.model.gain == pytest.approx(TRUTH.gain, rel=2e-3)
+    assert found.model.dead_time_s == pytest.approx(TRUTH.dead_time_s, abs=3e-3)
+    assert found.model.lag_s == pytest.approx(TRUTH.lag_s, abs=4e-3)
+    assert found.model.leak_um_per_s == pytest.approx(TRUTH.leak_um_per_s, rel=5e-3)
+
+
+def test_error_bars_are_honest() -> None:
+    """Of 24 fits, at 2 sigma 95 % should hold the truth; fewer than 20 would be a chance of 1 in 200."""
+    fits = [identify(record(TRUTH, seed=seed, samples=2000)) for seed in range(24)]
+    gain = [abs(f.model.gain - TRUTH.gain) <= 2 * f.sigma.gain for f in fits]
+    delay = [abs(f.model.delay_s - TRUTH.delay_s) <= 2 * f.sigma.delay_s for f in fits]
+    assert sum(gain) >= 20
+    assert sum(delay) >= 20
+    assert np.mean([f.sigma.gain for f in fits]) < 0.03
+
+
+def test_residuals_of_the_true_structure_are_white_and_know_nothing_of_the_flow() -> None:
+    found = identify(record(TRUTH, seed=5))
+    assert found.whiteness_p > 1e-3
+    assert found.independence_p > 1e-3
+
+
+def test_whiteness_and_independence_see_what_they_are_for() -> None:
+    rng = np.random.default_rng(1)
+    e, u = rng.standard_normal(4000), rng.standard_normal(4000)
+    assert whiteness(np.convolve(e, [1.0, 0.3], "same")) < 1e-6
+    assert independence(e, u) > 1e-3
+    assert independence(e[3:] + 0.2 * u[:-3], u[3:]) < 1e-6
+
+
+def test_a_short_or_silent_record_is_refused() -> None:
+    whole = record(TRUTH)
+    with pytest.raises(ValueError, match="too short"):
+        identify(whole.part(0.0, 1.0))
+    with pytest.raises(ValueError, match="relay"):
+        identify(replace(whole, flow_um_per_s=np.ones(len(whole))))
+
+
+def test_good_data_are_ok_and_hold_on_fresh_data() -> None:
+    whole = record(TRUTH, samples=5000)
+    fitted = identify(whole.part(0.0, 70.0))
+    checked = validate(fitted, whole.part(70.0, 100.0))
+    assert checked.innovation_ratio == pytest.approx(1.0, abs=0.1)
+    assert judge(whole, fitted, checked).verdict == "ok"
+
+
+def test_a_bench_that_changed_is_seen_on_fresh_data() -> None:
+    fitted = identify(record(TRUTH, laser_um=0.1))
+    checked = validate(fitted, record(replace(TRUTH, gain=1.6), laser_um=0.1, seed=2))
+    assert checked.independence_p < 1e-4
+    assert judge(record(TRUTH, laser_um=0.1), fitted, checked).verdict == "degraded"
+
+
+def test_a_slammed_door_is_named_with_its_time() -> None:
+    whole = record(TRUTH)
+    jumped = replace(whole, displacement_um=whole.displacement_um + 12.0 * (np.arange(3000) >= 1500))
+    found = judge(jumped, identify(jumped))
+    assert found.verdict == "refused"
+    assert any("30.0 s" in reason and "relay" in reason for reason in found.reasons)
+
+
+def test_a_pump_that_does_nothing_is_named() -> None:
+    dead = record(replace(TRUTH, gain=1e-9))
+    found = judge(dead, identify(dead))
+    assert found.verdict == "refused"
+    assert "pump map" in found.reasons[0]
+
+
+def test_a_blinking_laser_is_refused() -> None:
+    whole = record(TRUTH)
+    reading = whole.displacement_um.copy()
+    reading[::20] = np.nan
+    blinking = replace(whole, displacement_um=reading)
+    found = judge(blinking, identify(blinking))
+    assert found.verdict == "refused"
+    assert "laser" in found.reasons[0]
+
+
+def test_too_little_excitation_is_refused_with_the_experiment_that_helps() -> None:
+    whole = record(TRUTH, samples=400, laser_um=4.0, walk_um2_per_s=0.5)
+    found = judge(whole, identify(whole))
+    assert found.verdict == "refused"
+    assert any("longer" in reason or "doublets" in reason or "pump map" in reason for reason in found.reasons)

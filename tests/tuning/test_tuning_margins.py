@@ -1,0 +1,131 @@
+"""Margins and designs against closed forms and against python-control's own delay approximations."""
+
+from __future__ import annotations
+
+import math
+
+import control
+import numpy as np
+import pytest
+
+from benchmarks.minimum_variance import least_std_um as least_of_the_twin
+from membrane_ctrl.config import LoopConfig, TwinConfig
+from tuning.candidates import Demands, amigo, lambda_tuned, least_variance, load_peak_um, max_ki, simc
+from tuning.disturbance import Noise
+from tuning.disturbance_model import Disturbance
+from tuning.feedforward_fit import WeatherGain
+from tuning.loop_model import Gains
+from tuning.margins import margins, sensitivity_peak
+from tuning.minimum_variance import least_std_um, predict
+from tuning.plant_model import PlantModel
+
+DT_S = 1e-3
+DELAY = PlantModel(1.0, 0.3, 1e-4, 1.24)  # as good as a pure delay
+PUMP = PlantModel(1.0, 0.075, 0.15, 1.24)
+
+
+def test_proportional_control_of_an_integrator_with_delay() -> None:
+    """GM = pi / (2 k K d), PM = 90 deg - K d, delay margin = PM / K."""
+    found = margins(Gains(1.0, 1e6), DELAY, DT_S)
+    delay_s = DELAY.delay_s + DT_S / 2
+    assert found.stable
+    assert found.gain_margin == pytest.approx(math.pi / 2 / delay_s, rel=0.01)
+    assert found.phase_margin_deg == pytest.approx(90 - math.degrees(delay_s), abs=0.5)
+    assert found.delay_margin_s == pytest.approx(math.pi / 2 - delay_s, rel=0.01)
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_stability_is_told_on_both_sides_of_the_gain_margin(factor: float) -> None:
+    gains = Gains(2.0, 5.0)
+    edge = margins(gains, PUMP, 0.02).gain_margin
+    scaled = Gains(2.0 * edge * factor, 5.0)
+    assert margins(scaled, PUMP, 0.02).stable == (factor < 1)
+    assert math.isfinite(sensitivity_peak(scaled, PUMP, 0.02)) == (factor < 1)
+
+
+def test_an_integrator_that_is_too_fast_is_unstable() -> None:
+    assert not margins(Gains(0.1, 0.2), PUMP, 0.02).stable
+
+
+def test_margins_agree_with_a_high_order_pade() -> None:
+    s = control.tf("s")
+    num, den = control.pade(PUMP.dead_time_s + 0.01, 8)
+    loop = 0.9 * (1 + 1 / (7 * s)) / (0.1 * s + 1) / (s * (PUMP.lag_s * s + 1)) * control.tf(num, den)
+    gain_margin, phase_margin, _, _, _, _ = control.stability_margins(loop)
+    disk, _, _ = control.disk_margins(loop, np.geomspace(1e-3, 100, 2000))
+    found = margins(Gains(0.9, 7.0, 0.0, 0.1), PUMP, 0.02)
+    assert found.gain_margin == pytest.approx(gain_margin, rel=0.01)
+    assert found.phase_margin_deg == pytest.approx(phase_margin, abs=0.5)
+    assert found.disk_margin == pytest.approx(disk, rel=0.01)
+    assert found.ms >= 1 / (2 * math.sin(math.radians(found.phase_margin_deg) / 2))
+
+
+def test_rules_are_the_published_ones() -> None:
+    assert simc(DELAY, 0.0, 0.0).kp_per_s == pytest.approx(1 / (2 * DELAY.delay_s))
+    assert simc(DELAY, 0.0, 0.0).ti_s == pytest.approx(8 * DELAY.delay_s)
+    assert amigo(DELAY, 0.0, 0.0).kp_per_s == pytest.approx(0.35 / DELAY.delay_s)
+    slow = lambda_tuned(DELAY, 0.0, 0.0, factor=3.0)
+    assert slow.ti_s == pytest.approx(7 * DELAY.delay_s)
+    assert slow.kp_per_s == pytest.approx(7 / (16 * DELAY.delay_s))
+
+
+def test_max_ki_sits_on_its_sensitivity_and_beats_simc() -> None:
+    best = max_ki(PUMP, 0.02, 0.1, 1.4)
+    assert margins(best, PUMP, 0.02).ms == pytest.approx(1.4, abs=0.02)
+    slow = simc(PUMP, 0.02, 0.1, 1.0)
+    assert best.kp_per_s / best.ti_s > slow.kp_per_s / slow.ti_s
+
+
+@pytest.mark.parametrize("ti_s", [1.0, 4.0, 30.0])
+def test_load_peak_against_simulation(ti_s: float) -> None:
+    """Without delay the formula is exact."""
+    model = PlantModel(0.8, 0.0, 0.0, 1.0)
+    gains = Gains(1.0, ti_s)
+    t = np.linspace(0, 60, 6001)
+    system = control.tf([1.0, 0.0], [1.0, 0.8, 0.8 / ti_s])
+    _, y = control.step_response(0.6 * system, t)
+    assert load_peak_um(gains, model, 0.6) == pytest.approx(float(np.max(y)), rel=0.01)
+
+
+def typical(loop: LoopConfig) -> Disturbance:
+    """The twin's typical weather, known exactly; its slow return is left out."""
+    noise = Noise(math.sqrt(1.0 + 0.1**2 / 12), 0.0, 0.0, 12.0, 0.0, 0.0, 0.0, 1 / loop.rate_hz)
+    barometer = WeatherGain(-0.358, 0.0, 2 * 1.2**2 / 30, 0.05, 0.0)
+    return Disturbance(noise, barometer, WeatherGain(123.0, 0.0, 2 * 0.05**2 / 300, 0.002, 12.0))
+
+
+@pytest.mark.parametrize(("feedforward", "agreement"), [(False, 0.05), (True, 0.1)])
+def test_the_bound_is_that_of_the_twin(feedforward: bool, agreement: float) -> None:
+    """The twin's weather returns to its mean and a walk does not, which the slow end of the bound sees."""
+    loop = LoopConfig(feedforward_barometer=feedforward, feedforward_temperature=feedforward)
+    twin = TwinConfig(laser_noise_um=1.0)
+    assert least_std_um(PUMP, typical(loop), loop, write_s=0.005) == pytest.approx(
+        least_of_the_twin(loop, twin), rel=agreement
+    )
+
+
+def test_nothing_predicted_is_below_the_bound_and_the_search_comes_near_it() -> None:
+    loop = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
+    weather = typical(loop)
+    best = least_variance(PUMP, weather, loop, Demands())
+    least_um = least_std_um(PUMP, weather, loop)
+    found_um = predict(best, PUMP, weather, loop).std_um
+    assert least_um < found_um < 1.15 * least_um
+    assert margins(best, PUMP, 1 / loop.rate_hz).ms <= 1.42
+    for other in (Gains.of(loop), simc(PUMP, 0.02, 0.2), amigo(PUMP, 0.02, 0.2)):
+        assert found_um < predict(other, PUMP, weather, loop).std_um
+
+
+def test_demands_hold_where_the_weather_asks_for_nothing() -> None:
+    """With feed-forward the weather leaves so little that the least variance alone would switch the loop off."""
+    loop, demands = LoopConfig(), Demands()
+    gains = least_variance(PUMP, typical(loop), loop, demands)
+    assert load_peak_um(gains, PUMP, demands.load_step_um_per_s) <= 1.01 * demands.load_peak_um
+    assert 3 * gains.ti_s <= 1.01 * demands.recovery_s
+    assert margins(gains, PUMP, 0.02).stable
+
+
+def test_feed_forward_leaves_less_of_the_weather() -> None:
+    weather, w = typical(LoopConfig()), np.array([0.3])
+    off = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
+    assert weather.psd(w, PUMP, LoopConfig())[0] < 0.1 * weather.psd(w, PUMP, off)[0]
