@@ -13,7 +13,7 @@ from membrane_ctrl import __version__
 from membrane_ctrl.config import Config
 from membrane_ctrl.config_file import load
 from membrane_ctrl.durations import parse_duration_s
-from membrane_ctrl.errors import CommandError, Exit
+from membrane_ctrl.errors import CommandError, Exit, InputError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -49,6 +49,10 @@ def top(version: Annotated[bool, typer.Option("--version", help="Print the versi
 def hold(
     config: ConfigOption = None,
     twin: Annotated[bool, typer.Option("--twin", help="Hold the simulated bench instead of devices.")] = False,
+    devices: Annotated[
+        Path | None,
+        typer.Option(help="With --twin: emulate the instruments of this configuration's [devices], in bytes."),
+    ] = None,
     duration: Annotated[str | None, typer.Option(help="Stop after this long, e.g. 90s, 3m, 2h30m.")] = None,
     name: Annotated[str, typer.Option(help="Name of the run folder.")] = "hold",
     logs: Annotated[Path | None, typer.Option(help="Where run folders go.")] = None,
@@ -61,14 +65,15 @@ def hold(
     from membrane_ctrl.hold import HoldOptions, hold_mirror
 
     options = HoldOptions(
-        config=_config(config),
-        source=str(config or "the defaults"),
+        config=_with_devices(config, devices, twin),
+        source=str(config or devices or "the defaults"),
         twin=twin,
         duration_s=None if duration is None else parse_duration_s(duration),
         name=name,
         logs_dir=logs,
         clear_faults=clear_faults,
         json=json,
+        lab=devices is not None,
     )
     return hold_mirror(options)
 
@@ -93,6 +98,101 @@ def check(
     from membrane_ctrl.check import check_config
 
     return check_config(_config(config), str(config), json)
+
+
+@app.command()
+def devices(json: JsonOption = False) -> int:
+    """List serial ports, cameras and displays, with the text to paste into a configuration."""
+    from membrane_ctrl.devices import list_devices
+
+    return list_devices(json)
+
+
+@app.command()
+def conformance(
+    url: Annotated[str, typer.Argument(help="The board: tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200.")],
+    unit_id: Annotated[int, typer.Option(min=1, max=247, help="Modbus unit.")] = 1,
+    json: JsonOption = False,
+) -> int:
+    """Test whether a board does what a pump board must do. The pump runs at a few per cent: vent the mirror first."""
+    from membrane_ctrl.conformance import run_conformance
+
+    return run_conformance(url, unit_id, json)
+
+
+@app.command()
+def measure(
+    capture_set: Annotated[Path, typer.Argument(metavar="SET", help="Folder with capture.toml and its images.")],
+    geometry: Annotated[Path | None, typer.Option(help="Geometry to use instead of the set's own.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Where the result goes; SET/result by default.")] = None,
+    pictures: Annotated[bool, typer.Option(help="Draw pictures beside the result.")] = True,
+    rerun: Annotated[bool, typer.Option("--rerun", help="Write measurement.rrd beside the result.")] = False,
+    json: JsonOption = False,
+) -> int:
+    """Measure one capture set: height, Zernike coefficients, quality."""
+    from membrane_ctrl.measure import measure_command
+
+    return measure_command(capture_set, geometry, out, json, pictures, rerun)
+
+
+@app.command()
+def simulate(
+    set_dir: Annotated[Path, typer.Argument(metavar="SET_DIR", help="New folder for the set, or for the run.")],
+    config: ConfigOption = None,
+    sag_mm: Annotated[float, typer.Option(help="Depth of the bowl.")] = 37.1,
+    figure: Annotated[bool, typer.Option(help="The astigmatism, coma and so on of a mounted film.")] = True,
+    steps: Annotated[int | None, typer.Option(min=3, max=64, help="Phase steps.")] = None,
+    bits: Annotated[int | None, typer.Option(min=8, max=16, help="Depth of the frames.")] = None,
+    noise_adu: Annotated[float | None, typer.Option(min=0.0, help="Noise of a pixel.")] = None,
+    shrink: Annotated[int, typer.Option(min=1, max=16, help="Larger pixels, fewer of them.")] = 1,
+    gamma: Annotated[float, typer.Option(help="Of the display.")] = 1.0,
+    motion_um: Annotated[float, typer.Option(help="Amplitude of the film's motion.")] = 0.0,
+    motion_hz: Annotated[float, typer.Option(help="Its frequency.")] = 0.3,
+    drift_um_per_s: Annotated[float, typer.Option(help="Drift of the film.")] = 0.0,
+    laser_noise_um: Annotated[float, typer.Option(min=0.0, help="Noise of the laser's readings.")] = 0.0,
+    exact: Annotated[bool, typer.Option("--exact", help="Trace every pixel: slow, true to the last bit.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 1,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="kind:frame[:amount], as stale:x_sin_2; repeatable.")
+    ] = None,
+    sets: Annotated[int, typer.Option(min=1, help="More than one: a run, 0000 full, the others fringes.")] = 1,
+    interval_s: Annotated[float, typer.Option(min=0.0, help="From set to set of a run.")] = 4.0,
+) -> int:
+    """Write a capture set, or a run of sets, with its truth beside it."""
+    from membrane_ctrl.simulate_command import SimulateOptions, simulate_command
+    from membrane_ctrl.twin.simulation_spec import Motion
+
+    options = SimulateOptions(
+        folder=set_dir,
+        config=_config(config),
+        sag_mm=sag_mm,
+        figure=figure,
+        steps=steps,
+        bits=bits,
+        noise_adu=noise_adu,
+        shrink=shrink,
+        gamma=gamma,
+        motion=Motion(drift_um_per_s=drift_um_per_s, amplitude_um=motion_um, frequency_hz=motion_hz),
+        laser_noise_um=laser_noise_um,
+        exact=exact,
+        seed=seed,
+        faults=tuple(fault or ()),
+        sets=sets,
+        interval_s=interval_s,
+    )
+    return simulate_command(options)
+
+
+def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> Config:
+    """The configuration, its [devices] from the file of `--devices`; that file alone is a configuration, too."""
+    if devices is None:
+        return _config(config)
+    lab = _config(devices)
+    if not twin:
+        raise InputError("--devices: only with --twin; without it --config names the devices")
+    if lab.devices is None:
+        raise InputError(f"{devices}: devices: missing; there is nothing to emulate")
+    return lab if config is None else _config(config).model_copy(update={"devices": lab.devices})
 
 
 def _config(path: Path | None) -> Config:

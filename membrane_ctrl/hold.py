@@ -45,6 +45,7 @@ class HoldOptions:
     logs_dir: Path | None
     clear_faults: bool
     json: bool
+    lab: bool = False  # the twin answers as the instruments of the configuration, not as the pump board
 
 
 def hold_mirror(options: HoldOptions) -> int:
@@ -56,16 +57,16 @@ def hold_mirror(options: HoldOptions) -> int:
         raise InputError(f"{options.source}: devices: missing; name the pump board in [devices], or use --twin")
     clock = RunClock.start()
     with ExitStack() as stack:
-        twin = TwinProcess.started(options.config, clock, stack) if options.twin else None
+        twin = TwinProcess.started(options.config, clock, stack, options.lab) if options.twin else None
         config = twin.config if twin else options.config
         assert config.devices is not None
-        bench = open_bench(config.devices)
-        asyncio.run(_identify(bench, config.devices, options.clear_faults))
+        asyncio.run(_identify(open_bench(config.devices), config.devices, options.clear_faults))
         logs_dir = options.logs_dir or Path(config.recording.logs_dir)
         run_dir = create_run_folder(logs_dir, options.name, clock.origin_utc, config)
         rings = rings_for(config, twin.truth if twin else None, stack)
         crew = Crew(config, clock, rings, run_dir, options.name, options.duration_s)
         crew.start(stack)
+        bench = open_bench(config.devices)  # a link belongs to the event loop that opened it
         exit_code = asyncio.run(_run(bench, config, options.duration_s, clock, rings, crew, twin))
         crew.take_down()
     _report(run_dir, options.json)

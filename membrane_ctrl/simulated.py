@@ -32,13 +32,18 @@ class TwinProcess:
     truth: RingAddress
 
     @classmethod
-    def started(cls, config: Config, clock: RunClock, stack: ExitStack) -> TwinProcess:
-        """Start the twin and wait until it listens; the stack ends it. Raises DeviceError, e.g. for a busy port."""
+    def started(cls, config: Config, clock: RunClock, stack: ExitStack, lab: bool = False) -> TwinProcess:
+        """Start the twin and wait until it listens; the stack ends it. Raises DeviceError, e.g. for a busy port.
+
+        With `lab` it answers as the instruments that the configuration names, else as the pump board.
+        """
         from membrane_ctrl.twin.bench import BenchReport, BenchSpec
         from membrane_ctrl.twin.truth import TRUTH_BYTES
 
         truth = stack.enter_context(ring(_TRUTHS_KEPT, TRUTH_BYTES))
-        spec = BenchSpec(config.twin, config.pump, clock, config.twin.port, truth=truth)
+        spec = BenchSpec(
+            config.twin, config.pump, clock, config.twin.port, truth=truth, lab=config.devices if lab else None
+        )
         ours, theirs = pipe()
         child = Child("twin", "membrane_ctrl.twin.bench:serve", (spec, theirs), nice=0)
         child.start()
@@ -47,7 +52,7 @@ class TwinProcess:
         if report.error:
             raise DeviceError(report.error)
         watchdog = {} if config.devices is None else config.devices.model_dump(include={"timeout_s", "watchdog_s"})
-        devices = DevicesConfig(board=f"tcp://127.0.0.1:{report.port}", **watchdog)
+        devices = report.lab or DevicesConfig(board=f"tcp://127.0.0.1:{report.port}", **watchdog)
         return cls(config.model_copy(update={"devices": devices}), truth)
 
     def truth_reader(self) -> Callable[[], tuple[float, float]]:

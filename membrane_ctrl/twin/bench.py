@@ -15,9 +15,10 @@ from multiprocessing.connection import Connection
 from firmware_iface.emulators.board_state import BoardSample
 from firmware_iface.emulators.pump_board import PumpBoardEmulator
 from membrane_ctrl.clock import RunClock
-from membrane_ctrl.config import PumpConfig, TwinConfig
+from membrane_ctrl.config import DevicesConfig, PumpConfig, TwinConfig
 from membrane_ctrl.ipc.ring import RingAddress, RingWriter
 from membrane_ctrl.twin.events import Event
+from membrane_ctrl.twin.lab import Lab
 from membrane_ctrl.twin.plant import STEP_S, Plant
 
 _PERIOD_S = 0.004  # below the sensors' 5 ms, so that each of their samples is out on time
@@ -46,6 +47,8 @@ class BenchSpec:
         How long the bench outlives the process that started it, so that the tripped watchdog can be seen.
     events : tuple of Event
         What happens when, in plant time (0 at the start).
+    lab : DevicesConfig or None
+        Serve these instruments in place of the pump board.
     """
 
     twin: TwinConfig
@@ -57,14 +60,16 @@ class BenchSpec:
     truth: RingAddress | None = None
     linger_s: float = 5.0
     events: tuple[Event, ...] = ()
+    lab: DevicesConfig | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """What a bench process says once: the port it serves, or one line why it does not."""
+    """What a bench process says once: the devices it serves, or one line why it does not."""
 
     port: int = 0
     error: str = ""
+    lab: DevicesConfig | None = None
 
 
 def serve(spec: BenchSpec, ready: Connection) -> None:
@@ -89,8 +94,8 @@ async def _serve(spec: BenchSpec, ready: Connection) -> None:
     with _truth_writer(spec.truth) as writer:
         try:
             bench = LiveBench(spec, writer)
-            board = PumpBoardEmulator(bench, spec.host, spec.port)
-            await board.start()
+            served = PumpBoardEmulator(bench, spec.host, spec.port) if spec.lab is None else Lab(bench, spec.lab)
+            started = await served.start()
         except ValueError as error:
             ready.send(BenchReport(error=str(error)))
             return
@@ -99,10 +104,10 @@ async def _serve(spec: BenchSpec, ready: Connection) -> None:
             ready.send(BenchReport(error=f"twin.port = {spec.port} on {spec.host}: {reason}; 0 takes any free port"))
             return
         try:
-            ready.send(BenchReport(port=board.port))
+            ready.send(BenchReport(served.port if isinstance(served, PumpBoardEmulator) else 0, lab=started))
             await _keep_running(bench, spec, stop)
         finally:
-            await board.stop()
+            await served.stop()
 
 
 async def _keep_running(bench: LiveBench, spec: BenchSpec, stop: asyncio.Event) -> None:
