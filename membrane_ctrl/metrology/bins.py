@@ -35,6 +35,9 @@ class BinGrid:
         grid_columns, grid_rows = np.meshgrid(columns, rows)
         self.column_px, self.row_px = grid_columns.ravel(), grid_rows.ravel()
         self.rays = geometry.rays(self.column_px, self.row_px)
+        h = math.sqrt((bin_px**2 - 1) / 6)  # see `averaging_bias_mm`
+        offsets = ((h, 0.0), (-h, 0.0), (0.0, h), (0.0, -h)) if bin_px > 1 else ()
+        self._around = [geometry.rays(self.column_px + right, self.row_px + down) for right, down in offsets]
 
     def near_mirror(self, radius_mm: float) -> NDArray[np.bool_]:
         """Bins whose ray meets the plane z = 0 within a radius."""
@@ -56,11 +59,11 @@ class BinGrid:
         the mean of the four values at a distance h with h^2 = 2 sigma^2, so four traces of the model give it.
         """
         centre = tracer.predict_screen(points, surface)
-        h = math.sqrt((self._bin_px**2 - 1) / 6)
+        if not self._around:  # a bin is a pixel
+            return np.zeros_like(centre)
         total = np.zeros_like(centre)
-        for right, down in ((h, 0.0), (-h, 0.0), (0.0, h), (0.0, -h)):
-            rays = self._geometry.rays(self.column_px[index] + right, self.row_px[index] + down)
-            moved = Points(rays, centre, points.weights, points.t_mm.copy())
+        for around in self._around:
+            moved = Points(np.ascontiguousarray(around[:, index]), centre, points.weights, points.t_mm.copy())
             tracer.intersect(moved, surface, newton=3)
             total += tracer.predict_screen(moved, surface)
-        return total / 4 - centre
+        return total / len(self._around) - centre
