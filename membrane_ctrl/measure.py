@@ -1,0 +1,96 @@
+"""The `measure` command: one capture set to height, Zernike coefficients and quality."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.capture_set import read_geometry
+from membrane_ctrl.errors import Exit, InputError
+from membrane_ctrl.measurement import Measurement, measure_set
+from membrane_ctrl.metrology.outline import Outline, find_outline
+from membrane_ctrl.metrology.radial import RadialProfile, radial_profile
+from membrane_ctrl.result_files import details_table, result_table, write_result
+
+FloatArray = NDArray[np.float64]
+
+
+def measure_command(
+    folder: Path, geometry: Path | None, out: Path | None, as_json: bool, pictures: bool, rerun: bool
+) -> int:
+    """Measure one set, write the result, say what came out. Returns the exit code; raises InputError."""
+    measurement = measure_set(folder, None if geometry is None else read_geometry(geometry))
+    for key in measurement.head.ignored:
+        print(f"{folder / 'capture.toml'}: {key}: not known, ignored", file=sys.stderr)
+    target = out or folder / "result"
+    light, outline = _outline(measurement)
+    profile = _profile(measurement)
+    begin = time.perf_counter()
+    try:
+        write_result(target, measurement, details_table(measurement, profile, outline))
+        drawn: list[Path] = []
+        if pictures:
+            from membrane_ctrl.pictures import draw_all
+
+            drawn = draw_all(target, measurement, light, profile, outline)
+        if rerun:
+            from membrane_ctrl.measurement_rerun import log_measurement
+
+            log_measurement(target / "measurement.rrd", measurement, drawn)
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written: {error.strerror or error}") from None
+    print(f"written to {target} in {time.perf_counter() - begin:.1f} s", file=sys.stderr)
+    if as_json:
+        print(json.dumps(result_table(measurement)))
+    else:
+        print("\n".join(_lines(measurement, profile, outline)))
+    return int(Exit.REJECTED if measurement.verdict == "rejected" else Exit.DONE)
+
+
+def _outline(measurement: Measurement) -> tuple[FloatArray, Outline | None]:
+    """The light in the picture, in bins, and the rim found in it."""
+    checked, optics = measurement.checked, measurement.head.optics
+    if checked is None or measurement.full is None:
+        return np.zeros((2, 2)), None
+    light = checked.binned.means[[k for used in checked.view.used for k in used]].mean(axis=0).astype(float)
+    bin_px = checked.binned.bin_px
+    fine = np.repeat(np.repeat(light, bin_px, axis=0), bin_px, axis=1)
+    rim_z = checked.tracer.vertex_z_mm + measurement.full.surface.sag_mm
+    return light, find_outline(fine, checked.tracer.geometry, optics.mirror.radius_mm, rim_z)
+
+
+def _profile(measurement: Measurement) -> RadialProfile | None:
+    full = measurement.full
+    if full is None:
+        return None
+    return radial_profile(full.grid.axis_mm, full.height_mm(), measurement.head.optics.mirror.radius_mm)
+
+
+def _lines(measurement: Measurement, profile: RadialProfile | None, outline: Outline | None) -> list[str]:
+    """What a person wants to read."""
+    full = measurement.full
+    lines = [f"verdict   {measurement.verdict}{': ' + measurement.reason if measurement.reason else ''}"]
+    lines += [f"flagged   {item['file']}: {item['reason']}" for item in measurement.flagged_files()]
+    if full is None or profile is None:
+        return lines
+    residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
+    coeffs = 1e3 * full.surface.coeffs_mm
+    lines += [
+        f"sag       {full.surface.sag_mm:.4f} mm",
+        f"Hencky    {profile.sag_mm:.4f} mm, {profile.pressure_pa:.0f} Pa under the paper's film",
+        f"figure    astigmatism {np.hypot(*coeffs[4:6]):.2f} um, coma {np.hypot(*coeffs[6:8]):.2f} um, "
+        f"trefoil {np.hypot(*coeffs[8:10]):.2f} um (RMS)",
+        f"residual  {full.quality.residual_urad:.2f} urad of slope, {residual_um.std():.3f} um RMS of height",
+        f"fit       {len(full.fit.changes_mm)} iterations, last change {full.fit.changes_mm[-1]:.1e} mm, "
+        f"{np.count_nonzero(full.weights)} pixels",
+    ]
+    if outline is not None:
+        lines.append(
+            f"rim       {outline.offset_mm:.1f} mm from where the pose puts it, {outline.size_ratio:.4f} of its size"
+        )
+    return lines

@@ -1,0 +1,135 @@
+"""One capture set on disk to its full result: what `measure` and every analysis of many sets call."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from membrane_ctrl.capture_set import CaptureHead, CaptureSet, anchored, read_set
+from membrane_ctrl.config import GeometryConfig
+from membrane_ctrl.errors import InputError
+from membrane_ctrl.estimate import Verdict
+from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, check
+from membrane_ctrl.metrology.frame_stack import FrameStack
+from membrane_ctrl.metrology.full import FullResult, measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.integrity import Flag
+from membrane_ctrl.metrology.quality import judge
+from membrane_ctrl.metrology.reconstruct import HeightFunction
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What became of a set.
+
+    Attributes
+    ----------
+    head : CaptureHead
+        The set.
+    verdict : "ok", "degraded" or "rejected"
+        The worst that was found; `reason` says it.
+    flags : tuple of Flag
+        Frames that do not belong to the set.
+    checked, full : Checked, FullResult or None
+        None where the frames gave no figure.
+    displacement_um : float
+        Mean laser reading of the sinusoids: the moment that the figure belongs to; NaN without.
+    timing_s : dict
+        Seconds for "load", "phase" and "reconstruct".
+    """
+
+    head: CaptureHead
+    verdict: Verdict
+    reason: str
+    flags: tuple[Flag, ...]
+    checked: Checked | None
+    full: FullResult | None
+    displacement_um: float
+    timing_s: dict[str, float]
+
+    def flagged_files(self) -> list[dict[str, str]]:
+        """The flags as files."""
+        return [{"file": self.head.files[flag.frame], "reason": flag.reason} for flag in self.flags]
+
+
+def measure_set(
+    folder: Path,
+    geometry: GeometryConfig | None = None,
+    anchor: Anchor | None = None,
+    start: HeightFunction | None = None,
+) -> Measurement:
+    """Measure one set.
+
+    Parameters
+    ----------
+    folder : Path
+        The set.
+    geometry : GeometryConfig, optional
+        Instead of the set's own.
+    anchor : Anchor, optional
+        For a fringes set: its reference, if it has been read already (see `read_anchor`).
+    start : height function, optional
+        Starting shape of the fit.
+
+    Raises
+    ------
+    InputError
+        If the set or its reference is not one.
+    """
+    begin = time.perf_counter()
+    capture = read_set(folder, geometry)
+    if capture.head.reference is not None:
+        reference, own = read_anchor(capture.head.reference, geometry)
+        anchor = anchor or own
+        capture = CaptureSet(anchored(capture.head, reference), capture.frames, capture.unusable)
+    return measure_capture(capture, anchor, start, load_s=time.perf_counter() - begin)
+
+
+def read_anchor(folder: Path, geometry: GeometryConfig | None = None) -> tuple[CaptureHead, Anchor]:
+    """The reference of fringes sets. Raises InputError if it gives no figure."""
+    capture = read_set(folder, geometry)
+    if capture.head.kind != "full":
+        raise InputError(f"{folder / 'capture.toml'}: kind: a reference must be a full set")
+    stack = stack_of(capture)
+    try:
+        return capture.head, check(stack, capture.head.optics).anchor()
+    except RejectedSetError as error:
+        raise InputError(f"{folder}: cannot be a reference: {error}") from None
+
+
+def stack_of(capture: CaptureSet) -> FrameStack:
+    """The frames for the metrology."""
+    return FrameStack(capture.frames, capture.head.patterns, capture.head.displacement_um, capture.unusable)
+
+
+def measure_capture(
+    capture: CaptureSet, anchor: Anchor | None = None, start: HeightFunction | None = None, load_s: float = 0.0
+) -> Measurement:
+    """Measure frames that are in memory; never raises for what they show."""
+    stack, optics = stack_of(capture), capture.head.optics
+    mean_um = stack.mean_reading_um
+    begin = time.perf_counter()
+    try:
+        checked = check(stack, optics, anchor)
+    except RejectedSetError as error:
+        timing = {"load": load_s, "phase": time.perf_counter() - begin, "reconstruct": 0.0}
+        return Measurement(capture.head, "rejected", str(error), error.flags, None, None, mean_um, timing)
+    pixels = measure_pixels(stack, optics, checked)
+    middle = time.perf_counter()
+    full = reconstruct_full(stack, optics, checked, pixels, start)
+    end = time.perf_counter()
+    verdict, reason = judge(full.quality)
+    if verdict == "ok":
+        verdict, reason = checked.verdict
+    timing = {"load": load_s, "phase": middle - begin, "reconstruct": end - middle}
+    return Measurement(capture.head, verdict, reason, checked.flags, checked, full, mean_um, timing)
+
+
+def noise_seen_adu(measurement: Measurement) -> float:
+    """Noise of a pixel as the phase steps show it; NaN for three steps, which always agree."""
+    if measurement.checked is None or measurement.full is None:
+        return float("nan")
+    free = sum(len(used) - 3 for used in measurement.checked.view.used)
+    return float(np.sqrt(np.median(np.square(measurement.full.rest_adu)) / free)) if free else float("nan")

@@ -1,0 +1,249 @@
+"""The full result of a capture set: frames checked, every pixel's phase and slopes, the fit, and the zonal map.
+
+Bins first: they give the fringe orders, a surface, and what each frame should have shown. Frames that do not belong
+are left out, one at a time since one bad frame spoils the prediction of the others, until all that are left agree.
+Then every pixel, its period taken from its bin.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.config import OpticsConfig
+from membrane_ctrl.estimate import Verdict
+from membrane_ctrl.metrology.bins import BinGrid
+from membrane_ctrl.metrology.frame_evidence import Scene
+from membrane_ctrl.metrology.frame_stack import Binned, FrameStack, bin_frames
+from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.integrity import Flag, inspect
+from membrane_ctrl.metrology.orders import Orders, gray_bit, orders
+from membrane_ctrl.metrology.patterns import AXES
+from membrane_ctrl.metrology.reconstruct import Tracer
+from membrane_ctrl.metrology.tracking import TrackedPoints, establish
+from membrane_ctrl.metrology.unwrap import centre_phase_rad, mm_per_rad
+from membrane_ctrl.metrology.view import NoFigureError, View, look
+
+FloatArray = NDArray[np.float64]
+
+_ROUNDS = 8
+# A point whose phase moved further than this between two sets may have been taken for its neighbour a period away
+_GUARD_RAD = 0.9 * math.pi
+_LOST_SHARE = 0.01
+# the ring's plane is crossed this far at most from where the ray meets the film
+_FILM_BESIDE_PLANE_MM = 25.0
+# With these few of an axis' bits contradicting the orders, no other set of orders explains the rest
+_BIT_MISMATCH = 0.02
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """What a full set hands on to the fringes sets that lean on it.
+
+    Attributes
+    ----------
+    phase_rad : (2, rows, columns) array
+        Absolute phases of the bins; NaN where unknown.
+    light : (rows, columns) array
+        Of the bins.
+    """
+
+    phase_rad: FloatArray
+    light: FloatArray
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A set whose frames have been checked and whose bins have been fitted.
+
+    Attributes
+    ----------
+    binned : Binned
+        The frames over bins.
+    view : View
+        What the usable frames say.
+    phase_rad : (2, rows, columns) array
+        Absolute phases of the bins.
+    near : (rows, columns) bool array
+        Bins that may see the mirror.
+    tracer : Tracer
+        The bench, with the vertex where the laser saw it.
+    state : TrackedPoints
+        The bins' points with their surface.
+    flags : tuple of Flag
+        Frames that do not belong.
+    """
+
+    binned: Binned
+    view: View
+    phase_rad: FloatArray
+    near: NDArray[np.bool_]
+    tracer: Tracer
+    state: TrackedPoints
+    flags: tuple[Flag, ...]
+
+    @property
+    def verdict(self) -> tuple[Verdict, str]:
+        """What the frames alone say: "ok", or "degraded" with what was done about the bad ones."""
+        if not self.flags:
+            return "ok", ""
+        return "degraded", f"{len(self.flags)} frame(s) flagged; the figure is made without what they spoil"
+
+    def anchor(self) -> Anchor:
+        """For the sets that lean on this one."""
+        return Anchor(self.phase_rad, self.view.light)
+
+
+class RejectedSetError(NoFigureError):
+    """A set that gives no figure, with the frames to blame."""
+
+    def __init__(self, reason: str, flags: tuple[Flag, ...]) -> None:
+        super().__init__(reason)
+        self.flags = flags
+
+
+def vertex_z_mm(optics: OpticsConfig, displacement_um: float) -> float:
+    """Where the vertex stands at a displacement: z = -(d - reference)."""
+    reference = optics.geometry.reference_displacement_um
+    return 0.0 if reference is None or not math.isfinite(displacement_um) else -(displacement_um - reference) * 1e-3
+
+
+def check(stack: FrameStack, optics: OpticsConfig, anchor: Anchor | None = None) -> Checked:
+    """Check the frames and fit the bins.
+
+    Parameters
+    ----------
+    stack : FrameStack
+        The frames.
+    optics : OpticsConfig
+        Of the set; `camera.bits` tells saturation.
+    anchor : Anchor, optional
+        For a set without Gray code: where its fringe orders come from.
+
+    Raises
+    ------
+    RejectedSetError
+        If the frames do not give a figure.
+    """
+    binned = bin_frames(stack, 2**optics.camera.bits - 1)
+    geometry = Geometry.from_config(optics)
+    tracer = Tracer(geometry, optics.mirror.radius_mm, vertex_z_mm(optics, stack.mean_reading_um))
+    grid = BinGrid(geometry, optics.camera, binned.bin_px)
+    analysis_mm = optics.mirror.analysis_radius_mm
+    beside = grid.near_mirror(analysis_mm + _FILM_BESIDE_PLANE_MM)
+    near = np.flatnonzero(beside)
+    excluded = dict.fromkeys(stack.unusable, 0.0)
+    unreadable = [Flag(k, reason, math.inf) for k, reason in stack.unusable.items()]
+    flags: list[Flag] = []
+    for _ in range(_ROUNDS):
+        try:
+            view = look(stack, binned, excluded, None if anchor is None else anchor.light)
+            phase = _absolute(stack, binned, view, excluded, anchor, optics)
+            state = establish(grid, tracer, near, phase.reshape(2, -1)[:, near], optics.pattern, analysis_mm)
+        except (NoFigureError, ValueError) as error:
+            raise RejectedSetError(str(error), _all(unreadable, flags, excluded)) from None
+        flags = inspect(stack, binned, _scene(tracer, state, view, optics), excluded)
+        fresh = [flag for flag in flags if flag.frame not in excluded]
+        if not fresh:
+            _confirm_orders(stack, phase, binned, view, excluded)
+            found = _all(unreadable, flags, excluded)
+            return Checked(binned, view, phase, beside.reshape(view.mask.shape), tracer, state, found)
+        for group in _groups(stack):
+            worst = next((flag for flag in fresh if flag.frame in group), None)
+            if worst is not None:
+                excluded[worst.frame] = worst.severity
+    raise RejectedSetError("the frames do not agree, whichever are left out", _all(unreadable, flags, excluded))
+
+
+def _groups(stack: FrameStack) -> list[set[int]]:
+    """Frames of which one at a time is left out: each axis' sinusoids; the others spoil nobody's prediction."""
+    sinusoids = [set(stack.sinusoids(axis)) for axis in AXES]
+    others = set(range(len(stack.patterns))) - sinusoids[0] - sinusoids[1]
+    return [*sinusoids, *({k} for k in others)]
+
+
+def _all(unreadable: list[Flag], flags: list[Flag], excluded: dict[int, float]) -> tuple[Flag, ...]:
+    """All flags in the order of the frames; a frame left out in an earlier round stays flagged."""
+    named = {flag.frame: flag for flag in (*flags, *unreadable)}
+    for frame, severity in excluded.items():
+        named.setdefault(frame, Flag(frame, "does not agree with the other frames", severity))
+    return tuple(named[frame] for frame in sorted(named))
+
+
+def _absolute(
+    stack: FrameStack,
+    binned: Binned,
+    view: View,
+    excluded: dict[int, float],
+    anchor: Anchor | None,
+    optics: OpticsConfig,
+) -> FloatArray:
+    """Absolute phases of the bins, (2, rows, columns); NaN where not valid."""
+    if anchor is not None:
+        return _followed(view, anchor)
+    limit = math.pi * optics.pattern.periods
+    out = np.empty_like(view.phase_rad)
+    for k, axis in enumerate(AXES):
+        found = _axis_orders(stack, binned, view, axis, k)
+        inside = np.abs(found.phase_rad - centre_phase_rad(optics.pattern)) <= limit
+        out[k] = np.where(inside, found.phase_rad, np.nan)
+    return out
+
+
+def _axis_orders(stack: FrameStack, binned: Binned, view: View, axis: str, k: int) -> Orders:
+    """Gray bits against half the light: the fringes' own mean, which no single frame can spoil."""
+    bits = binned.means[stack.gray(axis)] > view.light
+    return orders(view.phase_rad[k], bits, view.mask)
+
+
+def _followed(view: View, anchor: Anchor) -> FloatArray:
+    """Phases next to the anchor's. Raises NoFigureError if the film moved too far to tell."""
+    change = np.angle(np.exp(1j * (view.phase_rad - anchor.phase_rad)))
+    seen = view.mask & np.isfinite(anchor.phase_rad).all(axis=0)
+    lost = float(np.mean(np.abs(change[:, seen]).max(axis=0) > _GUARD_RAD)) if seen.any() else 1.0
+    if lost > _LOST_SHARE:
+        raise NoFigureError(f"the phase moved by half a period from the reference at {lost:.0%} of the points")
+    return np.where(seen, anchor.phase_rad + change, np.nan)
+
+
+def _scene(tracer: Tracer, state: TrackedPoints, view: View, optics: OpticsConfig) -> Scene:
+    phase = tracer.predict_screen(state.points, state.surface) / mm_per_rad(optics.pattern)
+    return Scene(
+        state.index,
+        view.light.reshape(-1)[state.index],
+        phase + centre_phase_rad(optics.pattern),
+        state.sensitivity_rad_per_um,
+    )
+
+
+def _confirm_orders(
+    stack: FrameStack, phase_rad: FloatArray, binned: Binned, view: View, excluded: dict[int, float]
+) -> None:
+    """Raise unless the usable Gray bits of each axis allow no other orders than those taken."""
+    for k, axis in enumerate(AXES):
+        gray = stack.gray(axis)
+        good = [bit for bit, frame in enumerate(gray, start=1) if frame not in excluded]
+        if not gray or len(good) == len(gray):
+            continue
+        seen = np.isfinite(phase_rad[k])
+        phase = phase_rad[k][seen]
+        bits = {bit: (binned.means[gray[bit - 1]] > view.light)[seen] for bit in good}
+        explained = [shift for shift in range(-7, 8) if _explains(phase + 2 * math.pi * shift, bits)]
+        if explained != [0]:
+            flags = _all([], [], excluded)
+            raise RejectedSetError(f"the {axis} fringe orders are not certain without all Gray frames", flags)
+
+
+def _explains(phase_rad: FloatArray, bits: dict[int, NDArray[np.bool_]]) -> bool:
+    """Whether these orders lie in the pattern and show these bits, away from the bits' edges."""
+    if np.min(phase_rad) < -1.5 * math.pi or np.max(phase_rad) > 15.5 * math.pi:
+        return False
+    for bit, seen in bits.items():
+        shown, from_edge = gray_bit(phase_rad, bit)
+        sure = from_edge > 0.5
+        if np.mean(shown[sure] != seen[sure]) > _BIT_MISMATCH:
+            return False
+    return bool(bits)

@@ -1,0 +1,211 @@
+"""The full result of a checked set: slopes at every pixel, robust fit, and the zonal map of what the fit leaves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.config import OpticsConfig
+from membrane_ctrl.metrology.checked import Checked
+from membrane_ctrl.metrology.decode import FRINGE_SHARE
+from membrane_ctrl.metrology.frame_stack import FrameStack
+from membrane_ctrl.metrology.motion import combine_steps, sensitivity_mm_per_um, worth_correcting
+from membrane_ctrl.metrology.patterns import AXES
+from membrane_ctrl.metrology.phase import step_weights
+from membrane_ctrl.metrology.pixels import PixelPhases, pixel_phases
+from membrane_ctrl.metrology.quality import Quality
+from membrane_ctrl.metrology.reconstruct import CONTRACTION, Fit, HeightFunction, Points, parabola, solve
+from membrane_ctrl.metrology.surface import Surface
+from membrane_ctrl.metrology.unwrap import mm_per_rad, screen_mm
+from membrane_ctrl.metrology.zonal import ResidualGrid, integrate, residual_grid
+
+FloatArray = NDArray[np.float64]
+
+LASER_NOISE_UM = 1.0  # repeatability of the bench's laser; motion below twice that is not taken out
+_START_SAG_MM = 40.0  # the paper's starting parabola
+# Solutions from different starts agree to a hundredth of the last change: 1e-9 mm
+_LAST_CHANGE_MM = 1e-7
+# Tukey's weight reaches 0 here: noise (5 sigma in millions of pixels) keeps its say, dust and glints have none
+_TUKEY_SIGMAS = 8.0
+# A slope this far off is no slope of the film but a wrong fringe order (4.3 mrad) or a glint
+_NO_SLOPE = 4e-3
+
+
+@dataclass(frozen=True)
+class FullResult:
+    """Everything of one set.
+
+    Attributes
+    ----------
+    fit : Fit
+        The surface: Hencky excess and 36 terms; `changes_mm` of all iterations from the start.
+    index : (n,) int array
+        Pixels inside the analysis radius that gave slopes, counted row by row.
+    field : (6, n) array
+        x, y in mm, measured slopes, fitted slopes.
+    weights : (n,) array
+        What each had to say in the fit.
+    swing_adu : (n,) array
+        The smaller of the two fringe amplitudes.
+    rest_adu : (n,) array
+        What the sinusoids leave of the frames: noise, motion, the display's harmonics.
+    grid : ResidualGrid
+        Mean slope residuals in cells.
+    residual_mm : (m, m) array
+        Height over the fit, 0 at the vertex; NaN where nothing was measured.
+    quality : Quality
+        For the verdict.
+    moved : bool
+        Whether the film's motion was taken out.
+    """
+
+    fit: Fit
+    index: NDArray[np.int64]
+    field: FloatArray
+    weights: FloatArray
+    swing_adu: NDArray[np.float32]
+    rest_adu: NDArray[np.float32]
+    grid: ResidualGrid
+    residual_mm: FloatArray
+    quality: Quality
+    moved: bool
+
+    @property
+    def surface(self) -> Surface:
+        """The fitted surface."""
+        return self.fit.surface
+
+    def height_mm(self) -> FloatArray:
+        """Height above the vertex (m, m) on `grid.axis_mm`: the fit and what it leaves; NaN where not measured."""
+        x, y = np.meshgrid(self.grid.axis_mm, self.grid.axis_mm)
+        return self.surface.height(x, y) + self.residual_mm
+
+
+@dataclass(frozen=True)
+class PixelPoints:
+    """Pixels that see the pattern, with their screen points."""
+
+    index: NDArray[np.int64]
+    points: Points
+    swing_adu: NDArray[np.float32]
+    rest_adu: NDArray[np.float32]
+    moved: bool
+
+
+def measure_pixels(stack: FrameStack, optics: OpticsConfig, checked: Checked) -> PixelPoints:
+    """Phases of all pixels in bins that have one, with the film's motion between the frames taken out."""
+    bin_px, columns = checked.binned.bin_px, checked.phase_rad.shape[2]
+    known = np.isfinite(checked.phase_rad).all(axis=0) & checked.near
+    row, column = np.nonzero(np.repeat(np.repeat(known, bin_px, axis=0), bin_px, axis=1))
+    index = row * stack.size_px[1] + column
+    in_bin = row // bin_px * columns + column // bin_px
+    tracer, surface = checked.tracer, checked.state.surface
+    points = Points.of(tracer.geometry.rays(column, row), np.empty((2, index.size)))
+    points.t_mm[:] = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / points.rays[2]
+    tracer.intersect(points, surface, newton=4)
+    moved = worth_correcting(stack.readings_um, LASER_NOISE_UM)
+    sensitivity = np.zeros((2, index.size))
+    if moved:
+        sensitivity = sensitivity_mm_per_um(tracer, points, surface) / mm_per_rad(optics.pattern)
+    axes = [
+        _axis_phases(stack, optics, checked, k, index, in_bin, sensitivity[k] if moved else None) for k in range(2)
+    ]
+    points.screen_mm[:] = screen_mm(np.stack([a.phase_rad for a in axes]), optics.pattern)
+    swing = np.minimum(axes[0].swing_adu, axes[1].swing_adu)
+    x, y = tracer.position_mm(points)
+    keep = (x**2 + y**2 <= optics.mirror.analysis_radius_mm**2) & ~(axes[0].saturated | axes[1].saturated)
+    keep &= swing > FRINGE_SHARE * checked.view.light.reshape(-1)[in_bin]
+    rest = np.hypot(axes[0].rest_adu, axes[1].rest_adu)
+    return PixelPoints(index[keep], points.subset(keep), swing[keep], rest[keep], moved)
+
+
+def _axis_phases(
+    stack: FrameStack,
+    optics: OpticsConfig,
+    checked: Checked,
+    axis: int,
+    index: NDArray[np.int64],
+    in_bin: NDArray[np.int64],
+    sensitivity: FloatArray | None,
+) -> PixelPhases:
+    used = checked.view.used[axis]
+    shifts = stack.shifts_rad(used)
+    motion = None
+    if sensitivity is not None:
+        motion = stack.displacement_um[used] - stack.mean_reading_um
+    combined = combine_steps(step_weights(shifts), shifts, 1, motion)
+    every = stack.sinusoids(AXES[axis])
+    # a slice is no copy of the frames; a list is
+    frames = stack.frames[every[0] : every[-1] + 1] if used == every else stack.frames[used]
+    slope = np.zeros(index.size) if sensitivity is None else sensitivity
+    reference = checked.phase_rad[axis].reshape(-1)[in_bin]
+    return pixel_phases(frames, shifts, combined, index, slope, reference, 2**optics.camera.bits - 1)
+
+
+def reconstruct_full(
+    stack: FrameStack,
+    optics: OpticsConfig,
+    checked: Checked,
+    pixels: PixelPoints,
+    start: HeightFunction | None = None,
+) -> FullResult:
+    """Fit the pixels and integrate what the fit leaves.
+
+    Parameters
+    ----------
+    start : height function, optional
+        The starting shape, the paper's parabola of 40 mm if not given.
+    """
+    tracer, points = checked.tracer, pixels.points
+    # the way from the start is walked with the bins; the pixels take it up where it is nearly at its end
+    rough_points = checked.state.points.subset(np.ones(checked.state.index.size, bool))
+    rough = solve(tracer, rough_points, start or parabola(_START_SAG_MM, tracer.radius_mm))
+    tracer.intersect(points, rough.surface, newton=2)
+    first = solve(tracer, points, rough.surface, normal=tracer.normal_matrix(points), max_iterations=2)
+    tracer.intersect(points, first.surface)
+    field = tracer.slope_field(points, first.surface)
+    points.weights[:] = tukey(np.hypot(field[2] - field[4], field[3] - field[5]))
+    tolerance = _LAST_CHANGE_MM * CONTRACTION
+    fit = solve(tracer, points, first.surface, normal=tracer.normal_matrix(points), tolerance_mm=tolerance)
+    tracer.intersect(points, fit.surface)
+    field = tracer.slope_field(points, fit.surface)
+    seen = np.hypot(field[2] - field[4], field[3] - field[5]) < _NO_SLOPE
+    grid = residual_grid(field, seen.astype(float), optics.mirror.analysis_radius_mm)
+    changes = (*rough.changes_mm, *first.changes_mm, *fit.changes_mm)
+    whole = Fit(fit.surface, fit.normal, changes, fit.converged, fit.residual_x, fit.residual_y, fit.weight_sum)
+    return FullResult(
+        fit=whole,
+        index=pixels.index,
+        field=field,
+        weights=points.weights,
+        swing_adu=pixels.swing_adu,
+        rest_adu=pixels.rest_adu,
+        grid=grid,
+        residual_mm=integrate(grid),
+        quality=_quality(optics, checked, pixels, fit),
+        moved=pixels.moved,
+    )
+
+
+def tukey(residual: FloatArray) -> FloatArray:
+    """Tukey's weights (1 - (r / c)^2)^2, with c in robust sigmas (median of a Rayleigh distribution: 1.177 sigma)."""
+    # every 7th tells the median of millions well enough; the floor is the rounding of a noise-free set
+    reach = _TUKEY_SIGMAS * max(float(np.median(residual[::7])) / 1.177, 1e-9)
+    return np.asarray(np.square(np.maximum(1 - np.square(residual / reach), 0.0)))
+
+
+def _quality(optics: OpticsConfig, checked: Checked, pixels: PixelPoints, fit: Fit) -> Quality:
+    area = math.pi * optics.mirror.analysis_radius_mm**2
+    used = [k for axis in checked.view.used for k in axis]
+    saturated = checked.binned.saturated[used].any(axis=0) & checked.near
+    seen = (checked.view.mask & checked.near) | saturated
+    return Quality(
+        modulation_share=float(np.median(pixels.swing_adu)) / (2**optics.camera.bits - 1),
+        saturated_fraction=float(np.mean(saturated[seen])) if seen.any() else 0.0,
+        valid_fraction=min(1.0, float(np.sum(checked.state.area_mm2)) / area),
+        residual_urad=1e6 * math.hypot(fit.residual_x, fit.residual_y) / math.sqrt(2),
+        converged=fit.converged,
+    )

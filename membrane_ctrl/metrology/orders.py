@@ -1,0 +1,88 @@
+"""Fringe orders from the Gray code and from the phase's own continuity, each the other's witness.
+
+The paper's eq. 2 trusts every Gray bit of every pixel. Continuity gives the orders of a connected region up to one
+number, which all of its pixels vote for: one wrong Gray frame scatters its votes and is outvoted, and the frame that
+contradicts the winner is known. Where the phase itself is torn (a wrong sinusoid) eq. 2 remains.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.flood import tear_share, unwrap_regions
+from membrane_ctrl.metrology.unwrap import absolute_phase
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# A phase that is not torn has no tears at all but for dust; a stale frame of three tears at every quarter period.
+_TORN_SHARE = 0.003
+_LEAST_VOTES = 30  # a smaller island cannot outvote its own noise
+
+
+@dataclass(frozen=True)
+class Orders:
+    """Absolute phase of one axis.
+
+    Attributes
+    ----------
+    phase_rad : (H, W) array
+        Counted from the low edge's -pi; NaN where not known.
+    agreement : float
+        Share of the pixels whose own Gray bits give the same order.
+    torn : bool
+        The phase is not continuous: the orders are the Gray code's alone.
+    """
+
+    phase_rad: FloatArray
+    agreement: float
+    torn: bool
+
+
+def orders(wrapped_rad: FloatArray, bits: BoolArray, mask: BoolArray) -> Orders:
+    """Absolute phase of one axis.
+
+    Parameters
+    ----------
+    wrapped_rad : (H, W) array
+        Phase in (-pi, pi].
+    bits : (4, H, W) bool array
+        Gray bits, most significant first.
+    mask : (H, W) bool array
+        Pixels that see the pattern.
+    """
+    binary = np.bitwise_xor.accumulate(bits.astype(np.int64), axis=0)
+    k1 = 4 * binary[0] + 2 * binary[1] + binary[2]
+    coded = absolute_phase(wrapped_rad, k1, (2 * k1 + binary[3] + 1) // 2)
+    smooth, region = unwrap_regions(wrapped_rad, mask)
+    if tear_share(smooth) > _TORN_SHARE:
+        return Orders(np.where(mask, coded, np.nan), 1.0, torn=True)
+    offset = np.round((coded - smooth) / (2 * math.pi))
+    votes = np.zeros((region.max() + 1 if mask.any() else 0, 65), np.int64)  # orders differ by 32 at most
+    place = np.clip(offset[mask], -32, 32).astype(np.int64) + 32
+    np.add.at(votes, (region[mask], place), 1)
+    winner = np.argmax(votes, axis=1) - 32.0 if len(votes) else np.zeros(0)
+    small = votes.sum(axis=1) < _LEAST_VOTES
+    winner[small] = np.nan
+    shift = np.full(mask.shape, np.nan)
+    shift[mask] = winner[region[mask]]
+    known = np.isfinite(shift)
+    agreement = float(np.mean(offset[known] == shift[known])) if known.any() else 0.0
+    return Orders(smooth + 2 * math.pi * shift, agreement, torn=False)
+
+
+def gray_bit(phase_rad: FloatArray, bit: int) -> tuple[BoolArray, FloatArray]:
+    """What Gray frame `bit` (1..4) shows at an absolute phase, and the distance in rad to where that bit changes.
+
+    V2 = floor(2 s / T) with s / T = (phase + pi) / (2 pi). Bit b of the code changes at V2 = 2^(4-b) (odd number).
+    """
+    half_periods = (phase_rad + math.pi) / math.pi
+    v2 = np.floor(np.nan_to_num(half_periods)).astype(np.int64)
+    shown = ((v2 ^ (v2 >> 1)) >> (4 - bit)) & 1
+    spacing = 2 ** (4 - bit)
+    from_edge = np.abs(half_periods % (2 * spacing) - spacing)
+    return shown.astype(bool), from_edge * math.pi

@@ -1,0 +1,71 @@
+"""The radial profile against Hencky's bowl, and the pressure it stands for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology import hencky
+
+FloatArray = NDArray[np.float64]
+
+# The paper's mirror film (PET, 50 um): from its sag follows the pressure, p = E t / a (w0 / (0.653 a))^3
+_YOUNG_PA = 4.1e9
+_THICKNESS_MM = 0.05
+_CENTRE = 0.65344  # w0 / (a q^(1/3)) for a Poisson ratio of 0.3
+_RINGS = 48
+
+
+@dataclass(frozen=True)
+class RadialProfile:
+    """Height over radius.
+
+    Attributes
+    ----------
+    radius_mm : (n,) array
+        Middle of the rings.
+    mean_mm, low_mm, high_mm : (n,) arrays
+        Mean over azimuth and the band that holds 95 % of the ring.
+    hencky_mm : (n,) array
+        Hencky's bowl of the sag that fits best.
+    sag_mm : float
+        That sag, at the rim.
+    pressure_pa : float
+        Gauge pressure that bends the paper's film to that sag.
+    """
+
+    radius_mm: FloatArray
+    mean_mm: FloatArray
+    low_mm: FloatArray
+    high_mm: FloatArray
+    hencky_mm: FloatArray
+    sag_mm: float
+    pressure_pa: float
+
+
+def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) -> RadialProfile:
+    """Profile of a height map (n, n) on `axis_mm`, NaN where not measured, of a film with its rim at `rim_mm`."""
+    x, y = np.meshgrid(axis_mm, axis_mm)
+    seen = np.isfinite(height_mm)
+    r, h = np.hypot(x[seen], y[seen]), height_mm[seen]
+    shape = hencky.profile(r / rim_mm)
+    shape_mean, h_mean = shape.mean(), h.mean()
+    # least squares with a free offset: a dimple at the vertex must not tilt the whole comparison
+    sag = float(np.sum((shape - shape_mean) * (h - h_mean)) / np.sum((shape - shape_mean) ** 2))
+    edges = np.linspace(0.0, float(r.max()), _RINGS + 1)
+    ring = np.clip(np.digitize(r, edges) - 1, 0, _RINGS - 1)
+    rows = []
+    for k in range(_RINGS):
+        inside = ring == k
+        if np.any(inside):
+            rows.append((r[inside].mean(), h[inside].mean(), *np.percentile(h[inside], [2.5, 97.5])))
+    radius, mean, low, high = np.array(rows).T
+    bowl = sag * hencky.profile(radius / rim_mm) + h_mean - sag * shape_mean
+    return RadialProfile(radius, mean, low, high, bowl, sag, pressure_pa(sag, rim_mm))
+
+
+def pressure_pa(sag_mm: float, rim_mm: float) -> float:
+    """Gauge pressure under a film of the paper's kind with that sag: (w0 / (0.65344 a))^3 E t / a."""
+    return (sag_mm / (_CENTRE * rim_mm)) ** 3 * _YOUNG_PA * _THICKNESS_MM / rim_mm

@@ -1,0 +1,124 @@
+"""The zonal map: what the 36 terms cannot carry, integrated from the slopes' residual to the fit.
+
+Only the residual is integrated, so that neither the grid's step nor its interpolation touches the millimetres of the
+bowl. Slopes scattered over the mirror are averaged in cells; two neighbouring cells see the height change by the mean
+of their slopes (Southwell's model); least squares over all pairs of neighbours give the height.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+from membrane_ctrl.metrology.jit import kernel
+from membrane_ctrl.metrology.multigrid import MaskedLaplacian
+from membrane_ctrl.metrology.threads import split
+
+FloatArray = NDArray[np.float64]
+
+_CELLS_A_SIDE = 951  # over the analysis' diameter: 1 mm cells on a 1 m mirror, near two pixels each
+_PIXELS_A_CELL = 1.5  # with fewer, cells would be empty between pixels
+
+
+@dataclass(frozen=True)
+class ResidualGrid:
+    """Mean slope residual on a square grid of cells with the vertex in the middle one.
+
+    Attributes
+    ----------
+    axis_mm : (n,) array
+        Middle of the cells, along x and along y alike.
+    slope_x, slope_y : (n, n) arrays
+        Rows along y; 0 where there is none.
+    count : (n, n) array
+        Weight of the pixels in each cell.
+    """
+
+    axis_mm: FloatArray
+    slope_x: FloatArray
+    slope_y: FloatArray
+    count: FloatArray
+
+    @property
+    def step_mm(self) -> float:
+        """Side of a cell."""
+        return float(self.axis_mm[1] - self.axis_mm[0])
+
+
+@kernel
+def _scatter(field, weights, first_mm, step_mm, sums, start, stop):  # type: ignore[no-untyped-def]
+    n = sums.shape[1]
+    for p in range(start, stop):
+        w = weights[p]
+        if not w > 0:
+            continue
+        j = math.floor((field[0, p] - first_mm) / step_mm + 0.5)
+        i = math.floor((field[1, p] - first_mm) / step_mm + 0.5)
+        if i < 0 or j < 0 or i >= n or j >= n:
+            continue
+        sums[0, i, j] += w
+        sums[1, i, j] += w * (field[2, p] - field[4, p])
+        sums[2, i, j] += w * (field[3, p] - field[5, p])
+
+
+def residual_grid(field: FloatArray, weights: FloatArray, radius_mm: float) -> ResidualGrid:
+    """Average the residual in cells.
+
+    Parameters
+    ----------
+    field : (6, n) array
+        Rows of `Tracer.slope_field`.
+    weights : (n,) array
+        0 leaves a pixel out.
+    """
+    half = min(_CELLS_A_SIDE, int(math.sqrt(4 / math.pi * max(field.shape[1], 1) / _PIXELS_A_CELL))) // 2
+    half = max(half, 2)
+    axis: FloatArray = radius_mm / half * np.arange(-half, half + 1, dtype=np.float64)
+
+    def run(start: int, stop: int) -> FloatArray:
+        sums = np.zeros((3, axis.size, axis.size))
+        _scatter(field, weights, axis[0], axis[1] - axis[0], sums, start, stop)
+        return sums
+
+    count, x, y = np.sum(split(run, field.shape[1]), axis=0)
+    safe = np.where(count > 0, count, 1.0)
+    return ResidualGrid(axis, x / safe, y / safe, count)
+
+
+def integrate(grid: ResidualGrid) -> FloatArray:
+    """Height (n, n) in mm of the residual, 0 at the vertex; NaN where nothing was measured.
+
+    Parts that are not connected with each other (a hair across the mirror) have no height relative to each other that
+    slopes could tell: each is put on the fitted surface, mean 0.
+    """
+    seen = grid.count > 0
+    right = np.zeros(seen.shape)
+    down = np.zeros(seen.shape)
+    right[:, :-1] = seen[:, :-1] & seen[:, 1:]
+    down[:-1] = seen[:-1] & seen[1:]
+    rise_x = np.zeros(seen.shape)
+    rise_y = np.zeros(seen.shape)
+    rise_x[:, :-1] = right[:, :-1] * (grid.slope_x[:, :-1] + grid.slope_x[:, 1:]) * grid.step_mm / 2
+    rise_y[:-1] = down[:-1] * (grid.slope_y[:-1] + grid.slope_y[1:]) * grid.step_mm / 2
+    rhs = -rise_x - rise_y
+    rhs[:, 1:] += rise_x[:, :-1]
+    rhs[1:] += rise_y[:-1]
+    height = MaskedLaplacian(right, down).solve(rhs)
+    parts, _ = label(seen)
+    means = np.bincount(parts.ravel(), height.ravel()) / np.maximum(np.bincount(parts.ravel()), 1)
+    height = np.where(seen, height - means[parts], np.nan)
+    return height - _at_vertex(height)
+
+
+def _at_vertex(height: FloatArray) -> float:
+    """The middle cell, or the nearest that was seen."""
+    if not np.isfinite(height).any():
+        return 0.0
+    middle = height.shape[0] // 2
+    rows, columns = np.nonzero(np.isfinite(height))
+    nearest = np.argmin((rows - middle) ** 2 + (columns - middle) ** 2)
+    return float(height[rows[nearest], columns[nearest]])

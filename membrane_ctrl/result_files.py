@@ -1,0 +1,106 @@
+"""What `measure` leaves in a folder: `result.json` and `height.npz` (INTERFACES section 5), and `details.json`."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from membrane_ctrl.measurement import Measurement, noise_seen_adu
+from membrane_ctrl.metrology.full import FullResult
+from membrane_ctrl.metrology.outline import Outline
+from membrane_ctrl.metrology.radial import RadialProfile
+
+
+def result_table(measurement: Measurement) -> dict[str, Any]:
+    """The content of `result.json` (schema membrane-result/1); numbers that do not exist are null."""
+    full = measurement.full
+    radius_mm = measurement.head.optics.mirror.radius_mm
+    coeffs = [None] * 36 if full is None else (1e3 * full.surface.coeffs_mm).tolist()
+    full_scale = 2**measurement.head.optics.camera.bits - 1
+    quality: dict[str, Any] = {
+        "verdict": measurement.verdict,
+        "reason": measurement.reason,
+        "valid_fraction": 0.0 if full is None else full.quality.valid_fraction,
+        "modulation_median_adu": None if full is None else full.quality.modulation_share * full_scale,
+        "saturated_fraction": None if full is None else full.quality.saturated_fraction,
+        "flagged_frames": measurement.flagged_files(),
+    }
+    return {
+        "schema": "membrane-result/1",
+        "zernike": {
+            "index": "noll",
+            "first": 1,
+            "normalisation": "rms",
+            "radius_mm": radius_mm,
+            "coeffs_um": coeffs,
+        },
+        "fit": _fit_table(full),
+        "quality": quality,
+        "timing_s": measurement.timing_s,
+    }
+
+
+def _fit_table(full: FullResult | None) -> dict[str, Any]:
+    if full is None:
+        return {"iterations": 0, "converged": False, "last_change_mm": None, "slope_residual_urad": None, "points": 0}
+    return {
+        "iterations": len(full.fit.changes_mm),
+        "converged": full.fit.converged,
+        "last_change_mm": full.fit.changes_mm[-1],
+        "slope_residual_urad": full.quality.residual_urad,
+        "points": int(np.count_nonzero(full.weights)),
+    }
+
+
+def details_table(measurement: Measurement, profile: RadialProfile | None, outline: Outline | None) -> dict[str, Any]:
+    """What a person also asks for: sag, pressure, zonal residual, noise, the rim in the picture."""
+    full = measurement.full
+    table: dict[str, Any] = {
+        "set": str(measurement.head.folder),
+        "displacement_um": _number(measurement.displacement_um),
+        "ignored_keys": list(measurement.head.ignored),
+        "noise_seen_adu": _number(noise_seen_adu(measurement)),
+    }
+    if full is not None:
+        residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
+        table |= {
+            "sag_mm": full.surface.sag_mm,
+            "hencky_excess_sag_mm": full.surface.hencky_mm,
+            "changes_mm": list(full.fit.changes_mm),
+            "zonal_residual_rms_um": float(residual_um.std()),
+            "zonal_residual_max_um": float(np.max(np.abs(residual_um - residual_um.mean()))),
+            "motion_taken_out": full.moved,
+        }
+    if profile is not None:
+        table |= {"hencky_sag_mm": profile.sag_mm, "pressure_equivalent_pa": profile.pressure_pa}
+    if outline is not None:
+        table["rim"] = {
+            "centre_px": list(outline.centre_px),
+            "expected_centre_px": list(outline.expected_px),
+            "offset_mm": outline.offset_mm,
+            "size_ratio": outline.size_ratio,
+        }
+    return table
+
+
+def write_result(out: Path, measurement: Measurement, details: dict[str, Any]) -> None:
+    """Write `result.json`, `details.json` and, if there is a figure to be used, `height.npz`. Raises OSError."""
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / "result.json", result_table(measurement))
+    write_json(out / "details.json", details)
+    if measurement.full is not None and measurement.verdict != "rejected":
+        axis = measurement.full.grid.axis_mm
+        np.savez(out / "height.npz", x_mm=axis, y_mm=axis, h_mm=measurement.full.height_mm())
+
+
+def write_json(path: Path, table: dict[str, Any]) -> None:
+    """Write strict JSON: no NaN."""
+    path.write_text(json.dumps(table, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
