@@ -4,7 +4,8 @@ Manual: PTB330 user's guide M210855EN; FORM and its modifiers pages 70-72, UNIT,
 87-88. Its factory setting is 4800 7E1.
 
 Each message is made to carry pressure, unit, the modules' error flags, the running counter of measurements (a frozen
-value is seen) and a checksum (sum of all bytes before it modulo 65536): `FORM 4.3 P U3 ERR MCTR CS4`.
+value is seen), the serial number (another instrument is seen) and a checksum (sum of all bytes before it modulo
+65536): `FORM 4.3 P U3 ERR MCTR SN CS4`.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from firmware_iface.links.serial_port import BytePort, SerialSettings, as_port
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
 
 MANUAL = "PTB330 user's guide M210855EN, pages 70-88"
-FORMAT = '4.3 P " " U3 " " ERR " " MCTR " " CS4 #r #n'
+FORMAT = '4.3 P " " U3 " " ERR " " MCTR " " SN " " CS4 #r #n'
 PA_PER_HPA = 100.0
 RANGE_PA = (50_000.0, 110_000.0)  # of the instrument
-_MESSAGE = re.compile(r"(( *\d{3,4}\.\d{3}|\*+) hPa ([01]{1,3}) * *(\d+) )([0-9A-F]{4})\r\n")
+_MESSAGE = re.compile(r"(( *\d{3,4}\.\d{3}|\*+) hPa ([01]{1,3}) * *(\d+) +(\w+) )([0-9A-F]{4})\r\n")
 _IDENTITY = re.compile(r".*?(PTB330) / (\S+).*?Serial number\s*: *(\S+).*?Module 4\s*:[^\r\n]*\r\n", re.DOTALL)
 # the echo may still be on when it is asked first
 _VERSION = re.compile(r"(?:.*\r\n)?>? *\S+ / \S+ *\r\n>?", re.DOTALL)
@@ -38,6 +39,7 @@ class Message:
 
     pressure_pa: float
     counter: int
+    serial: str
 
 
 class VaisalaPtb330:
@@ -69,9 +71,10 @@ class VaisalaPtb330:
         self._link = LineLink(as_port(port, self._settings), "\r\n", timeout_s, LineFence("VERS", _VERSION))
         self._period_s, self._age_max_s = period_s, age_max_s
         self._task: asyncio.Task[None] | None = None
-        self._newest = Message(math.nan, -1)
+        self._newest = Message(math.nan, -1, "")
         self._newest_s = -math.inf
         self._down: LinkDownError | None = None
+        self._identity: DeviceIdentity | None = None
 
     @property
     def reconnects(self) -> int:
@@ -94,17 +97,31 @@ class VaisalaPtb330:
             Another instrument, or a format that is not taken.
         """
         await self.close()
-        self._newest, self._newest_s, self._down = Message(math.nan, -1), -math.inf, None
+        self._newest, self._newest_s, self._down = Message(math.nan, -1, ""), -math.inf, None
         self._link.connect("\r\nS\r\nECHO OFF\r\n")
         try:
-            identity = await self._identify()
-            await self._apply_settings()
-            await self._refresh()
+            identity = await self._known_again()
+            if identity is None:
+                identity = await self._identify()
+                await self._apply_settings()
+                self._identity = identity
+                await self._refresh()
         except LinkError:
             await self._link.close()
             raise
         self._task = asyncio.create_task(self._run(), name="barometer")
         return identity
+
+    async def _known_again(self) -> DeviceIdentity | None:
+        """Who it was before, if a message of the right form and serial number comes at once: a second saved."""
+        if self._identity is not None:
+            try:
+                await self._refresh()
+            except LinkDownError:
+                raise
+            except LinkError:
+                return None
+        return self._identity
 
     async def _identify(self) -> DeviceIdentity:
         try:
@@ -138,6 +155,9 @@ class VaisalaPtb330:
     async def _refresh(self) -> None:
         answer = await self._link.query("SEND", _MESSAGE)
         message = decode_message(answer, self._link.name)
+        if self._identity is not None and message.serial != self._identity.serial:
+            wanted, self._identity = self._identity.serial, None
+            raise LinkError(f"{self._link.name}: this is barometer {message.serial}, before it was {wanted}")
         if message.counter == self._newest.counter:
             return
         self._newest, self._newest_s = message, asyncio.get_running_loop().time()
@@ -182,12 +202,12 @@ def decode_message(message: re.Match[str], name: str) -> Message:
     LinkError
         Wrong checksum, or a pressure that the instrument cannot measure.
     """
-    checked, pressure, flags, counter, checksum = message.groups()
+    checked, pressure, flags, counter, serial, checksum = message.groups()
     if sum(checked.encode("ascii")) % 2**16 != int(checksum, 16):
         raise LinkError(f"{name}: wrong checksum; noise on the line")
     if "*" in pressure or "1" in flags:
-        return Message(math.nan, int(counter))
+        return Message(math.nan, int(counter), serial)
     pressure_pa = float(pressure) * PA_PER_HPA
     if not RANGE_PA[0] <= pressure_pa <= RANGE_PA[1]:
         raise LinkError(f"{name}: {pressure_pa:.0f} Pa is outside of {RANGE_PA[0]:.0f} .. {RANGE_PA[1]:.0f} Pa")
-    return Message(pressure_pa, int(counter))
+    return Message(pressure_pa, int(counter), serial)

@@ -22,6 +22,9 @@ FIRMWARE, DEVICE_TYPE, FIRMWARE_MINOR = 36, 37, 38
 DEVICE_TYPES = {2: "general purpose driver", 3: "smart pump module"}
 POWER_MAX_MW = 1400.0  # the most that any of these pumps is made for
 _MODE_MANUAL, _SOURCE_SET_VALUE, _OFF, _ON = 0, 0, 0, 1
+# what a hit write could change unseen, or a power cycle: read back with every command
+_KEPT = (POWER_LIMIT_MW, MODE, MANUAL_SOURCE)
+_STATE = (ENABLE, SET_VALUE, ERROR, *_KEPT)
 _NUMBER = r"-?\d+(?:\.\d+)?"
 _STEP_MW = 0.0011  # values are written with three decimals
 
@@ -52,7 +55,6 @@ class Ventus:
         fence = LineFence(f"#R{DEVICE_TYPE}", re.compile(rf"(?:#S[^\n]*\n)*#R{DEVICE_TYPE},({_NUMBER})\r?\n"))
         self._settings = SerialSettings(115_200)
         self._link = LineLink(as_port(port, self._settings), "\n", timeout_s, fence)
-        self._state = _registers(ENABLE, SET_VALUE, ERROR)
         self._commanded_mw = 0.0
 
     @property
@@ -88,21 +90,25 @@ class Ventus:
         return identity
 
     async def _identify(self) -> DeviceIdentity:
-        kind, major, minor = await self._read(DEVICE_TYPE, FIRMWARE, FIRMWARE_MINOR)
-        if int(kind) not in DEVICE_TYPES:
-            raise DeviceRefusedError(f"{self._link.name}: device type {kind:g} is no Ventus driver (2 or 3)")
-        return DeviceIdentity(f"Ventus {DEVICE_TYPES[int(kind)]}", "", f"{major:g}.{minor:g}")
+        about = await self._write_and_read({}, DEVICE_TYPE, FIRMWARE, FIRMWARE_MINOR)
+        kind = int(about[DEVICE_TYPE])
+        if kind not in DEVICE_TYPES:
+            raise DeviceRefusedError(f"{self._link.name}: device type {kind} is no Ventus driver (2 or 3)")
+        return DeviceIdentity(f"Ventus {DEVICE_TYPES[kind]}", "", f"{about[FIRMWARE]:g}.{about[FIRMWARE_MINOR]:g}")
 
     async def _apply_settings(self) -> None:
-        wanted = {
+        wanted = self._settings_wanted()
+        found = await self._write_and_read(wanted, *wanted)
+        if found != wanted:
+            raise DeviceRefusedError(f"{self._link.name}: registers set to {wanted}, read back {found}")
+
+    def _settings_wanted(self) -> dict[int, float]:
+        return {
             STREAM: 0.0,
             MODE: float(_MODE_MANUAL),
             MANUAL_SOURCE: float(_SOURCE_SET_VALUE),
             POWER_LIMIT_MW: float(round(self._power_max_mw)),
         }
-        found = await self._write_and_read(wanted, *wanted)
-        if found != tuple(wanted.values()):
-            raise DeviceRefusedError(f"{self._link.name}: registers set to {wanted}, read back {found}")
 
     async def set_pump(self, fraction: float) -> None:
         """Command the pump and read it back.
@@ -118,10 +124,9 @@ class Ventus:
         """
         if not 0.0 <= fraction <= 1.0:
             raise ValueError(f"pump fraction = {fraction} is not within 0..1")
-        power_mw = fraction * self._power_max_mw
-        writes = {SET_VALUE: power_mw, ENABLE: float(_ON if fraction > 0 else _OFF)}
-        self._commanded_mw = power_mw
-        await self._check(await self._write_and_read(writes, ENABLE, SET_VALUE, ERROR))
+        self._commanded_mw = fraction * self._power_max_mw
+        writes = {SET_VALUE: self._commanded_mw, ENABLE: float(_ON if fraction > 0 else _OFF)}
+        await self._check(await self._write_and_read(writes, *_STATE))
 
     async def pump_fraction(self) -> float:
         """Read back what the pump is set to.
@@ -133,36 +138,37 @@ class Ventus:
         LinkDownError
             The port is gone, or the pump is set to something that it was not told: open it again.
         """
-        return await self._check(await self._read(ENABLE, SET_VALUE, ERROR)) / self._power_max_mw
+        return await self._check(await self._write_and_read({}, *_STATE)) / self._power_max_mw
 
-    async def _check(self, state: tuple[float, ...]) -> float:
-        """Power in mW, when it is what was commanded; asked once more before anything else is believed."""
+    async def _check(self, state: dict[int, float]) -> float:
+        """Power in mW, when all is as commanded; asked once more before anything else is believed."""
         if not self._as_commanded(state):
-            state = await self._read(ENABLE, SET_VALUE, ERROR)
-        enabled, power_mw, error = state
+            state = await self._write_and_read({}, *_STATE)
         if not self._as_commanded(state):
             await self._link.close()
             raise LinkDownError(
-                f"{self._link.name}: told {self._commanded_mw:.3f} mW, it has {power_mw:g} mW and is "
-                f"{'on' if enabled else 'off'}; noise on the line, or it restarted: open it again"
+                f"{self._link.name}: told {self._commanded_mw:.3f} mW, it has {state[SET_VALUE]:g} mW (on: "
+                f"{state[ENABLE]:g}, mode: {state[MODE]:g}, source: {state[MANUAL_SOURCE]:g}, limit: "
+                f"{state[POWER_LIMIT_MW]:g} mW); noise on the line, or it restarted: open it again"
             )
-        if error:
+        if error := state[ERROR]:
             raise LinkError(f"{self._link.name}: the pump reports error {error:g}; see its manual")
-        return power_mw if enabled else 0.0
+        return state[SET_VALUE] if state[ENABLE] else 0.0
 
-    def _as_commanded(self, state: tuple[float, ...]) -> bool:
-        enabled, power_mw, _ = state
-        return abs(power_mw - self._commanded_mw) < _STEP_MW and bool(enabled) == (self._commanded_mw > 0)
+    def _as_commanded(self, state: dict[int, float]) -> bool:
+        settings = self._settings_wanted()
+        return (
+            abs(state[SET_VALUE] - self._commanded_mw) < _STEP_MW
+            and bool(state[ENABLE]) == (self._commanded_mw > 0)
+            and all(state[register] == settings[register] for register in _KEPT)
+        )
 
-    async def _read(self, *registers: int) -> tuple[float, ...]:
-        return await self._write_and_read({}, *registers)
-
-    async def _write_and_read(self, writes: dict[int, float], *registers: int) -> tuple[float, ...]:
+    async def _write_and_read(self, writes: dict[int, float], *registers: int) -> dict[int, float]:
         """Writes and reads in one go: a write has no answer of its own."""
         lines = [f"#W{register},{_text(register, value)}" for register, value in writes.items()]
         lines += [f"#R{register}" for register in registers]
         answer = await self._link.query("\n".join(lines), _registers(*registers), 24 * len(registers))
-        return tuple(float(value) for value in answer.groups())
+        return {register: float(value) for register, value in zip(registers, answer.groups(), strict=True)}
 
     async def close(self) -> None:
         """Switch the pump off and close the port. Never raises."""

@@ -57,7 +57,7 @@ class KeyenceDlRs1aEmulator(LineDevice):
     def line(self, text: str) -> None:
         """One command."""
         if text:  # of CR LF, the LF is left over
-            self.say(self._answer(text).encode("ascii") + b"\r\n")
+            self.say(self._answer(text).encode("ascii", "replace") + b"\r\n")
 
     def _answer(self, text: str) -> str:
         command, *parameters = text.split(",")

@@ -31,6 +31,8 @@ class SerialFaults:
     bit_errors : int
         So many bits of each answer are turned over. On a line with parity, a byte with an odd number of them is
         dropped, as the receiver does.
+    question_bit_errors : int
+        So many bits of each question are turned over.
     cut_bytes : int
         So many bytes are missing at the end of each answer.
     frozen : bool
@@ -42,6 +44,7 @@ class SerialFaults:
     delay_s: float = 0.0
     garbage_bytes: int = 0
     bit_errors: int = 0
+    question_bit_errors: int = 0
     cut_bytes: int = 0
     frozen: bool = False
 
@@ -61,7 +64,7 @@ class SerialDevice:
     faults : SerialFaults
         Switches.
     draw_faults : callable or None
-        When set, called for every answer in place of `faults`: random faults.
+        When set, called for every question, and for every answer: random faults.
     """
 
     def __init__(self, settings: SerialSettings, seed: int = 0) -> None:
@@ -100,8 +103,9 @@ class SerialDevice:
         self._later(asyncio.get_running_loop().time() + len(data) * self.settings.char_s, self._arrived, data)
 
     def _arrived(self, data: bytes) -> None:
-        if not self.faults.deaf:
-            self.received(data)
+        faults = self._drawn()
+        if not faults.deaf:
+            self.received(self._hit(data, faults.question_bit_errors))
 
     def received(self, data: bytes) -> None:
         """Bytes arrived: for the device to answer with `say`."""
@@ -109,7 +113,7 @@ class SerialDevice:
 
     def say(self, answer: bytes) -> None:
         """Send an answer, as the faults let it."""
-        faults = self.faults if self.draw_faults is None else self.draw_faults()
+        faults = self._drawn()
         if faults.silent:
             return
         data = self._spoilt(answer, faults)
@@ -124,14 +128,22 @@ class SerialDevice:
     def _spoilt(self, answer: bytes, faults: SerialFaults) -> bytes:
         if faults.garbage_bytes:
             return self._random.randbytes(faults.garbage_bytes)
-        data = bytearray(answer[: max(0, len(answer) - faults.cut_bytes)])
-        hit = bytearray(len(data))
-        for bit in self._random.sample(range(8 * len(data)), min(faults.bit_errors, 8 * len(data))):
-            data[bit // 8] ^= 1 << bit % 8
-            hit[bit // 8] ^= 1
-        if self.settings.parity != "N":
-            data = bytearray(byte for byte, odd in zip(data, hit, strict=True) if not odd)
-        return bytes(data)
+        return self._hit(answer[: max(0, len(answer) - faults.cut_bytes)], faults.bit_errors)
+
+    def _hit(self, data: bytes, bit_errors: int) -> bytes:
+        """With so many bits turned over, as the receiver at the other end gets it."""
+        if not bit_errors:
+            return data
+        spoilt, hits = bytearray(data), bytearray(len(data))
+        for bit in self._random.sample(range(8 * len(data)), min(bit_errors, 8 * len(data))):
+            spoilt[bit // 8] ^= 1 << bit % 8
+            hits[bit // 8] ^= 1
+        if self.settings.parity == "N":
+            return bytes(spoilt)
+        return bytes(byte for byte, odd in zip(spoilt, hits, strict=True) if not odd)
+
+    def _drawn(self) -> SerialFaults:
+        return self.faults if self.draw_faults is None else self.draw_faults()
 
     def _later(self, when_s: float, call: Callable[[bytes], None], data: bytes) -> None:
         def run() -> None:

@@ -35,6 +35,8 @@ class VaisalaPtb330Emulator(LineDevice):
     ----------
     error_flags : str
         Of its three modules.
+    serial : str
+        Its number.
     """
 
     end = b"\r"
@@ -49,6 +51,7 @@ class VaisalaPtb330Emulator(LineDevice):
     ) -> None:
         super().__init__(SerialSettings(baud, data_bits=7, parity="E"), seed)
         self.error_flags = "000"
+        self.serial = "A1234567"
         self._ambient_pressure_pa = ambient_pressure_pa
         self._model = model
         self._format, self._unit, self._echo = _DEFAULT_FORMAT, "hPa", True
@@ -121,7 +124,7 @@ class VaisalaPtb330Emulator(LineDevice):
     def _about(self) -> str:
         modules = "".join(f"Module {n}       : {'BARO-1' if n < 4 else 'EMPTY'}\n" for n in range(1, 5))
         return (
-            f"{self._model} / 1.01\nSerial number  : A1234567\nBatch number   : B8901234\n"
+            f"{self._model} / 1.01\nSerial number  : {self.serial}\nBatch number   : B8901234\n"
             f"Output format  : {self._format}\nAdjust. date   : 2007-05-03\nAdjust. info   : VAISALA\n"
             "Date           : 2007-05-08\nTime           : 13:42:01\nStart mode     : STOP\n"
             f"Baud P D S     : {self.settings.baud} E 7 1\nOutput interval: 1 s\nAddress        : 0\n"
@@ -151,6 +154,7 @@ class VaisalaPtb330Emulator(LineDevice):
             "U3": f"{self._unit:3.3}",
             "ERR": f"{self.error_flags:3}",
             "MCTR": f"{self._counter}",
+            "SN": self.serial,
             "CS4": f"{sum(so_far.encode('ascii')) % 2**16:04X}",
             "#R": "\r",
             "#N": "\n",

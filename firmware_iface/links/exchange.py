@@ -136,8 +136,13 @@ class SerialExchange:
         async with self._key_turns[key]:
             await self._turn.acquire()  # cancelled while waiting here, a question is never sent
             self._in_flight = asyncio.create_task(self._transact(question, timeout_s, fence, key))
-            self._in_flight.add_done_callback(lambda _: self._turn.release())
+            self._in_flight.add_done_callback(self._ended)
             return await asyncio.shield(self._in_flight)
+
+    def _ended(self, task: asyncio.Task[bytes]) -> None:
+        self._turn.release()
+        if not task.cancelled():
+            task.exception()  # of a cancelled caller nobody else looks at it
 
     async def _transact(self, question: Question, timeout_s: float, fence: Question | None, key: int) -> bytes:
         try:

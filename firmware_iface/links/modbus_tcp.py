@@ -196,8 +196,13 @@ class GuardedModbusTcp:
     ) -> ModbusPDU:
         await self._turn.acquire()  # cancelled while waiting here, a request is never sent
         self._in_flight = asyncio.create_task(self._transact(send, function_code, what))
-        self._in_flight.add_done_callback(lambda _: self._turn.release())
+        self._in_flight.add_done_callback(self._ended)
         return await asyncio.shield(self._in_flight)
+
+    def _ended(self, task: asyncio.Task[ModbusPDU]) -> None:
+        self._turn.release()
+        if not task.cancelled():
+            task.exception()  # of a cancelled caller nobody else looks at it
 
     async def _transact(
         self, send: Callable[[AsyncModbusTcpClient], Awaitable[ModbusPDU]], function_code: int, what: str

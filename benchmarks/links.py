@@ -1,0 +1,275 @@
+"""Serial links under random faults: how many wrong values are believed (none), and how far off the worst one is.
+
+Link, driver and emulated instrument are the real ones, the wire between them is memory and time is virtual: late
+answers and timeouts cost nothing, and every run is the same. A tenth of all questions or answers is hit.
+
+`run()` gives the figures for `make bench`, `audit(name, transactions)` those of one link for the tests.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import random
+from collections.abc import Callable, Coroutine, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from benchmarks.figures import Figure, at_least, at_most
+from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
+from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
+from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
+from firmware_iface.drivers.ventus import Ventus
+from firmware_iface.emulators.keyence_dl_rs1a import KeyenceDlRs1aEmulator
+from firmware_iface.emulators.modbus_rtu import RtuBusEmulator
+from firmware_iface.emulators.modbus_server import respond
+from firmware_iface.emulators.optoncdt1420 import Optoncdt1420Emulator
+from firmware_iface.emulators.serial_device import SerialDevice, SerialFaults
+from firmware_iface.emulators.vaisala_ptb330 import VaisalaPtb330Emulator
+from firmware_iface.emulators.ventus import VentusEmulator
+from firmware_iface.emulators.virtual_time import run_virtual
+from firmware_iface.emulators.wires import MemoryWire
+from firmware_iface.links.modbus_rtu import RtuBus
+from firmware_iface.links.serial_port import SerialSettings
+from firmware_iface.roles import Device, DisplacementSensor, LinkDownError, LinkError
+
+TIMEOUT_S = 0.05
+CANCELLED = 0.02  # of all calls
+HIT = 0.05  # of all questions, and of all answers
+
+
+@dataclass(slots=True)
+class Audit:
+    """What became of the transactions of one link. `worst` is the largest error of a value that was believed."""
+
+    believed: int = 0
+    refused: int = 0
+    cancelled: int = 0
+    wrong: int = 0
+    worst: float = 0.0
+
+    @property
+    def transactions(self) -> int:
+        """All of them."""
+        return self.believed + self.refused + self.cancelled
+
+    def judge(self, error: float, tolerance: float) -> None:
+        """One value that was believed."""
+        self.believed += 1
+        self.worst = max(self.worst, error)
+        self.wrong += not error <= tolerance  # NaN is wrong
+
+
+def random_faults(seed: int) -> Callable[[], SerialFaults]:
+    """One fault at a time: late by up to four timeouts, lost, cut, garbage, one to three turned bits."""
+    dice = random.Random(seed)
+
+    def draw() -> SerialFaults:
+        if dice.random() >= HIT:
+            return SerialFaults()
+        kinds: list[Callable[[], SerialFaults]] = [
+            lambda: SerialFaults(silent=True),
+            lambda: SerialFaults(deaf=True),
+            lambda: SerialFaults(delay_s=dice.uniform(0.0, 4 * TIMEOUT_S)),
+            lambda: SerialFaults(cut_bytes=dice.randint(1, 4)),
+            lambda: SerialFaults(garbage_bytes=dice.randint(1, 12)),
+            lambda: SerialFaults(bit_errors=dice.randint(1, 3)),
+            lambda: SerialFaults(question_bit_errors=dice.randint(1, 3)),
+        ]
+        return dice.choice(kinds)()
+
+    return draw
+
+
+class _Registers:
+    """Of one slave."""
+
+    def __init__(self) -> None:
+        self.words = [0] * 16
+
+    def read(self, address: int, count: int) -> list[int]:
+        return self.words[address : address + count]
+
+    def write(self, address: int, words: Sequence[int]) -> None:
+        self.words[address : address + len(words)] = words
+
+
+async def _rtu(transactions: int, audit: Audit, seed: int) -> None:
+    """Numbers that never come twice are written and read back, to three places of two slaves.
+
+    A confirmed write has to be in the device. What is read has to be the number that was confirmed last at this
+    place, or one that was tried since.
+    """
+    dice = random.Random(seed)
+    tables = {1: _Registers(), 2: _Registers()}
+    slaves = {unit: partial(respond, table=table) for unit, table in tables.items()}
+    emulator = RtuBusEmulator(SerialSettings(115_200), slaves, echo_test=bool(seed % 2), seed=seed)
+    emulator.draw_faults = random_faults(seed)
+    bus = RtuBus(MemoryWire(emulator), quiet_s=TIMEOUT_S)
+    devices = {unit: bus.device(unit, TIMEOUT_S) for unit in tables}
+    possible = {(unit, address): {0} for unit in tables for address in (0, 4, 8)}
+    number = 0
+    while audit.transactions < transactions:
+        unit, address = place = dice.choice(list(possible))
+        await devices[unit].connect()
+        number += 1
+        if write := dice.random() < 0.5:
+            possible[place].add(number)
+            call: Coroutine[Any, Any, Any] = devices[unit].write_registers(address, divmod(number, 2**16))
+        else:
+            call = devices[unit].read_holding(address, 2)
+        try:
+            words = await _perhaps_cancelled(call, dice)
+        except asyncio.CancelledError:
+            audit.cancelled += 1
+        except LinkError:
+            audit.refused += 1
+        else:
+            found = tables[unit].words[address : address + 2] if write else words
+            audit.judge(float(found[0] * 2**16 + found[1] not in ({number} if write else possible[place])), 0.0)
+            if write:
+                possible[place] = {number}
+    await devices[1].close()
+
+
+async def _perhaps_cancelled(call: Coroutine[Any, Any, Any], dice: random.Random) -> Any:
+    """The result of a call that is sometimes cancelled in mid-air. Raises CancelledError then."""
+    task = asyncio.ensure_future(call)
+    if dice.random() < CANCELLED:
+        await asyncio.wait([task], timeout=dice.uniform(0.0, TIMEOUT_S))
+        task.cancel()
+    return await task
+
+
+async def _keyence(transactions: int, audit: Audit, seed: int) -> None:
+    """Displacement that ramps at the speed of a fill; wrong is more than the driver's own gate."""
+    emulator = KeyenceDlRs1aEmulator(_ramp_um, baud=38_400, parity="E", seed=seed)
+    driver = KeyenceDlRs1a(MemoryWire(emulator), baud=38_400, parity="E", timeout_s=TIMEOUT_S)
+    await _displacements(driver, emulator, transactions, audit, seed)
+
+
+async def _optoncdt(transactions: int, audit: Audit, seed: int) -> None:
+    """The same with a stream; wrong is more than ten times its noise."""
+    emulator = Optoncdt1420Emulator(_ramp_um, noise_um=1.0, seed=seed)
+    driver = Optoncdt1420(MemoryWire(emulator), rate_khz=1.0, step_max_um=10.0, timeout_s=TIMEOUT_S)
+    await _displacements(driver, emulator, transactions, audit, seed)
+
+
+def _ramp_um() -> float:
+    time_s = asyncio.get_running_loop().time()
+    return 5.0 * abs(time_s % 400.0 - 200.0) - 500.0
+
+
+async def _displacements(
+    driver: DisplacementSensor, emulator: SerialDevice, transactions: int, audit: Audit, seed: int
+) -> None:
+    dice = random.Random(seed)
+    await driver.open()
+    emulator.draw_faults = random_faults(seed)
+    while audit.transactions < transactions:
+        await asyncio.sleep(0.02)
+        try:
+            sample = await _perhaps_cancelled(driver.displacement(), dice)
+        except asyncio.CancelledError:
+            audit.cancelled += 1
+        except LinkDownError:
+            audit.refused += 1
+            await _open_again(driver)
+        except LinkError:
+            audit.refused += 1
+        else:
+            if sample.quality:
+                audit.refused += 1
+            else:
+                audit.judge(abs(sample.displacement_um - _ramp_um()), 10.0)
+    await driver.close()
+
+
+async def _ventus(transactions: int, audit: Audit, seed: int) -> None:
+    """A command that was confirmed has to be what drives the gas."""
+    dice, driven = random.Random(seed), [0.0]
+    emulator = VentusEmulator(lambda fraction: driven.__setitem__(0, fraction), seed=seed)
+    driver = Ventus(MemoryWire(emulator), timeout_s=TIMEOUT_S)
+    await driver.open()
+    emulator.draw_faults = random_faults(seed)
+    while audit.transactions < transactions:
+        fraction = dice.choice((0.0, dice.random()))
+        try:
+            if dice.random() < 0.5:
+                await _perhaps_cancelled(driver.set_pump(fraction), dice)
+            else:
+                fraction = await _perhaps_cancelled(driver.pump_fraction(), dice)
+        except asyncio.CancelledError:
+            audit.cancelled += 1
+        except LinkDownError:
+            audit.refused += 1
+            await _open_again(driver)
+        except LinkError:
+            audit.refused += 1
+        else:
+            audit.judge(abs(fraction - driven[0]), 1e-5)
+    await driver.close()
+
+
+async def _ptb330(transactions: int, audit: Audit, seed: int) -> None:
+    """Pressure that runs up and down; the message and its age together may be off by what it ran in three seconds."""
+
+    def pressure_pa() -> float:
+        return 101_325.0 + 0.1 * abs(asyncio.get_running_loop().time() % 4000.0 - 2000.0)
+
+    emulator = VaisalaPtb330Emulator(pressure_pa, seed=seed)
+    driver = VaisalaPtb330(MemoryWire(emulator), timeout_s=TIMEOUT_S, period_s=0.1)
+    await driver.open()
+    emulator.draw_faults = random_faults(seed)
+    while audit.transactions < transactions:
+        await asyncio.sleep(0.2)
+        try:
+            found_pa = await driver.ambient_pressure_pa()
+        except LinkDownError:
+            audit.refused += 1
+            await _open_again(driver)
+        else:
+            if math.isnan(found_pa):
+                audit.refused += 1
+            else:
+                audit.judge(abs(found_pa - pressure_pa()), 0.5)
+    await driver.close()
+
+
+async def _open_again(driver: Device) -> None:
+    while True:
+        try:
+            await driver.open()
+            return
+        except LinkError:
+            await asyncio.sleep(0.02)
+
+
+LINKS = {
+    "Modbus RTU": (_rtu, ""),
+    "optoNCDT 1420": (_optoncdt, "um"),
+    "Keyence DL-RS1A": (_keyence, "um"),
+    "Ventus": (_ventus, ""),
+    "PTB330": (_ptb330, "Pa"),
+}
+
+
+def audit(name: str, transactions: int, seed: int = 1) -> Audit:
+    """So many transactions of one link under random faults."""
+    result = Audit()
+    run_virtual(LINKS[name][0](transactions, result, seed))
+    return result
+
+
+def run(transactions: int = 10**6) -> list[Figure]:
+    """Of all links."""
+    figures = []
+    for name, (_, unit) in LINKS.items():
+        found = audit(name, transactions)
+        figures += [
+            at_most(f"{name}: wrong values believed", found.wrong, "", 0, "transactions", found.transactions),
+            at_most(f"{name}: largest error believed", found.worst, unit),
+            at_least(f"{name}: believed", found.believed / found.transactions, "", 0.5),
+        ]
+    return figures
