@@ -74,14 +74,27 @@ class StatesConfig(Section):
 
     check_s: Annotated[float, Field(ge=0.1, le=600)] = 2.0  # of good readings before the pump may run
     check_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
+    actuator_test: bool = True  # pump up, pump off, vent, before a hold: does the film answer?
     inflate_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 14_400.0  # a fill from flat takes two hours
-    settle_s: Annotated[float, Field(ge=0.1, le=3600)] = 2.0  # inside the band before the state is `hold`
+    inflate_pause_um: Annotated[float, Field(gt=0, le=1e4)] = 10.0  # behind the ramp by this much: the ramp waits
+    settle_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.5  # inside the band before the state is `hold`
     settle_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 600.0
     # 10 s of laser loss cost 1.6 um on average (PHYSICS, inner loop); longer is no glitch
     hold_flow_max_s: Annotated[float, Field(gt=0, le=600)] = 12.0
     ramp_down_s: Annotated[float, Field(gt=0, le=600)] = 10.0
     pump_off_max_s: Annotated[float, Field(gt=0, le=1e6)] = 3600.0
     lower_timeout_s: Annotated[float, Field(gt=0, le=600)] = 3.0
+    pause_max_s: Annotated[float, Field(gt=0, le=1e5)] = 600.0
+    vented_pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 100.0  # `vent` is done below this
+    stay_after_trip: bool = False  # wait in `fault` for `ctl ack` instead of ending the run
+
+
+class ResumeConfig(Section):
+    """Which latched faults may clear by themselves once their cause has gone."""
+
+    faults: tuple[str, ...] = ()
+    wait_s: Annotated[float, Field(ge=1, le=1e5)] = 30.0
+    most_per_day: Annotated[int, Field(ge=0, le=1000)] = 3
 
 
 class ShapeConfig(Section):
@@ -216,6 +229,7 @@ class Config(Section):
     pump: PumpConfig = PumpConfig()
     limits: LimitsConfig = LimitsConfig()
     states: StatesConfig = StatesConfig()
+    resume: ResumeConfig = ResumeConfig()
     shape: ShapeConfig = ShapeConfig()
     optics: OpticsConfig = OpticsConfig()
     devices: DevicesConfig | None = None

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.roles import BenchCommand
+from membrane_ctrl.commands import Command, refusal
 from membrane_ctrl.config import Config
 from membrane_ctrl.control.inner_loop import InnerLoop
 from membrane_ctrl.control.shape_loop import ShapeLoop, ShapeOutput
@@ -19,10 +20,11 @@ from membrane_ctrl.errors import Exit
 from membrane_ctrl.ladder import Ladder
 from membrane_ctrl.names import Rung, State
 from membrane_ctrl.observer import Observer
+from membrane_ctrl.resume import ResumeRule
 from membrane_ctrl.safety import MOVING, Observation, Rule, SafetyTable, Verdict
-from membrane_ctrl.states import HANDLERS, Scene
+from membrane_ctrl.states import HANDLERS, Scene, Way
 from membrane_ctrl.telemetry import TelemetryRow
-from membrane_ctrl.tick import Command, Event, TickInputs, TickOutputs
+from membrane_ctrl.tick import Event, TickInputs, TickOutputs
 
 # dt outside this range of the nominal one is no time step a loop was designed for; what is beyond is a missed
 # tick, which safety sees by its lateness
@@ -48,7 +50,11 @@ class Controller:
         self._safety = SafetyTable(config.limits)
         self._shape = ShapeLoop(config.shape, sag_sensitivity)
         observer = Observer(config.limits)
-        self._scene = Scene(config, InnerLoop(config.loop, config.pump), observer, Ladder(config.states))
+        loop = InnerLoop(config.loop, config.pump)
+        self._scene = Scene(config, config.loop, loop, observer, Ladder(config.states), config.loop.setpoint_um)
+        self._resume = ResumeRule(config.resume)
+        self._answers: list[tuple[int, str]] = []
+        self._clear_board = False
         self._tick_error = ""
         self._ticks = 0
         self._state_since_s = math.nan
@@ -64,9 +70,10 @@ class Controller:
         events: list[Event] = []
         self._begin(inputs, events)
         error_um = scene.output.error_um if scene.output is not None and self.state in MOVING else math.nan
-        observation = scene.observer.observe(inputs, error_um, self._tick_error, scene.overdue)
+        observation = scene.observer.observe(inputs, error_um, self._tick_error, scene.overdue, scene.unfit)
         verdict = self._safety.judge(self.state, observation)
         self._apply(verdict, events)
+        self._consider_resuming(observation)
         shape = self._step_shape(inputs, events)
         if math.isnan(self._state_since_s):  # the verdict has just changed the state
             self._state_since_s, scene.state_age_s = inputs.now_s, 0.0
@@ -75,7 +82,14 @@ class Controller:
         scene.observer.wrote(command)
         scene.last_pump_fraction = scene.pump_fraction
         self._tell_why(events)
-        return TickOutputs(command, self._row(inputs, observation, shape), tuple(events), scene.finished)
+        return TickOutputs(
+            command=command,
+            row=self._row(inputs, observation, shape),
+            events=tuple(events),
+            finished=scene.finished,
+            answers=tuple(self._answers),
+            clear_board=self._clear_board,
+        )
 
     def _begin(self, inputs: TickInputs, events: list[Event]) -> None:
         scene = self._scene
@@ -88,21 +102,70 @@ class Controller:
         if math.isnan(self._state_since_s):  # the state's first tick
             self._state_since_s = inputs.now_s
         scene.state_age_s = inputs.now_s - self._state_since_s
+        self._answers, self._clear_board = [], False
         for command in inputs.commands:
             self._obey(command, events)
 
     def _obey(self, command: Command, events: list[Event]) -> None:
+        """Do what a command asks, or say why not; either is recorded with who asked and why."""
         scene = self._scene
-        events.append({"kind": "command", "command": command.kind, "who": command.who, "why": command.why})
+        refused = refusal(command, self.state, self._config)
+        self._answers.append((command.number, refused))
+        event: Event = {"kind": "command", "command": command.kind, "who": command.who, "why": command.why}
+        if math.isfinite(command.value):
+            event["value"] = command.value
+        if command.text:
+            event["text"] = command.text
+        events.append({**event, "refused": refused} if refused else event)
+        if refused:
+            return
         match command.kind:
             case "hold":
                 scene.hold_wanted = True
-            case "stop":
-                scene.stop_wanted = True
-                scene.stop_asked_by = command.who
-                scene.stop_exit = Exit.DONE if command.who == "duration" else Exit.INTERRUPTED
+            case "manual":
+                scene.manual_wanted, scene.manual_um_per_s = True, command.value
+            case "pause" | "resume":
+                scene.paused = command.kind == "pause"
+            case "setpoint":
+                scene.setpoint_um = command.value
+            case "gains":
+                assert command.loop is not None  # `refusal` has looked
+                scene.loop_config = command.loop
+                scene.loop.set_gains(command.loop)
             case "shape_on" | "shape_off":
                 self._shape.switch(command.kind == "shape_on", scene.now_s)
+            case "ack":
+                scene.acknowledged = self.state == State.FAULT
+                self._clear_board = True
+            case "stop":
+                scene.way_down = "stop"
+                scene.stop_exit = Exit.DONE if command.who == "duration" else Exit.INTERRUPTED
+            case "lower" | "vent":
+                self._go_down(command.kind)
+        if command.kind != "mark":
+            scene.asked_by = command.who
+
+    def _go_down(self, way: Way) -> None:
+        """A way down further down than the one under way; `stop` stays the last word."""
+        scene = self._scene
+        if self.state == State.FAULT and way == "vent":
+            scene.ladder.enter(Rung.VENT, scene.now_s)
+        elif scene.way_down != "stop":
+            scene.way_down = way
+
+    def _consider_resuming(self, observation: Observation) -> None:
+        """A latched fault on the list may go, once its cause has stayed away (`resume`)."""
+        scene, fault = self._scene, self.fault
+        scene.may_resume = scene.resume_possible = False
+        if self.state != State.FAULT or fault is None:
+            return
+        scene.resume_possible = self._resume.possible(fault, scene.ladder.rung, scene.now_s)
+        if scene.resume_possible and observation.link_up and observation.reading_age_s == 0.0:
+            own = observation.board_faults != 0  # the board latched when the controller was lost to it
+            scene.may_resume = self._resume.due(
+                not own and not fault.broken(observation, self._config.limits), scene.now_s
+            )
+            self._clear_board |= own
 
     def _apply(self, verdict: Verdict, events: list[Event]) -> None:
         """Put the verdict on the ladder; whatever goes below HOLD_FLOW latches as the run's fault."""
@@ -152,10 +215,15 @@ class Controller:
     def _go(self, state: State, why: str, events: list[Event]) -> None:
         scene = self._scene
         events.append({"kind": "state", "state": state.name.lower(), "from": self.state.name.lower(), "why": why})
+        if self.state == State.FAULT:  # it was acknowledged, or may resume
+            self.fault, self._tick_error = None, ""
+            scene.ladder.leave()
+            scene.acknowledged = False
         self.state = state
         self._state_since_s = math.nan
         scene.good_since_s = math.nan
-        scene.overdue = ""
+        scene.overdue = scene.unfit = ""
+        scene.test = None
 
     def _tell_why(self, events: list[Event]) -> None:
         """The one line of the operator, as an event when its words (not its numbers) have changed for good."""
@@ -180,7 +248,7 @@ class Controller:
             shape_state=shape.state,
             rung=scene.ladder.rung,
             fault=self.fault.code if self.fault else 0,
-            target_um=self._config.loop.setpoint_um,
+            target_um=scene.setpoint_um,
             setpoint_um=out.setpoint_um if out else nan,
             displacement_um=observation.displacement_um,
             filtered_um=out.filtered_um if out else nan,

@@ -21,6 +21,7 @@ from pathlib import Path
 from firmware_iface.roles import Bench, LinkError
 from membrane_ctrl.bench import connect, open_bench
 from membrane_ctrl.clock import RunClock
+from membrane_ctrl.commands import Command
 from membrane_ctrl.config import Config, DevicesConfig
 from membrane_ctrl.controller import Controller
 from membrane_ctrl.crew import Crew, Rings, rings_for
@@ -30,7 +31,6 @@ from membrane_ctrl.priority import raise_priority
 from membrane_ctrl.recording.run_folder import create_run_folder
 from membrane_ctrl.simulated import TwinProcess
 from membrane_ctrl.supervisor import Supervisor, Wiring
-from membrane_ctrl.tick import Command
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,6 +33,10 @@ class Ladder:
         assert self.rung <= Rung.HOLD_FLOW, self.rung
         self.rung = Rung.NONE
 
+    def leave(self) -> None:
+        """Leave the ladder from wherever it is: a person has acknowledged, or the resume rule allows it."""
+        self.rung = Rung.NONE
+
     def age_s(self, now_s: float) -> float:
         """Time on the present rung."""
         return now_s - self._since_s

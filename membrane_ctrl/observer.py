@@ -36,7 +36,7 @@ class Observer:
         """Note the command of the tick that just ended, to compare it with its read-back."""
         self._commanded = (command.pump_fraction, self._commanded[0])
 
-    def observe(self, inputs: TickInputs, error_um: float, tick_error: str, overdue: str) -> Observation:
+    def observe(self, inputs: TickInputs, error_um: float, tick_error: str, overdue: str, unfit: str) -> Observation:
         """One tick's observation."""
         reading = self.reading = inputs.reading
         now_s = inputs.now_s
@@ -66,6 +66,7 @@ class Observer:
             dead_tasks=inputs.dead_tasks,
             tick_error=tick_error,
             overdue=overdue,
+            unfit=unfit,
         )
 
     def _gate(self, reading: BenchReading | None, fresh: bool) -> float:

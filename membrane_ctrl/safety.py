@@ -54,6 +54,8 @@ class Observation:
         What a handler raised, if it did.
     overdue : str
         What the present state has waited for too long, if it has.
+    unfit : str
+        What the actuator test found, if anything.
     """
 
     link_up: bool
@@ -71,6 +73,7 @@ class Observation:
     dead_tasks: tuple[str, ...] = ()
     tick_error: str = ""
     overdue: str = ""
+    unfit: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,6 +314,19 @@ TABLE: tuple[Rule, ...] = (
         lambda o, c: bool(o.overdue),
     ),
     Rule(
+        26,
+        "actuator_test",
+        "the film does not answer to pump or vent",
+        1,
+        1,
+        "actuator_test.py",
+        Rung.PUMP_OFF,
+        True,
+        {State.CHECK},
+        "check hoses, valve and pump, and where the laser points",
+        lambda o, c: bool(o.unfit),
+    ),
+    Rule(
         40,
         "late",
         "ticks start too late to be a control loop",
@@ -372,5 +388,7 @@ def _seen(rule: Rule, observation: Observation) -> str:
             return observation.tick_error
         case "overdue":
             return observation.overdue
+        case "actuator_test":
+            return observation.unfit
         case _:
             return ""

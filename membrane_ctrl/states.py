@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Literal
 
-from membrane_ctrl.config import Config
+from membrane_ctrl.actuator_test import ActuatorTest
+from membrane_ctrl.config import Config, LoopConfig
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput, LoopOutput
 from membrane_ctrl.control.slope import Slope
 from membrane_ctrl.errors import Exit
@@ -18,8 +20,10 @@ from membrane_ctrl.ladder import Ladder
 from membrane_ctrl.names import Rung, State
 from membrane_ctrl.observer import Observer
 
-# a pump that someone left running has run down by then: lag 0.15 s, transport 0.1 s (PHYSICS, inner loop)
+# a pump that someone left running has run down by then: lag 0.15 s, transport 0.1 s (docs/physics.md, inner loop)
 _PUMP_STANDS_S = 0.5
+
+Way = Literal["stop", "lower", "vent"]
 
 
 @dataclass(slots=True)
@@ -27,21 +31,31 @@ class Scene:
     """What the handlers share: the loop, this tick's facts, and what they decide."""
 
     config: Config
+    loop_config: LoopConfig  # as it is now, after `gains`
     loop: InnerLoop
     observer: Observer
     ladder: Ladder
+    setpoint_um: float
     # this tick
     now_s: float = 0.0
     dt_s: float = 0.02
     state_age_s: float = 0.0  # 0 exactly in the first tick of a state
     trim_um: float = 0.0
+    # what was asked for
     hold_wanted: bool = False
-    stop_wanted: bool = False
+    manual_wanted: bool = False
+    manual_um_per_s: float = 0.0
+    paused: bool = False
+    way_down: Way | None = None
+    asked_by: str = ""
     stop_exit: Exit = Exit.DONE
-    stop_asked_by: str = ""
+    acknowledged: bool = False
+    may_resume: bool = False  # the resume rule lets a latched fault go
+    resume_possible: bool = False  # it may yet
     # memory of the states
     good_since_s: float = math.nan
     sinking: Slope = field(default_factory=Slope)  # of the mirror with the pump off, seen in `check`
+    test: ActuatorTest | None = None
     ramp_from_fraction: float = 0.0
     last_pump_fraction: float = 0.0
     # decisions of this tick
@@ -50,6 +64,7 @@ class Scene:
     vent_fraction: float = 0.0
     why: str = ""
     overdue: str = ""
+    unfit: str = ""
     finished: Exit | None = None
 
     def stay_good(self, good: bool) -> float:
@@ -64,8 +79,8 @@ class Scene:
 
 def standby(scene: Scene) -> State:
     """Pump off until someone wants the mirror held."""
-    if scene.stop_wanted:
-        return _stop(scene)
+    if scene.way_down is not None:
+        return _go_down(scene)
     if scene.hold_wanted:
         scene.why = "asked to hold the mirror"
         return State.CHECK
@@ -74,33 +89,37 @@ def standby(scene: Scene) -> State:
 
 
 def check(scene: Scene) -> State:
-    """Every sensor must have been good for a while before the pump may run; how fast the mirror sinks is the leak."""
-    if scene.stop_wanted:
-        return _stop(scene)
-    if scene.state_age_s > _PUMP_STANDS_S:
-        scene.sinking.add(scene.now_s, scene.observer.displacement_um)
+    """Every sensor must have been good for a while, and the film must answer, before the pump may run for good."""
+    if scene.way_down is not None:
+        return _go_down(scene)
     missing = _missing(scene)
-    scene.why = f"checking the sensors: {missing}" if missing else "checking the sensors: all good so far"
-    check_s = scene.config.states.check_s
-    if scene.stay_good(not missing) >= check_s:
-        # the flow that balances the leak, so that the integrator need not find it first
-        leak_um_per_s = max(0.0, -scene.sinking.per_s)
-        scene.loop.start(scene.observer.displacement_um, leak_um_per_s)
-        scene.why = f"all sensors good for {check_s:g} s; the mirror sinks by {leak_um_per_s:.2f} um/s"
-        return State.INFLATE
+    good_s = scene.stay_good(not missing)
     if scene.state_age_s > scene.config.states.check_timeout_s:
         scene.overdue = f"sensors not good after {scene.config.states.check_timeout_s:g} s: {missing}"
-    return State.CHECK
+    if missing:
+        scene.test = None  # what was measured with a hole in it is measured again
+        scene.why = f"checking the sensors: {missing}"
+        return State.CHECK
+    if scene.config.states.actuator_test:
+        return _test_actuators(scene)
+    scene.why = "checking the sensors: all good so far"
+    if scene.state_age_s > _PUMP_STANDS_S:
+        scene.sinking.add(scene.now_s, scene.observer.displacement_um)
+    if good_s < scene.config.states.check_s:
+        return State.CHECK
+    return _begin(scene, max(0.0, -scene.sinking.per_s))
 
 
 def inflate(scene: Scene) -> State:
-    """Ramp from where the mirror is to the setpoint."""
-    if scene.stop_wanted:
-        return _stop(scene)
-    output = _drive(scene)
-    to_go_um = scene.config.loop.setpoint_um - output.filtered_um
-    scene.why = f"inflating: {to_go_um:.1f} um to go"
-    ramp_left_um = scene.config.loop.setpoint_um + scene.trim_um - output.setpoint_um
+    """Ramp from where the mirror is to the setpoint; the ramp waits for a mirror that lags behind."""
+    if (elsewhere := _asked_elsewhere(scene)) is not None:
+        return elsewhere
+    lags = scene.output is not None and abs(scene.output.error_um) > scene.config.states.inflate_pause_um
+    target_um = scene.output.setpoint_um - scene.trim_um if scene.output is not None and lags else scene.setpoint_um
+    output = _drive(scene, target_um)
+    to_go_um = scene.setpoint_um - output.filtered_um
+    scene.why = f"inflating: {to_go_um:.1f} um to go" + (", the ramp waits for the mirror" if lags else "")
+    ramp_left_um = scene.setpoint_um + scene.trim_um - output.setpoint_um
     if max(abs(ramp_left_um), abs(to_go_um)) < scene.config.limits.band_um:
         return State.SETTLE
     if scene.state_age_s > scene.config.states.inflate_timeout_s:
@@ -110,41 +129,80 @@ def inflate(scene: Scene) -> State:
 
 def settle(scene: Scene) -> State:
     """Stay inside the band for a while before the state is called hold."""
-    if scene.stop_wanted:
-        return _stop(scene)
-    output = _drive(scene)
-    inside = abs(output.error_um) < scene.config.limits.band_um
-    settled_s = scene.stay_good(inside)
+    if (elsewhere := _asked_elsewhere(scene)) is not None:
+        return elsewhere
+    output = _drive(scene, scene.setpoint_um)
+    band_um = scene.config.limits.band_um
+    settled_s = scene.stay_good(abs(output.error_um) < band_um)
     scene.why = f"settling: inside the band for {settled_s:.0f} s"
     if settled_s >= scene.config.states.settle_s:
-        scene.why = f"inside +-{scene.config.limits.band_um:g} um for {settled_s:.1f} s"
+        scene.why = f"inside +-{band_um:g} um for {settled_s:.1f} s"
         return State.HOLD
     if scene.state_age_s > scene.config.states.settle_timeout_s:
-        scene.overdue = f"not inside +-{scene.config.limits.band_um:g} um for {scene.config.states.settle_s:g} s"
+        scene.overdue = f"not inside +-{band_um:g} um for {scene.config.states.settle_s:g} s"
     return State.SETTLE
 
 
 def hold(scene: Scene) -> State:
     """The main job."""
-    if scene.stop_wanted:
-        return _stop(scene)
-    scene.why = _why_hold(scene, _drive(scene))
+    if (elsewhere := _asked_elsewhere(scene)) is not None:
+        return elsewhere
+    if scene.paused:
+        scene.output = scene.loop.stale(scene.dt_s)
+        scene.pump_fraction = scene.output.pump_fraction
+        scene.vent_fraction = scene.loop_config.bleed_fraction
+        scene.why = f"paused by {scene.asked_by}: the pump gives its mean flow"
+        if scene.stay_good(True) > scene.config.states.pause_max_s:
+            scene.paused = False
+        return State.HOLD
+    scene.good_since_s = math.nan
+    scene.why = _why_hold(scene, _drive(scene, scene.setpoint_um))
     return State.HOLD
 
 
+def manual(scene: Scene) -> State:
+    """The flow that a person has asked for; the loop follows, so that `hold` takes over without a bump."""
+    if scene.way_down is not None:
+        return _go_down(scene)
+    if scene.hold_wanted:
+        scene.manual_wanted = False
+        scene.why = f"{scene.asked_by} asked to hold the mirror again"
+        return State.INFLATE
+    output = scene.output = scene.loop.follow(_given(scene, scene.setpoint_um), scene.manual_um_per_s, scene.dt_s)
+    scene.pump_fraction = output.pump_fraction
+    scene.vent_fraction = scene.loop_config.bleed_fraction
+    scene.why = f"manual: {scene.asked_by} has set the flow to {scene.manual_um_per_s:.2f} um/s"
+    return State.MANUAL
+
+
 def lower(scene: Scene) -> State:
-    """The clean way out: pump off, seen to be off, then done. The leak lets the mirror down by itself."""
-    reading = scene.observer.reading
-    scene.why = "stopping: pump off"
-    if _pump_seen_off(scene) or scene.state_age_s > scene.config.states.lower_timeout_s:
-        scene.finished = scene.stop_exit if reading is not None else Exit.DEVICE_FAILED
-    return State.LOWER
+    """The way down: pump off, seen to be off; the leak lets the mirror down by itself, or the vent does."""
+    way = scene.way_down or "lower"
+    scene.hold_wanted = False
+    timed_out = scene.state_age_s > scene.config.states.lower_timeout_s
+    if way == "vent":
+        scene.vent_fraction = 1.0
+        reading = scene.observer.reading
+        pressure_pa = reading.gauge_pressure_pa if reading else math.nan
+        scene.why = f"venting: {pressure_pa:.0f} Pa left"
+        if not pressure_pa < scene.config.states.vented_pressure_pa:
+            return State.LOWER
+    else:
+        scene.why = f"{way} asked for by {scene.asked_by}: pump off"
+        if not (_pump_seen_off(scene) or timed_out):
+            return State.LOWER
+    if way == "stop":
+        scene.finished = scene.stop_exit if scene.observer.reading is not None else Exit.DEVICE_FAILED
+        return State.LOWER
+    scene.way_down = None
+    return State.STANDBY
 
 
 def fault(scene: Scene) -> State:
-    """Down the ladder, latched: only a person clears it, after this run."""
+    """Down the ladder, latched; a person clears it, or the resume rule does for a cause that has gone."""
     rung = scene.ladder.step(scene.now_s)
     scene.why = f"fault: {rung.name.lower().replace('_', ' ')}"
+    scene.hold_wanted = False
     if rung == Rung.RAMP_DOWN:
         if scene.state_age_s == 0:
             scene.ramp_from_fraction = scene.last_pump_fraction
@@ -152,7 +210,17 @@ def fault(scene: Scene) -> State:
         scene.pump_fraction = left * scene.ramp_from_fraction
         return State.FAULT
     scene.vent_fraction = 1.0 if rung == Rung.VENT else 0.0
-    if _pump_seen_off(scene) or scene.ladder.age_s(scene.now_s) > scene.config.states.lower_timeout_s:
+    off = _pump_seen_off(scene) or scene.ladder.age_s(scene.now_s) > scene.config.states.lower_timeout_s
+    if scene.acknowledged and off:
+        scene.why = f"fault acknowledged by {scene.asked_by}"
+        return State.STANDBY
+    if scene.may_resume and off:
+        scene.hold_wanted = True
+        scene.why = "the cause has gone and may resume by itself"
+        return State.STANDBY
+    if off and scene.way_down == "stop":
+        scene.finished = Exit.SAFETY_TRIP
+    if off and not scene.config.states.stay_after_trip and not scene.resume_possible:
         scene.finished = Exit.SAFETY_TRIP
     return State.FAULT
 
@@ -163,32 +231,70 @@ HANDLERS: dict[State, Callable[[Scene], State]] = {
     State.INFLATE: inflate,
     State.SETTLE: settle,
     State.HOLD: hold,
+    State.MANUAL: manual,
     State.LOWER: lower,
     State.FAULT: fault,
 }
 
 
-def _stop(scene: Scene) -> State:
-    scene.why = f"stop asked for by {scene.stop_asked_by}"
+def _go_down(scene: Scene) -> State:
+    scene.why = f"{scene.way_down} asked for by {scene.asked_by}"
     return State.LOWER
 
 
-def _drive(scene: Scene) -> LoopOutput:
+def _asked_elsewhere(scene: Scene) -> State | None:
+    """The state that somebody has asked for, if it is another one than a hold."""
+    if scene.way_down is not None:
+        return _go_down(scene)
+    if scene.manual_wanted:
+        scene.hold_wanted = False
+        scene.why = f"{scene.asked_by} has taken the pump"
+        return State.MANUAL
+    return None
+
+
+def _test_actuators(scene: Scene) -> State:
+    reading = scene.observer.reading
+    if scene.test is None:
+        has_vent = reading is not None and math.isfinite(reading.vent_fraction)
+        scene.test = ActuatorTest(scene.config.pump, has_vent)
+    scene.test.step(scene.observer.displacement_um, scene.dt_s)
+    part = scene.test.part
+    if part is not None:
+        scene.pump_fraction, scene.vent_fraction = part.pump_fraction, part.vent_fraction
+        scene.why = f"checking that the film answers: {part.name}"
+        return State.CHECK
+    scene.unfit = scene.test.complaint()
+    if scene.unfit:
+        scene.why = f"the film does not answer: {scene.unfit}"
+        return State.CHECK
+    return _begin(scene, scene.test.leak_um_per_s)
+
+
+def _begin(scene: Scene, leak_um_per_s: float) -> State:
+    """Hand over to the loop, with the flow that balances the leak: the integrator need not find it first."""
+    scene.loop.start(scene.observer.displacement_um, leak_um_per_s)
+    scene.why = f"all sensors good, the film answers; it sinks by {leak_um_per_s:.2f} um/s"
+    scene.pump_fraction = scene.last_pump_fraction
+    return State.INFLATE
+
+
+def _drive(scene: Scene, target_um: float) -> LoopOutput:
     """Let the loop drive the pump: automatic with a valid reading, the held mean flow without one."""
     if math.isfinite(scene.observer.displacement_um):
-        output = scene.loop.step(_given(scene), scene.dt_s)
+        output = scene.loop.step(_given(scene, target_um), scene.dt_s)
     else:
         output = scene.loop.stale(scene.dt_s)
     scene.output = output
     scene.pump_fraction = output.pump_fraction
-    scene.vent_fraction = scene.config.loop.bleed_fraction
+    scene.vent_fraction = scene.loop_config.bleed_fraction
     return output
 
 
-def _given(scene: Scene) -> LoopInput:
+def _given(scene: Scene, target_um: float) -> LoopInput:
     reading = scene.observer.reading
     return LoopInput(
-        target_um=scene.config.loop.setpoint_um,
+        target_um=target_um,
         trim_um=scene.trim_um,
         displacement_um=scene.observer.displacement_um,
         ambient_pressure_pa=reading.ambient_pressure_pa if reading else math.nan,

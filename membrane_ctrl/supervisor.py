@@ -15,14 +15,14 @@ from dataclasses import dataclass, field
 
 from firmware_iface.roles import Bench, BenchCommand, BenchReading, LinkDownError, LinkError
 from membrane_ctrl.clock import RunClock
+from membrane_ctrl.commands import Command
 from membrane_ctrl.controller import Controller
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.ipc.ring import RingReader, RingWriter
 from membrane_ctrl.processes import Child
-from membrane_ctrl.tick import Command, Event, TickInputs
+from membrane_ctrl.tick import Event, TickInputs
 
-SAFE = BenchCommand(pump_fraction=0.0, vent_fraction=0.0)
 # Looking after a child costs a system call; half a second late is soon enough, the loop does not need them
 _CHILD_WATCH_S = 0.5
 
@@ -66,6 +66,7 @@ class Supervisor:
         self._link_error = ""
         self._dead: set[str] = set()
         self._next_watch_s = 0.0
+        self._vent_fraction = 0.0
         self.ticks = 0
         self.missed_ticks = 0
 
@@ -100,7 +101,8 @@ class Supervisor:
                 if finished is not None:
                     return finished
         finally:
-            await self._write(SAFE)
+            # the vent stays as it is: a mirror that is being vented must not be shut by the end of the program
+            await self._write(BenchCommand(0.0, self._vent_fraction))
 
     async def _tick(self, now_s: float, dt_s: float, late_s: float) -> Exit | None:
         wiring = self._wiring
@@ -126,6 +128,7 @@ class Supervisor:
                 truth_laser_bias_um=bias_um,
             )
         )
+        self._vent_fraction = outputs.command.vent_fraction
         await self._write(outputs.command)
         wiring.telemetry.put(outputs.row.pack())
         for event in outputs.events:

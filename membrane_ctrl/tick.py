@@ -8,23 +8,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from firmware_iface.roles import BenchCommand, BenchReading
+from membrane_ctrl.commands import Command
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.telemetry import TelemetryRow
 
 Event = dict[str, Any]  # one line of events.jsonl, without its times
-
-
-@dataclass(frozen=True, slots=True)
-class Command:
-    """What a person or program asks for."""
-
-    kind: Literal["hold", "stop", "shape_on", "shape_off"]
-    who: str
-    why: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +62,27 @@ class TickInputs:
 
 @dataclass(frozen=True, slots=True)
 class TickOutputs:
-    """What a tick decided: the write that ends it, the row for the record, events, and the exit code at the end."""
+    """What a tick decided.
+
+    Attributes
+    ----------
+    command : BenchCommand
+        The write that ends the tick.
+    row : TelemetryRow
+        For the record.
+    events : tuple of Event
+        For the record.
+    finished : Exit or None
+        The run is over, with this exit code.
+    answers : tuple of (int, str)
+        Number of each command of this tick, and why it was refused (empty: obeyed).
+    clear_board : bool
+        The board's own latches are to be cleared: a person said so, or the resume rule does.
+    """
 
     command: BenchCommand
     row: TelemetryRow
     events: tuple[Event, ...]
     finished: Exit | None
+    answers: tuple[tuple[int, str], ...] = ()
+    clear_board: bool = False

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.roles import BenchReading
+from membrane_ctrl.commands import Command
 from membrane_ctrl.config import Config
 from membrane_ctrl.controller import Controller
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.telemetry import TelemetryRow
-from membrane_ctrl.tick import Command, Event, TickInputs
+from membrane_ctrl.tick import Event, TickInputs
 from membrane_ctrl.twin.plant import Plant
 
 ShapeSource = Callable[[float], ShapeEstimate | None]

@@ -43,6 +43,7 @@ BAD = {
     "pressure_missing": replace(GOOD, gauge_pressure_pa=math.nan),
     "following_error": replace(GOOD, error_um=-LIMITS.following_error_max_um - 0.1),
     "overdue": replace(GOOD, overdue="waited too long"),
+    "actuator_test": replace(GOOD, unfit="the vent does nothing"),
     "late": replace(GOOD, lateness_ms=LIMITS.lateness_max_ms + 1),
 }
 

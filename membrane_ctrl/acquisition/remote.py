@@ -32,6 +32,7 @@ class Remote:
         self._control = control
         self._parent_pid = parent_pid
         self._full = False
+        self._said = ("", "")
         self.stop = False
         self.paused = False
 
@@ -62,7 +63,13 @@ class Remote:
         return wanted
 
     def report(self, state: AcquisitionState, message: str = "", **details: object) -> None:
-        """Send a report; it is dropped when the other end does not read, as the cycle must never wait for it."""
+        """Send a report that says something new; a cycle as good as the last is no news for a record of weeks.
+
+        It is dropped when the other end does not read, as the cycle must never wait for it.
+        """
+        if (state, message) == self._said:
+            return
+        self._said = (state, message)
         status = {"kind": "acquisition", "state": state, "message": message, **details}
         try:
             if select.select([], [self._control.fileno()], [], 0)[1]:

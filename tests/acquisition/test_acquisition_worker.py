@@ -167,7 +167,17 @@ def test_closed_line_and_dead_parent_stop_the_process(line: tuple[Connection, Co
 def test_reports_never_wait_for_a_reader(line: tuple[Connection, Connection]) -> None:
     ours, theirs = line
     remote = Remote(theirs, os.getppid())
-    for _ in range(3000):  # far more than the line holds
-        remote.report("running", "x" * 200, cycle=1)
+    for number in range(3000):  # far more than the line holds
+        remote.report("running", f"{number:0200}", cycle=1)
     assert not remote.stop
-    assert ours.recv() == {"kind": "acquisition", "state": "running", "message": "x" * 200, "cycle": 1}
+    assert ours.recv() == {"kind": "acquisition", "state": "running", "message": "0" * 200, "cycle": 1}
+
+
+def test_the_same_report_is_sent_once(line: tuple[Connection, Connection]) -> None:
+    ours, theirs = line
+    remote = Remote(theirs, os.getppid())
+    for cycle in (1, 2, 3):
+        remote.report("running", "ok", cycle=cycle)
+    remote.report("running", "rejected: dark", cycle=4)
+    assert [ours.recv()["cycle"] for _ in range(2)] == [1, 4]
+    assert not ours.poll()

@@ -1,0 +1,96 @@
+"""What may be asked of a running hold: by whom, in which states, and why not.
+
+One table for the control port, the command line and the controller. A refusal is a sentence for a person.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Literal
+
+from membrane_ctrl.config import Config, LoopConfig
+from membrane_ctrl.names import State
+from membrane_ctrl.safety import MOVING
+
+Kind = Literal[
+    "hold", "stop", "pause", "resume", "manual", "setpoint", "gains",
+    "shape_on", "shape_off", "mark", "ack", "lower", "vent",
+]  # fmt: skip
+Role = Literal["read", "operate", "tune"]
+
+ANY = frozenset(State)
+RUNNING = MOVING | {State.STANDBY, State.CHECK}
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What a person or program asks for.
+
+    Attributes
+    ----------
+    kind : str
+    who, why : str
+        Recorded with it.
+    value : float
+        `setpoint`: um. `manual`: flow in um/s of the centre.
+    text : str
+        `mark`: what to write on the timeline.
+    loop : LoopConfig or None
+        `gains`: the loop's new settings, whole.
+    number : int
+        Given by the asker, returned with the answer.
+    """
+
+    kind: Kind
+    who: str
+    why: str = ""
+    value: float = math.nan
+    text: str = ""
+    loop: LoopConfig | None = None
+    number: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One row: the role it takes, the states where it makes sense."""
+
+    role: Role
+    states: Collection[State]
+
+
+TABLE: dict[Kind, Rule] = {
+    "hold": Rule("operate", {State.STANDBY, State.MANUAL}),
+    "stop": Rule("operate", ANY),
+    "pause": Rule("operate", {State.HOLD}),
+    "resume": Rule("operate", {State.HOLD}),
+    "manual": Rule("operate", {State.SETTLE, State.HOLD, State.MANUAL}),
+    "setpoint": Rule("operate", RUNNING),
+    "gains": Rule("tune", RUNNING),
+    "shape_on": Rule("operate", ANY),
+    "shape_off": Rule("operate", ANY),
+    "mark": Rule("operate", ANY),
+    "ack": Rule("operate", {State.STANDBY, State.FAULT}),
+    "lower": Rule("operate", RUNNING),
+    "vent": Rule("operate", ANY),
+}
+
+
+def refusal(command: Command, state: State, config: Config) -> str:
+    """Why a command cannot be obeyed now; empty if it can."""
+    rule = TABLE[command.kind]
+    if state not in rule.states:
+        where = ", ".join(sorted(s.name.lower() for s in rule.states))
+        return f"{command.kind} makes no sense in state {state.name.lower()}; it does in {where}"
+    if command.kind == "setpoint":
+        low, high = config.limits.displacement_min_um, config.limits.displacement_max_um
+        if not low < command.value < high:
+            return f"setpoint {command.value:g} um is outside the limits ({low:g} .. {high:g} um)"
+    if command.kind == "manual" and not 0.0 <= command.value <= config.loop.flow_max_um_per_s:
+        return f"flow {command.value:g} um/s is outside 0 .. {config.loop.flow_max_um_per_s:g} um/s"
+    if command.kind == "gains" and command.loop is None:
+        return "gains without gains"
+    if command.kind == "gains" and command.loop is not None and command.loop.rate_hz != config.loop.rate_hz:
+        return "the tick rate cannot be changed while it ticks"
+    return ""
