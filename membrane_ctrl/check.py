@@ -4,49 +4,66 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 from dataclasses import asdict
-from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
-from firmware_iface.roles import BenchIdentity, BenchReading, LinkError
 from membrane_ctrl.bench import open_bench
-from membrane_ctrl.config import Config
+from membrane_ctrl.config import Config, DevicesConfig
 from membrane_ctrl.errors import DeviceError, Exit
+from membrane_ctrl.probe import Probe, probe_board, probe_roles
+from membrane_ctrl.role_devices import role_devices
 
 
 def check_config(config: Config, source: str, as_json: bool) -> int:
-    """Probe and report. Raises DeviceError (one line) if a device does not answer as it should."""
-    devices: dict[str, Any] = {}
-    if config.devices is not None:
-        identity, reading = asyncio.run(_probe(config))
-        devices = {"board": config.devices.board, "identity": asdict(identity), "reading": asdict(reading)}
+    """Probe and report. Raises DeviceError (one line, after the report) if a device does not answer as it should."""
+    probes = asyncio.run(_probes(config.devices)) if config.devices is not None else []
     would = _what_would_happen(config)
     if as_json:
-        print(json.dumps({"schema": "membrane-check/1", "source": source, "devices": devices, "would": would}))
-        return Exit.DONE
-    table = Table(title=f"{source}: valid", title_justify="left", show_header=False)
-    for key, value in devices.items():
-        rows = value if isinstance(value, dict) else {key: value}
-        for name, entry in rows.items():
-            table.add_row(name, f"{entry:g}" if isinstance(entry, float) else str(entry))
-    for name, line in would.items():
-        table.add_row(name, line)
-    Console().print(table)
+        listed = [{key: _plain(value) for key, value in asdict(probe).items()} for probe in probes]
+        print(json.dumps({"schema": "membrane-check/1", "source": source, "devices": listed, "would": would}))
+    else:
+        _show(source, probes, would)
+    wrong = [probe for probe in probes if probe.problem]
+    if wrong:
+        raise DeviceError(
+            f"{len(wrong)} of {len(probes)} devices cannot be used; {wrong[0].role}: {wrong[0].problem}"
+        )
     return Exit.DONE
 
 
-async def _probe(config: Config) -> tuple[BenchIdentity, BenchReading]:
-    assert config.devices is not None
-    bench = open_bench(config.devices)
-    try:
-        identity = await bench.open()
-        return identity, await bench.read()
-    except LinkError as error:
-        raise DeviceError(f"{config.devices.name}: {error}") from None
-    finally:
-        await bench.close()
+def _plain(value: object) -> object:
+    """A value that JSON has: None for NaN."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+async def _probes(devices: DevicesConfig) -> list[Probe]:
+    if devices.board is not None:
+        return [await probe_board(open_bench(devices), devices.board)]
+    return await probe_roles(role_devices(devices))
+
+
+def _show(source: str, probes: list[Probe], would: dict[str, str]) -> None:
+    console = Console()
+    if probes:
+        table = Table(
+            "role", "device", "identity", "reading", "p50 / p99 ms", "wrong, and what to do", title="devices"
+        )
+        for probe in probes:
+            latency = f"{probe.latency_p50_ms:.1f} / {probe.latency_p99_ms:.1f}" if probe.reading else ""
+            words = (probe.role, probe.device, probe.identity, probe.reading, latency, probe.problem or "nothing")
+            table.add_row(*(escape(word) for word in words))
+        console.print(table)
+    for probe in probes:
+        if probe.notes:
+            console.print(escape(f"{probe.role}: watchdog: {probe.notes}"))
+    table = Table(title=f"{source}: valid", title_justify="left", show_header=False)
+    for name, line in would.items():
+        table.add_row(name, escape(line))
+    console.print(table)
 
 
 def _what_would_happen(config: Config) -> dict[str, str]:

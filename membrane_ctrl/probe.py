@@ -1,0 +1,127 @@
+"""Talks to each device of a configuration once: who it is, what it says, how fast, and what is wrong."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from firmware_iface.role_bench import RoleDevices
+from firmware_iface.roles import Bench, BenchReading, Device, DisplacementSample, LinkError
+
+_READS = 100
+_LONGEST_S = 2.0  # a slow device gets fewer reads
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """What one device said.
+
+    Attributes
+    ----------
+    role : str
+        What it fills; "board" for all of them.
+    device : str
+        Port and settings.
+    identity : str
+        Who answered.
+    reading : str
+        One value, with its unit.
+    latency_p50_ms, latency_p99_ms : float
+        Of a read; NaN without one.
+    problem : str
+        What is wrong and what to do; empty when nothing is.
+    notes : str
+        What to know although nothing is wrong.
+    """
+
+    role: str
+    device: str
+    identity: str = ""
+    reading: str = ""
+    latency_p50_ms: float = math.nan
+    latency_p99_ms: float = math.nan
+    problem: str = ""
+    notes: str = ""
+
+
+async def probe_board(bench: Bench, name: str) -> Probe:
+    """Open the board, read it, close it."""
+    try:
+        identity = await bench.open()
+        reading, p50_ms, p99_ms = await _timed(bench.read)
+    except LinkError as error:
+        return Probe("board", name, problem=str(error))
+    finally:
+        await bench.close()
+    who = f"{identity.kind} {identity.firmware}, map {identity.map_version}, watchdog {identity.watchdog_s:g} s"
+    return Probe("board", name, who, _board_reading(reading), p50_ms, p99_ms, _board_problem(reading))
+
+
+def _board_reading(reading: BenchReading) -> str:
+    return (
+        f"{reading.displacement_um:.2f} um, {reading.gauge_pressure_pa:.1f} Pa gauge, "
+        f"{reading.ambient_pressure_pa:.1f} Pa ambient, {reading.air_temperature_c:.2f} degC"
+    )
+
+
+def _board_problem(reading: BenchReading) -> str:
+    if reading.latched_faults:
+        return f"faults {reading.latched_faults:#x} are latched (docs/registers.md); find out why"
+    if not math.isfinite(reading.displacement_um):
+        return f"the laser has no value (code {reading.displacement_quality}); check its aim"
+    return "" if math.isfinite(reading.gauge_pressure_pa) else "no gauge pressure; check the sensor"
+
+
+async def probe_roles(devices: RoleDevices) -> list[Probe]:
+    """Open, read and close each device, one after the other; a failed one does not hide the next."""
+    reads: dict[str, tuple[Callable[[Any], Callable[[], Awaitable[Any]]], str]] = {
+        "displacement": (lambda device: device.displacement, "um"),
+        "gauge_pressure": (lambda device: device.gauge_pressure_pa, "Pa"),
+        "barometer": (lambda device: device.ambient_pressure_pa, "Pa"),
+        "thermometer": (lambda device: device.air_temperature_c, "degC"),
+        "pump": (lambda device: device.pump_fraction, "of full scale"),
+        "vent": (lambda device: device.vent_fraction, "of full scale"),
+    }
+    probes = []
+    for role, device in devices.by_role().items():
+        read, unit = reads[role]
+        probes.append(await _probe(role, device, read(device), unit))
+    return probes
+
+
+async def _probe(role: str, device: Device, read: Callable[[], Awaitable[Any]], unit: str) -> Probe:
+    where = device.describe()
+    name, notes = where.get("port", ""), where.get("watchdog", "")
+    try:
+        found = await device.open()
+        value, p50_ms, p99_ms = await _timed(read)
+    except LinkError as error:
+        return Probe(role, name, problem=str(error), notes=notes)
+    finally:
+        await device.close()
+    identity = " ".join(part for part in (found.kind, found.serial, found.firmware, found.detail) if part)
+    problem = ""
+    if isinstance(value, DisplacementSample):
+        problem = "" if value.quality == 0 else f"no value, error code {value.quality}; check its aim and its manual"
+        value = value.displacement_um
+    if not problem and not math.isfinite(value):
+        problem = "it answers, but has no value"
+    return Probe(role, name, identity, f"{value:.6g} {unit}", p50_ms, p99_ms, problem, notes)
+
+
+async def _timed(read: Callable[[], Awaitable[Any]]) -> tuple[Any, float, float]:
+    """The last value of many reads, and how long they took (p50, p99) in ms."""
+    took_ms: list[float] = []
+    give_up_s = time.monotonic() + _LONGEST_S
+    while len(took_ms) < _READS and time.monotonic() < give_up_s:
+        begin_s = time.monotonic()
+        value = await read()
+        took_ms.append(1e3 * (time.monotonic() - begin_s))
+        await asyncio.sleep(0)
+    return value, float(np.percentile(took_ms, 50)), float(np.percentile(took_ms, 99))
