@@ -19,14 +19,10 @@ from membrane_ctrl.twin import pump as twin_pump
 from membrane_ctrl.twin.events import Event
 from membrane_ctrl.twin.plant import Plant
 from tuning.candidates import amigo, simc, ziegler_nichols
+from tuning.characterise import Characterised, characterise
 from tuning.design import propose, relay_ultimate
 from tuning.disturbance_model import observe
-from tuning.experiments import Finished, Patterned
-from tuning.identify import Identified, identify
-from tuning.patterns import doublets
-from tuning.quality import judge, validate
-from tuning.records import Measurement, Record
-from tuning.relay import Relay
+from tuning.records import Measurement
 from tuning.rig import Rig
 
 SETTLE_S = 40.0
@@ -98,41 +94,15 @@ class TwinBench:
         return Measurement(sample.displacement_um, sample.ambient_pressure_pa, sample.air_temperature_c)
 
 
-@dataclass(frozen=True, slots=True)
-class Characterised:
-    """The experiments of one session: relay, a short hold, doublets."""
-
-    relay: Record
-    doublets: Record
-    whole: Record
-    ended: tuple[Finished, Finished]
-    excursion_um: float
-
-
-def characterise(rig: Rig, bench: TwinBench) -> Characterised:
-    """Hold, relay, hold, doublets; `excursion_um` is the true one in the experiments."""
-    around = rig.around(rig.hold(60.0).part(20.0, 60.0))
-    start = len(bench.true_um)
-    relay, relay_end = rig.run(Relay(around, 0.0), around, 0.0)
-    excursion_um = max(abs(x) for x in bench.true_um[start:])
-    between = rig.hold(15.0)
-    start = len(bench.true_um)
-    gain = identify(relay).model.gain
-    pulses, pulses_end = rig.run(Patterned(around, doublets(around, gain), 60.0, 0.0), around, 0.0)
-    excursion_um = max(excursion_um, *(abs(x) for x in bench.true_um[start:]))
-    whole = relay.followed_by(between, pulses)
-    return Characterised(relay, pulses, whole, (relay_end, pulses_end), excursion_um)
-
-
 def identified(case: Case, seed: int) -> dict[str, float]:
     """One session's identification against the truth."""
     bench = TwinBench(case, seed)
     rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
-    done = characterise(rig, bench)
-    return _identified(case, done, identify(done.whole))
+    return _identified(case, bench, characterise(rig))
 
 
-def _identified(case: Case, done: Characterised, found: Identified) -> dict[str, float]:
+def _identified(case: Case, bench: TwinBench, done: Characterised) -> dict[str, float]:
+    found = done.identified
     model, sigma = found.model, found.sigma
     delay_error_s = model.delay_s - TRUE_DELAY_S * case.delay
     dead_error_s = model.dead_time_s - (TRUE_DELAY_S - twin_pump.LAG_S) * case.delay
@@ -146,8 +116,9 @@ def _identified(case: Case, done: Characterised, found: Identified) -> dict[str,
         "delay_error_s": delay_error_s,
         "delay_sigma_s": sigma.delay_s,
         "delay_z": delay_error_s / sigma.delay_s,
-        "excursion_um": done.excursion_um,
-        "completed": float(all(end.completed for end in done.ended)),
+        "excursion_um": max(abs(x) for x in bench.true_um),
+        "duration_s": bench.plant.time_s,
+        "completed": float(done.finished.completed),
     }
 
 
@@ -155,15 +126,15 @@ def session(case: Case, seed: int, rules: bool = False) -> dict[str, float]:
     """A whole session on one twin, then the true centre in fresh weather; with `rules` also the textbook's gains."""
     bench, before = TwinBench(case, seed), case.loop()
     rig = Rig(bench, before, PumpConfig(), case.holding_flow_um_per_s)
-    done = characterise(rig, bench)
-    found = identify(done.whole)
+    done = characterise(rig)
+    found = done.identified
+    figures = _identified(case, bench, done)
     rig.hold(SETTLE_S)
     disturbance = observe(rig.hold(OBSERVE_S), found.model, before)
-    quality = judge(done.whole, found, validate(identify(done.relay), done.doublets))
-    proposal = propose(found, disturbance, before, PumpConfig(), quality)
+    proposal = propose(found, disturbance, before, PumpConfig(), done.quality)
     least_um = least_std_um(before, case.twin(seed))
     assert proposal.chosen.predicted is not None
-    figures = _identified(case, done, found) | {
+    figures |= {
         "predicted_um": proposal.chosen.predicted.std_um,
         "preview_um": proposal.preview.std_um,
         "bound_said_um": proposal.least_std_um,
@@ -172,7 +143,7 @@ def session(case: Case, seed: int, rules: bool = False) -> dict[str, float]:
         "ti_s": proposal.loop.ti_s,
         "filter_s": proposal.loop.measurement_filter_s,
         "ms": proposal.chosen.margins.ms,
-        "degraded": float(quality.verdict == "degraded"),
+        "degraded": float(done.quality.verdict == "degraded"),
     }
     figures |= achieved("ours", proposal.loop, case, seed, least_um)
     figures["predicted_over_achieved"] = figures["predicted_um"] / figures["ours_um"]
@@ -241,8 +212,8 @@ def run(seeds: int = 16) -> dict[str, Any]:
 def _print(figures: dict[str, Any]) -> None:
     print(
         "| bench | k error: mean, worst | 2 sigma | dead time error s: mean, worst | 2 sigma "
-        "| delay error s: mean, worst | within 2 sigma (k, dead time, delay) | excursion um, worst |\n|---"
-        + "|---" * 7
+        "| delay error s: mean, worst | within 2 sigma (k, dead time, delay) | excursion um, worst | minutes |\n|---"
+        + "|---" * 8
         + "|"
     )
     for name, case in (figures["sessions"] | figures["plants"]).items():
@@ -251,7 +222,8 @@ def _print(figures: dict[str, Any]) -> None:
         print(
             f"| {name} | {k['mean']:+.1%}, {_worst(k):.1%} | {2 * case['gain_sigma']['mean']:.1%} "
             f"| {dead['mean']:+.3f}, {_worst(dead):.3f} | {2 * case['dead_time_sigma_s']['mean']:.3f} "
-            f"| {delay['mean']:+.3f}, {_worst(delay):.3f} | {cover} | {case['excursion_um']['max']:.1f} |"
+            f"| {delay['mean']:+.3f}, {_worst(delay):.3f} | {cover} | {case['excursion_um']['max']:.1f} "
+            f"| {case['duration_s']['mean'] / 60:.1f} |"
         )
     print(
         "\n| bench | least um | achieved um | / least: mean, worst | predicted / achieved: min, max "

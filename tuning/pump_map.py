@@ -24,12 +24,12 @@ _PROBE_MIN_S, _PROBE_MAX_S = 1.5, 5.0
 _TRAVEL_UM = 6.0  # of a probe in which the mirror sinks
 _SKIP_S = 0.8  # of a probe: transport and five lags
 _NEAR_UM = 1.0
-_REPEATS = 3  # of the curve, which start and stall are judged by
+_REPEATS = 3
 _CURVE_STEP = 0.2  # between the two commands that give the curve: flows of about one and two leaks
 _RETURN_MAX_S = 60.0
 _RUN_FRACTION = 0.45  # surely running
-_BISECTIONS = 5  # of a range of 0.35: to 0.01
-_LOWEST, _HIGHEST = 0.05, 0.40
+_START_BISECTIONS, _STALL_BISECTIONS = 5, 3  # each to about 0.015
+_HIGHEST = 0.40
 # Share of the flow a running pump would give at the command, from which on it counts as running.
 _RUNS_SHARE = 0.5
 
@@ -148,6 +148,13 @@ class PumpMapper:
             return Finished(False, f"the mirror did not {way} back in {_RETURN_MAX_S:g} s: too tight, or no pump")
         return 0.0 if off_um > 0 else max(_RUN_FRACTION, self._holding_fraction)
 
+    def _mean_flow(self, prepare_fraction: float, fraction: float) -> Generator[Probe, None, float]:
+        """Mean of some measurements: one has an error of 0.1 um/s, and just above stalling there is no more flow."""
+        total = 0.0
+        for _ in range(_REPEATS):
+            total += yield from self._flow(prepare_fraction, fraction)
+        return total / _REPEATS
+
     def _flow(self, prepare_fraction: float, fraction: float) -> Generator[Probe, None, float]:
         """Flow at a command: speed with it less speed without the pump, one right after the other.
 
@@ -163,14 +170,12 @@ class PumpMapper:
         low = self._holding_fraction + 0.02
         flows = []
         for fraction in (low, low + _CURVE_STEP):
-            total = 0.0
-            for _ in range(_REPEATS):
-                total += yield from self._flow(_RUN_FRACTION, fraction)
-            flows.append(total / _REPEATS)
+            flows.append((yield from self._mean_flow(_RUN_FRACTION, fraction)))
         slope = (flows[1] - flows[0]) / _CURVE_STEP
-        dead = low - flows[0] / slope if slope > 0 else math.nan
-        start = yield from self._edge(0.0, slope, dead)
-        stall = yield from self._edge(_RUN_FRACTION, slope, dead)
+        dead = max(0.0, low - flows[0] / slope) if slope > 0 else 0.0
+        start = yield from self._edge(0.0, dead, _HIGHEST, _START_BISECTIONS, slope, dead)
+        highest = start if math.isfinite(start) else _HIGHEST
+        stall = yield from self._edge(_RUN_FRACTION, dead, highest, _STALL_BISECTIONS, slope, dead)
         leak = float(np.mean(self._sinking_um_per_s))
         self.result = PumpMap(
             leak_um_per_s=leak,
@@ -183,12 +188,13 @@ class PumpMapper:
             too_tight=leak < TOO_TIGHT_UM_PER_S,
         )
 
-    def _edge(self, prepare_fraction: float, slope: float, dead: float) -> Generator[Probe, None, float]:
-        """Lowest command at which a standing (or running) pump runs; NaN if none in the range does."""
-        off, on = _LOWEST, _HIGHEST
-        for _ in range(_BISECTIONS):
+    def _edge(
+        self, prepare_fraction: float, off: float, on: float, steps: int, slope: float, dead: float
+    ) -> Generator[Probe, None, float]:
+        """Lowest command at which a standing (or running) pump runs, by bisection; NaN if none up to `on` does."""
+        highest = on
+        for _ in range(steps):
             middle = (off + on) / 2
-            flow = yield from self._flow(prepare_fraction, middle)
-            runs = flow > _RUNS_SHARE * max(slope * (middle - dead), 0.0)
-            off, on = (off, middle) if runs and middle > dead else (middle, on)
-        return on if on < _HIGHEST else math.nan
+            flow = yield from self._mean_flow(prepare_fraction, middle)
+            off, on = (off, middle) if flow > _RUNS_SHARE * slope * (middle - dead) else (middle, on)
+        return on if on < highest else math.nan

@@ -7,11 +7,11 @@ import numpy as np
 from tuning.plant_model import PlantModel
 from tuning.records import Record, Series
 
-FINE = 40
+FINE = 10
 
 
 def way_um(flow: Series, model: PlantModel, dt_s: float) -> Series:
-    """Centre at each reading by Euler steps of dt / 40, from rest at the first flow."""
+    """Centre at each reading by Euler steps of dt / 10, from rest at the first flow."""
     step_s = dt_s / FINE
     held = np.repeat(flow, FINE)
     late = round(model.dead_time_s / step_s)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import tuning
-from benchmarks.tuning import SESSIONS, Case, TwinBench, characterise, session
+from benchmarks.tuning import SESSIONS, Case, TwinBench, session
 from membrane_ctrl.config import LoopConfig, PumpConfig
+from tuning.characterise import characterise
 from tuning.design import RefusedError, propose, table
 from tuning.disturbance_model import observe
-from tuning.identify import identify
 from tuning.preview import ModelBench, preview
 from tuning.quality import Quality
 from tuning.rig import Rig
@@ -28,9 +28,16 @@ RATIO_MAX = {
 }
 
 
-@pytest.mark.parametrize("name", RATIO_MAX)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "typical, 1 um",
+        "gusty, 1 um",
+        *(pytest.param(n, marks=pytest.mark.campaign) for n in ("quiet, 1 um", "quiet, 0.3 um", "typical, 0.3 um")),
+    ],
+)
 def test_a_session_reaches_what_it_must(name: str) -> None:
-    figures = session(SESSIONS[name], 3)
+    figures = session(SESSIONS[name], 3, rules=name == "typical, 1 um")
     # a run of 600 s has a standard deviation that scatters by some per cent
     assert figures["ours_ratio"] < 1.05 * RATIO_MAX[name]
     assert 0.7 < figures["predicted_over_achieved"] < 1.3
@@ -41,6 +48,8 @@ def test_a_session_reaches_what_it_must(name: str) -> None:
     assert abs(figures["dead_time_error_s"]) < 0.1
     assert figures["excursion_um"] < 10.0
     assert figures["ms"] <= 1.42
+    for key, factor in (("default_um", 1.0), ("simc_um", 1.0), ("amigo_um", 1.0), ("zn_um", 3.0)):
+        assert key not in figures or factor * figures["ours_um"] < figures[key], key
 
 
 def test_with_weather_sensors_and_bleed_it_beats_the_laser_alone() -> None:
@@ -50,20 +59,13 @@ def test_with_weather_sensors_and_bleed_it_beats_the_laser_alone() -> None:
     assert 0.7 < figures["predicted_over_achieved"] < 1.3
 
 
-def test_it_beats_the_textbooks_on_the_same_plant() -> None:
-    figures = session(Case(), 5, rules=True)
-    for other in ("default", "simc", "amigo"):
-        assert figures["ours_um"] < figures[f"{other}_um"], other
-    assert figures["zn_um"] > 3 * figures["ours_um"]
-
-
 @pytest.fixture(scope="module")
 def designed():  # type: ignore[no-untyped-def]
     """One characterised bench: identified, disturbance, loop."""
     case = Case()
     bench = TwinBench(case, 4)
     rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
-    found = identify(characterise(rig, bench).whole)
+    found = characterise(rig).identified
     rig.hold(30.0)
     return found, observe(rig.hold(300.0), found.model, case.loop()), case.loop()
 
