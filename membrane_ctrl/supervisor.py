@@ -107,7 +107,9 @@ class Supervisor:
     async def _tick(self, now_s: float, dt_s: float, late_s: float) -> Exit | None:
         wiring = self._wiring
         self.ticks += 1
-        reading = await self._read()
+        if not self._link_up:
+            await self._reconnect()
+        reading = await self._read() if self._link_up else None
         if now_s >= self._next_watch_s:
             self._next_watch_s = now_s + _CHILD_WATCH_S
             self._watch()
@@ -129,6 +131,8 @@ class Supervisor:
             )
         )
         self._vent_fraction = outputs.command.vent_fraction
+        if outputs.clear_board:
+            await self._clear_board()
         await self._write(outputs.command)
         wiring.telemetry.put(outputs.row.pack())
         for event in outputs.events:
@@ -142,6 +146,21 @@ class Supervisor:
             self._link_failed(error)
             return None
         return reading
+
+    async def _reconnect(self) -> None:
+        """Try the lost link again; the link backs off by itself, and there is nothing to be late for meanwhile."""
+        try:
+            await self._wiring.bench.open()
+        except LinkError:
+            return
+        self._link_up, self._link_error = True, ""
+        self.tell({"kind": "link", "message": "connected again"})
+
+    async def _clear_board(self) -> None:
+        try:
+            await self._wiring.bench.clear_faults()
+        except LinkError as error:
+            self._link_failed(error)
 
     async def _write(self, command: BenchCommand) -> None:
         """The write that ends a tick and feeds the board's watchdog."""
