@@ -49,17 +49,16 @@ async def _probes(devices: DevicesConfig) -> list[Probe]:
 def _show(source: str, probes: list[Probe], would: dict[str, str]) -> None:
     console = Console()
     if probes:
-        table = Table(
-            "role", "device", "identity", "reading", "p50 / p99 ms", "wrong, and what to do", title="devices"
-        )
+        table = Table("role", "device", "identity", "reading", "p50 / p99 ms")
         for probe in probes:
             latency = f"{probe.latency_p50_ms:.1f} / {probe.latency_p99_ms:.1f}" if probe.reading else ""
-            words = (probe.role, probe.device, probe.identity, probe.reading, latency, probe.problem or "nothing")
+            words = (probe.role, probe.device, probe.identity or "not usable", probe.reading, latency)
             table.add_row(*(escape(word) for word in words))
         console.print(table)
     for probe in probes:
-        if probe.notes:
-            console.print(escape(f"{probe.role}: watchdog: {probe.notes}"))
+        for word, line in (("wrong", probe.problem), ("watchdog", probe.notes)):
+            if line:
+                console.print(escape(f"{probe.role}: {word}: {line}"), soft_wrap=True)
     table = Table(title=f"{source}: valid", title_justify="left", show_header=False)
     for name, line in would.items():
         table.add_row(name, escape(line))

@@ -16,6 +16,7 @@ from firmware_iface.roles import Bench, BenchReading, Device, DisplacementSample
 
 _READS = 100
 _LONGEST_S = 2.0  # a slow device gets fewer reads
+_BACK_OFF_S = 0.2  # a bus that the device before could not open is left alone for this long
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +93,8 @@ async def probe_roles(devices: RoleDevices) -> list[Probe]:
     for role, device in devices.by_role().items():
         read, unit = reads[role]
         probes.append(await _probe(role, device, read(device), unit))
+        if probes[-1].problem:
+            await asyncio.sleep(_BACK_OFF_S)
     return probes
 
 
