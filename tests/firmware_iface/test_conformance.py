@@ -1,0 +1,218 @@
+"""The conformance test passes the emulated board and fails each broken one for the right reason."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import pytest
+from counting_plant import CountingPlant, ManualClock
+
+from firmware_iface.conformance import Conformance, Finding, examine
+from firmware_iface.emulators.board_state import BoardSample, BoardState
+from firmware_iface.emulators.modbus_rtu import RtuBusEmulator
+from firmware_iface.emulators.modbus_server import RegisterRefusal, respond
+from firmware_iface.emulators.pump_board import PumpBoardEmulator
+from firmware_iface.emulators.wires import PtyWire
+from firmware_iface.links.modbus_tcp import GuardedModbusTcp
+from firmware_iface.links.serial_port import SerialSettings
+from firmware_iface.register_map import default_map
+from firmware_iface.roles import LinkError
+
+PUMP, VENT, HEARTBEAT = 56, 57, 58
+
+
+class NoWatchdog(BoardState):
+    """Never trips."""
+
+    def advance(self, now_s: float, sample: BoardSample) -> None:
+        super().advance(now_s, sample)
+        self._fed_s = now_s
+
+
+class HoldsLastValue(BoardState):
+    """Trips and says so, and goes on with the last command."""
+
+    @property
+    def pump_fraction(self) -> float:
+        return self.last
+
+    last = 0.0
+
+    def write(self, address: int, words: Sequence[int]) -> None:
+        super().write(address, words)
+        if address == PUMP:
+            self.last = words[0] / 50_000
+
+
+class AcceptsOutOfRange(BoardState):
+    """Takes whatever is written to a single register, without doing anything about it."""
+
+    def write(self, address: int, words: Sequence[int]) -> None:
+        try:
+            super().write(address, words)
+        except RegisterRefusal:
+            if len(words) != 1 or address < 48:
+                raise
+
+
+class AnyWriteFeeds(BoardState):
+    """Feeds the watchdog with every write of the pump command, whatever the heartbeat."""
+
+    def write(self, address: int, words: Sequence[int]) -> None:
+        super().write(address, words)
+        if address == PUMP:
+            self._fed_s = self._now_s
+
+
+class DisarmsAnyTime(BoardState):
+    """Lets itself be disarmed with the pump running."""
+
+    def write(self, address: int, words: Sequence[int]) -> None:
+        if list(words[-1:]) == [0] and address == 48:
+            self._settable["pump_command_fraction"] = 0.0
+        super().write(address, words)
+
+
+class Frozen(BoardState):
+    """Shows the first sample for ever."""
+
+    def advance(self, now_s: float, sample: BoardSample) -> None:
+        super().advance(now_s, self._sample)
+
+
+class ForgetsPeriod(BoardState):
+    """Says yes to a watchdog period and keeps its own."""
+
+    def write(self, address: int, words: Sequence[int]) -> None:
+        super().write(address, words)
+        self._settable["watchdog_period_s"] = 1.0
+
+
+class StartsWhenCleared(BoardState):
+    """Goes on with the last command as soon as the fault is cleared."""
+
+    last = 0.0
+
+    def write(self, address: int, words: Sequence[int]) -> None:
+        super().write(address, words)
+        if address == PUMP:
+            self.last = words[0] / 50_000
+        elif address == 64:
+            self._settable["pump_command_fraction"] = self.last
+
+
+class OtherMap(BoardState):
+    """Of a later map."""
+
+    def read(self, address: int, count: int) -> list[int]:
+        self.map_version = 7
+        return super().read(address, count)
+
+
+class ClockedPlant(CountingPlant):
+    """Its samples are stamped with the test's clock."""
+
+    def __init__(self, clock: ManualClock) -> None:
+        super().__init__()
+        self._clock = clock
+
+    def sample(self) -> BoardSample:
+        return replace(super().sample(), device_time_s=self._clock())
+
+
+@dataclass
+class Bench:
+    """An emulated board of some kind, on a clock that the conformance test's own waiting moves."""
+
+    board: PumpBoardEmulator
+    clock: ManualClock
+
+    async def examine(self) -> list[Finding]:
+        async def sleep(duration_s: float) -> None:
+            self.clock.now_s += duration_s
+            await asyncio.sleep(0)
+
+        link = GuardedModbusTcp("127.0.0.1", self.board.port, 1, 5.0)
+        await link.connect()
+        try:
+            return await Conformance(link, sleep).run()
+        finally:
+            await link.close()
+
+
+@pytest.fixture
+async def serve() -> AsyncIterator[Callable[[type[BoardState]], Awaitable[Bench]]]:
+    benches: list[Bench] = []
+
+    async def make(kind: type[BoardState]) -> Bench:
+        clock = ManualClock()
+        plant = ClockedPlant(clock)
+        bench = Bench(PumpBoardEmulator(plant, clock=clock), clock)
+        bench.board.state = kind(default_map(), plant.sample())
+        benches.append(bench)
+        await bench.board.start()
+        return bench
+
+    yield make
+    for bench in benches:
+        await bench.board.stop()
+
+
+def problems(findings: list[Finding]) -> dict[str, str]:
+    return {finding.check: finding.problem for finding in findings if finding.problem}
+
+
+async def test_the_emulator_conforms(serve: Callable[[type[BoardState]], Awaitable[Bench]]) -> None:
+    bench = await serve(BoardState)
+    findings = await bench.examine()
+    assert problems(findings) == {}
+    assert len(findings) == 14
+    assert bench.board.state.pump_fraction == 0.0
+    assert bench.board.state.read(49, 1) == [0]  # left as it was found: watchdog off
+
+
+async def test_the_emulator_conforms_over_rtu_and_in_real_time(tmp_path: Path) -> None:
+    plant = CountingPlant()
+    board = PumpBoardEmulator(plant)
+    await board.start()
+    settings = SerialSettings(115_200, parity="E")
+    wire = PtyWire(RtuBusEmulator(settings, {1: partial(respond, table=board.state)}), tmp_path / "tty")
+    wire.plug()
+    try:
+        findings = await examine(f"rtu://{tmp_path}/tty?baud=115200&parity=E")
+    finally:
+        wire.unplug()
+        await board.stop()
+    assert problems(findings) == {}
+
+
+@pytest.mark.parametrize(
+    ("kind", "check", "words"),
+    [
+        (NoWatchdog, "a silent host stops the pump", "holds the pump at 0.05 after a host silent"),
+        (HoldsLastValue, "a silent host stops the pump", "holds the pump at 0.05 after a host silent"),
+        (AcceptsOutOfRange, "values outside the limits are refused", "accepts watchdog_period_s = 0.049"),
+        (AnyWriteFeeds, "the same heartbeat does not feed", "writes that repeat one heartbeat"),
+        (AnyWriteFeeds, "half a command does not feed", "writes of the pump command alone"),
+        (DisarmsAnyTime, "disarming is refused while the pump is commanded", "be disarmed while the pump is comm"),
+        (Frozen, "samples advance", "sample_counter stands still"),
+        (ForgetsPeriod, "settings are read back as written", "written 0.3, read back 1"),
+        (StartsWhenCleared, "clearing sets the pump to 0", "starts the pump at 0.05"),
+        (OtherMap, "identity", "map version is 7"),
+    ],
+)
+async def test_a_broken_board_fails_for_the_right_reason(
+    serve: Callable[[type[BoardState]], Awaitable[Bench]], kind: type[BoardState], check: str, words: str
+) -> None:
+    bench = await serve(kind)
+    found = problems(await bench.examine())
+    assert words in found[check]
+
+
+async def test_nobody_there_is_an_error_and_no_finding() -> None:
+    with pytest.raises(LinkError):
+        await examine("tcp://127.0.0.1:9")
