@@ -104,7 +104,8 @@ class ShapeConfig(Section):
     period_s: Annotated[float, Field(ge=0.2, le=3600)] = 2.0
     frame_interval_s: Annotated[float, Field(ge=0.0, le=10)] = 0.1
     bin_px: Annotated[int, Field(ge=1, le=16)] = 4
-    time_constant_s: Annotated[float, Field(ge=1, le=1e5)] = 60.0
+    # a laser mount that sets off at 2 um/min is then followed within 0.5 um (control/drift.py)
+    time_constant_s: Annotated[float, Field(ge=1, le=1e5)] = 40.0
     trim_rate_max_um_per_s: Annotated[float, Field(gt=0, le=10)] = 0.1
     trim_max_um: Annotated[float, Field(gt=0, le=1000)] = 100.0
     fresh_s: Annotated[float, Field(gt=0, le=3600)] = 15.0

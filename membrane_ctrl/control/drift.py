@@ -15,11 +15,6 @@ from __future__ import annotations
 
 import math
 
-# While the memory is short of readings it is cut to this share of their age, ...
-YOUNG_SHARE = 0.5
-# ... but not below this part of the full memory: the noise then is sqrt(3) of what it will be.
-YOUNG_LEAST = 1.0 / 3.0
-
 
 class DriftTracker:
     """Value and rate of a drift that is 0 at the beginning.
@@ -32,14 +27,16 @@ class DriftTracker:
 
     def __init__(self, memory_s: float) -> None:
         self._memory_s = memory_s
-        self._begin_s = math.nan
         self._time_s = math.nan
         self._value_um = 0.0
         self._rate_um_per_s = 0.0
 
     def begin(self, time_s: float) -> None:
-        """The drift is 0 at this time and nothing is known of its rate."""
-        self._begin_s = self._time_s = time_s
+        """The drift is 0 at this time, and its rate is taken for 0.
+
+        A short memory at first would find an old drift sooner, but its noise would move a mirror that stands still.
+        """
+        self._time_s = time_s
         self._value_um = self._rate_um_per_s = 0.0
 
     def at(self, time_s: float) -> float:
@@ -49,8 +46,7 @@ class DriftTracker:
     def take(self, reading_um: float, time_s: float) -> None:
         """Take a reading, later than the last one, into the memory."""
         dt_s = time_s - self._time_s
-        young_s = max(YOUNG_SHARE * (time_s - self._begin_s), YOUNG_LEAST * self._memory_s)
-        beta = math.exp(-dt_s / min(self._memory_s, young_s))
+        beta = math.exp(-dt_s / self._memory_s)
         expected_um = self.at(time_s)
         residual_um = reading_um - expected_um
         self._value_um = expected_um + (1.0 - beta**2) * residual_um
