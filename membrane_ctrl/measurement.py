@@ -116,9 +116,9 @@ def measure_capture(
     except RejectedSetError as error:
         timing = {"load": load_s, "phase": time.perf_counter() - begin, "reconstruct": 0.0}
         return Measurement(capture.head, "rejected", str(error), error.flags, None, None, mean_um, timing)
-    pixels = measure_pixels(stack, optics, checked)
+    pixels = measure_pixels(optics, checked)
     middle = time.perf_counter()
-    full = reconstruct_full(stack, optics, checked, pixels, start)
+    full = reconstruct_full(optics, checked, pixels, start)
     end = time.perf_counter()
     verdict, reason = judge(full.quality)
     if verdict == "ok":

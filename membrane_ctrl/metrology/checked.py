@@ -61,6 +61,8 @@ class Checked:
 
     Attributes
     ----------
+    stack : FrameStack
+        The frames, swapped ones put back.
     binned : Binned
         The frames over bins.
     view : View
@@ -77,6 +79,7 @@ class Checked:
         Frames that do not belong.
     """
 
+    stack: FrameStack
     binned: Binned
     view: View
     phase_rad: FloatArray
@@ -130,56 +133,79 @@ def check(stack: FrameStack, optics: OpticsConfig, anchor: Anchor | None = None)
     """
     binned = bin_frames(stack, 2**optics.camera.bits - 1)
     geometry = Geometry.from_config(optics)
-    tracer = Tracer(geometry, optics.mirror.radius_mm, vertex_z_mm(optics, stack.mean_reading_um))
     grid = BinGrid(geometry, optics.camera, binned.bin_px)
-    analysis_mm = optics.mirror.analysis_radius_mm
-    beside = grid.near_mirror(analysis_mm + _FILM_BESIDE_PLANE_MM)
-    near = np.flatnonzero(beside)
-    excluded = dict.fromkeys(stack.unusable, 0.0)
-    unreadable = [Flag(k, reason, math.inf) for k, reason in stack.unusable.items()]
+    near = grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
+    known = {frame: Flag(frame, reason, math.inf) for frame, reason in stack.unusable.items()}
+    excluded = set(stack.unusable)
     flags: list[Flag] = []
     for _ in range(_ROUNDS):
         try:
-            view = look(stack, binned, excluded, None if anchor is None else anchor.light)
-            phase = _absolute(stack, binned, view, excluded, anchor, optics)
-            state = establish(grid, tracer, near, phase.reshape(2, -1)[:, near], optics.pattern, analysis_mm)
+            attempt = _attempt(stack, binned, optics, geometry, grid, near, excluded, anchor)
         except (NoFigureError, ValueError) as error:
-            raise RejectedSetError(str(error), _all(unreadable, flags, excluded)) from None
-        flags = inspect(stack, binned, _scene(tracer, state, view, optics), excluded)
+            raise RejectedSetError(str(error), _merged(flags, known)) from None
+        flags = inspect(stack, binned, attempt.scene, excluded)
         fresh = [flag for flag in flags if flag.frame not in excluded]
         if not fresh:
-            _confirm_orders(stack, phase, binned, view, excluded)
-            found = _all(unreadable, flags, excluded)
-            return Checked(binned, view, phase, beside.reshape(view.mask.shape), tracer, state, found)
-        for group in _groups(stack):
-            worst = next((flag for flag in fresh if flag.frame in group), None)
-            if worst is not None:
-                excluded[worst.frame] = worst.severity
-    raise RejectedSetError("the frames do not agree, whichever are left out", _all(unreadable, flags, excluded))
+            _confirm_orders(stack, attempt.phase_rad, binned, attempt.view, excluded, _merged(flags, known))
+            shape = attempt.view.mask.shape
+            fitted = (attempt.view, attempt.phase_rad, near.reshape(shape), attempt.tracer, attempt.state)
+            return Checked(stack, binned, *fitted, _merged(flags, known))
+        pair = next((flag for flag in fresh if flag.swapped_with is not None), None)
+        if pair is not None and pair.swapped_with is not None and not {pair.frame, pair.swapped_with} & set(known):
+            order = list(range(len(stack.patterns)))
+            order[pair.frame], order[pair.swapped_with] = pair.swapped_with, pair.frame
+            stack, binned = stack.reordered(order), binned.reordered(order)
+            known |= {flag.frame: flag for flag in flags if flag.frame in (pair.frame, pair.swapped_with)}
+            continue
+        chosen = {flag.frame: flag for flag in _to_leave_out(stack, fresh)}
+        known |= chosen
+        excluded |= set(chosen)
+    raise RejectedSetError("the frames do not agree, whichever are left out", _merged(flags, known))
 
 
-def _groups(stack: FrameStack) -> list[set[int]]:
-    """Frames of which one at a time is left out: each axis' sinusoids; the others spoil nobody's prediction."""
-    sinusoids = [set(stack.sinusoids(axis)) for axis in AXES]
-    others = set(range(len(stack.patterns))) - sinusoids[0] - sinusoids[1]
-    return [*sinusoids, *({k} for k in others)]
+@dataclass(frozen=True)
+class _Attempt:
+    view: View
+    phase_rad: FloatArray
+    tracer: Tracer
+    state: TrackedPoints
+    scene: Scene
 
 
-def _all(unreadable: list[Flag], flags: list[Flag], excluded: dict[int, float]) -> tuple[Flag, ...]:
-    """All flags in the order of the frames; a frame left out in an earlier round stays flagged."""
-    named = {flag.frame: flag for flag in (*flags, *unreadable)}
-    for frame, severity in excluded.items():
-        named.setdefault(frame, Flag(frame, "does not agree with the other frames", severity))
+def _attempt(
+    stack: FrameStack,
+    binned: Binned,
+    optics: OpticsConfig,
+    geometry: Geometry,
+    grid: BinGrid,
+    near: NDArray[np.bool_],
+    excluded: set[int],
+    anchor: Anchor | None,
+) -> _Attempt:
+    """Fit the bins without the excluded frames. Raises NoFigureError or ValueError if that cannot be."""
+    tracer = Tracer(geometry, optics.mirror.radius_mm, vertex_z_mm(optics, stack.mean_reading_um))
+    view = look(stack, binned, excluded, None if anchor is None else anchor.light)
+    phase = _absolute(stack, binned, view, anchor, optics)
+    candidates = np.flatnonzero(near)
+    flat = phase.reshape(2, -1)[:, candidates]
+    state = establish(grid, tracer, candidates, flat, optics.pattern, optics.mirror.analysis_radius_mm)
+    return _Attempt(view, phase, tracer, state, _scene(tracer, state, view, optics))
+
+
+def _to_leave_out(stack: FrameStack, fresh: list[Flag]) -> list[Flag]:
+    """The worst sinusoid, which may be all that is wrong with the others' predictions; else all that are flagged."""
+    sinusoids = [flag for flag in fresh if stack.patterns[flag.frame].role == "sin"]
+    return sinusoids[:1] or fresh
+
+
+def _merged(flags: list[Flag], known: dict[int, Flag]) -> tuple[Flag, ...]:
+    """All flags in the order of the frames; the latest inspection knows best, and what is known before it stays."""
+    named = {**known, **{flag.frame: flag for flag in flags if known.get(flag.frame, flag).swapped_with is None}}
     return tuple(named[frame] for frame in sorted(named))
 
 
 def _absolute(
-    stack: FrameStack,
-    binned: Binned,
-    view: View,
-    excluded: dict[int, float],
-    anchor: Anchor | None,
-    optics: OpticsConfig,
+    stack: FrameStack, binned: Binned, view: View, anchor: Anchor | None, optics: OpticsConfig
 ) -> FloatArray:
     """Absolute phases of the bins, (2, rows, columns); NaN where not valid."""
     if anchor is not None:
@@ -220,7 +246,12 @@ def _scene(tracer: Tracer, state: TrackedPoints, view: View, optics: OpticsConfi
 
 
 def _confirm_orders(
-    stack: FrameStack, phase_rad: FloatArray, binned: Binned, view: View, excluded: dict[int, float]
+    stack: FrameStack,
+    phase_rad: FloatArray,
+    binned: Binned,
+    view: View,
+    excluded: set[int],
+    flags: tuple[Flag, ...],
 ) -> None:
     """Raise unless the usable Gray bits of each axis allow no other orders than those taken."""
     for k, axis in enumerate(AXES):
@@ -233,7 +264,6 @@ def _confirm_orders(
         bits = {bit: (binned.means[gray[bit - 1]] > view.light)[seen] for bit in good}
         explained = [shift for shift in range(-7, 8) if _explains(phase + 2 * math.pi * shift, bits)]
         if explained != [0]:
-            flags = _all([], [], excluded)
             raise RejectedSetError(f"the {axis} fringe orders are not certain without all Gray frames", flags)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +55,10 @@ class FrameStack:
         """Phase steps of sinusoids."""
         return np.array([self.patterns[k].shift_rad for k in frames])
 
+    def reordered(self, order: list[int]) -> FrameStack:
+        """The same with other pictures for the patterns: frame k shows what `order[k]` did."""
+        return replace(self, frames=self.frames[order])
+
     @property
     def readings_um(self) -> FloatArray:
         """Laser readings of the sinusoids, x and then y."""
@@ -88,6 +92,10 @@ class Binned:
     bin_px: int
     means: NDArray[np.float32]
     saturated: NDArray[np.bool_]
+
+    def reordered(self, order: list[int]) -> Binned:
+        """As `FrameStack.reordered`."""
+        return replace(self, means=self.means[order], saturated=self.saturated[order])
 
 
 def bin_side_px(size_px: tuple[int, int]) -> int:

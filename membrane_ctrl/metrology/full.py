@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from membrane_ctrl.config import OpticsConfig
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.decode import FRINGE_SHARE
-from membrane_ctrl.metrology.frame_stack import FrameStack
 from membrane_ctrl.metrology.motion import combine_steps, sensitivity_mm_per_um, worth_correcting
 from membrane_ctrl.metrology.patterns import AXES
 from membrane_ctrl.metrology.phase import step_weights
@@ -95,8 +94,9 @@ class PixelPoints:
     moved: bool
 
 
-def measure_pixels(stack: FrameStack, optics: OpticsConfig, checked: Checked) -> PixelPoints:
+def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     """Phases of all pixels in bins that have one, with the film's motion between the frames taken out."""
+    stack = checked.stack
     bin_px, columns = checked.binned.bin_px, checked.phase_rad.shape[2]
     known = np.isfinite(checked.phase_rad).all(axis=0) & checked.near
     row, column = np.nonzero(np.repeat(np.repeat(known, bin_px, axis=0), bin_px, axis=1))
@@ -110,9 +110,7 @@ def measure_pixels(stack: FrameStack, optics: OpticsConfig, checked: Checked) ->
     sensitivity = np.zeros((2, index.size))
     if moved:
         sensitivity = sensitivity_mm_per_um(tracer, points, surface) / mm_per_rad(optics.pattern)
-    axes = [
-        _axis_phases(stack, optics, checked, k, index, in_bin, sensitivity[k] if moved else None) for k in range(2)
-    ]
+    axes = [_axis_phases(optics, checked, k, index, in_bin, sensitivity[k] if moved else None) for k in range(2)]
     points.screen_mm[:] = screen_mm(np.stack([a.phase_rad for a in axes]), optics.pattern)
     swing = np.minimum(axes[0].swing_adu, axes[1].swing_adu)
     x, y = tracer.position_mm(points)
@@ -123,7 +121,6 @@ def measure_pixels(stack: FrameStack, optics: OpticsConfig, checked: Checked) ->
 
 
 def _axis_phases(
-    stack: FrameStack,
     optics: OpticsConfig,
     checked: Checked,
     axis: int,
@@ -131,7 +128,7 @@ def _axis_phases(
     in_bin: NDArray[np.int64],
     sensitivity: FloatArray | None,
 ) -> PixelPhases:
-    used = checked.view.used[axis]
+    stack, used = checked.stack, checked.view.used[axis]
     shifts = stack.shifts_rad(used)
     motion = None
     if sensitivity is not None:
@@ -146,7 +143,6 @@ def _axis_phases(
 
 
 def reconstruct_full(
-    stack: FrameStack,
     optics: OpticsConfig,
     checked: Checked,
     pixels: PixelPoints,

@@ -29,7 +29,7 @@ REST_SHARE = 0.015
 SATURATED_SHARE = 0.02
 # Bits are read against half the light: a Gray frame may be a tenth off; its own kind agrees better than with white.
 GRAY_SHARE = 0.04
-WHITE_SHARE = 0.10
+WHITE_SHARE = 0.08
 GRAY_REST = 0.15
 FLAT_REST = 0.08
 _SCATTERS = 6.0  # of the good frames' scatter
@@ -48,11 +48,14 @@ class Flag:
         First word: stale, swapped, saturated, dark, flicker, moved, or what could not be read.
     severity : float
         Times the limit.
+    swapped_with : int or None
+        The frame that shows this one's pattern while this one shows its.
     """
 
     frame: int
     reason: str
     severity: float
+    swapped_with: int | None = None
 
 
 def identical_frames(stack: FrameStack) -> dict[int, int]:
@@ -90,33 +93,38 @@ def inspect(stack: FrameStack, binned: Binned, scene: Scene, excluded: Collectio
 
 
 def _judge_sinusoids(stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[int, Evidence]) -> list[Flag]:
-    sinusoids = [k for axis in AXES for k in stack.sinusoids(axis)]
-    moved_limit, moved_middle = _limit([trusted[k].moved_um for k in sinusoids if k in trusted], MOVED_UM)
-    level_limit, level_middle = _limit([trusted[k].level for k in sinusoids if k in trusted], 0.0)
+    """Each against the others, itself left out, so that it cannot widen its own limit."""
     flags = []
     for axis in AXES:
         frames = [k for k in stack.sinusoids(axis) if k in evidence]
-        good = [evidence[k] for k in frames if k in trusted] or [evidence[k] for k in frames]
-        if not good:
-            continue
-        swing, rest = float(np.median([e.swing for e in good])), float(np.median([e.rest for e in good]))
-        step_limit, step_middle = _limit([e.step_rad for e in good], STEP_RAD)
         for k in frames:
-            e = evidence[k]
-            others = float(np.median([o.saturated for o in good]))
-            worst = {
-                "step": abs(_wrapped(e.step_rad - step_middle)) / step_limit,
-                "light": abs(e.level - level_middle) / max(LEVEL_SHARE * level_middle, level_limit),
-                "swing": abs(e.swing - swing) / (SWING_SHARE * max(swing, 1e-9)),
-                "moved": abs(e.moved_um - moved_middle) / moved_limit,
-                "rest": max(e.rest**2 - rest**2, 0.0) ** 0.5 / max(REST_SHARE, 1.2 * rest),
-                "saturated": (e.saturated - others) / SATURATED_SHARE,
-                "shows": 2.0 if e.shows != k and e.shows not in trusted else 0.0,
-            }
-            kind = max(worst, key=lambda name: worst[name])
-            if worst[kind] > 1:
-                flags.append(Flag(k, _sinusoid_reason(kind, e, level_middle, moved_middle), worst[kind]))
+            same = [trusted[j] for j in frames if j != k and j in trusted]
+            every = [e for j, e in trusted.items() if j != k and stack.patterns[j].role == "sin"]
+            if same:
+                flags += _judge_sinusoid(k, evidence[k], same, every, trusted)
     return flags
+
+
+def _judge_sinusoid(
+    frame: int, e: Evidence, same: list[Evidence], every: list[Evidence], trusted: dict[int, Evidence]
+) -> list[Flag]:
+    """One sinusoid against those of its axis and, for the light, against those of both."""
+    step_limit, step = _limit([o.step_rad for o in same], STEP_RAD)
+    moved_limit, moved_um = _limit([o.moved_um for o in same], MOVED_UM)
+    level_limit, level = _limit([o.level for o in every], 0.0)
+    swing_limit, swing = _limit([o.swing for o in same], 0.0)
+    rest = float(np.median([o.rest for o in same]))
+    saturated = float(np.median([o.saturated for o in same]))
+    worst = {
+        "step": abs(_wrapped(e.step_rad - step)) / step_limit,
+        "light": abs(e.level - level) / max(LEVEL_SHARE * level, level_limit),
+        "swing": abs(e.swing - swing) / max(SWING_SHARE * swing, swing_limit),
+        "moved": abs(e.moved_um - moved_um) / moved_limit,
+        "rest": max(e.rest**2 - rest**2, 0.0) ** 0.5 / max(REST_SHARE, 1.2 * rest),
+        "saturated": (e.saturated - saturated) / SATURATED_SHARE,
+    }
+    kind = max(worst, key=lambda name: worst[name])
+    return [Flag(frame, _sinusoid_reason(kind, e, level, moved_um), worst[kind])] if worst[kind] > 1 else []
 
 
 def _sinusoid_reason(kind: str, e: Evidence, level: float, moved_um: float) -> str:
@@ -129,7 +137,7 @@ def _sinusoid_reason(kind: str, e: Evidence, level: float, moved_um: float) -> s
         return f"flicker: {light:.3f} of the light of the others"
     if kind in ("moved", "rest") and abs(e.moved_um - moved_um) > MOVED_UM:
         return f"moved: the film stood {e.moved_um - moved_um:+.0f} um from where the others saw it"
-    if kind in ("step", "shows"):
+    if kind == "step":
         return f"stale or wrong picture: its phase step is {e.step_rad:+.2f} rad off"
     return f"differs from its prediction by {e.rest:.1%} of the light"
 
@@ -145,7 +153,7 @@ def _judge_gray(stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[
     for k in gray:
         e = evidence[k]
         light = abs(e.level / max(bright, 1e-9) - 1) / max(GRAY_SHARE, bright_limit / max(bright, 1e-9))
-        content = max(e.rest / (GRAY_REST * bright), 2.0 if e.shows != k else 0.0)
+        content = max(e.rest / (GRAY_REST * bright), 2.0 if e.shows != k else 0.0, 0.5 * bright / max(e.swing, 1e-9))
         if max(light, content) > 1:
             flags.append(Flag(k, _gray_reason(e, bright, content > light), max(light, content)))
     for role in ("white", "black"):
@@ -186,8 +194,9 @@ def _named(stack: FrameStack, flag: Flag, evidence: dict[int, Evidence], twins: 
     if e.shows != k:
         name = stack.patterns[e.shows].name
         partner = evidence.get(e.shows)
-        word = "swapped with" if partner is not None and partner.shows == k else "stale: shows"
-        return Flag(k, f"{word} {name}", flag.severity)
+        if partner is not None and partner.shows == k:
+            return Flag(k, f"swapped with {name}", flag.severity, e.shows)
+        return Flag(k, f"stale: shows {name}", flag.severity)
     return flag
 
 
