@@ -171,7 +171,7 @@ class VaisalaPtb330:
             The port is gone: open it again.
         """
         if self._down is not None:
-            raise self._down
+            raise LinkDownError(str(self._down))
         if not self._link.connected:
             raise LinkDownError(f"{self._link.name}: not connected")
         fresh = asyncio.get_running_loop().time() - self._newest_s <= self._age_max_s

@@ -281,8 +281,8 @@ def _opened(path: str, name: str, settings: SerialSettings) -> Any:
             exclusive=True,
         )
     except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
-        code = getattr(error, "errno", None) or (error.args[0] if error.args else None)
-        remedy = _REMEDIES.get(code, str(error)) if isinstance(code, int) else str(error)
+        code = _errno(error)
+        remedy = _REMEDIES.get(code, str(error))
         if code == errno.ENOTTY:
             raise DeviceRefusedError(f"{name}: {remedy}") from error
         raise LinkDownError(f"{name}: {remedy}") from error
@@ -291,6 +291,15 @@ def _opened(path: str, name: str, settings: SerialSettings) -> Any:
     if settings.parity != "N":
         _drop_wrong_parity(port.fileno())
     return port
+
+
+def _errno(error: BaseException) -> int:
+    """Of a SerialException, which has it itself, or of the termios.error that it was raised from; else 0."""
+    for source in (error, error.__context__):
+        for code in (getattr(source, "errno", None), *getattr(source, "args", ())[:1]):
+            if isinstance(code, int):
+                return code
+    return 0
 
 
 def _drop_wrong_parity(descriptor: int) -> None:
