@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 from firmware_iface.drivers.modbus_map import ValueMap
-from firmware_iface.emulators.modbus_server import ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterRefusal
+from firmware_iface.emulators.modbus_server import (
+    ILLEGAL_ADDRESS,
+    ILLEGAL_VALUE,
+    READ_HOLDING,
+    RegisterRefusal,
+    RegisterTable,
+    respond,
+)
+
+READ_INPUT = 4
 
 
 class MapDevice:
@@ -67,3 +76,11 @@ class MapDevice:
         value = found.decode([self._written[found.address + n] for n in range(found.words)])
         # a current below 4 mA is a broken wire to what hangs on the output: off
         tell(value if found.allows(value) else 0.0)
+
+
+def respond_to_input(pdu: bytes, table: RegisterTable) -> bytes:
+    """`respond`, and "read input registers" (function 4) answered from the same registers."""
+    if pdu[0] != READ_INPUT:
+        return respond(pdu, table)
+    reply = respond(bytes([READ_HOLDING]) + pdu[1:], table)
+    return bytes([reply[0] - READ_HOLDING + READ_INPUT]) + reply[1:]

@@ -14,12 +14,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from firmware_iface.drivers.modbus_map import make_map, preset
+from firmware_iface.drivers.modbus_map import ValueMap, make_map, preset
 from firmware_iface.emulators.bronkhorst import BronkhorstRegisters, Instrument, ProparDevice
 from firmware_iface.emulators.keyence_dl_rs1a import KeyenceDlRs1aEmulator
-from firmware_iface.emulators.modbus_map_device import MapDevice
+from firmware_iface.emulators.modbus_map_device import MapDevice, respond_to_input
 from firmware_iface.emulators.modbus_rtu import RtuBusEmulator
-from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer, RegisterTable, exception_pdu, respond
+from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer, RegisterTable, exception_pdu
 from firmware_iface.emulators.optoncdt1420 import Optoncdt1420Emulator
 from firmware_iface.emulators.pump_board import Plant, PumpBoardEmulator
 from firmware_iface.emulators.serial_device import SerialDevice
@@ -66,10 +66,13 @@ class Lab:
         self._servers: dict[str, ModbusTcpServer] = {}
         self._tables: defaultdict[str, dict[int, RegisterTable]] = defaultdict(dict)
         for role, section in devices.roles().items():
-            if isinstance(section, (table.ModbusMap, table.BronkhorstModbus)):
-                self._tables[section.link][section.unit_id] = self._registers(role, section)
-            else:
+            if isinstance(section, table.BronkhorstModbus):
+                self._tables[section.link][section.unit_id] = BronkhorstRegisters(
+                    self._bronkhorst(role, section.serial)
+                )
+            elif not isinstance(section, table.ModbusMap):
                 self.serial[section.port] = self._device(role, section)
+        self._map_devices()
         self._board: PumpBoardEmulator | None = None
         if devices.board is not None:
             self._board = PumpBoardEmulator(plant)
@@ -77,7 +80,7 @@ class Lab:
         for url, slaves in self._tables.items():
             if url.startswith("rtu:"):
                 _, settings = parse_rtu_url(url)
-                handlers = {unit: partial(respond, table=found) for unit, found in slaves.items()}
+                handlers = {unit: partial(respond_to_input, table=found) for unit, found in slaves.items()}
                 self.serial[url] = RtuBusEmulator(settings, handlers)
 
     async def start(self) -> DevicesConfig:
@@ -143,17 +146,31 @@ class Lab:
             case _:
                 raise AssertionError(section)
 
-    def _registers(self, role: str, section: table.ModbusMap | table.BronkhorstModbus) -> RegisterTable:
-        if isinstance(section, table.BronkhorstModbus):
-            return BronkhorstRegisters(self._bronkhorst(role, section.serial))
-        value_map, _ = make_map(map_keys(section), section.preset)
-        constants = {} if value_map.version_address is None else {value_map.version_address: _VERSION}
-        if value_map.identity is not None:
-            constants[value_map.identity[0]] = value_map.identity[1]
-        if role in self._outputs:
-            low, high = preset(section.preset).get("raw_limits", (0, 0xFFFF)) if section.preset else (0, 0xFFFF)
-            return MapDevice({}, {value_map: self._actuator(role)}, constants, (low, high))
-        return MapDevice({value_map: self._sensor(role)}, {}, constants)
+    def _map_devices(self) -> None:
+        """One device for all maps that name the same unit of the same link."""
+        units: defaultdict[tuple[str, int], list[tuple[str, table.ModbusMap]]] = defaultdict(list)
+        for role, section in self._devices.roles().items():
+            if isinstance(section, table.ModbusMap):
+                units[section.link, section.unit_id].append((role, section))
+        for (link, unit_id), members in units.items():
+            sensors: dict[ValueMap, Callable[[], float]] = {}
+            outputs: dict[ValueMap, Callable[[float], None]] = {}
+            constants: dict[int, int] = {}
+            raw_limits = (0, 0xFFFF)
+            for role, section in members:
+                value_map, _ = make_map(map_keys(section), section.preset)
+                if value_map.version_address is not None:
+                    constants[value_map.version_address] = _VERSION
+                if value_map.identity is not None:
+                    constants[value_map.identity[0]] = value_map.identity[1]
+                if role in self._outputs:
+                    outputs[value_map] = self._actuator(role)
+                else:
+                    sensors[value_map] = self._sensor(role)
+                if section.preset:
+                    low, high = preset(section.preset).get("raw_limits", raw_limits)
+                    raw_limits = (low, high)
+            self._tables[link][unit_id] = MapDevice(sensors, outputs, constants, raw_limits)
 
     def _bronkhorst(self, role: str, serial: str) -> Instrument:
         if role == "pump":
@@ -185,4 +202,4 @@ class Lab:
 def _answer(slaves: Mapping[int, Any], unit: int, pdu: bytes) -> Answer:
     if unit not in slaves:
         return Answer(exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
-    return Answer(respond(pdu, slaves[unit]))
+    return Answer(respond_to_input(pdu, slaves[unit]))

@@ -1,0 +1,134 @@
+"""Every configuration in examples/ passes `check` against emulators of the devices that it names."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+
+import pytest
+
+from firmware_iface.emulators.board_state import BoardSample
+from membrane_ctrl.cli import run
+from membrane_ctrl.config import Config
+from membrane_ctrl.config_file import dump, load
+from membrane_ctrl.twin.lab import Lab
+
+EXAMPLES = sorted(Path(__file__).parents[1].glob("examples/*.toml"))
+
+
+class StillPlant:
+    """A mirror that stands, with a laser that sees it."""
+
+    def __init__(self) -> None:
+        self.outputs: list[tuple[float, float]] = []
+        self._counter = 0
+
+    def sample(self) -> BoardSample:
+        self._counter += 1
+        return BoardSample(12.5, 0, 600.0, 101_325.0, 22.5, 23.0, self._counter, self._counter / 200)
+
+    def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
+        self.outputs.append((pump_fraction, vent_fraction))
+
+
+def test_there_are_examples() -> None:
+    assert {"paper-bench", "all-serial", "all-modbus-tcp", "twin"} <= {path.stem for path in EXAMPLES}
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+async def test_the_example_passes_check(example: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = load(example, Config)
+    plant = StillPlant()
+    if config.devices is None:
+        assert await asyncio.to_thread(run, ["check", str(example), "--json"]) == 0
+        return
+    lab = Lab(plant, config.devices)
+    try:
+        devices = await lab.start()
+        path = tmp_path / "moved.toml"
+        path.write_text(dump(config.model_copy(update={"devices": devices})))
+        code = await asyncio.to_thread(run, ["check", str(path), "--json"])
+    finally:
+        await lab.stop()
+    printed = capsys.readouterr()
+    assert code == 0, printed.err
+    probes = {probe["role"]: probe for probe in json.loads(printed.out)["devices"]}
+    assert set(probes) == (set(devices.roles()) or {"board"})
+    assert all(probe["identity"] and probe["latency_p99_ms"] > 0 for probe in probes.values())
+    displacement = (probes.get("displacement") or probes["board"])["reading"]
+    assert float(displacement.split()[0]) == pytest.approx(12.5, abs=1.0)
+    assert all(outputs[0] == 0.0 for outputs in plant.outputs)  # checking moves no gas
+
+
+async def test_check_names_every_broken_device_and_the_remedy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    config = load(EXAMPLES[0].with_name("all-serial.toml"), Config)
+    assert config.devices is not None
+    assert config.devices.barometer is not None
+    lab = Lab(StillPlant(), config.devices)
+    try:
+        devices = await lab.start()
+        lab.wires[config.devices.barometer.port].unplug()  # type: ignore[union-attr]
+        path = tmp_path / "moved.toml"
+        path.write_text(dump(config.model_copy(update={"devices": devices})))
+        code = await asyncio.to_thread(run, ["check", str(path)])
+    finally:
+        await lab.stop()
+    printed = capsys.readouterr()
+    assert code == 4
+    assert "1 of 4 devices cannot be used; barometer" in printed.err
+    assert "is the adapter plugged in?" in printed.out
+    assert "Bronkhorst DMFC" in printed.out  # the others are shown all the same
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            '[devices.displacement]\ndriver = "optoncdt1421"\nport = "/dev/x"\n',
+            ["devices.displacement", "optoncdt1420"],
+        ),
+        ('[devices.displacement]\ndriver = "optoncdt1420"\nprot = "/dev/x"\n', ["devices.displacement", "port"]),
+        (
+            '[devices]\nboard = "tcp://h"\n[devices.pump]\ndriver = "ventus"\nport = "/dev/x"\n',
+            ["not board and pump"],
+        ),
+        ('[devices.pump]\ndriver = "ventus"\nport = "/dev/x"\n', ["no device fills displacement"]),
+        ("[devices]\n", ["name the pump board"]),
+        ('[devices]\nboard = "serial:1"\n', ["devices.board", "tcp://HOST:PORT"]),
+    ],
+)
+def test_a_wrong_devices_table_is_one_line(
+    text: str, words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "lab.toml"
+    path.write_text(text)
+    assert run(["check", str(path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert all(word in line for word in words), line
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"preset": "waveshare"}, "known are waveshare_ao8"),
+        ({"address": 8}, "waveshare_ao8 has 0 .. 7"),
+        ({"raw": (0.0, 30_000.0)}, "the device takes 0 .. 20000"),
+    ],
+)
+def test_a_preset_refuses_what_its_device_does_not_have(
+    change: dict[str, object], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = load(EXAMPLES[0].with_name("all-modbus-tcp.toml"), Config)
+    assert config.devices is not None
+    assert config.devices.pump is not None
+    pump = config.devices.pump.model_copy(update=change)
+    path = tmp_path / "lab.toml"
+    path.write_text(dump(config.model_copy(update={"devices": config.devices.model_copy(update={"pump": pump})})))
+    assert run(["check", str(path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line
+    assert "devices.pump" in line
