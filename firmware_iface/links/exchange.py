@@ -201,7 +201,7 @@ class SerialExchange:
 
     def _missing(self, timeout_s: float) -> str:
         if not self._heard:
-            return f"no answer within {timeout_s:g} s"
+            return f"no answer within {timeout_s:g} s; is it on, wired and set to {self._port.settings}?"
         shown = self._heard[:_SHOWN_BYTES]
         return f"no whole answer within {timeout_s:g} s, but {len(self._heard)} bytes ({shown!r}); wrong baud rate?"
 
