@@ -43,13 +43,13 @@ class ActuatorTest:
     ----------
     pump : PumpConfig
         What the pump is said to give.
-    has_vent : bool
-        Whether the bench has a vent to test.
+    test_vent : bool
+        The bench has a vent, and the mirror has the pressure to let gas out by it.
     """
 
-    def __init__(self, pump: PumpConfig, has_vent: bool) -> None:
+    def __init__(self, pump: PumpConfig, test_vent: bool) -> None:
         self._pump = pump
-        self._parts = [part for part in PARTS if has_vent or part.name != "vent"]
+        self._parts = [part for part in PARTS if test_vent or part.name != "vent"]
         self._speeds = {part.name: Slope() for part in self._parts}
         self._elapsed_s = 0.0
 

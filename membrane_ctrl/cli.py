@@ -17,6 +17,9 @@ from membrane_ctrl.errors import CommandError, Exit, InputError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
+FlatOption = Annotated[
+    bool, typer.Option("--from-flat", help="The simulated mirror starts flat: a fill takes two hours.")
+]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="Configuration, one TOML file.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
@@ -59,13 +62,14 @@ def hold(
     clear_faults: Annotated[
         bool, typer.Option("--clear-faults", help="Clear what the board has latched, once you know why.")
     ] = False,
+    from_flat: FlatOption = False,
     json: JsonOption = False,
 ) -> int:
     """Hold the mirror until told to stop: the main job."""
     from membrane_ctrl.hold import HoldOptions, hold_mirror
 
     options = HoldOptions(
-        config=_with_devices(config, devices, twin),
+        config=_started(_with_devices(config, devices, twin), from_flat),
         source=str(config or devices or "the defaults"),
         twin=twin,
         duration_s=None if duration is None else parse_duration_s(duration),
@@ -82,11 +86,12 @@ def hold(
 def twin(
     config: ConfigOption = None,
     speed: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Simulated seconds a second.")] = 1.0,
+    from_flat: FlatOption = False,
 ) -> int:
     """Serve the simulated bench on its real protocol, for any client, until interrupted."""
     from membrane_ctrl.serve_twin import serve_twin
 
-    return serve_twin(_config(config), speed)
+    return serve_twin(_started(_config(config), from_flat), speed)
 
 
 @app.command()
@@ -193,6 +198,12 @@ def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> Conf
     if lab.devices is None:
         raise InputError(f"{devices}: devices: missing; there is nothing to emulate")
     return lab if config is None else _config(config).model_copy(update={"devices": lab.devices})
+
+
+def _started(config: Config, from_flat: bool) -> Config:
+    if not from_flat:
+        return config
+    return config.model_copy(update={"twin": config.twin.model_copy(update={"from_flat": True})})
 
 
 def _config(path: Path | None) -> Config:

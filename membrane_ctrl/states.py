@@ -256,8 +256,9 @@ def _asked_elsewhere(scene: Scene) -> State | None:
 def _test_actuators(scene: Scene) -> State:
     reading = scene.observer.reading
     if scene.test is None:
-        has_vent = reading is not None and math.isfinite(reading.vent_fraction)
-        scene.test = ActuatorTest(scene.config.pump, has_vent)
+        vents = reading is not None and math.isfinite(reading.vent_fraction)
+        tense = reading is not None and reading.gauge_pressure_pa > scene.config.states.vented_pressure_pa
+        scene.test = ActuatorTest(scene.config.pump, test_vent=vents and tense)
     scene.test.step(scene.observer.displacement_um, scene.dt_s)
     part = scene.test.part
     if part is not None:

@@ -186,6 +186,29 @@ def test_a_mirror_that_cannot_follow_is_given_up() -> None:
     assert [f["name"] for f in run.of("fault")] == ["following_error"]
 
 
+def test_a_flat_mirror_is_filled_in_hours_and_held() -> None:
+    twin = TwinConfig(scenario="calm", laser_noise_um=0.3, from_flat=True)
+    loop = LoopConfig(rate_hz=5.0)
+    limits = LimitsConfig(displacement_min_um=-40_000.0)
+    run = Run(Config(twin=twin, loop=loop, limits=limits), 4.0 * 3600)
+    assert run.states == ["check", "inflate", "settle", "hold", "lower"], run.of("fault")
+    hold_s = run.of("state")[3]["mono_s"]
+    assert 2.0 * 3600 < hold_s < 4.0 * 3600
+    assert np.max(run.value("truth_displacement_um")) < 5.0  # no overshoot to speak of
+
+
+def vent_stuck(reading: BenchReading) -> BenchReading:
+    return replace(reading, displacement_um=-25.0 + 1e-3 * (reading.sample_counter % 7))
+
+
+def test_a_film_that_does_not_answer_is_not_inflated() -> None:
+    run = Run(CALM, 30.0, lambda now_s, r: vent_stuck(r))
+    assert run.finished == Exit.SAFETY_TRIP
+    assert [f["name"] for f in run.of("fault")] == ["actuator_test"]
+    assert "vent" in run.of("fault")[0]["seen"]
+    assert State.INFLATE not in run.value("state")
+
+
 def test_the_same_seed_gives_the_same_run() -> None:
     config = Config(loop=LoopConfig(rate_hz=25.0))
     first, second = Run(config, 20.0), Run(config, 20.0)
