@@ -168,11 +168,10 @@ class PumpMapper:
     def _probes(self) -> Generator[Probe, None, None]:
         """The plan, as a coroutine: each probe's speed is there when the next one is asked for."""
         low = self._holding_fraction + 0.02
-        flows = []
-        for fraction in (low, low + _CURVE_STEP):
-            flows.append((yield from self._mean_flow(_RUN_FRACTION, fraction)))
-        slope = (flows[1] - flows[0]) / _CURVE_STEP
-        dead = max(0.0, low - flows[0] / slope) if slope > 0 else 0.0
+        less = yield from self._mean_flow(_RUN_FRACTION, low)
+        more = yield from self._mean_flow(_RUN_FRACTION, low + _CURVE_STEP)
+        slope = (more - less) / _CURVE_STEP
+        dead = max(0.0, low - less / slope) if slope > 0 else 0.0
         start = yield from self._edge(0.0, dead, _HIGHEST, _START_BISECTIONS, slope, dead)
         highest = start if math.isfinite(start) else _HIGHEST
         stall = yield from self._edge(_RUN_FRACTION, dead, highest, _STALL_BISECTIONS, slope, dead)

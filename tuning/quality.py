@@ -56,7 +56,7 @@ class Validation:
 def validate(identified: Identified, fresh: Record, settle_s: float = 2.0) -> Validation:
     """Predict a fresh record with a fitted model; the noise filter's start is left out."""
     errors = prediction_errors(
-        fresh, identified.model, identified.beta, identified.pressure_gain_um_per_pa if fresh.has_barometer else 0.0
+        fresh, identified.model, identified.noise, identified.pressure_gain_um_per_pa if fresh.has_barometer else 0.0
     )[round(settle_s / fresh.dt_s) :]
     change = np.diff(fresh.flow_um_per_s)[-errors.size :]
     return Validation(float(errors.std() / identified.innovation_um), whiteness(errors), independence(errors, change))

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.signal import lfilter
 
 from tuning.plant_model import PlantModel
 from tuning.records import Record, Series
 
-FINE = 10
+FINE = 40
 
 
 def way_um(flow: Series, model: PlantModel, dt_s: float) -> Series:
-    """Centre at each reading by Euler steps of dt / 10, from rest at the first flow."""
+    """Centre at each reading by trapezoids of dt / 40, from rest at the first flow."""
     step_s = dt_s / FINE
     held = np.repeat(flow, FINE)
     late = round(model.dead_time_s / step_s)
-    delayed = np.concatenate((np.full(late, flow[0]), held))[: held.size]
-    arriving, y, out = float(flow[0]), 0.0, np.empty(flow.size)
-    for i, v in enumerate(delayed):
-        if i % FINE == 0:
-            out[i // FINE] = y
-        before = arriving
-        arriving += (v - arriving) * -np.expm1(-step_s / model.lag_s)
-        y += (model.gain * (before + arriving) / 2 - model.leak_um_per_s) * step_s
-    return out
+    delayed = np.concatenate((np.full(late, flow[0]), held))[: held.size] - flow[0]
+    share = -np.expm1(-step_s / model.lag_s)
+    arrived = np.concatenate(([0.0], lfilter([share], [1.0, share - 1.0], delayed))) + flow[0]
+    speed = model.gain * (arrived[1:] + arrived[:-1]) / 2 - model.leak_um_per_s
+    return np.concatenate(([0.0], np.cumsum(speed) * step_s))[:-1:FINE]
 
 
 def telegraph(rng: np.random.Generator, samples: int, low: float, high: float, hold: int = 60) -> Series:

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.tuning import Case, TwinBench
 from membrane_ctrl.config import PumpConfig
 from membrane_ctrl.twin.events import AmbientChange, LaserDropout
-from tuning.characterise import characterise
+from tuning.characterise import ExperimentError, characterise
 from tuning.experiments import Around, Finished, Patterned
 from tuning.patterns import doublets, multisine, steps
 from tuning.pump_map import PumpMapper
@@ -62,12 +62,9 @@ def held_again(rig: Rig, bench: TwinBench) -> bool:
     ids=["nominal", "leak x3", "leak /3", "pump x3", "pump /3", "delay x3", "delay /3"],
 )
 def test_excursion_stays_bounded_on_any_plant(case: Case) -> None:
-    bench = TwinBench(case, 7)
-    rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
-    start = len(bench.true_um)
-    done = characterise(rig)
-    assert max(abs(x) for x in bench.true_um[start:]) < 10.0
-    assert done.finished.completed, done.finished.reason
+    _, record, _, excursion_um = relay_after_hold(TwinBench(case, 7), case)
+    assert excursion_um < 10.0
+    assert record.duration_s > 30.0
 
 
 def test_a_door_slammed_in_the_relay_ends_it_and_the_mirror_is_held() -> None:
@@ -98,6 +95,14 @@ def test_a_stuck_pump_never_crosses_and_is_named() -> None:
     assert not end.completed
     assert "did not" in end.reason
     assert excursion_um < 10.0
+
+
+def test_characterising_gives_up_by_name_when_no_relay_can_be_completed() -> None:
+    case = Case("calm", laser_noise_um=0.3)
+    bench = StuckPump(case, 1)
+    bench.stuck_from_s = 60.0
+    with pytest.raises(ExperimentError, match="did not"):
+        characterise(Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s))
 
 
 def test_a_mirror_that_is_too_tight_is_told_to_open_the_bleed() -> None:
