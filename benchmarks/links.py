@@ -1,7 +1,8 @@
 """Serial links under random faults: how many wrong values are believed (none), and how far off the worst one is.
 
 Link, driver and emulated instrument are the real ones, the wire between them is memory and time is virtual: late
-answers and timeouts cost nothing, and every run is the same. A tenth of all questions or answers is hit.
+answers and timeouts cost nothing, and every run is the same. A tenth of all questions or answers is hit. Only Modbus
+TCP goes through real sockets and real time.
 
 `run()` gives the figures for `make bench`, `audit(name, transactions)` those of one link for the tests.
 """
@@ -9,9 +10,10 @@ answers and timeouts cost nothing, and every run is the same. A tenth of all que
 from __future__ import annotations
 
 import asyncio
+import itertools
 import math
 import random
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -23,7 +25,7 @@ from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
 from firmware_iface.drivers.ventus import Ventus
 from firmware_iface.emulators.keyence_dl_rs1a import KeyenceDlRs1aEmulator
 from firmware_iface.emulators.modbus_rtu import RtuBusEmulator
-from firmware_iface.emulators.modbus_server import respond
+from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer, respond
 from firmware_iface.emulators.optoncdt1420 import Optoncdt1420Emulator
 from firmware_iface.emulators.serial_device import SerialDevice, SerialFaults
 from firmware_iface.emulators.vaisala_ptb330 import VaisalaPtb330Emulator
@@ -31,10 +33,13 @@ from firmware_iface.emulators.ventus import VentusEmulator
 from firmware_iface.emulators.virtual_time import run_virtual
 from firmware_iface.emulators.wires import MemoryWire
 from firmware_iface.links.modbus_rtu import RtuBus
+from firmware_iface.links.modbus_rules import ModbusLink
+from firmware_iface.links.modbus_tcp import GuardedModbusTcp
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import Device, DisplacementSensor, LinkDownError, LinkError
 
 TIMEOUT_S = 0.05
+TCP_TIMEOUT_S = 0.01  # of real time
 CANCELLED = 0.02  # of all calls
 HIT = 0.05  # of all questions, and of all answers
 
@@ -96,23 +101,62 @@ class _Registers:
 
 
 async def _rtu(transactions: int, audit: Audit, seed: int) -> None:
-    """Numbers that never come twice are written and read back, to three places of two slaves.
-
-    A confirmed write has to be in the device. What is read has to be the number that was confirmed last at this
-    place, or one that was tried since.
-    """
-    dice = random.Random(seed)
+    """Two slaves on one bus."""
     tables = {1: _Registers(), 2: _Registers()}
     slaves = {unit: partial(respond, table=table) for unit, table in tables.items()}
     emulator = RtuBusEmulator(SerialSettings(115_200), slaves, echo_test=bool(seed % 2), seed=seed)
     emulator.draw_faults = random_faults(seed)
     bus = RtuBus(MemoryWire(emulator), quiet_s=TIMEOUT_S)
     devices = {unit: bus.device(unit, TIMEOUT_S) for unit in tables}
+    await _numbers(devices, tables, transactions, audit, random.Random(seed))
+    await devices[1].close()
+
+
+async def _tcp(transactions: int, audit: Audit, seed: int) -> None:
+    """A server that is late, silent, short, of another function or transaction, or hangs up."""
+    dice, table = random.Random(seed + 1), _Registers()
+
+    def answer(unit: int, pdu: bytes) -> Answer:
+        reply = respond(pdu, table)
+        if dice.random() >= HIT:
+            return Answer(reply)
+        kinds: list[Callable[[], Answer]] = [
+            lambda: Answer(),
+            lambda: Answer(reply, delay_s=dice.uniform(0.0, 4 * TCP_TIMEOUT_S)),
+            lambda: Answer(reply, transaction_offset=dice.choice((1, -1))),
+            lambda: Answer(bytes([23 if reply[0] == 3 else 6]) + reply[1:]),
+            lambda: Answer(bytes([3, 2]) + reply[2:4] if reply[0] == 3 else reply[:3] + b"\0" + reply[4:]),
+            lambda: Answer(hang_up=True),
+        ]
+        return dice.choice(kinds)()
+
+    server = ModbusTcpServer(answer, "127.0.0.1", 0)
+    await server.start()
+    seconds = itertools.count()  # the back-off is over at every look
+    device = GuardedModbusTcp("127.0.0.1", server.port, 1, TCP_TIMEOUT_S, clock=lambda: 10.0 * next(seconds))
+    await _numbers({1: device}, {1: table}, transactions, audit, random.Random(seed))
+    await device.close()
+    await server.stop()
+
+
+async def _numbers(
+    devices: Mapping[int, ModbusLink],
+    tables: Mapping[int, _Registers],
+    transactions: int,
+    audit: Audit,
+    dice: random.Random,
+) -> None:
+    """Numbers that never come twice are written and read back, to three places of each device.
+
+    A confirmed write has to be in the device. What is read has to be the number that was confirmed last at this
+    place, or one that was tried since.
+    """
     possible = {(unit, address): {0} for unit in tables for address in (0, 4, 8)}
     number = 0
     while audit.transactions < transactions:
         unit, address = place = dice.choice(list(possible))
-        await devices[unit].connect()
+        if not devices[unit].connected:
+            await devices[unit].connect()
         number += 1
         if write := dice.random() < 0.5:
             possible[place].add(number)
@@ -130,14 +174,13 @@ async def _rtu(transactions: int, audit: Audit, seed: int) -> None:
             audit.judge(float(found[0] * 2**16 + found[1] not in ({number} if write else possible[place])), 0.0)
             if write:
                 possible[place] = {number}
-    await devices[1].close()
 
 
 async def _perhaps_cancelled(call: Coroutine[Any, Any, Any], dice: random.Random) -> Any:
     """The result of a call that is sometimes cancelled in mid-air. Raises CancelledError then."""
     task = asyncio.ensure_future(call)
     if dice.random() < CANCELLED:
-        await asyncio.wait([task], timeout=dice.uniform(0.0, TIMEOUT_S))
+        await asyncio.wait([task], timeout=dice.uniform(0.0, TCP_TIMEOUT_S))
         task.cancel()
     return await task
 
@@ -247,18 +290,21 @@ async def _open_again(driver: Device) -> None:
 
 
 LINKS = {
+    "Modbus TCP": (_tcp, ""),
     "Modbus RTU": (_rtu, ""),
     "optoNCDT 1420": (_optoncdt, "um"),
     "Keyence DL-RS1A": (_keyence, "um"),
     "Ventus": (_ventus, ""),
     "PTB330": (_ptb330, "Pa"),
 }
+REAL_TIME = ("Modbus TCP",)
 
 
 def audit(name: str, transactions: int, seed: int = 1) -> Audit:
     """So many transactions of one link under random faults."""
     result = Audit()
-    run_virtual(LINKS[name][0](transactions, result, seed))
+    main = LINKS[name][0](transactions, result, seed)
+    asyncio.run(main) if name in REAL_TIME else run_virtual(main)
     return result
 
 
