@@ -1,0 +1,37 @@
+"""The mirror held through a serial laser, a Bronkhorst flow controller and a barometer, all in bytes on ptys."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "all-serial.toml"
+HOLD = [sys.executable, "-m", "membrane_ctrl", "hold", "--devices", str(EXAMPLE)]
+
+
+def test_the_mirror_is_held_through_serial_instruments(tmp_path: Path) -> None:
+    near = tmp_path / "near.toml"
+    near.write_text(EXAMPLE.read_text() + "\n[twin]\nstart_error_um = -4.0\n")
+    done = subprocess.run(
+        [*HOLD[:-1], str(near), "--twin", "--duration", "22s", "--logs", str(tmp_path / "logs"), "--json"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert "hold" in [state["state"] for state in summary["states"]]
+    assert 0 < summary["true_std_um"] < 1.0  # the twin's truth, not the laser's reading
+    assert "Traceback" not in done.stderr
+
+
+def test_devices_without_twin_is_a_usage_error(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [*HOLD, "--logs", str(tmp_path / "logs")], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 2
+    assert "only with --twin" in done.stderr
+    assert not (tmp_path / "logs").exists()
