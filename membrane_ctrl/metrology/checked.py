@@ -19,7 +19,7 @@ from membrane_ctrl.metrology.bins import BinGrid
 from membrane_ctrl.metrology.frame_evidence import Scene
 from membrane_ctrl.metrology.frame_stack import Binned, FrameStack, bin_frames
 from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.integrity import Flag, inspect
+from membrane_ctrl.metrology.integrity import Flag, inspect, obvious
 from membrane_ctrl.metrology.orders import Orders, gray_bit, orders
 from membrane_ctrl.metrology.patterns import AXES
 from membrane_ctrl.metrology.reconstruct import Tracer
@@ -136,13 +136,14 @@ def check(stack: FrameStack, optics: OpticsConfig, anchor: Anchor | None = None)
     grid = BinGrid(geometry, optics.camera, binned.bin_px)
     near = grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
     known = {frame: Flag(frame, reason, math.inf) for frame, reason in stack.unusable.items()}
-    excluded = set(stack.unusable)
+    known |= {flag.frame: flag for flag in obvious(stack, binned)}
+    excluded = set(known)
     flags: list[Flag] = []
     for _ in range(_ROUNDS):
         try:
             attempt = _attempt(stack, binned, optics, geometry, grid, near, excluded, anchor)
         except (NoFigureError, ValueError) as error:
-            raise RejectedSetError(str(error), _merged(flags, known)) from None
+            raise RejectedSetError(str(error), _merged(_believable(stack, flags), known)) from None
         flags = inspect(stack, binned, attempt.scene, excluded)
         fresh = [flag for flag in flags if flag.frame not in excluded]
         if not fresh:
@@ -160,7 +161,8 @@ def check(stack: FrameStack, optics: OpticsConfig, anchor: Anchor | None = None)
         chosen = {flag.frame: flag for flag in _to_leave_out(stack, fresh)}
         known |= chosen
         excluded |= set(chosen)
-    raise RejectedSetError("the frames do not agree, whichever are left out", _merged(flags, known))
+    reason = "the frames do not agree, whichever are left out"
+    raise RejectedSetError(reason, _merged(_believable(stack, flags), known))
 
 
 @dataclass(frozen=True)
@@ -190,6 +192,11 @@ def _attempt(
     flat = phase.reshape(2, -1)[:, candidates]
     state = establish(grid, tracer, candidates, flat, optics.pattern, optics.mirror.analysis_radius_mm)
     return _Attempt(view, phase, tracer, state, _scene(tracer, state, view, optics))
+
+
+def _believable(stack: FrameStack, flags: list[Flag]) -> list[Flag]:
+    """While sinusoids are wrong so may be the prediction: then only they are named."""
+    return [flag for flag in flags if stack.patterns[flag.frame].role == "sin"] or flags
 
 
 def _to_leave_out(stack: FrameStack, fresh: list[Flag]) -> list[Flag]:

@@ -73,6 +73,27 @@ def identical_frames(stack: FrameStack) -> dict[int, int]:
     return out
 
 
+def obvious(stack: FrameStack, binned: Binned) -> list[Flag]:
+    """Sinusoids that need no prediction to be seen as bad: far too dark or burnt out against the others."""
+    frames = [k for axis in AXES for k in stack.sinusoids(axis) if k not in stack.unusable]
+    if not frames:
+        return []
+    bright = np.max(binned.means[frames], axis=0)
+    where = bright > np.median(bright)
+    light = {k: float(np.mean(binned.means[k][where])) for k in frames}
+    burnt = {k: float(np.mean(binned.saturated[k][where])) for k in frames}
+    middle, usual = float(np.median(list(light.values()))), float(np.median(list(burnt.values())))
+    flags = []
+    for k in frames:
+        if light[k] < _DARK * middle:
+            flags.append(
+                Flag(k, f"dark: {light[k] / middle:.2f} of the light of the others", middle / max(light[k], 1e-9))
+            )
+        elif burnt[k] > usual + 10 * SATURATED_SHARE:
+            flags.append(Flag(k, f"saturated: {burnt[k]:.0%} of the bins", burnt[k] / SATURATED_SHARE))
+    return flags
+
+
 def inspect(stack: FrameStack, binned: Binned, scene: Scene, excluded: Collection[int]) -> list[Flag]:
     """Judge all readable frames, worst first.
 
