@@ -183,12 +183,12 @@ class SerialExchange:
 
     async def _ask(self, question: Question, timeout_s: float) -> bytes:
         self._require_open(question.what)
+        self._port.write(question.data)
         self._heard, self._take = b"", question.take
         self._answer = asyncio.get_running_loop().create_future()
         wire_s = (len(question.data) + question.answer_bytes) * self._port.settings.char_s
         try:
             async with asyncio.timeout(timeout_s + wire_s):
-                self._port.write(question.data)
                 return await self._answer
         except TimeoutError:
             raise LinkError(f"{question.what}: {self._missing(timeout_s)}") from None
