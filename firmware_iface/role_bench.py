@@ -8,7 +8,7 @@ again in the background, so that a cable put back is a good reading within its b
 Watchdog: only the pump board has one of its own. An instrument keeps the last setpoint it was given, so this bench
 watches itself: no `write` within `watchdog_s` and it sets the pump to 0 and says so. That covers a controller that
 hangs in a tick, not one that is killed: then the last flow stays until the gas is shut off by hand or by a relief
-valve. docs/devices.md and `check` say so.
+valve. docs/decisions/106 and `check` say so.
 """
 
 from __future__ import annotations

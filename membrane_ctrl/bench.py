@@ -34,14 +34,15 @@ async def connect(bench: Bench, devices: DevicesConfig) -> BenchIdentity:
     DeviceError
         One line that names the device and what is wrong.
     """
+    where = devices.board or "devices"  # a composed bench names the role itself
     loop = asyncio.get_running_loop()
     give_up_s = loop.time() + _PATIENCE_S
     while True:
         try:
             return await bench.open()
         except DeviceRefusedError as error:
-            raise DeviceError(f"{devices.name}: {error}") from None
+            raise DeviceError(f"{where}: {error}") from None
         except LinkError as error:
             if loop.time() > give_up_s:
-                raise DeviceError(f"{devices.name}: {error}") from None
+                raise DeviceError(f"{where}: {error}") from None
         await asyncio.sleep(_PAUSE_S)
