@@ -79,7 +79,7 @@ def obvious(stack: FrameStack, binned: Binned) -> list[Flag]:
     if not frames:
         return []
     bright = np.max(binned.means[frames], axis=0)
-    where = bright > np.median(bright)
+    where = bright >= np.median(bright)
     light = {k: float(np.mean(binned.means[k][where])) for k in frames}
     burnt = {k: float(np.mean(binned.saturated[k][where])) for k in frames}
     middle, usual = float(np.median(list(light.values()))), float(np.median(list(burnt.values())))
