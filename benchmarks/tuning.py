@@ -17,7 +17,7 @@ from benchmarks.minimum_variance import least_std_um
 from membrane_ctrl.config import LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.twin import pump as twin_pump
 from membrane_ctrl.twin.events import Event
-from membrane_ctrl.twin.plant import Plant
+from membrane_ctrl.twin.plant import STEP_S, Plant
 from tuning.candidates import amigo, simc, ziegler_nichols
 from tuning.characterise import Characterised, characterise
 from tuning.design import propose, relay_ultimate
@@ -30,8 +30,6 @@ OBSERVE_S = 600.0
 VERIFY_S = 600.0
 # the vent that lets out as much as the leak, 1.24 um/s at 100 um/s fully open
 BLEED_FRACTION = 0.0124
-# what a ramp comes late by on the nominal twin: tube, lag, less half a step of the simulation
-TRUE_DELAY_S = 0.2225
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +102,9 @@ def identified(case: Case, seed: int) -> dict[str, float]:
 def _identified(case: Case, bench: TwinBench, done: Characterised) -> dict[str, float]:
     found = done.identified
     model, sigma = found.model, found.sigma
-    delay_error_s = model.delay_s - TRUE_DELAY_S * case.delay
-    dead_error_s = model.dead_time_s - (TRUE_DELAY_S - twin_pump.LAG_S) * case.delay
+    # the twin's flow acts from the step on in which it changes: half a step early on average
+    dead_error_s = model.dead_time_s - (twin_pump.TRANSPORT_S * case.delay - STEP_S / 2)
+    delay_error_s = dead_error_s + model.lag_s - twin_pump.LAG_S * case.delay
     return {
         "gain_error": model.gain / case.pump - 1,
         "gain_sigma": sigma.gain / model.gain,
