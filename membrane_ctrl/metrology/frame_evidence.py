@@ -124,7 +124,9 @@ def _template(stack: FrameStack, scene: Scene, frame: int, reading_um: float) ->
     phase = scene.phase_rad[axis] + slope * reading_um
     if pattern.role == "gray":
         shown, from_edge = gray_bit(phase, pattern.index)
-        return _Template("gray", np.stack([ones, shown.astype(float)]), from_edge > _EDGE_RAD)
+        sure = from_edge > _EDGE_RAD
+        # where edges are everywhere (a prediction that is nonsense) all bins must do
+        return _Template("gray", np.stack([ones, shown.astype(float)]), sure if sure.any() else ones.astype(bool))
     psi = phase + pattern.shift_rad
     sine = np.sin(psi)
     columns = [ones, np.cos(psi), -sine, -(slope - slope.mean()) * sine, np.cos(2 * psi), np.cos(3 * psi)]

@@ -20,6 +20,8 @@ from membrane_ctrl.metrology.phase import step_weights
 
 FloatArray = NDArray[np.float64]
 
+_LEAST_SWING_ADU = 1.0  # less than a rounding step is no fringe
+
 
 class NoFigureError(Exception):
     """The frames do not carry a figure; the message says why."""
@@ -59,7 +61,7 @@ def look(stack: FrameStack, binned: Binned, excluded: Collection[int], witness: 
     Raises
     ------
     NoFigureError
-        If an axis has fewer than three usable steps.
+        If an axis has fewer than three usable steps, or if there are no fringes.
     """
     used = tuple([k for k in stack.sinusoids(axis) if k not in excluded] for axis in AXES)
     light, swing, phase, saturated = [], [], [], np.zeros(binned.means.shape[1:], bool)
@@ -77,7 +79,10 @@ def look(stack: FrameStack, binned: Binned, excluded: Collection[int], witness: 
         saturated |= binned.saturated[frames].any(axis=0)
     third = _third_witness(stack, binned, excluded) if witness is None else witness
     seen = _middle([*swing] if third is None else [*swing, third])
-    mask = seen > CONTRAST_SHARE * np.percentile(seen, 95)
+    brightest = float(np.percentile(seen, 95))
+    if not brightest > _LEAST_SWING_ADU:
+        raise NoFigureError(f"no fringes: they swing by {brightest:.2g} ADU where they swing most")
+    mask = seen > CONTRAST_SHARE * brightest
     mask &= np.minimum(*swing) > FRINGE_SHARE * seen
     mask &= ~saturated
     every = light if third is None else [*light, third]

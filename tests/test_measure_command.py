@@ -1,0 +1,218 @@
+"""`simulate` and `measure` from the command line: files, exit codes, and one line for every bad input."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tomli_w
+
+from membrane_ctrl.cli import run
+
+SMALL = ["--shrink", "8"]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of one full and one fringes set."""
+    folder = tmp_path_factory.mktemp("sets") / "run"
+    assert run(["simulate", str(folder), *SMALL, "--sets", "2", "--drift-um-per-s", "2.0"]) == 0
+    return folder
+
+
+@pytest.fixture
+def capture_set(made: Path, tmp_path: Path) -> Path:
+    """A full set to be spoiled."""
+    shutil.copytree(made, tmp_path / "run")
+    return tmp_path / "run" / "0000"
+
+
+def rewrite(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change capture.toml."""
+    table = tomllib.loads((folder / "capture.toml").read_text())
+    change(table)
+    (folder / "capture.toml").write_text(tomli_w.dumps(table))
+
+
+def measured(folder: Path, out: Path, *options: str) -> tuple[int, dict[str, Any]]:
+    """Exit code and result.json."""
+    code = run(["measure", str(folder), "--out", str(out), "--no-pictures", *options])
+    return code, json.loads((out / "result.json").read_text())
+
+
+def test_a_full_set(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, result = measured(made / "0000", tmp_path, "--json")
+    assert code == 0
+    assert json.loads(capsys.readouterr().out) == result
+    assert result["schema"] == "membrane-result/1"
+    assert result["zernike"] | {"coeffs_um": None} == {
+        "index": "noll", "first": 1, "normalisation": "rms", "radius_mm": 500.0, "coeffs_um": None,
+    }  # fmt: skip
+    assert len(result["zernike"]["coeffs_um"]) == 36
+    assert result["fit"]["converged"]
+    assert result["fit"]["last_change_mm"] <= 1e-6
+    assert result["quality"]["verdict"] == "ok"
+    assert result["quality"]["flagged_frames"] == []
+    assert set(result["timing_s"]) == {"load", "phase", "reconstruct"}
+    truth, maps = np.load(made / "0000" / "truth.npz"), np.load(tmp_path / "height.npz")
+    x, y = np.meshgrid(maps["x_mm"], maps["y_mm"])
+    assert maps["h_mm"].shape == (maps["y_mm"].size, maps["x_mm"].size)
+    middle = maps["x_mm"].size // 2
+    assert maps["x_mm"][middle] == 0.0
+    assert maps["h_mm"][middle, middle] == pytest.approx(0.0, abs=1e-12)
+    assert np.all(np.isnan(maps["h_mm"][np.hypot(x, y) > 480]))
+    inside = np.hypot(*np.meshgrid(truth["x_mm"], truth["y_mm"])) < 450
+    columns = np.searchsorted(maps["x_mm"], truth["x_mm"]).clip(0, maps["x_mm"].size - 1)
+    near = maps["h_mm"][np.ix_(columns, columns)]
+    assert np.nanmax(np.abs(near - truth["h_mm"])[inside]) < 1.5  # a cell beside, on a slope of 0.15: sign and place
+
+
+def test_a_fringes_set_leans_on_its_reference(made: Path, tmp_path: Path) -> None:
+    code, result = measured(made / "0001", tmp_path)
+    assert code == 0
+    truth = np.load(made / "0001" / "truth.npz")
+    _, first = measured(made / "0000", tmp_path / "first")
+    deeper_um = np.array(result["zernike"]["coeffs_um"]) - first["zernike"]["coeffs_um"]
+    grown_mm = truth["h_mm"][100, 200] - np.load(made / "0000" / "truth.npz")["h_mm"][100, 200]
+    # Noll 4 of a Hencky bowl is 0.282 of its sag
+    assert deeper_um[3] == pytest.approx(282 * grown_mm, rel=0.05)
+
+
+def test_pictures_and_recording(made: Path, tmp_path: Path) -> None:
+    assert run(["measure", str(made / "0000"), "--out", str(tmp_path), "--rerun"]) == 0
+    names = {path.stem for path in tmp_path.glob("*.png")}
+    assert names == {"frames", "sag", "residual", "slopes", "modulation", "profile", "convergence", "uncertainty"}
+    assert (tmp_path / "measurement.rrd").stat().st_size > 10_000
+    details = json.loads((tmp_path / "details.json").read_text())
+    assert details["hencky_sag_mm"] == pytest.approx(37.1, abs=0.05)
+    assert details["pressure_equivalent_pa"] == pytest.approx(600, abs=5)
+    assert details["rim"]["offset_mm"] < 3
+
+
+def test_a_missing_sinusoid_is_done_without(capture_set: Path, tmp_path: Path) -> None:
+    (capture_set / "x_sin_2.png").unlink()
+    code, result = measured(capture_set, tmp_path / "out")
+    assert code == 0
+    assert result["quality"]["verdict"] == "degraded"
+    assert result["quality"]["flagged_frames"] == [{"file": "x_sin_2.png", "reason": "missing: no such file"}]
+
+
+@pytest.mark.parametrize(
+    ("image", "reason"),
+    [
+        (np.zeros((255, 306), np.uint8), "wrong size"),
+        (np.zeros((256, 306), np.uint16), "wrong bit depth"),
+        (np.zeros((256, 306, 3), np.uint8), "colour"),
+    ],
+    ids=["size", "depth", "colour"],
+)
+def test_a_frame_of_another_kind_is_named(capture_set: Path, tmp_path: Path, image: np.ndarray, reason: str) -> None:
+    assert cv2.imwrite(str(capture_set / "y_sin_1.png"), image)
+    code, result = measured(capture_set, tmp_path / "out")
+    assert code == 0
+    (flag,) = result["quality"]["flagged_frames"]
+    assert flag["file"] == "y_sin_1.png"
+    assert reason in flag["reason"]
+
+
+def test_too_many_bad_frames_are_a_rejection(capture_set: Path, tmp_path: Path) -> None:
+    (capture_set / "x_sin_2.png").unlink()
+    (capture_set / "x_sin_3.png").write_bytes(b"no image")
+    code, result = measured(capture_set, tmp_path / "out")
+    assert code == 3
+    assert result["quality"]["verdict"] == "rejected"
+    assert [flag["file"] for flag in result["quality"]["flagged_frames"]] == ["x_sin_2.png", "x_sin_3.png"]
+    assert not (tmp_path / "out" / "height.npz").exists()
+
+
+def test_all_pixels_dark_is_a_rejection(capture_set: Path, tmp_path: Path) -> None:
+    for path in capture_set.glob("*.png"):
+        cv2.imwrite(str(path), np.full((256, 306), 5, np.uint8))
+    code, result = measured(capture_set, tmp_path / "out")
+    assert code == 3
+    assert result["zernike"]["coeffs_um"] == [None] * 36
+
+
+def _sixteen(folder: Path) -> None:
+    for path in folder.glob("*.png"):
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.uint16) * 257)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda f: rewrite(f, lambda t: t["geometry"].update(a_mm=2.672)), ["capture.toml", "geometry.a_mm", "100"]),
+        (lambda f: rewrite(f, lambda t: t["frames"].pop()), ["capture.toml", "frames", "black"]),
+        (lambda f: rewrite(f, lambda t: t["frames"].pop(0)), ["x_sin_0"]),
+        (lambda f: rewrite(f, lambda t: t["frames"].append(t["frames"][0])), ["x_sin_0", "twice"]),
+        (lambda f: rewrite(f, lambda t: t.update(kind="half")), ["kind"]),
+        (lambda f: rewrite(f, lambda t: t.update(schema="other/2")), ["schema"]),
+        (lambda f: rewrite(f, lambda t: t["camera"].update(width_px=400)), ["camera.width_px", "306 x 256"]),
+        (lambda f: rewrite(f, lambda t: t["geometry"].update(a_mm=float("nan"))), ["geometry.a_mm"]),
+        (lambda f: (_sixteen(f), rewrite(f, lambda t: t["camera"].update(bits=8))), ["camera.bits = 8", "16 bit"]),
+        (lambda f: (f / "capture.toml").write_text("a = = 1"), ["capture.toml", "TOML"]),
+        (lambda f: (f / "capture.toml").unlink(), ["capture.toml", "no such file"]),
+        (lambda f: [p.unlink() for p in f.glob("*.png")], ["none of the 18 images"]),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line(
+    capture_set: Path, capsys: pytest.CaptureFixture[str], spoil: Callable[[Path], object], words: list[str]
+) -> None:
+    spoil(capture_set)
+    assert run(["measure", str(capture_set)]) == 2
+    message = capsys.readouterr().err.strip()
+    assert "\n" not in message
+    assert all(word in message for word in words), message
+
+
+def test_16_bit_frames_need_no_declaration(capture_set: Path, tmp_path: Path) -> None:
+    _sixteen(capture_set)
+    code, result = measured(capture_set, tmp_path / "out")
+    assert code == 0
+    assert result["quality"]["modulation_median_adu"] > 10_000
+
+
+def test_a_reference_that_is_not_there(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(made / "0001", tmp_path / "alone")
+    assert run(["measure", str(tmp_path / "alone")]) == 2
+    assert "no such capture set" in capsys.readouterr().err
+
+
+def test_another_geometry(made: Path, tmp_path: Path) -> None:
+    (tmp_path / "geometry.toml").write_text("[geometry]\na_mm = 2680.0\nb_mm = 2871.0\nalpha_deg = 80.9\n")
+    _, own = measured(made / "0000", tmp_path / "own")
+    _, other = measured(made / "0000", tmp_path / "other", "--geometry", str(tmp_path / "geometry.toml"))
+    assert other["zernike"]["coeffs_um"][3] != pytest.approx(own["zernike"]["coeffs_um"][3], abs=1.0)
+
+
+def test_unknown_keys_are_said_and_ignored(
+    capture_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rewrite(capture_set, lambda t: t["camera"].update(gain_db=3))
+    code, _ = measured(capture_set, tmp_path / "out")
+    assert code == 0
+    assert "camera.gain_db" in capsys.readouterr().err
+
+
+def test_simulate_refuses_what_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["simulate", str(tmp_path / "a"), *SMALL, "--fault", "eaten:x_sin_0"]) == 2
+    assert "eaten" in capsys.readouterr().err
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").touch()
+    assert run(["simulate", str(tmp_path / "full"), *SMALL]) == 2
+    assert "not empty" in capsys.readouterr().err
+
+
+def test_a_simulated_fault_is_found_by_measure(tmp_path: Path) -> None:
+    assert run(["simulate", str(tmp_path / "set"), *SMALL, "--fault", "stale:y_sin_3", "--steps", "5"]) == 0
+    code, result = measured(tmp_path / "set", tmp_path / "out")
+    assert code == 0
+    (flag,) = result["quality"]["flagged_frames"]
+    assert flag == {"file": "y_sin_3.png", "reason": "stale: the same picture as y_sin_2"}
