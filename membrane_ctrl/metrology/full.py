@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from membrane_ctrl.config import OpticsConfig
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.decode import FRINGE_SHARE
+from membrane_ctrl.metrology.geometry import Geometry
 from membrane_ctrl.metrology.motion import combine_steps, sensitivity_mm_per_um, worth_correcting
 from membrane_ctrl.metrology.patterns import AXES
 from membrane_ctrl.metrology.phase import step_weights
@@ -29,6 +30,7 @@ _START_SAG_MM = 40.0  # the paper's starting parabola
 _LAST_CHANGE_MM = 1e-7
 # Tukey's weight reaches 0 here: noise (5 sigma in millions of pixels) keeps its say, dust and glints have none
 _TUKEY_SIGMAS = 8.0
+_PART = 1 << 18  # pixels worked on at a time where memory would grow with them
 # A slope this far off is no slope of the film but a wrong fringe order (4.3 mrad) or a glint
 _NO_SLOPE = 4e-3
 
@@ -103,7 +105,8 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     index = row * stack.size_px[1] + column
     in_bin = row // bin_px * columns + column // bin_px
     tracer, surface = checked.tracer, checked.state.surface
-    points = Points.of(tracer.geometry.rays(column, row), np.empty((2, index.size)))
+    points = Points.of(_rays(tracer.geometry, column, row), np.empty((2, index.size)))
+    del row, column
     points.t_mm[:] = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / points.rays[2]
     tracer.intersect(points, surface, newton=4)
     moved = worth_correcting(stack.readings_um, LASER_NOISE_UM)
@@ -118,6 +121,15 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     keep &= swing > FRINGE_SHARE * checked.view.light.reshape(-1)[in_bin]
     rest = np.hypot(axes[0].rest_adu, axes[1].rest_adu)
     return PixelPoints(index[keep], points.subset(keep), swing[keep], rest[keep], moved)
+
+
+def _rays(geometry: Geometry, column: NDArray[np.int64], row: NDArray[np.int64]) -> FloatArray:
+    """Rays of pixels, in parts: what is needed on the way to them is larger than they are."""
+    out = np.empty((3, column.size))
+    for start in range(0, column.size, _PART):
+        part = slice(start, start + _PART)
+        out[:, part] = geometry.rays(column[part], row[part])
+    return out
 
 
 def _axis_phases(
@@ -164,6 +176,7 @@ def reconstruct_full(
     tracer.intersect(points, first.surface)
     field = tracer.slope_field(points, first.surface)
     points.weights[:] = tukey(np.hypot(field[2] - field[4], field[3] - field[5]))
+    del field
     tolerance = _LAST_CHANGE_MM * CONTRACTION
     fit = solve(tracer, points, first.surface, normal=tracer.normal_matrix(points), tolerance_mm=tolerance)
     tracer.intersect(points, fit.surface)

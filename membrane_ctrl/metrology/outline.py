@@ -74,16 +74,16 @@ def find_outline(light: FloatArray, geometry: Geometry, rim_mm: float, rim_z_mm:
     if np.count_nonzero(found) < _LEAST_FOUND * _POINTS:
         return None
     scale = reach[first] - (reach[1] - reach[0]) / 2
-    rim = (middle[:, None] + (expected - middle[:, None]) * scale)[:, found]
-    # to first order the rim is the expected one shifted and scaled: rim - middle = shift + ratio (expected - middle)
-    ray = (expected - middle[:, None])[:, found]
-    design = np.concatenate(
-        [
-            np.stack([np.ones_like(ray[0]), np.zeros_like(ray[0]), ray[0]], axis=1),
-            np.stack([np.zeros_like(ray[1]), np.ones_like(ray[1]), ray[1]], axis=1),
-        ]
-    )
-    shift_x, shift_y, ratio = np.linalg.lstsq(design, (rim - middle[:, None]).ravel(), rcond=None)[0]
+    ray = expected - middle[:, None]
+    rim = middle[:, None] + ray * scale
+    # A rim shifted by w and scaled by ratio meets the ray at scale |ray| = ratio |ray| + (n w) / (n u), with n the
+    # normal of the expected rim and u the ray's direction.
+    length = np.linalg.norm(ray, axis=0)
+    tangent = np.roll(expected, -1, axis=1) - np.roll(expected, 1, axis=1)
+    normal = np.stack([tangent[1], -tangent[0]])
+    design = np.stack([length, *(normal / np.sum(normal * ray / length, axis=0))], axis=1)[found]
+    ratio, shift_x, shift_y = np.linalg.lstsq(design, (scale * length)[found], rcond=None)[0]
+    rim = rim[:, found]
     mm_per_px = rim_mm / float(np.mean(np.linalg.norm(expected - middle[:, None], axis=0)))
     return Outline(
         rim_px=rim,

@@ -54,16 +54,18 @@ def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) ->
     shape_mean, h_mean = shape.mean(), h.mean()
     # least squares with a free offset: a dimple at the vertex must not tilt the whole comparison
     sag = float(np.sum((shape - shape_mean) * (h - h_mean)) / np.sum((shape - shape_mean) ** 2))
+    left = h - (sag * (shape - shape_mean) + h_mean)
     edges = np.linspace(0.0, float(r.max()), _RINGS + 1)
     ring = np.clip(np.digitize(r, edges) - 1, 0, _RINGS - 1)
     rows = []
     for k in range(_RINGS):
         inside = ring == k
         if np.any(inside):
-            rows.append((r[inside].mean(), h[inside].mean(), *np.percentile(h[inside], [2.5, 97.5])))
+            # of the difference to the bowl: across a ring the bowl itself climbs by millimetres
+            rows.append((r[inside].mean(), left[inside].mean(), *np.percentile(left[inside], [2.5, 97.5])))
     radius, mean, low, high = np.array(rows).T
     bowl = sag * hencky.profile(radius / rim_mm) + h_mean - sag * shape_mean
-    return RadialProfile(radius, mean, low, high, bowl, sag, pressure_pa(sag, rim_mm))
+    return RadialProfile(radius, bowl + mean, bowl + low, bowl + high, bowl, sag, pressure_pa(sag, rim_mm))
 
 
 def pressure_pa(sag_mm: float, rim_mm: float) -> float:
