@@ -21,6 +21,8 @@ BoolArray = NDArray[np.bool_]
 
 # A phase that is not torn has no tears at all but for dust; a stale frame of three tears at every quarter period.
 _TORN_SHARE = 0.003
+# One wrong Gray frame leaves half of the votes or more on the right order; fewer agree only if the phase is wrong.
+_LEAST_AGREEMENT = 0.35
 _LEAST_VOTES = 30  # a smaller island cannot outvote its own noise
 
 
@@ -35,7 +37,7 @@ class Orders:
     agreement : float
         Share of the pixels whose own Gray bits give the same order.
     torn : bool
-        The phase is not continuous: the orders are the Gray code's alone.
+        The phase is not continuous, or hardly any code agrees with it: the orders are the Gray code's alone.
     """
 
     phase_rad: FloatArray
@@ -72,6 +74,8 @@ def orders(wrapped_rad: FloatArray, bits: BoolArray, mask: BoolArray) -> Orders:
     shift[mask] = winner[region[mask]]
     known = np.isfinite(shift)
     agreement = float(np.mean(offset[known] == shift[known])) if known.any() else 0.0
+    if agreement < _LEAST_AGREEMENT:
+        return Orders(np.where(mask, coded, np.nan), 1.0, torn=True)
     return Orders(smooth + 2 * math.pi * shift, agreement, torn=False)
 
 
