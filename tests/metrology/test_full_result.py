@@ -1,4 +1,4 @@
-"""Every pixel: accuracy against the twin's truth (issue's table), from frames to height."""
+"""Every pixel: accuracy against the twin's truth, from frames to height."""
 
 from __future__ import annotations
 
