@@ -1,7 +1,8 @@
-"""A run in virtual time: the same controller on the twin, without processes, sockets or waiting.
+"""A run in virtual time: the same controller on the twin behind its board, without processes, sockets or waiting.
 
-What a run has and this has not: the link and its latency (a read here is the plant's state at the tick, a write
-takes effect at once), lateness, and the processes. A shape source, if given, is asked on its cycle's deadlines.
+What a run has and this has not: the latency of the link (a read here is the plant's state at the tick, a write takes
+effect at once) and the processes. A shape source, if given, is asked on its cycle's deadlines. The board is the
+emulator's own, with its watchdog, latches and limits, on the plant's time.
 """
 
 from __future__ import annotations
@@ -12,17 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.roles import BenchReading
+from firmware_iface.roles import BenchCommand, BenchReading, LinkDownError, LinkError
 from membrane_ctrl.commands import Command
 from membrane_ctrl.config import Config
 from membrane_ctrl.controller import Controller
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.telemetry import TelemetryRow
-from membrane_ctrl.tick import Event, TickInputs
+from membrane_ctrl.tick import Event, TickInputs, TickOutputs
 from membrane_ctrl.twin.plant import Plant
+from membrane_ctrl.virtual_bench import VirtualBench
 
 ShapeSource = Callable[[float], ShapeEstimate | None]
+Alter = Callable[[float, BenchReading], BenchReading | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,88 +37,155 @@ class VirtualTick:
     finished: Exit | None
 
 
+class VirtualRun:
+    """Does for a controller in virtual time what the supervisor does in real time, a tick a call.
+
+    Parameters
+    ----------
+    config : Config
+        As for a run.
+    bench : VirtualBench
+        Plant, board, and what is wrong with them.
+    sag_sensitivity : (36,) array
+        See `Controller`.
+    shape : callable, optional
+        Called with the time every `shape.period_s`; returns an estimate or None.
+    alter : callable, optional
+        Stands between the board and the controller: gets the time and the reading, returns what is read.
+
+    Attributes
+    ----------
+    now_s : float
+        The run's clock.
+    finished : Exit or None
+        How the run ended.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        bench: VirtualBench,
+        sag_sensitivity: NDArray[np.float64],
+        shape: ShapeSource | None = None,
+        alter: Alter | None = None,
+    ) -> None:
+        self._bench = bench
+        self._controller = Controller(config, sag_sensitivity)
+        self._shape, self._alter = shape, alter
+        self._shape_period_s = config.shape.period_s
+        self._shape_due_s = 0.0
+        self._period_s = 1.0 / config.loop.rate_hz
+        self._steps = 0
+        self._last_s = 0.0
+        self._missed = 0
+        self._link_up = True
+        self._vent_fraction = 0.0
+        self.now_s = 0.0
+        self.finished: Exit | None = None
+        bench.open()
+
+    def tick(self, commands: tuple[Command, ...] = ()) -> VirtualTick | None:
+        """Let one period pass and run the tick at its end; None if the control process did not run."""
+        self._steps += 1
+        self.now_s = self._steps * self._period_s  # no sum, which would drift
+        self._bench.advance(self._period_s)
+        if self.finished is not None:
+            return None
+        if self._bench.wrong.stalled:
+            self._missed += 1
+            return None
+        reading = self._read()
+        if reading is not None and self._alter is not None:
+            reading = self._alter(self.now_s, reading)
+        outputs = self._controller.tick(self._inputs(reading, commands))
+        self._last_s = self.now_s
+        self._act(outputs)
+        return VirtualTick(outputs.row, outputs.events, outputs.finished)
+
+    def _inputs(self, reading: BenchReading | None, commands: tuple[Command, ...]) -> TickInputs:
+        wrong, truth = self._bench.wrong, self._bench.plant.truth()
+        dt_s = self.now_s - self._last_s
+        return TickInputs(
+            now_s=self.now_s,
+            dt_s=dt_s,
+            reading=reading,
+            lateness_ms=wrong.late_ms + 1e3 * max(0.0, dt_s - 1.5 * self._period_s),
+            missed_ticks=self._missed,
+            link_up=self._link_up,
+            estimate=self._newest_shape(),
+            commands=commands,
+            dead_tasks=("virtual task",) if wrong.dead_task else (),
+            truth_displacement_um=truth.displacement_um,
+            truth_laser_bias_um=truth.laser_bias_um,
+        )
+
+    def _newest_shape(self) -> ShapeEstimate | None:
+        if self._shape is None or self.now_s < self._shape_due_s:
+            return None
+        self._shape_due_s += self._shape_period_s
+        return self._shape(self.now_s)
+
+    def _act(self, outputs: TickOutputs) -> None:
+        self._vent_fraction = outputs.command.vent_fraction
+        if outputs.clear_board:
+            self._try(self._bench.clear_faults)
+        self._try(lambda: self._bench.write(outputs.command))
+        if outputs.finished is not None:
+            self.finished = outputs.finished
+            self._try(lambda: self._bench.write(BenchCommand(0.0, self._vent_fraction)))
+            self._bench.close()
+
+    def _read(self) -> BenchReading | None:
+        if not self._link_up:
+            self._link_up = True
+            self._try(self._bench.open)
+        readings: list[BenchReading] = []
+        self._try(lambda: readings.append(self._bench.read()))
+        return readings[0] if readings else None
+
+    def _try(self, ask: Callable[[], None]) -> None:
+        """Ask the bench for something, unless the link is known to be down."""
+        if not self._link_up:
+            return
+        try:
+            ask()
+        except LinkDownError:
+            self._link_up = False
+        except LinkError:
+            pass  # one answer less: the age of the readings tells
+
+
 def run_virtual(
     config: Config,
     plant: Plant,
     duration_s: float,
     sag_sensitivity: NDArray[np.float64],
     shape: ShapeSource | None = None,
-    alter: Callable[[float, BenchReading], BenchReading | None] | None = None,
+    alter: Alter | None = None,
 ) -> Iterator[VirtualTick]:
     """Hold the twin for `duration_s` of its time, as fast as it goes.
 
     Parameters
     ----------
-    config : Config
-        As for a run.
+    config, sag_sensitivity, shape, alter
+        See `VirtualRun`.
     plant : Plant
         The twin's physics.
     duration_s : float
         When the hold is asked to stop.
-    sag_sensitivity : (36,) array
-        See `Controller`.
-    shape : callable, optional
-        Called with the time every `shape.period_s`; returns an estimate or None.
-    alter : callable, optional
-        Stands between the sensors and the controller, to make faults: gets the time and the reading.
 
     Yields
     ------
     VirtualTick
         Until the controller says that the run is over.
     """
-    controller = Controller(config, sag_sensitivity)
-    period_s = 1.0 / config.loop.rate_hz
-    due_s = 0.0
+    run = VirtualRun(config, VirtualBench(plant), sag_sensitivity, shape, alter)
     commands: tuple[Command, ...] = (Command("hold", "virtual run"),)
-    tick = 0
-    stopping = False
-    while True:
-        plant.advance(period_s)
-        tick += 1
-        now_s = tick * period_s
-        if now_s >= duration_s and not stopping:
-            stopping, commands = True, (*commands, Command("stop", "duration"))
-        estimate = None
-        if shape is not None and now_s >= due_s:
-            due_s += config.shape.period_s
-            estimate = shape(now_s)
-        reading: BenchReading | None = read_plant(plant)
-        if alter is not None and reading is not None:
-            reading = alter(now_s, reading)
-        truth = plant.truth()
-        outputs = controller.tick(
-            TickInputs(
-                now_s=now_s,
-                dt_s=period_s,
-                reading=reading,
-                estimate=estimate,
-                commands=commands,
-                truth_displacement_um=truth.displacement_um,
-                truth_laser_bias_um=truth.laser_bias_um,
-            )
-        )
+    stop_at_s = duration_s
+    while run.finished is None:
+        if run.now_s + 1.0 / config.loop.rate_hz >= stop_at_s:
+            commands, stop_at_s = (*commands, Command("stop", "duration")), float("inf")
+        tick = run.tick(commands)
         commands = ()
-        plant.actuate(outputs.command.pump_fraction, outputs.command.vent_fraction)
-        yield VirtualTick(outputs.row, outputs.events, outputs.finished)
-        if outputs.finished is not None:
-            return
-
-
-def read_plant(plant: Plant) -> BenchReading:
-    """The plant's sensors as the device would report them."""
-    sample = plant.sample()
-    return BenchReading(
-        displacement_um=sample.displacement_um,
-        displacement_quality=sample.displacement_quality,
-        gauge_pressure_pa=sample.gauge_pressure_pa,
-        ambient_pressure_pa=sample.ambient_pressure_pa,
-        air_temperature_c=sample.air_temperature_c,
-        gas_temperature_c=sample.gas_temperature_c,
-        pump_fraction=sample.pump_fraction,
-        vent_fraction=sample.vent_fraction,
-        sample_counter=sample.sample_counter,
-        device_time_s=sample.device_time_s,
-        watchdog_tripped=False,
-        latched_faults=0,
-    )
+        if tick is not None:
+            yield tick

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from firmware_iface.links.modbus_links import ModbusLinks
+from firmware_iface.links.modbus_rules import ModbusLink
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import (
     BenchCommand,
@@ -34,6 +35,8 @@ class PumpBoard:
         For connecting and for each reply.
     watchdog_s : float
         The board turns the pump off when it gets no `write` for this long.
+    link : ModbusLink, optional
+        A link that is there already (one in memory, in virtual time), in place of the URL's.
 
     Raises
     ------
@@ -41,8 +44,16 @@ class PumpBoard:
         The URL is none, or the board cannot have this watchdog period.
     """
 
-    def __init__(self, url: str, unit_id: int = 1, timeout_s: float = 0.2, watchdog_s: float = 0.5) -> None:
-        link = ModbusLinks().link(url, unit_id, timeout_s)
+    def __init__(
+        self,
+        url: str,
+        unit_id: int = 1,
+        timeout_s: float = 0.2,
+        watchdog_s: float = 0.5,
+        link: ModbusLink | None = None,
+    ) -> None:
+        if link is None:
+            link = ModbusLinks().link(url, unit_id, timeout_s)
         registers = default_map()
         self._map_version = registers.map_version
         self._device_kind = registers.device_kind
