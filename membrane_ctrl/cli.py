@@ -141,6 +141,43 @@ def measure(
 
 
 @app.command()
+def uncertainty(
+    capture_set: Annotated[Path, typer.Argument(metavar="SET", help="Folder with capture.toml and its images.")],
+    against: Annotated[
+        Path | None, typer.Option(metavar="SET", help="Of the change since this set, instead of the height.")
+    ] = None,
+    trials: Annotated[int, typer.Option(min=2, help="Monte Carlo trials.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 1,
+    geometry: Annotated[
+        Path | None, typer.Option(help="Geometry to use instead of the set's own, with its covariance.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes; by default as many as the trials are worth.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Run on this Dask scheduler, e.g. tcp://host:8786.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Where the result goes; SET/uncertainty by default.")] = None,
+    json: JsonOption = False,
+) -> int:
+    """Monte Carlo over geometry and pixel noise: RMSE of the height, or of the change between two sets."""
+    from membrane_ctrl.uncertainty_command import UncertaintyOptions, uncertainty_command
+
+    options = UncertaintyOptions(
+        folder=capture_set,
+        against=against,
+        geometry=geometry,
+        trials=trials,
+        seed=seed,
+        workers=workers,
+        scheduler=scheduler,
+        out=out,
+        as_json=json,
+    )
+    return uncertainty_command(options)
+
+
+@app.command()
 def simulate(
     set_dir: Annotated[Path, typer.Argument(metavar="SET_DIR", help="New folder for the set, or for the run.")],
     config: ConfigOption = None,

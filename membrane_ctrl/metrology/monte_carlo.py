@@ -1,0 +1,153 @@
+"""Monte Carlo over geometry and pixel noise (the paper's section 3.1), as cheap as it can honestly be.
+
+A trial of the paper disturbs the frames of every pixel and reconstructs them anew. The disturbance of a bin's phase
+by white noise of the pixels is known: sigma sqrt(2 / N) / (B m) for bins of m x m pixels. And of all the bins a few
+thousand hold 36 terms: one in k, with a k-th of the variance each, gives the fit the same covariance as all of them.
+So a trial draws a geometry, disturbs the screen points that the fitted surface predicts, and takes the two or three
+Gauss-Newton steps from the fitted surface to the disturbed one.
+
+Seeds: the geometry of trial t comes from (seed, 0, t), the noise of set s in it from (seed, 1 + s, t): independent
+of the order, of the number of workers and of what else is in the run, and the geometry is common to all sets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.config import OpticsConfig
+from membrane_ctrl.metrology.bin_figure import BinFigure
+from membrane_ctrl.metrology.checked import Checked
+from membrane_ctrl.metrology.covariance import slope_per_screen
+from membrane_ctrl.metrology.fit import NormalMatrix
+from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.geometry_spread import GeometrySpread, changed
+from membrane_ctrl.metrology.reconstruct import Points, Tracer, solve
+from membrane_ctrl.metrology.surface import PARAMETERS, Surface
+
+FloatArray = NDArray[np.float64]
+
+# 170 a parameter: errors of a geometry are smooth and need fewer; a trial then takes about a millisecond
+TRIAL_POINTS = 6000
+
+
+@dataclass(frozen=True)
+class TrialBench:
+    """All that the trials of one set need; half a megabyte, so that it can be sent to where they run.
+
+    Attributes
+    ----------
+    optics : OpticsConfig
+        With the nominal geometry.
+    vertex_z_mm : float
+        Where the vertex stood.
+    column_px, row_px : (n,) arrays
+        The points in the picture.
+    screen_mm, sigma_mm : (2, n) arrays
+        Where the fitted surface sends them, and 1 sigma of noise there.
+    t_mm : (n,) array
+        Lengths of their rays.
+    surface, normal
+        The fit, and the normal matrix of these points.
+    """
+
+    optics: OpticsConfig
+    vertex_z_mm: float
+    column_px: FloatArray
+    row_px: FloatArray
+    screen_mm: FloatArray
+    sigma_mm: FloatArray
+    t_mm: FloatArray
+    surface: Surface
+    normal: NormalMatrix
+
+    @classmethod
+    def of(cls, optics: OpticsConfig, checked: Checked, figure: BinFigure, count: int = TRIAL_POINTS) -> TrialBench:
+        """Thin the points of a set's figure to about `count`."""
+        tracer, surface = checked.tracer, figure.fit.surface
+        chosen = _spread_evenly(figure.index.size, count)
+        points = figure.points.subset(chosen)
+        row, column = np.divmod(figure.index[chosen], checked.phase_rad.shape[2])
+        side = checked.binned.bin_px
+        thinning = figure.index.size / np.count_nonzero(chosen)
+        return cls(
+            optics=optics,
+            vertex_z_mm=tracer.vertex_z_mm,
+            column_px=side * column + (side - 1) / 2,
+            row_px=side * row + (side - 1) / 2,
+            screen_mm=tracer.predict_screen(points, surface),
+            sigma_mm=figure.sigma_mm[:, chosen] / np.sqrt(thinning),
+            t_mm=points.t_mm,
+            surface=surface,
+            normal=tracer.normal_matrix(points),
+        )
+
+    def solve(self, geometry: Geometry, disturbance_mm: FloatArray | float = 0.0) -> FloatArray:
+        """Parameters (36,) in mm of the surface under a geometry, the screen points (2, n) off by a disturbance.
+
+        Raises
+        ------
+        ArithmeticError
+            If the fit does not converge: the geometry is not near the nominal one.
+        """
+        tracer = Tracer(geometry, self.surface.radius_mm, self.vertex_z_mm)
+        points = Points.of(geometry.rays(self.column_px, self.row_px), self.screen_mm + disturbance_mm)
+        points.t_mm[:] = self.t_mm
+        tracer.intersect(points, self.surface, newton=3)
+        fit = solve(tracer, points, self.surface, normal=self.normal)
+        if not fit.converged:
+            raise ArithmeticError("a trial did not converge: the geometry's spread is too wide to be a spread")
+        return fit.surface.parameters
+
+    def geometry(self, names: tuple[str, ...], change: FloatArray) -> Geometry:
+        """The nominal geometry changed."""
+        return Geometry.from_config(
+            self.optics.model_copy(update={"geometry": changed(self.optics.geometry, names, change)})
+        )
+
+    def slope_variance(self) -> FloatArray:
+        """(2,) variance of an x and of a y slope from the noise."""
+        gain = slope_per_screen(Geometry.from_config(self.optics), self.surface.radius_mm, self.surface.sag_mm)
+        return np.asarray(gain @ np.mean(np.square(self.sigma_mm), axis=1))
+
+
+def _spread_evenly(size: int, count: int) -> NDArray[np.bool_]:
+    """About `count` of `size` points by a golden-ratio sequence: even along rows and columns alike."""
+    if size <= count:
+        return np.ones(size, bool)
+    place = (np.arange(size) * ((np.sqrt(5) - 1) / 2)) % 1
+    return np.asarray(place < count / size)
+
+
+def run_trials(
+    benches: Sequence[TrialBench],
+    spread: GeometrySpread,
+    seed: int,
+    trials: Sequence[int],
+    first_set: int = 0,
+) -> FloatArray:
+    """Parameters (trials, sets, 36) in mm of some trials; all sets share the geometry of a trial.
+
+    Parameters
+    ----------
+    benches : sequence of TrialBench
+        One a set; of one bench, that is with the same nominal geometry.
+    spread : GeometrySpread
+        Of the geometry.
+    seed : int
+        Of all that is random.
+    trials : sequence of int
+        Numbers of the trials.
+    first_set : int
+        Number of the first set in its run: noise differs from set to set.
+    """
+    out = np.empty((len(trials), len(benches), PARAMETERS))
+    for row, trial in enumerate(trials):
+        change = spread.draw(np.random.default_rng((seed, 0, trial)))
+        for k, bench in enumerate(benches):
+            noise = np.random.default_rng((seed, 1 + first_set + k, trial)).standard_normal(bench.sigma_mm.shape)
+            out[row, k] = bench.solve(bench.geometry(spread.names, change), noise * bench.sigma_mm)
+    return out
