@@ -46,6 +46,8 @@ class RecorderSpec:
         Pickled `ShapeEstimate`s.
     frames : FrameAddress or None
         Shared camera frames, for thumbnails.
+    inputs : RingAddress or None
+        What the ticks were given (`tick_record`), for a replay.
     flush_s : float
         What a killed recorder may lose.
     """
@@ -58,6 +60,7 @@ class RecorderSpec:
     events: RingAddress
     shapes: RingAddress | None = None
     frames: FrameAddress | None = None
+    inputs: RingAddress | None = None
     flush_s: float = 1.0
 
 
@@ -92,7 +95,12 @@ def _record(
     from membrane_ctrl.recording.sink import Recording
     from membrane_ctrl.recording.thumbnails import Thumbnails
 
-    addresses = {"telemetry": spec.telemetry, "events": spec.events, "shapes": spec.shapes}
+    addresses = {
+        "telemetry": spec.telemetry,
+        "events": spec.events,
+        "shapes": spec.shapes,
+        "inputs": spec.inputs,
+    }
     rings = {name: RingReader(address) for name, address in addresses.items() if address is not None}
     recording = Recording(spec.run_dir, spec.run_name, spec.clock, spec.config)
     wanted = spec.frames is not None and spec.config.recording.thumbnails

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
+from membrane_ctrl import __version__
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.estimate import ShapeEstimate
@@ -17,14 +18,17 @@ from membrane_ctrl.ipc.ring import RingReader
 from membrane_ctrl.names import State
 from membrane_ctrl.recording import events, plain_json
 from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.recording.column_tables import ColumnTables
 from membrane_ctrl.recording.event_streams import send_events
 from membrane_ctrl.recording.events import Event, EventsFile
+from membrane_ctrl.recording.inputs_file import InputsFile
 from membrane_ctrl.recording.rows import Rows, changes, column, unpack
 from membrane_ctrl.recording.run_folder import free_mb
 from membrane_ctrl.recording.shape_streams import ShapeStreams
 from membrane_ctrl.recording.sink import SEGMENT_S, Recording, RecordingError
 from membrane_ctrl.recording.summary import Summary
 from membrane_ctrl.recording.telemetry_streams import TelemetryStreams
+from membrane_ctrl.tick_record import TickAssembler
 
 # A full disk is tried again this often: a person who made room sees the recording go on.
 RETRY_S = 10.0
@@ -51,7 +55,7 @@ class Recorder:
     config : Config
         The run's configuration.
     rings : dict
-        Readers by name: "telemetry", "events" and, if the shape is measured, "shapes".
+        Readers by name: "telemetry", "events", "inputs" and, if the shape is measured, "shapes".
     recording : Recording
         The Rerun file, no segment begun yet.
     thumbnails : FrameSource or None
@@ -81,7 +85,11 @@ class Recorder:
         self._telemetry_streams = TelemetryStreams(recording, config.limits.band_um)
         self._shape_streams = ShapeStreams(recording)
         self._summary = Summary(config)
+        self._columns = ColumnTables(run_dir)
+        self._inputs_file = InputsFile(run_dir, __version__)
+        self._assembler = TickAssembler()
         self._messages: list[bytes] = []
+        self._input_messages: list[bytes] = []
         self._shapes: list[ShapeEstimate] = []
         self._events: list[Event] = []
         self._alive = False
@@ -96,6 +104,8 @@ class Recorder:
     def drain(self) -> None:
         """Take in what the rings hold; events go to `events.jsonl` at once."""
         self._messages += self._rings["telemetry"].drain()
+        if "inputs" in self._rings:
+            self._input_messages += self._rings["inputs"].drain()
         if "shapes" in self._rings:
             for message in self._rings["shapes"].drain():
                 self._guarded("shape estimate", partial(self._take_shape, message))
@@ -113,6 +123,7 @@ class Recorder:
         estimate: ShapeEstimate = pickle.loads(message)
         self._summary.add_shape(estimate)
         self._shapes.append(estimate)
+        self._guarded("shape columns", lambda: self._columns.add_shape(estimate))
 
     def write(self) -> None:
         """Send to Rerun what came since the last call, and see that it reached the file."""
@@ -120,12 +131,19 @@ class Recorder:
         rows = unpack(self._messages)
         self._messages = []
         self._guarded("summary", lambda: self._summary.add_rows(rows))
+        self._guarded("tick columns", lambda: self._columns.add_rows(rows))
         self._guarded("disk check", self._watch_disk)
         self._guarded("shape reference", lambda: self._watch_hold(rows))
         sent = self._send(now_s, rows)
         if not sent:
             self._rows_lost += len(rows)
+        self._guarded("inputs file", self._write_inputs)
         self._shapes, self._events = [], []
+
+    def _write_inputs(self) -> None:
+        batch = self._assembler.take(self._input_messages)
+        self._input_messages = []
+        self._inputs_file.append(batch, self._shapes)
 
     def _send(self, now_s: float, rows: Rows) -> bool:
         """One second's worth; a writer that died is given a new file once, at once, then every `RETRY_S`."""
@@ -164,6 +182,7 @@ class Recorder:
             return False
         self._alive = True
         self._segment_until_s = now_s + SEGMENT_S
+        self._guarded("inputs file", lambda: self._inputs_file.next_segment(self._recording.segments - 1))
         self._telemetry_streams.start_segment()
         self._shape_streams.start_segment()
         return True
@@ -189,16 +208,19 @@ class Recorder:
         self.drain()
         self.write()
         self._guarded("recording", self._recording.close)
+        self._guarded("columns", self._columns.close)
         dropped = {name: ring.dropped for name, ring in self._rings.items()}
         account = {
             "segments": self._recording.segments,
             "errors": self._errors,
             "rows_lost": self._rows_lost,
+            "column_rows_lost": self._columns.lost,
             "events_lost": self._events_file.lost,
         }
         text = plain_json.dumps(self._summary.as_dict(dropped, account), indent=2) + "\n"
         self._guarded("summary.json", lambda: write_text_atomic(self._run_dir / "summary.json", text))
         self._events_file.close()
+        self._inputs_file.close()
         self._report({"kind": "recorder_done", "dropped": dropped, **account})
 
     def _guarded(self, what: str, action: Callable[[], None]) -> None:

@@ -1,0 +1,9 @@
+"""Looking back at runs: reading, statistics, events found, reports, the viewer.
+
+`open_run(path)` is the door for programs: columns as Arrow tables, shapes and maps as arrays, events as dicts.
+"""
+
+from membrane_ctrl.review.run import Run, open_run
+from membrane_ctrl.review.shapes import Shapes
+
+__all__ = ["Run", "Shapes", "open_run"]

@@ -1,0 +1,105 @@
+"""The small files of a run folder, read so that what is broken is named and the rest is used."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl.config import Config
+from membrane_ctrl.config_file import parse, read_toml
+from membrane_ctrl.errors import InputError
+from membrane_ctrl.recording.column_file import FOLDER
+from membrane_ctrl.review.annotations import ANNOTATIONS_FILE
+
+_SUMMARY_SCHEMA = "membrane-summary/1"
+
+
+def find_folder(path: Path) -> Path:
+    """The run's folder for a path to it or into it. Raises InputError if it is not a run."""
+    folder = path.parent if path.is_file() else path
+    if not folder.exists():
+        raise InputError(f"{path}: no such run; `membrane-ctrl runs` lists those there are")
+    if not is_run(folder):
+        raise InputError(f"{path}: not a run: neither events.jsonl nor a recording is in it")
+    return folder.resolve()
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder holds anything of a run."""
+    return folder.is_dir() and (
+        (folder / "events.jsonl").exists() or any(folder.glob("*.rrd")) or any(folder.glob(f"{FOLDER}/*.arrows"))
+    )
+
+
+def read_events(folder: Path, notes: list[str]) -> tuple[dict[str, Any], ...]:
+    """Events and annotations in the order of time; lines that are no JSON object are counted in `notes`."""
+    events = _json_lines(folder / "events.jsonl", notes)
+    if not (folder / "events.jsonl").exists():
+        notes.append("events.jsonl: missing; states are taken from the telemetry")
+    later = _json_lines(folder / ANNOTATIONS_FILE, notes)
+    return tuple(sorted(events + later, key=_moment))
+
+
+def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
+    """`summary.json`; None with a note if it is missing or broken."""
+    path = folder / "summary.json"
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        notes.append("summary.json: missing; the run is still going, or its recorder was killed")
+        return None
+    except (OSError, ValueError) as error:
+        notes.append(f"summary.json: cannot be read ({error})")
+        return None
+    if not isinstance(summary, dict) or summary.get("schema") != _SUMMARY_SCHEMA:
+        notes.append(f"summary.json: not of schema {_SUMMARY_SCHEMA}; its figures are not used")
+        return {} if not isinstance(summary, dict) else summary
+    return summary
+
+
+def read_config(folder: Path, notes: list[str]) -> Config:
+    """`config.toml`; tables that this version does not understand are at their defaults, with a note."""
+    path = folder / "config.toml"
+    try:
+        tables = read_toml(path)
+        return parse(tables, Config, "config.toml")
+    except InputError as error:
+        notes.append(f"{error}; what it does not say is taken at its default")
+        if not path.exists():
+            return Config()
+    try:
+        tables = read_toml(path)
+    except InputError:
+        return Config()
+    known: dict[str, Any] = {}
+    for name, table in tables.items():
+        try:
+            parse({name: table}, Config, "config.toml")
+        except InputError:
+            continue
+        known[name] = table
+    return parse(known, Config, "config.toml")
+
+
+def _json_lines(path: Path, notes: list[str]) -> list[dict[str, Any]]:
+    if not path.exists():
+        return []
+    found, broken = [], 0
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            event = json.loads(line)
+        except ValueError:
+            event = None
+        if isinstance(event, dict):
+            found.append(event)
+        else:
+            broken += 1
+    if broken:
+        notes.append(f"{path.name}: {broken} line{'s' * (broken > 1)} cannot be read")
+    return found
+
+
+def _moment(event: dict[str, Any]) -> float:
+    moment = event.get("mono_s")
+    return float(moment) if isinstance(moment, (int, float)) else 0.0

@@ -1,0 +1,128 @@
+"""Telemetry and shapes out of Rerun segments: for runs without tables, and for a killed run's last minute.
+
+Slow against the tables (a chunk an entity a second), but everything is in there.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+
+from membrane_ctrl.recording.streams import (
+    LATENCY,
+    MODULATION,
+    QUALITY,
+    RESIDUAL,
+    SAG,
+    SHAPE_STREAMS,
+    STREAMS,
+    ZERNIKE,
+)
+
+Column = NDArray[np.float64]
+_VALUES = "Scalars:scalars"
+_TIME = "run_time"
+
+
+def segments(folder: Path) -> list[Path]:
+    """The run's Rerun segments in their order."""
+    return sorted(folder.glob("*.rrd"))
+
+
+def read_ticks(path: Path, names: Sequence[str], notes: list[str]) -> dict[str, Column]:
+    """Columns of telemetry from one segment, on the ticks of `/tick/record`; NaN where a stream has no row.
+
+    Parameters
+    ----------
+    path : Path
+        Segment.
+    names : sequence of str
+        Fields of `TelemetryRow`, `mono_s` among them.
+    notes : list
+        Gets a line when the segment is damaged.
+    """
+    wanted = {stream.path: stream for stream in STREAMS if any(line.field in names for line in stream.lines)}
+    found = _scalars(path, {*wanted, "/tick/record"}, notes)
+    if "/tick/record" not in found:
+        return {name: np.empty(0) for name in names}
+    clock_ns = found["/tick/record"][0]
+    columns: dict[str, Column] = {"mono_s": _seconds(clock_ns)}
+    for entity, stream in wanted.items():
+        times, values = found.get(entity, (clock_ns[:0], np.empty((0, len(stream.lines)))))
+        rows = np.searchsorted(clock_ns, times)
+        there = (rows < clock_ns.size) & (clock_ns[np.minimum(rows, clock_ns.size - 1)] == times)
+        for place, line in enumerate(stream.lines):
+            column = np.full(clock_ns.size, np.nan)
+            if place < values.shape[1]:
+                column[rows[there]] = values[there, place]
+            columns[line.field] = column
+    return {name: columns.get(name, np.full(clock_ns.size, np.nan)) for name in names}
+
+
+def read_shapes(path: Path, notes: list[str]) -> dict[str, Column]:
+    """Shape estimates of one segment: `time_s`, `coeffs_um` (n, 36), changes of sag and laser, quality."""
+    found = _scalars(path, {stream.path for stream in SHAPE_STREAMS}, notes)
+    if ZERNIKE.path not in found:
+        return {}
+    clock_ns, coeffs_um = found[ZERNIKE.path]
+
+    def at(entity: str, place: int) -> Column:
+        values = np.full(clock_ns.size, np.nan)
+        times, rows = found.get(entity, (clock_ns[:0], np.empty((0, place + 1))))
+        _, here, there = np.intersect1d(clock_ns, times, return_indices=True)
+        values[here] = rows[there, place]
+        return values
+
+    sag_um = at(SAG.path, 0)
+    return {
+        "time_s": _seconds(clock_ns),
+        "coeffs_um": coeffs_um,
+        "sag_um": sag_um,
+        "sag_sigma_um": at(SAG.path, 1) - sag_um,
+        "displacement_um": at(SAG.path, 3),
+        "slope_residual_urad": at(RESIDUAL.path, 0),
+        "valid_fraction": at(QUALITY.path, 0),
+        "saturated_fraction": at(QUALITY.path, 1),
+        "modulation_median_adu": at(MODULATION.path, 0),
+        "latency_s": at(LATENCY.path, 0) * 1e-3,
+    }
+
+
+def _seconds(clock_ns: NDArray[np.int64]) -> Column:
+    return np.asarray(clock_ns * 1e-9, dtype=np.float64)
+
+
+def _scalars(path: Path, entities: set[str], notes: list[str]) -> dict[str, tuple[NDArray[np.int64], Column]]:
+    """(times in ns, (n, m) values) of each entity with scalars, sorted by time."""
+    parts: dict[str, list[tuple[NDArray[np.int64], Column]]] = {}
+    for entity, times, values in _chunks(path, entities, notes):
+        parts.setdefault(entity, []).append((times, values))
+    joined = {}
+    for entity, chunks in parts.items():
+        times = np.concatenate([chunk[0] for chunk in chunks])
+        values = np.concatenate([chunk[1] for chunk in chunks])
+        order = np.argsort(times, kind="stable")
+        joined[entity] = (times[order], values[order])
+    return joined
+
+
+def _chunks(path: Path, entities: set[str], notes: list[str]) -> Iterator[tuple[str, NDArray[np.int64], Column]]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the reader's way to say that a file has no footer
+            for chunk in RrdReader(path).stream():
+                if chunk.entity_path not in entities:
+                    continue
+                batch = chunk.to_record_batch()
+                if _VALUES not in batch.schema.names or _TIME not in batch.schema.names:
+                    continue
+                cells = batch.column(_VALUES)
+                values = cells.flatten().to_numpy(zero_copy_only=False).reshape(batch.num_rows, -1)
+                yield chunk.entity_path, batch.column(_TIME).cast("int64").to_numpy(), values
+    except (RuntimeError, ValueError, OSError) as error:
+        notes.append(f"{path.name}: damaged or cut short ({str(error).splitlines()[0][:120]})")

@@ -1,0 +1,200 @@
+"""A run folder as data: `open_run(path)`, then columns, levels, shapes, events. Nothing here ever writes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from membrane_ctrl.config import Config
+from membrane_ctrl.recording.column_tables import SHAPES, TICKS, level_table
+from membrane_ctrl.recording.levels import NAMES as LEVEL_NAMES
+from membrane_ctrl.recording.levels import TICK_FIELDS, WINDOWS_S, coarser_level, first_level
+from membrane_ctrl.review import rrd_reader, shapes
+from membrane_ctrl.review.column_reader import column_files, first_s, missing_files, read_file
+from membrane_ctrl.review.folder import find_folder, read_config, read_events, read_summary
+from membrane_ctrl.review.shapes import Shapes
+from membrane_ctrl.telemetry import FIELDS
+
+Column = NDArray[np.float64]
+Block = dict[str, Column]
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A run, opened for reading.
+
+    Attributes
+    ----------
+    folder : Path
+    config : Config
+        As run; of a version that is not ours, what of it can be read, the rest at its default.
+    events : tuple of dict
+        `events.jsonl` and the annotations made later, in the order of time.
+    summary : dict or None
+        `summary.json`; None while the run goes on, or if its recorder was killed.
+    origin_utc : datetime
+        UTC at 0 s of the run.
+    notes : list of str
+        What is missing or damaged, a line each; reading may add to it.
+    """
+
+    folder: Path
+    config: Config
+    events: tuple[dict[str, Any], ...]
+    summary: dict[str, Any] | None
+    origin_utc: datetime
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.folder.name
+
+    def utc(self, mono_s: float) -> datetime:
+        """UTC of a second of the run."""
+        return self.origin_utc + timedelta(seconds=mono_s)
+
+    def ticks(self, names: Sequence[str] | None = None, start_s: float = -np.inf, end_s: float = np.inf) -> pa.Table:
+        """Telemetry as an Arrow table (`.to_pandas()` where pandas is installed).
+
+        Parameters
+        ----------
+        names : sequence of str, optional
+            Fields of `telemetry.TelemetryRow`; all by default. `mono_s` is always there.
+        start_s, end_s : float
+            Part of the run wanted.
+        """
+        wanted = _with_time(names or FIELDS)
+        blocks = [pa.table(block) for block in self.tick_blocks(wanted, start_s, end_s)]
+        empty = pa.table({name: np.empty(0) for name in wanted})
+        return pa.concat_tables(blocks, promote_options="permissive") if blocks else empty
+
+    def tick_blocks(self, names: Sequence[str], start_s: float = -np.inf, end_s: float = np.inf) -> Iterator[Block]:
+        """Telemetry in blocks of some hours, so that a month needs no more memory than a night."""
+        wanted = _with_time(names)
+        last_s = -np.inf
+        for block in self._table_blocks(TICKS, "mono_s", wanted, start_s, end_s):
+            last_s = float(block["mono_s"][-1])
+            yield block
+        if last_s >= end_s or (self.summary is not None and last_s > -np.inf):
+            return
+        paths = rrd_reader.segments(self.folder)
+        for path in paths if last_s == -np.inf else paths[-2:]:
+            block = _cut(rrd_reader.read_ticks(path, wanted, self.notes), "mono_s", start_s, end_s)
+            block = _cut(block, "mono_s", np.nextafter(last_s, np.inf) if last_s > -np.inf else -np.inf, np.inf)
+            if block["mono_s"].size:
+                yield block
+
+    def level(self, window_s: float, start_s: float = -np.inf, end_s: float = np.inf) -> Block:
+        """Overview: least, mean and greatest of each signal in windows of 1, 10 or 60 s (`recording.levels`).
+
+        What is not in the table of the level is made from the next finer one, in the end from the ticks.
+        """
+        finer = {coarse: fine for fine, coarse in pairwise(WINDOWS_S)}
+        if window_s not in WINDOWS_S:
+            raise ValueError(f"levels are {', '.join(f'{w:g}' for w in WINDOWS_S)} s, not {window_s:g}")
+        table = level_table(window_s)
+        blocks = list(self._table_blocks(table, "time_s", LEVEL_NAMES, start_s, end_s))
+        until_s = float(blocks[-1]["time_s"][-1]) + window_s if blocks else start_s
+        if self.summary is None or not blocks:
+            if window_s in finer:
+                blocks.append(coarser_level(self.level(finer[window_s], until_s, end_s), window_s))
+            else:
+                blocks += [first_level(block) for block in self.tick_blocks(TICK_FIELDS, until_s, end_s)]
+        if not blocks:
+            return {name: np.empty(0) for name in LEVEL_NAMES}
+        return {name: np.concatenate([block[name] for block in blocks]) for name in LEVEL_NAMES}
+
+    def shapes(self) -> Shapes:
+        """Every measured figure of the run."""
+        tables = [read_file(path, None, self.notes) for path in column_files(self.folder, SHAPES)]
+        found = [shapes.from_table(table) for table in tables if table is not None and table.num_rows]
+        if not found:
+            columns = [rrd_reader.read_shapes(path, self.notes) for path in rrd_reader.segments(self.folder)]
+            found = [shapes.from_columns(part) for part in columns if part]
+        return shapes.joined(found)
+
+    def _table_blocks(
+        self, table: str, time_name: str, names: Sequence[str], start_s: float, end_s: float
+    ) -> Iterator[Block]:
+        files = column_files(self.folder, table)
+        limited = np.isfinite(start_s) or np.isfinite(end_s)
+        starts = [first_s(path, time_name) if limited else None for path in files]
+        for place, path in enumerate(files):
+            begins, ends = starts[place], next((s for s in starts[place + 1 :] if s is not None), None)
+            if (begins is not None and begins >= end_s) or (ends is not None and ends <= start_s):
+                continue
+            read = read_file(path, names, self.notes)
+            if read is None or time_name not in read.column_names:
+                continue
+            block = {name: _array(read, name) for name in names}
+            block = _cut(block, time_name, start_s, end_s)
+            if block[time_name].size:
+                yield block
+
+
+def open_run(path: Path | str) -> Run:
+    """Open a run folder, also one that is still going, was killed, or lacks parts.
+
+    Parameters
+    ----------
+    path : Path or str
+        Folder of the run, or a file in it.
+
+    Raises
+    ------
+    InputError
+        If there is no such folder, or nothing in it is of a run.
+    """
+    folder = find_folder(Path(path))
+    notes: list[str] = []
+    events = read_events(folder, notes)
+    summary = read_summary(folder, notes)
+    for files in (column_files(folder, TICKS), rrd_reader.segments(folder)):
+        notes += [f"{name}: missing; what it held is left out" for name in missing_files(files)]
+    if not rrd_reader.segments(folder):
+        notes.append("no Rerun segment: there is nothing for the viewer but what the tables hold")
+    return Run(folder, read_config(folder, notes), events, summary, _origin(folder, events), notes)
+
+
+def _origin(folder: Path, events: Sequence[dict[str, Any]]) -> datetime:
+    for event in events:
+        try:
+            moment = datetime.fromisoformat(event["time_utc"])
+            return moment.astimezone(UTC) - timedelta(seconds=float(event["mono_s"]))
+        except (KeyError, TypeError, ValueError):
+            continue
+    try:
+        return datetime.strptime(folder.name[:16], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+    except ValueError:
+        return datetime.fromtimestamp(folder.stat().st_mtime, UTC)
+
+
+def _with_time(names: Sequence[str]) -> tuple[str, ...]:
+    unknown = sorted(set(names) - set(FIELDS))
+    if unknown:
+        raise ValueError(f"no such column: {', '.join(unknown)}; known are {json.dumps(FIELDS)}")
+    return tuple(dict.fromkeys(("mono_s", *names)))
+
+
+def _array(table: pa.Table, name: str) -> Column:
+    if name not in table.column_names:
+        return np.full(table.num_rows, np.nan)
+    return np.asarray(table.column(name).to_numpy())
+
+
+def _cut(block: Block, time_name: str, start_s: float, end_s: float) -> Block:
+    time_s = block[time_name]
+    first, last = np.searchsorted(time_s, [start_s, end_s])
+    if first == 0 and last == time_s.size:
+        return block
+    return {name: values[first:last] for name, values in block.items()}

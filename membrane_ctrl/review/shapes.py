@@ -1,0 +1,130 @@
+"""The measured figure over a run: coefficients, their covariance, heights anywhere on the mirror."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.surface import Surface
+
+Column = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Shapes:
+    """Cycles in their order; arrays (n,) unless said otherwise, NaN where nothing was recorded.
+
+    Attributes
+    ----------
+    time_s, sag_um, sag_sigma_um, displacement_um, slope_residual_urad, valid_fraction, latency_s, hencky_um : array
+        As in `ShapeEstimate`.
+    coeffs_um : (n, 36) array
+    verdict : (n,) array of str
+    covariance_time_s : (k,) array
+        Of the cycles whose covariance was recorded.
+    covariance_um2 : (k, 36, 36) array
+    """
+
+    time_s: Column
+    coeffs_um: Column
+    hencky_um: Column
+    sag_um: Column
+    sag_sigma_um: Column
+    displacement_um: Column
+    slope_residual_urad: Column
+    valid_fraction: Column
+    latency_s: Column
+    verdict: NDArray[np.str_]
+    covariance_time_s: Column
+    covariance_um2: Column
+
+    def __len__(self) -> int:
+        return int(self.time_s.size)
+
+    def select(self, wanted: NDArray[np.bool_]) -> Shapes:
+        """The cycles for which `wanted` (n,) is true; the covariances stay all."""
+        parts = {name: getattr(self, name)[wanted] for name in (*_NUMBERS, "coeffs_um", "verdict")}
+        return Shapes(**parts, covariance_time_s=self.covariance_time_s, covariance_um2=self.covariance_um2)
+
+    def heights_um(self, x: Column, y: Column) -> Column:
+        """(n, points) height above the vertex at points of the unit disc (mirror radius 1), um."""
+        return self.parameters_um() @ height_basis(x, y)
+
+    def parameters_um(self) -> Column:
+        """(n, 37): the 36 coefficients and the amplitude of the Hencky part beyond them."""
+        return np.column_stack((self.coeffs_um, self.hencky_um))
+
+    def covariance_near(self, time_s: float) -> Column | None:
+        """(36, 36) um^2 recorded nearest to a time; None if none was."""
+        if not self.covariance_time_s.size:
+            return None
+        return np.asarray(self.covariance_um2[np.argmin(np.abs(self.covariance_time_s - time_s))])
+
+
+_NUMBERS = (
+    "time_s", "hencky_um", "sag_um", "sag_sigma_um", "displacement_um", "slope_residual_urad", "valid_fraction",
+    "latency_s",
+)  # fmt: skip
+
+
+def height_basis(x: Column, y: Column) -> Column:
+    """(37, points): height of a unit of each parameter, from the vertex."""
+    units = np.eye(37)
+    return np.stack([Surface(unit[:36], unit[36], 1.0).height(x, y) for unit in units])
+
+
+def from_table(table: pa.Table) -> Shapes:
+    """Shapes of the recorder's table, whatever columns it has."""
+    count = table.num_rows
+    covariances = _lists(table, "covariance_um2")
+    kept = [(place, values) for place, values in enumerate(covariances) if len(values) == 36 * 36]
+    time_s = _numbers(table, "time_s")
+    coeffs = table.column("coeffs_um").combine_chunks() if "coeffs_um" in table.column_names else None
+    return Shapes(
+        **{name: _numbers(table, name) for name in _NUMBERS},
+        coeffs_um=np.full((count, 36), np.nan) if coeffs is None else _matrix(coeffs, count),
+        verdict=np.array(table.column("verdict").to_pylist() if "verdict" in table.column_names else ["ok"] * count),
+        covariance_time_s=time_s[[place for place, _ in kept]],
+        covariance_um2=np.array([values for _, values in kept], dtype=np.float64).reshape(-1, 36, 36),
+    )
+
+
+def from_columns(columns: Mapping[str, Column]) -> Shapes:
+    """Shapes of a Rerun segment (`rrd_reader.read_shapes`): the Hencky part and the covariance are not in there."""
+    count = columns["time_s"].size if columns else 0
+    numbers = {name: columns.get(name, np.full(count, np.nan)) for name in _NUMBERS}
+    return Shapes(
+        **{**numbers, "hencky_um": np.zeros(count)},
+        coeffs_um=columns.get("coeffs_um", np.empty((0, 36))),
+        verdict=np.array(["ok"] * count),
+        covariance_time_s=np.empty(0),
+        covariance_um2=np.empty((0, 36, 36)),
+    )
+
+
+def joined(parts: list[Shapes]) -> Shapes:
+    """One after the other."""
+    if not parts:
+        return from_columns({})
+    names = (*_NUMBERS, "coeffs_um", "verdict", "covariance_time_s", "covariance_um2")
+    return Shapes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
+def _numbers(table: pa.Table, name: str) -> Column:
+    if name not in table.column_names:
+        return np.full(table.num_rows, np.nan)
+    return np.asarray(table.column(name).to_numpy(), dtype=np.float64)
+
+
+def _matrix(cells: pa.Array, count: int) -> Column:
+    return np.asarray(cells.flatten().to_numpy(zero_copy_only=False), dtype=np.float64).reshape(count, 36)
+
+
+def _lists(table: pa.Table, name: str) -> list[NDArray[np.float32]]:
+    if name not in table.column_names:
+        return []
+    return [np.asarray(cell.values.to_numpy()) for chunk in table.column(name).chunks for cell in chunk]
