@@ -7,7 +7,7 @@ are found, a pump that is 30 % weaker than stated is not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from membrane_ctrl.config import PumpConfig
 from membrane_ctrl.control.slope import Slope
@@ -31,6 +31,7 @@ PARTS = (
     Part("off", 0.0, 0.0, 0.35, 1.2),
     Part("pump", 0.8, 0.0, 0.4, 0.7),
 )
+_RATE_HZ = 50.0  # for which the parts' times are
 # Slopes over 0.35 s at 50 Hz and 1 um of noise have a standard deviation of 2.4 um/s, those of the pump 0.8 um/s
 _VENT_LEAST_UM_PER_S = 2.0
 _PUMP_LEAST_SHARE, _PUMP_MOST_SHARE = 0.3, 3.0
@@ -45,11 +46,17 @@ class ActuatorTest:
         What the pump is said to give.
     test_vent : bool
         The bench has a vent, and the mirror has the pressure to let gas out by it.
+    rate_hz : float
+        Tick rate. Fewer readings a second take longer to show a slope.
     """
 
-    def __init__(self, pump: PumpConfig, test_vent: bool) -> None:
+    def __init__(self, pump: PumpConfig, test_vent: bool, rate_hz: float) -> None:
         self._pump = pump
-        self._parts = [part for part in PARTS if test_vent or part.name != "vent"]
+        # the slope's standard deviation goes with rate^(-1/2) T^(-3/2): this T keeps it
+        longer = (_RATE_HZ / min(rate_hz, _RATE_HZ)) ** (1 / 3)
+        self._parts = [
+            replace(part, measure_s=part.measure_s * longer) for part in PARTS if test_vent or part.name != "vent"
+        ]
         self._speeds = {part.name: Slope() for part in self._parts}
         self._elapsed_s = 0.0
 

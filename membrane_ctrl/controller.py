@@ -223,7 +223,7 @@ class Controller:
         self._state_since_s = math.nan
         scene.good_since_s = math.nan
         scene.overdue = scene.unfit = ""
-        scene.test = None
+        scene.test, scene.tested_once = None, False
 
     def _tell_why(self, events: list[Event]) -> None:
         """The one line of the operator, as an event when its words (not its numbers) have changed for good."""

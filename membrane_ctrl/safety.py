@@ -2,8 +2,8 @@
 
 Each rule names a cause, how many of the last ticks must show it (N of M), the limit, the rung of the ladder of
 safe actions where it enters, and whether it latches. Every rule is judged on every tick in the states where it
-applies; the first cause that trips wins, and is what the operator is told. `docs/faults.md` is made from this
-table.
+applies. Of rules that trip together the one that enters deepest wins; the first cause of a fault is what the
+operator is told. `docs/faults.md` is made from this table.
 """
 
 from __future__ import annotations
@@ -351,7 +351,10 @@ class SafetyTable:
         self._history = [0] * len(table)
 
     def judge(self, state: State, observation: Observation) -> Verdict:
-        """The first rule that trips. All rules are looked at, so that no history has a hole."""
+        """The tripped rule that enters deepest, of equal ones the first. All are looked at: no history has a hole.
+
+        Not simply the first: a lost laser, which is held on the mean flow, must not hide a lost pressure sensor.
+        """
         tripped: Rule | None = None
         for index, rule in enumerate(self._table):
             if state not in rule.states:
@@ -360,7 +363,7 @@ class SafetyTable:
             mask = (1 << rule.window) - 1
             history = ((self._history[index] << 1) | rule.broken(observation, self._limits)) & mask
             self._history[index] = history
-            if tripped is None and history.bit_count() >= rule.needed:
+            if history.bit_count() >= rule.needed and (tripped is None or rule.rung > tripped.rung):
                 tripped = rule
         return Verdict(tripped, _seen(tripped, observation) if tripped else "")
 
