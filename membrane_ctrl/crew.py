@@ -13,6 +13,7 @@ from membrane_ctrl.ipc.ring import RingAddress, ring
 from membrane_ctrl.processes import Child, pipe
 from membrane_ctrl.telemetry import ROW_BYTES
 from membrane_ctrl.tick import Event
+from membrane_ctrl.tick_record import MESSAGE_BYTES
 
 # A recorder that is busy for a minute (a slow disk, a big flush) loses nothing
 _TELEMETRY_KEPT_S = 60.0
@@ -28,6 +29,7 @@ class Rings:
 
     telemetry: RingAddress
     events: RingAddress
+    inputs: RingAddress
     shapes: RingAddress | None
     frames: FrameAddress | None
     truth: RingAddress | None
@@ -35,12 +37,14 @@ class Rings:
 
 def rings_for(config: Config, truth: RingAddress | None, stack: ExitStack) -> Rings:
     """Make the rings; the stack gives their memory back."""
-    telemetry = stack.enter_context(ring(round(_TELEMETRY_KEPT_S * config.loop.rate_hz), ROW_BYTES))
+    kept = round(_TELEMETRY_KEPT_S * config.loop.rate_hz)
+    telemetry = stack.enter_context(ring(kept, ROW_BYTES))
     events = stack.enter_context(ring(_EVENTS_KEPT, _EVENT_BYTES))
+    inputs = stack.enter_context(ring(kept, MESSAGE_BYTES))
     if truth is None or not config.shape.enabled:  # no camera but the twin's is known yet
-        return Rings(telemetry, events, None, None, truth)
+        return Rings(telemetry, events, inputs, None, None, truth)
     shapes = stack.enter_context(ring(_SHAPES_KEPT, _SHAPE_BYTES))
-    return Rings(telemetry, events, shapes, _frames(config, stack), truth)
+    return Rings(telemetry, events, inputs, shapes, _frames(config, stack), truth)
 
 
 def _frames(config: Config, stack: ExitStack) -> FrameAddress:
@@ -67,7 +71,7 @@ class Crew:
         from membrane_ctrl.screen.process import ScreenSpec
 
         recorder_spec = RecorderSpec(
-            run_dir, name, clock, config, rings.telemetry, rings.events, rings.shapes, rings.frames
+            run_dir, name, clock, config, rings.telemetry, rings.events, rings.shapes, rings.frames, rings.inputs
         )
         screen_spec = ScreenSpec(clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s)
         status, theirs = pipe()

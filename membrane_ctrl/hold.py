@@ -102,10 +102,9 @@ async def _run(
 ) -> Exit:
     from membrane_ctrl.metrology.hencky import zernike_projection
 
-    with _open(rings) as (telemetry, events, shapes):
-        wiring = Wiring(
-            bench, telemetry, events, shapes, twin.truth_reader() if twin else None, crew.children, crew.reports
-        )
+    with _open(rings) as (telemetry, events, inputs, shapes):
+        truth = twin.truth_reader() if twin else None
+        wiring = Wiring(bench, telemetry, events, inputs, shapes, truth, crew.children, crew.reports)
         controller = Controller(config, zernike_projection())
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         devices = config.devices.name if config.devices else ""
@@ -137,13 +136,13 @@ async def _run(
 
 
 @contextlib.contextmanager
-def _open(rings: Rings) -> Iterator[tuple[RingWriter, RingWriter, RingReader | None]]:
-    telemetry, events = RingWriter(rings.telemetry), RingWriter(rings.events)
+def _open(rings: Rings) -> Iterator[tuple[RingWriter, RingWriter, RingWriter, RingReader | None]]:
+    telemetry, events, inputs = RingWriter(rings.telemetry), RingWriter(rings.events), RingWriter(rings.inputs)
     shapes = RingReader(rings.shapes) if rings.shapes else None
     try:
-        yield telemetry, events, shapes
+        yield telemetry, events, inputs, shapes
     finally:
-        for ring in (telemetry, events, shapes):
+        for ring in (telemetry, events, inputs, shapes):
             if ring is not None:
                 ring.close()
 

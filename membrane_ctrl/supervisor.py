@@ -10,6 +10,7 @@ import asyncio
 import json
 import math
 import pickle
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -21,7 +22,8 @@ from membrane_ctrl.errors import Exit
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.ipc.ring import RingReader, RingWriter
 from membrane_ctrl.processes import Child
-from membrane_ctrl.tick import Event, TickInputs
+from membrane_ctrl.tick import Event, TickInputs, TickOutputs
+from membrane_ctrl.tick_record import pack_tick
 
 # Looking after a child costs a system call; half a second late is soon enough, the loop does not need them
 _CHILD_WATCH_S = 0.5
@@ -34,6 +36,7 @@ class Wiring:
     bench: Bench
     telemetry: RingWriter
     events: RingWriter
+    inputs: RingWriter | None = None  # what the ticks were given, for a replay
     shapes: RingReader | None = None
     truth: Callable[[], tuple[float, float]] | None = None  # (displacement_um, laser_bias_um) of the twin
     children: Sequence[Child] = ()
@@ -64,6 +67,7 @@ class Supervisor:
         self._pending: list[Command] = []
         self._link_up = True
         self._link_error = ""
+        self._inputs_error = ""
         self._dead: set[str] = set()
         self._next_watch_s = 0.0
         self._vent_fraction = 0.0
@@ -115,29 +119,44 @@ class Supervisor:
             self._watch()
         truth_um, bias_um = wiring.truth() if wiring.truth else (math.nan, math.nan)
         commands, self._pending = tuple(self._pending), []
-        outputs = self._controller.tick(
-            TickInputs(
-                now_s=now_s,
-                dt_s=dt_s,
-                reading=reading,
-                lateness_ms=1e3 * late_s,
-                missed_ticks=self.missed_ticks,
-                link_up=self._link_up,
-                estimate=self._newest_shape(),
-                commands=commands,
-                dead_tasks=tuple(name for name, task in wiring.tasks.items() if task.done()),
-                truth_displacement_um=truth_um,
-                truth_laser_bias_um=bias_um,
-            )
+        inputs = TickInputs(
+            now_s=now_s,
+            dt_s=dt_s,
+            reading=reading,
+            lateness_ms=1e3 * late_s,
+            missed_ticks=self.missed_ticks,
+            link_up=self._link_up,
+            estimate=self._newest_shape(),
+            commands=commands,
+            dead_tasks=tuple(name for name, task in wiring.tasks.items() if task.done()),
+            truth_displacement_um=truth_um,
+            truth_laser_bias_um=bias_um,
         )
+        outputs = self._controller.tick(inputs)
         self._vent_fraction = outputs.command.vent_fraction
         if outputs.clear_board:
             await self._clear_board()
         await self._write(outputs.command)
-        wiring.telemetry.put(outputs.row.pack())
+        self._record(inputs, outputs)
         for event in outputs.events:
             self.tell(event)
         return outputs.finished
+
+    def _record(self, inputs: TickInputs, outputs: TickOutputs) -> None:
+        """The row for people, the inputs for a replay; a value of a wrong kind costs the replay, not the run."""
+        row = outputs.row.pack()
+        self._wiring.telemetry.put(row)
+        if self._wiring.inputs is None:
+            return
+        try:
+            messages = pack_tick(self.ticks, inputs, outputs, row)
+        except (struct.error, TypeError, ValueError) as error:
+            if not self._inputs_error:
+                self._inputs_error = str(error)
+                self.tell({"kind": "inputs_not_recorded", "message": self._inputs_error})
+            return
+        for message in messages:
+            self._wiring.inputs.put(message)
 
     async def _read(self) -> BenchReading | None:
         try:

@@ -13,7 +13,7 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -85,108 +85,122 @@ def _write_all(descriptor: int, data: bytes) -> None:
         os.write(descriptor, data[written:])
 
 
-@dataclass(slots=True)
-class Inputs:
-    """What the files of a run hold.
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """About a second of a run: ticks by number, tails by tick, shape estimates by time."""
+
+    records: Records
+    tails: dict[int, bytes]
+    estimates: dict[float, ShapeEstimate]
+
+
+class InputsReader:
+    """Reads the `inputs-*.bin` of a folder frame by frame; damage is listed, not raised.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the run, or of an incident.
 
     Attributes
     ----------
     program : str
-        Who recorded them.
-    records : (n,) array of `tick_record.RECORD`
-        Ticks by number, each once.
-    tails : dict
-        Commands and ended tasks by tick.
-    estimates : dict
-        Shape estimates by time.
+        Who recorded the last file that was read.
     damage : list of str
-        What could not be read, one line a place.
+        What could not be read so far, one line a place.
     """
 
-    program: str = ""
-    records: Records = field(default_factory=lambda: np.empty(0, dtype=RECORD))
-    tails: dict[int, bytes] = field(default_factory=dict)
-    estimates: dict[float, ShapeEstimate] = field(default_factory=dict)
-    damage: list[str] = field(default_factory=list)
+    def __init__(self, folder: Path) -> None:
+        self.paths = sorted(folder.glob("inputs-*.bin"))
+        self.program = ""
+        self.damage: list[str] = []
 
+    def __iter__(self) -> Iterator[Frame]:
+        """All frames in order; a tick that was written twice (a recorder that went on) comes once. Raises OSError."""
+        last = 0
+        for path in self.paths:
+            data = path.read_bytes()
+            kind = self._kind_of(data, path.name)
+            if kind is None:
+                continue
+            for body in self._bodies(data, path.name):
+                frame = _frame_of(body, kind)
+                fresh = frame.records[frame.records["tick"] > last]
+                if len(fresh):
+                    last = int(fresh["tick"][-1])
+                yield Frame(fresh, frame.tails, frame.estimates)
 
-def read_inputs(folder: Path) -> Inputs:
-    """Read all `inputs-*.bin` of a folder; damage is listed, not raised.
-
-    Raises
-    ------
-    OSError
-        A file cannot be read at all.
-    """
-    found = Inputs()
-    parts = []
-    for path in sorted(folder.glob("inputs-*.bin")):
-        data = path.read_bytes()
+    def _kind_of(self, data: bytes, name: str) -> np.dtype[np.void] | None:
+        """The file's own record: one of an older program may lack a field, one of a newer have more."""
         line, _, _ = data.partition(b"\n")
         try:
             head = json.loads(line)
-            same = head["schema"] == SCHEMA and [tuple(f) for f in head["fields"]] == RECORD.descr
+            kind = np.dtype([(str(field), str(code)) for field, code in head["fields"]])
+            self.program = head["program"]
         except (ValueError, KeyError, TypeError):
-            found.damage.append(f"{path.name}: its first line is not readable")
-        else:
-            if not same:
-                found.damage.append(f"{path.name}: {head['schema']} of {head.get('program')}: other fields than ours")
+            self.damage.append(f"{name}: its first line is damaged; taken for one of this program")
+            return RECORD
+        if head.get("schema") != SCHEMA:
+            self.damage.append(f"{name}: {head.get('schema')} where {SCHEMA} is known")
+            return None
+        return kind
+
+    def _bodies(self, data: bytes, name: str) -> Iterator[bytes]:
+        """Bodies of all whole frames; between them anything may lie."""
+        place = good_until = data.find(b"\n") + 1
+        while (place := data.find(_MAGIC, place)) >= 0:
+            body, end = _body_at(data, place)
+            if body is None:
+                place += 1
                 continue
-            found.program = head["program"]
-        for body in _frames(data, path.name, found.damage):
-            parts.append(_take_frame(body, found))
-    if parts:
-        every = np.concatenate(parts)
-        _, first = np.unique(every["tick"], return_index=True)  # a recorder that went on repeats a second at most
-        found.records = every[first]
-    return found
+            self._note_damage(name, good_until, place)
+            yield body
+            place = good_until = end
+        self._note_damage(name, good_until, len(data))
+
+    def _note_damage(self, name: str, start: int, end: int) -> None:
+        if end > start:
+            self.damage.append(f"{name}: {end - start} bytes at {start} are not readable")
 
 
-def _frames(data: bytes, name: str, damage: list[str]) -> Iterator[bytes]:
-    """Bodies of all whole frames; between them anything may lie."""
-    place = data.find(_MAGIC)
-    end = place
-    while place >= 0:
-        if place > end:
-            damage.append(f"{name}: {place - end} bytes at {end} are not readable")
-        body = _frame_at(data, place)
-        if body is None:
-            following = data.find(_MAGIC, place + 1)
-            stop = following if following >= 0 else len(data)
-            damage.append(f"{name}: {stop - place} bytes at {place} are not readable")
-            place = end = following
-            continue
-        packed_bytes = _HEAD.unpack_from(data, place)[1]
-        yield body
-        end = place + _HEAD.size + packed_bytes
-        place = data.find(_MAGIC, end)
-        if place < 0 and end < len(data):
-            damage.append(f"{name}: {len(data) - end} bytes at {end} are not readable")
-
-
-def _frame_at(data: bytes, place: int) -> bytes | None:
+def _body_at(data: bytes, place: int) -> tuple[bytes | None, int]:
+    """A frame's body and where the frame ends; None if it is not whole."""
     if place + _HEAD.size > len(data):
-        return None
+        return None, place
     _, length, crc = _HEAD.unpack_from(data, place)
-    packed = data[place + _HEAD.size : place + _HEAD.size + length]
-    if len(packed) < length or zlib.crc32(packed) != crc:
-        return None
-    return zlib.decompress(packed)
+    end = place + _HEAD.size + length
+    packed = data[place + _HEAD.size : end]
+    if end > len(data) or zlib.crc32(packed) != crc:
+        return None, place
+    return zlib.decompress(packed), end
 
 
-def _take_frame(body: bytes, found: Inputs) -> Records:
+def _frame_of(body: bytes, kind: np.dtype[np.void]) -> Frame:
     (count,) = _COUNT.unpack_from(body)
-    place = _COUNT.size + count * RECORD.itemsize
-    columns = np.frombuffer(body[_COUNT.size : place], dtype="u1").reshape(RECORD.itemsize, count)
+    place = _COUNT.size + count * kind.itemsize
+    columns = np.frombuffer(body[_COUNT.size : place], dtype="u1").reshape(kind.itemsize, count)
     columns = np.bitwise_xor.accumulate(columns, axis=1)
-    records: Records = np.ascontiguousarray(columns.T).view(RECORD).reshape(count)
+    frame = Frame(_known_fields(np.ascontiguousarray(columns.T).view(kind).reshape(count)), {}, {})
     while place < len(body):
-        kind, tick, length = _PART.unpack_from(body, place)
+        part, tick, length = _PART.unpack_from(body, place)
         data = body[place + _PART.size : place + _PART.size + length]
         place += _PART.size + length
-        if kind == _TAIL:
-            found.tails[tick] = data
-        else:
+        if part == _TAIL:
+            frame.tails[tick] = data
+        elif part == _SHAPE:
             estimate = unpack_estimate(data)
-            found.estimates[estimate.time_s] = estimate
-    return records
+            frame.estimates[estimate.time_s] = estimate
+    return frame
+
+
+def _known_fields(records: Records) -> Records:
+    """The records as ours: what they lack is NaN or 0."""
+    if records.dtype == RECORD:
+        return records
+    ours = np.zeros(len(records), dtype=RECORD)
+    for name in RECORD.names or ():
+        if name in (records.dtype.names or ()):
+            ours[name] = records[name]
+        elif RECORD[name].kind == "f":
+            ours[name] = np.nan
+    return ours

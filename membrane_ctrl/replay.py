@@ -1,0 +1,204 @@
+"""Replay: the recorded inputs of a run through today's control code, on the run's own clock.
+
+A tick is a pure function of its inputs and of the ticks before it, so the same code gives the same outputs to the
+last bit; what differs is a change of the code. Each tick's outputs are compared by their checksum. Where ticks are
+missing in the record, what follows starts from a controller that missed them, too: from there on only decisions
+(states, faults) are compared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.config import Config
+from membrane_ctrl.controller import Controller
+from membrane_ctrl.errors import Exit
+from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.recording.inputs_file import Frame
+from membrane_ctrl.telemetry import TelemetryRow
+from membrane_ctrl.tick import Event, TickInputs, TickOutputs
+from membrane_ctrl.tick_record import output_crc, unpack_tick
+
+# A shape is used in the tick it arrives in; more than these need not be remembered.
+_SHAPES_KEPT = 16
+# Events that are decisions, and the key that says which.
+_DECISIONS = {"state": "state", "fault": "name", "cleared": "name", "shape": "state"}
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What the controller decided, and when: a state, a fault, the shape loop's state."""
+
+    time_s: float
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedTick:
+    """One tick of the record: its inputs, and the checksum of what came out of it."""
+
+    tick: int
+    inputs: TickInputs
+    output_crc: int
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Ticks that are not in the record, or not whole."""
+
+    after_tick: int
+    time_s: float
+    ticks: int
+    reason: str
+
+
+@dataclass(slots=True)
+class Replay:
+    """What a replay found.
+
+    Attributes
+    ----------
+    ticks : int
+        Replayed.
+    compared : int
+        Of these, compared bit by bit.
+    different : int
+        Of these, not the same.
+    first_different : TelemetryRow or None
+        Row of today's code in the first tick that differs.
+    gaps : list of Gap
+    decisions : list of Decision
+        Of today's code.
+    finished : Exit or None
+        How today's code ended the run.
+    """
+
+    ticks: int = 0
+    compared: int = 0
+    different: int = 0
+    first_different: TelemetryRow | None = None
+    gaps: list[Gap] = field(default_factory=list)
+    decisions: list[Decision] = field(default_factory=list)
+    finished: Exit | None = None
+
+
+def replay(
+    config: Config,
+    record: Iterable[RecordedTick | Gap],
+    sag_sensitivity: NDArray[np.float64],
+    from_s: float = 0.0,
+    to_s: float = math.inf,
+) -> Replay:
+    """Run recorded ticks through a new controller.
+
+    Parameters
+    ----------
+    config : Config
+        As the run had it.
+    record : iterable
+        From the run's first tick on: a controller has a memory.
+    sag_sensitivity : (36,) array
+        See `Controller`.
+    from_s, to_s : float
+        What is compared; ticks before it run, but are not compared.
+    """
+    controller = Controller(config, sag_sensitivity)
+    found = Replay()
+    for item in record:
+        if isinstance(item, Gap):
+            if item.time_s <= to_s:
+                found.gaps.append(item)
+            continue
+        if item.inputs.now_s > to_s or found.finished is not None:
+            break
+        outputs = controller.tick(item.inputs)
+        found.ticks += 1
+        found.finished = outputs.finished
+        if item.inputs.now_s >= from_s:
+            found.decisions += decisions_of(outputs.events, item.inputs.now_s)
+            _compare(item, outputs, found)
+    return found
+
+
+def _compare(item: RecordedTick, outputs: TickOutputs, found: Replay) -> None:
+    if found.gaps:
+        return
+    found.compared += 1
+    if output_crc(outputs, outputs.row.pack()) != item.output_crc:
+        found.different += 1
+        found.first_different = found.first_different or outputs.row
+
+
+def decisions_of(events: Iterable[Event], time_s: float | None = None) -> list[Decision]:
+    """The decisions among events; their time is `time_s`, or that of the event itself."""
+    return [
+        Decision(event["mono_s"] if time_s is None else time_s, f"{event['kind']} {event[_DECISIONS[event['kind']]]}")
+        for event in events
+        if event.get("kind") in _DECISIONS and _DECISIONS[event["kind"]] in event
+    ]
+
+
+def recorded_ticks(frames: Iterable[Frame]) -> Iterator[RecordedTick | Gap]:
+    """The ticks of a record in order, and a `Gap` wherever some are missing."""
+    estimates: dict[float, ShapeEstimate] = {}
+    last, last_s = 0, 0.0
+    for frame in frames:
+        estimates |= frame.estimates
+        for record in frame.records:
+            tick = int(record["tick"])
+            try:
+                inputs = unpack_tick(record, frame.tails.get(tick, b""), estimates)
+            except LookupError as error:
+                yield Gap(tick - 1, last_s, 1, str(error.args[0]))
+            else:
+                if tick > last + 1:
+                    yield Gap(last, last_s, tick - last - 1, "not recorded")
+                yield RecordedTick(tick, inputs, int(record["output_crc"]))
+            last, last_s = tick, float(record["now_s"])
+        while len(estimates) > _SHAPES_KEPT:
+            del estimates[next(iter(estimates))]
+
+
+def differing_fields(today: TelemetryRow, recorded: TelemetryRow) -> dict[str, tuple[float, float]]:
+    """Fields that are not the same to the last bit: recorded and today's value."""
+    fields: dict[str, tuple[float, float]] = {}
+    for name in TelemetryRow.__slots__:
+        then, now = getattr(recorded, name), getattr(today, name)
+        if then != now and not (math.isnan(then) and math.isnan(now)):
+            fields[name] = (float(then), float(now))
+    return fields
+
+
+def unmatched(recorded: list[Decision], today: list[Decision], slack_s: float) -> list[str]:
+    """Where two lists of decisions differ, as sentences; times may differ by `slack_s`."""
+    said: list[str] = []
+    for place in range(max(len(recorded), len(today))):
+        then = recorded[place] if place < len(recorded) else None
+        now = today[place] if place < len(today) else None
+        if then is None or now is None or then.what != now.what or abs(then.time_s - now.time_s) > slack_s:
+            said.append(f"recorded: {_told(then)}; today: {_told(now)}")
+            if then is None or now is None or then.what != now.what:
+                break  # all that follow are shifted against each other
+    return said
+
+
+def _told(decision: Decision | None) -> str:
+    return "nothing more" if decision is None else f"{decision.what} at {decision.time_s:.2f} s"
+
+
+def as_dict(found: Replay) -> dict[str, Any]:
+    """For `--json`."""
+    return {
+        "ticks": found.ticks,
+        "compared": found.compared,
+        "different": found.different,
+        "gaps": [{"after_tick": g.after_tick, "ticks": g.ticks, "reason": g.reason} for g in found.gaps],
+        "decisions": [{"time_s": d.time_s, "what": d.what} for d in found.decisions],
+        "finished": None if found.finished is None else found.finished.name.lower(),
+    }
