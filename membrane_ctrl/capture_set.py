@@ -107,11 +107,14 @@ class CaptureSet:
         uint8 or uint16; zeros where a frame is in `unusable`.
     unusable : dict from frame to reason
         Frames that could not be read as the others.
+    lost : tuple of int
+        Those of them of which there is no picture at all.
     """
 
     head: CaptureHead
     frames: Frames
     unusable: dict[int, str]
+    lost: tuple[int, ...] = ()
 
 
 def read_head(folder: Path, geometry: GeometryConfig | None = None) -> CaptureHead:
@@ -201,7 +204,8 @@ def assemble(head: CaptureHead, images: Sequence[Frames | str]) -> CaptureSet:
             frames[k] = image
     bits = _depth(head, frames, path)
     optics = head.optics.model_copy(update={"camera": camera.model_copy(update={"bits": bits})})
-    return CaptureSet(replace(head, optics=optics), frames, unusable)
+    lost = tuple(k for k, image in enumerate(images) if isinstance(image, str))
+    return CaptureSet(replace(head, optics=optics), frames, unusable, lost)
 
 
 def read_geometry(path: Path) -> GeometryConfig:

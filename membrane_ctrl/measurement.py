@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -83,7 +84,7 @@ def measure_set(
     if capture.head.reference is not None:
         reference, own = read_anchor(capture.head.reference, geometry)
         anchor = anchor or own
-        capture = CaptureSet(anchored(capture.head, reference), capture.frames, capture.unusable)
+        capture = replace(capture, head=anchored(capture.head, reference))
     return measure_capture(capture, anchor, start, load_s=time.perf_counter() - begin)
 
 
@@ -92,15 +93,25 @@ def read_anchor(folder: Path, geometry: GeometryConfig | None = None) -> tuple[C
     capture = read_set(folder, geometry)
     if capture.head.kind != "full":
         raise InputError(f"{folder / 'capture.toml'}: kind: a reference must be a full set")
-    stack = stack_of(capture)
     try:
-        return capture.head, check(stack, capture.head.optics).anchor()
+        return capture.head, check(stack_of(capture), capture.head.optics).anchor()
     except RejectedSetError as error:
         raise InputError(f"{folder}: cannot be a reference: {error}") from None
 
 
 def stack_of(capture: CaptureSet) -> FrameStack:
-    """The frames for the metrology."""
+    """The frames for the metrology.
+
+    Raises
+    ------
+    RejectedSetError
+        If a picture is missing or unreadable. It could often be done without, but a set that was not written whole is
+        not to be trusted for the rest of it either.
+    """
+    if capture.lost:
+        flags = tuple(Flag(k, capture.unusable[k], math.inf) for k in capture.lost)
+        first = capture.lost[0]
+        raise RejectedSetError(f"{capture.head.files[first]} is {capture.unusable[first]}", flags)
     return FrameStack(capture.frames, capture.head.patterns, capture.head.displacement_um, capture.unusable)
 
 
@@ -108,10 +119,12 @@ def measure_capture(
     capture: CaptureSet, anchor: Anchor | None = None, start: HeightFunction | None = None, load_s: float = 0.0
 ) -> Measurement:
     """Measure frames that are in memory; never raises for what they show."""
-    stack, optics = stack_of(capture), capture.head.optics
-    mean_um = stack.mean_reading_um
+    optics = capture.head.optics
+    mean_um = float("nan")
     begin = time.perf_counter()
     try:
+        stack = stack_of(capture)
+        mean_um = stack.mean_reading_um
         checked = check(stack, optics, anchor)
     except RejectedSetError as error:
         timing = {"load": load_s, "phase": time.perf_counter() - begin, "reconstruct": 0.0}

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from membrane_ctrl.capture_set import CaptureHead, CaptureSet, anchored, read_set
+from membrane_ctrl.capture_set import CaptureHead, anchored, read_set
 from membrane_ctrl.config import GeometryConfig
 from membrane_ctrl.errors import CommandError, RejectedError
 from membrane_ctrl.estimate import Verdict
@@ -76,9 +76,10 @@ class Figures:
         anchor = None
         if capture.head.reference is not None:
             reference, anchor = self._anchored_by(capture.head.reference)
-            capture = CaptureSet(anchored(capture.head, reference), capture.frames, capture.unusable)
-        stack, optics = stack_of(capture), capture.head.optics
+            capture = replace(capture, head=anchored(capture.head, reference))
+        optics = capture.head.optics
         try:
+            stack = stack_of(capture)
             checked = check(stack, optics, anchor)
         except RejectedSetError as error:
             raise RejectedError(f"{folder}: rejected: {error}") from None

@@ -96,12 +96,21 @@ def test_pictures_and_recording(made: Path, tmp_path: Path) -> None:
     assert details["rim"]["offset_mm"] < 3
 
 
-def test_a_missing_sinusoid_is_done_without(capture_set: Path, tmp_path: Path) -> None:
-    (capture_set / "x_sin_2.png").unlink()
+@pytest.mark.parametrize("frame", ["x_sin_2.png", "y_gray_3.png", "white.png", "black.png"])
+def test_a_missing_picture_is_a_rejection_that_names_it(capture_set: Path, tmp_path: Path, frame: str) -> None:
+    (capture_set / frame).unlink()
     code, result = measured(capture_set, tmp_path / "out")
-    assert code == 0
-    assert result["quality"]["verdict"] == "degraded"
-    assert result["quality"]["flagged_frames"] == [{"file": "x_sin_2.png", "reason": "missing: no such file"}]
+    assert code == 3
+    assert result["quality"]["verdict"] == "rejected"
+    assert result["quality"]["flagged_frames"] == [{"file": frame, "reason": "missing: no such file"}]
+
+
+def test_a_torn_picture_is_a_rejection_that_names_it(capture_set: Path, tmp_path: Path) -> None:
+    path = capture_set / "x_sin_0.png"
+    path.write_bytes(path.read_bytes()[:300])
+    code, result = measured(capture_set, tmp_path / "out")
+    assert code == 3
+    assert [flag["file"] for flag in result["quality"]["flagged_frames"]] == ["x_sin_0.png"]
 
 
 @pytest.mark.parametrize(
