@@ -178,6 +178,24 @@ def uncertainty(
 
 
 @app.command()
+def stability(
+    run_of_sets: Annotated[Path, typer.Argument(metavar="RUN_OF_SETS", help="Folder of capture sets.")],
+    out: Annotated[Path | None, typer.Option(help="Where the result goes; RUN_OF_SETS/stability by default.")] = None,
+    point: Annotated[
+        list[str] | None, typer.Option(help="NAME=X,Y in mm: a point to follow, instead of A, B and C; repeatable.")
+    ] = None,
+    trials: Annotated[int, typer.Option(min=2, help="Monte Carlo trials, for every set.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 1,
+    json: JsonOption = False,
+) -> int:
+    """Stability of a run of sets: standard deviation, points in time, pairs with their uncertainty."""
+    from membrane_ctrl.stability_command import StabilityOptions, stability_command
+
+    options = StabilityOptions(run_of_sets, out, tuple(point or ()), trials, seed, json)
+    return stability_command(options)
+
+
+@app.command()
 def simulate(
     set_dir: Annotated[Path, typer.Argument(metavar="SET_DIR", help="New folder for the set, or for the run.")],
     config: ConfigOption = None,
@@ -223,6 +241,40 @@ def simulate(
         interval_s=interval_s,
     )
     return simulate_command(options)
+
+
+@app.command()
+def replay(
+    run_dir: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")],
+    start: Annotated[
+        str | None, typer.Option("--from", help="Compare from this time of the run on, e.g. 3m.")
+    ] = None,
+    end: Annotated[str | None, typer.Option("--to", help="End at this time of the run.")] = None,
+    to_test: Annotated[str | None, typer.Option(help="Make a regression test of it, tests/incidents/NAME.")] = None,
+    json: JsonOption = False,
+) -> int:
+    """Run a run's recorded inputs through today's control code and say what is not the same (exit 3)."""
+    import math
+
+    from membrane_ctrl.replay_command import replay_command
+
+    from_s = 0.0 if start is None else parse_duration_s(start)
+    to_s = math.inf if end is None else parse_duration_s(end)
+    return replay_command(run_dir, from_s, to_s, to_test, json)
+
+
+@app.command()
+def repair(
+    run_dir: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")],
+    in_place: Annotated[
+        bool, typer.Option("--in-place", help="Put what was repaired in place of the torn files.")
+    ] = False,
+    json: JsonOption = False,
+) -> int:
+    """Mend what a crash left of a run: torn segments, a torn event log, a missing summary."""
+    from membrane_ctrl.repair import repair_command
+
+    return repair_command(run_dir, in_place, json)
 
 
 def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> Config:
