@@ -63,6 +63,8 @@ class LimitsConfig(Section):
     displacement_max_um: float = 500.0
     gauge_pressure_max_pa: Annotated[float, Field(gt=0, le=5000)] = 750.0
     stale_s: Annotated[float, Field(gt=0, le=10)] = 0.3
+    # a film is never still: a reading equal to the last bit for so long comes from a sensor that has stopped
+    stuck_s: Annotated[float, Field(gt=0, le=600)] = 5.0
     lateness_max_ms: Annotated[float, Field(gt=0, le=10000)] = 100.0
     step_max_um: Annotated[float, Field(gt=0, le=10000)] = 50.0  # a jump between two ticks that no film makes
     following_error_max_um: Annotated[float, Field(gt=0, le=10000)] = 60.0

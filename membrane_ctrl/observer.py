@@ -28,6 +28,7 @@ class Observer:
         self._stamp: tuple[int, float] | None = None
         self._good_um = math.nan
         self._jumps = 0
+        self._same_um, self._same_since_s = math.nan, math.nan
         self._commanded = (0.0, 0.0)  # the last two pump commands, newest first
         self.reading: BenchReading | None = None
         self.displacement_um = math.nan
@@ -54,6 +55,7 @@ class Observer:
             link_up=inputs.link_up,
             reading_age_s=now_s - self._last_read_s,
             advance_age_s=advance_age_s,
+            same_s=self._same_s(now_s),
             displacement_um=_good_quality_um(reading),
             displacement_valid=math.isfinite(self.displacement_um),
             jumps=self._jumps,
@@ -84,6 +86,12 @@ class Observer:
         self._jumps = 0
         self._good_um = value_um
         return value_um
+
+    def _same_s(self, now_s: float) -> float:
+        """How long the valid readings have been equal to the last bit."""
+        if math.isfinite(self.displacement_um) and self.displacement_um != self._same_um:
+            self._same_um, self._same_since_s = self.displacement_um, now_s
+        return 0.0 if math.isnan(self._same_since_s) else now_s - self._same_since_s
 
     def _mismatch(self, reading: BenchReading | None) -> float:
         """How far the read-back is from both of the last two commands: one tick of transport is no mismatch."""

@@ -34,6 +34,8 @@ class Observation:
         Since the last answer of the device.
     advance_age_s : float
         Since the device's sample counter and time last advanced: an old answer repeated does not count.
+    same_s : float
+        Since the valid readings have been equal to the last bit.
     displacement_um : float
         The laser's reading as it came, NaN if it was bad or absent.
     displacement_valid : bool
@@ -74,6 +76,7 @@ class Observation:
     tick_error: str = ""
     overdue: str = ""
     unfit: str = ""
+    same_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,6 +241,19 @@ TABLE: tuple[Rule, ...] = (
         lambda o, c: o.advance_age_s > c.stale_s,
     ),
     Rule(
+        15,
+        "displacement_stuck",
+        "the laser repeats one value to the last bit",
+        1,
+        1,
+        "limits.stuck_s",
+        Rung.HOLD_FLOW,
+        False,
+        MOVING,
+        "restart the sensor; with coarse steps and a calm mirror raise limits.stuck_s",
+        lambda o, c: o.displacement_valid and o.same_s > c.stuck_s,
+    ),
+    Rule(
         13,
         "displacement_jump",
         "the laser reading jumped further than a film can",
@@ -379,6 +395,8 @@ def _seen(rule: Rule, observation: Observation) -> str:
             return f"{observation.error_um:.1f} um"
         case "device_silent":
             return f"{observation.reading_age_s:.2f} s"
+        case "displacement_stuck":
+            return f"{observation.same_s:.1f} s"
         case "displacement_frozen":
             return f"{observation.advance_age_s:.2f} s"
         case "late":

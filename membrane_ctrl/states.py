@@ -286,8 +286,8 @@ def _begin(scene: Scene, leak_um_per_s: float) -> State:
 
 
 def _drive(scene: Scene, target_um: float) -> LoopOutput:
-    """Let the loop drive the pump: automatic with a valid reading, the held mean flow without one."""
-    if math.isfinite(scene.observer.displacement_um):
+    """Let the loop drive the pump: automatic with a reading to trust, the held mean flow without one."""
+    if math.isfinite(scene.observer.displacement_um) and scene.ladder.rung == Rung.NONE:
         output = scene.loop.step(_given(scene, target_um), scene.dt_s)
     else:
         output = scene.loop.stale(scene.dt_s)
