@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,15 +189,3 @@ def unmatched(recorded: list[Decision], today: list[Decision], slack_s: float) -
 
 def _told(decision: Decision | None) -> str:
     return "nothing more" if decision is None else f"{decision.what} at {decision.time_s:.2f} s"
-
-
-def as_dict(found: Replay) -> dict[str, Any]:
-    """For `--json`."""
-    return {
-        "ticks": found.ticks,
-        "compared": found.compared,
-        "different": found.different,
-        "gaps": [{"after_tick": g.after_tick, "ticks": g.ticks, "reason": g.reason} for g in found.gaps],
-        "decisions": [{"time_s": d.time_s, "what": d.what} for d in found.decisions],
-        "finished": None if found.finished is None else found.finished.name.lower(),
-    }

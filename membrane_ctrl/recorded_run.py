@@ -1,0 +1,64 @@
+"""What a replay needs of a run folder: configuration, inputs, recorded decisions, recorded rows."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from membrane_ctrl.config import Config
+from membrane_ctrl.config_file import load
+from membrane_ctrl.errors import InputError
+from membrane_ctrl.recording.inputs_file import InputsReader
+from membrane_ctrl.replay import Decision, decisions_of
+from membrane_ctrl.telemetry import TelemetryRow
+
+# A row is found in the recording by its time, which Rerun keeps in whole nanoseconds.
+_SAME_TIME_S = 2e-9
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedRun:
+    """A run folder, opened for a replay."""
+
+    folder: Path
+    config: Config
+    inputs: InputsReader
+    decisions: list[Decision]
+
+    def row_at(self, time_s: float) -> TelemetryRow | None:
+        """The row that was recorded then; None if the recording does not have it."""
+        from membrane_ctrl.recording.read_back import read_rows
+
+        for path in sorted(self.folder.glob("*.rrd")):
+            rows = read_rows(path)
+            near = np.flatnonzero(np.abs(rows[:, 0] - time_s) < _SAME_TIME_S)
+            if near.size:
+                values = rows[near[0]].tolist()
+                return TelemetryRow(time_s, *values[1:])
+        return None
+
+
+def open_run(folder: Path) -> RecordedRun:
+    """Open a run. Raises InputError in one line that names the folder and what is missing."""
+    if not (folder / "config.toml").is_file():
+        raise InputError(f"{folder}: not a run folder: there is no config.toml in it")
+    inputs = InputsReader(folder)
+    if not inputs.paths:
+        raise InputError(f"{folder}: no inputs-*.bin: this run was recorded without what a replay needs")
+    return RecordedRun(folder, load(folder / "config.toml", Config), inputs, _decisions(folder / "events.jsonl"))
+
+
+def _decisions(path: Path) -> list[Decision]:
+    """Recorded decisions; a line that a crash tore is passed over."""
+    events = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []:
+        try:
+            event = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(event, dict):
+            events.append(event)
+    return decisions_of(events)

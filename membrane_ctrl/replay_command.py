@@ -1,0 +1,97 @@
+"""`replay RUN`: the run's recorded inputs through today's control code, and what is not the same."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl.errors import Exit
+from membrane_ctrl.incident import write_incident
+from membrane_ctrl.metrology.hencky import zernike_projection
+from membrane_ctrl.recorded_run import RecordedRun, open_run
+from membrane_ctrl.replay import Replay, differing_fields, recorded_ticks, replay, unmatched
+
+# An event is stamped when it is told, at the end of its tick.
+DECISION_SLACK_S = 0.5
+
+
+def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None, as_json: bool) -> int:
+    """Replay and report; exit 3 if anything is not the same, 0 if all is.
+
+    Raises
+    ------
+    InputError
+        Not a run that can be replayed, or (with `to_test`) a name that is taken.
+    """
+    run = open_run(folder)
+    begin = time.perf_counter()
+    found = replay(run.config, recorded_ticks(run.inputs), zernike_projection(), from_s, to_s)
+    took_s = time.perf_counter() - begin
+    report = _report(run, found, from_s, to_s)
+    if as_json:
+        print(json.dumps(report))
+    else:
+        print("\n".join(_lines(report)))
+    rate = found.ticks / took_s if took_s else math.inf
+    print(f"{found.ticks} ticks in {took_s:.1f} s ({rate:.0f} a second)", file=sys.stderr)
+    if to_test is not None:
+        target = write_incident(run, found, to_test, to_s)
+        print(f"written: {target}; say in its incident.toml what happened", file=sys.stderr)
+    return int(Exit.DONE if report["verdict"] == "identical" else Exit.REJECTED)
+
+
+def _report(run: RecordedRun, found: Replay, from_s: float, to_s: float) -> dict[str, Any]:
+    recorded = [decision for decision in run.decisions if from_s <= decision.time_s <= to_s]
+    decisions = unmatched(recorded, found.decisions, DECISION_SLACK_S)
+    same = not (found.different or found.gaps or run.inputs.damage or decisions)
+    first = found.first_different
+    fields: dict[str, tuple[float, float]] | None = None
+    if first is not None and (row := run.row_at(first.mono_s)) is not None:
+        fields = differing_fields(first, row)
+    return {
+        "verdict": "identical"
+        if same and found.compared
+        else "different"
+        if found.different or decisions
+        else "gaps",
+        "recorded_by": run.inputs.program,
+        "ticks": found.ticks,
+        "compared": found.compared,
+        "different": found.different,
+        "first_different": None if first is None else {"tick": int(first.tick), "time_s": first.mono_s},
+        "fields": fields,
+        "decisions": decisions,
+        "gaps": [
+            {"after_tick": g.after_tick, "time_s": g.time_s, "ticks": g.ticks, "why": g.reason} for g in found.gaps
+        ],
+        "damage": run.inputs.damage,
+    }
+
+
+def _lines(report: dict[str, Any]) -> list[str]:
+    """What a person wants to read."""
+    lines = [f"verdict    {report['verdict']}: {report['compared']} of {report['ticks']} ticks compared bit by bit"]
+    lines.append(f"recorded   by {report['recorded_by'] or 'an unknown program'}")
+    first = report["first_different"]
+    if first is not None:
+        lines.append(
+            f"different  {report['different']} ticks, the first is tick {first['tick']} at {first['time_s']:.3f} s"
+        )
+        if report["fields"] is None:
+            lines.append("           what was recorded there is not in the *.rrd files")
+        elif not report["fields"]:
+            lines.append("           its row is the same: events or answers to commands differ")
+        for name, (then, now) in (report["fields"] or {}).items():
+            lines.append(f"           {name}: recorded {then!r}, today {now!r}")
+    lines += [f"decision   {sentence}" for sentence in report["decisions"]]
+    for gap in report["gaps"]:
+        lines.append(
+            f"gap        {gap['ticks']} ticks after tick {gap['after_tick']} at {gap['time_s']:.2f} s: {gap['why']}; "
+            "from there on decisions only"
+        )
+    lines += [f"damage     {sentence}" for sentence in report["damage"]]
+    return lines
