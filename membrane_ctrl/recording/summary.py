@@ -20,7 +20,7 @@ SCHEMA = "membrane-summary/1"
 # of 1.45 s (PHYSICS, inner loop) leave 5 % of a step, of which the `settle` state has already taken most.
 SETTLED_AFTER_S = 5.0
 # The ramp has arrived when setpoint minus trim is this near to the target; far below the laser's 0.1 um steps.
-_ARRIVED_UM = 0.01
+ARRIVED_UM = 0.01
 # Transitions and faults listed; the counters beside the lists go on (a device that flickers for a week).
 _LISTED_MAX = 1000
 
@@ -84,7 +84,7 @@ class Summary:
         for moment_s, holding, rest_um in zip(column(rows, "mono_s"), hold, ramp_um, strict=True):
             if not holding:
                 self._unsettled_s = math.nan
-            elif math.isnan(self._unsettled_s) or not abs(rest_um) <= _ARRIVED_UM:
+            elif math.isnan(self._unsettled_s) or not abs(rest_um) <= ARRIVED_UM:
                 self._unsettled_s = float(moment_s)
             settled.append(bool(holding and moment_s - self._unsettled_s >= SETTLED_AFTER_S))
         return settled

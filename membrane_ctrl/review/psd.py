@@ -56,7 +56,7 @@ def power_spectrum(values: NDArray[np.floating], rate_hz: float, length: int | N
     """
     if length is None:
         length = min(_LONGEST, 1 << max(3, int(np.log2(max(values.size, 8) * 2 / (_SEGMENTS + 1)))))
-    frequency_hz = np.fft.rfftfreq(length, 1 / rate_hz)
+    frequency_hz = np.asarray(np.fft.rfftfreq(length, 1 / rate_hz), dtype=np.float64)
     if values.size < length:
         return Spectrum(frequency_hz, np.full(frequency_hz.size, np.nan), 0)
     pieces = np.lib.stride_tricks.sliding_window_view(values, length)[:: length // 2]

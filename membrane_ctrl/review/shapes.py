@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.metrology.surface import Surface
 
 Column = NDArray[np.float64]
@@ -75,6 +76,18 @@ def height_basis(x: Column, y: Column) -> Column:
     """(37, points): height of a unit of each parameter, from the vertex."""
     units = np.eye(37)
     return np.stack([Surface(unit[:36], unit[36], 1.0).height(x, y) for unit in units])
+
+
+def from_estimates(estimates: Sequence[ShapeEstimate]) -> Shapes:
+    """Shapes of estimates in memory, all covariances among them."""
+    numbers = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in _NUMBERS}
+    return Shapes(
+        **numbers,
+        coeffs_um=np.array([estimate.coeffs_um for estimate in estimates]).reshape(-1, 36),
+        verdict=np.array([estimate.verdict for estimate in estimates], dtype=np.str_),
+        covariance_time_s=numbers["time_s"],
+        covariance_um2=np.array([estimate.covariance_um2 for estimate in estimates]).reshape(-1, 36, 36),
+    )
 
 
 def from_table(table: pa.Table) -> Shapes:

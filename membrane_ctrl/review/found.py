@@ -1,0 +1,247 @@
+"""Events found by machine: what a person would circle on the timeline, with time, size and confidence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.names import State
+from membrane_ctrl.recording.levels import coarser_level
+from membrane_ctrl.review.shapes import Shapes
+from membrane_ctrl.review.steps import confidence, differences, local_sigma, steps
+
+Column = NDArray[np.float64]
+Level = dict[str, Column]
+
+# A door is 20 Pa, weather within two seconds a few Pa (gusty: 1.8 Pa, 1 sigma).
+DOOR_LEAST_PA = 6.0
+DOOR_LEAST_SIGMAS = 5.5
+# Means of five minutes tell a tenth of the leak; what matters to the hold is a quarter.
+LEAK_LEAST_SHARE = 0.2
+LEAK_LEAST_SIGMAS = 6.0
+LEAK_HALF_MIN = 5
+# A laser's noise is 1 um; the film makes no spike of a single tick.
+GLITCH_LEAST_UM = 4.0
+GLITCH_LEAST_SIGMAS = 8.0
+LATE_LEAST_MS = 5.0
+LATE_LEAST_RATIO = 8.0
+LATE_BURST_S = 10.0
+LATE_BURST_LEAST = 3
+# Half as much noise again, over ten minutes on both sides.
+SPREAD_LEAST = np.log(1.5)
+SPREAD_LEAST_SIGMAS = 6.0
+SPREAD_HALF_MIN = 10
+JUMP_LEAST_UM = 0.3
+JUMP_LEAST_SIGMAS = 8.0
+JUMP_HALF_CYCLES = 5
+# Robust sigma of a greatest-of-a-second is taken about its median.
+_SIGMA_OVER_MAD = 1.4826
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """An event that nobody reported.
+
+    Attributes
+    ----------
+    kind : str
+        "pressure step", "leak step", "laser glitch", "laser lost", "lateness burst", "noise change" or "shape jump".
+    start_s, end_s : float
+        Time range of the run that shows it.
+    time_s : float
+        When it happened.
+    size : float
+        In `unit`.
+    unit : str
+    confidence : float
+        1 minus the chance that noise alone looks like this somewhere in the run.
+    """
+
+    kind: str
+    time_s: float
+    start_s: float
+    end_s: float
+    size: float
+    unit: str
+    confidence: float
+
+
+def find_events(level: Level, shapes: Shapes) -> list[Found]:
+    """All events of a run in the order of time.
+
+    Parameters
+    ----------
+    level : dict
+        The 1 s level (`Run.level(1.0)`).
+    shapes : Shapes
+        May be empty.
+    """
+    found: list[Found] = []
+    if level["time_s"].size:
+        even = _even(level)
+        finders: Iterable[Callable[[Level], list[Found]]] = (
+            pressure_steps, leak_steps, laser_glitches, laser_losses, lateness_bursts, noise_changes,
+        )  # fmt: skip
+        for finder in finders:
+            found += finder(even)
+    found += shape_jumps(shapes)
+    return sorted(found, key=lambda event: event.time_s)
+
+
+def pressure_steps(level: Level) -> list[Found]:
+    """Doors: the air pressure steps within a second or two."""
+    values = level["mean_ambient_pressure_pa"]
+    found = steps(values, half=1, skip=1, least=DOOR_LEAST_PA, least_sigmas=DOOR_LEAST_SIGMAS)
+    return [_event("pressure step", level, s.row, 1, s.size, "Pa", confidence(s.sigmas, values.size)) for s in found]
+
+
+def leak_steps(level: Level) -> list[Found]:
+    """The flow that holds the mirror steps, and the weather (what is fed forward) does not explain it."""
+    minutes = coarser_level(_held(level), 60.0)
+    whole = minutes["rows"] > 0.5 * np.nanmedian(minutes["rows"])
+    leak = minutes["mean_flow_um_per_s"] - np.nan_to_num(minutes["mean_feedforward_um_per_s"])
+    leak = np.where(whole, leak, np.nan)
+    if not np.isfinite(leak).any():
+        return []
+    least = LEAK_LEAST_SHARE * abs(float(np.nanmedian(leak)))
+    found = steps(leak, half=LEAK_HALF_MIN, skip=1, least=least, least_sigmas=LEAK_LEAST_SIGMAS)
+    before = [float(np.nanmean(leak[max(0, s.row - LEAK_HALF_MIN) : s.row])) for s in found]
+    return [
+        _event("leak step", minutes, s.row, 60, 100 * s.size / old, "%", confidence(s.sigmas, leak.size))
+        for s, old in zip(found, before, strict=True)
+        if old > 0
+    ]
+
+
+def laser_glitches(level: Level) -> list[Found]:
+    """A reading far from its second's mean, while the mirror before and after is where it was."""
+    mean = level["mean_displacement_um"]
+    above, below = level["max_displacement_um"] - mean, mean - level["min_displacement_um"]
+    excursion = np.fmax(above, below)
+    usual = float(np.nanmedian(excursion)) if np.isfinite(excursion).any() else 0.0
+    sigma = local_sigma(excursion - usual)
+    moved = np.nan_to_num(np.abs(differences(mean, 1, 1)))
+    enough = np.fmax(GLITCH_LEAST_UM, GLITCH_LEAST_SIGMAS * sigma)
+    rows = np.flatnonzero((excursion - usual > enough) & (moved < 0.3 * excursion) & (level["state"] == State.HOLD))
+    rows = rows[np.concatenate(([True], np.diff(rows) > 2))] if rows.size else rows
+    size = np.where(above >= below, above, -below)
+    scores = (excursion - usual) / np.maximum(sigma, 1e-9)
+    return [
+        _event("laser glitch", level, int(row), 1, float(size[row]), "um", confidence(float(scores[row]), mean.size))
+        for row in rows
+    ]
+
+
+def laser_losses(level: Level) -> list[Found]:
+    """The laser said that its reading is no good, or gave none."""
+    bad = (level["max_displacement_quality"] > 0) | ~np.isfinite(level["mean_displacement_um"])
+    bad &= (level["state"] == State.HOLD) & (level["rows"] > 0)
+    return [
+        Found(
+            "laser lost",
+            float(level["time_s"][a]),
+            level["time_s"][a] - 5,
+            level["time_s"][b] + 6,
+            b - a + 1.0,
+            "s",
+            1.0,
+        )
+        for a, b in _runs(bad, 1)
+    ]
+
+
+def lateness_bursts(level: Level) -> list[Found]:
+    """Several late ticks close together; a single one is any machine's."""
+    worst = level["max_lateness_ms"]
+    usual = float(np.nanmedian(worst)) if np.isfinite(worst).any() else 0.0
+    late = worst > max(LATE_LEAST_MS, LATE_LEAST_RATIO * usual)
+    return [
+        Found("lateness burst", float(level["time_s"][a]), level["time_s"][a] - 5, level["time_s"][b] + 6,
+              float(np.nanmax(worst[a : b + 1])), "ms", 1.0)
+        for a, b in _runs(late, int(LATE_BURST_S))
+        if int(late[a : b + 1].sum()) >= LATE_BURST_LEAST
+    ]  # fmt: skip
+
+
+def noise_changes(level: Level) -> list[Found]:
+    """The spread of the error changes for minutes."""
+    held = _held(level)
+    minute = np.floor(held["time_s"] / 60).astype(int)
+    error = held["mean_error_um"]
+    there = np.isfinite(error)
+    if not there.any():
+        return []
+    first, size = minute[0], minute[-1] - minute[0] + 1
+    number, error = minute[there] - first, error[there]
+    count = np.bincount(number, minlength=size)
+    mean = np.bincount(number, error, size) / np.maximum(count, 1)
+    spread = np.sqrt(np.bincount(number, (error - mean[number]) ** 2, size) / np.maximum(count, 1))
+    value = np.where((count >= 50) & (spread > 0), np.log(np.maximum(spread, 1e-12)), np.nan)
+    found = steps(value, SPREAD_HALF_MIN, 1, least=float(SPREAD_LEAST), least_sigmas=SPREAD_LEAST_SIGMAS)
+    time_s = {"time_s": (first + np.arange(size)) * 60.0}
+    return [
+        _event("noise change", time_s, s.row, 60, float(np.exp(s.size)), "times", confidence(s.sigmas, size))
+        for s in found
+    ]
+
+
+def shape_jumps(shapes: Shapes) -> list[Found]:
+    """The figure beside its sag (terms 5 to 11) steps between cycles."""
+    good = shapes.select(shapes.verdict != "rejected")
+    if len(good) < 4 * JUMP_HALF_CYCLES:
+        return []
+    terms = good.coeffs_um[:, 4:11]
+    change = np.stack([differences(term, JUMP_HALF_CYCLES, 0) for term in terms.T])
+    size = np.sqrt((change**2).sum(axis=0))
+    scale = np.nanmedian(size)
+    sigma = _SIGMA_OVER_MAD * float(np.nanmedian(np.abs(size - scale))) + 1e-12
+    score = np.nan_to_num((size - scale) / sigma)
+    rows = np.flatnonzero((np.nan_to_num(size) >= JUMP_LEAST_UM) & (score >= JUMP_LEAST_SIGMAS))
+    groups = np.split(rows, np.flatnonzero(np.diff(rows) > 2 * JUMP_HALF_CYCLES) + 1) if rows.size else []
+    best = [int(group[np.argmax(size[group])]) for group in groups]
+    time_s = {"time_s": good.time_s}
+    return [
+        _event("shape jump", time_s, row, 60, float(size[row]), "um", confidence(float(score[row]), size.size))
+        for row in best
+    ]
+
+
+def _event(kind: str, table: Level, row: int, half_s: float, size: float, unit: str, sure: float) -> Found:
+    """An event with a range about it of some times what it was found in."""
+    time_s = float(table["time_s"][row])
+    return Found(kind, time_s, time_s - 30 * half_s**0.5, time_s + 30 * half_s**0.5, size, unit, sure)
+
+
+def _runs(flags: NDArray[np.bool_], join: int) -> list[tuple[int, int]]:
+    """First and last row of each stretch of true rows; those `join` or fewer apart are one."""
+    rows = np.flatnonzero(flags)
+    if not rows.size:
+        return []
+    parts = np.split(rows, np.flatnonzero(np.diff(rows) > join) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts]
+
+
+def _held(level: Level) -> Level:
+    """The level with NaN where the mirror was not held, so that no step is seen where a hold begins."""
+    held = level["state"] == State.HOLD
+    kept = {"time_s", "rows", "state"}
+    return {name: values if name in kept else np.where(held, values, np.nan) for name, values in level.items()}
+
+
+def _even(level: Level) -> Level:
+    """The level with a row for every second; NaN where the run has none."""
+    second = np.rint(level["time_s"]).astype(np.int64)
+    place = second - second[0]
+    size = int(place[-1]) + 1
+    if size == second.size:
+        return level
+    even: Level = {}
+    for name, values in level.items():
+        even[name] = np.full(size, np.nan)
+        even[name][place] = values
+    even["time_s"] = (second[0] + np.arange(size)).astype(np.float64)
+    even["rows"] = np.nan_to_num(even["rows"])
+    return even

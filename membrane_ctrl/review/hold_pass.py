@@ -1,0 +1,213 @@
+"""One pass over every tick of a run: everything of the report that needs single ticks, in memory for two series."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.names import State
+from membrane_ctrl.recording.levels import true_error_um
+from membrane_ctrl.recording.statistics import LogHistogram, Moments
+from membrane_ctrl.review.feedforward import WithoutFeedforward
+from membrane_ctrl.review.run import Run
+from membrane_ctrl.review.settled import FIELDS as SETTLED_FIELDS
+from membrane_ctrl.review.settled import Settled
+from membrane_ctrl.review.windows import SecondSums
+
+Column = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+NAMES = (
+    *SETTLED_FIELDS, "displacement_um", "truth_displacement_um", "feedforward_um_per_s", "flow_wanted_um_per_s",
+    "flow_um_per_s", "pump_fraction", "lateness_ms", "missed_ticks",
+)  # fmt: skip
+# Series of the sums over seconds.
+READING, TRUE, KEPT_AWAY = range(3)
+# The histogram reaches this many bands to each side, in bins of a fiftieth of a band.
+_HISTOGRAM_BANDS = 5
+_HISTOGRAM_BINS = 500
+# Flow wanted and flow given differ by less than this when nothing limits: single precision at full flow.
+_SATURATED_UM_PER_S = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class PumpActivity:
+    """What the pump did while the mirror was held."""
+
+    mean_fraction: float
+    std_fraction: float
+    travel_per_hour: float  # sum of the changes of its command: what wears it
+    starts_per_hour: float
+    running_share: float
+    saturated_share: float  # of ticks whose flow a limit cut
+
+
+@dataclass(frozen=True, slots=True)
+class HoldPass:
+    """What single ticks say.
+
+    Attributes
+    ----------
+    ticks, settled : int
+    missed_ticks : int
+    start_s, end_s : float
+    hold_s : float
+        Time in `hold`.
+    grid_s : float
+        Time of the first place of the grids.
+    reading_um, true_um : (n,) float32
+        Setpoint minus laser reading and target minus true centre on a grid of ticks, NaN where not settled.
+    seconds : tuple
+        `SecondSums.result` of reading error, true error and what the feed-forward kept away.
+    raw_reading, raw_true : Moments
+    raw_in_band : float
+        Share of settled readings within the band.
+    histogram_um, histogram_counts : arrays
+        Edges and counts of the reading error.
+    lateness_ms : LogHistogram
+    pump : PumpActivity
+    """
+
+    ticks: int
+    settled: int
+    missed_ticks: int
+    start_s: float
+    end_s: float
+    hold_s: float
+    grid_s: float
+    reading_um: Single
+    true_um: Single
+    seconds: tuple[NDArray[np.int64], Column, Column]
+    raw_reading: Moments
+    raw_true: Moments
+    raw_in_band: float
+    histogram_um: Column
+    histogram_counts: NDArray[np.int64]
+    lateness_ms: LogHistogram
+    pump: PumpActivity
+
+
+def hold_pass(run: Run, span_s: tuple[float, float], part_s: tuple[float, float] = (-np.inf, np.inf)) -> HoldPass:
+    """Go through a run once.
+
+    Parameters
+    ----------
+    run : Run
+    span_s : tuple
+        First and last second, from a level.
+    part_s : tuple
+        Part of the run wanted.
+    """
+    collected = _Collector(run, span_s)
+    for block in run.tick_blocks(NAMES, *part_s):
+        collected.add(block)
+    return collected.result()
+
+
+class _Collector:
+    def __init__(self, run: Run, span_s: tuple[float, float]) -> None:
+        loop, self._band_um = run.config.loop, run.config.limits.band_um
+        self._period_s = 1 / loop.rate_hz
+        self._settled = Settled()
+        self._without = WithoutFeedforward(loop.kp_per_s, loop.ti_s, self._period_s)
+        self._grid_s = span_s[0]
+        size = max(0, math.ceil((span_s[1] - span_s[0]) / self._period_s) + 2)
+        self._reading = np.full(size, np.nan, dtype=np.float32)
+        self._true = np.full(size, np.nan, dtype=np.float32)
+        self._seconds = SecondSums(3)
+        self._raw_reading, self._raw_true = Moments(), Moments()
+        reach_um = _HISTOGRAM_BANDS * self._band_um
+        self._edges_um = np.linspace(-reach_um, reach_um, _HISTOGRAM_BINS + 1)
+        self._histogram = np.zeros(_HISTOGRAM_BINS, dtype=np.int64)
+        self._lateness = LogHistogram()
+        self._pump = _PumpSums()
+        self._ticks = self._counted = self._inside = self._hold = 0
+        self._missed = 0.0
+        self._span = (math.nan, math.nan)
+
+    def add(self, block: Mapping[str, Column]) -> None:
+        time_s = block["mono_s"]
+        mask = self._settled.mask(block)
+        kept_away = self._without.kept_away_um(block["feedforward_um_per_s"])[mask]
+        self._ticks += time_s.size
+        self._span = (self._span[0] if self._ticks > time_s.size else float(time_s[0]), float(time_s[-1]))
+        self._hold += int((block["state"] == State.HOLD).sum())
+        missed = block["missed_ticks"][np.isfinite(block["missed_ticks"])]
+        self._missed = max(self._missed, float(missed.max())) if missed.size else self._missed
+        self._lateness.add(block["lateness_ms"])
+        held = {name: np.asarray(block[name][mask], dtype=np.float64) for name in NAMES}
+        self._pump.add(held)
+        reading = held["setpoint_um"] - held["displacement_um"]
+        true = true_error_um(held)
+        place = np.rint((held["mono_s"] - self._grid_s) / self._period_s).astype(np.int64)
+        inside = (place >= 0) & (place < self._reading.size)
+        self._reading[place[inside]] = reading[inside]
+        self._true[place[inside]] = true[inside]
+        there = np.isfinite(reading)
+        self._seconds.add(held["mono_s"][there], np.stack((reading, true, kept_away))[:, there])
+        self._raw_reading.add(reading)
+        self._raw_true.add(true)
+        reading = reading[there]
+        self._counted += reading.size
+        self._inside += int((np.abs(reading) <= self._band_um).sum())
+        scale = _HISTOGRAM_BINS / (self._edges_um[-1] - self._edges_um[0])
+        bins = np.clip((reading - self._edges_um[0]) * scale, 0, _HISTOGRAM_BINS - 1).astype(np.int64)
+        self._histogram += np.bincount(bins, minlength=_HISTOGRAM_BINS)
+
+    def result(self) -> HoldPass:
+        return HoldPass(
+            ticks=self._ticks,
+            settled=self._counted,
+            missed_ticks=int(self._missed),
+            start_s=self._span[0],
+            end_s=self._span[1],
+            hold_s=self._hold * self._period_s,
+            grid_s=self._grid_s,
+            reading_um=self._reading,
+            true_um=self._true,
+            seconds=self._seconds.result(),
+            raw_reading=self._raw_reading,
+            raw_true=self._raw_true,
+            raw_in_band=self._inside / self._counted if self._counted else math.nan,
+            histogram_um=self._edges_um,
+            histogram_counts=self._histogram,
+            lateness_ms=self._lateness,
+            pump=self._pump.result(self._period_s),
+        )
+
+
+class _PumpSums:
+    """Sums behind `PumpActivity`."""
+
+    def __init__(self) -> None:
+        self._fraction = Moments()
+        self._travel = 0.0
+        self._starts = self._running = self._saturated = 0
+
+    def add(self, held: Mapping[str, Column]) -> None:
+        pump = np.nan_to_num(held["pump_fraction"])
+        self._fraction.add(pump)
+        running = pump > 0
+        self._travel += float(np.abs(np.diff(pump)).sum())
+        self._starts += int((running[1:] & ~running[:-1]).sum())
+        self._running += int(running.sum())
+        cut = np.abs(held["flow_wanted_um_per_s"] - held["flow_um_per_s"])
+        self._saturated += int((cut > _SATURATED_UM_PER_S).sum())
+
+    def result(self, period_s: float) -> PumpActivity:
+        count = self._fraction.count
+        hours = count * period_s / 3600
+        per_hour = 1 / hours if hours else math.nan
+        share = 1 / count if count else math.nan
+        return PumpActivity(
+            mean_fraction=self._fraction.mean if count else math.nan,
+            std_fraction=self._fraction.std,
+            travel_per_hour=self._travel * per_hour,
+            starts_per_hour=self._starts * per_hour,
+            running_share=self._running * share,
+            saturated_share=self._saturated * share,
+        )

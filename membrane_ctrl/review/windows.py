@@ -1,0 +1,111 @@
+"""Means over windows of seconds, and what is said of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Column = NDArray[np.float64]
+
+# A window with fewer of its ticks than this says nothing of its length.
+LEAST_SHARE = 0.9
+
+
+@dataclass(frozen=True, slots=True)
+class WindowStatistics:
+    """Statistics of means over windows of one length; NaN without windows.
+
+    Attributes
+    ----------
+    window_s : float
+        0: single ticks.
+    count : int
+    mean_um, std_um, max_um, p99_7_um : float
+        `max` and `p99_7` of the absolute value.
+    in_band : float
+        Share within the band.
+    """
+
+    window_s: float
+    count: int
+    mean_um: float
+    std_um: float
+    max_um: float
+    p99_7_um: float
+    in_band: float
+
+
+class SecondSums:
+    """Sums over whole seconds of the run of several series at once, from blocks that come in their order.
+
+    Parameters
+    ----------
+    series : int
+        How many.
+    """
+
+    def __init__(self, series: int) -> None:
+        self._parts: list[tuple[NDArray[np.int64], Column, Column]] = []
+        self._series = series
+
+    def add(self, time_s: Column, values: Column) -> None:
+        """Take in (n,) times and (series, n) values, all finite or NaN together."""
+        if not time_s.size:
+            return
+        second = np.floor(time_s + 1e-9).astype(np.int64)
+        starts = np.flatnonzero(np.concatenate(([True], second[1:] != second[:-1])))
+        counts = np.diff(np.append(starts, time_s.size)).astype(np.float64)
+        self._parts.append((second[starts], counts, np.add.reduceat(values, starts, axis=1)))
+
+    def result(self) -> tuple[NDArray[np.int64], Column, Column]:
+        """(k,) seconds that have ticks, (k,) their ticks, (series, k) sums."""
+        if not self._parts:
+            return np.empty(0, dtype=np.int64), np.empty(0), np.empty((self._series, 0))
+        second = np.concatenate([part[0] for part in self._parts])
+        counts = np.concatenate([part[1] for part in self._parts])
+        sums = np.concatenate([part[2] for part in self._parts], axis=1)
+        # a second that two blocks share
+        starts = np.flatnonzero(np.concatenate(([True], second[1:] != second[:-1])))
+        return second[starts], np.add.reduceat(counts, starts), np.add.reduceat(sums, starts, axis=1)
+
+
+def window_means(
+    second: NDArray[np.int64], counts: Column, sums: Column, window_s: int, rate_hz: float
+) -> tuple[Column, Column]:
+    """Middles (k,) in s and means of the windows that have at least `LEAST_SHARE` of their ticks.
+
+    Parameters
+    ----------
+    second, counts, sums : (n,) arrays
+        From `SecondSums`.
+    window_s : int
+        Length of a window.
+    rate_hz : float
+        Ticks a second.
+    """
+    if not second.size:
+        return np.empty(0), np.empty(0)
+    number = second // window_s
+    starts = np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
+    ticks, total = np.add.reduceat(counts, starts), np.add.reduceat(sums, starts)
+    whole = (ticks >= LEAST_SHARE * window_s * rate_hz) & np.isfinite(total)
+    return np.asarray((number[starts][whole] + 0.5) * window_s, dtype=np.float64), total[whole] / ticks[whole]
+
+
+def describe(means_um: Column, window_s: float, band_um: float) -> WindowStatistics:
+    """What is said of windows' means."""
+    if not means_um.size:
+        nan = float("nan")
+        return WindowStatistics(window_s, 0, nan, nan, nan, nan, nan)
+    size_um = np.abs(means_um)
+    return WindowStatistics(
+        window_s,
+        int(means_um.size),
+        float(means_um.mean()),
+        float(means_um.std()),
+        float(size_um.max()),
+        float(np.quantile(size_um, 0.997)),
+        float((size_um <= band_um).mean()),
+    )
