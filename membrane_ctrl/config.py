@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from membrane_ctrl.device_config import DevicesConfig as DevicesConfig
+from membrane_ctrl.port_config import AlarmsConfig, PortConfig
 from membrane_ctrl.section import Section as Section
 
 Positive = Annotated[float, Field(gt=0)]
@@ -238,6 +239,8 @@ class Config(Section):
     devices: DevicesConfig | None = None
     twin: TwinConfig = TwinConfig()
     recording: RecordingConfig = RecordingConfig()
+    port: PortConfig = PortConfig()
+    alarms: AlarmsConfig = AlarmsConfig()
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
