@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks.minimum_variance import least_std_um
 from membrane_ctrl.config import LoopConfig, PumpConfig, TwinConfig
+from membrane_ctrl.control.experiments.measurement import Measurement
 from membrane_ctrl.twin import pump as twin_pump
 from membrane_ctrl.twin.events import Event
 from membrane_ctrl.twin.plant import STEP_S, Plant
@@ -22,7 +23,6 @@ from tuning.candidates import amigo, simc, ziegler_nichols
 from tuning.characterise import Characterised, characterise
 from tuning.design import propose, relay_ultimate
 from tuning.disturbance_model import observe
-from tuning.records import Measurement
 from tuning.rig import Rig
 
 SETTLE_S = 40.0

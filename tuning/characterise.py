@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tuning.experiments import Around, Finished, Patterned
+from membrane_ctrl.control.experiments.machine import Around, Finished, Patterned
+from membrane_ctrl.control.experiments.patterns import doublets
+from membrane_ctrl.control.experiments.relay import Relay
 from tuning.identify import Identified, identify
-from tuning.patterns import doublets
 from tuning.quality import Quality, judge, validate
 from tuning.records import Record
-from tuning.relay import Relay
 from tuning.rig import Rig
 
 _RELAYS_MAX, _DOUBLETS_MAX = 4, 4

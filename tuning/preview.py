@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.config import LoopConfig, PumpConfig
+from membrane_ctrl.control.experiments.measurement import Measurement
 from tuning.disturbance_model import Disturbance
 from tuning.plant_model import PlantModel
-from tuning.records import Measurement, Series
+from tuning.records import Series
 from tuning.rig import Rig
 
 _SUBSTEPS = 4  # a tick: a dead time is then met within 2.5 ms at 50 Hz

@@ -9,16 +9,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from membrane_ctrl.control.experiments.measurement import Measurement
+
 Series = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Measurement:
-    """One sample of the bench; NaN for what the bench does not have or has lost."""
-
-    displacement_um: float
-    ambient_pressure_pa: float = float("nan")
-    air_temperature_c: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True)

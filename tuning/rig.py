@@ -9,10 +9,11 @@ from typing import Protocol
 import numpy as np
 
 from membrane_ctrl.config import LoopConfig, PumpConfig
+from membrane_ctrl.control.experiments.machine import Around, ExcursionGuard, Experiment, Finished
+from membrane_ctrl.control.experiments.measurement import Measurement
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput, LoopOutput
 from membrane_ctrl.control.pump_curve import PumpCurve
-from tuning.experiments import Around, ExcursionGuard, Experiment, Finished
-from tuning.records import Measurement, Record
+from tuning.records import Record
 
 Tick = Callable[[LoopOutput], None]
 

@@ -9,13 +9,14 @@ import pytest
 
 from benchmarks.tuning import Case, TwinBench
 from membrane_ctrl.config import PumpConfig
+from membrane_ctrl.control.experiments.machine import Around, Finished, Patterned
+from membrane_ctrl.control.experiments.measurement import Measurement
+from membrane_ctrl.control.experiments.patterns import doublets, multisine, steps
+from membrane_ctrl.control.experiments.pump_map import PumpMapper
+from membrane_ctrl.control.experiments.relay import Relay
 from membrane_ctrl.twin.events import AmbientChange, LaserDropout
 from tuning.characterise import ExperimentError, characterise
-from tuning.experiments import Around, Finished, Patterned
-from tuning.patterns import doublets, multisine, steps
-from tuning.pump_map import PumpMapper
-from tuning.records import Measurement, Record
-from tuning.relay import Relay
+from tuning.records import Record
 from tuning.rig import Rig, laser_noise_um
 
 AROUND = Around(1.24, 0.32, 5.3, 1.0)

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from membrane_ctrl.control.experiments.measurement import Measurement
 from membrane_ctrl.control.filters import LowPass
-from tuning.records import Measurement
 
 FAST_S, SLOW_S = 0.1, 0.4  # of the two filters whose difference is the speed
 _LOST_MAX_S = 0.3  # as long as the safety table bears a stale reading

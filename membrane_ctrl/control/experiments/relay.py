@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 
-from tuning.experiments import COAST_S, Around, Finished, Motion
-from tuning.records import Measurement
+from membrane_ctrl.control.experiments.machine import COAST_S, Around, Finished, Motion
+from membrane_ctrl.control.experiments.measurement import Measurement
 
 THRESHOLD_SHARE = 0.25  # of the excursion limit
 OVERSHOOT_SHARE = 0.2

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.config import PumpConfig
+from membrane_ctrl.control.experiments.machine import Finished, Motion
+from membrane_ctrl.control.experiments.measurement import Measurement
 from membrane_ctrl.control.leak import TOO_TIGHT_UM_PER_S
 from membrane_ctrl.control.slope import Slope
-from tuning.experiments import Finished, Motion
-from tuning.records import Measurement
 
 _PREPARE_S = 1.0  # seven lags of the pump: it stands, or runs
 _PROBE_MIN_S, _PROBE_MAX_S = 1.5, 5.0

@@ -1,4 +1,4 @@
-"""Flows in time for `experiments.Patterned`, sized so that the mirror stays within a few um.
+"""Flows in time for `machine.Patterned`, sized so that the mirror stays within a few um.
 
 Each takes the identified gain: the same excursion on a strong and a weak pump.
 """
@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tuning.experiments import Around
+from membrane_ctrl.control.experiments.machine import Around
 
 Pattern = Callable[[float], float]
 
