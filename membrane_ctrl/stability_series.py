@@ -51,7 +51,7 @@ class SeriesFile:
         coeffs_um: Sequence[float] = (),
     ) -> None:
         """One line; `numbers` are time_s, displacement_um, sag_um, slope_residual_urad, rmse_mean_um."""
-        cells = [f"{value:.9g}" for value in (*numbers, *points_um, *coeffs_um)]
+        cells = [f"{value:.12g}" for value in (*numbers, *points_um, *coeffs_um)]
         self._writer.writerow((name, verdict, reason, *cells))
 
 

@@ -54,6 +54,8 @@ class GeometrySpread:
             raise ValueError(f"matrix: {len(self.names)} names need as many rows and columns")
         if not np.all(np.isfinite(self.covariance)) or not np.allclose(self.covariance, self.covariance.T):
             raise ValueError("matrix: not finite and symmetric")
+        if np.any(np.diag(self.covariance) < 0):
+            raise ValueError("matrix: a variance is negative")
         # rounding of a written matrix may leave a little below 0
         if self.names and np.linalg.eigvalsh(self.correlation()).min() < -1e-6:
             raise ValueError("matrix: not a covariance (an eigenvalue is negative)")

@@ -97,7 +97,8 @@ class TrialBench:
         points = Points.of(geometry.rays(self.column_px, self.row_px), self.screen_mm + disturbance_mm)
         points.t_mm[:] = self.t_mm
         tracer.intersect(points, self.surface, newton=3)
-        fit = solve(tracer, points, self.surface, normal=self.normal)
+        with np.errstate(over="ignore", invalid="ignore"):  # of a fit that runs away, which is told below
+            fit = solve(tracer, points, self.surface, normal=self.normal)
         if not fit.converged:
             raise ArithmeticError("a trial did not converge: the geometry's spread is too wide to be a spread")
         return fit.surface.parameters
