@@ -224,6 +224,10 @@ class RecordingConfig(Section):
     logs_dir: str = "logs"
     min_free_mb: Annotated[float, Field(ge=1)] = 500.0
     thumbnails: bool = True
+    segment_s: Annotated[float, Field(ge=10, le=86_400)] = 3600.0  # a crash leaves at most this much unoptimised
+    quiet_hz: Annotated[float, Field(ge=0.1, le=200)] = 10.0  # rows for the viewer while nothing happens
+    keep_gb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None  # old runs beyond this are deleted; none: never
+    keep_days: Annotated[float, Field(ge=0.1, le=1e5)] | None = None
 
 
 class Config(Section):

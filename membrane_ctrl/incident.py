@@ -74,7 +74,6 @@ def write_incident(run: RecordedRun, found: Replay, name: str, to_s: float, inci
         raise InputError(f"{folder}: is there already; choose another name")
     folder.mkdir()
     file = InputsFile(folder, __version__)
-    file.next_segment(0)
     for frame in _until(run.inputs, to_s):
         file.append(TickBatch(frame.records, frame.tails), list(frame.estimates.values()))
     file.close()

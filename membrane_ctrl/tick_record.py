@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.commands import Command
 from membrane_ctrl.config import LoopConfig
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.tick import TickInputs, TickOutputs
 
@@ -101,6 +102,7 @@ def _tail(inputs: TickInputs) -> bytes:
     commands = [
         {field.name: getattr(command, field.name) for field in fields(Command)}
         | {"loop": command.loop.model_dump(mode="json") if command.loop else None}
+        | {"experiment": command.experiment.model_dump(mode="json") if command.experiment else None}
         for command in inputs.commands
     ]
     return json.dumps({"commands": commands, "dead_tasks": inputs.dead_tasks}).encode()
@@ -147,8 +149,14 @@ def unpack_tick(record: np.void, tail: bytes, estimates: Mapping[float, ShapeEst
 
 
 def _command(given: dict[str, Any]) -> Command:
-    loop = given["loop"]
-    return Command(**{**given, "loop": None if loop is None else LoopConfig.model_validate(loop)})
+    loop, experiment = given["loop"], given.get("experiment")
+    return Command(
+        **{
+            **given,
+            "loop": None if loop is None else LoopConfig.model_validate(loop),
+            "experiment": None if experiment is None else ExperimentSpec.model_validate(experiment),
+        }
+    )
 
 
 @dataclass(frozen=True, slots=True)

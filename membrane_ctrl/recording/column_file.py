@@ -103,8 +103,9 @@ class ColumnFile:
             self.close_file()
         if self._writer is None:
             self._folder.mkdir(exist_ok=True)
-            self._sink = pa.OSFile(str(self._folder / f"{self._table}-{self._number:03d}{SUFFIX}"), "wb")
-            self._number += 1
+            while (path := self._folder / f"{self._table}-{self._number:03d}{SUFFIX}").exists():
+                self._number += 1  # also those of a recorder that was killed
+            self._sink = pa.OSFile(str(path), "wb")
             self._file_until_s = time_s + FILE_S
             # one thread: compressing is not urgent, the tick beside it is
             options = pa.ipc.IpcWriteOptions(compression="zstd", use_threads=False)

@@ -31,14 +31,21 @@ def parse(message: bytes) -> Event:
 class EventsFile:
     """Appends events; after a failed write nothing is lost or torn, the next call goes on where it stopped.
 
+    Parameters
+    ----------
+    path : Path
+    resumed : bool
+        A recorder was killed: half a line at the end goes, and what is there is not written again.
+
     Attributes
     ----------
     lost : int
         Events given up because too many waited for a full disk.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, resumed: bool = False) -> None:
         self._path = path
+        self._written = _mend_tail(path) if resumed else frozenset()
         self._waiting: deque[bytes] = deque()
         self._sync = False
         self._descriptor: int | None = None
@@ -47,7 +54,10 @@ class EventsFile:
     def append(self, events: Sequence[Event]) -> None:
         """Write events, and those still waiting from before. Raises OSError (full disk)."""
         for event in events:
-            self._waiting.append(plain_json.dumps(event).encode() + b"\n")
+            line = plain_json.dumps(event).encode() + b"\n"
+            if line in self._written:
+                continue
+            self._waiting.append(line)
             self._sync |= event.get("kind") in _SYNCED
         while len(self._waiting) > _WAITING_MAX:
             # the front line may be half on the disk already: it stays, the one behind it goes
@@ -74,3 +84,20 @@ class EventsFile:
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
+
+
+# A killed recorder had handed on how far it was a second before: at most this much may come twice.
+_TAIL_BYTES = 1_000_000
+
+
+def _mend_tail(path: Path) -> frozenset[bytes]:
+    """Cut half a line off the end; the last whole lines."""
+    if not path.exists():
+        return frozenset()
+    with path.open("r+b") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - _TAIL_BYTES))
+        tail = file.read()
+        whole = tail[: tail.rfind(b"\n") + 1]
+        file.truncate(size - len(tail) + len(whole))
+    return frozenset(whole.splitlines(keepends=True))

@@ -9,6 +9,7 @@ all ticks, then the next byte): together that takes four fifths off; then the ra
 from __future__ import annotations
 
 import json
+import math
 import os
 import struct
 import zlib
@@ -38,26 +39,23 @@ class InputsFile:
         Folder of the run.
     version : str
         Of the program; a replay by another one says so.
+    segment_s : float
+        Length of a file.
     """
 
-    def __init__(self, run_dir: Path, version: str) -> None:
+    def __init__(self, run_dir: Path, version: str, segment_s: float = math.inf) -> None:
         self._run_dir = run_dir
+        self._segment_s = segment_s
+        self._segment_until_s = math.inf
         head = {"schema": SCHEMA, "program": f"membrane-ctrl {version}", "fields": [list(f) for f in RECORD.descr]}
         self._head = json.dumps(head).encode() + b"\n"
         self._descriptor: int | None = None
 
-    def next_segment(self, number: int) -> None:
-        """Go on in file `number`, or behind what is already in it. Raises OSError."""
-        self.close()
-        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
-        self._descriptor = os.open(self._run_dir / f"inputs-{number:03d}.bin", flags, 0o644)
-        if os.fstat(self._descriptor).st_size == 0:
-            _write_all(self._descriptor, self._head)
-
-    def append(self, batch: TickBatch, shapes: list[ShapeEstimate]) -> None:
+    def append(self, batch: TickBatch, shapes: list[ShapeEstimate], now_s: float = 0.0) -> None:
         """Write one frame. Raises OSError (full disk): its ticks are then lost to a replay."""
-        if self._descriptor is None or not (len(batch.records) or shapes):
+        if not (len(batch.records) or shapes):
             return
+        descriptor = self._descriptor_at(now_s)
         parts = [(_TAIL, tick, tail) for tick, tail in batch.tails.items()]
         parts += [(_SHAPE, 0, pack_estimate(shape)) for shape in shapes]
         columns = batch.records.view("u1").reshape(-1, RECORD.itemsize).T.copy()
@@ -65,7 +63,18 @@ class InputsFile:
         body = _COUNT.pack(len(batch.records)) + columns.tobytes()
         body += b"".join(_PART.pack(kind, tick, len(data)) + data for kind, tick, data in parts)
         packed = zlib.compress(body, 6)
-        _write_all(self._descriptor, _HEAD.pack(_MAGIC, len(packed), zlib.crc32(packed)) + packed)
+        _write_all(descriptor, _HEAD.pack(_MAGIC, len(packed), zlib.crc32(packed)) + packed)
+
+    def _descriptor_at(self, now_s: float) -> int:
+        if now_s >= self._segment_until_s:
+            self.close()
+        if self._descriptor is None:
+            number = sum(1 for _ in self._run_dir.glob("inputs-*.bin"))
+            path = self._run_dir / f"inputs-{number:03d}.bin"
+            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+            self._segment_until_s = now_s + self._segment_s
+            _write_all(self._descriptor, self._head)
+        return self._descriptor
 
     def sync(self) -> None:
         """Wait until the disk has it. Raises OSError."""
@@ -147,7 +156,8 @@ class InputsReader:
 
     def _bodies(self, data: bytes, name: str) -> Iterator[bytes]:
         """Bodies of all whole frames; between them anything may lie."""
-        place = good_until = data.find(b"\n") + 1
+        place = 0
+        good_until = data.find(b"\n") + 1
         while (place := data.find(_MAGIC, place)) >= 0:
             body, end = _body_at(data, place)
             if body is None:

@@ -48,6 +48,8 @@ class RecorderSpec:
         Shared camera frames, for thumbnails.
     inputs : RingAddress or None
         What the ticks were given (`tick_record`), for a replay.
+    resumes : int
+        How many recorders of this run have died before this one; it goes on where they stopped.
     flush_s : float
         What a killed recorder may lose.
     """
@@ -61,6 +63,7 @@ class RecorderSpec:
     shapes: RingAddress | None = None
     frames: FrameAddress | None = None
     inputs: RingAddress | None = None
+    resumes: int = 0
     flush_s: float = 1.0
 
 
@@ -102,10 +105,11 @@ def _record(
         "inputs": spec.inputs,
     }
     rings = {name: RingReader(address) for name, address in addresses.items() if address is not None}
-    recording = Recording(spec.run_dir, spec.run_name, spec.clock, spec.config)
+    first = sum(1 for _ in spec.run_dir.glob(f"{spec.run_name}-*.rrd")) if spec.resumes else 0
+    recording = Recording(spec.run_dir, spec.run_name, spec.clock, spec.config, first)
     wanted = spec.frames is not None and spec.config.recording.thumbnails
     thumbnails = Thumbnails(recording, spec.frames) if wanted and spec.frames is not None else None
-    recorder = Recorder(spec.run_dir, spec.clock, spec.config, rings, recording, thumbnails, report)
+    recorder = Recorder(spec.run_dir, spec.clock, spec.config, rings, recording, thumbnails, report, spec.resumes)
     next_write_s = 0.0
     while not recorder.ended:
         # asked before draining: what a parent put before it died is then seen in this round
@@ -113,7 +117,7 @@ def _record(
         recorder.drain()
         if exit_word and not recorder.ended:
             recorder.take_events([_end_event(spec.clock, exit_word)])
-        elif time.monotonic() >= next_write_s:
+        elif recorder.urgent or time.monotonic() >= next_write_s:
             next_write_s = time.monotonic() + spec.flush_s
             recorder.write()
         if not recorder.ended:

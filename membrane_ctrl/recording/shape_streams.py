@@ -33,11 +33,20 @@ _DIFFERENCE_LEAST_UM = 0.5
 
 
 class ShapeStreams:
-    """Sends estimates to a recording. Changes are against the first estimate since `rebase` that was not rejected."""
+    """Sends estimates to a recording. Changes are against the first estimate since `rebase` that was not rejected.
+
+    Attributes
+    ----------
+    reference : ShapeEstimate or None
+        That estimate.
+    pictures : bool
+        Whether maps are sent.
+    """
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._reference: ShapeEstimate | None = None
+        self.reference: ShapeEstimate | None = None
+        self.pictures = True
         self._next_map_s = -math.inf
         self._next_difference_s = -math.inf
         self._colours: dict[str, tuple[float, float]] = {}
@@ -51,7 +60,7 @@ class ShapeStreams:
 
     def rebase(self) -> None:
         """Take the next estimate as the reference, and show the maps against it at once."""
-        self._reference = None
+        self.reference = None
         self._next_difference_s = -math.inf
 
     def send(self, estimate: ShapeEstimate) -> None:
@@ -64,13 +73,14 @@ class ShapeStreams:
             self._recording.columns(VERDICT.path, time_s, rr.StateChange.columns(state=[estimate.verdict]))
         if estimate.verdict == "rejected":
             return
-        self._reference = self._reference or estimate
-        for stream, values in _figure(estimate, self._reference).items():
+        self.reference = self.reference or estimate
+        for stream, values in _figure(estimate, self.reference).items():
             self._recording.scalars(stream.path, time_s, np.array([values]))
-        change_um = (estimate.coeffs_um - self._reference.coeffs_um)[1:]
+        change_um = (estimate.coeffs_um - self.reference.coeffs_um)[1:]
         bars = rr.BarChart(change_um, abscissa=np.arange(2, 37))
         self._recording.log("/shape/change_bars", estimate.time_s, bars)
-        self._send_maps(estimate, self._reference)
+        if self.pictures:
+            self._send_maps(estimate, self.reference)
 
     def _send_maps(self, estimate: ShapeEstimate, reference: ShapeEstimate) -> None:
         time_s = estimate.time_s

@@ -10,6 +10,7 @@ kept and left alone, and the process has to end without exit handlers.
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
@@ -31,8 +32,6 @@ RUN_TIME = "run_time"
 UTC = "utc"
 OUTSIDE_CLASS = 1
 
-# A file that is not closed has no footer and is slow to open: a crash may cost that for six hours, not for a week.
-SEGMENT_S = 6 * 3600.0
 # A disk that takes longer than this to take a second of data (tens of kB) is as good as gone.
 _FLUSH_TIMEOUT_S = 5.0
 
@@ -58,24 +57,28 @@ class Recording:
         Gives UTC for the run's seconds.
     config : Config
         Shown among the recording's properties and used for the blueprint.
+    first_segment : int
+        Number of the first file: not 0 when another recorder has begun the run.
 
     Attributes
     ----------
     segments : int
-        Files begun so far.
+        Number of the next file.
+    path : Path or None
+        The file there is.
     stuck : bool
         A stream was abandoned: Rerun's exit handler may wait for it for ever.
     """
 
-    def __init__(self, run_dir: Path, run_name: str, clock: RunClock, config: Config) -> None:
+    def __init__(self, run_dir: Path, run_name: str, clock: RunClock, config: Config, first_segment: int = 0) -> None:
         self._run_dir = run_dir
         self._run_name = run_name
         self._origin = np.datetime64(clock.origin_utc.replace(tzinfo=None), "ns")
         self._config = config
         self._stream = self._new_stream()
         self.stuck = False
-        self._path: Path | None = None
-        self.segments = 0
+        self.path: Path | None = None
+        self.segments = first_segment
 
     def next_segment(self) -> None:
         """Close the file there is and go on in a new one. Raises RecordingError; then call it again later."""
@@ -88,7 +91,7 @@ class Recording:
             path.unlink(missing_ok=True)
             self._abandon()
             raise RecordingError(f"{path}: {error}") from None
-        self._path = path
+        self.path = path
         self.segments += 1
 
     def _new_stream(self) -> rr.RecordingStream:
@@ -99,7 +102,7 @@ class Recording:
         _abandoned.append(self._stream)
         self.stuck = True
         self._stream = self._new_stream()
-        self._path = None
+        self.path = None
 
     def _send_statics(self) -> None:
         stream = self._stream
@@ -149,6 +152,21 @@ class Recording:
             self._abandon()
             raise RecordingError(str(error)) from None
 
+    def pause(self) -> None:
+        """Close the file and begin no other; `next_segment` goes on. Raises RecordingError as `close`."""
+        self.close()
+        self._stream = self._new_stream()
+
+    def sync(self) -> None:
+        """Wait until the disk has what was flushed: Rerun never asks it to. Raises OSError."""
+        if self.path is None:
+            return
+        descriptor = os.open(self.path, os.O_RDONLY)
+        try:
+            os.fdatasync(descriptor)
+        finally:
+            os.close(descriptor)
+
     def close(self) -> None:
         """Write the footer and close the file.
 
@@ -159,11 +177,12 @@ class Recording:
         """
         self.flush()
         self._stream.disconnect()
-        if self._path is not None and not _is_whole(self._path):
-            raise RecordingError(f"{self._path}: closed without its footer; `rerun rrd optimize` mends it")
+        path, self.path = self.path, None
+        if path is not None and not is_whole(path):
+            raise RecordingError(f"{path}: closed without its footer; `membrane-ctrl repair` mends it")
 
 
-def _is_whole(path: Path) -> bool:
+def is_whole(path: Path) -> bool:
     """Whether a closed file has its footer: `disconnect` does not say."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the reader's own way to say that there is none

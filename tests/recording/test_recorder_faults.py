@@ -19,8 +19,9 @@ from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config, RecordingConfig
 from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
 from membrane_ctrl.recording import recorder as recorder_module
-from membrane_ctrl.recording.recorder import RETRY_S, Recorder
-from membrane_ctrl.recording.sink import SEGMENT_S, Recording, RecordingError
+from membrane_ctrl.recording.recorder import Recorder
+from membrane_ctrl.recording.rerun_output import RETRY_S
+from membrane_ctrl.recording.sink import Recording, RecordingError
 from membrane_ctrl.telemetry import ROW_BYTES
 
 
@@ -146,18 +147,29 @@ def test_a_full_disk_is_reported_once_counted_and_recovered_from(bench: Bench) -
     assert found["ticks"] == 7 * 50  # the statistics lost nothing
 
 
-def test_a_file_that_was_not_closed_whole_is_reported(bench: Bench) -> None:
+def test_a_file_that_was_not_closed_whole_is_reported(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.second(0)
+    monkeypatch.setattr(FlakyRecording, "sync", lambda _: None)
     (bench.run_dir / "test-000.rrd").unlink()
     bench.recorder.finish()
     assert bench.kinds() == ["recorder_error", "recorder_done"]
     assert "closed without its footer" in bench.reports[0]["message"]
 
 
+def test_a_segment_deleted_under_the_recorder_is_reported_and_another_begun(bench: Bench) -> None:
+    bench.second(0)
+    (bench.run_dir / "test-000.rrd").unlink()
+    bench.second(1)
+    bench.second(2)
+    bench.recorder.finish()
+    assert bench.kinds() == ["recorder_error", "recorder_recovered", "recorder_done"]
+    assert times_s(bench) == [2]
+
+
 def test_segments_are_changed_in_time_without_losing_a_row(bench: Bench) -> None:
     bench.second(0)
     bench.second(1)
-    HandClock.moment_s = SEGMENT_S + 1
+    HandClock.moment_s = Config().recording.segment_s + 1
     for row in rows_of(3.0)[-50:]:
         bench.writers["telemetry"].put(row.pack())
     bench.recorder.drain()

@@ -255,7 +255,7 @@ def test_a_writer_that_dies_is_reported_and_the_recording_goes_on(feed: Feed) ->
         kinds = [report["kind"] for report in received(status)]
     assert kinds == ["recorder_error", "recorder_recovered", "recorder_done"]
     account = summary_of(run_dir)["recorder"]
-    lost = {"rows_lost": 0, "column_rows_lost": 0, "events_lost": 0}
+    lost = {"rows_lost": 0, "column_rows_lost": 0, "events_lost": 0, "restarts": 0, "partial": False}
     assert account == {"segments": account["segments"], "errors": 1} | lost
     assert has_footer(run_dir / "test-001.rrd")
     # the batch that met the full disk is in the new file, whole

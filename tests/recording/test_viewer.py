@@ -35,7 +35,7 @@ HOLD_GREEN = (0, 127, 92)
 def run_dir(tmp_path: Path) -> Path:
     recording = Recording(tmp_path, "test", RunClock.start(), Config())
     recording.next_segment()
-    TelemetryStreams(recording, 2.0).send(unpack([row.pack() for row in rows_of(30.0)]))
+    TelemetryStreams(recording, Config()).send(unpack([row.pack() for row in rows_of(30.0)]))
     send_events(recording, [{"kind": "state", "mono_s": 6.0, "to": "hold"}])
     shapes = ShapeStreams(recording)
     for cycle in range(10):

@@ -1,0 +1,72 @@
+"""What the recorder does beside recording: looks at the disk, optimises closed segments, deletes old runs."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+from membrane_ctrl.clock import RunClock
+from membrane_ctrl.config import RecordingConfig
+from membrane_ctrl.recording.complaints import Complaints
+from membrane_ctrl.recording.optimizer import Optimizer
+from membrane_ctrl.recording.retention import deletable_runs, delete_run, expired, size_bytes
+from membrane_ctrl.recording.run_folder import free_mb
+from membrane_ctrl.recording.thrift import Thrift, thrift
+
+# Counting the bytes of a hundred runs takes a second of disk.
+RETENTION_INTERVAL_S = 3600.0
+
+
+class Housekeeping:
+    """One look each second.
+
+    Attributes
+    ----------
+    thrift : Thrift
+        What has to be left out.
+    """
+
+    def __init__(self, run_dir: Path, clock: RunClock, config: RecordingConfig, complaints: Complaints) -> None:
+        self._run_dir = run_dir
+        self._clock = clock
+        self._config = config
+        self._complaints = complaints
+        self._optimizer = Optimizer()
+        self._retention_due_s = 0.0
+        self.thrift = Thrift.ALL
+
+    def look(self, now_s: float, closed: list[Path]) -> None:
+        """Watch the disk, go on with what is under way; `closed` are segments to optimise."""
+        self._complaints.guarded("disk check", self._watch_disk)
+        if self.thrift == Thrift.ALL:  # a second copy of a segment needs room
+            for path in closed:
+                self._optimizer.add(path)
+        self._complaints.guarded("optimise", self._optimizer.poll)
+        if now_s >= self._retention_due_s:
+            self._retention_due_s = now_s + RETENTION_INTERVAL_S
+            self._complaints.guarded("retention", self._delete_old)
+
+    def _watch_disk(self) -> None:
+        left_mb, least_mb = free_mb(self._run_dir), self._config.min_free_mb
+        self.thrift = thrift(left_mb, least_mb, self.thrift)
+        if left_mb < least_mb:
+            limit = f"less than recording.min_free_mb = {least_mb:g} MB free"
+            self._complaints.complain("disk", f"{self._run_dir}: {limit}; delete old runs", kind="disk_low")
+        else:
+            self._complaints.recovered("disk")
+
+    def _delete_old(self) -> None:
+        config = self._config
+        if config.keep_gb is None and config.keep_days is None:
+            return
+        # the run's own axis: a wall clock that is set wrong meanwhile deletes nothing
+        now_utc = self._clock.utc(self._clock.now())
+        runs = deletable_runs(self._run_dir.parent, self._run_dir, now_utc)
+        for run, why in expired(runs, size_bytes(self._run_dir), config.keep_gb, config.keep_days, now_utc):
+            delete_run(run)
+            self._complaints.report({"kind": "run_deleted", "run": run.folder.name, "message": why})
+
+    def close(self) -> None:
+        """End what is under way."""
+        with contextlib.suppress(OSError):
+            self._optimizer.close()

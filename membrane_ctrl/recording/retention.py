@@ -1,0 +1,97 @@
+"""Old runs go when they are too old or too many bytes; never the present one, and none that a person keeps."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+_RUN = re.compile(r"(\d{8}T\d{6}Z)-.+")
+_KEEP = ".keep"
+# A clock that is wrong by years must not take every run with it.
+_NEVER_TOO_OLD = 3
+# A run without a summary may be running, unless nothing in it has changed for this long.
+_ABANDONED_AFTER = timedelta(hours=24)
+
+
+@dataclass(frozen=True, slots=True)
+class OldRun:
+    """A run folder that may be deleted: its name begins with its start."""
+
+    folder: Path
+    started_utc: datetime
+    size_bytes: int
+
+
+def deletable_runs(logs_dir: Path, present: Path, now_utc: datetime) -> list[OldRun]:
+    """Runs in `logs_dir`, oldest first, but for the present one, those that may still run, and those with a `.keep`.
+
+    Only folders that look like a run are looked at: a name that begins with a time, and `config.toml`.
+    """
+    found = []
+    for folder in sorted(logs_dir.iterdir()):
+        match = _RUN.fullmatch(folder.name)
+        if not match or not (folder / "config.toml").is_file() or folder.resolve() == present.resolve():
+            continue
+        if (folder / _KEEP).exists() or _may_run(folder, now_utc):
+            continue
+        started = datetime.strptime(match[1], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+        found.append(OldRun(folder, started, size_bytes(folder)))
+    return found
+
+
+def size_bytes(folder: Path) -> int:
+    """Bytes of all files below a folder; one that goes away meanwhile counts nothing."""
+    total = 0
+    for path in folder.rglob("*"):
+        try:
+            total += path.lstat().st_size
+        except OSError:
+            continue
+    return total
+
+
+def _may_run(folder: Path, now_utc: datetime) -> bool:
+    if (folder / "summary.json").exists():
+        return False
+    newest_s = max(path.lstat().st_mtime for path in folder.iterdir())
+    return now_utc - datetime.fromtimestamp(newest_s, UTC) < _ABANDONED_AFTER
+
+
+def expired(
+    runs: Sequence[OldRun], present_bytes: int, keep_gb: float | None, keep_days: float | None, now_utc: datetime
+) -> list[tuple[OldRun, str]]:
+    """Which runs have to go, and why.
+
+    Parameters
+    ----------
+    runs : sequence of OldRun
+        Oldest first.
+    present_bytes : int
+        Of the present run; it counts, and stays.
+    keep_gb, keep_days : float or None
+        Limits (1e9 bytes); None: no limit. The newest three are never too old.
+    now_utc : datetime
+    """
+    total = present_bytes + sum(run.size_bytes for run in runs)
+    gone: list[tuple[OldRun, str]] = []
+    for place, run in enumerate(runs):
+        old_enough = place < len(runs) - _NEVER_TOO_OLD
+        if keep_days is not None and old_enough and now_utc - run.started_utc > timedelta(days=keep_days):
+            gone.append((run, f"older than recording.keep_days = {keep_days:g}"))
+        elif keep_gb is not None and total > keep_gb * 1e9:
+            gone.append((run, f"all runs are more than recording.keep_gb = {keep_gb:g}"))
+        else:
+            continue
+        total -= run.size_bytes
+    return gone
+
+
+def delete_run(run: OldRun) -> None:
+    """Delete a run; renamed first, so that what a crash leaves of it is no run. Raises OSError."""
+    doomed = run.folder.with_name(f".deleted-{run.folder.name}")
+    run.folder.rename(doomed)
+    shutil.rmtree(doomed)
