@@ -13,10 +13,13 @@ from numpy.typing import NDArray
 
 from firmware_iface.roles import BenchCommand
 from membrane_ctrl.commands import Command, refusal
-from membrane_ctrl.config import Config
+from membrane_ctrl.config import Config, LoopConfig
+from membrane_ctrl.control.experiments.machine import Finished
+from membrane_ctrl.control.experiments.trial import Trial
 from membrane_ctrl.control.inner_loop import InnerLoop
 from membrane_ctrl.control.shape_loop import ShapeLoop, ShapeOutput
 from membrane_ctrl.errors import Exit
+from membrane_ctrl.gains_trial import GainsTrial
 from membrane_ctrl.ladder import Ladder
 from membrane_ctrl.names import Rung, State
 from membrane_ctrl.observer import Observer
@@ -53,6 +56,7 @@ class Controller:
         loop = InnerLoop(config.loop, config.pump)
         self._scene = Scene(config, config.loop, loop, observer, Ladder(config.states), config.loop.setpoint_um)
         self._resume = ResumeRule(config.resume)
+        self._gains = GainsTrial(config.loop)
         self._answers: list[tuple[int, str]] = []
         self._clear_board = False
         self._tick_error = ""
@@ -105,17 +109,21 @@ class Controller:
         self._answers, self._clear_board = [], False
         for command in inputs.commands:
             self._obey(command, events)
+        if self._gains.overdue(scene.now_s):
+            self._revert_gains("nobody has kept them in time", events)
 
     def _obey(self, command: Command, events: list[Event]) -> None:
         """Do what a command asks, or say why not; either is recorded with who asked and why."""
         scene = self._scene
-        refused = refusal(command, self.state, self._config)
+        refused = refusal(command, self.state, self._config) or self._prepare(command)
         self._answers.append((command.number, refused))
         event: Event = {"kind": "command", "command": command.kind, "who": command.who, "why": command.why}
         if math.isfinite(command.value):
             event["value"] = command.value
         if command.text:
             event["text"] = command.text
+        if command.experiment is not None:
+            event["experiment"] = command.experiment.model_dump()
         events.append({**event, "refused": refused} if refused else event)
         if refused:
             return
@@ -130,8 +138,10 @@ class Controller:
                 scene.setpoint_um = command.value
             case "gains":
                 assert command.loop is not None  # `refusal` has looked
-                scene.loop_config = command.loop
-                scene.loop.set_gains(command.loop)
+                self._gains.begin(command.loop, scene.now_s, command.value)
+                self._set_gains(command.loop)
+            case "keep":
+                self._gains.keep()
             case "shape_on" | "shape_off":
                 self._shape.switch(command.kind == "shape_on", scene.now_s)
             case "ack":
@@ -144,6 +154,27 @@ class Controller:
                 self._go_down(command.kind)
         if command.kind != "mark":
             scene.asked_by = command.who
+
+    def _prepare(self, command: Command) -> str:
+        """Make the experiment that is asked for; why it cannot be, if it cannot."""
+        scene, spec = self._scene, command.experiment
+        if command.kind != "tune" or spec is None:
+            return ""
+        centre_um = scene.setpoint_um + scene.trim_um
+        try:
+            scene.trial = Trial(spec, scene.loop_config, self._config.pump, centre_um)
+        except ValueError as error:
+            return str(error)
+        scene.hold_wanted = scene.paused = False
+        return ""
+
+    def _set_gains(self, loop: LoopConfig) -> None:
+        self._scene.loop_config = loop
+        self._scene.loop.set_gains(loop)
+
+    def _revert_gains(self, why: str, events: list[Event]) -> None:
+        self._set_gains(self._gains.revert())
+        events.append({"kind": "gains_reverted", "why": why})
 
     def _go_down(self, way: Way) -> None:
         """A way down further down than the one under way; `stop` stays the last word."""
@@ -215,13 +246,27 @@ class Controller:
     def _go(self, state: State, why: str, events: list[Event]) -> None:
         scene = self._scene
         events.append({"kind": "state", "state": state.name.lower(), "from": self.state.name.lower(), "why": why})
+        if self.state == State.TUNE and scene.trial is not None:
+            ended = scene.trial_ended or Finished(False, why)
+            events.append(
+                {
+                    "kind": "experiment",
+                    "experiment": scene.trial.spec.kind,
+                    "completed": ended.completed,
+                    "reason": ended.reason,
+                    **scene.trial.result(),
+                }
+            )
+            scene.trial = scene.trial_ended = None
+        if state == State.FAULT and self._gains.on_trial:
+            self._revert_gains("a fault came while they were on trial", events)
         if self.state == State.FAULT:  # it was acknowledged, or may resume
             self.fault, self._tick_error = None, ""
             scene.ladder.leave()
             scene.acknowledged = False
         self.state = state
         self._state_since_s = math.nan
-        scene.good_since_s = math.nan
+        scene.good_since_s = scene.last_good_s = math.nan
         scene.overdue = scene.unfit = ""
         scene.test, scene.tested_once = None, False
 

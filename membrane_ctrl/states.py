@@ -13,6 +13,9 @@ from typing import Literal
 
 from membrane_ctrl.actuator_test import ActuatorTest
 from membrane_ctrl.config import Config, LoopConfig
+from membrane_ctrl.control.experiments.machine import Finished
+from membrane_ctrl.control.experiments.measurement import Measurement
+from membrane_ctrl.control.experiments.trial import Trial
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput, LoopOutput
 from membrane_ctrl.control.slope import Slope
 from membrane_ctrl.errors import Exit
@@ -46,6 +49,7 @@ class Scene:
     manual_wanted: bool = False
     manual_um_per_s: float = 0.0
     paused: bool = False
+    trial: Trial | None = None  # an experiment, until its end has been told
     way_down: Way | None = None
     asked_by: str = ""
     stop_exit: Exit = Exit.DONE
@@ -54,6 +58,7 @@ class Scene:
     resume_possible: bool = False  # it may yet
     # memory of the states
     good_since_s: float = math.nan
+    last_good_s: float = math.nan  # in `check`
     sinking: Slope = field(default_factory=Slope)  # of the mirror with the pump off, seen in `check`
     test: ActuatorTest | None = None
     tested_once: bool = False  # with a complaint, which a second test must confirm
@@ -67,6 +72,7 @@ class Scene:
     overdue: str = ""
     unfit: str = ""
     finished: Exit | None = None
+    trial_ended: Finished | None = None
 
     def stay_good(self, good: bool) -> float:
         """How long `good` has been true without a break, in seconds."""
@@ -94,10 +100,14 @@ def check(scene: Scene) -> State:
     if scene.way_down is not None:
         return _go_down(scene)
     missing = _missing(scene)
-    good_s = scene.stay_good(not missing)
+    if not missing:
+        scene.last_good_s = scene.now_s
+    # an answer that is lost now and then is no sensor that is bad
+    gone = not scene.now_s - scene.last_good_s <= scene.config.limits.stale_s
+    good_s = scene.stay_good(not gone)
     if scene.state_age_s > scene.config.states.check_timeout_s:
         scene.overdue = f"sensors not good after {scene.config.states.check_timeout_s:g} s: {missing}"
-    if missing:
+    if gone:
         scene.test = None  # what was measured with a hole in it is measured again
         scene.why = f"checking the sensors: {missing}"
         return State.CHECK
@@ -106,7 +116,7 @@ def check(scene: Scene) -> State:
     scene.why = "checking the sensors: all good so far"
     if scene.state_age_s > _PUMP_STANDS_S:
         scene.sinking.add(scene.now_s, scene.observer.displacement_um)
-    if good_s < scene.config.states.check_s:
+    if good_s < scene.config.states.check_s or missing:
         return State.CHECK
     return _begin(scene, max(0.0, -scene.sinking.per_s))
 
@@ -176,6 +186,37 @@ def manual(scene: Scene) -> State:
     return State.MANUAL
 
 
+def tune(scene: Scene) -> State:
+    """An experiment, inside its guard; whatever ends it, the loop takes the mirror back at the holding flow."""
+    trial = scene.trial
+    assert trial is not None  # the command that leads here has made it
+    if scene.way_down is not None:
+        return _go_down(scene)
+    given = _given(scene, scene.setpoint_um)
+    measurement = Measurement(given.displacement_um, given.ambient_pressure_pa, given.air_temperature_c)
+    wanted: float | Finished
+    if scene.hold_wanted:
+        wanted = Finished(False, f"ended by {scene.asked_by}")
+    elif scene.ladder.rung != Rung.NONE:
+        wanted = Finished(False, "the safety table holds the mean flow")
+    else:
+        wanted = trial.step(measurement, scene.dt_s)
+    scene.vent_fraction = scene.loop_config.bleed_fraction
+    if isinstance(wanted, Finished):
+        scene.output = scene.loop.follow(given, trial.spec.holding_flow_um_per_s, scene.dt_s)
+        scene.trial_ended = wanted
+        scene.why = f"{trial.spec.kind} {'done' if wanted.completed else 'stopped'}: {wanted.reason}"
+    elif trial.raw:
+        scene.output = scene.loop.follow_raw(given, wanted, scene.dt_s)
+    else:
+        scene.output = scene.loop.follow(given, wanted, scene.dt_s)
+    scene.pump_fraction = scene.output.pump_fraction
+    if scene.trial_ended is not None:
+        return State.HOLD
+    scene.why = f"tuning: {trial.spec.kind} asked for by {scene.asked_by}"
+    return State.TUNE
+
+
 def lower(scene: Scene) -> State:
     """The way down: pump off, seen to be off; the leak lets the mirror down by itself, or the vent does."""
     way = scene.way_down or "lower"
@@ -233,6 +274,7 @@ HANDLERS: dict[State, Callable[[Scene], State]] = {
     State.SETTLE: settle,
     State.HOLD: hold,
     State.MANUAL: manual,
+    State.TUNE: tune,
     State.LOWER: lower,
     State.FAULT: fault,
 }
@@ -247,6 +289,9 @@ def _asked_elsewhere(scene: Scene) -> State | None:
     """The state that somebody has asked for, if it is another one than a hold."""
     if scene.way_down is not None:
         return _go_down(scene)
+    if scene.trial is not None:
+        scene.why = f"{scene.asked_by} asked for the experiment {scene.trial.spec.kind}"
+        return State.TUNE
     if scene.manual_wanted:
         scene.hold_wanted = False
         scene.why = f"{scene.asked_by} has taken the pump"
@@ -266,6 +311,8 @@ def _test_actuators(scene: Scene) -> State:
         scene.pump_fraction, scene.vent_fraction = part.pump_fraction, part.vent_fraction
         scene.why = f"checking that the film answers: {part.name}"
         return State.CHECK
+    if _missing(scene):
+        return State.CHECK  # the loop begins at a reading
     complaint = scene.test.complaint()
     if complaint:
         scene.why = f"the film does not answer: {complaint}"

@@ -1,0 +1,260 @@
+"""What may go wrong in the campaign, and what must come of it: one row a fault."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from membrane_ctrl.names import Rung, State
+from membrane_ctrl.safety import MOVING
+
+# limits close to the work, so that a run of a minute can reach them: 40 um are 2 Pa, the gauge's noise is 0.5 Pa
+DISPLACEMENT_MIN_UM, DISPLACEMENT_MAX_UM = -80.0, 40.0
+GAUGE_PRESSURE_MAX_PA = 605.0
+FOLLOWING_ERROR_MAX_UM = 25.0
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """A fault that lasts must have led to `rung` or deeper `within_s` after it set in."""
+
+    rung: Rung
+    within_s: float
+
+
+@dataclass(frozen=True)
+class Case:
+    """One fault.
+
+    Attributes
+    ----------
+    name : str
+    wrong : dict
+        Switches of `virtual_bench.Wrong`.
+    said : frozenset of str
+        Rules that may name it; empty: harmless, nothing may trip.
+    moving, checking, always : Reaction or None
+        What must follow in MOVING states, in `check`, in every state (in `fault` only what vents is still judged).
+    for_s : float
+        It goes away after this.
+    every_s : float
+        With `for_s`: it comes back with this period.
+    leak_factor, door_pa : float
+        It is of the mirror: the leak, the air pressure.
+    power_cycle, raises : bool
+        It is of the board, of the control code.
+    laser_lies : bool
+        The laser's reading is not the mirror's place.
+    gauge_lies : bool
+        The gauge's reading is not the pressure.
+    """
+
+    name: str
+    wrong: dict[str, float] = field(default_factory=dict)
+    said: frozenset[str] = frozenset()
+    moving: Reaction | None = None
+    checking: Reaction | None = None
+    always: Reaction | None = None
+    for_s: float = math.inf
+    every_s: float = math.inf
+    leak_factor: float = 1.0
+    door_pa: float = 0.0
+    power_cycle: bool = False
+    raises: bool = False
+    laser_lies: bool = False
+    gauge_lies: bool = False
+
+    @property
+    def harmless(self) -> bool:
+        """Nothing may trip."""
+        return not self.said
+
+    def reaction(self, state: State) -> Reaction | None:
+        """What must follow when it sets in while the controller is in `state`."""
+        if self.always is not None and (state != State.FAULT or self.always.rung == Rung.VENT):
+            return self.always
+        return self.moving if state in MOVING else self.checking if state == State.CHECK else None
+
+
+def _case(name: str, said: str = "", **rest: object) -> Case:
+    return Case(name, said=frozenset(said.split()), **rest)  # type: ignore[arg-type]
+
+
+_LOST = "displacement_missing displacement_frozen overdue"
+_TICK_S = 0.04
+_SOON = 4 * _TICK_S  # two ticks after a rule that looks once, and the tick in which it sets in
+
+CASES: tuple[Case, ...] = (
+    _case("nothing"),
+    _case("no light", _LOST, wrong={"no_light": 1}, moving=Reaction(Rung.HOLD_FLOW, 6 * _TICK_S)),
+    _case("no light for 5 s", _LOST, wrong={"no_light": 1}, for_s=5.0),
+    _case("light comes and goes", _LOST, wrong={"no_light": 1}, for_s=1.0, every_s=2.0),
+    _case("laser 20 um off", "", wrong={"laser_offset_um": -20}, laser_lies=True, for_s=0.2, every_s=20.0),
+    _case(
+        "laser 200 um off",
+        f"{_LOST} displacement_jump following_error over_displacement under_displacement actuator_test",
+        wrong={"laser_offset_um": -200},
+        laser_lies=True,
+        moving=Reaction(Rung.HOLD_FLOW, 8 * _TICK_S),
+    ),
+    _case(
+        "laser 600 um too deep",
+        "over_displacement",
+        wrong={"laser_offset_um": 600},
+        laser_lies=True,
+        always=Reaction(Rung.VENT, 5 * _TICK_S),
+    ),
+    _case(
+        "laser stuck",
+        f"{_LOST} displacement_stuck actuator_test following_error",
+        wrong={"laser_stuck": 1},
+        laser_lies=True,
+        moving=Reaction(Rung.HOLD_FLOW, 5.0 + _SOON),
+    ),
+    _case(
+        "board repeats its sample",
+        f"{_LOST} pump_mismatch",
+        wrong={"samples_frozen": 1},
+        laser_lies=True,
+        gauge_lies=True,
+        moving=Reaction(Rung.HOLD_FLOW, 6 * _TICK_S),
+    ),
+    _case(
+        "gauge lost",
+        "pressure_missing overdue",
+        wrong={"gauge_lost": 1},
+        gauge_lies=True,
+        moving=Reaction(Rung.RAMP_DOWN, 13 * _TICK_S),
+    ),
+    _case(
+        "gauge reads too much",
+        "over_pressure",
+        wrong={"gauge_offset_pa": 100},
+        gauge_lies=True,
+        always=Reaction(Rung.VENT, 5 * _TICK_S),
+    ),
+    _case(
+        "gauge reads above the board's limit",
+        "over_pressure board_fault",
+        wrong={"gauge_offset_pa": 300},
+        gauge_lies=True,
+        always=Reaction(Rung.VENT, 5 * _TICK_S),
+    ),
+    _case("gauge reads too little", "", wrong={"gauge_offset_pa": -100}, gauge_lies=True),
+    _case("barometer lost", wrong={"barometer_lost": 1}),
+    _case("thermometer lost", wrong={"thermometer_lost": 1}),
+    _case(
+        "no answers",
+        "device_silent displacement_missing overdue",
+        wrong={"silent": 1},
+        moving=Reaction(Rung.PUMP_OFF, 0.3 + _SOON),
+        checking=Reaction(Rung.PUMP_OFF, 0.3 + _SOON),
+    ),
+    _case("no answers for 0.2 s", "displacement_missing", wrong={"silent": 1}, for_s=0.2),
+    _case("every 15th answer lost", wrong={"lost_every": 15}),
+    _case("every 7th answer lost", wrong={"lost_every": 7}),
+    _case(
+        "network cut",
+        "link_lost",
+        wrong={"unreachable": 1},
+        moving=Reaction(Rung.PUMP_OFF, _SOON),
+        checking=Reaction(Rung.PUMP_OFF, _SOON),
+    ),
+    _case("network cut for 0.1 s", "link_lost", wrong={"unreachable": 1}, for_s=0.1),
+    _case(
+        "network cut for 5 s", "link_lost watchdog_tripped board_fault overdue", wrong={"unreachable": 1}, for_s=5.0
+    ),
+    _case(
+        "network comes and goes",
+        "link_lost watchdog_tripped board_fault overdue",
+        wrong={"unreachable": 1},
+        for_s=1.5,
+        every_s=3.0,
+    ),
+    _case("board loses its power", "link_lost actuator_test", power_cycle=True),
+    _case(
+        "pump's read-back stays at 1",
+        "pump_mismatch",
+        wrong={"readback_fraction": 1.0},
+        moving=Reaction(Rung.PUMP_OFF, 8.0),  # the command itself may be near 1 while the mirror rises
+    ),
+    _case(
+        "pump gives nothing",
+        "following_error actuator_test under_displacement",
+        wrong={"pump_share": 0.0},
+    ),
+    _case("pump gives 60 %", "", wrong={"pump_share": 0.6}),
+    _case(
+        "pump runs at full",
+        "over_displacement over_pressure following_error actuator_test",
+        wrong={"pump_stuck_fraction": 1.0},
+        moving=Reaction(Rung.RAMP_DOWN, 25.0),
+    ),
+    _case(
+        "pump stays at 0.5",
+        "over_displacement over_pressure following_error actuator_test",
+        wrong={"pump_stuck_fraction": 0.5},
+    ),
+    _case(
+        "vent stays open",
+        f"{_LOST} following_error under_displacement displacement_jump actuator_test",
+        wrong={"vent_stuck_fraction": 1.0},
+    ),
+    _case("vent stays shut", "actuator_test", wrong={"vent_stuck_fraction": 0.0}),
+    _case("process stopped for 0.2 s", "late", wrong={"stalled": 1}, for_s=0.2),
+    _case(
+        "process stopped for 2 s",
+        "watchdog_tripped board_fault device_silent displacement_frozen late overdue actuator_test",
+        wrong={"stalled": 1},
+        for_s=2.0,
+    ),
+    _case("process stopped for ever", "-", wrong={"stalled": 1}),
+    _case(
+        "ticks 150 ms late",
+        "late",
+        wrong={"late_ms": 150},
+        moving=Reaction(Rung.RAMP_DOWN, 8 * _TICK_S),
+    ),
+    _case("task dead", "dead_task", wrong={"dead_task": 1}, always=Reaction(Rung.PUMP_OFF, _SOON)),
+    _case("control code raises", "tick_error", raises=True, always=Reaction(Rung.PUMP_OFF, _SOON)),
+    _case("camera lost", wrong={"camera_lost": 1}),
+    _case("camera sees 30 um too much", wrong={"camera_offset_um": 30.0}),
+    _case("leak ten times", "following_error under_displacement actuator_test", leak_factor=10.0),
+    _case("door, 20 Pa", "actuator_test", door_pa=20.0),
+    _case("storm, 250 Pa at once", f"{_LOST} displacement_jump following_error under_displacement", door_pa=250.0),
+    _case(
+        "laser and gauge lost",
+        f"{_LOST} pressure_missing",
+        wrong={"no_light": 1, "gauge_lost": 1},
+        gauge_lies=True,
+        moving=Reaction(Rung.RAMP_DOWN, 13 * _TICK_S),
+    ),
+    _case(
+        "laser lost while the pump runs at full",
+        f"{_LOST} over_pressure over_displacement following_error actuator_test",
+        wrong={"no_light": 1, "pump_stuck_fraction": 1.0},
+        moving=Reaction(Rung.HOLD_FLOW, 6 * _TICK_S),
+    ),
+    _case(
+        "process stopped while the laser is lost",
+        f"{_LOST} watchdog_tripped board_fault device_silent late",
+        wrong={"no_light": 1, "stalled": 1},
+        for_s=1.0,
+    ),
+    _case(
+        "no answers and late",
+        f"{_LOST} device_silent late",
+        wrong={"silent": 1, "late_ms": 150},
+        moving=Reaction(Rung.RAMP_DOWN, 0.3 + _SOON),
+    ),
+)
+STATES: tuple[State, ...] = (
+    State.STANDBY,
+    State.CHECK,
+    State.INFLATE,
+    State.SETTLE,
+    State.HOLD,
+    State.MANUAL,
+    State.LOWER,
+    State.FAULT,
+)
