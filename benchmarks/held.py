@@ -1,4 +1,4 @@
-"""The true centre in typical weather at 50 Hz and 1 um of laser noise, in virtual time: four seeds, five minutes each.
+"""The true centre in typical weather at 50 Hz and 1 um of laser noise, in virtual time: four seeds of five minutes.
 
 The reference is the least standard deviation any controller could reach with the same sensors (minimum variance).
 """
