@@ -11,14 +11,18 @@ from dataclasses import dataclass
 from typing import Literal
 
 from membrane_ctrl.config import Config, LoopConfig
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.names import State
 from membrane_ctrl.safety import MOVING
 
 Kind = Literal[
     "hold", "stop", "pause", "resume", "manual", "setpoint", "gains",
-    "shape_on", "shape_off", "mark", "ack", "lower", "vent",
+    "shape_on", "shape_off", "mark", "ack", "lower", "vent", "tune", "keep",
 ]  # fmt: skip
 Role = Literal["read", "operate", "tune"]
+
+# Gains on trial are watched by whoever asked for them; longer than this nobody watches.
+TRIAL_MAX_S = 7200.0
 
 ANY = frozenset(State)
 RUNNING = MOVING | {State.STANDBY, State.CHECK}
@@ -34,11 +38,14 @@ class Command:
     who, why : str
         Recorded with it.
     value : float
-        `setpoint`: um. `manual`: flow in um/s of the centre.
+        `setpoint`: um. `manual`: flow in um/s of the centre. `gains`: seconds until they go back to what they were,
+        unless `keep` comes before; NaN: for good.
     text : str
         `mark`: what to write on the timeline.
     loop : LoopConfig or None
         `gains`: the loop's new settings, whole.
+    experiment : ExperimentSpec or None
+        `tune`: what to do.
     number : int
         Given by the asker, returned with the answer.
     """
@@ -49,6 +56,7 @@ class Command:
     value: float = math.nan
     text: str = ""
     loop: LoopConfig | None = None
+    experiment: ExperimentSpec | None = None
     number: int = 0
 
 
@@ -61,13 +69,15 @@ class Rule:
 
 
 TABLE: dict[Kind, Rule] = {
-    "hold": Rule("operate", {State.STANDBY, State.MANUAL}),
+    "hold": Rule("operate", {State.STANDBY, State.MANUAL, State.TUNE}),
     "stop": Rule("operate", ANY),
     "pause": Rule("operate", {State.HOLD}),
     "resume": Rule("operate", {State.HOLD}),
     "manual": Rule("operate", {State.SETTLE, State.HOLD, State.MANUAL}),
     "setpoint": Rule("operate", RUNNING),
     "gains": Rule("tune", RUNNING),
+    "keep": Rule("tune", RUNNING),
+    "tune": Rule("tune", {State.HOLD}),
     "shape_on": Rule("operate", ANY),
     "shape_off": Rule("operate", ANY),
     "mark": Rule("operate", ANY),
@@ -89,8 +99,12 @@ def refusal(command: Command, state: State, config: Config) -> str:
             return f"setpoint {command.value:g} um is outside the limits ({low:g} .. {high:g} um)"
     if command.kind == "manual" and not 0.0 <= command.value <= config.loop.flow_max_um_per_s:
         return f"flow {command.value:g} um/s is outside 0 .. {config.loop.flow_max_um_per_s:g} um/s"
+    if command.kind == "tune" and command.experiment is None:
+        return "tune without an experiment"
     if command.kind == "gains" and command.loop is None:
         return "gains without gains"
+    if command.kind == "gains" and not (math.isnan(command.value) or 1.0 <= command.value <= TRIAL_MAX_S):
+        return f"gains on trial for {command.value:g} s: 1 .. {TRIAL_MAX_S:g} s are possible"
     if command.kind == "gains" and command.loop is not None and command.loop.rate_hz != config.loop.rate_hz:
         return "the tick rate cannot be changed while it ticks"
     return ""

@@ -68,6 +68,11 @@ class Controller:
         self.state = State.STANDBY
         self.fault: Rule | None = None
 
+    @property
+    def loop_config(self) -> LoopConfig:
+        """The loop's settings as they are now."""
+        return self._scene.loop_config
+
     def tick(self, inputs: TickInputs) -> TickOutputs:
         """Run one tick. Never raises: what a handler raises is a fault of the next judgement."""
         scene = self._scene
@@ -122,6 +127,8 @@ class Controller:
             event["value"] = command.value
         if command.text:
             event["text"] = command.text
+        if command.loop is not None:
+            event["loop"] = command.loop.model_dump()
         if command.experiment is not None:
             event["experiment"] = command.experiment.model_dump()
         events.append({**event, "refused": refused} if refused else event)
@@ -246,17 +253,9 @@ class Controller:
     def _go(self, state: State, why: str, events: list[Event]) -> None:
         scene = self._scene
         events.append({"kind": "state", "state": state.name.lower(), "from": self.state.name.lower(), "why": why})
-        if self.state == State.TUNE and scene.trial is not None:
-            ended = scene.trial_ended or Finished(False, why)
-            events.append(
-                {
-                    "kind": "experiment",
-                    "experiment": scene.trial.spec.kind,
-                    "completed": ended.completed,
-                    "reason": ended.reason,
-                    **scene.trial.result(),
-                }
-            )
+        if self.state == State.TUNE:
+            self._tell_trial(why, events)
+        if state != State.TUNE:
             scene.trial = scene.trial_ended = None
         if state == State.FAULT and self._gains.on_trial:
             self._revert_gains("a fault came while they were on trial", events)
@@ -269,6 +268,14 @@ class Controller:
         scene.good_since_s = scene.last_good_s = math.nan
         scene.overdue = scene.unfit = ""
         scene.test, scene.tested_once = None, False
+
+    def _tell_trial(self, why: str, events: list[Event]) -> None:
+        """How the experiment ended: by itself, or because the state was left."""
+        trial = self._scene.trial
+        assert trial is not None
+        ended = self._scene.trial_ended or Finished(False, why)
+        told = {"kind": "experiment", "experiment": trial.spec.kind, "completed": ended.completed}
+        events.append({**told, "reason": ended.reason, **trial.result()})
 
     def _tell_why(self, events: list[Event]) -> None:
         """The one line of the operator, as an event when its words (not its numbers) have changed for good."""

@@ -191,6 +191,23 @@ class InnerLoop:
         terms = PidTerms(0.0, self._pid.integral_um_per_s, 0.0)
         return self._output(terms, weather_um_per_s, flow_um_per_s, fraction)
 
+    def follow_raw(self, given: LoopInput, fraction: float, dt_s: float) -> LoopOutput:
+        """One tick in which somebody else gives the pump's command itself; whether the pump runs is not known.
+
+        Parameters
+        ----------
+        given : LoopInput
+            As for `follow`.
+        fraction : float
+            Put out as it is, 0..1.
+        dt_s : float
+        """
+        flow_um_per_s = self._curve.flow(fraction)
+        self.follow(given, flow_um_per_s, dt_s)
+        self._curve.stopped()
+        self._leak.pause()
+        return self._output(PidTerms(0.0, self._pid.integral_um_per_s, 0.0), 0.0, flow_um_per_s, fraction)
+
     def set_gains(self, loop: LoopConfig) -> None:
         """Take new settings without a bump in the flow."""
         flow_max_um_per_s = min(loop.flow_max_um_per_s, self._flow_full_um_per_s)
