@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 from membrane_ctrl.acquisition.frame_address import FrameAddress
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.ipc.ring import RingAddress, ring
+from membrane_ctrl.post import Make, Post
 from membrane_ctrl.processes import Child, pipe
 from membrane_ctrl.telemetry import ROW_BYTES
 from membrane_ctrl.tick import Event
@@ -56,63 +58,82 @@ def _frames(config: Config, stack: ExitStack) -> FrameAddress:
 
 
 class Crew:
-    """Recorder, live screen and acquisition of one run.
+    """Recorder, live screen and acquisition of one run. The hold goes on without any of them, and says so.
 
     Attributes
     ----------
     children : list of Child
-        For the supervisor to look after.
+        Those that are not replaced when they end: the supervisor tells when they do.
     """
 
     def __init__(
         self, config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str, duration_s: float | None
     ) -> None:
-        from membrane_ctrl.recording.process import RecorderSpec
         from membrane_ctrl.screen.process import ScreenSpec
 
-        recorder_spec = RecorderSpec(
-            run_dir, name, clock, config, rings.telemetry, rings.events, rings.shapes, rings.frames, rings.inputs
-        )
+        self._clock = clock
         screen_spec = ScreenSpec(clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s)
-        status, theirs = pipe()
-        self._recorder = Child(
-            "recorder", "membrane_ctrl.recording.process:recorder_main", (recorder_spec, theirs), nice=5
-        )
         self._screen = Child("screen", "membrane_ctrl.screen.process:screen_main", (screen_spec,), nice=5)
-        self.children = [self._recorder, self._screen]
-        self._lines = [status]
+        self.children = [self._screen]
+        self._recorder = Post(_recorder(config, clock, rings, run_dir, name))
+        self._acquisition = None
         if rings.shapes is not None and rings.frames is not None:
-            from membrane_ctrl.acquisition.process import AcquisitionSpec
+            self._acquisition = Post(_acquisition(config, clock, rings, rings.shapes, rings.frames))
 
-            control, theirs = pipe()
-            self._lines.append(control)
-            spec = AcquisitionSpec(config, clock, rings.telemetry, rings.shapes, rings.truth, rings.frames)
-            acquisition = Child(
-                "acquisition", "membrane_ctrl.acquisition.process:acquisition_main", (spec, theirs), nice=10
-            )
-            self.children.append(acquisition)
+    @property
+    def _posts(self) -> list[Post]:
+        return [post for post in (self._recorder, self._acquisition) if post is not None]
 
     def start(self, stack: ExitStack) -> None:
         """Start all; the stack ends whatever `take_down` has not."""
-        for child in self.children:
-            child.start()
-            stack.callback(child.stop, _CHILD_STOPS_S)
+        for post in self._posts:
+            post.start()
+        self._screen.start()
+        stack.callback(self._stop)
+
+    def _stop(self) -> None:
+        for child in (*(post.child for post in self._posts), self._screen):
+            child.stop(_CHILD_STOPS_S)
 
     def reports(self) -> list[Event]:
-        """What the children have said since the last call; never waits."""
-        said: list[Event] = []
-        for line in self._lines:
-            try:
-                while line.poll():
-                    said.append(line.recv())
-            except (EOFError, OSError):  # the child has ended; `children` shows it
-                continue
-        return said
+        """What the children have said since the last call, and who was replaced; never waits."""
+        return [event for post in self._posts for event in post.look(self._clock.now())]
 
     def take_down(self) -> None:
         """Stop the acquisition, then let recorder and screen finish by themselves: the "end" event is their sign."""
-        for child in self.children:
-            if child not in (self._recorder, self._screen):
-                child.stop(_CHILD_STOPS_S)
-        self._recorder.join(_RECORDER_CLOSES_S)
+        if self._acquisition is not None:
+            self._acquisition.child.stop(_CHILD_STOPS_S)
+        self._recorder.child.join(_RECORDER_CLOSES_S)
+        if self._recorder.child.exit_code not in (0, None):  # it died near the end: another writes the end down
+            self._recorder.replace(self._clock.now())
+            self._recorder.child.join(_RECORDER_CLOSES_S)
         self._screen.join(_CHILD_STOPS_S)
+
+
+def _recorder(config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str) -> Make:
+    from membrane_ctrl.recording.process import RecorderSpec
+
+    spec = RecorderSpec(
+        run_dir, name, clock, config, rings.telemetry, rings.events, rings.shapes, rings.frames, rings.inputs
+    )
+
+    def make(resumes: int) -> tuple[Child, Connection]:
+        ours, theirs = pipe()
+        arguments = (replace(spec, resumes=resumes), theirs)
+        return Child("recorder", "membrane_ctrl.recording.process:recorder_main", arguments, nice=5), ours
+
+    return make
+
+
+def _acquisition(config: Config, clock: RunClock, rings: Rings, shapes: RingAddress, frames: FrameAddress) -> Make:
+    from membrane_ctrl.acquisition.process import AcquisitionSpec
+
+    spec = AcquisitionSpec(config, clock, rings.telemetry, shapes, rings.truth, frames)
+
+    def make(_: int) -> tuple[Child, Connection]:
+        ours, theirs = pipe()
+        return Child(
+            "acquisition", "membrane_ctrl.acquisition.process:acquisition_main", (spec, theirs), nice=10
+        ), ours
+
+    return make
