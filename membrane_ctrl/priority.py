@@ -1,4 +1,4 @@
-"""The tick before everything else on the machine, where the machine allows it."""
+"""The tick (and the twin, which stands for devices) before everything else on the machine, where it allows that."""
 
 from __future__ import annotations
 

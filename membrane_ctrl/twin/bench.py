@@ -17,6 +17,7 @@ from firmware_iface.emulators.pump_board import PumpBoardEmulator
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import DevicesConfig, PumpConfig, TwinConfig
 from membrane_ctrl.ipc.ring import RingAddress, RingWriter
+from membrane_ctrl.priority import raise_priority
 from membrane_ctrl.twin.events import Event
 from membrane_ctrl.twin.lab import Lab
 from membrane_ctrl.twin.plant import STEP_S, Plant
@@ -85,6 +86,8 @@ def serve(spec: BenchSpec, ready: Connection) -> None:
         Gets one BenchReport; a bench that cannot be built or cannot listen says so there and ends.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if spec.speed <= 1.0:
+        raise_priority()  # it stands for devices with processors of their own; faster than that it may use up a core
     asyncio.run(_serve(spec, ready))
 
 
