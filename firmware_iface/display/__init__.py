@@ -1,0 +1,1 @@
+"""What is shown on the screen and what is learnt of it, as pure functions of images and numbers."""
