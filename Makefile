@@ -34,8 +34,9 @@ bench: $(STAMP)  ## measured figures, each against a reference of the same run
 campaign: $(STAMP)
 	$(BIN)/pytest -m campaign
 
-generate: $(STAMP)  ## the files made from firmware_iface/registers.toml
+generate: $(STAMP)  ## the files made from firmware_iface/registers.toml and the safety table
 	$(BIN)/python -m firmware_iface.generate
+	$(BIN)/python -m membrane_ctrl.faults_page
 
 clean:
 	rm -rf $(VENV) .mypy_cache .ruff_cache

@@ -1,0 +1,87 @@
+"""The fault that outlives its run: written at a trip, respected at the next start, cleared by a person.
+
+One file beside the run folders. It is written without waiting for the disk (a tick has no time for that) and
+replaced as a whole, so that a reader sees the old one or the new one; one that cannot be read counts as a fault.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+NAME = "latched-fault.json"
+SCHEMA = "membrane-latched-fault/1"
+
+
+@dataclass(frozen=True, slots=True)
+class LatchedFault:
+    """What tripped, when, and where it is recorded."""
+
+    name: str
+    cause: str
+    seen: str
+    remedy: str
+    time_utc: str
+    run: str
+
+    def __str__(self) -> str:
+        """For one line."""
+        seen = f" ({self.seen})" if self.seen else ""
+        return f"{self.name}: {self.cause}{seen}, {self.time_utc}, run {self.run}"
+
+
+class LatchedFile:
+    """The file in a folder of runs.
+
+    Parameters
+    ----------
+    logs_dir : Path
+        Where run folders go.
+    """
+
+    def __init__(self, logs_dir: Path) -> None:
+        self.path = logs_dir / NAME
+
+    def read(self) -> LatchedFault | None:
+        """The latched fault, None if there is none. Never raises: what cannot be read is latched."""
+        try:
+            text = self.path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            return None
+        except (OSError, UnicodeDecodeError) as error:
+            return self._unreadable(str(error))
+        try:
+            table = json.loads(text)
+            if table.pop("schema") != SCHEMA or not all(isinstance(value, str) for value in table.values()):
+                raise ValueError("another schema")
+            return LatchedFault(**table)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            return self._unreadable(f"{type(error).__name__}: {error}")
+
+    def write(self, fault: LatchedFault) -> None:
+        """Latch, in place of an older fault. Raises OSError."""
+        beside = self.path.with_suffix(".new")
+        beside.write_text(json.dumps({"schema": SCHEMA, **asdict(fault)}, indent=1) + "\n", encoding="utf-8")
+        beside.replace(self.path)
+
+    def sync(self) -> None:
+        """Wait until it is on the disk, power cut or not; for the end of a run. Raises OSError."""
+        if not self.path.exists():
+            return
+        for path in (self.path, self.path.parent):
+            number = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(number)
+            finally:
+                os.close(number)
+
+    def clear(self) -> None:
+        """A person has looked at it, or the resume rule let it go. Raises OSError."""
+        self.path.unlink(missing_ok=True)
+
+    def _unreadable(self, why: str) -> LatchedFault:
+        return LatchedFault(
+            "unreadable", f"{self.path} cannot be read", why, "look at the last run", "unknown time", "unknown"
+        )

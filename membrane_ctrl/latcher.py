@@ -1,0 +1,80 @@
+"""Keeps the latched-fault file in step with the controller, without a tick waiting for a disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime
+from types import TracebackType
+
+from membrane_ctrl.latched import LatchedFault, LatchedFile
+from membrane_ctrl.tick import Event, TickOutputs
+
+
+class Latcher:
+    """A listener to ticks; a context manager that waits for the disk at the end, when the pump is off.
+
+    Parameters
+    ----------
+    file : LatchedFile or None
+        None: nothing is latched beyond the run (the twin's default).
+    run : str
+        Name of the run folder.
+    utc : callable
+        UTC of a moment on the run's clock.
+    tell : callable
+        Takes an event, for a file that could not be written.
+    """
+
+    def __init__(
+        self, file: LatchedFile | None, run: str, utc: Callable[[float], datetime], tell: Callable[[Event], None]
+    ) -> None:
+        self._file, self._run, self._utc, self._tell = file, run, utc, tell
+        # one thread, so that a fault and its acknowledgement stay in order; it exists only once there is a fault
+        self._disk = ThreadPoolExecutor(1, thread_name_prefix="latched-fault")
+        self._failed = ""
+        self._fault: Event = {}
+
+    def __enter__(self) -> Latcher:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._file is not None:
+            self._disk.submit(self._try, self._file.sync)
+        self._disk.shutdown()
+        self._report()
+
+    def heard(self, outputs: TickOutputs) -> None:
+        """A tick has ended: latch when it went into `fault`, clear when it left it or was acknowledged."""
+        self._report()
+        for event in outputs.events:
+            match event:
+                case {"kind": "fault"}:
+                    self._fault = event
+                case {"kind": "state", "state": "fault"}:
+                    self._latch(outputs.row.mono_s)
+                case {"kind": "state", "from": "fault"} | {"kind": "command", "command": "ack"} if (
+                    "refused" not in event and self._file is not None
+                ):
+                    self._disk.submit(self._try, self._file.clear)
+
+    def _latch(self, now_s: float) -> None:
+        if self._file is None:
+            return
+        words = {key: str(self._fault.get(key, "")) for key in ("name", "cause", "seen", "remedy")}
+        fault = LatchedFault(**words, time_utc=self._utc(now_s).isoformat(timespec="seconds"), run=self._run)
+        file = self._file
+        self._disk.submit(self._try, lambda: file.write(fault))
+
+    def _try(self, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except OSError as error:
+            self._failed = str(error)
+
+    def _report(self) -> None:
+        if self._failed:
+            self._tell({"kind": "latch_failed", "message": self._failed})
+            self._failed = ""

@@ -1,0 +1,110 @@
+"""The fault that outlives its run."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from firmware_iface.roles import BenchCommand
+from membrane_ctrl.latched import NAME, LatchedFault, LatchedFile
+from membrane_ctrl.latcher import Latcher
+from membrane_ctrl.telemetry import FIELDS, TelemetryRow
+from membrane_ctrl.tick import Event, TickOutputs
+
+FAULT = LatchedFault("over_pressure", "too much", "801 Pa", "look", "2026-01-02T03:04:05+00:00", "run-1")
+TRIP: tuple[Event, ...] = (
+    {"kind": "fault", "name": "late", "cause": "ticks start too late", "seen": "150 ms", "remedy": "less work"},
+    {"kind": "state", "state": "fault", "from": "hold", "why": "late"},
+)
+
+
+def outputs(*events: Event) -> TickOutputs:
+    return TickOutputs(BenchCommand(0.0, 0.0), TelemetryRow(**dict.fromkeys(FIELDS, 1.0)), events, None)
+
+
+def test_it_comes_back_as_it_was_and_goes_when_cleared(tmp_path: Path) -> None:
+    file = LatchedFile(tmp_path)
+    assert file.read() is None
+    file.write(FAULT)
+    file.sync()
+    assert LatchedFile(tmp_path).read() == FAULT
+    assert "801 Pa" in str(FAULT)
+    file.clear()
+    file.clear()
+    assert file.read() is None
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{", b"\xff\xfe", b"[]", b'"x"', b"null", b'{"schema": "other"}', b"\0" * 300,
+     b'{"schema": "membrane-latched-fault/1"}', b'{"schema": "membrane-latched-fault/1", "name": 3}'],
+)  # fmt: skip
+def test_a_corrupt_file_counts_as_latched(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / NAME).write_bytes(content)
+    found = LatchedFile(tmp_path).read()
+    assert found is not None
+    assert found.name == "unreadable"
+    assert "\n" not in str(found)
+
+
+def test_a_torn_file_at_every_length_counts_as_latched(tmp_path: Path) -> None:
+    file = LatchedFile(tmp_path)
+    file.write(FAULT)
+    whole = file.path.read_bytes()
+    for length in range(len(whole) - 1):
+        file.path.write_bytes(whole[:length])
+        assert file.read() is not None, length
+
+
+def test_a_folder_or_no_permission_in_its_place_counts_as_latched(tmp_path: Path) -> None:
+    (tmp_path / NAME).mkdir()
+    assert LatchedFile(tmp_path).read() is not None
+
+
+def make(folder: Path, told: list[Event]) -> Latcher:
+    return Latcher(LatchedFile(folder), "run-7", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), told.append)
+
+
+def test_a_trip_is_latched_and_an_acknowledgement_clears_it(tmp_path: Path) -> None:
+    told: list[Event] = []
+    with make(tmp_path, told) as latcher:
+        latcher.heard(outputs(*TRIP))
+    found = LatchedFile(tmp_path).read()
+    assert found == LatchedFault(
+        "late", "ticks start too late", "150 ms", "less work", "2026-01-01T00:00:00+00:00", "run-7"
+    )
+    with make(tmp_path, told) as latcher:
+        latcher.heard(outputs({"kind": "command", "command": "ack", "refused": "not now"}))
+    assert LatchedFile(tmp_path).read() is not None
+    with make(tmp_path, told) as latcher:
+        latcher.heard(outputs({"kind": "command", "command": "ack"}))
+    assert LatchedFile(tmp_path).read() is None
+    assert not told
+
+
+def test_a_resumed_fault_is_no_longer_latched(tmp_path: Path) -> None:
+    with make(tmp_path, []) as latcher:
+        latcher.heard(outputs(*TRIP))
+        latcher.heard(outputs({"kind": "state", "state": "standby", "from": "fault", "why": "resumes"}))
+    assert LatchedFile(tmp_path).read() is None
+
+
+def test_a_forgiven_fault_is_not_latched(tmp_path: Path) -> None:
+    with make(tmp_path, []) as latcher:
+        latcher.heard(outputs(TRIP[0]))
+    assert LatchedFile(tmp_path).read() is None
+
+
+def test_a_disk_that_fails_is_told(tmp_path: Path) -> None:
+    told: list[Event] = []
+    with make(tmp_path / "nowhere", told) as latcher:
+        latcher.heard(outputs(*TRIP))
+    assert [event["kind"] for event in told] == ["latch_failed"]
+
+
+def test_the_twin_latches_nothing(tmp_path: Path) -> None:
+    with Latcher(None, "run", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), lambda event: None) as latcher:
+        latcher.heard(outputs(*TRIP))
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,88 @@
+"""What systemd is told, on a socket of our own; and the unit file."""
+
+from __future__ import annotations
+
+import configparser
+import math
+import socket
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from firmware_iface.roles import BenchCommand
+from membrane_ctrl.names import State
+from membrane_ctrl.systemd import SystemdNotify
+from membrane_ctrl.telemetry import FIELDS, TelemetryRow
+from membrane_ctrl.tick import TickOutputs
+
+ROW = TelemetryRow(**dict.fromkeys(FIELDS, 0.0))
+UNIT = Path(__file__).parents[1] / "examples" / "membrane-ctrl.service"
+
+
+def outputs(mono_s: float, state: State, error_um: float = math.nan, fault: float = 0) -> TickOutputs:
+    row = replace(ROW, mono_s=mono_s, state=state, error_um=error_um, fault=fault)
+    return TickOutputs(BenchCommand(0.0, 0.0), row, (), None)
+
+
+@pytest.fixture
+def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as heard:
+        heard.bind(str(tmp_path / "notify"))
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        yield heard
+
+
+def said(heard: socket.socket) -> list[list[str]]:
+    found = []
+    while True:
+        try:
+            found.append(heard.recv(4096).decode().splitlines())
+        except BlockingIOError:
+            return found
+
+
+def test_ready_once_then_the_watchdog_twice_a_second_and_at_each_change(systemd: socket.socket) -> None:
+    with SystemdNotify() as notify:
+        for tick in range(101):
+            notify.heard(outputs(tick * 0.02, State.CHECK))
+        notify.heard(outputs(2.02, State.HOLD, -0.42))
+        notify.heard(outputs(2.04, State.FAULT, fault=20))
+    messages = said(systemd)
+    assert messages[0] == ["READY=1", "WATCHDOG=1", "STATUS=check"]
+    assert messages[1:5] == [["WATCHDOG=1", "STATUS=check"]] * 4
+    assert messages[5:] == [
+        ["WATCHDOG=1", "STATUS=hold, error -0.42 um"],
+        ["WATCHDOG=1", "STATUS=fault, fault 20"],
+        ["STOPPING=1"],
+    ]
+
+
+def test_without_systemd_or_with_one_that_is_gone_nothing_happens(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    with SystemdNotify() as notify:
+        notify.heard(outputs(0.0, State.HOLD))
+    with SystemdNotify(str(tmp_path / "nobody")) as notify:
+        notify.heard(outputs(0.0, State.HOLD))
+
+
+def test_a_full_socket_is_not_waited_for(systemd: socket.socket) -> None:
+    with SystemdNotify() as notify:
+        for tick in range(5000):
+            notify.heard(outputs(float(tick), State.HOLD))
+    assert 0 < len(said(systemd)) < 5000
+
+
+def test_the_unit_stops_what_it_must_and_never_restarts_into_a_fault() -> None:
+    unit = configparser.ConfigParser(strict=False, interpolation=None, delimiters=("=",))
+    unit.optionxform = str  # type: ignore[assignment,method-assign]
+    unit.read(UNIT)
+    service = unit["Service"]
+    assert service["Type"] == "notify"
+    assert service["KillMode"] == "mixed"
+    assert " safe " in service["ExecStopPost"]
+    assert {"2", "4", "5"} <= set(service["RestartPreventExitStatus"].split())
+    assert float(service["WatchdogSec"]) >= 5.0
