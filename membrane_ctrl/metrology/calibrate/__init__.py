@@ -1,0 +1,1 @@
+"""The mirror calibrates its own optics: one geometry for many sets of different sag (docs/calibration.md)."""

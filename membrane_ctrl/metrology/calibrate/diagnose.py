@@ -1,0 +1,194 @@
+"""Is the model right, and do the sets belong together? All of it from the equations at the solution.
+
+What is asked is always the same: by how much does the sum of squares fall if something more is free? The fall is a
+chi-square of as many degrees of freedom if the data are good, whatever is asked. A parameter that was held (a bent
+screen, a lens that distorts), a camera that stands otherwise for some of the sets, one set that disagrees with all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from membrane_ctrl.metrology.calibrate.parameters import LASER, NAMES, OPTICAL, POSE, usual_sigma
+from membrane_ctrl.metrology.calibrate.separable import COMMON
+from membrane_ctrl.metrology.calibrate.solve import Solution, prior, step
+
+FloatArray = NDArray[np.float64]
+
+SURE = 1e-6  # probability that good data look as bad
+_CAMERA = tuple(NAMES.index(name) for name in ("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg"))
+_CAMERA_SIGMA_DEG = 1.0  # of a bump: what a hand on the mount does
+_LASER_SIGMA = 1.0  # of its scale when the optics alone shall say it
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A held parameter that the sets want to move: what it would be, and how sure that is (in sigmas)."""
+
+    name: str
+    value: float
+    sigma: float
+    fall: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether noise would hardly ever ask for as much."""
+        return bool(chi2.sf(self.fall, 1) < SURE)
+
+
+@dataclass(frozen=True)
+class Bump:
+    """The camera stands otherwise for some of the sets."""
+
+    sets: tuple[int, ...]
+    turned_deg: tuple[float, float, float]
+    fall: float
+
+    @property
+    def sure(self) -> bool:
+        """As for `Suspect`."""
+        return bool(chi2.sf(self.fall, len(_CAMERA)) < SURE)
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """One set against the geometry of all others.
+
+    Attributes
+    ----------
+    index : int
+        Of the set.
+    fall : float
+        Of the sum of squares, when this set has a geometry and a ring of its own.
+    freedom : int
+        Numbers that the set then determines by itself.
+    """
+
+    index: int
+    fall: float
+    freedom: int
+
+    @property
+    def disagrees(self) -> bool:
+        """As for `Suspect.sure`."""
+        return bool(chi2.sf(self.fall, self.freedom) < SURE)
+
+
+def suspects(solution: Solution) -> tuple[Suspect, ...]:
+    """Held optical parameters that would take more than noise out of the residuals, the strongest first."""
+    sums = np.sum(_reduced(solution), axis=0)
+    out = []
+    for name in NAMES[len(POSE) : OPTICAL]:
+        if name in solution.free:
+            continue
+        k = NAMES.index(name)
+        freed = solution.problem.sigmas.copy()
+        freed[k] = usual_sigma(name)
+        moved = step(sums + prior(freed, solution.common), freed)
+        fall = _squares(sums, solution.problem.sigmas, solution.common) - moved.squares
+        out.append(Suspect(name, float(moved.delta[k]), float(np.sqrt(moved.covariance[k, k])), fall))
+    return tuple(sorted((s for s in out if s.sure), key=lambda s: -s.fall))
+
+
+def laser_scale(solution: Solution) -> tuple[float, float]:
+    """Scale of the laser and its sigma as the optics alone see it: 1 for a good one."""
+    k = NAMES.index(LASER.name)
+    free = solution.problem.sigmas.copy()
+    free[k] = _LASER_SIGMA
+    sums = np.sum(_reduced(solution), axis=0) + prior(free, solution.common)
+    moved = step(sums, free)
+    return 1 + float(solution.common[k] + moved.delta[k]), float(np.sqrt(moved.covariance[k, k]))
+
+
+def left_out(solution: Solution) -> tuple[LeftOut, ...]:
+    """Each set against the others."""
+    reduced, sigmas = _reduced(solution), solution.problem.sigmas
+    own = prior(sigmas, solution.common)
+    everything = step(np.sum(reduced, axis=0) + own, sigmas).squares
+    out = []
+    for k, this in enumerate(reduced):
+        others = np.sum([r for j, r in enumerate(reduced) if j != k], axis=0) + own
+        alone, freedom = _alone(this, sigmas)
+        fall = everything - step(others, sigmas).squares - alone
+        out.append(LeftOut(k, float(fall), freedom))
+    return tuple(out)
+
+
+def bumps(solution: Solution) -> tuple[Bump, ...]:
+    """The camera turned for one set, or from one set on; those that are sure, the strongest first."""
+    reduced, sigmas = _reduced(solution), solution.problem.sigmas
+    count = len(reduced)
+    before = _squares(np.sum(reduced, axis=0), sigmas, solution.common)
+    groups = {(k,) for k in range(count)} | {tuple(range(k, count)) for k in range(1, count)}
+    out = []
+    for group in sorted(groups):
+        sums = np.sum([_with_bump(each, k in group) for k, each in enumerate(reduced)], axis=0)
+        known = _with_bump(prior(sigmas, solution.common), False)
+        extra = np.arange(COMMON, COMMON + len(_CAMERA))
+        known[extra, extra] += 1 / _CAMERA_SIGMA_DEG**2
+        kept = np.append(np.append(sigmas > 0, np.ones(COMMON - len(NAMES), bool)), np.ones(len(_CAMERA), bool))
+        delta, squares = _solved(sums + known, np.flatnonzero(kept))
+        yaw, pitch, roll = (float(v) for v in delta[-len(_CAMERA) :])
+        out.append(Bump(group, (yaw, pitch, roll), before - squares))
+    return tuple(sorted((bump for bump in out if bump.sure), key=lambda bump: -bump.fall))
+
+
+def without(solution: Solution, index: int) -> Solution:
+    """The same to first order without one set: its equations and state are left out, the unknowns moved."""
+    keep = [k for k in range(len(solution.states)) if k != index]
+    problem = replace(solution.problem, sets=tuple(solution.problem.sets[k] for k in keep))
+    linear = tuple(solution.equations[k] for k in keep)
+    sigmas = problem.sigmas
+    moved = step(np.sum([each.reduced() for each in linear], axis=0) + prior(sigmas, solution.common), sigmas)
+    common = solution.common + moved.delta
+    return replace(
+        solution,
+        problem=problem,
+        values=common[: len(NAMES)],
+        common=common,
+        states=tuple(solution.states[k] for k in keep),
+        equations=linear,
+        covariance=moved.covariance,
+    )
+
+
+def _reduced(solution: Solution) -> list[FloatArray]:
+    return [each.reduced() for each in solution.equations]
+
+
+def _squares(sums: FloatArray, sigmas: FloatArray, common: FloatArray) -> float:
+    return step(sums + prior(sigmas, common), sigmas).squares
+
+
+def _alone(reduced: FloatArray, sigmas: FloatArray) -> tuple[float, int]:
+    """Least sum of squares of one set by itself, and how many numbers it determines; no prior."""
+    free = np.flatnonzero(np.append(sigmas > 0, np.ones(COMMON - len(NAMES), bool)))
+    matrix, right = reduced[np.ix_(free, free)], reduced[free, -1]
+    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
+    good = values > 1e-10
+    along = vectors.T @ (right * scale)
+    return float(reduced[-1, -1] - np.sum(along[good] ** 2 / values[good])), int(np.count_nonzero(good))
+
+
+def _with_bump(sums: FloatArray, bumped: bool) -> FloatArray:
+    """The sums with three more unknowns before the residual; for a bumped set they act as the camera's turns do."""
+    order: Sequence[int] = [*range(COMMON), *_CAMERA, COMMON]
+    out = sums[np.ix_(order, order)].copy()
+    if not bumped:
+        out[COMMON:-1, :], out[:, COMMON:-1] = 0.0, 0.0
+    return np.asarray(out)
+
+
+def _solved(sums: FloatArray, free: NDArray[np.int64]) -> tuple[FloatArray, float]:
+    matrix, right = sums[np.ix_(free, free)], sums[free, -1]
+    scale = 1 / np.sqrt(np.diag(matrix))
+    found = scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * right)
+    delta = np.zeros(len(sums) - 1)
+    delta[free] = found
+    return delta, float(sums[-1, -1] - right @ found)

@@ -1,0 +1,212 @@
+"""What may be wrong with a bench, as one vector of named parameters around what is stated.
+
+All are 0 for the stated bench. With hinge = F x O' / |F x O'| (world -y for the paper's bench), R(n, w) the turn by w
+about n, and the stated pinhole F0, camera rows C0, screen origin O0 and screen rows X0 (s_x, s_y, normal):
+
+    F = (1 + a / |F0|) R(hinge, alpha) F0           C = R(x, pitch) R(y, yaw) R(z, roll) C0 R(hinge, alpha)^T
+    O' = R(hinge, -alpha) ((1 + b / |O0|) O0 + x s_x + y s_y)
+    X = R(s_x, turn_x) R(s_y, turn_y) R(normal, turn_z) X0 R(hinge, -alpha)^T
+
+so that a, b and alpha are the paper's. A turn of everything about z would be seen by nothing: the camera's azimuth is
+therefore not among the parameters, it defines the direction of x. The other rigid motions are: two shifts, which the
+ring that stays where it is takes away, and two tilts, which only what was measured by hand takes away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.geometry import Geometry
+
+FloatArray = NDArray[np.float64]
+
+BOW_RADIUS_MM = 200.0  # where the bow is counted: half the paper's pattern, rounded
+_COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number that may be wrong.
+
+    Attributes
+    ----------
+    name : str
+        Ends in the unit.
+    sigma : float
+        What is known of it by hand, in that unit: a ruler, a laser meter, a protractor, a data sheet.
+    says : str
+        For a person.
+    """
+
+    name: str
+    sigma: float
+    says: str
+
+    @property
+    def unit(self) -> str:
+        """The unit in the name; empty for a plain number."""
+        tail = self.name.rsplit("_", 1)[-1]
+        return tail if tail in ("mm", "deg", "px") else ""
+
+
+POSE = (
+    Parameter("a_mm", 2.0, "distance of the camera from the vertex"),
+    Parameter("b_mm", 2.0, "distance of the screen from the vertex"),
+    Parameter("alpha_deg", 0.3, "elevation of camera and screen"),
+    Parameter("screen_x_mm", 1.0, "shift of the screen along s_x"),
+    Parameter("screen_y_mm", 1.0, "shift of the screen along s_y"),
+    Parameter("screen_turn_x_deg", 0.5, "turn of the screen about s_x"),
+    Parameter("screen_turn_y_deg", 0.5, "turn of the screen about s_y"),
+    Parameter("screen_turn_z_deg", 0.2, "turn of the screen in its plane"),
+    Parameter("camera_yaw_deg", 0.1, "turn of the camera to the right"),
+    Parameter("camera_pitch_deg", 0.1, "turn of the camera up"),
+    Parameter("camera_roll_deg", 0.1, "turn of the camera about its axis"),
+)
+OPTIONAL = (
+    Parameter("focal_relative", 2e-3, "focal length, natural logarithm"),
+    Parameter("principal_x_px", 10.0, "principal point, column"),
+    Parameter("principal_y_px", 10.0, "principal point, row"),
+    Parameter("k1", 0.02, "radial lens distortion, r^2"),
+    Parameter("k2", 0.05, "radial lens distortion, r^4"),
+    Parameter("p1", 1e-3, "decentring of the lens"),
+    Parameter("p2", 1e-3, "decentring of the lens"),
+    Parameter("bow_mm", 1.5, "bow of the screen, 200 mm from its middle, towards the mirror"),
+    Parameter("pitch_relative", 1e-3, "pixel pitch of the screen, relative"),
+)
+LASER = Parameter("laser_relative", 1e-3, "scale of the laser, relative")
+ALL = (*POSE, *OPTIONAL, LASER)
+NAMES = tuple(parameter.name for parameter in ALL)
+OPTICAL = len(POSE) + len(OPTIONAL)  # those that the fringes depend on; the laser's scale comes after them
+
+
+def sigmas(free: Mapping[str, float] | None = None) -> FloatArray:
+    """Prior standard deviations in the order of `NAMES`; 0 holds a parameter where it is.
+
+    Parameters
+    ----------
+    free : mapping from name to sigma, optional
+        Changes: another sigma, 0 to hold, more than 0 to free. Without it the poses and the laser's scale are free.
+
+    Raises
+    ------
+    ValueError
+        For a name that is not a parameter, or a sigma below 0.
+    """
+    own = {p.name: p.sigma for p in (*POSE, LASER)}
+    for name, sigma in (free or {}).items():
+        if name not in NAMES:
+            raise ValueError(f"{name} is not a parameter; known are {', '.join(NAMES)}")
+        if not (np.isfinite(sigma) and sigma >= 0):
+            raise ValueError(f"{name}: a sigma must be 0 or more, it is {sigma:g}")
+        own[name] = sigma
+    return np.array([own.get(name, 0.0) for name in NAMES])
+
+
+def usual_sigma(name: str) -> float:
+    """The sigma that a parameter has when it is freed without one."""
+    return ALL[NAMES.index(name)].sigma
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A geometry with what `Geometry` cannot say.
+
+    Attributes
+    ----------
+    geometry : Geometry
+        Camera and screen.
+    bow_per_mm : float
+        The screen's face stands off its plane by bow_per_mm (s_x^2 + s_y^2), towards the mirror.
+    pitch : float
+        True length of what the screen calls a millimetre.
+    """
+
+    geometry: Geometry
+    bow_per_mm: float = 0.0
+    pitch: float = 1.0
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Pinhole (3,), camera rows (3, 3), screen origin (3,) and screen rows (3, 3): s_x, s_y, normal."""
+
+    pinhole_mm: NDArray[Any]
+    camera: NDArray[Any]
+    origin_mm: NDArray[Any]
+    screen: NDArray[Any]
+
+
+def bench_at(stated: Geometry, values: FloatArray) -> Bench:
+    """The bench whose parameters, in the order of `NAMES`, are `values`."""
+    poses = poses_at(stated, values)
+    focal, column, row, k1, k2, p1, p2, bow_mm, pitch = values[len(POSE) : OPTICAL]
+    lens = np.array((*stated.distortion, *[0.0] * 4)[: max(4, len(stated.distortion))])
+    lens[:4] += (k1, k2, p1, p2)
+    geometry = replace(
+        stated,
+        pinhole_mm=poses.pinhole_mm,
+        rotation=poses.camera,
+        focal_px=stated.focal_px * float(np.exp(focal)),
+        principal_px=(stated.principal_px[0] + column, stated.principal_px[1] + row),
+        distortion=tuple(float(k) for k in lens) if lens.any() else (),
+        screen_origin_mm=poses.origin_mm,
+        screen_s_x=poses.screen[0],
+        screen_s_y=poses.screen[1],
+    )
+    return Bench(geometry, bow_mm / BOW_RADIUS_MM**2, 1 + pitch)
+
+
+def poses_at(stated: Geometry, values: NDArray[Any]) -> Poses:
+    """Poses of a parameter vector (real, or complex for `pose_derivatives`); only the first eleven count."""
+    a, b, alpha, x, y, turn_x, turn_y, turn_z, yaw, pitch, roll = _radians(values[: len(POSE)])
+    f0, o0 = stated.pinhole_mm, stated.screen_origin_mm
+    hinge = _unit(np.cross(f0, o0))
+    up, back = _turn(hinge, alpha), _turn(hinge, -alpha)
+    rows = np.stack([stated.screen_s_x, stated.screen_s_y, np.cross(stated.screen_s_x, stated.screen_s_y)])
+    i, j, k = np.eye(3)
+    return Poses(
+        pinhole_mm=(1 + a / np.linalg.norm(f0)) * (up @ f0),
+        camera=_turn(i, pitch) @ _turn(j, yaw) @ _turn(k, roll) @ stated.rotation @ up.T,
+        origin_mm=back @ ((1 + b / np.linalg.norm(o0)) * o0 + x * rows[0] + y * rows[1]),
+        screen=_turn(i, turn_x) @ _turn(j, turn_y) @ _turn(k, turn_z) @ rows @ back.T,
+    )
+
+
+def pose_derivatives(stated: Geometry, values: FloatArray) -> list[Poses]:
+    """d poses / d parameter, one for each of the eleven, exact to rounding.
+
+    All of `poses_at` is analytic, so Im f(p + i h) / h is its derivative, without the loss of a difference.
+    """
+    out = []
+    for k in range(len(POSE)):
+        there = values.astype(complex)
+        there[k] += 1j * _COMPLEX_STEP
+        poses = poses_at(stated, there)
+        parts = (poses.pinhole_mm, poses.camera, poses.origin_mm, poses.screen)
+        out.append(Poses(*(np.asarray(part.imag / _COMPLEX_STEP) for part in parts)))
+    return out
+
+
+def _radians(values: NDArray[Any]) -> NDArray[Any]:
+    """Millimetres as they are, degrees as radians."""
+    factors = [np.pi / 180 if parameter.unit == "deg" else 1.0 for parameter in POSE]
+    return np.asarray(values * factors)
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    length = float(np.linalg.norm(vector))
+    if length == 0:
+        raise ValueError("camera and screen stand in one line with the vertex: alpha has no meaning")
+    return vector / length
+
+
+def _turn(axis: FloatArray, angle: Any) -> NDArray[Any]:
+    """Rodrigues' matrix of a turn about a unit vector."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross))

@@ -1,0 +1,279 @@
+"""The forward model: where a surface on a bench sends each camera ray on the screen, and its derivatives.
+
+A ray P = F + t d meets the film at F_z + t d_z = z + h(x, y), with n = (-h_x, -h_y, 1) its normal there; it leaves as
+u = d - 2 (d n) / (n n) n and meets the screen at S = P + k u. For small changes of anything (chain rule):
+
+    dP = G (dF + t dd) + d / (n d) (dz + dh)             G = 1 - d n^T / (n d)
+    dn = -(dh_x, dh_y, 0) - H dP                         H = second derivatives of h, bordered by zeros
+    du = (1 - 2 n n^T / (n n)) dd + B dn                 B = -2 / (n n) (n d^T + (d n) 1 - 2 (d n) / (n n) n n^T)
+    ds = T (dP + k du - dO' + X^T dX (S - O')) + (E u) s^2 dc / (N u)
+
+with X the screen's rows, E the first two, N = (third row) - 2 c (s_x e_x + s_y e_y) the normal of a face bowed by
+w = c s^2 (a plane for c = 0) and T = E (1 - u N^T / (N u)), which lets the ray run to the face.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import polynomial as series
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology import hencky, zernike
+from membrane_ctrl.metrology.calibrate.parameters import BOW_RADIUS_MM, OPTICAL, POSE, Bench, Poses
+from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.reconstruct import Points, Tracer
+from membrane_ctrl.metrology.surface import PARAMETERS, Surface
+
+FloatArray = NDArray[np.float64]
+
+LOCAL = PARAMETERS + 1  # of one set: its surface, and the height of its vertex
+COLUMNS = LOCAL + OPTICAL
+_CHUNK = 8192  # points whose derivatives are in memory at a time: 8 MB
+
+
+@dataclass(frozen=True)
+class SetPhases:
+    """What one capture set says, as screen points of bins.
+
+    Attributes
+    ----------
+    name : str
+        Of the set, for people.
+    column_px, row_px : (n,) arrays
+        Centres of the bins.
+    screen_mm : (2, n) array
+        s_x, s_y seen there.
+    sigma_mm : (n,) array
+        Expected noise of each of the two.
+    displacement_um : float
+        Mean laser reading of the set; NaN without.
+    """
+
+    name: str
+    column_px: FloatArray
+    row_px: FloatArray
+    screen_mm: FloatArray
+    sigma_mm: FloatArray
+    displacement_um: float
+
+    def thinned(self, most: int) -> SetPhases:
+        """Every k-th bin, so that at most `most` are left."""
+        keep = slice(None, None, -(-self.column_px.size // most))
+        return SetPhases(
+            self.name,
+            self.column_px[keep],
+            self.row_px[keep],
+            self.screen_mm[:, keep],
+            self.sigma_mm[keep],
+            self.displacement_um,
+        )
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Residuals and derivatives of some points.
+
+    Attributes
+    ----------
+    place : slice
+        Which points.
+    residual_mm : (2, m) array
+        Seen minus predicted.
+    derivatives : (2, m, COLUMNS) array
+        Of the prediction: 36 of the surface in mm, the vertex' height in mm, the optical parameters in their units.
+    """
+
+    place: slice
+    residual_mm: FloatArray
+    derivatives: FloatArray
+
+
+def camera_rays(geometry: Geometry, phases: SetPhases) -> FloatArray:
+    """Unit vectors (3, n) in world of a set's bins."""
+    return geometry.rays(phases.column_px, phases.row_px)
+
+
+def place_rays(bench: Bench, phases: SetPhases, surface: Surface, vertex_z_mm: float) -> Points:
+    """The set's rays, followed to the surface."""
+    points = Points.of(camera_rays(bench.geometry, phases), phases.screen_mm)
+    tracer = Tracer(bench.geometry, surface.radius_mm, vertex_z_mm)
+    tracer.start(points, surface.height)
+    tracer.intersect(points, surface, newton=3)
+    return points
+
+
+def residual_mm(bench: Bench, phases: SetPhases, surface: Surface, vertex_z_mm: float) -> FloatArray:
+    """Seen minus predicted screen points (2, n)."""
+    points = place_rays(bench, phases, surface, vertex_z_mm)
+    parts = [_meet(bench, points, surface, part).screen_mm for part in _parts(points.t_mm.size)]
+    return phases.screen_mm - np.concatenate(parts, axis=1) / bench.pitch
+
+
+def chunks(
+    bench: Bench, turns: list[Poses], phases: SetPhases, surface: Surface, vertex_z_mm: float
+) -> Iterator[Chunk]:
+    """Residuals with derivatives, some points at a time.
+
+    Parameters
+    ----------
+    turns : list of Poses
+        `pose_derivatives` at the bench's parameters.
+    """
+    points = place_rays(bench, phases, surface, vertex_z_mm)
+    for part in _parts(points.t_mm.size):
+        meet = _meet(bench, points, surface, part)
+        lens = lens_derivatives(bench.geometry, phases.column_px[part], phases.row_px[part], meet.ray)
+        seen = phases.screen_mm[:, part] - meet.screen_mm / bench.pitch
+        yield Chunk(part, seen, _derivatives(bench, turns, surface, meet, lens))
+
+
+def _parts(count: int) -> Iterator[slice]:
+    return (slice(first, min(first + _CHUNK, count)) for first in range(0, count, _CHUNK))
+
+
+@dataclass(frozen=True)
+class _Meeting:
+    """Where rays meet film and screen; vectors are (3, m)."""
+
+    ray: FloatArray
+    t_mm: FloatArray
+    place: FloatArray
+    normal: FloatArray
+    leaves: FloatArray
+    reach_mm: FloatArray
+    from_origin: FloatArray
+    face: FloatArray
+    screen_mm: FloatArray
+
+
+def _meet(bench: Bench, points: Points, surface: Surface, part: slice) -> _Meeting:
+    """Reflect the rays and follow them to the face, by Newton's steps from the plane if it is bowed."""
+    geometry, d, t = bench.geometry, points.rays[:, part], points.t_mm[part]
+    place = geometry.pinhole_mm[:, None] + t * d
+    hx, hy = slopes(surface, place[0], place[1])
+    n = np.stack([-hx, -hy, np.ones_like(hx)])
+    u = d - 2 * np.sum(d * n, axis=0) / np.sum(n * n, axis=0) * n
+    axes = _screen_rows(geometry)
+    start, along = axes @ (place - geometry.screen_origin_mm[:, None]), axes @ u
+    k = -start[2] / along[2]
+    c = bench.bow_per_mm
+    for _ in range(4 if c else 0):  # quadratic: 1 mm of bow is met to 1e-12 mm after three
+        at = start + k * along
+        slope = along[2] - 2 * c * (at[0] * along[0] + at[1] * along[1])
+        k = k - (at[2] - c * (at[0] ** 2 + at[1] ** 2)) / slope
+    at = start + k * along
+    face = axes[2][:, None] - 2 * c * (at[0] * axes[0][:, None] + at[1] * axes[1][:, None])
+    return _Meeting(d, t, place, n, u, k, axes.T @ at, face, at[:2])
+
+
+def _screen_rows(geometry: Geometry) -> FloatArray:
+    normal = np.cross(geometry.screen_s_x, geometry.screen_s_y)
+    return np.stack([geometry.screen_s_x, geometry.screen_s_y, normal])
+
+
+def _derivatives(bench: Bench, turns: list[Poses], surface: Surface, m: _Meeting, lens: FloatArray) -> FloatArray:
+    """(2, m, COLUMNS) by the formulas above, right to left: what a change of P, u, n, d does to s."""
+    geometry, d, n, u, k = bench.geometry, m.ray, m.normal, m.leaves, m.reach_mm
+    axes = _screen_rows(geometry)
+    across, onto = axes[:2] @ u, np.sum(m.face * u, axis=0)  # E u, N u
+    by_point = axes[:2, :, None] - across[:, None] * (m.face / onto)  # T
+    nn, nd = np.sum(n * n, axis=0), np.sum(n * d, axis=0)
+    ray = by_point * k  # T k, of u
+    along = np.einsum("acm,cm->am", ray, n)
+    by_normal = -2 / nn * (along[:, None] * d + nd * ray - 2 * nd / nn * along[:, None] * n)
+    hxx, hxy, hyy = curvatures(surface, m.place[0], m.place[1])
+    by_place = by_point.copy()
+    by_place[:, 0] -= by_normal[:, 0] * hxx + by_normal[:, 1] * hxy
+    by_place[:, 1] -= by_normal[:, 0] * hxy + by_normal[:, 1] * hyy
+    by_height = np.einsum("acm,cm->am", by_place, d) / nd
+    by_pinhole = by_place - by_height[:, None] * n  # by_place G
+    by_ray = by_pinhole * m.t_mm + ray - 2 / nn * along[:, None] * n
+    out = np.empty((2, d.shape[1], COLUMNS))
+    height, height_x, height_y = basis(m.place[0] / surface.radius_mm, m.place[1] / surface.radius_mm)
+    scale = 1 / surface.radius_mm
+    for axis in range(2):
+        slope = (by_normal[axis, 0] * height_x + by_normal[axis, 1] * height_y) * scale
+        out[axis, :, :PARAMETERS] = (by_height[axis] * height - slope).T
+    out[:, :, PARAMETERS] = by_height
+    in_camera = geometry.rotation @ d
+    for j, turn in enumerate(turns):
+        moved = axes.T @ (turn.screen @ m.from_origin) - turn.origin_mm[:, None]
+        of_ray = turn.camera.T @ in_camera
+        column = np.einsum("acm,c->am", by_pinhole, turn.pinhole_mm)
+        column += np.einsum("acm,cm->am", by_ray, of_ray) + np.einsum("acm,cm->am", by_point, moved)
+        out[:, :, LOCAL + j] = column
+    first = LOCAL + len(POSE)
+    out[:, :, first : first + len(lens)] = np.einsum("acm,lcm->aml", by_ray, lens)
+    square = m.screen_mm[0] ** 2 + m.screen_mm[1] ** 2
+    out[:, :, -2] = across * square / onto / BOW_RADIUS_MM**2
+    out /= bench.pitch
+    out[:, :, -1] = -m.screen_mm / bench.pitch**2
+    return out
+
+
+def lens_derivatives(geometry: Geometry, column_px: FloatArray, row_px: FloatArray, rays: FloatArray) -> FloatArray:
+    """d ray / d (relative focal length, principal point, k1, k2, p1, p2), (7, 3, m).
+
+    A pixel fixes the distorted point q = ((c, r) - principal) / focal = f(p; k): dp = (df/dp)^-1 (dq - df/dk dk), and
+    the unit vector c of (p, 1) turns by (1 - c c^T) (dp, 0) / |(p, 1)|. Coefficients beyond the first four, if the
+    stated lens has any, count as constants of df/dp only to first order: they are left out there.
+    """
+    c = geometry.rotation @ rays
+    x, y = c[0] / c[2], c[1] / c[2]
+    k1, k2, p1, p2 = (*geometry.distortion, 0.0, 0.0, 0.0, 0.0)[:4]
+    r2 = x * x + y * y
+    radial, grows = 1 + k1 * r2 + k2 * r2**2, 2 * (k1 + 2 * k2 * r2)
+    fxx = radial + grows * x * x + 2 * p1 * y + 6 * p2 * x
+    fxy = grows * x * y + 2 * p1 * x + 2 * p2 * y
+    fyy = radial + grows * y * y + 6 * p1 * y + 2 * p2 * x
+    qx = (column_px - geometry.principal_px[0]) / geometry.focal_px
+    qy = (row_px - geometry.principal_px[1]) / geometry.focal_px
+    zero, step = np.zeros_like(x), np.full_like(x, -1 / geometry.focal_px)
+    of_x = np.stack([-qx, step, zero, -x * r2, -x * r2**2, -2 * x * y, -(r2 + 2 * x * x)])
+    of_y = np.stack([-qy, zero, step, -y * r2, -y * r2**2, -(r2 + 2 * y * y), -2 * x * y])
+    det = fxx * fyy - fxy**2
+    px, py = (fyy * of_x - fxy * of_y) / det, (fxx * of_y - fxy * of_x) / det
+    moved = np.stack([px, py, np.zeros_like(px)], axis=1) * c[2]
+    turned = moved - np.sum(moved * c, axis=1, keepdims=True) * c
+    return np.asarray(np.einsum("ij,lim->ljm", geometry.rotation, turned))
+
+
+def basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Heights and slopes (36, n) of the surface's parameters in radii, each 0 at the vertex."""
+    v = x * x + y * y
+    excess = hencky.excess() / hencky.excess_rms()
+    bowl = series.polyval(v, excess) - excess[0]
+    grows = 2 * series.polyval(v, series.polyder(excess))
+    heights = zernike.values(x, y)[1:] - zernike.at_vertex()[1:, None]
+    slopes_x, slopes_y = zernike.gradients(x, y)
+    return (
+        np.vstack([heights, bowl]),
+        np.vstack([slopes_x[1:], grows * x]),
+        np.vstack([slopes_y[1:], grows * y]),
+    )
+
+
+def slopes(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """dh/dx and dh/dy."""
+    x, y = x_mm / surface.radius_mm, y_mm / surface.radius_mm
+    grows = 2 * series.polyval(x * x + y * y, series.polyder(surface.excess))
+    of_x, of_y = (series.polyval2d(x, y, series.polyder(surface.polynomial, axis=axis)) for axis in (0, 1))
+    return (of_x + grows * x) / surface.radius_mm, (of_y + grows * y) / surface.radius_mm
+
+
+def curvatures(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """h_xx, h_xy and h_yy in 1/mm."""
+    x, y = x_mm / surface.radius_mm, y_mm / surface.radius_mm
+    v = x * x + y * y
+    first, second = (
+        2 * series.polyval(v, series.polyder(surface.excess)),
+        4 * series.polyval(v, series.polyder(surface.excess, 2)),
+    )
+    by_x, by_y = (series.polyder(surface.polynomial, axis=axis) for axis in (0, 1))
+    hxx = series.polyval2d(x, y, series.polyder(by_x, axis=0)) + first + second * x * x
+    hxy = series.polyval2d(x, y, series.polyder(by_x, axis=1)) + second * x * y
+    hyy = series.polyval2d(x, y, series.polyder(by_y, axis=1)) + first + second * y * y
+    return hxx / surface.radius_mm**2, hxy / surface.radius_mm**2, hyy / surface.radius_mm**2

@@ -1,0 +1,175 @@
+"""Normal equations of one set, and its surface taken out of them (variable projection).
+
+The unknowns of set i are its surface q_i (36) and the height z_i of its vertex; those of all sets are the geometry's
+parameters, the ring's form and the laser's scale. The Schur complement over (q_i, z_i) leaves a matrix of the common
+unknowns alone. These matrices add, so that the cost grows with the number of sets and not with its cube, and any
+subset of the sets, and any choice of free parameters, can be solved again without another look at the points.
+
+Two more observations a set stand in the same matrix. The ring stays where it is: the harmonics 0..7 of the height of
+the rim, z_i e_0 + E q_i, are the same in all sets (a polynomial of degree 7 has no others). The vertex stands where
+the laser says: z_i = -(1 + scale) (d_i - reference) / 1000, d_i in um.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.calibrate.parameters import NAMES, OPTICAL, Bench, Poses
+from membrane_ctrl.metrology.calibrate.residuals import COLUMNS, LOCAL, SetPhases, basis, chunks
+from membrane_ctrl.metrology.surface import PARAMETERS, Surface
+from membrane_ctrl.metrology.zernike import DEGREE
+
+FloatArray = NDArray[np.float64]
+
+RING = 2 * DEGREE + 1  # harmonics of the rim: a constant, seven cosines, seven sines
+COMMON = len(NAMES) + RING  # parameters of `NAMES`, then the ring
+_HUBER = 1.9  # of the length of two normal components: keeps 95 % of the efficiency of least squares
+
+
+@dataclass(frozen=True)
+class SetState:
+    """Where a set's own unknowns stand: its surface, and the height of its vertex in mm."""
+
+    surface: Surface
+    vertex_z_mm: float
+
+
+@dataclass(frozen=True)
+class Witness:
+    """What is known beside the fringes.
+
+    Attributes
+    ----------
+    reference_um : float
+        Laser reading at which the vertex stands at z = 0.
+    laser_sigma_um : float
+        Of a set's mean reading.
+    ring_sigma_um : float
+        How far the ring's harmonics may differ from set to set.
+    """
+
+    reference_um: float
+    laser_sigma_um: float = 1.0
+    # the clamp creeps by less than a micrometre in the minutes that a calibration takes
+    ring_sigma_um: float = 1.0
+
+
+@dataclass(frozen=True)
+class Trust:
+    """How points are believed: robust weights (n,), 1 for a good one, and their variance over the expected one."""
+
+    weights: FloatArray
+    variance: float
+
+    @classmethod
+    def full(cls, phases: SetPhases) -> Trust:
+        """Every point as its noise says."""
+        return cls(np.ones(phases.sigma_mm.size), 1.0)
+
+    @classmethod
+    def seen(cls, phases: SetPhases, residual_mm: FloatArray) -> Trust:
+        """From residuals (2, n): Huber's weights against their own scatter."""
+        length = np.hypot(*residual_mm) / phases.sigma_mm
+        # the median of a Rayleigh distribution is 1.177 sigma; less noise than the camera must have is not believed
+        variance = max(float(np.median(length) / 1.1774) ** 2, 1.0)
+        return cls(_HUBER / np.maximum(length / np.sqrt(variance), _HUBER), variance)
+
+
+@dataclass(frozen=True)
+class Equations:
+    """Everything one set says, linearised where its unknowns stand.
+
+    Attributes
+    ----------
+    sums : (LOCAL + COMMON + 1, squared) array
+        J^T W J of the prediction's derivatives, with the residual as one more column: normal matrix, right side and
+        sum of squares in one.
+    residual_mm : (2, n) array
+        Seen minus predicted screen points.
+    trust : Trust
+        The points' weights.
+    """
+
+    sums: FloatArray
+    residual_mm: FloatArray
+    trust: Trust
+
+    @property
+    def variance(self) -> float:
+        """How many times larger than expected the variance of the points was taken to be."""
+        return self.trust.variance
+
+    def local_step(self, common_step: FloatArray) -> FloatArray:
+        """Step (LOCAL,) of the set's own unknowns that goes with one of the common ones."""
+        own, mixed = self.sums[:LOCAL, :LOCAL], self.sums[:LOCAL, LOCAL:]
+        return np.asarray(np.linalg.solve(own, mixed[:, -1] - mixed[:, :-1] @ common_step))
+
+    def reduced(self) -> FloatArray:
+        """Schur complement over the set's own unknowns, (COMMON + 1, squared)."""
+        mixed = self.sums[:LOCAL, LOCAL:]
+        left = self.sums[LOCAL:, LOCAL:] - mixed.T @ np.linalg.solve(self.sums[:LOCAL, :LOCAL], mixed)
+        return np.asarray((left + left.T) / 2)
+
+
+def equations(
+    bench: Bench,
+    turns: list[Poses],
+    phases: SetPhases,
+    state: SetState,
+    common: FloatArray,
+    witness: Witness,
+    trust: Trust,
+) -> Equations:
+    """Linearise one set; `common` (COMMON,) are parameters and ring."""
+    sums = np.zeros((LOCAL + COMMON + 1,) * 2)
+    keep = np.append(np.arange(COLUMNS), LOCAL + COMMON)
+    root = np.sqrt(trust.weights / trust.variance) / phases.sigma_mm
+    residual = np.empty_like(phases.screen_mm)
+    for part in chunks(bench, turns, phases, state.surface, state.vertex_z_mm):
+        residual[:, part.place] = part.residual_mm
+        rows = np.concatenate([part.derivatives, part.residual_mm[:, :, None]], axis=2)
+        rows *= root[part.place][:, None]
+        flat = rows.reshape(-1, COLUMNS + 1)
+        sums[np.ix_(keep, keep)] += flat.T @ flat
+    rows = _witness_rows(phases, state, common, witness)
+    return Equations(sums + rows.T @ rows, residual, trust)
+
+
+def _witness_rows(phases: SetPhases, state: SetState, common: FloatArray, witness: Witness) -> FloatArray:
+    """Ring and laser as weighted rows [derivatives, miss]."""
+    rows = np.zeros((RING + 1, LOCAL + COMMON + 1))
+    ring = rows[:RING]
+    ring[:, :PARAMETERS] = rim_harmonics()
+    ring[0, PARAMETERS] = 1.0
+    ring[:, LOCAL + len(NAMES) : -1] = -np.eye(RING)
+    ring[:, -1] = common[len(NAMES) :] - rim_of(state)
+    ring /= witness.ring_sigma_um * 1e-3
+    if np.isfinite(phases.displacement_um):
+        moved_mm = (phases.displacement_um - witness.reference_um) * 1e-3
+        laser = rows[RING]
+        laser[PARAMETERS] = 1.0
+        laser[LOCAL + OPTICAL] = moved_mm
+        laser[-1] = -(1 + common[OPTICAL]) * moved_mm - state.vertex_z_mm
+        laser /= witness.laser_sigma_um * 1e-3
+    return rows
+
+
+def rim_of(state: SetState) -> FloatArray:
+    """Harmonics (RING,) of the rim's height in world."""
+    out = rim_harmonics() @ state.surface.parameters
+    out[0] += state.vertex_z_mm
+    return np.asarray(out)
+
+
+@cache
+def rim_harmonics() -> FloatArray:
+    """Matrix (RING, 36) from the surface's parameters to the harmonics of the rim's height above the vertex."""
+    theta = 2 * np.pi * np.arange(4 * RING) / (4 * RING)
+    heights = basis(np.cos(theta), np.sin(theta))[0]
+    orders = np.outer(np.arange(1, DEGREE + 1), theta)
+    waves = np.vstack([np.full((1, theta.size), 0.5), np.cos(orders), np.sin(orders)])
+    return np.asarray(waves @ heights.T * 2 / theta.size)

@@ -1,0 +1,215 @@
+"""The one least-squares problem: Gauss-Newton on the common unknowns, surfaces eliminated (`separable`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.calibrate.parameters import NAMES, Bench, bench_at, pose_derivatives
+from membrane_ctrl.metrology.calibrate.residuals import SetPhases, camera_rays
+from membrane_ctrl.metrology.calibrate.separable import COMMON, Equations, SetState, Trust, Witness, equations, rim_of
+from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola
+from membrane_ctrl.metrology.reconstruct import solve as solve_surface
+from membrane_ctrl.metrology.surface import PARAMETERS, Surface
+
+FloatArray = NDArray[np.float64]
+
+MAX_ITERATIONS = 25
+_SETTLED = 1e-2  # of each parameter's own standard deviation: no reader of the result sees less
+_NEARLY = 0.1  # likewise: the next step is far below the noise
+_FEW = 6000  # bins of a set: a hundred times the unknowns
+_START_SAG_MM = 40.0
+_FREE_RING_MM = 1e3  # the ring's form is not known beforehand
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is to be solved.
+
+    Attributes
+    ----------
+    stated : Geometry
+        What was measured by hand.
+    sets : tuple of SetPhases
+        At different sags.
+    sigmas : (len(NAMES),) array
+        Of the hand's measurements; 0 holds a parameter.
+    witness : Witness
+        Laser and ring.
+    radius_mm : float
+        Of the ring.
+    """
+
+    stated: Geometry
+    sets: tuple[SetPhases, ...]
+    sigmas: FloatArray
+    witness: Witness
+    radius_mm: float
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where the unknowns ended, and the equations there.
+
+    Attributes
+    ----------
+    problem : Problem
+        As given.
+    values : (len(NAMES),) array
+        Parameters, 0 for the stated bench.
+    common : (COMMON,) array
+        Parameters and ring.
+    states : tuple of SetState
+        Surface and vertex of each set.
+    equations : tuple of Equations
+        Of each set, at the end.
+    covariance : (COMMON, COMMON) array
+        Of the common unknowns; zeros for what was held.
+    changes : tuple of float
+        Largest change of each step, in standard deviations.
+    converged : bool
+        Whether the last step was too small to matter.
+    """
+
+    problem: Problem
+    values: FloatArray
+    common: FloatArray
+    states: tuple[SetState, ...]
+    equations: tuple[Equations, ...]
+    covariance: FloatArray
+    changes: tuple[float, ...]
+    converged: bool
+
+    @property
+    def bench(self) -> Bench:
+        """The calibrated bench."""
+        return bench_at(self.problem.stated, self.values)
+
+    @property
+    def free(self) -> list[str]:
+        """Names of the parameters that were free."""
+        return [name for name, sigma in zip(NAMES, self.problem.sigmas, strict=True) if sigma > 0]
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard deviations of the parameters, in the order of `NAMES`."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[: len(NAMES)]))
+
+
+def prior(sigmas: FloatArray, common: FloatArray) -> FloatArray:
+    """What is known without the sets, as sums (COMMON + 1, squared) about where the unknowns stand."""
+    wide = np.append(sigmas, np.full(COMMON - len(NAMES), _FREE_RING_MM))
+    weight = np.divide(1, wide**2, out=np.zeros(COMMON), where=wide > 0)
+    rows = np.hstack([np.diag(np.sqrt(weight)), -(np.sqrt(weight) * common)[:, None]])
+    return np.asarray(rows.T @ rows)
+
+
+@dataclass(frozen=True)
+class Step:
+    """Step (COMMON,) of the common unknowns, their covariance, and the sum of squares after it."""
+
+    delta: FloatArray
+    covariance: FloatArray
+    squares: float
+
+
+def step(sums: FloatArray, sigmas: FloatArray) -> Step:
+    """Solve for what is free. `sums` (COMMON + 1, squared) hold the sets and the prior."""
+    free = np.flatnonzero(np.append(sigmas > 0, np.ones(COMMON - len(NAMES), bool)))
+    matrix, right = sums[np.ix_(free, free)], sums[free, -1]
+    scale = 1 / np.sqrt(np.diag(matrix))  # parameters have units of their own: the scaled matrix loses fewer digits
+    inverse = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
+    delta, covariance = np.zeros(COMMON), np.zeros((COMMON, COMMON))
+    delta[free] = inverse @ right
+    covariance[np.ix_(free, free)] = inverse
+    return Step(delta, covariance, float(sums[-1, -1] - right @ delta[free]))
+
+
+def solve(
+    problem: Problem, progress: Callable[[int, float], None] | None = None, start: Solution | None = None
+) -> Solution:
+    """Calibrate. Sets of very many bins are solved with some of them first: the last steps alone need them all.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Told the number of the step and its largest change in standard deviations.
+    start : Solution, optional
+        Of the same sets, or of some of their bins: where to begin.
+
+    Raises
+    ------
+    ValueError
+        If there is no set, or if a set's points do not determine a surface.
+    """
+    if not problem.sets:
+        raise ValueError("no capture set to calibrate with")
+    if start is None and max(phases.sigma_mm.size for phases in problem.sets) > 2 * _FEW:
+        some = replace(problem, sets=tuple(phases.thinned(_FEW) for phases in problem.sets))
+        start = solve(some, progress)
+    states = start.states if start is not None else tuple(_first(problem, phases) for phases in problem.sets)
+    common = start.common if start is not None else _common(states)
+    trust = tuple(Trust.full(phases) for phases in problem.sets)
+    changes: list[float] = []
+    weighed = False  # whether the step before was the first with new weights
+    while True:
+        linear = _linearise(problem, states, common, trust)
+        sums = np.sum([each.reduced() for each in linear], axis=0) + prior(problem.sigmas, common)
+        moved = step(sums, problem.sigmas)
+        sigmas = np.sqrt(np.diag(moved.covariance))
+        changes.append(float(np.max(np.abs(moved.delta[sigmas > 0]) / sigmas[sigmas > 0], initial=0.0)))
+        if not np.isfinite(changes[-1]):
+            raise ValueError("the sets lead the calibration astray: they do not show the stated bench")
+        if progress is not None:
+            progress(len(changes), changes[-1])
+        settled = weighed and changes[-1] < _SETTLED
+        if settled or len(changes) == MAX_ITERATIONS:
+            values = common[: len(NAMES)].copy()
+            return Solution(problem, values, common, states, linear, moved.covariance, tuple(changes), settled)
+        states = tuple(_moved(s, each, moved.delta) for s, each in zip(states, linear, strict=True))
+        common = common + moved.delta
+        # Weights are renewed where the steps have nearly come to rest: renewed at every step they may chase it
+        weighed = changes[-1] < _NEARLY
+        if weighed:
+            left = (each.residual_mm for each in linear)
+            trust = tuple(Trust.seen(phases, residual) for phases, residual in zip(problem.sets, left, strict=True))
+
+
+def _common(states: Sequence[SetState]) -> FloatArray:
+    """Parameters as stated, and the ring as the sets' first surfaces have it."""
+    return np.append(np.zeros(len(NAMES)), np.mean([rim_of(state) for state in states], axis=0))
+
+
+def _linearise(
+    problem: Problem, states: Sequence[SetState], common: FloatArray, trust: Sequence[Trust]
+) -> tuple[Equations, ...]:
+    values = common[: len(NAMES)]
+    bench, turns = bench_at(problem.stated, values), pose_derivatives(problem.stated, values)
+    return tuple(
+        equations(bench, turns, phases, state, common, problem.witness, believed)
+        for phases, state, believed in zip(problem.sets, states, trust, strict=True)
+    )
+
+
+def _moved(state: SetState, linear: Equations, common_step: FloatArray) -> SetState:
+    own = linear.local_step(common_step)
+    surface = Surface.from_parameters(state.surface.parameters + own[:PARAMETERS], state.surface.radius_mm)
+    return SetState(surface, state.vertex_z_mm + float(own[PARAMETERS]))
+
+
+def _first(problem: Problem, phases: SetPhases) -> SetState:
+    """The set's surface as the stated geometry sees it."""
+    moved_um = phases.displacement_um - problem.witness.reference_um
+    vertex_z_mm = -moved_um * 1e-3 if np.isfinite(moved_um) else 0.0
+    return SetState(surface_of(Bench(problem.stated), phases, problem.radius_mm, vertex_z_mm), vertex_z_mm)
+
+
+def surface_of(bench: Bench, phases: SetPhases, radius_mm: float, vertex_z_mm: float) -> Surface:
+    """One set's surface on a bench without bow, as `measure` fits it. Raises ValueError if there is none."""
+    tracer = Tracer(bench.geometry, radius_mm, vertex_z_mm)
+    points = Points.of(camera_rays(bench.geometry, phases), phases.screen_mm * bench.pitch)
+    return solve_surface(tracer, points, parabola(_START_SAG_MM, radius_mm)).surface
