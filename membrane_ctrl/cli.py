@@ -125,6 +125,36 @@ def conformance(
     return run_conformance(url, unit_id, json)
 
 
+@app.command(context_settings={"ignore_unknown_options": True})  # a negative setpoint is no option
+def ctl(
+    action: Annotated[
+        str,
+        typer.Argument(
+            metavar="ACTION",
+            help="status, watch, setpoint UM, hold, pause, resume, manual FLOW, gains FILE, shape on|off, "
+            'mark "text", ack, lower, vent, stop, release, quiet.',
+        ),
+    ],
+    argument: Annotated[str | None, typer.Argument(metavar="[VALUE]")] = None,
+    why: Annotated[str, typer.Option(help="Recorded with the command.")] = "",
+    take_over: Annotated[bool, typer.Option("--take-over", help="Take the command from who has it.")] = False,
+    every: Annotated[str, typer.Option(help="watch: a line this often.")] = "1s",
+    run: Annotated[Path | None, typer.Option(help="The run's folder.")] = None,
+    socket: Annotated[Path | None, typer.Option(help="The hold's socket; logs/control.sock by default.")] = None,
+    tls: Annotated[str, typer.Option(metavar="HOST:PORT", help="By TCP, with the certificate below.")] = "",
+    certificate: Annotated[Path | None, typer.Option(help="With --tls: the own certificate.")] = None,
+    key: Annotated[Path | None, typer.Option(help="With --tls: its key.")] = None,
+    authority: Annotated[Path | None, typer.Option(help="With --tls: who signed the hold's certificate.")] = None,
+    json: JsonOption = False,
+) -> int:
+    """Talk to a running hold: ask how it is, or tell it what to do."""
+    from membrane_ctrl.ctl import CtlOptions, Where
+    from membrane_ctrl.ctl import ctl as ask
+
+    where = Where(socket, run, tls, certificate, key, authority)
+    return ask(CtlOptions(action, argument, why, take_over, every, json, where))
+
+
 @app.command()
 def measure(
     capture_set: Annotated[Path, typer.Argument(metavar="SET", help="Folder with capture.toml and its images.")],

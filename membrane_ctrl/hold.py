@@ -16,6 +16,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from firmware_iface.roles import Bench, LinkError
@@ -27,6 +28,8 @@ from membrane_ctrl.controller import Controller
 from membrane_ctrl.crew import Crew, Rings, rings_for
 from membrane_ctrl.errors import DeviceError, Exit, InputError
 from membrane_ctrl.ipc.ring import RingReader, RingWriter
+from membrane_ctrl.port.listeners import listeners_for
+from membrane_ctrl.port.server import Port, RunHooks
 from membrane_ctrl.priority import raise_priority
 from membrane_ctrl.recording.run_folder import create_run_folder
 from membrane_ctrl.simulated import TwinProcess
@@ -60,14 +63,16 @@ def hold_mirror(options: HoldOptions) -> int:
         twin = TwinProcess.started(options.config, clock, stack, options.lab) if options.twin else None
         config = twin.config if twin else options.config
         assert config.devices is not None
-        asyncio.run(_identify(open_bench(config.devices), config.devices, options.clear_faults))
         logs_dir = options.logs_dir or Path(config.recording.logs_dir)
+        listeners = listeners_for(config.port, logs_dir, stack)  # a second hold ends here, no device touched
+        asyncio.run(_identify(open_bench(config.devices), config.devices, options.clear_faults))
         run_dir = create_run_folder(logs_dir, options.name, clock.origin_utc, config)
         rings = rings_for(config, twin.truth if twin else None, stack)
         crew = Crew(config, clock, rings, run_dir, options.name, options.duration_s)
         crew.start(stack)
         bench = open_bench(config.devices)  # a link belongs to the event loop that opened it
-        exit_code = asyncio.run(_run(bench, config, options.duration_s, clock, rings, crew, twin))
+        port = partial(Port, config.port, listeners, run_dir.name)
+        exit_code = asyncio.run(_run(bench, config, options.duration_s, clock, rings, crew, twin, port))
         crew.take_down()
     _report(run_dir, options.json)
     return exit_code
@@ -99,6 +104,7 @@ async def _run(
     rings: Rings,
     crew: Crew,
     twin: TwinProcess | None,
+    port_for: Callable[[RunHooks], Port],
 ) -> Exit:
     from membrane_ctrl.metrology.hencky import zernike_projection
 
@@ -107,6 +113,8 @@ async def _run(
         wiring = Wiring(bench, telemetry, events, inputs, shapes, truth, crew.children, crew.reports)
         controller = Controller(config, zernike_projection())
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
+        port = port_for(RunHooks(supervisor.ask, supervisor.tell, clock.now, lambda: controller.loop_config))
+        wiring.heard = port.heard
         devices = config.devices.name if config.devices else ""
         supervisor.tell({"kind": "start", "devices": devices, "priority": raise_priority()})
         exit_code = Exit.DEVICE_FAILED
@@ -116,8 +124,9 @@ async def _run(
             supervisor.ask(Command("hold", "command line"))
             gc.collect()
             gc.freeze()  # what lives for the whole run need not be looked at again between two ticks
-            with _signals(supervisor):
-                exit_code = await supervisor.run(duration_s)
+            async with port.open():
+                with _signals(supervisor):
+                    exit_code = await supervisor.run(duration_s)
         except LinkError as error:
             supervisor.tell({"kind": "link", "message": str(error)})
             raise DeviceError(str(error)) from None

@@ -52,15 +52,18 @@ def wait_for(what: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
+def run_dirs(folder: Path) -> list[Path]:
+    """Folders of runs; beside them is the control port's socket."""
+    return [path for path in (folder / "logs").glob("*") if path.is_dir()]
+
+
 def run_dir(folder: Path) -> Path:
-    (found,) = (folder / "logs").iterdir()
+    (found,) = run_dirs(folder)
     return found
 
 
 def events(folder: Path) -> list[dict[str, object]]:
-    path = (
-        run_dir(folder) / "events.jsonl" if (folder / "logs").exists() and any((folder / "logs").iterdir()) else None
-    )
+    path = run_dir(folder) / "events.jsonl" if run_dirs(folder) else None
     if path is None or not path.exists():
         return []
     return [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]

@@ -1,0 +1,1 @@
+"""The control port: how people and programs talk to a running hold (docs/control-port.md)."""

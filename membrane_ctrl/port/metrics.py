@@ -1,0 +1,69 @@
+"""Prometheus text on localhost: every field of the newest tick as a gauge, and a few counts.
+
+Names keep the project's units (`membrane_error_um`): the scale a person reads in alarms and telemetry is the one they
+find here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import socket
+from collections.abc import Callable
+from dataclasses import asdict
+
+from membrane_ctrl.names import State
+from membrane_ctrl.port.wire import Wire
+from membrane_ctrl.telemetry import TelemetryRow
+
+_REQUEST_S = 2.0
+_COUNTERS = {"tick": "ticks_total", "missed_ticks": "missed_ticks_total"}
+
+
+def metrics_text(row: TelemetryRow | None, clients: int, refused: int) -> str:
+    """Prometheus' text format, version 0.0.4.
+
+    Parameters
+    ----------
+    row : TelemetryRow or None
+        The newest tick; None before the first.
+    clients, refused : int
+        Of the control port.
+    """
+    lines: list[str] = []
+
+    def add(name: str, kind: str, *samples: tuple[str, float]) -> None:
+        lines.append(f"# TYPE membrane_{name} {kind}")
+        lines.extend(f"membrane_{name}{labels} {_number(value)}" for labels, value in samples)
+
+    add("port_clients", "gauge", ("", clients))
+    add("port_refused_total", "counter", ("", refused))
+    if row is not None:
+        add("in_state", "gauge", *((f'{{state="{s.name.lower()}"}}', float(row.state == s)) for s in State))
+        for field, value in asdict(row).items():
+            counter = _COUNTERS.get(field)
+            add(counter or field, "counter" if counter else "gauge", ("", value))
+    return "\n".join(lines) + "\n"
+
+
+def _number(value: float) -> str:
+    return "NaN" if math.isnan(value) else repr(float(value))
+
+
+async def serve_metrics(connection: socket.socket, text: Callable[[], str]) -> None:
+    """Answer one HTTP request: `GET /metrics`, or 404."""
+    wire = await Wire.on(connection)
+    try:
+        with contextlib.suppress(TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError):
+            head = await asyncio.wait_for(wire.until(b"\r\n\r\n"), _REQUEST_S)
+            found = head.split(b"\r\n")[0].split(b" ")[:2] == [b"GET", b"/metrics"]
+            body = (text() if found else "only /metrics is here\n").encode()
+            kind = "text/plain; version=0.0.4; charset=utf-8"
+            wire.send_bytes(
+                f"HTTP/1.1 {'200 OK' if found else '404 Not Found'}\r\nContent-Type: {kind}\r\n"
+                f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode()
+                + body
+            )
+    finally:
+        await wire.close()

@@ -1,0 +1,243 @@
+"""The port as the run sees it: hears what every tick decided, asks the next one.
+
+The control process has one thread and one loop: what is done here is done between two ticks, and all of it is
+bounded: connections, messages, their rate, what waits to be sent. A door that fails opens again by itself
+(`door.Door`): a hold that cannot be asked is no reason to let the mirror down, and signals still stop it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import math
+import socket
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from membrane_ctrl.commands import TABLE, Command
+from membrane_ctrl.config import LoopConfig
+from membrane_ctrl.config_file import parse
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
+from membrane_ctrl.errors import InputError
+from membrane_ctrl.port.door import Door
+from membrane_ctrl.port.listeners import Listeners
+from membrane_ctrl.port.metrics import metrics_text, serve_metrics
+from membrane_ctrl.port.people import FREE, Helm, Peer, may_not
+from membrane_ctrl.port.picture import Picture
+from membrane_ctrl.port.protocol import KINDS, VERSION, Request
+from membrane_ctrl.port.refusals import Refusals
+from membrane_ctrl.port.session import Session
+from membrane_ctrl.port.wire import Wire
+from membrane_ctrl.port_config import PortConfig
+from membrane_ctrl.tick import Event, TickOutputs
+
+# Beyond these the connection that has been silent longest goes: one person's terminals cannot lock out another's stop
+_SESSIONS_MOST, _SESSIONS_EACH = 16, 4
+# A tick takes a command up within its period; a loop that does not in so long has other troubles, and says so
+_ANSWER_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class RunHooks:
+    """What the port needs of the run.
+
+    Attributes
+    ----------
+    ask : callable
+        Hands a command to the next tick.
+    tell : callable
+        Puts an event on record.
+    now : callable
+        The run's clock.
+    loop : callable
+        The loop's settings as they are now.
+    """
+
+    ask: Callable[[Command], None]
+    tell: Callable[[Event], None]
+    now: Callable[[], float]
+    loop: Callable[[], LoopConfig]
+
+
+class Port:
+    """Commands in, answers and status out.
+
+    Parameters
+    ----------
+    config : PortConfig
+        The run's.
+    listeners : Listeners
+        Bound sockets.
+    run : str
+        Name of the run folder.
+    hooks : RunHooks
+        What it needs of the run.
+    """
+
+    def __init__(self, config: PortConfig, listeners: Listeners, run: str, hooks: RunHooks) -> None:
+        self._listeners, self._run, self._hooks = listeners, run, hooks
+        self._tell, self._now = hooks.tell, hooks.now
+        self._helm = Helm(config.commander_lapses_s)
+        self._refusals = Refusals(hooks.tell, hooks.now)
+        self._picture = Picture()
+        self._numbers = itertools.count(1)
+        self._waiting: dict[int, asyncio.Future[str]] = {}
+        self._sessions: list[Session] = []
+
+    def heard(self, outputs: TickOutputs) -> None:
+        """Take in what a tick decided; those who asked for it get their answer."""
+        self._picture.take(outputs)
+        for event in outputs.events:
+            for session in self._sessions:
+                session.event(event)
+        for number, refusal in outputs.answers:
+            future = self._waiting.pop(number, None)
+            if future is not None and not future.done():
+                future.set_result(refusal)
+
+    @contextlib.asynccontextmanager
+    async def open(self) -> AsyncIterator[None]:
+        """Let clients in for the length of a `with` block."""
+        listeners = self._listeners
+        doors = []
+        if listeners.unix is not None:
+            doors.append(Door("unix", listeners.unix.socket, self._welcome_unix, self._tell))
+        if listeners.tls is not None:
+            doors.append(Door("tls", listeners.tls.socket, self._welcome_tls, self._tell))
+        if listeners.metrics is not None:
+            welcome = partial(serve_metrics, text=self.metrics)
+            doors.append(Door("metrics", listeners.metrics, welcome, self._tell))
+        for door in doors:
+            door.open()
+        if doors:
+            self._tell({"kind": "port", **listeners.addresses})
+        try:
+            yield
+        finally:
+            for future in self._waiting.values():
+                if not future.done():
+                    future.set_result("the run is over")
+            await asyncio.sleep(0.0)  # let the answers out
+            for door in doors:
+                await door.close()
+
+    def status(self) -> dict[str, Any]:
+        """What `status` answers and `watch` streams."""
+        return {
+            "run": self._run,
+            **self._picture.status(),
+            "commander": self._helm.holder(self._now()) or None,
+            "clients": len(self._sessions),
+        }
+
+    def metrics(self) -> str:
+        """The same for Prometheus."""
+        return metrics_text(self._picture.row, len(self._sessions), self._refusals.count)
+
+    async def _welcome_unix(self, connection: socket.socket) -> None:
+        assert self._listeners.unix is not None
+        peer = self._listeners.unix.peer(connection)
+        await self._serve(await Wire.on(connection), peer)
+
+    async def _welcome_tls(self, connection: socket.socket) -> None:
+        assert self._listeners.tls is not None
+        try:
+            wire = await Wire.on(connection, self._listeners.tls.context)
+        except OSError as error:  # no certificate, an expired one, one of a stranger, no TLS at all, too slow
+            self._refusals.record("tls:unknown", "", f"handshake: {error}")
+            return
+        await self._serve(wire, self._listeners.tls.peer(wire.certificate))
+
+    async def _serve(self, wire: Wire, peer: Peer) -> None:
+        self._make_room(peer)
+        session = Session(wire, peer, self.status)
+        self._sessions.append(session)
+        greeting = {
+            "membrane_ctrl": VERSION,
+            "run": self._run,
+            "you": peer.who,
+            "role": peer.role,
+            "commander": self._helm.holder(self._now()) or None,
+        }
+        try:
+            await session.run(greeting, self._answer, self._refusals.record)
+        finally:
+            self._sessions.remove(session)
+
+    def _make_room(self, peer: Peer) -> None:
+        own = [session for session in self._sessions if session.peer.who == peer.who]
+        crowd = own if len(own) >= _SESSIONS_EACH else self._sessions if len(self._sessions) >= _SESSIONS_MOST else []
+        if crowd:
+            min(crowd, key=lambda session: session.heard_s).drop("too many connections: this was silent longest")
+
+    async def _answer(self, session: Session, request: Request) -> dict[str, Any]:
+        """Do what is asked, or say why not. What the controller refuses, it records itself."""
+        peer = session.peer
+        refusal = may_not(peer, request.do) or self._take_helm(peer, request)
+        if not refusal and request.do not in TABLE:
+            return self._run_errand(session, request)
+        try:
+            command = self._command(peer, request) if not refusal else None
+        except InputError as error:
+            refusal, command = str(error), None
+        if command is None:
+            self._refusals.record(peer.who, request.do, refusal)
+            return {"ok": False, "refused": refusal}
+        refusal = await self._obeyed(command)
+        if refusal:
+            return {"ok": False, "refused": refusal}
+        return {"ok": True, "state": self._picture.status()["state"]}
+
+    def _take_helm(self, peer: Peer, request: Request) -> str:
+        if request.do in FREE:
+            return ""
+        former = self._helm.holder(self._now())
+        refusal = self._helm.claim(peer.who, request.take_over, self._now())
+        if not refusal and former != peer.who:
+            self._tell({"kind": "commander", "who": peer.who, "former": former or None, "why": request.why})
+            for session in self._sessions:
+                if session.peer.who == former:
+                    session.notice(
+                        f"{peer.who} has taken over the command" + (f": {request.why}" * bool(request.why))
+                    )
+        return refusal
+
+    def _run_errand(self, session: Session, request: Request) -> dict[str, Any]:
+        who = session.peer.who
+        match request.do:
+            case "watch":
+                session.watch(request.period_s)
+            case "release":
+                self._helm.release(who)
+                self._tell({"kind": "commander", "who": None, "former": who, "why": request.why})
+            case "quiet":
+                self._tell({"kind": "alarms_acknowledged", "who": who, "why": request.why})
+        return {"ok": True, "status": self.status()}
+
+    def _command(self, peer: Peer, request: Request) -> Command:
+        """The command of a request. Raises InputError for gains or an experiment that are none."""
+        kind = next(kind for kind in KINDS if kind == request.do)
+        loop = None if request.loop is None else self._new_loop(request.loop)
+        experiment = None if request.experiment is None else parse(request.experiment, ExperimentSpec, "tune")
+        value = math.nan if request.value is None else request.value
+        return Command(kind, peer.who, request.why, value, request.text, loop, experiment, next(self._numbers))
+
+    def _new_loop(self, changes: dict[str, bool | float]) -> LoopConfig:
+        if "setpoint_um" in changes:
+            raise InputError("gains: setpoint_um: use the command setpoint")
+        return parse({**self._hooks.loop().model_dump(), **changes}, LoopConfig, "gains")
+
+    async def _obeyed(self, command: Command) -> str:
+        """Why the tick that took the command up refused it; empty if it obeyed."""
+        future: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._waiting[command.number] = future
+        self._hooks.ask(command)
+        try:
+            return await asyncio.wait_for(future, _ANSWER_S)
+        except TimeoutError:
+            return f"no tick took it up within {_ANSWER_S:g} s; it may still be obeyed"
+        finally:
+            self._waiting.pop(command.number, None)
