@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from membrane_ctrl.camera_config import AravisCamera, UvcCamera
 from membrane_ctrl.device_config import DevicesConfig as DevicesConfig
 from membrane_ctrl.port_config import AlarmsConfig, PortConfig
 from membrane_ctrl.section import Section as Section
@@ -224,6 +225,8 @@ class RecordingConfig(Section):
     logs_dir: str = "logs"
     min_free_mb: Annotated[float, Field(ge=1)] = 500.0
     thumbnails: bool = True
+    raw_every_cycles: Annotated[int, Field(ge=0, le=1_000_000)] = 0  # keep the frames of every n-th cycle; 0: of none
+    raw_before_fault_cycles: Annotated[int, Field(ge=0, le=20)] = 2  # and always of the last before a fault
     segment_s: Annotated[float, Field(ge=10, le=86_400)] = 3600.0  # a crash leaves at most this much unoptimised
     quiet_hz: Annotated[float, Field(ge=0.1, le=200)] = 10.0  # rows for the viewer while nothing happens
     keep_gb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None  # old runs beyond this are deleted; none: never
@@ -256,4 +259,8 @@ class Config(Section):
                 f"loop.setpoint_um = {self.loop.setpoint_um:g} is outside the limits "
                 f"({limits.displacement_min_um:g} .. {limits.displacement_max_um:g} um)"
             )
+        if self.devices is not None and isinstance(self.devices.camera, AravisCamera | UvcCamera):
+            bits = self.devices.camera.bits
+            if bits != self.optics.camera.bits:
+                raise ValueError(f"optics.camera.bits = {self.optics.camera.bits}, but devices.camera gives {bits}")
         return self

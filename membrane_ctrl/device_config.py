@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from membrane_ctrl.camera_config import CameraTable, FolderCamera, ScreenTable
 from membrane_ctrl.section import Section
 
 UnitId = Annotated[int, Field(ge=1, le=247)]
@@ -143,6 +144,8 @@ class DevicesConfig(Section):
     vent: ModbusMap | None = None
     barometer: BarometerDriver | None = None
     thermometer: ModbusMap | None = None
+    camera: CameraTable | None = None
+    screen: ScreenTable | None = None
 
     @model_validator(mode="after")
     def _board_or_roles(self) -> DevicesConfig:
@@ -158,6 +161,14 @@ class DevicesConfig(Section):
             section = getattr(self, role)
             if isinstance(section, ModbusMap) and not _is_fraction(section.limits or section.value):
                 raise ValueError(f"{role}: value and limits of an actuator are fractions within 0..1")
+        return self
+
+    @model_validator(mode="after")
+    def _camera_sees_a_screen(self) -> DevicesConfig:
+        if self.camera is None and self.screen is not None:
+            raise ValueError("[devices.screen] needs a [devices.camera] that looks at it")
+        if self.camera is not None and (self.screen is None) != isinstance(self.camera, FolderCamera):
+            raise ValueError("a camera needs a [devices.screen]; a folder of frames needs none")
         return self
 
     def roles(self) -> dict[str, AnyDriver]:

@@ -6,19 +6,20 @@ a camera, over the twin's renderer and over a fake in a test.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.roles import Frame, Pattern, Screen
+from firmware_iface.roles import Pattern, Screen
+from membrane_ctrl.acquisition.exposures import CycleCamera as CycleCamera
+from membrane_ctrl.acquisition.exposures import CycleClock as CycleClock
+from membrane_ctrl.acquisition.exposures import Exposures, Laser
 from membrane_ctrl.acquisition.frames import FrameWriter, Pixels
+from membrane_ctrl.acquisition.stages import Stage, StageError, during
 from membrane_ctrl.estimate import ShapeEstimate
-
-Stage = Literal["screen", "camera", "reconstruction"]
 
 # A full cycle may be spoilt by a door or by the mirror still moving: take two more at once. Three in a row mean
 # that there is no mirror to be seen (flat, dark, covered), which a pause does not worsen.
@@ -27,34 +28,6 @@ FIRST_PAUSE_S = 1.0
 LONGEST_PAUSE_S = 60.0  # within a minute of the cause being gone the shape is measured again
 
 TRACKING_LOST = "tracking lost"
-
-
-class CycleClock(Protocol):
-    """The run's clock, and a way to wait on it."""
-
-    def now(self) -> float:
-        """Seconds since the run's start."""
-        ...
-
-    def sleep(self, duration_s: float) -> None:
-        """Return after `duration_s` on this clock."""
-        ...
-
-
-class CycleCamera(Protocol):
-    """A camera that can write a frame where it is wanted."""
-
-    def grab(self, out: Pixels | None = None) -> Frame:
-        """One exposure, in `out` if the camera is able to. Raises LinkError."""
-        ...
-
-
-class Laser(Protocol):
-    """Knows the displacement at a moment of the near past."""
-
-    def at(self, time_s: float) -> float:
-        """Displacement in um, NaN if unknown."""
-        ...
 
 
 class Reconstructor(Protocol):
@@ -128,11 +101,9 @@ class ShapeCycle:
         laser: Laser,
         stopping: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._camera = camera
-        self._screen = screen
+        self._exposures = Exposures(camera, screen, frames, clock, laser, plan.frame_interval_s)
         self._reconstructor = reconstructor
         self._plan = plan
-        self._frames = frames
         self._clock = clock
         self._laser = laser
         self._stopping = stopping
@@ -150,7 +121,7 @@ class ShapeCycle:
         self._cycle += 1
         try:
             estimate = self._measure("full" if self._full_next else "fringes")
-        except _StageError as error:
+        except StageError as error:
             self._failed_in_a_row += 1
             return CycleFailed(self._cycle, error.stage, str(error), pause_s(self._failed_in_a_row))
         if estimate is None:
@@ -169,36 +140,18 @@ class ShapeCycle:
             self._full_next = True
 
     def _measure(self, kind: Literal["full", "fringes"]) -> ShapeEstimate | None:
-        pixels: list[Pixels] = []
-        time_s: list[float] = []
-        for pattern in self._plan.full if kind == "full" else self._plan.fringes:
-            if self._stopping():
-                return None
-            frame = self._expose(pattern, time_s[-1] if time_s else None)
-            pixels.append(frame.pixels)
-            time_s.append(frame.time_s)
+        patterns = self._plan.full if kind == "full" else self._plan.fringes
+        frames = self._exposures.take(patterns, self._cycle, self._stopping)
+        if frames is None:
+            return None
         arrived_s = self._clock.now()
         # asked again for all: when a frame arrives, the second half of the readings around it is still to come
-        displacement_um = np.array([self._laser.at(moment_s) for moment_s in time_s])
-        with _during("reconstruction"):
+        displacement_um = np.array([self._laser.at(frame.time_s) for frame in frames])
+        time_s = np.array([frame.time_s for frame in frames])
+        with during("reconstruction"):
             reconstruct = self._reconstructor.full if kind == "full" else self._reconstructor.fringes
-            estimate = reconstruct(pixels, np.array(time_s), displacement_um)
+            estimate = reconstruct([frame.pixels for frame in frames], time_s, displacement_um)
         return replace(estimate, latency_s=self._clock.now() - arrived_s, cycle=self._cycle)
-
-    def _expose(self, pattern: Pattern, last_s: float | None) -> Frame:
-        with _during("screen"):
-            self._screen.show(pattern)
-        if last_s is not None:
-            self._clock.sleep(max(0.0, last_s + self._plan.frame_interval_s - self._clock.now()))
-        slot = self._frames.begin()
-        with _during("camera"):
-            frame = self._camera.grab(out=slot.pixels)
-            if frame.pixels is not slot.pixels:
-                if frame.pixels.shape != slot.pixels.shape or frame.pixels.dtype != slot.pixels.dtype:
-                    raise ValueError(_mismatch(frame.pixels, slot.pixels))
-                slot.pixels[...] = frame.pixels
-        slot.commit(pattern.name, frame.time_s, self._laser.at(frame.time_s), self._cycle)
-        return Frame(slot.pixels, frame.time_s)
 
 
 def pause_s(failures: int) -> float:
@@ -206,25 +159,3 @@ def pause_s(failures: int) -> float:
     if failures <= 0:
         return 0.0
     return float(min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** min(failures - 1, 32)))
-
-
-class _StageError(Exception):
-    def __init__(self, stage: Stage, message: str) -> None:
-        super().__init__(message)
-        self.stage = stage
-
-
-@contextmanager
-def _during(stage: Stage) -> Iterator[None]:
-    """Whatever a device or the numerics raise becomes one kind of error that names where it happened."""
-    try:
-        yield
-    except Exception as error:
-        raise _StageError(stage, f"{type(error).__name__}: {error}") from error
-
-
-def _mismatch(got: Pixels, wanted: Pixels) -> str:
-    return (
-        f"camera gave {got.shape[1]} x {got.shape[0]} {got.dtype}, "
-        f"the configuration says {wanted.shape[1]} x {wanted.shape[0]} {wanted.dtype}"
-    )

@@ -1,0 +1,206 @@
+"""The frames of a cycle, with everything overlapping that may.
+
+While a pattern settles on the screen, the frame of the one before is transferred and stored; while the first pattern
+of the next cycle settles, this one is reconstructed. The producer is the camera's own thread (aravis fills buffers
+outside of Python), the consumer is the cycle.
+
+    screen   | settle 1     | expose 1 | settle 2             | expose 2 | settle 1 (ahead)
+    camera   |              |          | transfer 1 | store 1 |          | transfer 2 | store 2
+    cycle    |                                                                       | reconstruct
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Protocol, runtime_checkable
+
+from firmware_iface.drivers.frame_lost import TRIES, FrameLostError
+from firmware_iface.roles import Frame, Pattern, Screen
+from membrane_ctrl.acquisition.frames import FrameSlot, FrameWriter, Pixels
+from membrane_ctrl.acquisition.stages import during
+
+
+class CycleClock(Protocol):
+    """The run's clock, and a way to wait on it."""
+
+    def now(self) -> float:
+        """Seconds since the run's start."""
+        ...
+
+    def sleep(self, duration_s: float) -> None:
+        """Return after `duration_s` on this clock."""
+        ...
+
+
+class CycleCamera(Protocol):
+    """A camera that can write a frame where it is wanted."""
+
+    def grab(self, out: Pixels | None = None) -> Frame:
+        """One exposure, in `out` if the camera is able to. Raises LinkError."""
+        ...
+
+
+@runtime_checkable
+class ExposingCamera(Protocol):
+    """A camera whose transfer may overlap with the next pattern (`firmware_iface.drivers.camera_aravis`)."""
+
+    def expose(self, out: Pixels | None = None) -> None:
+        """Trigger, and return when the exposure is over. Raises LinkError."""
+        ...
+
+    def fetch(self) -> Frame:
+        """The frame of the last `expose`. Raises FrameLostError, LinkError."""
+        ...
+
+
+@runtime_checkable
+class SettlingScreen(Protocol):
+    """A screen that leaves its caller free while a pattern settles (`firmware_iface.drivers.screen_pygame`)."""
+
+    def begin(self, pattern: Pattern) -> None:
+        """Send the pattern to the display. Raises LinkError."""
+        ...
+
+    def wait(self) -> None:
+        """Return when what was begun is lit and settled."""
+        ...
+
+
+class Laser(Protocol):
+    """Knows the displacement at a moment of the near past."""
+
+    def at(self, time_s: float) -> float:
+        """Displacement in um, NaN if unknown."""
+        ...
+
+
+class Exposures:
+    """Takes the frames of a cycle into the ring of frames.
+
+    Parameters
+    ----------
+    camera, screen, laser
+        What it works with; a camera or a screen that knows only its plain role is used step by step.
+    frames : FrameWriter
+        Where the pixels go.
+    clock : CycleClock
+        The run's clock.
+    interval_s : float
+        Least time between the starts of two exposures.
+    """
+
+    def __init__(
+        self,
+        camera: CycleCamera,
+        screen: Screen,
+        frames: FrameWriter,
+        clock: CycleClock,
+        laser: Laser,
+        interval_s: float,
+    ) -> None:
+        self._camera: ExposingCamera = camera if isinstance(camera, ExposingCamera) else _Grabbing(camera)
+        self._screen: SettlingScreen = screen if isinstance(screen, SettlingScreen) else _Showing(screen)
+        self._looks_ahead = isinstance(screen, SettlingScreen)
+        self._frames, self._clock, self._laser = frames, clock, laser
+        self._interval_s = interval_s
+
+    def take(self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]) -> list[Frame] | None:
+        """Frames of these patterns, in their order; None if `stopping` said so before an exposure.
+
+        Raises
+        ------
+        StageError
+            "screen" or "camera", and what went wrong there.
+        """
+        taken: list[Frame] = []
+        pending: tuple[Pattern, FrameSlot] | None = None
+        exposed_s = -self._interval_s
+        for pattern in patterns:
+            if stopping():
+                return None
+            with during("screen"):
+                self._screen.begin(pattern)
+            if pending is not None:
+                taken.append(self._store(*pending, cycle, then=pattern))
+                exposed_s = taken[-1].time_s
+            with during("screen"):
+                self._screen.wait()
+            self._clock.sleep(max(0.0, exposed_s + self._interval_s - self._clock.now()))
+            slot = self._frames.begin()
+            with during("camera"):
+                self._camera.expose(slot.pixels)
+            pending = pattern, slot
+        if pending is not None:
+            ahead = patterns[0] if self._looks_ahead else None  # both kinds of cycle begin with the same pattern
+            if ahead is not None:
+                with during("screen"):
+                    self._screen.begin(ahead)
+            taken.append(self._store(*pending, cycle, then=ahead))
+        return taken
+
+    def _store(self, pattern: Pattern, slot: FrameSlot, cycle: int, then: Pattern | None) -> Frame:
+        """Fetch what was exposed with `pattern` into its slot; `then` is on the screen already, and afterwards."""
+        frame = self._fetch(pattern, slot, then)
+        if frame.pixels is not slot.pixels:
+            with during("camera"):
+                if frame.pixels.shape != slot.pixels.shape or frame.pixels.dtype != slot.pixels.dtype:
+                    raise ValueError(_mismatch(frame.pixels, slot.pixels))
+            slot.pixels[...] = frame.pixels
+        slot.commit(pattern.name, frame.time_s, self._laser.at(frame.time_s), cycle)
+        return Frame(slot.pixels, frame.time_s)
+
+    def _fetch(self, pattern: Pattern, slot: FrameSlot, then: Pattern | None) -> Frame:
+        """The frame; one that was lost is taken again, with its own pattern on the screen."""
+        for tried in range(1, TRIES + 1):
+            with during("camera"):
+                try:
+                    frame = self._camera.fetch()
+                    break
+                except FrameLostError:
+                    if tried == TRIES:
+                        raise
+            with during("screen"):
+                self._screen.begin(pattern)
+                self._screen.wait()
+            with during("camera"):
+                self._camera.expose(slot.pixels)
+        if tried > 1 and then is not None:
+            with during("screen"):
+                self._screen.begin(then)
+        return frame
+
+
+class _Grabbing:
+    """A camera that is triggered and read in one."""
+
+    def __init__(self, camera: CycleCamera) -> None:
+        self._camera = camera
+        self._frame: Frame | None = None
+
+    def expose(self, out: Pixels | None = None) -> None:
+        self._frame = self._camera.grab(out=out)
+
+    def fetch(self) -> Frame:
+        assert self._frame is not None  # after an exposure
+        frame, self._frame = self._frame, None
+        return frame
+
+
+class _Showing:
+    """A screen that returns when the pattern is settled."""
+
+    def __init__(self, screen: Screen) -> None:
+        self._screen = screen
+
+    def begin(self, pattern: Pattern) -> None:
+        self._screen.show(pattern)
+
+    def wait(self) -> None:
+        return
+
+
+def _mismatch(got: Pixels, wanted: Pixels) -> str:
+    return (
+        f"camera gave {got.shape[1]} x {got.shape[0]} {got.dtype}, "
+        f"the configuration says {wanted.shape[1]} x {wanted.shape[0]} {wanted.dtype}"
+    )
