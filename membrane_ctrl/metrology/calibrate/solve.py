@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from membrane_ctrl.metrology.calibrate.averaging import averaged
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, Bench, bench_at, pose_derivatives
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, camera_rays
 from membrane_ctrl.metrology.calibrate.separable import COMMON, Equations, SetState, Trust, Witness, equations, rim_of
@@ -21,7 +22,7 @@ FloatArray = NDArray[np.float64]
 MAX_ITERATIONS = 25
 _SETTLED = 1e-2  # of each parameter's own standard deviation: no reader of the result sees less
 _NEARLY = 0.1  # likewise: the next step is far below the noise
-_FEW = 6000  # bins of a set: a hundred times the unknowns
+_FEW = 4000  # points of a set: a hundred times its unknowns
 _START_SAG_MM = 40.0
 _FREE_RING_MM = 1e3  # the ring's form is not known beforehand
 
@@ -58,7 +59,7 @@ class Solution:
     Attributes
     ----------
     problem : Problem
-        As given.
+        As given, many bins averaged.
     values : (len(NAMES),) array
         Parameters, 0 for the stated bench.
     common : (COMMON,) array
@@ -132,14 +133,14 @@ def step(sums: FloatArray, sigmas: FloatArray) -> Step:
 def solve(
     problem: Problem, progress: Callable[[int, float], None] | None = None, start: Solution | None = None
 ) -> Solution:
-    """Calibrate. Sets of very many bins are solved with some of them first: the last steps alone need them all.
+    """Calibrate. Sets of very many bins are solved with some of them first, and then with means of them all.
 
     Parameters
     ----------
     progress : callable, optional
         Told the number of the step and its largest change in standard deviations.
     start : Solution, optional
-        Of the same sets, or of some of their bins: where to begin.
+        Of the same sets: where to begin.
 
     Raises
     ------
@@ -151,6 +152,8 @@ def solve(
     if start is None and max(phases.sigma_mm.size for phases in problem.sets) > 2 * _FEW:
         some = replace(problem, sets=tuple(phases.thinned(_FEW) for phases in problem.sets))
         start = solve(some, progress)
+        pairs = zip(problem.sets, start.states, strict=True)
+        problem = replace(problem, sets=tuple(averaged(start.bench, *pair, _FEW) for pair in pairs))
     states = start.states if start is not None else tuple(_first(problem, phases) for phases in problem.sets)
     common = start.common if start is not None else _common(states)
     trust = tuple(Trust.full(phases) for phases in problem.sets)
