@@ -14,6 +14,7 @@ from membrane_ctrl.config import Config
 from membrane_ctrl.config_file import load
 from membrane_ctrl.durations import parse_duration_s
 from membrane_ctrl.errors import CommandError, Exit, InputError
+from membrane_ctrl.review.cli import add_commands as add_review_commands
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -327,3 +328,6 @@ def _started(config: Config, from_flat: bool) -> Config:
 
 def _config(path: Path | None) -> Config:
     return Config() if path is None else load(path, Config)
+
+
+add_review_commands(app)

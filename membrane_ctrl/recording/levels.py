@@ -66,16 +66,20 @@ def first_level(ticks: Mapping[str, Column]) -> Columns:
 
 
 def coarser_level(level: Mapping[str, Column], window_s: float) -> Columns:
-    """A level of longer windows out of a finer one; means are weighted with the number of ticks."""
+    """A level of longer windows out of a finer one; means are weighted with the number of ticks.
+
+    Signals and codes that the finer one does not have, the coarser one has not either.
+    """
     if not level["time_s"].size:
-        return {name: np.empty(0) for name in NAMES}
+        return {name: np.empty(0) for name in level}
     starts, window = _windows(level["time_s"], window_s)
     coarse: Columns = {"time_s": window, "rows": np.add.reduceat(level["rows"], starts)}
     coarse |= _codes(level, starts)
-    for name in SIGNALS:
-        coarse[f"min_{name}"] = np.fmin.reduceat(level[f"min_{name}"], starts)
-        coarse[f"mean_{name}"] = _mean(level[f"mean_{name}"], level["rows"], starts)
-        coarse[f"max_{name}"] = np.fmax.reduceat(level[f"max_{name}"], starts)
+    for name, values in level.items():
+        if name.startswith("mean_"):
+            coarse[name] = _mean(values, level["rows"], starts)
+        elif name.startswith(("min_", "max_")):
+            coarse[name] = (np.fmin if name.startswith("min_") else np.fmax).reduceat(values, starts)
     return coarse
 
 
@@ -97,9 +101,10 @@ def _counts(starts: NDArray[np.intp], size: int) -> Column:
 
 
 def _codes(table: Mapping[str, Column], starts: NDArray[np.intp]) -> Columns:
-    last = np.append(starts[1:], table["fault"].size) - 1
-    codes = {name: np.asarray(table[name], dtype=np.float64)[last] for name in CODES}
-    return codes | {"fault": np.fmax.reduceat(table["fault"], starts)}
+    size = next(iter(table.values())).size
+    last = np.append(starts[1:], size) - 1
+    codes = {name: np.asarray(table[name], dtype=np.float64)[last] for name in CODES if name in table}
+    return codes | ({"fault": np.fmax.reduceat(table["fault"], starts)} if "fault" in table else {})
 
 
 def _mean(values: Column, weights: Column, starts: NDArray[np.intp]) -> Column:
@@ -109,4 +114,4 @@ def _mean(values: Column, weights: Column, starts: NDArray[np.intp]) -> Column:
     base = np.where(there, values, 0.0)[starts]
     offset = np.repeat(base, np.diff(np.append(starts, values.size)))
     summed = np.add.reduceat(np.where(there, (values - offset) * weights, 0.0), starts)
-    return np.where(total > 0, base + summed / np.maximum(total, 1e-300), np.nan)
+    return np.where(total > 0, base + summed / np.where(total > 0, total, 1.0), np.nan)

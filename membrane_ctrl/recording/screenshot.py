@@ -13,7 +13,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -50,6 +50,14 @@ def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:
     with _viewer() as viewer:
         viewer.open(segments)
         _show_tab(viewer, tab)
+        viewer.set_time("run_time", play_state="following")
+        return _at_rest(viewer)
+
+
+def screenshot_of(files: Sequence[Path]) -> bytes:
+    """PNG of recordings as they open, at their end. Raises RuntimeError as `screenshot`."""
+    with _viewer() as viewer:
+        viewer.open([str(path.resolve()) for path in files])
         viewer.set_time("run_time", play_state="following")
         return _at_rest(viewer)
 

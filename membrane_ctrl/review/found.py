@@ -16,6 +16,11 @@ from membrane_ctrl.review.steps import confidence, differences, local_sigma, ste
 Column = NDArray[np.float64]
 Level = dict[str, Column]
 
+# Columns of the 1 s level that are looked at.
+LEVEL_COLUMNS = (
+    "state", "mean_ambient_pressure_pa", "mean_flow_um_per_s", "mean_feedforward_um_per_s", "min_displacement_um",
+    "mean_displacement_um", "max_displacement_um", "max_displacement_quality", "max_lateness_ms", "mean_error_um",
+)  # fmt: skip
 # A door is 20 Pa, weather within two seconds a few Pa (gusty: 1.8 Pa, 1 sigma).
 DOOR_LEAST_PA = 6.0
 DOOR_LEAST_SIGMAS = 5.5

@@ -94,25 +94,32 @@ class Run:
             if block["mono_s"].size:
                 yield block
 
-    def level(self, window_s: float, start_s: float = -np.inf, end_s: float = np.inf) -> Block:
+    def level(
+        self,
+        window_s: float,
+        start_s: float = -np.inf,
+        end_s: float = np.inf,
+        names: Sequence[str] = LEVEL_NAMES,
+    ) -> Block:
         """Overview: least, mean and greatest of each signal in windows of 1, 10 or 60 s (`recording.levels`).
 
         What is not in the table of the level is made from the next finer one, in the end from the ticks.
         """
+        names = tuple(dict.fromkeys(("time_s", "rows", *names)))
         finer = {coarse: fine for fine, coarse in pairwise(WINDOWS_S)}
         if window_s not in WINDOWS_S:
             raise ValueError(f"levels are {', '.join(f'{w:g}' for w in WINDOWS_S)} s, not {window_s:g}")
         table = level_table(window_s)
-        blocks = list(self._table_blocks(table, "time_s", LEVEL_NAMES, start_s, end_s))
+        blocks = list(self._table_blocks(table, "time_s", names, start_s, end_s))
         until_s = float(blocks[-1]["time_s"][-1]) + window_s if blocks else start_s
         if self.summary is None or not blocks:
             if window_s in finer:
-                blocks.append(coarser_level(self.level(finer[window_s], until_s, end_s), window_s))
+                blocks.append(coarser_level(self.level(finer[window_s], until_s, end_s, names), window_s))
             else:
                 blocks += [first_level(block) for block in self.tick_blocks(TICK_FIELDS, until_s, end_s)]
         if not blocks:
-            return {name: np.empty(0) for name in LEVEL_NAMES}
-        return {name: np.concatenate([block[name] for block in blocks]) for name in LEVEL_NAMES}
+            return {name: np.empty(0) for name in names}
+        return {name: np.concatenate([block[name] for block in blocks]) for name in names}
 
     def shapes(self) -> Shapes:
         """Every measured figure of the run."""
@@ -163,10 +170,11 @@ def open_run(path: Path | str) -> Run:
         notes += [f"{name}: missing; what it held is left out" for name in missing_files(files)]
     if not rrd_reader.segments(folder):
         notes.append("no Rerun segment: there is nothing for the viewer but what the tables hold")
-    return Run(folder, read_config(folder, notes), events, summary, _origin(folder, events), notes)
+    return Run(folder, read_config(folder, notes), events, summary, origin_of(folder, events), notes)
 
 
-def _origin(folder: Path, events: Sequence[dict[str, Any]]) -> datetime:
+def origin_of(folder: Path, events: Sequence[dict[str, Any]]) -> datetime:
+    """UTC at 0 s of a run: from its first event that says both, else from the folder's name or age."""
     for event in events:
         try:
             moment = datetime.fromisoformat(event["time_utc"])

@@ -1,0 +1,204 @@
+"""Everything a report says of a run, computed once; `report_json` and `report_html` only write it down."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.errors import InputError
+from membrane_ctrl.names import State
+from membrane_ctrl.review.allan import Allan, allan_deviation
+from membrane_ctrl.review.anomalies import Anomaly, anomalies
+from membrane_ctrl.review.drift import Slope, slope
+from membrane_ctrl.review.found import LEVEL_COLUMNS, Found, find_events
+from membrane_ctrl.review.hold_pass import KEPT_AWAY, READING, TRUE, HoldPass, hold_pass
+from membrane_ctrl.review.psd import Spectrum, power_spectrum
+from membrane_ctrl.review.run import Block, Run
+from membrane_ctrl.review.shape_review import ShapeReview, review_shapes
+from membrane_ctrl.review.windows import WindowStatistics, describe, window_means
+
+Column = NDArray[np.float64]
+
+WINDOWS_S = (1, 4, 60)
+# Decades of frequency whose RMS is given; the last ends at half the tick rate.
+BANDS_HZ = (1e-4, 1e-3, 1e-2, 0.1, 1.0)
+# A level with about this many rows makes a picture.
+_PICTURE_ROWS = 9000
+# The slope is fitted to minutes, of a short run to seconds.
+_SLOPE_MINUTES_FROM_S = 3600.0
+# A missed tick or a glitch is bridged by a straight line, or no segment of a spectrum would be whole.
+FILLED_S = 0.5
+# A day has slower and larger motions than any hold; longer means say no more than the slope.
+_ALLAN_LONGEST_S = 1e5
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Statistics of one error: `reading` (in the loop) or `true` (the twin's centre).
+
+    Attributes
+    ----------
+    windows : tuple of WindowStatistics
+        At `WINDOWS_S`.
+    seconds_um : (2, n) array
+        Times and means of the 1 s windows.
+    allan : Allan
+    spectrum : Spectrum
+    drift : Slope
+        um per hour.
+    """
+
+    windows: tuple[WindowStatistics, ...]
+    seconds_um: Column
+    allan: Allan
+    spectrum: Spectrum
+    drift: Slope
+
+
+@dataclass(frozen=True, slots=True)
+class Benefit:
+    """Feed-forward: std of the 1 s means as held, and as they would have been without it (um)."""
+
+    with_um: float
+    without_um: float
+
+
+@dataclass(frozen=True, slots=True)
+class Analysis:
+    """What is known of a run.
+
+    Attributes
+    ----------
+    run : Run
+    part_s : tuple
+        Part of the run that was asked for.
+    ticks : HoldPass
+    level : dict
+        Overview for the pictures; its windows are `level_s` long.
+    level_s : float
+    reading, true : Series or None
+        None when there is nothing settled (or, of `true`, on a real bench).
+    benefit : Benefit or None
+    leak_um_per_s : tuple
+        Median, least and greatest minute of the leak estimate while held.
+    found : tuple of Found
+    shape : ShapeReview or None
+    anomalies : tuple of Anomaly
+    """
+
+    run: Run
+    part_s: tuple[float, float]
+    ticks: HoldPass
+    level: Block
+    level_s: float
+    reading: Series | None
+    true: Series | None
+    benefit: Benefit | None
+    leak_um_per_s: tuple[float, float, float]
+    found: tuple[Found, ...]
+    shape: ShapeReview | None
+    anomalies: tuple[Anomaly, ...]
+
+
+def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> Analysis:
+    """Analyse a run or a part of it.
+
+    Parameters
+    ----------
+    run : Run
+    start_s, end_s : float
+        Seconds of the run.
+
+    Raises
+    ------
+    InputError
+        If there is no tick in it.
+    """
+    seconds = run.level(1.0, start_s, end_s, LEVEL_COLUMNS)
+    if not seconds["time_s"].size:
+        raise InputError(f"{run.folder}: nothing to report: no telemetry in this part of the run")
+    span_s = (float(seconds["time_s"][0]), float(seconds["time_s"][-1]) + 1.0)
+    ticks = hold_pass(run, span_s, (start_s, end_s))
+    shapes = run.shapes()
+    shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
+    found = tuple(find_events(seconds, shapes))
+    held = _held_at(seconds, shapes.time_s)
+    mirror = run.config.optics.mirror
+    level_s = _level_for(span_s[1] - span_s[0])
+    level = run.level(level_s, start_s, end_s)
+    reading = _series(run, ticks, READING)
+    true = _series(run, ticks, TRUE)
+    benefit = _benefit(run, ticks, true is not None)
+    shape = review_shapes(shapes, held, mirror.analysis_radius_mm / mirror.radius_mm)
+    leak = _leak(level)
+    odd = anomalies(run, ticks, reading, true, leak[0], found, shape)
+    return Analysis(
+        run, (start_s, end_s), ticks, level, level_s, reading, true, benefit, leak, found, shape, odd
+    )  # fmt: skip
+
+
+def _series(run: Run, ticks: HoldPass, which: int) -> Series | None:
+    rate_hz, band_um = run.config.loop.rate_hz, run.config.limits.band_um
+    second, counts, sums = ticks.seconds
+    moments = ticks.raw_reading if which == READING else ticks.raw_true
+    if not moments.count:
+        return None
+    means = {w: window_means(second, counts, sums[which], w, rate_hz) for w in WINDOWS_S}
+    grid = ticks.reading_um if which == READING else ticks.true_um
+    grid = fill_short_gaps(grid[_first(grid) : grid.size - _first(grid[::-1])], round(FILLED_S * rate_hz))
+    longest = max(1, min(grid.size // 4, round(_ALLAN_LONGEST_S * rate_hz)))
+    lengths = 2 ** np.arange(int(np.log2(longest)) + 1)
+    minutes = ticks.hold_s >= _SLOPE_MINUTES_FROM_S
+    return Series(
+        windows=tuple(describe(means[w][1], w, band_um) for w in WINDOWS_S),
+        seconds_um=np.stack(means[1]),
+        allan=allan_deviation(grid, 1 / rate_hz, lengths),
+        spectrum=power_spectrum(grid, rate_hz),
+        drift=slope(*means[60 if minutes else 1]),
+    )
+
+
+def fill_short_gaps(values: NDArray[np.float32], most: int) -> NDArray[np.float32]:
+    """Gaps of at most `most` values filled with straight lines; longer ones stay NaN."""
+    gap = ~np.isfinite(values)
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], gap, [False])).astype(np.int8)))
+    filled = values.copy()
+    for start, end in edges.reshape(-1, 2):
+        if end - start <= most and start > 0 and end < values.size:
+            filled[start:end] = np.linspace(values[start - 1], values[end], end - start + 2)[1:-1]
+    return filled
+
+
+def _first(grid: NDArray[np.float32]) -> int:
+    """Places in front of the first value."""
+    return int(np.argmax(np.isfinite(grid)))
+
+
+def _benefit(run: Run, ticks: HoldPass, true: bool) -> Benefit | None:
+    second, counts, sums = ticks.seconds
+    error = sums[TRUE if true else READING]
+    _, held = window_means(second, counts, error, 1, run.config.loop.rate_hz)
+    _, without = window_means(second, counts, error + sums[KEPT_AWAY], 1, run.config.loop.rate_hz)
+    return Benefit(float(held.std()), float(without.std())) if held.size else None
+
+
+def _leak(level: Block) -> tuple[float, float, float]:
+    leak = level["mean_leak_um_per_s"][level["state"] == State.HOLD]
+    leak = leak[np.isfinite(leak)]
+    if not leak.size:
+        return (math.nan, math.nan, math.nan)
+    return float(np.median(leak)), float(leak.min()), float(leak.max())
+
+
+def _held_at(seconds: Block, time_s: Column) -> NDArray[np.bool_]:
+    """Whether the second that holds each time, and the one before, were in `hold`."""
+    place = np.clip(np.searchsorted(seconds["time_s"], time_s, side="right") - 1, 0, None)
+    hold = seconds["state"] == State.HOLD
+    return np.asarray(hold[place] & hold[np.maximum(place - 1, 0)])
+
+
+def _level_for(span_s: float) -> float:
+    return next((w for w in (1.0, 10.0) if span_s / w <= _PICTURE_ROWS), 60.0)

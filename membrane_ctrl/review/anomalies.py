@@ -1,0 +1,87 @@
+"""What is not as it should be, by name and with the figure that says so."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from membrane_ctrl.review.drift import Slope
+from membrane_ctrl.review.found import Found
+from membrane_ctrl.review.hold_pass import HoldPass
+from membrane_ctrl.review.run import Run
+from membrane_ctrl.review.shape_review import ShapeReview
+from membrane_ctrl.review.windows import WindowStatistics
+
+# 95 % in band is what noise alone leaves of single ticks; of seconds a hold keeps all.
+_IN_BAND_LEAST = 0.999
+_BIAS_MOST_UM = 0.1
+_LATE_P99_MOST_MS = 5.0
+_REJECTED_MOST = 0.02
+# Below this a one-sided pump loses the band (PHYSICS: a mirror that is too tight).
+_LEAK_LEAST_UM_PER_S = 0.4
+# A one-sided pump is at 0 now and then in typical weather (2 % on the twin).
+_SATURATED_MOST = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Anomaly:
+    """One thing: its name, and what was seen."""
+
+    name: str
+    seen: str
+
+
+class _Series(Protocol):
+    @property
+    def windows(self) -> tuple[WindowStatistics, ...]: ...
+    @property
+    def drift(self) -> Slope: ...
+
+
+def anomalies(
+    run: Run,
+    ticks: HoldPass,
+    reading: _Series | None,
+    true: _Series | None,
+    leak_um_per_s: float,
+    found: Sequence[Found],
+    shape: ShapeReview | None,
+) -> tuple[Anomaly, ...]:
+    """All of a run, the gravest first."""
+    odd = [Anomaly("incomplete recording", note) for note in run.notes]
+    faults = [event for event in run.events if event.get("kind") == "fault"]
+    names = Counter(str(event.get("name", "?")) for event in faults)
+    odd += [Anomaly("fault", f"{name}, {count} time{'s' * (count > 1)}") for name, count in names.most_common()]
+    if reading is None:
+        odd.append(Anomaly("never settled", "no tick counts as held: there are no hold statistics"))
+    series = true or reading
+    if series is not None:
+        seconds = series.windows[0]
+        if seconds.count and not seconds.in_band >= _IN_BAND_LEAST:
+            odd.append(Anomaly("band left", f"{100 * seconds.in_band:.3g} % of 1 s means within the band"))
+        if seconds.count and abs(seconds.mean_um) > _BIAS_MOST_UM:
+            odd.append(Anomaly("bias", f"{seconds.mean_um:+.3f} um on average"))
+        if series.drift.significant:
+            odd.append(Anomaly("drift", _of(series.drift, "um/h")))
+    if ticks.missed_ticks:
+        odd.append(Anomaly("missed ticks", f"{ticks.missed_ticks} of {ticks.ticks + ticks.missed_ticks}"))
+    if ticks.lateness_ms.quantile(0.99) > _LATE_P99_MOST_MS:
+        odd.append(Anomaly("late ticks", f"p99 is {ticks.lateness_ms.quantile(0.99):.1f} ms"))
+    if leak_um_per_s < _LEAK_LEAST_UM_PER_S:
+        odd.append(Anomaly("too tight", f"a leak of {leak_um_per_s:.2f} um/s leaves the pump no way to lower"))
+    if ticks.pump.saturated_share > _SATURATED_MOST:
+        odd.append(Anomaly("saturation", f"{100 * ticks.pump.saturated_share:.1f} % of ticks at a limit of the flow"))
+    if shape is not None:
+        if shape.rejected > _REJECTED_MOST * shape.cycles:
+            odd.append(Anomaly("rejected cycles", f"{shape.rejected} of {shape.cycles}"))
+        if shape.disagreement.significant:
+            odd.append(Anomaly("camera and laser part", _of(shape.disagreement, "um/h")))
+    counts = Counter(event.kind for event in found)
+    odd += [Anomaly(kind, f"{count} found") for kind, count in counts.most_common()]
+    return tuple(odd)
+
+
+def _of(drift: Slope, unit: str) -> str:
+    return f"{drift.per_hour:+.3g} {unit} (95 %: {drift.low:+.3g} to {drift.high:+.3g})"

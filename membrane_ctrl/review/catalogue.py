@@ -1,0 +1,204 @@
+"""The runs there are: listed, filtered, shown, pruned."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl.errors import DeviceError, InputError
+from membrane_ctrl.review.folder import is_run, read_config, read_events, read_summary
+from membrane_ctrl.review.run import origin_of
+
+# A file of this name in a run's folder keeps it from being pruned.
+KEPT_FILE = "keep"
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A run in one line.
+
+    Attributes
+    ----------
+    folder : Path
+    started_utc : datetime
+    duration_s : float
+        NaN while it goes on, or if its recorder was killed.
+    std_um : float
+        Of the true centre on the twin, else of the reading.
+    in_band : float
+        Share of 1 s means within the band.
+    faults : int
+    exit : str
+        "done", "trip", ...; "open" without a summary.
+    kp_per_s, ti_s : float
+        Gains.
+    configuration : str
+        First 8 digits of the SHA-256 of `config.toml`.
+    size_mb : float
+    marks : int
+        Annotations.
+    kept : bool
+        A file `keep` is in the folder: prune leaves it.
+    """
+
+    folder: Path
+    started_utc: datetime
+    duration_s: float
+    std_um: float
+    in_band: float
+    faults: int
+    exit: str
+    kp_per_s: float
+    ti_s: float
+    configuration: str
+    size_mb: float
+    marks: int
+    kept: bool
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.folder.name
+
+
+@dataclass(frozen=True, slots=True)
+class Filter:
+    """Which runs are wanted; None: any."""
+
+    since_utc: datetime | None = None
+    until_utc: datetime | None = None
+    least_s: float | None = None
+    most_std_um: float | None = None
+    with_faults: bool | None = None
+    configuration: str | None = None
+    text: str | None = None
+
+    def takes(self, entry: Entry) -> bool:
+        """Whether an entry is wanted."""
+        return (
+            (self.since_utc is None or entry.started_utc >= self.since_utc)
+            and (self.until_utc is None or entry.started_utc < self.until_utc)
+            and (self.least_s is None or entry.duration_s >= self.least_s)
+            and (self.most_std_um is None or entry.std_um <= self.most_std_um)
+            and (self.with_faults is None or (entry.faults > 0) == self.with_faults)
+            and (self.configuration is None or entry.configuration.startswith(self.configuration.lower()))
+            and (self.text is None or self.text in entry.name)
+        )
+
+
+def entries(logs_dir: Path, wanted: Filter | None = None) -> list[Entry]:
+    """The runs of a folder, oldest first. Raises InputError if there is no such folder."""
+    if not logs_dir.is_dir():
+        raise InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
+    found = [entry(folder) for folder in sorted(logs_dir.iterdir()) if is_run(folder)]
+    return [item for item in found if wanted is None or wanted.takes(item)]
+
+
+def entry(folder: Path) -> Entry:
+    """One run's line, from its small files only."""
+    notes: list[str] = []
+    events = read_events(folder, notes)
+    summary: dict[str, Any] = read_summary(folder, notes) or {}
+    loop = read_config(folder, notes).loop
+    std = _number(summary.get("true_std_um"))
+    return Entry(
+        folder=folder,
+        started_utc=origin_of(folder, events),
+        duration_s=_number(summary.get("duration_s")),
+        std_um=std if math.isfinite(std) else _number(summary.get("reading_std_um")),
+        in_band=_number(summary.get("in_band_1s_fraction")),
+        faults=sum(event.get("kind") == "fault" for event in events),
+        exit=str(summary.get("exit", "open")),
+        kp_per_s=loop.kp_per_s,
+        ti_s=loop.ti_s,
+        configuration=_hash(folder / "config.toml"),
+        size_mb=sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6,
+        marks=sum(event.get("kind") == "mark" for event in events),
+        kept=(folder / KEPT_FILE).exists(),
+    )
+
+
+def resolve(run: Path, logs_dir: Path = Path("logs")) -> Path:
+    """The folder meant: a path; a run's name, or the end of it, below `logs`; or `last`.
+
+    Raises
+    ------
+    InputError
+        If no run, or more than one, is meant.
+    """
+    if run.exists() or not logs_dir.is_dir():
+        return run
+    folders = [folder for folder in sorted(logs_dir.iterdir()) if is_run(folder)]
+    if str(run) == "last" and folders:
+        return folders[-1]
+    near = [folder for folder in folders if folder.name == run.name or str(run) in folder.name]
+    if len(near) > 1:
+        raise InputError(f"{run}: more than one run is called so: {', '.join(folder.name for folder in near[:4])}")
+    return near[0] if near else run
+
+
+def to_prune(
+    runs: Sequence[Entry], now_utc: datetime, older_than: timedelta, most_mb: float | None = None
+) -> list[Entry]:
+    """The runs that the retention rule gives up, oldest first.
+
+    Those older than `older_than`, then the oldest until all together are at most `most_mb`. Never a run that is
+    still open, had a fault, carries a mark, or holds a file `keep`: those are what someone may come back for.
+    """
+    free = [run for run in runs if not (run.kept or run.faults or run.marks or run.exit == "open")]
+    gone = [run for run in free if now_utc - run.started_utc > older_than]
+    if most_mb is not None:
+        left_mb = sum(run.size_mb for run in runs) - sum(run.size_mb for run in gone)
+        for run in sorted((r for r in free if r not in gone), key=lambda r: r.started_utc):
+            if left_mb <= most_mb:
+                break
+            gone.append(run)
+            left_mb -= run.size_mb
+    return sorted(gone, key=lambda r: r.started_utc)
+
+
+def prune(runs: Sequence[Entry]) -> None:
+    """Delete the folders of runs. Raises DeviceError at the first that cannot be."""
+    for run in runs:
+        try:
+            shutil.rmtree(run.folder)
+        except OSError as error:
+            raise DeviceError(f"{run.folder}: cannot be deleted ({error.strerror or error})") from None
+
+
+def as_dict(run: Entry) -> dict[str, Any]:
+    """An entry as plain data."""
+    names = [name for name in Entry.__dataclass_fields__ if name not in {"folder", "started_utc"}]
+    table = {name: getattr(run, name) for name in names}
+    return {"name": run.name, "folder": str(run.folder), "started_utc": run.started_utc.isoformat(), **table}
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, (int, float)) else math.nan
+
+
+def _hash(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:8]
+    except OSError:
+        return ""
+
+
+def now_utc() -> datetime:
+    """The wall clock: a run's age is counted in days."""
+    return datetime.now(UTC)
+
+
+def dumps(runs: Sequence[Entry]) -> str:
+    """JSON of entries; NaN as null."""
+    plain = [
+        {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in as_dict(r).items()} for r in runs
+    ]
+    return json.dumps(plain, indent=1)

@@ -1,0 +1,137 @@
+"""The commands over finished runs, added to the command line by `add_commands`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+RunArgument = Annotated[
+    Path, typer.Argument(metavar="RUN", help="Folder of the run, its name or a part of it, or `last`.")
+]
+LogsOption = Annotated[Path, typer.Option("--logs", help="Folder of the runs.")]
+FromOption = Annotated[
+    str | None, typer.Option("--from", help="From this moment: 03:12 (UTC), an ISO time, or +90m from the start.")
+]
+ToOption = Annotated[str | None, typer.Option("--to", help="Up to this moment.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+runs_app = typer.Typer(invoke_without_command=True, help="List, show and prune runs.")
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add `review`, `report`, `export` and `runs`."""
+    app.command()(review)
+    app.command()(report)
+    app.command("export")(export_run)
+    app.add_typer(runs_app, name="runs")
+
+
+def review(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="One run, or several laid over each other.")],
+    at: Annotated[str | None, typer.Option(help="Open on this moment: 03:12 (UTC) or +90m from the start.")] = None,
+    around: Annotated[str | None, typer.Option(help="Open on the first event called so, e.g. a fault.")] = None,
+    start: FromOption = None,
+    end: ToOption = None,
+    tab: Annotated[str, typer.Option(help="overview, loop, shape, faults or tuning.")] = "overview",
+    align: Annotated[str, typer.Option(help="Several runs: 0 s at hold, start, or by utc.")] = "hold",
+    live: Annotated[bool, typer.Option("--live", help="Follow a run that is still going.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="Serve it to a browser.")] = False,
+    bind: Annotated[str, typer.Option(help="With --web: address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="With --web: of the page; 0: any free one.")] = 0,
+    save: Annotated[Path | None, typer.Option(help="Write the review's recording instead of showing it.")] = None,
+    screenshot: Annotated[Path | None, typer.Option(help="Write a picture instead of showing it.")] = None,
+) -> int:
+    """Open the timeline of one run, or of several laid over each other, in the Rerun viewer.
+
+    `review mark RUN TEXT --at 03:12` marks a moment: it stands on the timeline and in the report.
+    """
+    if runs[0] == Path("mark"):
+        from membrane_ctrl.review.runs_command import mark_command
+
+        return mark_command([str(run) for run in runs[1:]], at)
+    from membrane_ctrl.review.review_command import ReviewOptions, review_command
+
+    return review_command(
+        ReviewOptions(runs, at, around, start, end, tab, align, live, web, bind, port, save, screenshot)
+    )
+
+
+def report(
+    run: RunArgument,
+    out: Annotated[Path | None, typer.Option(help="Folder for report.html and report.json; RUN/report.")] = None,
+    compare: Annotated[Path | None, typer.Option("--compare", help="Another run to set it against.")] = None,
+    start: FromOption = None,
+    end: ToOption = None,
+    json: JsonOption = False,
+) -> int:
+    """Write the stability report of a run: one HTML page and its figures as JSON."""
+    from membrane_ctrl.review.report_command import report_command
+
+    return report_command(run, out, compare, start, end, json)
+
+
+def export_run(
+    run: RunArgument,
+    to: Annotated[str, typer.Option("--to", help="parquet, csv or hdf5.")] = "parquet",
+    out: Annotated[Path | None, typer.Option(help="Folder for the files; RUN/export.")] = None,
+    streams: Annotated[
+        list[str] | None, typer.Option("--streams", help="A path, a field, shapes or events; repeatable.")
+    ] = None,
+    start: FromOption = None,
+    end: Annotated[str | None, typer.Option("--until", help="Up to this moment.")] = None,
+) -> int:
+    """Write a run's columns for other programs."""
+    from membrane_ctrl.review.runs_command import export_command
+
+    return export_command(run, to, out, streams or [], start, end)
+
+
+@runs_app.callback()
+def list_runs(
+    context: typer.Context,
+    logs: LogsOption = Path("logs"),
+    since: Annotated[str | None, typer.Option(help="Started on this day (UTC) or later.")] = None,
+    until: Annotated[str | None, typer.Option(help="Started before this day.")] = None,
+    longer: Annotated[str | None, typer.Option(help="At least this long, e.g. 2h.")] = None,
+    std_um: Annotated[float | None, typer.Option(min=0, help="Standard deviation at most this.")] = None,
+    faults: Annotated[bool | None, typer.Option("--faults/--no-faults", help="With faults, or without.")] = None,
+    configuration: Annotated[str | None, typer.Option(help="Beginning of the configuration's hash.")] = None,
+    name: Annotated[str | None, typer.Option(help="Part of the name.")] = None,
+    json: JsonOption = False,
+) -> int:
+    """List the runs there are, oldest first."""
+    from membrane_ctrl.durations import parse_duration_s
+    from membrane_ctrl.review.catalogue import Filter
+    from membrane_ctrl.review.runs_command import list_command
+
+    if context.invoked_subcommand is not None:
+        return 0
+    least_s = None if longer is None else parse_duration_s(longer)
+    wanted = Filter(
+        least_s=least_s, most_std_um=std_um, with_faults=faults, configuration=configuration, text=name
+    )  # fmt: skip
+    return list_command(logs, wanted, since, until, json)
+
+
+@runs_app.command("show")
+def show_run(run: RunArgument, json: JsonOption = False) -> int:
+    """Show one run: figures, states, faults, marks, what is missing."""
+    from membrane_ctrl.review.runs_command import show_command
+
+    return show_command(run, json)
+
+
+@runs_app.command("prune")
+def prune_runs(
+    logs: LogsOption = Path("logs"),
+    older_than: Annotated[str, typer.Option(help="Give up runs older than this.")] = "90d",
+    most_gb: Annotated[float | None, typer.Option(min=0, help="Then the oldest, until all are at most this.")] = None,
+    delete: Annotated[bool, typer.Option("--delete", help="Do it; otherwise it is only said.")] = False,
+    json: JsonOption = False,
+) -> int:
+    """Give up old runs. Never one with a fault, a mark or a file `keep` in it, or without its end."""
+    from membrane_ctrl.review.runs_command import prune_command
+
+    return prune_command(logs, older_than, most_gb, delete, json)

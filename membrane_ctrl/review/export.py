@@ -1,0 +1,158 @@
+"""A run for other programs: Parquet, CSV or HDF5."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from membrane_ctrl.errors import DeviceError, InputError
+from membrane_ctrl.recording.streams import STREAMS
+from membrane_ctrl.review.run import Run
+from membrane_ctrl.telemetry import FIELDS
+
+FORMATS = ("parquet", "csv", "hdf5")
+SHAPES = "shapes"
+EVENTS = "events"
+
+
+def export(
+    run: Run,
+    to: str,
+    out: Path,
+    streams: Sequence[str] = (),
+    start_s: float = -math.inf,
+    end_s: float = math.inf,
+) -> list[Path]:
+    """Write a run's columns.
+
+    Parameters
+    ----------
+    run : Run
+    to : str
+        One of `FORMATS`.
+    out : Path
+        Folder for the files: `ticks.<format>`, `shapes.<format>`, `events.jsonl`; HDF5 is one file `run.h5`.
+    streams : sequence of str
+        Rerun paths (`/loop/error`), fields (`error_um`), `shapes` or `events`; everything by default.
+    start_s, end_s : float
+        Part of the run.
+
+    Raises
+    ------
+    InputError
+        If the format or a stream is not known, or h5py is missing.
+    DeviceError
+        If the folder cannot be written.
+    """
+    if to not in FORMATS:
+        raise InputError(f"--to {to}: known are {', '.join(FORMATS)}")
+    fields, extras = _selected(streams)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if to == "hdf5":
+            return [_hdf5(run, out / "run.h5", fields, extras, start_s, end_s)]
+        written = []
+        if fields:
+            blocks = (pa.table(block) for block in run.tick_blocks(fields, start_s, end_s))
+            written += _tables(blocks, out / f"ticks.{to}", to)
+        if SHAPES in extras:
+            written += _tables(iter([shape_table(run, start_s, end_s)]), out / f"shapes.{to}", to)
+        if EVENTS in extras:
+            path = out / "events.jsonl"
+            path.write_text("".join(json.dumps(e, ensure_ascii=False) + "\n" for e in run.events), encoding="utf-8")
+            written.append(path)
+    except OSError as error:
+        raise DeviceError(f"{out}: cannot be written ({(error.strerror or str(error)).lower()})") from None
+    return written
+
+
+def shape_table(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> pa.Table:
+    """One row a cycle: time, Z1..Z36 in um, sag, quality, verdict."""
+    shapes = run.shapes()
+    shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
+    names = (
+        "hencky_um",
+        "sag_um",
+        "sag_sigma_um",
+        "displacement_um",
+        "slope_residual_urad",
+        "valid_fraction",
+        "latency_s",
+    )
+    columns: dict[str, object] = {"time_s": shapes.time_s}
+    columns |= {f"z{j}_um": np.ascontiguousarray(shapes.coeffs_um[:, j - 1]) for j in range(1, 37)}
+    columns |= {name: getattr(shapes, name) for name in names}
+    return pa.table(columns | {"verdict": [str(word) for word in shapes.verdict]})
+
+
+def _selected(streams: Sequence[str]) -> tuple[tuple[str, ...], set[str]]:
+    """Fields of telemetry and other tables that are meant."""
+    if not streams:
+        return FIELDS, {SHAPES, EVENTS}
+    by_path = {stream.path: [line.field for line in stream.lines] for stream in STREAMS}
+    fields: list[str] = []
+    extras: set[str] = set()
+    for name in streams:
+        if name in {SHAPES, EVENTS}:
+            extras.add(name)
+        elif name in FIELDS:
+            fields.append(name)
+        elif name in by_path:
+            fields += by_path[name]
+        else:
+            raise InputError(
+                f"--streams {name}: known are {', '.join([*by_path, SHAPES, EVENTS])} and telemetry fields"
+            )
+    return (tuple(dict.fromkeys(["mono_s", *fields])) if fields else ()), extras
+
+
+def _tables(tables: Iterator[pa.Table], path: Path, to: str) -> list[Path]:
+    """Write tables of one schema behind each other; nothing is written if there are none."""
+    writer = None
+    try:
+        for table in tables:
+            if writer is None:
+                make = pa.parquet.ParquetWriter if to == "parquet" else pa.csv.CSVWriter
+                writer = make(str(path), table.schema)
+            writer.write_table(table.cast(writer.schema) if to == "parquet" else table)
+    finally:
+        if writer is not None:
+            writer.close()
+    return [path] if writer is not None else []
+
+
+def _hdf5(run: Run, path: Path, fields: Sequence[str], extras: set[str], start_s: float, end_s: float) -> Path:
+    try:
+        import h5py
+    except ImportError:
+        raise InputError("--to hdf5 needs h5py: pip install 'membrane-ctrl[sofast]'") from None
+    with h5py.File(path, "w") as file:
+        file.attrs["run"] = run.name
+        file.attrs["started_utc"] = run.origin_utc.isoformat()
+        for block in run.tick_blocks(fields, start_s, end_s) if fields else ():
+            for name, values in block.items():
+                place = f"ticks/{name}"
+                if place not in file:
+                    file.create_dataset(
+                        place, data=values, maxshape=(None,), chunks=True, compression="gzip", shuffle=True
+                    )
+                    continue
+                data = file[place]
+                data.resize(data.shape[0] + values.size, axis=0)
+                data[-values.size :] = values
+        if SHAPES in extras:
+            shapes = run.shapes()
+            shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
+            for name in ("time_s", "coeffs_um", "hencky_um", "sag_um", "sag_sigma_um", "displacement_um"):
+                file.create_dataset(f"shapes/{name}", data=getattr(shapes, name))
+        if EVENTS in extras:
+            lines = [json.dumps(event, ensure_ascii=False) for event in run.events]
+            file.create_dataset("events", data=lines, dtype=h5py.string_dtype())
+    return path

@@ -1,0 +1,80 @@
+"""`membrane-ctrl report RUN`: the page, the JSON beside it, and the verdict on the terminal."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+from membrane_ctrl.errors import DeviceError, InputError
+from membrane_ctrl.recording import plain_json
+from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.review.analysis import Analysis, analyse
+from membrane_ctrl.review.catalogue import resolve
+from membrane_ctrl.review.compare import compare
+from membrane_ctrl.review.report_html import render
+from membrane_ctrl.review.report_json import report_table
+from membrane_ctrl.review.run import Run, open_run
+from membrane_ctrl.review.verdict import verdict
+from membrane_ctrl.review.words import moment_s
+
+
+def report_command(
+    run: Path,
+    out: Path | None,
+    compare_with: Path | None,
+    start: str | None,
+    end: str | None,
+    json: bool,
+) -> int:
+    """Write `report.html` and `report.json`; see `membrane-ctrl report --help`."""
+    began_s = time.monotonic()
+    opened = open_run(resolve(run))
+    span = _part(opened, start, end)
+    analysis = analyse(opened, *span)
+    other = None if compare_with is None else analyse(open_run(resolve(compare_with)))
+    differences = [] if other is None else compare(analysis, other)
+    table = report_table(analysis)
+    if other is not None:
+        table["compared_with"] = {
+            "run": other.run.name,
+            "report": report_table(other),
+            "differences": [asdict(difference) | {"said": difference.said} for difference in differences],
+        }
+    folder = out or opened.folder / "report"
+    text = plain_json.dumps(table, indent=1)
+    _write(folder, {"report.json": text + "\n", "report.html": render(analysis, other, differences)})
+    if json:
+        print(text)
+    else:
+        _say(analysis, folder, time.monotonic() - began_s)
+    return 0
+
+
+def _part(run: Run, start: str | None, end: str | None) -> tuple[float, float]:
+    start_s = -math.inf if start is None else moment_s(start, run.origin_utc)
+    end_s = math.inf if end is None else moment_s(end, run.origin_utc)
+    if not start_s < end_s:
+        raise InputError(f"--from {start} is not before --to {end}")
+    return start_s, end_s
+
+
+def _write(folder: Path, files: dict[str, str]) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in files.items():
+            write_text_atomic(folder / name, text)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise DeviceError(f"{folder}: cannot be written ({reason}); choose another folder with --out") from None
+
+
+def _say(analysis: Analysis, folder: Path, took_s: float) -> None:
+    for note in analysis.run.notes:
+        print(f"note: {note}", file=sys.stderr)
+    print(verdict(analysis)[1])
+    for event in analysis.found[:20]:
+        print(f"  {analysis.run.utc(event.time_s):%Y-%m-%d %H:%M:%S}  {event.kind}, {event.size:.3g} {event.unit}")
+    print(f"{folder / 'report.html'} ({took_s:.1f} s)")

@@ -1,0 +1,239 @@
+"""The report for people: one HTML file with everything in it."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from membrane_ctrl import __version__
+from membrane_ctrl.review import figures_hold, figures_shape
+from membrane_ctrl.review.analysis import Analysis, Series
+from membrane_ctrl.review.compare import Difference
+from membrane_ctrl.review.drift import Slope
+from membrane_ctrl.review.report_json import bands, timeline
+from membrane_ctrl.review.shape_review import ShapeReview
+from membrane_ctrl.review.style import STYLE
+from membrane_ctrl.review.verdict import verdict
+from membrane_ctrl.review.words import number, span
+
+# A month has thousands of lines; the file beside the report has all.
+_LINES_MOST = 200
+_HIDDEN = {"time_utc", "mono_s", "kind", "exit_code", "made_utc"}
+
+
+def render(analysis: Analysis, other: Analysis | None = None, differences: Sequence[Difference] = ()) -> str:
+    """HTML of a report.
+
+    Parameters
+    ----------
+    analysis : Analysis
+    other : Analysis, optional
+        A run it is set against.
+    differences : sequence of Difference
+        From `compare.compare`, if there is another.
+    """
+    run = analysis.run
+    word, sentence = verdict(analysis)
+    parts = [
+        f"<header><h1>{_text(run.name)}</h1>"
+        f"<p class='when'>{run.utc(analysis.ticks.start_s):%Y-%m-%d %H:%M:%S} UTC, "
+        f"{span(analysis.ticks.end_s - analysis.ticks.start_s)}</p></header>",
+        f"<p class='verdict {word}'>{_text(sentence)}</p>",
+        _anomalies(analysis),
+        f"<figure>{figures_hold.overview(analysis)}</figure>",
+        _section("Found by machine", _found(analysis)),
+        _section("How well it was held", _windows(analysis) + _details(analysis)),
+        f"<figure>{figures_hold.distributions(analysis)}</figure>",
+        _section("Pump, leak, feed-forward, ticks", _pump(analysis)),
+        f"<figure>{figures_hold.surroundings(analysis)}</figure>",
+    ]
+    if analysis.shape is not None:
+        parts.append(_section("Figure", _shape(analysis.shape)))
+        parts.append(f"<figure>{figures_shape.stability(analysis.shape)}</figure>")
+        if analysis.shape.pairs:
+            parts.append(f"<figure>{figures_shape.pairs(analysis.shape)}</figure>")
+    if other is not None:
+        parts.append(_section(f"Against {_text(other.run.name)}", _compared(analysis, other, differences)))
+        parts.append(f"<figure>{figures_hold.overview(other)}</figure>")
+    parts.append(_section("Timeline", _timeline(analysis)))
+    parts.append(f"<footer>membrane-ctrl {__version__}, report of {_text(str(run.folder.name))}</footer>")
+    return (
+        "<!doctype html><html lang='en'><head><meta charset='utf-8'>"
+        "<meta name='viewport' content='width=device-width, initial-scale=1'>"
+        f"<title>{_text(run.name)}</title><style>{STYLE}</style></head><body><main>{''.join(parts)}</main></body></html>"
+    )
+
+
+def _anomalies(analysis: Analysis) -> str:
+    if not analysis.anomalies:
+        return ""
+    return _list(f"<b>{_text(a.name)}</b> {_text(a.seen)}" for a in analysis.anomalies)
+
+
+def _found(analysis: Analysis) -> str:
+    if not analysis.found:
+        return (
+            "<p>Nothing: no door, leak step, laser glitch, lateness burst, change of noise or jump of the figure.</p>"
+        )
+    rows = [
+        [
+            f"{analysis.run.utc(event.time_s):%Y-%m-%d %H:%M:%S}",
+            event.kind,
+            f"{number(event.size)} {_text(event.unit)}",
+            f"{event.confidence:.3f}",
+            f"<code>membrane-ctrl review {_text(analysis.run.name)} --from +{max(event.start_s, 1):.0f}s "
+            f"--to +{event.end_s:.0f}s</code>",
+        ]
+        for event in analysis.found[:_LINES_MOST]
+    ]
+    return _table(["UTC", "what", "size", "confidence", "look at it"], rows) + _more(len(analysis.found))
+
+
+def _windows(analysis: Analysis) -> str:
+    both = (("reading (in the loop)", analysis.reading), ("true centre (twin)", analysis.true))
+    rows = [
+        [
+            name,
+            f"{window.window_s:g} s",
+            f"{window.count}",
+            *(number(v) for v in (window.mean_um, window.std_um, window.p99_7_um, window.max_um)),
+            f"{number(100 * window.in_band, 6)} %",
+        ]
+        for name, series in both
+        for window in (() if series is None else series.windows)
+    ]
+    band = f"in ±{analysis.run.config.limits.band_um:g} µm"
+    return _table(["", "means of", "count", "mean µm", "std µm", "p99.7 µm", "greatest µm", band], rows)
+
+
+def _details(analysis: Analysis) -> str:
+    series = analysis.true or analysis.reading
+    if series is None:
+        return ""
+    ticks = analysis.ticks
+    return _facts(
+        [
+            ("drift", _slope(series.drift, "µm/h")),
+            (
+                "single readings",
+                f"std {number(ticks.raw_reading.std)} µm, {100 * ticks.raw_in_band:.2f} % in the band",
+            ),
+            ("RMS by frequency", _bands(series)),
+        ]
+    )
+
+
+def _bands(series: Series) -> str:
+    said = [f"{number(b['low_hz'])}–{number(b['high_hz'])} Hz: {number(b['rms_um'])} µm" for b in bands(series)]
+    return "; ".join(said)
+
+
+def _pump(analysis: Analysis) -> str:
+    pump, ticks, late = analysis.ticks.pump, analysis.ticks, analysis.ticks.lateness_ms
+    median, least, most = analysis.leak_um_per_s
+    benefit = analysis.benefit
+    facts = [
+        ("pump", f"{100 * pump.mean_fraction:.1f} ± {100 * pump.std_fraction:.1f} % of full, running "
+                 f"{100 * pump.running_share:.1f} % of the time"),
+        ("wear", f"{number(pump.starts_per_hour)} starts and {number(pump.travel_per_hour)} full strokes an hour"),
+        ("at a limit", f"{100 * pump.saturated_share:.2f} % of ticks"),
+        ("leak", f"{number(median)} µm/s (from {number(least)} to {number(most)})"),
+        ("lateness", f"p50 {number(late.quantile(0.5))}, p99 {number(late.quantile(0.99))}, greatest "
+                     f"{number(late.largest)} ms; {ticks.missed_ticks} ticks missed"),
+    ]  # fmt: skip
+    if benefit is not None:
+        said = f"std of 1 s means {number(benefit.with_um)} µm, without it {number(benefit.without_um)} µm (computed)"
+        facts.insert(4, ("feed-forward", said))
+    return _facts(facts)
+
+
+def _shape(shape: ShapeReview) -> str:
+    drifting = [
+        f"Z{j} {_slope(term, 'µm/h')}" for j, term in enumerate(shape.drift_um_per_hour, 2) if term.significant
+    ]
+    facts = [
+        ("cycles", f"{shape.time_s.size} used of {shape.cycles}, {shape.rejected} rejected"),
+        ("standard deviation", f"{number(shape.mean_sd_um)} µm, mean over the area"),
+        ("A, B, C", ", ".join(f"{name} {number(float(v.std()))} µm" for name, v in shape.points_um.items())),
+        ("drifting terms", ", ".join(drifting) or "none"),
+        ("sag by camera − laser", _slope(shape.disagreement, "µm/h")),
+    ]
+    facts += [
+        (
+            f"{pair.lag_s:.0f} s apart",
+            f"RMS change {number(pair.rms_um)} µm (pair shown), {number(pair.all_rms_um)} µm (all {pair.pairs}); "
+            f"uncertainty {number(pair.mean_sigma_um)} µm",
+        )
+        for pair in shape.pairs
+    ]
+    return _facts(facts)
+
+
+def _compared(analysis: Analysis, other: Analysis, differences: Sequence[Difference]) -> str:
+    rows = [
+        [
+            d.name,
+            number(d.ours),
+            number(d.theirs),
+            d.unit,
+            d.said,
+            f"{d.p_value:.2g}" if d.p_value == d.p_value else "–",
+        ]
+        for d in differences
+    ]
+    _, sentence = verdict(other)
+    table = _table(["", "this run", "other run", "", "difference", "p"], rows)
+    return f"<p>{_text(sentence)}</p>{table}"
+
+
+def _timeline(analysis: Analysis) -> str:
+    events = timeline(analysis)
+    rows = [
+        [
+            f"{analysis.run.utc(float(event.get('mono_s') or 0)):%Y-%m-%d %H:%M:%S}",
+            _text(str(event.get("kind"))),
+            _text(_said(event)),
+        ]
+        for event in events[:_LINES_MOST]
+    ]
+    return _table(["UTC", "what", ""], rows) + _more(len(events))
+
+
+def _said(event: dict[str, Any]) -> str:
+    return ", ".join(
+        f"{key} {value}" for key, value in event.items() if key not in _HIDDEN and value not in (None, "")
+    )
+
+
+def _slope(slope: Slope, unit: str) -> str:
+    if slope.per_hour != slope.per_hour:
+        return "too short to say"
+    said = f"{slope.per_hour:+.3g} {unit} (95 %: {slope.low:+.3g} to {slope.high:+.3g})"
+    return said if slope.significant else f"{said}, not significant"
+
+
+def _more(count: int) -> str:
+    return f"<p>{count - _LINES_MOST} more in the JSON report.</p>" if count > _LINES_MOST else ""
+
+
+def _section(title: str, body: str) -> str:
+    return f"<section><h2>{title}</h2>{body}</section>"
+
+
+def _facts(facts: Iterable[tuple[str, str]]) -> str:
+    return "<dl>" + "".join(f"<dt>{_text(name)}</dt><dd>{said}</dd>" for name, said in facts) + "</dl>"
+
+
+def _list(items: Iterable[str]) -> str:
+    return "<ul class='odd'>" + "".join(f"<li>{item}</li>" for item in items) + "</ul>"
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    cells = "".join(f"<th>{title}</th>" for title in head)
+    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<div class='scroll'><table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>"
+
+
+def _text(text: str) -> str:
+    return html.escape(text)

@@ -1,0 +1,130 @@
+"""The report for programs: plain data, units in the names."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from itertools import pairwise
+from typing import Any
+
+from membrane_ctrl.names import State
+from membrane_ctrl.review.analysis import BANDS_HZ, Analysis, Series
+from membrane_ctrl.review.drift import Slope
+from membrane_ctrl.review.shape_review import ShapeReview
+from membrane_ctrl.review.verdict import verdict
+
+SCHEMA = "membrane-report/1"
+
+
+def report_table(analysis: Analysis) -> dict[str, Any]:
+    """All figures of the report (`membrane-report/1`); NaN where there is nothing to say."""
+    run, ticks = analysis.run, analysis.ticks
+    word, sentence = verdict(analysis)
+    late = ticks.lateness_ms
+    return {
+        "schema": SCHEMA,
+        "run": run.name,
+        "started_utc": run.origin_utc.isoformat(),
+        "verdict": word,
+        "sentence": sentence,
+        "part_s": {"start": ticks.start_s, "end": ticks.end_s},
+        "duration_s": ticks.end_s - ticks.start_s,
+        "hold_s": ticks.hold_s,
+        "ticks": ticks.ticks,
+        "ticks_settled": ticks.settled,
+        "ticks_missed": ticks.missed_ticks,
+        "band_um": run.config.limits.band_um,
+        "in_band_single_ticks": ticks.raw_in_band,
+        "std_single_ticks_um": ticks.raw_reading.std,
+        "reading": _series(analysis.reading),
+        "true": _series(analysis.true),
+        "histogram": {"edges_um": list(ticks.histogram_um), "counts": [int(n) for n in ticks.histogram_counts]},
+        "pump": asdict(ticks.pump),
+        "leak_um_per_s": dict(zip(("median", "min", "max"), analysis.leak_um_per_s, strict=True)),
+        "feedforward": None
+        if analysis.benefit is None
+        else {"std_1s_with_um": analysis.benefit.with_um, "std_1s_without_um": analysis.benefit.without_um},
+        "lateness_ms": {"p50": late.quantile(0.5), "p99": late.quantile(0.99), "max": late.largest},
+        "timeline": timeline(analysis),
+        "found": [asdict(event) for event in analysis.found],
+        "shape": None if analysis.shape is None else _shape(analysis.shape),
+        "anomalies": [asdict(anomaly) for anomaly in analysis.anomalies],
+        "notes": list(run.notes),
+        "exit": None if not run.summary else run.summary.get("exit"),
+    }
+
+
+def timeline(analysis: Analysis) -> list[dict[str, Any]]:
+    """State changes, faults, commands and marks in their order; without events, states from the telemetry."""
+    start_s, end_s = analysis.part_s
+    kinds = {"start", "state", "fault", "cleared", "command", "mark", "end"}
+    events = [event for event in analysis.run.events if event.get("kind") in kinds]
+    if not any(event.get("kind") == "state" for event in events):
+        level = analysis.level
+        codes = level["state"]
+        events += [
+            {"mono_s": float(level["time_s"][row]), "kind": "state", "state": State(int(codes[row])).name.lower()}
+            for row in range(codes.size)
+            if math.isfinite(codes[row]) and (row == 0 or codes[row] != codes[row - 1])
+        ]
+    inside = [event for event in events if start_s <= _moment_s(event) < end_s]
+    return sorted(inside, key=_moment_s)
+
+
+def _moment_s(event: dict[str, Any]) -> float:
+    moment = event.get("mono_s")
+    return float(moment) if isinstance(moment, (int, float)) else 0.0
+
+
+def _series(series: Series | None) -> dict[str, Any] | None:
+    if series is None:
+        return None
+    return {
+        "windows": [asdict(window) for window in series.windows],
+        "drift_um_per_hour": _slope(series.drift),
+        "allan": {
+            "tau_s": list(series.allan.tau_s),
+            "deviation_um": list(series.allan.deviation),
+            "windows": [int(n) for n in series.allan.windows],
+        },
+        "bands_rms_um": bands(series),
+        "spectrum_segments": series.spectrum.segments,
+    }
+
+
+def bands(series: Series) -> list[dict[str, float]]:
+    """RMS in each of `BANDS_HZ`."""
+    edges = [*BANDS_HZ, float(series.spectrum.frequency_hz[-1])]
+    return [
+        {"low_hz": low, "high_hz": high, "rms_um": series.spectrum.band_rms(low, high)}
+        for low, high in pairwise(edges)
+    ]
+
+
+def _slope(slope: Slope) -> dict[str, float | bool]:
+    return asdict(slope) | {"significant": slope.significant}
+
+
+def _shape(shape: ShapeReview) -> dict[str, Any]:
+    return {
+        "cycles": shape.cycles,
+        "rejected": shape.rejected,
+        "used": int(shape.time_s.size),
+        "mean_sd_um": shape.mean_sd_um,
+        "points_sd_um": {name: float(values.std()) for name, values in shape.points_um.items()},
+        "drift_um_per_hour": {f"Z{j}": _slope(term) for j, term in enumerate(shape.drift_um_per_hour, 2)},
+        "sag_minus_laser_um_per_hour": _slope(shape.disagreement),
+        "sag_std_um": float(shape.sag_um.std()),
+        "laser_std_um": float(shape.laser_um.std()),
+        "pairs": [
+            {
+                "first_s": pair.first_s,
+                "lag_s": pair.lag_s,
+                "rms_um": pair.rms_um,
+                "mean_sigma_um": pair.mean_sigma_um,
+                "all_pairs_rms_um": pair.all_rms_um,
+                "pairs": pair.pairs,
+            }
+            for pair in shape.pairs
+        ],
+    }

@@ -1,0 +1,162 @@
+"""`membrane-ctrl review RUN...`: the timeline of one run or several, on the moment asked for."""
+
+from __future__ import annotations
+
+import math
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from membrane_ctrl.errors import InputError
+from membrane_ctrl.names import State
+from membrane_ctrl.recording.screenshot import screenshot_of
+from membrane_ctrl.review import viewer
+from membrane_ctrl.review.blueprints import TABS, ReviewBlueprint
+from membrane_ctrl.review.catalogue import resolve
+from membrane_ctrl.review.found import Found
+from membrane_ctrl.review.layer import Layer
+from membrane_ctrl.review.run import Run, open_run
+from membrane_ctrl.review.words import moment_s
+
+# Seen about a moment asked for with --at or --around.
+_AROUND_S = 120.0
+
+
+@dataclass(frozen=True, slots=True)
+class ReviewOptions:
+    """What `review` was asked for; see `membrane-ctrl review --help`."""
+
+    runs: Sequence[Path]
+    at: str | None = None
+    around: str | None = None
+    start: str | None = None
+    end: str | None = None
+    tab: str = "overview"
+    align: str = "hold"
+    live: bool = False
+    web: bool = False
+    bind: str = "127.0.0.1"
+    port: int = 0
+    save: Path | None = None
+    screenshot: Path | None = None
+
+
+def review_command(options: ReviewOptions) -> int:
+    """Make the review and show it."""
+    if options.tab not in TABS:
+        raise InputError(f"--tab {options.tab}: known are {', '.join(TABS)}")
+    if options.align not in {"hold", "start", "utc"}:
+        raise InputError(f"--align {options.align}: known are hold, start, utc")
+    runs = [open_run(resolve(path)) for path in options.runs]
+    if options.live:
+        if len(runs) != 1:
+            raise InputError("--live: one run at a time")
+        return viewer.live(runs[0].folder, ["--serve-web"] if options.web else [])
+    with tempfile.TemporaryDirectory(prefix="membrane-review-") as folder:
+        file = options.save or Path(folder) / "review.rrd"
+        make_review(runs, options, file)
+        for run in runs:
+            for note in run.notes:
+                print(f"note: {run.name}: {note}", file=sys.stderr)
+        if options.screenshot is not None:
+            options.screenshot.write_bytes(screenshot_of([file]))
+            return 0
+        if options.save is not None:
+            print(file)
+            return 0
+        return viewer.serve([file], options.bind, options.port) if options.web else viewer.show([file])
+
+
+def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> None:
+    """Write the recording that the viewer opens.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        One, or several that are laid over each other.
+    options : ReviewOptions
+    file : Path
+        To write.
+
+    Raises
+    ------
+    InputError
+        If a time or an event asked for is not in the first run, or a run has no telemetry.
+    """
+    for run in runs:
+        if not run.level(60.0, names=("rows",))["time_s"].size:
+            raise InputError(f"{run.folder}: nothing to show: no telemetry can be read")
+    span_s = _span(runs[0], options)
+    zeros_s = _zeros(runs, options.align)
+    prefixes = ("",) if len(runs) == 1 else tuple(f"/run_{number}" for number in range(1, len(runs) + 1))
+    layer = Layer(file, runs[0].name if len(runs) == 1 else " and ".join(run.name for run in runs))
+    shown = None if span_s is None else (span_s[0] - zeros_s[0], span_s[1] - zeros_s[0])
+    layer.blueprint(ReviewBlueprint(prefixes, shown, runs[0].config.limits.band_um).made(options.tab))
+    for run, prefix, zero_s in zip(runs, prefixes, zeros_s, strict=True):
+        part_s = (-math.inf, math.inf) if shown is None else (shown[0] + zero_s, shown[1] + zero_s)
+        layer.add(run, prefix, zero_s, part_s)
+    layer.close()
+
+
+def _span(run: Run, options: ReviewOptions) -> tuple[float, float] | None:
+    """The part of the run asked for, in its seconds."""
+    if options.start is not None or options.end is not None:
+        start_s = 0.0 if options.start is None else moment_s(options.start, run.origin_utc)
+        end_s = _end_s(run) if options.end is None else moment_s(options.end, run.origin_utc)
+        if not start_s < end_s:
+            raise InputError(f"--from {options.start} is not before --to {options.end}")
+        return start_s, end_s
+    if options.at is not None:
+        at_s = moment_s(options.at, run.origin_utc)
+        if not -_AROUND_S <= at_s <= _end_s(run) + _AROUND_S:
+            last = f"{run.utc(0):%Y-%m-%d %H:%M} to {run.utc(_end_s(run)):%Y-%m-%d %H:%M} UTC"
+            raise InputError(f"--at {options.at}: not in the run, which went from {last}")
+        return at_s - _AROUND_S, at_s + _AROUND_S
+    if options.around is not None:
+        at_s = _around(run, options.around)
+        return at_s - _AROUND_S, at_s + _AROUND_S
+    return None
+
+
+def _around(run: Run, what: str) -> float:
+    """Time of the first event whose kind, name, state or text is or contains `what`; found ones count, too."""
+    wanted = what.lower()
+    for event in run.events:
+        words = [str(event.get(key, "")).lower() for key in ("kind", "name", "state", "text")]
+        if any(wanted in word for word in words):
+            return float(event.get("mono_s") or 0.0)
+    from membrane_ctrl.review.found import LEVEL_COLUMNS, find_events
+
+    found: list[Found] = find_events(run.level(1.0, names=LEVEL_COLUMNS), run.shapes())
+    for item in found:
+        if wanted in item.kind:
+            return item.time_s
+    named = sorted(
+        {str(e.get("name") or e.get("state") or e.get("kind")) for e in run.events} | {f.kind for f in found}
+    )
+    raise InputError(f"--around {what}: no such event in {run.name}; there are {', '.join(named)}")
+
+
+def _zeros(runs: Sequence[Run], align: str) -> list[float]:
+    """The second of each run that the timeline calls 0."""
+    if len(runs) == 1 or align == "start":
+        return [0.0] * len(runs)
+    if align == "utc":
+        return [(runs[0].origin_utc - run.origin_utc).total_seconds() for run in runs]
+    return [_hold_s(run) for run in runs]
+
+
+def _hold_s(run: Run) -> float:
+    level = run.level(60.0, names=("state",))
+    entered = [e for e in run.events if e.get("kind") == "state" and e.get("state") == "hold"]
+    if entered:
+        return float(entered[0].get("mono_s") or 0.0)
+    rows = [float(t) for t, code in zip(level["time_s"], level["state"], strict=True) if code == State.HOLD]
+    return rows[0] if rows else 0.0
+
+
+def _end_s(run: Run) -> float:
+    time_s = run.level(60.0, names=("rows",))["time_s"]
+    return float(time_s[-1]) + 60.0 if time_s.size else 0.0

@@ -1,0 +1,152 @@
+"""`membrane-ctrl runs`: list, show, prune; `export`; `mark`."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from membrane_ctrl.durations import parse_duration_s
+from membrane_ctrl.errors import InputError
+from membrane_ctrl.recording import plain_json
+from membrane_ctrl.review import catalogue
+from membrane_ctrl.review.annotations import add_mark
+from membrane_ctrl.review.catalogue import Entry, Filter, entries, resolve
+from membrane_ctrl.review.export import export
+from membrane_ctrl.review.run import Run, open_run
+from membrane_ctrl.review.words import moment_s, number, span
+
+
+def list_command(logs: Path, wanted: Filter, since: str | None, until: str | None, json: bool) -> int:
+    """The table of runs that pass a filter."""
+    wanted = replace(wanted, since_utc=_day(since), until_utc=_day(until))
+    found = entries(logs, wanted)
+    if json:
+        print(catalogue.dumps(found))
+    else:
+        _console().print(_table(found))
+    return 0
+
+
+def show_command(run: Path, json: bool) -> int:
+    """One run: its line of the catalogue, its states and faults, what is missing of it."""
+    opened = open_run(resolve(run))
+    entry = catalogue.entry(opened.folder)
+    if json:
+        print(
+            plain_json.dumps(catalogue.as_dict(entry) | {"notes": opened.notes, "summary": opened.summary}, indent=1)
+        )
+        return 0
+    _console().print(_table([entry]))
+    for event in opened.events:
+        if event.get("kind") in {"state", "fault", "mark", "end"}:
+            said = event.get("state") or event.get("name") or event.get("text") or event.get("exit") or ""
+            print(f"  {opened.utc(float(event.get('mono_s') or 0)):%H:%M:%S}  {event['kind']:6} {said}")
+    for note in opened.notes:
+        print(f"  note: {note}")
+    return 0
+
+
+def prune_command(logs: Path, older_than: str, most_gb: float | None, delete: bool, json: bool) -> int:
+    """What the retention rule gives up; deleted only with `delete`."""
+    found = entries(logs)
+    rule = timedelta(seconds=parse_duration_s(older_than))
+    gone = catalogue.to_prune(found, catalogue.now_utc(), rule, None if most_gb is None else 1000 * most_gb)
+    if delete:
+        catalogue.prune(gone)
+    if json:
+        print(catalogue.dumps(gone))
+        return 0
+    for entry in gone:
+        print(f"{'deleted' if delete else 'would delete'} {entry.name} ({entry.size_mb:.0f} MB)")
+    freed_mb = sum(entry.size_mb for entry in gone)
+    print(
+        f"{len(gone)} of {len(found)} runs, {freed_mb:.0f} MB" + ("" if delete or not gone else "; --delete does it")
+    )
+    return 0
+
+
+def mark_command(words: Sequence[str], at: str | None) -> int:
+    """Add a mark to a run's timeline: the run and what to say, where."""
+    if len(words) != 2 or at is None:
+        raise InputError("review mark: write `review mark RUN TEXT --at 03:12` (TEXT in quotes)")
+    opened = open_run(resolve(Path(words[0])))
+    mark = add_mark(opened.folder, opened.origin_utc, moment_s(at, opened.origin_utc), words[1])
+    print(f"marked {mark['time_utc']} in {opened.name}")
+    return 0
+
+
+def export_command(
+    run: Path, to: str, out: Path | None, streams: list[str], start: str | None, end: str | None
+) -> int:
+    """Write a run for other programs and say where."""
+    opened = open_run(resolve(run))
+    files = export(opened, to, out or opened.folder / "export", streams, *_part(opened, start, end))
+    for note in opened.notes:
+        print(f"note: {note}")
+    for path in files:
+        print(path)
+    return 0
+
+
+def _part(run: Run, start: str | None, end: str | None) -> tuple[float, float]:
+    start_s = -math.inf if start is None else moment_s(start, run.origin_utc)
+    end_s = math.inf if end is None else moment_s(end, run.origin_utc)
+    return start_s, end_s
+
+
+def _day(text: str | None) -> datetime | None:
+    """A date or a moment, in UTC."""
+    if text is None:
+        return None
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise InputError(f"date {text!r}: write 2026-11-21 or 2026-11-21T03:00") from None
+    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+
+
+def _console() -> Console:
+    """As wide as the terminal; into a file or pipe, as wide as the table."""
+    return Console(width=None if sys.stdout.isatty() else 170)
+
+
+def _table(found: list[Entry]) -> Table:
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for title in (
+        "run",
+        "started, UTC",
+        "length",
+        "std µm",
+        "in band",
+        "faults",
+        "Kp",
+        "Ti",
+        "configuration",
+        "MB",
+        "end",
+    ):
+        table.add_column(
+            title, justify="left" if title in {"run", "started, UTC", "configuration", "end"} else "right"
+        )
+    for entry in found:
+        table.add_row(
+            entry.name,
+            f"{entry.started_utc:%Y-%m-%d %H:%M}",
+            span(entry.duration_s),
+            number(entry.std_um),
+            "–" if math.isnan(entry.in_band) else f"{100 * entry.in_band:.4g} %",
+            str(entry.faults),
+            number(entry.kp_per_s),
+            number(entry.ti_s),
+            entry.configuration,
+            f"{entry.size_mb:.1f}",
+            entry.exit + (f", {entry.marks} marked" if entry.marks else "") + (", kept" if entry.kept else ""),
+        )
+    return table

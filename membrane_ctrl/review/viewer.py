@@ -1,0 +1,129 @@
+"""Starts the viewer on a review: on this screen, for a browser, into a picture, or following a run that goes on."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO
+
+import rerun_cli  # type: ignore[import-untyped]
+
+from membrane_ctrl.errors import DeviceError
+from membrane_ctrl.review.rrd_reader import segments
+
+# The recorder flushes every second.
+_FOLLOW_S = 0.5
+_CHUNK_BYTES = 1 << 20
+
+
+def viewer_command(*arguments: str) -> list[str]:
+    """The viewer itself: the `rerun` command is a Python shim, and ending that would leave the viewer behind."""
+    return [str(Path(rerun_cli.__file__).parent / "rerun"), *arguments]
+
+
+def show(files: list[Path]) -> int:
+    """Open files on this machine's screen; returns when the window is closed."""
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise DeviceError("no screen here: use --web and open the address in a browser, or --screenshot FILE")
+    paths = [str(path) for path in files]
+    return _run(viewer_command("--bind", "127.0.0.1", "--port", str(free_port()), *paths))
+
+
+def serve(files: list[Path], bind: str, port: int) -> int:
+    """Serve files to browsers until interrupted.
+
+    Parameters
+    ----------
+    bind : str
+        127.0.0.1 unless the network may look: then the address to listen on.
+    port : int
+        Of the page; 0: a free one.
+    """
+    port = port or free_port()
+    data_port = free_port()
+    host = "127.0.0.1" if bind == "127.0.0.1" else socket.gethostname()
+    address = f"http://{host}:{port}/?url=rerun%2Bhttp%3A%2F%2F{host}%3A{data_port}%2Fproxy"
+    print(f"open {address}", file=sys.stderr)
+    if bind == "127.0.0.1":
+        tunnel = f"ssh -L {port}:127.0.0.1:{port} -L {data_port}:127.0.0.1:{data_port} {socket.gethostname()}"
+        print(f"from another machine first: {tunnel}", file=sys.stderr)
+    options = ["--serve-web", "--bind", bind, "--port", str(data_port), "--web-viewer-port", str(port)]
+    return _run(viewer_command(*options, *(str(path) for path in files)))
+
+
+def live(folder: Path, options: list[str]) -> int:
+    """Show a run that is still going, by reading behind its recorder: the run does not know that it is watched."""
+    command = viewer_command("--bind", "127.0.0.1", "--port", str(free_port()), *options, "-")
+    try:
+        with subprocess.Popen(command, stdin=subprocess.PIPE, env=_environment()) as viewer:
+            assert viewer.stdin is not None
+            try:
+                follow(folder, viewer.stdin, lambda: viewer.poll() is None)
+            except (BrokenPipeError, KeyboardInterrupt):
+                pass
+            finally:
+                viewer.terminate()
+    except OSError as error:
+        raise DeviceError(f"the viewer did not start: {error}") from None
+    return 0
+
+
+def follow(
+    folder: Path, out: IO[bytes], wanted: Callable[[], bool], sleep: Callable[[float], None] = time.sleep
+) -> None:
+    """Copy the run's segments as they grow, one after the other, until the run has its summary or nobody looks.
+
+    Raises BrokenPipeError when the reader has gone.
+    """
+    for data in _grown(folder, wanted, sleep):
+        out.write(data)
+        out.flush()
+
+
+def _grown(folder: Path, wanted: Callable[[], bool], sleep: Callable[[float], None]) -> Iterator[bytes]:
+    number, place = 0, 0
+    while wanted():
+        over = (folder / "summary.json").exists()
+        files = segments(folder)
+        data = b""
+        if number < len(files):
+            with files[number].open("rb") as file:
+                file.seek(place)
+                data = file.read(_CHUNK_BYTES)
+        if data:
+            place += len(data)
+            yield data
+        elif number + 1 < len(files):
+            number, place = number + 1, 0
+        elif over:
+            return
+        else:
+            sleep(_FOLLOW_S)
+
+
+def free_port() -> int:
+    """A TCP port that nobody listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _run(command: list[str]) -> int:
+    try:
+        with subprocess.Popen(command, env=_environment()) as viewer:
+            try:
+                return 0 if viewer.wait() == 0 else 4
+            except KeyboardInterrupt:
+                viewer.terminate()
+                return 0
+    except OSError as error:
+        raise DeviceError(f"the viewer did not start: {error}") from None
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, "RUST_LOG": os.environ.get("RUST_LOG", "error")}
