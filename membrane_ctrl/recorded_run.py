@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +29,7 @@ class RecordedRun:
     config: Config
     inputs: InputsReader
     decisions: list[Decision]
+    told_until_s: float  # the event log ends here, if a crash cut it
 
     def row_at(self, time_s: float) -> TelemetryRow | None:
         """The row that was recorded then; None if the recording does not have it."""
@@ -48,11 +51,14 @@ def open_run(folder: Path) -> RecordedRun:
     inputs = InputsReader(folder)
     if not inputs.paths:
         raise InputError(f"{folder}: no inputs-*.bin: this run was recorded without what a replay needs")
-    return RecordedRun(folder, load(folder / "config.toml", Config), inputs, _decisions(folder / "events.jsonl"))
+    events = _events(folder / "events.jsonl")
+    cut = not any(event.get("kind") == "end" for event in events)
+    told_until_s = max((float(event.get("mono_s") or 0.0) for event in events), default=0.0) if cut else math.inf
+    return RecordedRun(folder, load(folder / "config.toml", Config), inputs, decisions_of(events), told_until_s)
 
 
-def _decisions(path: Path) -> list[Decision]:
-    """Recorded decisions; a line that a crash tore is passed over."""
+def _events(path: Path) -> list[dict[str, Any]]:
+    """Recorded events; a line that a crash tore is passed over."""
     events = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []:
         try:
@@ -61,4 +67,4 @@ def _decisions(path: Path) -> list[Decision]:
             continue
         if isinstance(event, dict):
             events.append(event)
-    return decisions_of(events)
+    return events

@@ -74,6 +74,8 @@ class Replay:
     gaps : list of Gap
     decisions : list of Decision
         Of today's code.
+    last_s : float
+        Time of the last tick replayed.
     finished : Exit or None
         How today's code ended the run.
     """
@@ -84,6 +86,7 @@ class Replay:
     first_different: TelemetryRow | None = None
     gaps: list[Gap] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
+    last_s: float = -math.inf
     finished: Exit | None = None
 
 
@@ -105,7 +108,7 @@ def replay(
     sag_sensitivity : (36,) array
         See `Controller`.
     from_s, to_s : float
-        What is compared; ticks before it run, but are not compared.
+        What is compared bit by bit; ticks before it run all the same.
     """
     controller = Controller(config, sag_sensitivity)
     found = Replay()
@@ -118,9 +121,10 @@ def replay(
             break
         outputs = controller.tick(item.inputs)
         found.ticks += 1
+        found.last_s = item.inputs.now_s
         found.finished = outputs.finished
+        found.decisions += decisions_of(outputs.events, item.inputs.now_s)
         if item.inputs.now_s >= from_s:
-            found.decisions += decisions_of(outputs.events, item.inputs.now_s)
             _compare(item, outputs, found)
     return found
 

@@ -31,7 +31,7 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
     begin = time.perf_counter()
     found = replay(run.config, recorded_ticks(run.inputs), zernike_projection(), from_s, to_s)
     took_s = time.perf_counter() - begin
-    report = _report(run, found, from_s, to_s)
+    report = _report(run, found, to_s)
     if as_json:
         print(json.dumps(report))
     else:
@@ -44,20 +44,19 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
     return int(Exit.DONE if report["verdict"] == "identical" else Exit.REJECTED)
 
 
-def _report(run: RecordedRun, found: Replay, from_s: float, to_s: float) -> dict[str, Any]:
-    recorded = [decision for decision in run.decisions if from_s <= decision.time_s <= to_s]
-    decisions = unmatched(recorded, found.decisions, DECISION_SLACK_S)
-    same = not (found.different or found.gaps or run.inputs.damage or decisions)
+def _report(run: RecordedRun, found: Replay, to_s: float) -> dict[str, Any]:
+    # where the log or the inputs end early, nothing is said of what came then
+    end_s = min(to_s, run.told_until_s, found.last_s)
+    today = [decision for decision in found.decisions if decision.time_s <= end_s]
+    recorded = [decision for decision in run.decisions if decision.time_s <= end_s + DECISION_SLACK_S]
+    in_time = sum(decision.time_s <= end_s for decision in recorded)
+    decisions = unmatched(recorded[: max(in_time, len(today))], today, DECISION_SLACK_S)
     first = found.first_different
     fields: dict[str, tuple[float, float]] | None = None
     if first is not None and (row := run.row_at(first.mono_s)) is not None:
         fields = differing_fields(first, row)
     return {
-        "verdict": "identical"
-        if same and found.compared
-        else "different"
-        if found.different or decisions
-        else "gaps",
+        "verdict": _verdict(found, bool(decisions), bool(run.inputs.damage)),
         "recorded_by": run.inputs.program,
         "ticks": found.ticks,
         "compared": found.compared,
@@ -70,6 +69,13 @@ def _report(run: RecordedRun, found: Replay, from_s: float, to_s: float) -> dict
         ],
         "damage": run.inputs.damage,
     }
+
+
+def _verdict(found: Replay, decisions_differ: bool, damaged: bool) -> str:
+    """Identical only if everything was compared; behind a gap another decision says nothing of the code."""
+    if found.different or (decisions_differ and not found.gaps):
+        return "different"
+    return "gaps" if found.gaps or damaged or not found.compared else "identical"
 
 
 def _lines(report: dict[str, Any]) -> list[str]:

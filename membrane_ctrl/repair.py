@@ -1,0 +1,227 @@
+"""`repair RUN`: what a crash left of a run, made whole again. Originals stay as they are unless a person says so."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from membrane_ctrl.config import Config
+from membrane_ctrl.config_file import load
+from membrane_ctrl.errors import Exit, InputError
+from membrane_ctrl.recording import events as event_lines
+from membrane_ctrl.recording import plain_json
+from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.recording.inputs_file import InputsReader
+from membrane_ctrl.recording.optimizer import optimize_command, quiet_environment
+from membrane_ctrl.recording.read_back import read_rows
+from membrane_ctrl.recording.rows import COLUMN, Rows, column
+from membrane_ctrl.recording.sink import is_whole
+from membrane_ctrl.recording.summary import Summary
+
+FOLDER = "repaired"
+# A recorder writes each second: what has changed since is a run that is still going on.
+_STILL_RUNNING_S = 5.0
+_SEGMENT_TIMEOUT_S = 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One file of the run: what was wrong with it, and what was done."""
+
+    file: str
+    state: str
+    action: str
+
+
+def repair_command(run_dir: Path, in_place: bool, as_json: bool) -> int:
+    """Repair and report; exit 0 also when nothing was wrong.
+
+    Raises
+    ------
+    InputError
+        Not a run folder, or a run that is still going on.
+    """
+    findings = repair(run_dir, in_place)
+    if as_json:
+        rows = [{"file": f.file, "state": f.state, "action": f.action} for f in findings]
+        print(json.dumps({"run": run_dir.resolve().name, "files": rows}))
+    else:
+        for finding in findings:
+            print(f"{finding.file:28} {finding.state}{': ' if finding.action else ''}{finding.action}")
+    if not in_place and (run_dir / FOLDER).exists():
+        print(f"repaired files: {run_dir / FOLDER}; --in-place puts them in the originals' place", file=sys.stderr)
+    return int(Exit.DONE)
+
+
+def repair(run_dir: Path, in_place: bool = False) -> list[Finding]:
+    """Mend every file of a run that a crash can have torn.
+
+    Parameters
+    ----------
+    run_dir : Path
+        Folder of the run.
+    in_place : bool
+        Repaired files replace the originals; what was cut off the event log stays beside it as `.torn`. Otherwise
+        they go to `repaired/`. A summary that is missing is written to its place in either case.
+    """
+    if not (run_dir / "config.toml").is_file():
+        raise InputError(f"{run_dir}: not a run folder: there is no config.toml in it")
+    _refuse_running(run_dir)
+    segments = sorted(run_dir.glob("*.rrd"))
+    findings = [_repair_segment(path, in_place) for path in segments]
+    findings += _repair_events(run_dir, in_place)
+    findings += _look_at_inputs(run_dir)
+    return [*findings, _repair_summary(run_dir, in_place)]
+
+
+def _refuse_running(run_dir: Path) -> None:
+    state = run_dir / ".recorder-state"
+    if state.exists():
+        age_s = _now_s(run_dir) - state.stat().st_mtime
+        if 0 <= age_s < _STILL_RUNNING_S:
+            raise InputError(f"{run_dir}: this run is still being recorded; stop it first")
+
+
+def _now_s(folder: Path) -> float:
+    """The file system's own time: that of another machine's disk need not be ours."""
+    probe = folder / ".probe"
+    try:
+        probe.touch()
+        now_s = probe.stat().st_mtime
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror}); copy the run first") from None
+    return now_s
+
+
+def _target(path: Path, in_place: bool) -> Path:
+    if in_place:
+        return path
+    folder = path.parent / FOLDER
+    folder.mkdir(exist_ok=True)
+    return folder / path.name
+
+
+def _repair_segment(path: Path, in_place: bool) -> Finding:
+    if is_whole(path):
+        return Finding(path.name, "whole", "")
+    part = path.with_name(f".{path.name}.part")
+    done = subprocess.run(
+        optimize_command(path, part, "--continue-on-error"),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env=quiet_environment(),
+        timeout=_SEGMENT_TIMEOUT_S,
+        check=False,
+    )
+    if not part.exists() or not is_whole(part):
+        part.unlink(missing_ok=True)
+        why = done.stderr.decode(errors="replace").strip().splitlines()
+        return Finding(path.name, "torn", f"nothing could be recovered ({why[-1] if why else 'no data in it'})")
+    target = _target(path, in_place)
+    part.replace(target)
+    return Finding(path.name, "torn", f"recovered to {target.relative_to(path.parent)}")
+
+
+def _repair_events(run_dir: Path, in_place: bool) -> list[Finding]:
+    path = run_dir / "events.jsonl"
+    if not path.exists():
+        return [Finding(path.name, "missing", "the run had no event, or it was lost")]
+    data = path.read_bytes()
+    good, torn = _split_events(data)
+    if not torn:
+        return [Finding(path.name, "whole", "")]
+    target = _target(path, in_place)
+    target.with_name(f"{path.name}.torn").write_bytes(torn)
+    write_text_atomic(target, good.decode())
+    where = target.relative_to(run_dir)
+    return [Finding(path.name, "torn", f"{len(torn)} bytes cut to {where}.torn, the rest in {where}")]
+
+
+def _split_events(data: bytes) -> tuple[bytes, bytes]:
+    """Whole lines, and what is none: a torn tail, a block of zeros that a power cut left."""
+    good: list[bytes] = []
+    torn: list[bytes] = []
+    for line in data.splitlines(keepends=True):
+        (good if line.endswith(b"\n") and _is_event(line) else torn).append(line)
+    return b"".join(good), b"".join(torn)
+
+
+def _is_event(line: bytes) -> bool:
+    try:
+        return isinstance(json.loads(line), dict)
+    except ValueError:
+        return False
+
+
+def _look_at_inputs(run_dir: Path) -> list[Finding]:
+    """Nothing to mend: a replay reads every frame that is whole."""
+    reader = InputsReader(run_dir)
+    ticks = sum(len(frame.records) for frame in reader)
+    name = f"inputs ({len(reader.paths)} files)"
+    if reader.damage:
+        return [Finding(name, "torn", f"{ticks} ticks are readable; {'; '.join(reader.damage)}")]
+    return [Finding(name, "whole", f"{ticks} ticks")] if reader.paths else []
+
+
+def _repair_summary(run_dir: Path, in_place: bool) -> Finding:
+    path = run_dir / "summary.json"
+    there = path.exists()
+    if there and _is_event(path.read_bytes()):
+        return Finding(path.name, "whole", "")
+    table = rebuild_summary(run_dir)
+    target = _target(path, in_place or not there)
+    write_text_atomic(target, plain_json.dumps(table, indent=2) + "\n")
+    state = "unreadable" if there else "missing"
+    return Finding(path.name, state, f"rebuilt from {table['ticks']} ticks: {target.relative_to(run_dir)}")
+
+
+def rebuild_summary(run_dir: Path) -> dict[str, Any]:
+    """`summary.json` from what is on the disk; `"rebuilt": true` says so.
+
+    Ticks the recording thinned out in quiet times are not in the statistics, and neither is what was lost.
+    """
+    summary = Summary(load(run_dir / "config.toml", Config))
+    path = run_dir / "events.jsonl"
+    last_s = -np.inf
+    for rows in _all_rows(run_dir):
+        new = rows[column(rows, "mono_s") > last_s]
+        if len(new):
+            last_s = float(new[-1, COLUMN["mono_s"]])
+            summary.add_rows(new[np.isfinite(column(new, "state"))])
+    ticks = 0
+    for frame in InputsReader(run_dir):
+        ticks += len(frame.records)
+        for estimate in frame.estimates.values():
+            summary.add_shape(estimate)
+    good, _ = _split_events(path.read_bytes()) if path.exists() else (b"", b"")
+    for line in good.splitlines():
+        summary.add_event(event_lines.parse(line))
+    table = summary.as_dict({}, {"segments": len(_segments(run_dir))})
+    table["ticks"] = max(table["ticks"], ticks)
+    return {**table, "exit": table["exit"] or "crashed", "rebuilt": True}
+
+
+def _segments(run_dir: Path) -> Sequence[Path]:
+    """Each segment once: the repaired one where there is one."""
+    repaired = run_dir / FOLDER
+    paths = sorted(run_dir.glob("*.rrd"))
+    return [repaired / path.name if (repaired / path.name).exists() else path for path in paths]
+
+
+def _all_rows(run_dir: Path) -> Sequence[Rows]:
+    """Rows of all segments that can be read."""
+    found = []
+    for path in _segments(run_dir):
+        try:
+            found.append(read_rows(path))
+        except (RuntimeError, ValueError, OSError):  # Rerun's own ways to say that nothing can be read
+            continue
+    return found

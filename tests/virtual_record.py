@@ -1,0 +1,72 @@
+"""A virtual run of the twin with its record, as supervisor and recorder would have written it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_shape import shape_at
+
+from firmware_iface.roles import BenchReading
+from membrane_ctrl import __version__, config_file, virtual_run
+from membrane_ctrl.config import Config, TwinConfig
+from membrane_ctrl.controller import Controller
+from membrane_ctrl.metrology.hencky import zernike_projection
+from membrane_ctrl.recording.inputs_file import InputsFile
+from membrane_ctrl.tick import TickInputs, TickOutputs
+from membrane_ctrl.tick_record import TickAssembler, pack_tick
+from membrane_ctrl.twin.plant import Plant
+from membrane_ctrl.virtual_run import Alter, run_virtual
+
+CONFIG = Config(twin=TwinConfig(laser_noise_um=0.5))
+
+
+class RecordedController(Controller):
+    """A controller whose ticks are kept."""
+
+    ticks: list[tuple[TickInputs, TickOutputs]] = []  # noqa: RUF012  # of the one run that is being recorded
+
+    def tick(self, inputs: TickInputs) -> TickOutputs:
+        outputs = super().tick(inputs)
+        self.ticks.append((inputs, outputs))
+        return outputs
+
+
+def kept_ticks(duration_s: float, alter: Alter | None = None) -> list[tuple[TickInputs, TickOutputs]]:
+    """Inputs and outputs of every tick of a hold of the twin."""
+    RecordedController.ticks = ticks = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(virtual_run, "Controller", RecordedController)
+        plant = Plant(CONFIG.twin, CONFIG.pump)
+        for _ in run_virtual(CONFIG, plant, duration_s, zernike_projection(), shape_at, alter):
+            pass
+    return ticks
+
+
+def write_record(folder: Path, ticks: list[tuple[TickInputs, TickOutputs]], lost: range = range(0)) -> None:
+    """The run's folder: configuration, inputs a frame a second, events; ticks of `lost` are not in it."""
+    (folder / "config.toml").write_text(config_file.dump(CONFIG))
+    file, assembler = InputsFile(folder, __version__), TickAssembler()
+    lines = []
+    for first in range(0, len(ticks), 50):
+        messages: list[bytes] = []
+        shapes = []
+        for place, (inputs, outputs) in enumerate(ticks[first : first + 50], start=first + 1):
+            if place not in lost:
+                messages += pack_tick(place, inputs, outputs, outputs.row.pack())
+            if inputs.estimate is not None:
+                shapes.append(inputs.estimate)
+            lines += [json.dumps({"mono_s": inputs.now_s + 1e-4, **event}) for event in outputs.events]
+        file.append(assembler.take(messages), shapes)
+    file.close()
+    lines.append(json.dumps({"mono_s": ticks[-1][0].now_s + 1e-3, "kind": "end", "exit": "done"}))
+    (folder / "events.jsonl").write_text("\n".join(lines) + "\n")
+
+
+def laser_lost(now_s: float, reading: BenchReading) -> BenchReading:
+    """The laser sees nothing from second 14 to 15."""
+    from dataclasses import replace
+
+    return replace(reading, displacement_um=np.nan, displacement_quality=1) if 14.0 <= now_s < 15.0 else reading
