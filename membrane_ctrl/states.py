@@ -290,6 +290,7 @@ def _asked_elsewhere(scene: Scene) -> State | None:
     if scene.way_down is not None:
         return _go_down(scene)
     if scene.trial is not None:
+        _drive(scene, scene.setpoint_um)  # the loop has this tick: without it the pump would be off for 20 ms
         scene.why = f"{scene.asked_by} asked for the experiment {scene.trial.spec.kind}"
         return State.TUNE
     if scene.manual_wanted:

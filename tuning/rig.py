@@ -11,6 +11,8 @@ import numpy as np
 from membrane_ctrl.config import LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments.machine import Around, ExcursionGuard, Experiment, Finished
 from membrane_ctrl.control.experiments.measurement import Measurement
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
+from membrane_ctrl.control.experiments.trial import Trial
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput, LoopOutput
 from membrane_ctrl.control.pump_curve import PumpCurve
 from tuning.records import Record
@@ -62,15 +64,21 @@ class Rig:
             self._last = self._bench.exchange(out.pump_fraction, self._config.bleed_fraction)
         return Record.from_samples(self.dt_s, flows, samples)
 
+    def perform(self, spec: ExperimentSpec) -> tuple[Record, Finished]:
+        """Run an experiment about 0 until it says that it is finished; the loop may hold from there on."""
+        return self._run(Trial(spec, self._config, self._pump, 0.0), spec.holding_flow_um_per_s)
+
     def run(self, experiment: Experiment, around: Around, centre_um: float) -> tuple[Record, Finished]:
-        """Run an experiment inside the guard until it says that it is finished; the loop may hold from there on."""
-        guard = ExcursionGuard(experiment, around, centre_um)
+        """The same for an experiment of one's own, inside the guard."""
+        return self._run(ExcursionGuard(experiment, around, centre_um), around.holding_flow_um_per_s)
+
+    def _run(self, guard: Experiment, holding_flow_um_per_s: float) -> tuple[Record, Finished]:
         flows: list[float] = []
         samples: list[Measurement] = []
         while True:
             wanted = guard.step(self._last, self.dt_s)
             if isinstance(wanted, Finished):
-                self._loop.follow(self._given(0.0), around.holding_flow_um_per_s, self.dt_s)
+                self._loop.follow(self._given(0.0), holding_flow_um_per_s, self.dt_s)
                 return Record.from_samples(self.dt_s, flows, samples), wanted
             out = self._loop.follow(self._given(0.0), wanted, self.dt_s)
             flows.append(out.flow_um_per_s)
@@ -79,13 +87,7 @@ class Rig:
 
     def around(self, held: Record, limit_um: float = 10.0) -> Around:
         """The frame of an experiment, from a hold before it."""
-        return Around(
-            holding_flow_um_per_s=float(held.flow_um_per_s.mean()),
-            least_flow_um_per_s=PumpCurve(self._pump).least_flow_um_per_s,
-            full_flow_um_per_s=min(self._pump.flow_full_um_per_s, self._config.flow_max_um_per_s),
-            laser_um=laser_noise_um(held),
-            limit_um=limit_um,
-        )
+        return around_of(held, self._config, self._pump, limit_um)
 
     def _given(self, target_um: float) -> LoopInput:
         now = self._last
@@ -93,6 +95,17 @@ class Rig:
 
     def _fraction(self, flow_um_per_s: float) -> float:
         return PumpCurve(self._pump).command(flow_um_per_s, self.dt_s) if flow_um_per_s > 0 else 0.0
+
+
+def around_of(held: Record, loop: LoopConfig, pump: PumpConfig, limit_um: float) -> Around:
+    """The frame of an experiment: what a hold before it shows, and the pump's range."""
+    return Around(
+        holding_flow_um_per_s=float(held.flow_um_per_s.mean()),
+        least_flow_um_per_s=PumpCurve(pump).least_flow_um_per_s,
+        full_flow_um_per_s=min(pump.flow_full_um_per_s, loop.flow_max_um_per_s),
+        laser_um=laser_noise_um(held),
+        limit_um=limit_um,
+    )
 
 
 def laser_noise_um(record: Record) -> float:

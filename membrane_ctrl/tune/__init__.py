@@ -1,0 +1,1 @@
+"""The command `tune`: sessions on a running hold or on the twin."""
