@@ -43,7 +43,8 @@ def rings_for(config: Config, truth: RingAddress | None, stack: ExitStack) -> Ri
     telemetry = stack.enter_context(ring(kept, ROW_BYTES))
     events = stack.enter_context(ring(_EVENTS_KEPT, _EVENT_BYTES))
     inputs = stack.enter_context(ring(kept, MESSAGE_BYTES))
-    if truth is None or not config.shape.enabled:  # no camera but the twin's is known yet
+    camera = truth is not None or (config.devices is not None and config.devices.camera is not None)
+    if not camera or not config.shape.enabled:
         return Rings(telemetry, events, inputs, None, None, truth)
     shapes = stack.enter_context(ring(_SHAPES_KEPT, _SHAPE_BYTES))
     return Rings(telemetry, events, inputs, shapes, _frames(config, stack), truth)
@@ -52,7 +53,7 @@ def rings_for(config: Config, truth: RingAddress | None, stack: ExitStack) -> Ri
 def _frames(config: Config, stack: ExitStack) -> FrameAddress:
     from membrane_ctrl.acquisition.frames import FrameRing
 
-    owner = FrameRing.for_optics(config.optics)
+    owner = FrameRing.for_optics(config.optics, config.recording.raw_before_fault_cycles)
     stack.callback(owner.close)
     return owner.address
 
@@ -78,7 +79,7 @@ class Crew:
         self._recorder = Post(_recorder(config, clock, rings, run_dir, name))
         self._acquisition = None
         if rings.shapes is not None and rings.frames is not None:
-            self._acquisition = Post(_acquisition(config, clock, rings, rings.shapes, rings.frames))
+            self._acquisition = Post(_acquisition(config, clock, rings, rings.shapes, rings.frames, run_dir))
 
     @property
     def _posts(self) -> list[Post]:
@@ -125,10 +126,12 @@ def _recorder(config: Config, clock: RunClock, rings: Rings, run_dir: Path, name
     return make
 
 
-def _acquisition(config: Config, clock: RunClock, rings: Rings, shapes: RingAddress, frames: FrameAddress) -> Make:
+def _acquisition(
+    config: Config, clock: RunClock, rings: Rings, shapes: RingAddress, frames: FrameAddress, run_dir: Path
+) -> Make:
     from membrane_ctrl.acquisition.process import AcquisitionSpec
 
-    spec = AcquisitionSpec(config, clock, rings.telemetry, shapes, rings.truth, frames)
+    spec = AcquisitionSpec(config, clock, rings.telemetry, shapes, rings.truth, frames, run_dir)
 
     def make(_: int) -> tuple[Child, Connection]:
         ours, theirs = pipe()

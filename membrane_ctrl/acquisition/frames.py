@@ -89,10 +89,13 @@ class FrameRing:
             ) from error
 
     @classmethod
-    def for_optics(cls, optics: OpticsConfig) -> FrameRing:
-        """A ring for the frames of one full cycle (2 x (N sinusoids + 4 Gray) + white + black) and one more."""
+    def for_optics(cls, optics: OpticsConfig, kept_cycles: int = 1) -> FrameRing:
+        """A ring for the frames of one full cycle (2 x (N sinusoids + 4 Gray) + white + black) and one more.
+
+        Larger if `kept_cycles` cycles of 2 N sinusoids need it.
+        """
         camera = optics.camera
-        slots = 2 * (optics.pattern.steps + 4) + 2 + 1
+        slots = max(2 * (optics.pattern.steps + 4) + 2, kept_cycles * 2 * optics.pattern.steps) + 1
         return cls(slots, camera.height_px, camera.width_px, "uint8" if camera.bits == 8 else "uint16")
 
     def close(self) -> None:

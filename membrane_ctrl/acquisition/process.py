@@ -12,6 +12,7 @@ import signal
 import traceback
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 from membrane_ctrl.acquisition.frame_address import FrameAddress
 from membrane_ctrl.acquisition.remote import Remote
@@ -41,6 +42,8 @@ class AcquisitionSpec:
         The twin's truth, which its camera renders; None on a real bench.
     frames : FrameAddress
         Where the pixels go.
+    run_dir : Path or None
+        Folder of the run, for the frames that are kept.
     """
 
     config: Config
@@ -49,6 +52,7 @@ class AcquisitionSpec:
     shapes: RingAddress
     truth: RingAddress | None
     frames: FrameAddress
+    run_dir: Path | None = None
 
 
 def acquisition_main(spec: AcquisitionSpec, control: Connection) -> None:

@@ -8,19 +8,23 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 
 from firmware_iface.roles import LinkError
-from membrane_ctrl.acquisition.cycle import CyclePlan, ShapeCycle
+from membrane_ctrl.acquisition.cycle import CyclePlan, ShapeCycle, pause_s
 from membrane_ctrl.acquisition.frames import FrameWriter
 from membrane_ctrl.acquisition.laser import LaserHistory
+from membrane_ctrl.acquisition.optical_bench import OpticalBench, configured_bench, open_bench
 from membrane_ctrl.acquisition.process import AcquisitionSpec
+from membrane_ctrl.acquisition.raw_frames import RawFrames
 from membrane_ctrl.acquisition.remote import Remote
 from membrane_ctrl.acquisition.twin_bench import TwinTruth
-from membrane_ctrl.acquisition.warm_up import small, warm_up
+from membrane_ctrl.acquisition.warm_up import TYPICAL_FILM, small, warm_up
 from membrane_ctrl.acquisition.worker import estimate_message, keep_cycling
 from membrane_ctrl.clock import RunClock
-from membrane_ctrl.ipc.ring import RingWriter
+from membrane_ctrl.config import Config
+from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.ipc.ring import RingAddress, RingWriter
 from membrane_ctrl.metrology.live import LiveReconstructor
 from membrane_ctrl.metrology.patterns import fringe_sequence, full_sequence
-from membrane_ctrl.twin.camera import TwinOptics
+from membrane_ctrl.twin.camera import FilmPosition, TwinOptics
 
 _TRUTH_LOOK_S = 0.1
 
@@ -49,33 +53,78 @@ def run(spec: AcquisitionSpec, remote: Remote) -> None:
     Raises
     ------
     LinkError
-        If there is no camera.
+        If no camera is configured, or its patterns do not fit on the screen.
     """
     remote.report("preparing", "tracing the first picture, compiling what is not compiled yet")
-    if spec.truth is None:
-        raise LinkError("no camera: the twin's is the only one known; set shape.enabled = false to run without")
     config, clock = spec.config, WaitingClock(spec.clock)
     pattern = config.optics.pattern
     plan = CyclePlan(full_sequence(pattern), fringe_sequence(pattern), config.shape.frame_interval_s)
     with ExitStack() as stack:
-        truth = stack.enter_context(closing(TwinTruth(spec.truth)))
-        while not truth.known and not remote.stop:
-            remote.listen(_TRUTH_LOOK_S)
+        if spec.truth is None:
+            bench = configured_bench(config, clock)
+            _warm_up(config, plan, TYPICAL_FILM, clock)
+            signal.signal(signal.SIGTERM, lambda number, frame: remote.end())
+            stack.callback(bench.close)
+            _open(bench, config, clock, remote)
+        else:
+            bench = _twin_bench(spec.truth, config, plan, clock, remote, stack)
+            signal.signal(signal.SIGTERM, lambda number, frame: remote.end())
+            stack.callback(bench.close)
         if remote.stop:
             return
-        coarse = small(config.optics)
-        warm_up(LiveReconstructor(coarse, config.shape.bin_px), coarse, plan, truth(), clock)
-        bench = TwinOptics(config.optics, config.twin, truth, clock)
-        bench.prepare()
         reconstructor = LiveReconstructor(config.optics, config.shape.bin_px)
-        signal.signal(signal.SIGTERM, lambda number, frame: remote.end())
         shapes = stack.enter_context(closing(RingWriter(spec.shapes)))
         frames = stack.enter_context(closing(FrameWriter(spec.frames)))
         laser = stack.enter_context(closing(LaserHistory(spec.telemetry)))
-        stack.callback(bench.camera.close)
-        stack.callback(bench.screen.close)
+        raw = stack.enter_context(closing(_raw_frames(spec, plan))) if spec.run_dir is not None else None
         cycle = ShapeCycle(
             bench.camera, bench.screen, reconstructor, plan, frames, clock, laser, stopping=remote.interrupts
         )
+
+        def publish(estimate: ShapeEstimate) -> None:
+            shapes.put(estimate_message(estimate))
+            if raw is not None:
+                raw.after(estimate)
+
         remote.report("running", "first cycle")
-        keep_cycling(cycle, remote, lambda e: shapes.put(estimate_message(e)), clock, config.shape.period_s)
+        keep_cycling(cycle, remote, publish, clock, config.shape.period_s)
+
+
+def _twin_bench(
+    address: RingAddress, config: Config, plan: CyclePlan, clock: WaitingClock, remote: Remote, stack: ExitStack
+) -> OpticalBench:
+    """The twin's camera and screen, once its bench has said where the film is."""
+    truth = stack.enter_context(closing(TwinTruth(address)))
+    while not truth.known and not remote.stop:
+        remote.listen(_TRUTH_LOOK_S)
+    optics = TwinOptics(config.optics, config.twin, truth, clock)
+    if not remote.stop:
+        _warm_up(config, plan, truth(), clock)
+        optics.prepare()
+    return OpticalBench(optics.camera, optics.screen)
+
+
+def _warm_up(config: Config, plan: CyclePlan, position: FilmPosition, clock: WaitingClock) -> None:
+    coarse = small(config.optics)
+    warm_up(LiveReconstructor(coarse, config.shape.bin_px), coarse, plan, position, clock)
+
+
+def _open(bench: OpticalBench, config: Config, clock: WaitingClock, remote: Remote) -> None:
+    """Open camera and screen; what is not there is tried again until told to stop: the hold goes on meanwhile."""
+    failures = 0
+    while not remote.stop:
+        try:
+            open_bench(bench, config, clock, lambda line: remote.report("preparing", line))
+            return
+        except LinkError as error:
+            failures += 1
+            remote.report("retrying", str(error))
+        again_s = clock.now() + pause_s(failures)
+        while not remote.stop and (remaining_s := again_s - clock.now()) > 0:
+            remote.listen(remaining_s)
+
+
+def _raw_frames(spec: AcquisitionSpec, plan: CyclePlan) -> RawFrames:
+    assert spec.run_dir is not None
+    config = spec.config
+    return RawFrames(spec.run_dir / "raw", config.optics, plan, config.recording, spec.frames, spec.telemetry)

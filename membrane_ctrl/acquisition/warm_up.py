@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,6 +12,18 @@ from membrane_ctrl.acquisition.cycle import CycleClock, CyclePlan, Reconstructor
 from membrane_ctrl.acquisition.frames import Pixels
 from membrane_ctrl.config import OpticsConfig, TwinConfig
 from membrane_ctrl.twin.camera import FilmPosition, TwinOptics
+
+
+@dataclass(frozen=True, slots=True)
+class _StandingFilm:
+    """A film at its usual sag."""
+
+    displacement_um: float
+    sag_mm: float
+
+
+# A real film's sag is not known before it was measured; a meter of film at the usual pressure has this one
+TYPICAL_FILM: FilmPosition = _StandingFilm(0.0, 37.1)
 
 _SMALL_PX = 300  # this side still gives 36 terms enough points, in a hundredth of the work
 
