@@ -28,6 +28,7 @@ from membrane_ctrl.safety import MOVING, Observation, Rule, SafetyTable, Verdict
 from membrane_ctrl.states import HANDLERS, Scene, Way
 from membrane_ctrl.telemetry import TelemetryRow
 from membrane_ctrl.tick import Event, TickInputs, TickOutputs
+from membrane_ctrl.witnesses import Witnesses
 
 # dt outside this range of the nominal one is no time step a loop was designed for; what is beyond is a missed
 # tick, which safety sees by its lateness
@@ -57,6 +58,7 @@ class Controller:
         self._scene = Scene(config, config.loop, loop, observer, Ladder(config.states), config.loop.setpoint_um)
         self._resume = ResumeRule(config.resume)
         self._gains = GainsTrial(config.loop)
+        self._witnesses = Witnesses(config)
         self._answers: list[tuple[int, str]] = []
         self._clear_board = False
         self._tick_error = ""
@@ -79,7 +81,11 @@ class Controller:
         events: list[Event] = []
         self._begin(inputs, events)
         error_um = scene.output.error_um if scene.output is not None and self.state in MOVING else math.nan
-        observation = scene.observer.observe(inputs, error_um, self._tick_error, scene.overdue, scene.unfit)
+        leak_um_per_s = scene.output.leak_um_per_s if scene.output is not None else math.nan
+        events += self._witnesses.ask(inputs, self.state, scene.dt_s, scene.setpoint_um, leak_um_per_s)
+        observation = scene.observer.observe(
+            inputs, error_um, self._tick_error, scene.overdue, scene.unfit, self._witnesses.laser_lies
+        )
         verdict = self._safety.judge(self.state, observation)
         self._apply(verdict, events)
         self._consider_resuming(observation)
@@ -225,7 +231,14 @@ class Controller:
     def _step_shape(self, inputs: TickInputs, events: list[Event]) -> ShapeOutput:
         scene = self._scene
         settled = self.state == State.HOLD and scene.ladder.rung == Rung.NONE
-        shape = self._shape.step(inputs.now_s, scene.dt_s, inputs.estimate, scene.observer.displacement_um, settled)
+        shape = self._shape.step(
+            inputs.now_s,
+            scene.dt_s,
+            inputs.estimate,
+            scene.observer.displacement_um,
+            settled,
+            self._witnesses.camera_lies,
+        )
         scene.trim_um = shape.trim_um if self.state in MOVING else 0.0
         if (shape.state, shape.reason) != self._shape_was:
             self._shape_was = (shape.state, shape.reason)

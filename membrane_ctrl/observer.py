@@ -37,7 +37,9 @@ class Observer:
         """Note the command of the tick that just ended, to compare it with its read-back."""
         self._commanded = (command.pump_fraction, self._commanded[0])
 
-    def observe(self, inputs: TickInputs, error_um: float, tick_error: str, overdue: str, unfit: str) -> Observation:
+    def observe(
+        self, inputs: TickInputs, error_um: float, tick_error: str, overdue: str, unfit: str, laser_lies: str
+    ) -> Observation:
         """One tick's observation."""
         reading = self.reading = inputs.reading
         now_s = inputs.now_s
@@ -69,6 +71,7 @@ class Observer:
             tick_error=tick_error,
             overdue=overdue,
             unfit=unfit,
+            laser_lies=laser_lies,
         )
 
     def _gate(self, reading: BenchReading | None, fresh: bool) -> float:

@@ -58,6 +58,8 @@ class Observation:
         What the present state has waited for too long, if it has.
     unfit : str
         What the actuator test found, if anything.
+    laser_lies : str
+        What the three witnesses of the sag have seen, if it is the laser that does not fit.
     """
 
     link_up: bool
@@ -77,6 +79,7 @@ class Observation:
     overdue: str = ""
     unfit: str = ""
     same_s: float = 0.0
+    laser_lies: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,6 +244,19 @@ TABLE: tuple[Rule, ...] = (
         lambda o, c: o.advance_age_s > c.stale_s,
     ),
     Rule(
+        14,
+        "laser_implausible",
+        "camera and gauge agree that the laser does not show where the mirror is",
+        1,
+        1,
+        "shape.disagreement_max_um",
+        Rung.HOLD_FLOW,
+        False,
+        HOLDING,
+        "look for a knocked laser mount; then take a new reference with `ctl shape off` and `ctl shape on`",
+        lambda o, c: bool(o.laser_lies),
+    ),
+    Rule(
         15,
         "displacement_stuck",
         "the laser repeats one value to the last bit",
@@ -395,6 +411,8 @@ def _seen(rule: Rule, observation: Observation) -> str:
             return f"{observation.error_um:.1f} um"
         case "device_silent":
             return f"{observation.reading_age_s:.2f} s"
+        case "laser_implausible":
+            return observation.laser_lies
         case "displacement_stuck":
             return f"{observation.same_s:.1f} s"
         case "displacement_frozen":

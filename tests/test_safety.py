@@ -38,6 +38,7 @@ BAD = {
     "board_fault": replace(GOOD, board_faults=4),
     "pump_mismatch": replace(GOOD, pump_mismatch=0.2),
     "displacement_frozen": replace(GOOD, advance_age_s=LIMITS.stale_s + 0.01),
+    "laser_implausible": replace(GOOD, laser_lies="laser +30 um, camera 0 um, gauge 0 um"),
     "displacement_stuck": replace(GOOD, same_s=LIMITS.stuck_s + 0.01),
     "displacement_jump": replace(GOOD, jumps=1),
     "displacement_missing": replace(GOOD, displacement_valid=False),

@@ -90,7 +90,13 @@ class ShapeLoop:
         self._admitted_s, self._seen_s = math.nan, now_s
 
     def step(
-        self, now_s: float, dt_s: float, estimate: ShapeEstimate | None, displacement_um: float, settled: bool
+        self,
+        now_s: float,
+        dt_s: float,
+        estimate: ShapeEstimate | None,
+        displacement_um: float,
+        settled: bool,
+        distrust: str = "",
     ) -> ShapeOutput:
         """One tick.
 
@@ -104,6 +110,8 @@ class ShapeLoop:
             Laser reading now.
         settled : bool
             Whether the inner loop holds its setpoint.
+        distrust : str
+            Why the camera is not to be believed, if so.
         """
         if not settled:
             self._settled_since_s = math.inf
@@ -112,7 +120,7 @@ class ShapeLoop:
         if self._state != ShapeState.OFF:
             if estimate is not None:
                 self._seen_s = estimate.time_s
-            refusal = self._refusal(now_s, estimate, displacement_um, settled)
+            refusal = distrust or self._refusal(now_s, estimate, displacement_um, settled)
             if refusal:
                 self._refuse(refusal)
             elif estimate is not None:

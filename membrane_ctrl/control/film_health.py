@@ -1,0 +1,115 @@
+"""Slow changes that end in a failure: seen in hourly means, told ahead. Pure.
+
+leak      mean loss of gas; a seam that opens makes it grow until the pump cannot keep up
+reserve   what the pump has left above the leak
+tight     a mirror that loses too little gas cannot be lowered (control/leak.py)
+creep     at a held sag p J = const (Hencky, J the compliance): as the film gives the pressure falls, dJ/J = -dp/p
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from membrane_ctrl.control.leak import TOO_TIGHT_UM_PER_S
+
+HOUR_S = 3600.0
+DAY_HOURS = 24
+# A day of typical weather moves an hourly mean by some per cent; half as much again is the seam.
+LEAK_GREW = 1.5
+# The loop needs room for gusts: below this share of the pump's flow for the leak there is enough.
+RESERVE_SHARE = 0.6
+# The laws of both films give 0.7 % in the first day and 0.15 % in the second; more than this is no creep of the law.
+CREEP_PER_DAY = 0.01
+# Warned of again only after it has been clearly better.
+BETTER = 0.9
+
+
+@dataclass(frozen=True, slots=True)
+class Hour:
+    """Means of an hour of hold."""
+
+    leak_um_per_s: float
+    pressure_pa: float
+
+
+@dataclass(frozen=True, slots=True)
+class Maintenance:
+    """Something that a person should look at before it fails."""
+
+    name: str
+    message: str
+
+
+class FilmHealth:
+    """Collects a held mirror's hours and warns once of what gets worse.
+
+    Parameters
+    ----------
+    flow_max_um_per_s : float
+        What the pump has.
+    """
+
+    def __init__(self, flow_max_um_per_s: float) -> None:
+        self._flow_max_um_per_s = flow_max_um_per_s
+        self._hours: deque[Hour] = deque(maxlen=DAY_HOURS + 1)
+        self._first: Hour | None = None
+        self._warned: set[str] = set()
+        self._begin_hour()
+
+    def step(self, dt_s: float, leak_um_per_s: float, gauge_pressure_pa: float) -> tuple[Maintenance, ...]:
+        """One tick of a held mirror; what is newly worth a warning, at the end of an hour."""
+        if not (math.isfinite(leak_um_per_s) and math.isfinite(gauge_pressure_pa)):
+            return ()
+        self._held_s += dt_s
+        self._leak_um += dt_s * leak_um_per_s
+        self._pressure_pa_s += dt_s * gauge_pressure_pa
+        if self._held_s < HOUR_S:
+            return ()
+        hour = Hour(self._leak_um / self._held_s, self._pressure_pa_s / self._held_s)
+        self._begin_hour()
+        self._hours.append(hour)
+        self._first = self._first or hour
+        return tuple(self._newly_bad(hour, self._first))
+
+    def setpoint_moved(self) -> None:
+        """The sag is another one from now on: pressures before and after cannot be compared."""
+        self._hours.clear()
+        self._begin_hour()
+
+    def _begin_hour(self) -> None:
+        self._held_s = self._leak_um = self._pressure_pa_s = 0.0
+
+    def _newly_bad(self, hour: Hour, first: Hour) -> list[Maintenance]:
+        leak, most = hour.leak_um_per_s, self._flow_max_um_per_s
+        creep = self._creep_per_day()
+        found = (
+            ("leak_growth", leak / (LEAK_GREW * max(first.leak_um_per_s, TOO_TIGHT_UM_PER_S)), self._says_leak(leak)),
+            ("pump_reserve", leak / (RESERVE_SHARE * most), f"the leak takes {100 * leak / most:.0f} % of the pump"),
+            (
+                "too_tight",
+                TOO_TIGHT_UM_PER_S / max(leak, 1e-6),
+                f"the mirror loses only {leak:.2f} um/s: open a bleed (loop.bleed_fraction)",
+            ),
+            ("creep", creep / CREEP_PER_DAY, f"the film's compliance grows by {100 * creep:.1f} % a day"),
+        )
+        new = [Maintenance(name, says) for name, over, says in found if over > 1 and name not in self._warned]
+        self._warned = {name for name, over, _ in found if over > (BETTER if name in self._warned else 1.0)}
+        return new
+
+    def _says_leak(self, leak_um_per_s: float) -> str:
+        """How bad, and until when the pump can keep up if it goes on like this."""
+        days = (len(self._hours) - 1) / DAY_HOURS
+        growth_per_day = (leak_um_per_s - self._hours[0].leak_um_per_s) / days if days else 0.0
+        left = (self._flow_max_um_per_s - leak_um_per_s) / growth_per_day if growth_per_day > 0 else math.inf
+        until = f"; the pump keeps up for {left:.1f} days more" if left < 365 else ""
+        return f"the leak has grown to {leak_um_per_s:.2f} um/s{until}: look for an opening seam"
+
+    def _creep_per_day(self) -> float:
+        """Over what there is of the last day; 0 before six hours, for the trend of less is noise."""
+        hours = len(self._hours) - 1
+        if hours < 6:
+            return 0.0
+        first, last = self._hours[0].pressure_pa, self._hours[-1].pressure_pa
+        return (first - last) / first * DAY_HOURS / hours

@@ -1,0 +1,100 @@
+"""Who lies is found by the third witness, in a time and from a size that are stated; nobody is accused in peace."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.control.plausibility import Liar, Plausibility
+from membrane_ctrl.estimate import ShapeEstimate
+
+RATE_HZ = 10.0
+SAG_UM, PRESSURE_PA = 37_100.0, 600.0
+Story = Callable[[float], tuple[float, float, float]]  # time -> true sag change, laser's lie, camera's lie; um
+
+
+def estimate(time_s: float, sag_um: float, verdict: str = "ok") -> ShapeEstimate:
+    nothing = np.zeros(36)
+    return ShapeEstimate(
+        time_s, "fringes", nothing, 0.0, np.eye(36), sag_um, 1.0, 0.0, 1.0, 1.0, 80.0, 0.0, verdict  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def told(story: Story, duration_s: float = 400.0, seed: int = 1, gauge_drift_pa_per_s: float = 0.0) -> list[Liar]:
+    """What is said on every tick of a story; noise 1 um, 1 um and 0.5 Pa."""
+    rng = np.random.default_rng(seed)
+    judge, said = Plausibility(10.0), []
+    for tick in range(round(duration_s * RATE_HZ)):
+        time_s = tick / RATE_HZ
+        true_um, laser_um, camera_um = story(time_s)
+        noise = rng.standard_normal(3)
+        gauge_pa = PRESSURE_PA * (1 + 3 * true_um / SAG_UM) + 0.5 * noise[0] + gauge_drift_pa_per_s * time_s
+        shape = estimate(time_s, SAG_UM + true_um + camera_um + noise[1]) if tick % 20 == 0 else None
+        said.append(judge.step(1 / RATE_HZ, true_um + laser_um + noise[2], gauge_pa, shape))
+    return said
+
+
+def after(start_s: float, value: float) -> Callable[[float], float]:
+    return lambda time_s: value if time_s >= start_s else 0.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_in_peace_nobody_is_accused(seed: int) -> None:
+    wander: Story = lambda t: (8 * math.sin(t / 30), 0.0, 0.0)  # noqa: E731
+    assert set(told(wander, 1200.0, seed)) == {Liar.NOBODY}
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("size_um", [-40.0, -20.0, 20.0, 40.0])
+def test_a_laser_that_was_knocked_is_found_within_a_minute(size_um: float, seed: int) -> None:
+    # the loop brings the reading back to its setpoint, and the mirror off its place
+    said = told(lambda t: (-after(200.0, size_um)(t), after(200.0, size_um)(t), 0.0), seed=seed)
+    found = said.index(Liar.LASER) / RATE_HZ
+    assert 200.0 < found < 260.0
+    assert Liar.OPTICS not in said
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("size_um", [-40.0, -20.0, 20.0, 40.0])
+def test_a_camera_that_was_knocked_is_found_within_a_minute(size_um: float, seed: int) -> None:
+    said = told(lambda t: (0.0, 0.0, after(200.0, size_um)(t)), seed=seed)
+    found = said.index(Liar.OPTICS) / RATE_HZ
+    assert 200.0 < found < 260.0
+    assert Liar.LASER not in said
+
+
+def test_a_lie_that_ends_is_forgiven() -> None:
+    said = told(lambda t: (0.0, 0.0, 30.0 if 100 <= t < 200 else 0.0))
+    assert Liar.OPTICS in said
+    assert set(said[-500:]) == {Liar.NOBODY}
+
+
+def test_slow_drifts_are_no_lies() -> None:
+    assert set(told(lambda t: (0.0, 2.0 * t / 60, 0.0), 900.0)) == {Liar.NOBODY}  # the laser's mount
+    assert set(told(lambda t: (0.0, 0.0, 0.0), 900.0, gauge_drift_pa_per_s=0.01)) == {Liar.NOBODY}
+
+
+def test_a_witness_that_drifts_off_accuses_nobody_falsely() -> None:
+    # 0.1 Pa a minute, far more than a gauge's zero moves
+    said = told(lambda t: (0.0, after(200.0, 30.0)(t), 0.0), gauge_drift_pa_per_s=0.1 / 60)
+    assert Liar.LASER in said
+    assert Liar.OPTICS not in said
+
+
+def test_without_a_camera_or_a_gauge_nothing_is_said() -> None:
+    judge = Plausibility(10.0)
+    for tick in range(2000):
+        assert judge.step(0.1, 500.0 * (tick > 1000), 600.0, None) == Liar.NOBODY
+        assert judge.step(0.1, 500.0 * (tick > 1000), math.nan, estimate(tick * 0.1, SAG_UM)) == Liar.NOBODY
+        judge.reset()
+
+
+def test_a_rejected_shape_is_no_witness() -> None:
+    judge = Plausibility(10.0)
+    for tick in range(3000):
+        bad = estimate(tick * 0.1, SAG_UM + 500.0, "rejected") if tick % 20 == 10 else None
+        good = estimate(tick * 0.1, SAG_UM) if tick % 20 == 0 else None
+        assert judge.step(0.1, 0.0, 600.0, bad or good) == Liar.NOBODY
