@@ -21,6 +21,9 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 FlatOption = Annotated[
     bool, typer.Option("--from-flat", help="The simulated mirror starts flat: a fill takes two hours.")
 ]
+alarm_app = typer.Typer(no_args_is_help=True)
+app.add_typer(alarm_app, name="alarm")
+
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="Configuration, one TOML file.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
@@ -132,7 +135,7 @@ def ctl(
         str,
         typer.Argument(
             metavar="ACTION",
-            help="status, watch, setpoint UM, hold, pause, resume, manual FLOW, gains FILE, shape on|off, "
+            help="status, watch, setpoint UM, hold, pause, resume, manual FLOW, gains FILE, keep, shape on|off, "
             'mark "text", ack, lower, vent, stop, release, quiet.',
         ),
     ],
@@ -140,6 +143,7 @@ def ctl(
     why: Annotated[str, typer.Option(help="Recorded with the command.")] = "",
     take_over: Annotated[bool, typer.Option("--take-over", help="Take the command from who has it.")] = False,
     every: Annotated[str, typer.Option(help="watch: a line this often.")] = "1s",
+    trial: Annotated[str, typer.Option(help="gains: back to the old ones after this, unless `keep` comes.")] = "",
     run: Annotated[Path | None, typer.Option(help="The run's folder.")] = None,
     socket: Annotated[Path | None, typer.Option(help="The hold's socket; logs/control.sock by default.")] = None,
     tls: Annotated[str, typer.Option(metavar="HOST:PORT", help="By TCP, with the certificate below.")] = "",
@@ -153,7 +157,24 @@ def ctl(
     from membrane_ctrl.ctl import ctl as ask
 
     where = Where(socket, run, tls, certificate, key, authority)
-    return ask(CtlOptions(action, argument, why, take_over, every, json, where))
+    return ask(CtlOptions(action, argument, why, take_over, every, trial, json, where))
+
+
+@alarm_app.callback()
+def alarm() -> None:
+    """Who is told when nobody looks."""
+
+
+@alarm_app.command("test")
+def alarm_test(
+    config: ConfigOption = None,
+    escalated: Annotated[bool, typer.Option("--escalated", help="Also to those of the escalation.")] = False,
+    json: JsonOption = False,
+) -> int:
+    """Send a test notice to all whom an alarm would reach."""
+    from membrane_ctrl.alarms.command import send_test_alarm
+
+    return send_test_alarm(_config(config), str(config or "the defaults"), escalated, json)
 
 
 @app.command()

@@ -23,6 +23,7 @@ _EVENTS_KEPT, _EVENT_BYTES = 1024, 4096
 _SHAPES_KEPT, _SHAPE_BYTES = 64, 1 << 16  # a 36 x 36 covariance is 10 kB
 _RECORDER_CLOSES_S = 30.0
 _CHILD_STOPS_S = 3.0
+_ALARMS_LEAVE_S = 10.0  # it gives itself 8 s for the last notices
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,10 +81,11 @@ class Crew:
         self._acquisition = None
         if rings.shapes is not None and rings.frames is not None:
             self._acquisition = Post(_acquisition(config, clock, rings, rings.shapes, rings.frames, run_dir))
+        self._alarms = Post(_alarms(config, clock, rings, run_dir.name)) if config.alarms.urls_file else None
 
     @property
     def _posts(self) -> list[Post]:
-        return [post for post in (self._recorder, self._acquisition) if post is not None]
+        return [post for post in (self._recorder, self._acquisition, self._alarms) if post is not None]
 
     def start(self, stack: ExitStack) -> None:
         """Start all; the stack ends whatever `take_down` has not."""
@@ -109,6 +111,8 @@ class Crew:
             self._recorder.replace(self._clock.now())
             self._recorder.child.join(_RECORDER_CLOSES_S)
         self._screen.join(_CHILD_STOPS_S)
+        if self._alarms is not None:
+            self._alarms.child.join(_ALARMS_LEAVE_S)
 
 
 def _recorder(config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str) -> Make:
@@ -138,5 +142,17 @@ def _acquisition(
         return Child(
             "acquisition", "membrane_ctrl.acquisition.process:acquisition_main", (spec, theirs), nice=10
         ), ours
+
+    return make
+
+
+def _alarms(config: Config, clock: RunClock, rings: Rings, run: str) -> Make:
+    from membrane_ctrl.alarms.process import AlarmsSpec
+
+    spec = AlarmsSpec(clock, rings.telemetry, rings.events, config.alarms, run)
+
+    def make(_: int) -> tuple[Child, Connection]:
+        ours, theirs = pipe()
+        return Child("alarms", "membrane_ctrl.alarms.process:alarms_main", (spec, theirs), nice=5), ours
 
     return make

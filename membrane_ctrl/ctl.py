@@ -19,7 +19,8 @@ from membrane_ctrl.port.unix import SOCKET_NAME
 
 _SHAPE = {"on": "shape_on", "off": "shape_off"}
 _NUMBERS = {"setpoint": "um", "manual": "um/s of the centre"}
-_PLAIN = ("status", "watch", "release", "quiet", *(k for k in KINDS if not k.startswith("shape_")))
+# `tune` takes more than a word: `membrane-ctrl tune` asks for it
+_PLAIN = ("status", "watch", "release", "quiet", *(k for k in KINDS if not k.startswith("shape_") and k != "tune"))
 ACTIONS = (*_PLAIN, "shape")
 
 
@@ -44,6 +45,7 @@ class CtlOptions:
     why: str
     take_over: bool
     every: str
+    trial: str
     json: bool
     where: Where
 
@@ -89,6 +91,8 @@ def request_for(options: CtlOptions) -> dict[str, Any]:
         request["text"] = argument
     elif action == "gains":
         request["loop"] = _gains(argument)
+        if options.trial:
+            request["value"] = parse_duration_s(options.trial)
     elif argument is not None:
         raise InputError(f"ctl {action} takes no argument (it is {argument!r})")
     return request

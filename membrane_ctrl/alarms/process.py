@@ -1,0 +1,106 @@
+"""The process that tells people: mail servers may take a minute, and nothing of the run waits for them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from types import FrameType
+from typing import Any
+
+from membrane_ctrl.alarms.apprise_sender import apprise_sender
+from membrane_ctrl.alarms.book import Notice
+from membrane_ctrl.alarms.outbox import Outbox, Send
+from membrane_ctrl.alarms.watcher import Watcher
+from membrane_ctrl.clock import RunClock
+from membrane_ctrl.ipc.ring import RingAddress, RingReader
+from membrane_ctrl.port_config import AlarmsConfig
+from membrane_ctrl.tick import Event
+
+_LOOK_S = 0.5
+# After the run's end, for the last notices; a longer one would keep a service manager from restarting
+_LAST_S = 8.0
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmsSpec:
+    """What the process needs to know of the run.
+
+    Attributes
+    ----------
+    clock : RunClock
+        The run's clock.
+    telemetry, events : RingAddress
+        What to look at.
+    config : AlarmsConfig
+        Rules, times and files of URLs.
+    run : str
+        Name of the run folder.
+    """
+
+    clock: RunClock
+    telemetry: RingAddress
+    events: RingAddress
+    config: AlarmsConfig
+    run: str
+
+
+def alarms_main(spec: AlarmsSpec, status: Any) -> None:
+    """Watch until the run ends, or the control process is gone.
+
+    Target of a `spawn`ed process; `status` is its end of a pipe, for events about what it has sent.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _leave)
+    parent_pid = os.getppid()
+    watch(spec, apprise_sender(spec.config, spec.run), status.send, lambda: os.getppid() == parent_pid)
+
+
+def watch(spec: AlarmsSpec, send: Send, report: Callable[[Event], None], parent_lives: Callable[[], bool]) -> None:
+    """The process's loop.
+
+    Parameters
+    ----------
+    spec : AlarmsSpec
+        The run.
+    send : callable
+        Tells people; see `Outbox`.
+    report : callable
+        Tells the run's record what was sent.
+    parent_lives : callable
+        Whether the control process is still there.
+    """
+    clock = spec.clock
+    outbox = Outbox(_reporting(send, report))
+    watcher = Watcher(spec.config, outbox, clock.now())
+    with closing(RingReader(spec.telemetry)) as telemetry, closing(RingReader(spec.events)) as events:
+        while True:
+            lives = parent_lives()  # before the rings: who ends puts the last word in first
+            watcher.look(telemetry.drain(), events.drain(), clock.now())
+            if watcher.ended or not lives:
+                break
+            time.sleep(_LOOK_S)
+        if not watcher.ended:
+            watcher.orphaned(clock.now())
+    give_up_s = clock.now() + _LAST_S
+    while not outbox.empty and clock.now() < give_up_s:
+        time.sleep(_LOOK_S)
+        outbox.step(clock.now())
+
+
+def _reporting(send: Send, report: Callable[[Event], None]) -> Send:
+    def sending(notice: Notice) -> bool:
+        through = send(notice)
+        event = {"kind": "alarm", "alarm": notice.name, "what": notice.kind, "severity": notice.severity}
+        with suppress(OSError):  # the control process is gone: that is what the notice is about
+            report({**event, "text": notice.text, "sent": through, "escalated": notice.escalated})
+        return through
+
+    return sending
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    raise SystemExit(0)

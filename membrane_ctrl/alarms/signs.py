@@ -1,0 +1,105 @@
+"""What the run's events and telemetry mean as alarms: each sign raises an alarm or takes it away."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from membrane_ctrl.port_config import AlarmRule
+from membrane_ctrl.tick import Event
+
+Severity = Literal["warning", "critical"]
+
+# a fault that holds the flow for a few samples and is over again wakes nobody
+_GLITCH_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Sign:
+    """One alarm's condition has come or gone.
+
+    Attributes
+    ----------
+    name : str
+        Of the alarm.
+    bad : bool
+        It has come; False: gone.
+    severity, text
+        Of an alarm that has come.
+    for_s : float
+        How long the condition must stand before anyone is told.
+    """
+
+    name: str
+    bad: bool
+    severity: Severity = "warning"
+    text: str = ""
+    for_s: float = 0.0
+
+
+def signs_of(event: Event) -> list[Sign]:
+    """What an event says; most say nothing."""
+    match event.get("kind"):
+        case "fault":
+            text = f"{event.get('cause')} ({event.get('seen')}; {event.get('limit')}); {event.get('remedy')}"
+            if event.get("latching"):
+                return [Sign("fault", True, "critical", f"{event.get('name')}: {text}")]
+            return [Sign("glitch", True, "warning", f"{event.get('name')}: {text}", _GLITCH_S)]
+        case "cleared":
+            return [Sign("glitch", False)]
+        case "state" if event.get("from") == "fault":
+            return [Sign("fault", False), Sign("glitch", False)]
+        case "link":
+            up = event.get("message") == "connected again"
+            return [Sign("link", not up, "warning", str(event.get("message")), _GLITCH_S)]
+        case "child_ended":
+            child, code = event.get("child"), event.get("exit_code")
+            text = f"the {child} process ended with {code}; the hold goes on without it"
+            return [Sign(f"{child}_ended", True, "warning", text, _GLITCH_S)]
+        case "child_restarted":
+            return [Sign(f"{event.get('child')}_ended", False)]
+        case "recorder_error" | "disk_low":
+            return [Sign("recorder", True, "warning", str(event.get("message", event)))]
+        case "recorder_recovered":
+            return [Sign("recorder", False)]
+        case "port_failed":
+            return [Sign("port", True, "warning", f"the control port failed: {event.get('message')}", _GLITCH_S)]
+        case "port_open":
+            return [Sign("port", False)]
+        case "end":
+            return _end_signs(event)
+    return []
+
+
+def _end_signs(event: Event) -> list[Sign]:
+    if event.get("exit") in ("done", "interrupted"):
+        return []
+    return [Sign("run_ended", True, "critical", f"the run has ended: {event.get('exit')}")]
+
+
+def sign_of_value(rule: AlarmRule, value: float, standing: bool) -> Sign | None:
+    """What a telemetry value says to a rule; None: as before.
+
+    Parameters
+    ----------
+    rule : AlarmRule
+        Its limits; between them nothing changes.
+    value : float
+        Of the rule's field. NaN says nothing: that a value is missing is the safety table's business.
+    standing : bool
+        The alarm's condition was there with the last value.
+    """
+    if math.isnan(value):
+        return None
+    if rule.magnitude:
+        value = abs(value)
+    side = 1.0 if rule.raise_at > rule.clear_at else -1.0
+    if not standing and side * value > side * rule.raise_at:
+        text = (
+            f"{rule.field} = {value:.4g}, {'above' if side > 0 else 'below'} {rule.raise_at:g} for {rule.for_s:g} s"
+        )
+        return Sign(rule.name, True, rule.severity, text, rule.for_s)
+    if standing and side * value < side * rule.clear_at:
+        return Sign(rule.name, False)
+    return None
