@@ -1,0 +1,99 @@
+"""A post is filled again: at once, then later and later, not for ever."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from typing import Any
+
+from membrane_ctrl.post import Post
+
+
+class FakeChild:
+    """A child that ends when told to."""
+
+    name = "recorder"
+
+    def __init__(self) -> None:
+        self.alive = False
+        self.exit_code: int | None = None
+
+    def start(self) -> None:
+        self.alive = True
+
+    def die(self) -> None:
+        self.alive, self.exit_code = False, -9
+
+
+class Agency:
+    """Makes fake children and keeps the other ends of their pipes."""
+
+    def __init__(self) -> None:
+        self.numbers: list[int] = []
+        self.theirs: list[Connection] = []
+
+    def make(self, number: int) -> Any:
+        ours, theirs = Pipe()
+        self.numbers.append(number)
+        self.theirs.append(theirs)
+        return FakeChild(), ours
+
+
+def kinds(events: list[dict[str, Any]]) -> list[str]:
+    return [event["kind"] for event in events]
+
+
+def make_post() -> tuple[Post, Agency]:
+    agency = Agency()
+    post = Post(agency.make)
+    post.start()
+    return post, agency
+
+
+def test_what_the_child_says_is_handed_on() -> None:
+    post, agency = make_post()
+    agency.theirs[0].send({"kind": "disk_low"})
+    assert post.look(0.0) == [{"kind": "disk_low"}]
+    assert post.look(0.5) == []
+
+
+def test_a_dead_child_is_replaced_at_once_and_told() -> None:
+    post, agency = make_post()
+    agency.theirs[0].send({"kind": "last words"})
+    post.child.die()
+    assert kinds(post.look(3.0)) == ["last words", "child_ended", "child_restarted"]
+    assert agency.numbers == [0, 1]
+    assert post.child.alive
+    agency.theirs[1].send({"kind": "hello"})
+    assert kinds(post.look(3.5)) == ["hello"]
+
+
+def test_the_next_ones_come_later_and_later_and_no_more_than_ten_an_hour() -> None:
+    post, _ = make_post()
+    said: list[str] = []
+    restarted_s = []
+    for half_second in range(2 * 3600):
+        if post.child.alive:
+            post.child.die()
+        events = kinds(post.look(0.5 * half_second))
+        said += events
+        if "child_restarted" in events:
+            restarted_s.append(0.5 * half_second)
+    waits = [later - before for before, later in pairwise(restarted_s)]
+    assert len(restarted_s) == 10
+    assert waits == sorted(waits)
+    assert waits[0] <= 2.0
+    assert waits[-1] >= 60.0
+    assert said.count("child_given_up") == 1
+    assert said.count("child_ended") == 11
+
+
+def test_after_an_hour_it_is_tried_again() -> None:
+    post, agency = make_post()
+    for second in range(3000):
+        if post.child.alive:
+            post.child.die()
+        post.look(float(second))
+    assert agency.numbers[-1] == 10
+    assert kinds(post.look(3700.0)) == ["child_restarted"]
