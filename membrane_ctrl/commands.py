@@ -17,7 +17,7 @@ from membrane_ctrl.safety import MOVING
 
 Kind = Literal[
     "hold", "stop", "pause", "resume", "manual", "setpoint", "gains",
-    "shape_on", "shape_off", "mark", "ack", "lower", "vent", "tune", "keep",
+    "shape_on", "shape_off", "mark", "ack", "lower", "vent", "tune", "keep", "latch",
 ]  # fmt: skip
 Role = Literal["read", "operate", "tune"]
 
@@ -41,7 +41,7 @@ class Command:
         `setpoint`: um. `manual`: flow in um/s of the centre. `gains`: seconds until they go back to what they were,
         unless `keep` comes before; NaN: for good.
     text : str
-        `mark`: what to write on the timeline.
+        `mark`: what to write on the timeline. `latch`: the fault.
     loop : LoopConfig or None
         `gains`: the loop's new settings, whole.
     experiment : ExperimentSpec or None
@@ -82,6 +82,7 @@ TABLE: dict[Kind, Rule] = {
     "shape_off": Rule("operate", ANY),
     "mark": Rule("operate", ANY),
     "ack": Rule("operate", {State.STANDBY, State.FAULT}),
+    "latch": Rule("operate", {State.STANDBY}),  # a fault of an earlier run, or a person's lock: no hold before `ack`
     "lower": Rule("operate", RUNNING),
     "vent": Rule("operate", ANY),
 }

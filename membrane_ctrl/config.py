@@ -90,6 +90,7 @@ class StatesConfig(Section):
     lower_timeout_s: Annotated[float, Field(gt=0, le=600)] = 3.0
     pause_max_s: Annotated[float, Field(gt=0, le=1e5)] = 600.0
     vented_pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 100.0  # `vent` is done below this
+    latch_twin_faults: bool = False  # a trip of the simulated mirror keeps the next run down, as a real one does
     stay_after_trip: bool = False  # wait in `fault` for `ctl ack` instead of ending the run
 
 

@@ -157,7 +157,10 @@ class Controller:
                 self._gains.keep()
             case "shape_on" | "shape_off":
                 self._shape.switch(command.kind == "shape_on", scene.now_s)
+            case "latch":
+                scene.latched = command.text or f"locked by {command.who}"
             case "ack":
+                scene.latched = ""
                 scene.acknowledged = self.state == State.FAULT
                 self._clear_board = True
             case "stop":
@@ -169,8 +172,10 @@ class Controller:
             scene.asked_by = command.who
 
     def _prepare(self, command: Command) -> str:
-        """Make the experiment that is asked for; why it cannot be, if it cannot."""
+        """Make the experiment that is asked for; why it cannot be, or may not begin, if so."""
         scene, spec = self._scene, command.experiment
+        if command.kind == "hold" and scene.latched:
+            return f"a fault is latched: {scene.latched}; acknowledge it first"
         if command.kind != "tune" or spec is None:
             return ""
         centre_um = scene.setpoint_um + scene.trim_um

@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 
 from firmware_iface.roles import Bench, LinkError
+from membrane_ctrl.alarms.apprise_sender import require_sendable
 from membrane_ctrl.bench import connect, open_bench
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.commands import Command
@@ -28,12 +29,16 @@ from membrane_ctrl.controller import Controller
 from membrane_ctrl.crew import Crew, Rings, rings_for
 from membrane_ctrl.errors import DeviceError, Exit, InputError
 from membrane_ctrl.ipc.ring import RingReader, RingWriter
+from membrane_ctrl.latched import LatchedFile
+from membrane_ctrl.latcher import Latcher
 from membrane_ctrl.port.listeners import listeners_for
 from membrane_ctrl.port.server import Port, RunHooks
 from membrane_ctrl.priority import raise_priority
 from membrane_ctrl.recording.run_folder import create_run_folder
 from membrane_ctrl.simulated import TwinProcess
 from membrane_ctrl.supervisor import Supervisor, Wiring
+from membrane_ctrl.systemd import SystemdNotify
+from membrane_ctrl.tick import Event
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +53,7 @@ class HoldOptions:
     logs_dir: Path | None
     clear_faults: bool
     json: bool
+    standby: bool = False  # wait for `ctl hold`
     lab: bool = False  # the twin answers as the instruments of the configuration, not as the pump board
 
 
@@ -58,6 +64,7 @@ def hold_mirror(options: HoldOptions) -> int:
     """
     if options.config.devices is None and not options.twin:
         raise InputError(f"{options.source}: devices: missing; name the pump board in [devices], or use --twin")
+    require_sendable(options.config.alarms)
     clock = RunClock.start()
     with ExitStack() as stack:
         twin = TwinProcess.started(options.config, clock, stack, options.lab) if options.twin else None
@@ -65,6 +72,7 @@ def hold_mirror(options: HoldOptions) -> int:
         assert config.devices is not None
         logs_dir = options.logs_dir or Path(config.recording.logs_dir)
         listeners = listeners_for(config.port, logs_dir, stack)  # a second hold ends here, no device touched
+        latched = _latched(config, logs_dir, options)
         asyncio.run(_identify(open_bench(config.devices), config.devices, options.clear_faults))
         run_dir = create_run_folder(logs_dir, options.name, clock.origin_utc, config)
         rings = rings_for(config, twin.truth if twin else None, stack)
@@ -72,10 +80,28 @@ def hold_mirror(options: HoldOptions) -> int:
         crew.start(stack)
         bench = open_bench(config.devices)  # a link belongs to the event loop that opened it
         port = partial(Port, config.port, listeners, run_dir.name)
-        exit_code = asyncio.run(_run(bench, config, options.duration_s, clock, rings, crew, twin, port))
+        latcher = partial(Latcher, latched, run_dir.name, clock.utc)
+        exit_code = asyncio.run(_run(bench, config, options, clock, rings, crew, twin, port, latcher))
         crew.take_down()
     _report(run_dir, options.json)
     return exit_code
+
+
+def _latched(config: Config, logs_dir: Path, options: HoldOptions) -> LatchedFile | None:
+    """The file of the fault that outlives a run; the twin has one only if its configuration says so.
+
+    Raises DeviceError if a fault is latched, unless it is to be cleared, or nobody asks to hold the mirror yet.
+    """
+    if options.twin and not config.states.latch_twin_faults:
+        return None
+    file = LatchedFile(logs_dir)
+    fault = file.read()
+    if fault is None or options.standby:
+        return file
+    if not options.clear_faults:
+        raise DeviceError(f"a fault is latched: {fault}; {fault.remedy}, then start with --clear-faults")
+    file.clear()
+    return file
 
 
 async def _identify(bench: Bench, devices: DevicesConfig, clear_faults: bool) -> None:
@@ -99,12 +125,13 @@ async def _identify(bench: Bench, devices: DevicesConfig, clear_faults: bool) ->
 async def _run(
     bench: Bench,
     config: Config,
-    duration_s: float | None,
+    options: HoldOptions,
     clock: RunClock,
     rings: Rings,
     crew: Crew,
     twin: TwinProcess | None,
     port_for: Callable[[RunHooks], Port],
+    latcher_for: Callable[[Callable[[Event], None]], Latcher],
 ) -> Exit:
     from membrane_ctrl.metrology.hencky import zernike_projection
 
@@ -114,19 +141,23 @@ async def _run(
         controller = Controller(config, zernike_projection())
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         port = port_for(RunHooks(supervisor.ask, supervisor.tell, clock.now, lambda: controller.loop_config))
-        wiring.heard = port.heard
+        latcher, systemd = latcher_for(supervisor.tell), SystemdNotify()
+        wiring.heard = (port.heard, latcher.heard, systemd.heard)
         devices = config.devices.name if config.devices else ""
         supervisor.tell({"kind": "start", "devices": devices, "priority": raise_priority()})
         exit_code = Exit.DEVICE_FAILED
         try:
             assert config.devices is not None
             await connect(bench, config.devices)
-            supervisor.ask(Command("hold", "command line"))
+            if not options.standby:
+                supervisor.ask(Command("hold", "command line"))
+            elif latcher.latched:
+                supervisor.ask(Command("latch", "command line", text=latcher.latched))
             gc.collect()
             gc.freeze()  # what lives for the whole run need not be looked at again between two ticks
             async with port.open():
-                with _signals(supervisor):
-                    exit_code = await supervisor.run(duration_s)
+                with _signals(supervisor), latcher, systemd:
+                    exit_code = await supervisor.run(options.duration_s)
         except LinkError as error:
             supervisor.tell({"kind": "link", "message": str(error)})
             raise DeviceError(str(error)) from None

@@ -35,6 +35,12 @@ class Latcher:
         self._failed = ""
         self._fault: Event = {}
 
+    @property
+    def latched(self) -> str:
+        """What is latched now, in one line; empty for nothing."""
+        fault = None if self._file is None else self._file.read()
+        return "" if fault is None else str(fault)
+
     def __enter__(self) -> Latcher:
         return self
 

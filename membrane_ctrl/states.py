@@ -54,6 +54,7 @@ class Scene:
     asked_by: str = ""
     stop_exit: Exit = Exit.DONE
     acknowledged: bool = False
+    latched: str = ""  # a fault of an earlier run: no hold before a person has acknowledged it
     may_resume: bool = False  # the resume rule lets a latched fault go
     resume_possible: bool = False  # it may yet
     # memory of the states
@@ -91,7 +92,7 @@ def standby(scene: Scene) -> State:
     if scene.hold_wanted:
         scene.why = "asked to hold the mirror"
         return State.CHECK
-    scene.why = "standby: nobody has asked to hold the mirror"
+    scene.why = f"standby: latched: {scene.latched}" if scene.latched else "standby: nobody has asked for a hold"
     return State.STANDBY
 
 

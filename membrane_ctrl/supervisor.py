@@ -42,7 +42,7 @@ class Wiring:
     children: Sequence[Child] = ()
     reports: Callable[[], list[Event]] = list  # what the children have said since the last call
     tasks: dict[str, asyncio.Task[None]] = field(default_factory=dict)
-    heard: Callable[[TickOutputs], None] | None = None  # who wants to know what each tick decided; must not raise
+    heard: Sequence[Callable[[TickOutputs], None]] = ()  # who wants to know what each tick decided; must not raise
 
 
 class Supervisor:
@@ -141,8 +141,8 @@ class Supervisor:
         self._record(inputs, outputs)
         for event in outputs.events:
             self.tell(event)
-        if wiring.heard is not None:
-            wiring.heard(outputs)
+        for hear in wiring.heard:
+            hear(outputs)
         return outputs.finished
 
     def _record(self, inputs: TickInputs, outputs: TickOutputs) -> None:

@@ -29,11 +29,11 @@ class SystemdNotify:
 
     def __init__(self, address: str | None = None) -> None:
         self._address = (address or os.environ.get("NOTIFY_SOCKET", "")).replace("@", "\0", 1)
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         self._next_s = -math.inf
         self._state = -1.0
 
     def __enter__(self) -> SystemdNotify:
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         return self
 
     def __exit__(

@@ -123,7 +123,8 @@ class Plausibility:
         if abs(laser - optics) <= limit_um:
             self.liar = Liar.NOBODY
             follow = smoothing(dt_s, REFERENCE_S)
-            self._reference = tuple(r + follow * (m - r) for r, m in zip(self._reference, means, strict=True))
+            a, b, c = (was + follow * (mean - was) for was, mean in zip(self._reference, means, strict=True))
+            self._reference = a, b, c
             return
         if self.liar in (Liar.LASER, Liar.OPTICS):
             return  # it stands until the two agree again: a gauge that drifts meanwhile accuses nobody else
