@@ -64,8 +64,9 @@ def hold(
     name: Annotated[str, typer.Option(help="Name of the run folder.")] = "hold",
     logs: Annotated[Path | None, typer.Option(help="Where run folders go.")] = None,
     clear_faults: Annotated[
-        bool, typer.Option("--clear-faults", help="Clear what the board has latched, once you know why.")
+        bool, typer.Option("--clear-faults", help="Clear what board or an earlier run has latched, once you know why.")
     ] = False,
+    standby: Annotated[bool, typer.Option("--standby", help="Wait for `ctl hold`.")] = False,
     from_flat: FlatOption = False,
     json: JsonOption = False,
 ) -> int:
@@ -81,6 +82,7 @@ def hold(
         logs_dir=logs,
         clear_faults=clear_faults,
         json=json,
+        standby=standby,
         lab=devices is not None,
     )
     return hold_mirror(options)
@@ -107,6 +109,14 @@ def check(
     from membrane_ctrl.check import check_config
 
     return check_config(_config(config), str(config), json)
+
+
+@app.command()
+def safe(config: Annotated[Path, typer.Argument(help="Configuration, one TOML file.", metavar="CONFIG")]) -> int:
+    """Stop the pump of the devices that a configuration names, whatever runs or ran; the vent stays as it is."""
+    from membrane_ctrl.safe_state import make_safe
+
+    return make_safe(_config(config), str(config))
 
 
 @app.command()
