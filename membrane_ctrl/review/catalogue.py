@@ -5,19 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.errors import DeviceError, InputError
+from membrane_ctrl.recording.retention import OldRun, deletable_runs, delete_run, expired
 from membrane_ctrl.review.folder import is_run, read_config, read_events, read_summary
 from membrane_ctrl.review.run import origin_of
 
 # A file of this name in a run's folder keeps it from being pruned.
-KEPT_FILE = "keep"
+KEPT_FILE = ".keep"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Entry:
     marks : int
         Annotations.
     kept : bool
-        A file `keep` is in the folder: prune leaves it.
+        A file `.keep` is in the folder: it is never pruned.
     """
 
     folder: Path
@@ -145,30 +145,22 @@ def resolve(run: Path, logs_dir: Path = Path("logs")) -> Path:
 
 
 def to_prune(
-    runs: Sequence[Entry], now_utc: datetime, older_than: timedelta, most_mb: float | None = None
-) -> list[Entry]:
-    """The runs that the retention rule gives up, oldest first.
-
-    Those older than `older_than`, then the oldest until all together are at most `most_mb`. Never a run that is
-    still open, had a fault, carries a mark, or holds a file `keep`: those are what someone may come back for.
-    """
-    free = [run for run in runs if not (run.kept or run.faults or run.marks or run.exit == "open")]
-    gone = [run for run in free if now_utc - run.started_utc > older_than]
-    if most_mb is not None:
-        left_mb = sum(run.size_mb for run in runs) - sum(run.size_mb for run in gone)
-        for run in sorted((r for r in free if r not in gone), key=lambda r: r.started_utc):
-            if left_mb <= most_mb:
-                break
-            gone.append(run)
-            left_mb -= run.size_mb
-    return sorted(gone, key=lambda r: r.started_utc)
+    logs_dir: Path, now_utc: datetime, keep_days: float | None, keep_gb: float | None
+) -> list[tuple[OldRun, str]]:
+    """The runs that the recorder's retention rule (`recording.retention`) gives up, and why; oldest first."""
+    if not logs_dir.is_dir():
+        raise InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
+    if keep_days is None and keep_gb is None:
+        raise InputError("runs prune: say what to keep: --keep-days, --keep-gb or both")
+    runs = deletable_runs(logs_dir, logs_dir / "none", now_utc)
+    return expired(runs, 0, keep_gb, keep_days, now_utc)
 
 
-def prune(runs: Sequence[Entry]) -> None:
+def prune(runs: Sequence[OldRun]) -> None:
     """Delete the folders of runs. Raises DeviceError at the first that cannot be."""
     for run in runs:
         try:
-            shutil.rmtree(run.folder)
+            delete_run(run)
         except OSError as error:
             raise DeviceError(f"{run.folder}: cannot be deleted ({error.strerror or error})") from None
 

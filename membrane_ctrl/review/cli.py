@@ -126,12 +126,12 @@ def show_run(run: RunArgument, json: JsonOption = False) -> int:
 @runs_app.command("prune")
 def prune_runs(
     logs: LogsOption = Path("logs"),
-    older_than: Annotated[str, typer.Option(help="Give up runs older than this.")] = "90d",
-    most_gb: Annotated[float | None, typer.Option(min=0, help="Then the oldest, until all are at most this.")] = None,
+    keep_days: Annotated[float | None, typer.Option(min=0, help="Give up runs older than this.")] = None,
+    keep_gb: Annotated[float | None, typer.Option(min=0, help="Then the oldest, until all are at most this.")] = None,
     delete: Annotated[bool, typer.Option("--delete", help="Do it; otherwise it is only said.")] = False,
     json: JsonOption = False,
 ) -> int:
-    """Give up old runs. Never one with a fault, a mark or a file `keep` in it, or without its end."""
+    """Give up old runs by the recorder's rule: never the newest three for their age, nor one with a file `.keep`."""
     from membrane_ctrl.review.runs_command import prune_command
 
-    return prune_command(logs, older_than, most_gb, delete, json)
+    return prune_command(logs, keep_days, keep_gb, delete, json)

@@ -10,7 +10,7 @@ from membrane_ctrl.config import Config
 from membrane_ctrl.config_file import parse, read_toml
 from membrane_ctrl.errors import InputError
 from membrane_ctrl.recording.column_file import FOLDER
-from membrane_ctrl.review.annotations import ANNOTATIONS_FILE
+from membrane_ctrl.review.annotations import ANNOTATIONS_FILE, MARK
 
 _SUMMARY_SCHEMA = "membrane-summary/1"
 
@@ -92,12 +92,19 @@ def _json_lines(path: Path, notes: list[str]) -> list[dict[str, Any]]:
         except ValueError:
             event = None
         if isinstance(event, dict):
-            found.append(event)
+            found.append(_mark(event))
         else:
             broken += 1
     if broken:
         notes.append(f"{path.name}: {broken} line{'s' * (broken > 1)} cannot be read")
     return found
+
+
+def _mark(event: dict[str, Any]) -> dict[str, Any]:
+    """A mark made while the run went on (`ctl mark`) is recorded as a command; here it is what it means."""
+    if event.get("kind") == "command" and event.get("command") == MARK:
+        return event | {"kind": MARK, "text": event.get("text") or event.get("why") or ""}
+    return event
 
 
 def _moment(event: dict[str, Any]) -> float:

@@ -26,6 +26,7 @@ DOOR_LEAST_PA = 6.0
 DOOR_LEAST_SIGMAS = 5.5
 # Means of five minutes tell a tenth of the leak; what matters to the hold is a quarter.
 LEAK_LEAST_SHARE = 0.2
+LEAK_LEAST_UM_PER_S = 0.03
 LEAK_LEAST_SIGMAS = 6.0
 LEAK_HALF_MIN = 5
 # A laser's noise is 1 um; the film makes no spike of a single tick.
@@ -111,13 +112,12 @@ def leak_steps(level: Level) -> list[Found]:
     leak = np.where(whole, leak, np.nan)
     if not np.isfinite(leak).any():
         return []
-    least = LEAK_LEAST_SHARE * abs(float(np.nanmedian(leak)))
-    found = steps(leak, half=LEAK_HALF_MIN, skip=1, least=least, least_sigmas=LEAK_LEAST_SIGMAS)
+    found = steps(leak, half=LEAK_HALF_MIN, skip=1, least=LEAK_LEAST_UM_PER_S, least_sigmas=LEAK_LEAST_SIGMAS)
     before = [float(np.nanmean(leak[max(0, s.row - LEAK_HALF_MIN) : s.row])) for s in found]
     return [
         _event("leak step", minutes, s.row, 60, 100 * s.size / old, "%", confidence(s.sigmas, leak.size))
         for s, old in zip(found, before, strict=True)
-        if old > 0
+        if old > 0 and abs(s.size) >= LEAK_LEAST_SHARE * old
     ]
 
 

@@ -6,13 +6,12 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-from membrane_ctrl.durations import parse_duration_s
 from membrane_ctrl.errors import InputError
 from membrane_ctrl.recording import plain_json
 from membrane_ctrl.review import catalogue
@@ -53,22 +52,19 @@ def show_command(run: Path, json: bool) -> int:
     return 0
 
 
-def prune_command(logs: Path, older_than: str, most_gb: float | None, delete: bool, json: bool) -> int:
+def prune_command(logs: Path, keep_days: float | None, keep_gb: float | None, delete: bool, json: bool) -> int:
     """What the retention rule gives up; deleted only with `delete`."""
-    found = entries(logs)
-    rule = timedelta(seconds=parse_duration_s(older_than))
-    gone = catalogue.to_prune(found, catalogue.now_utc(), rule, None if most_gb is None else 1000 * most_gb)
+    gone = catalogue.to_prune(logs, catalogue.now_utc(), keep_days, keep_gb)
     if delete:
-        catalogue.prune(gone)
+        catalogue.prune([run for run, _ in gone])
     if json:
-        print(catalogue.dumps(gone))
+        table = [{"name": run.folder.name, "size_bytes": run.size_bytes, "why": why} for run, why in gone]
+        print(plain_json.dumps({"deleted": delete, "runs": table}, indent=1))
         return 0
-    for entry in gone:
-        print(f"{'deleted' if delete else 'would delete'} {entry.name} ({entry.size_mb:.0f} MB)")
-    freed_mb = sum(entry.size_mb for entry in gone)
-    print(
-        f"{len(gone)} of {len(found)} runs, {freed_mb:.0f} MB" + ("" if delete or not gone else "; --delete does it")
-    )
+    for run, why in gone:
+        print(f"{'deleted' if delete else 'would delete'} {run.folder.name}, {run.size_bytes / 1e6:.0f} MB: {why}")
+    freed_mb = sum(run.size_bytes for run, _ in gone) / 1e6
+    print(f"{len(gone)} runs, {freed_mb:.0f} MB" + ("" if delete or not gone else "; --delete does it"))
     return 0
 
 
