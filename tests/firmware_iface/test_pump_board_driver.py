@@ -93,9 +93,7 @@ def test_urls(url: str, target: tuple[str, int]) -> None:
     assert parse_tcp_url(url) == target
 
 
-@pytest.mark.parametrize(
-    "url", ["127.0.0.1:5020", "http://h", "tcp://", "tcp://h:x", "tcp://h:70000", "tcp://h/p"]
-)
+@pytest.mark.parametrize("url", ["127.0.0.1:5020", "http://h", "tcp://", "tcp://h:x", "tcp://h:70000", "tcp://h/p"])
 def test_a_wrong_url_is_named(url: str) -> None:
     with pytest.raises(ValueError, match=url):
         PumpBoard(url)
