@@ -64,7 +64,8 @@ def hold(
     name: Annotated[str, typer.Option(help="Name of the run folder.")] = "hold",
     logs: Annotated[Path | None, typer.Option(help="Where run folders go.")] = None,
     clear_faults: Annotated[
-        bool, typer.Option("--clear-faults", help="Clear what board or an earlier run has latched, once you know why.")
+        bool,
+        typer.Option("--clear-faults", help="Clear what board or an earlier run has latched, once you know why."),
     ] = False,
     standby: Annotated[bool, typer.Option("--standby", help="Wait for `ctl hold`.")] = False,
     from_flat: FlatOption = False,
