@@ -17,9 +17,7 @@ from membrane_ctrl.errors import CommandError, InputError, RejectedError
 from membrane_ctrl.metrology.stability import default_points_mm
 from membrane_ctrl.result_files import write_json
 from membrane_ctrl.set_figure import Figures
-from membrane_ctrl.stability_run import StabilityRun
-
-RESULT = "stability.json"
+from membrane_ctrl.stability_run import SERIES, StabilityRun
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,7 @@ def stability_command(options: StabilityOptions) -> int:
         if run.used == 0:
             raise RejectedError(f"{options.folder}: none of {len(folders)} sets gave a figure ({run.first_reason})")
         table = {"schema": "membrane-stability/1", "run": str(options.folder), "size_px": size_px} | run.table()
-        write_json(out / RESULT, table)
+        write_json(out / "stability.json", table)
         run.draw()
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror or error}") from None
@@ -61,7 +59,7 @@ def set_folders(run: Path, out: Path) -> list[Path]:
     if not run.is_dir():
         raise InputError(f"{run}: no such run of sets")
     found = sorted(path for path in run.iterdir() if path.is_dir() and path.resolve() != out.resolve())
-    folders = [path for path in found if not (path / RESULT).is_file()]
+    folders = [path for path in found if not (path / SERIES).is_file()]
     if not folders:
         hint = "; it is a capture set itself, give the folder above it" if (run / "capture.toml").is_file() else ""
         raise InputError(f"{run}: holds no capture sets{hint}")

@@ -48,7 +48,8 @@ def draw_stability(
     _image(shown, f"SD (um), mean {np.nanmean(sd_um):.3g}", axis_mm, sd_um, "magma")
     for name, (x, y) in points.items():
         shown.plot(x, y, "o", color="white", markeredgecolor="black")
-        shown.annotate(name, (x, y), xytext=(5, 5), textcoords="offset points", color="white")
+        frame = {"boxstyle": "round,pad=0.15", "facecolor": "black", "alpha": 0.6}  # readable on any colour
+        shown.annotate(name, (x, y), xytext=(7, 7), textcoords="offset points", color="white", bbox=frame)
     _save(path, figure)
 
 

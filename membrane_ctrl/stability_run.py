@@ -25,6 +25,7 @@ from membrane_ctrl.stability_series import SeriesFile, read_series
 
 FloatArray = NDArray[np.float64]
 
+SERIES = "series.csv"  # also what tells a folder of results from a set
 _NAMED_BAD = 100  # bad sets listed in the table; all of them are in series.csv
 _PAIR_HEAD = ("lag_s", "earlier", "later", "seconds", "change_rms_um", "rmse_mean_um", "rmse_max_um")
 
@@ -51,7 +52,7 @@ class StabilityRun:
         self._out = out
         self._points_mm = dict(points_mm)
         self._trials, self._seed = trials, seed
-        self._series = SeriesFile(out / "series.csv", list(points_mm))
+        self._series = SeriesFile(out / SERIES, list(points_mm))
         self._pair_file = (out / "pairs.csv").open("w", newline="", encoding="utf-8")
         self._pair_rows = csv.writer(self._pair_file, lineterminator="\n")
         self._pair_rows.writerow(_PAIR_HEAD)
@@ -177,7 +178,7 @@ class StabilityRun:
             return
         axis, sd = grid.axis_mm, grid.picture(self._sd_um())
         np.savez(self._out / "sd.npz", x_mm=axis, y_mm=axis, sd_um=sd)
-        times, heights, coeffs = read_series(self._out / "series.csv", len(self._points_mm))
+        times, heights, coeffs = read_series(self._out / SERIES, len(self._points_mm))
         if not np.isfinite(times).all():  # sets without times: count them
             times = np.arange(len(times), dtype=float)
         draw_stability(self._out / "stability.png", axis, sd, times, self._points_mm, heights)

@@ -24,7 +24,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run over twelve minutes in which the film sinks by 1.2 um a minute."""
     folder = tmp_path_factory.mktemp("sets") / "run"
     motion = ["--sets", str(SETS), "--interval-s", str(INTERVAL_S), "--drift-um-per-s", str(DRIFT_UM_PER_S)]
-    assert run(["simulate", str(folder), "--shrink", "8", *motion]) == 0
+    assert run(["simulate", str(folder), "--shrink", "12", *motion]) == 0
     return folder
 
 
@@ -71,7 +71,7 @@ def test_a_sinking_film(made: Path, result: Path) -> None:
     rim_um = np.array([float(row["rim_um"]) for row in rows(result / "series.csv")])
     truth = np.load(made / "0000" / "truth.npz")
     share = truth["h_per_sag"][len(truth["y_mm"]) // 2, np.argmin(np.abs(truth["x_mm"] - 474))]
-    assert np.abs(rim_um - rim_um[0] - share * (sunk_um - sunk_um[0])).max() < 0.2
+    assert np.abs(rim_um - rim_um[0] - share * (sunk_um - sunk_um[0])).max() < 0.25
     assert table["points"]["rim"]["sd_um"] == pytest.approx(rim_um.std(ddof=1), rel=1e-6)
     assert table["points"]["rim"]["peak_to_peak_um"] == pytest.approx(np.ptp(rim_um), rel=1e-6)
     assert table["points"]["vertex"]["sd_um"] == pytest.approx(0, abs=1e-9)
@@ -84,8 +84,8 @@ def test_pairs_of_every_set(result: Path) -> None:
     assert (minute["lag_s"], minute["count"]) == (60.0, SETS - 1)
     assert (ten["lag_s"], ten["count"]) == (600.0, SETS - 10)
     assert ten["change_rms_um"]["mean"] == pytest.approx(10 * minute["change_rms_um"]["mean"], rel=0.05)
-    # noise of 1/64 of the real sensor's pixels; the geometry's 12 um cancel
-    assert 0.01 < minute["rmse_um"]["mean"] < 0.06
+    # noise of 1/144 of the real sensor's pixels; the geometry's 12 um cancel
+    assert 0.02 < minute["rmse_um"]["mean"] < 0.08
     assert table["rmse_um"]["mean"] > 100 * ten["rmse_um"]["mean"]
     listed = rows(result / "pairs.csv")
     assert len(listed) == minute["count"] + ten["count"]
@@ -131,7 +131,7 @@ def test_bad_sets_are_counted_and_named(spoiled: Path, tmp_path: Path, capsys: p
     assert (table["sets"]["used"], table["sets"]["bad"]) == (2, 2)
     bad = {item["set"]: item["reason"] for item in table["sets"]["bad_sets"]}
     assert "x_sin_1.png is missing" in bad["0001"]
-    assert "306 x 255" in bad["0002"]
+    assert "204 x 169" in bad["0002"]
     assert [row["verdict"] for row in rows(tmp_path / "out" / "series.csv")] == ["ok", "rejected", "rejected", "ok"]
     said = capsys.readouterr().err
     assert "passed over 0001" in said
@@ -161,15 +161,16 @@ def test_two_sizes(spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     said = capsys.readouterr().err.strip().splitlines()
     assert len(said) == 1
     assert "0002" in said[0]
-    assert "300 x 256" in said[0]
-    assert "306 x 256" in said[0]
+    assert "300 x 170" in said[0]
+    assert "204 x 170" in said[0]
     assert not (tmp_path / "out").exists()
 
 
 def test_no_set_gives_a_figure(spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.rmtree(spoiled / "0000")  # the reference of all
-    assert run(["stability", str(spoiled), "--out", str(tmp_path / "out")]) == 3
-    assert "none of 3 sets" in capsys.readouterr().err
+    for options in ([], ["--out", str(tmp_path / "out")]):  # what the first leaves behind is no set
+        assert run(["stability", str(spoiled), *options]) == 3
+        assert "none of 3 sets" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,7 @@ def test_seeds(analysed: Callable[..., dict[str, Any]]) -> None:
 
 
 def test_workers_change_nothing(analysed: Callable[..., dict[str, Any]]) -> None:
-    options = ("--trials", "150")  # two batches
+    options = ("--trials", "110")  # two batches
     alone, together = analysed(*options, "--workers", "1"), analysed(*options, "--workers", "2")
     assert together["rmse_um"] == pytest.approx(alone["rmse_um"], rel=1e-9)
 
@@ -154,8 +154,8 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_on_a_cluster(analysed: Callable[..., dict[str, Any]], cluster: list[str]) -> None:
-    here = analysed("--trials", "150")
-    there = analysed("--trials", "150", "--scheduler", "tcp://host:8786")
+    here = analysed("--trials", "110")
+    there = analysed("--trials", "110", "--scheduler", "tcp://host:8786")
     assert there["rmse_um"] == pytest.approx(here["rmse_um"], rel=1e-9)
     assert _Client.addresses == ["tcp://host:8786", "closed"]
 
