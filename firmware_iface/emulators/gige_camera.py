@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import socket
 import tempfile
+import time
 from collections.abc import Callable
 from ctypes import c_size_t, c_uint32, c_void_p
 from typing import Any
@@ -132,6 +133,7 @@ class GigeCameraEmulator:
 
     def _fill_buffer(self, buffer: int, _: Any, exposure_us: int, gain: int, pixel_format: int) -> None:
         self.exposures += 1
+        over_s = time.monotonic() + exposure_us / 1e6
         # the buffer does not know its size before it is filled
         size_bytes = self._aravis.call("arv_fake_camera_get_payload", self._inner)
         start = self._aravis.call("arv_buffer_get_data", buffer, None)
@@ -141,6 +143,7 @@ class GigeCameraEmulator:
         except Exception as error:
             self.error = error
             ctypes.memset(start, 0, size_bytes)
+        time.sleep(max(0.0, over_s - time.monotonic()))  # a frame is sent when its exposure is over
 
 
 def _description() -> str:
