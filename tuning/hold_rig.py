@@ -10,6 +10,8 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from membrane_ctrl.commands import Command
 from membrane_ctrl.config import LoopConfig
 from membrane_ctrl.control.experiments.machine import Around, Finished
@@ -20,7 +22,7 @@ from membrane_ctrl.names import State
 from membrane_ctrl.telemetry import TelemetryRow
 from membrane_ctrl.tick import Event
 from tuning.hold_link import HoldError, HoldLink
-from tuning.records import Record
+from tuning.records import Record, Series
 from tuning.rig import around_of
 
 Progress = Callable[[float], None]  # seconds of the hold that have been recorded since the last call
@@ -57,6 +59,14 @@ class HoldRig:
     def hold(self, duration_s: float) -> Record:
         """The next seconds of hold. Raises HoldError if the mirror is not held throughout."""
         return self.record([self._next_held() for _ in range(round(duration_s / self.dt_s))])
+
+    def hold_about(self, duration_s: float) -> tuple[Record, Series]:
+        """As `hold`, with the setpoint of each sample in um: the outer loop moves it, and the mirror with it."""
+        rows = [self._next_held() for _ in range(round(duration_s / self.dt_s))]
+        record = self.record(rows)
+        ticks = np.array([row.tick + row.missed_ticks for row in rows])
+        setpoints = np.interp(ticks[0] + np.arange(len(record)), ticks, [row.setpoint_um for row in rows])
+        return record, setpoints
 
     def around(self, held: Record, limit_um: float = 10.0) -> Around:
         """The frame of an experiment, from a hold before it."""
@@ -102,7 +112,8 @@ class HoldRig:
 
     def go_back(self, loop: LoopConfig) -> None:
         """End an experiment that may be running, and set the last good gains."""
-        if self._peek().state == State.TUNE:
+        self._take()
+        if self._rows and self._rows[-1].state == State.TUNE:
             self._link.ask(Command("hold", self._who, "tuning session interrupted"))
         if loop != self.loop:
             self.set_gains(loop, "back to the last good gains")

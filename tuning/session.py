@@ -1,0 +1,300 @@
+"""The steps of a session, each a function on its folder.
+
+What a step needs is read from the folder, what it has found is left there.
+
+Steps that move the mirror take a `HoldRig`; the others run anywhere, at any later time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl import config_file
+from membrane_ctrl.config import LoopConfig, PumpConfig
+from membrane_ctrl.control.experiments.machine import Around, Finished
+from membrane_ctrl.control.experiments.pump_map import PumpMap
+from membrane_ctrl.errors import RejectedError
+from membrane_ctrl.recording.atomic import write_text_atomic
+from tuning import plain
+from tuning.characterise import ExperimentError, Experiments, experiment, fitted, spec_of
+from tuning.design import Candidate, RefusedError, propose, table
+from tuning.disturbance_model import Disturbance, observe
+from tuning.gains_file import GainsFile, PlantSection, for_hold, load_gains, require_sound, save_gains
+from tuning.hold_link import HoldError
+from tuning.hold_rig import HoldRig
+from tuning.identify import Identified
+from tuning.preview import Preview, preview
+from tuning.quality import Quality
+from tuning.records import Record
+from tuning.records_file import load_record, save_record
+from tuning.robustness import Robustness
+from tuning.session_folder import SessionFolder
+from tuning.verify import SETTLE_S, STAGES, Stage, Trial, look
+
+OBSERVE_S = 600.0
+_PREVIEW_SEEDS = 3
+# Time to look at what was applied and to start the verification; then the gains go back by themselves.
+_APPLY_S = 900.0
+_SPARE_S = 120.0
+
+
+@dataclass(frozen=True, slots=True)
+class ExperimentsHead:
+    """`experiments.json`: what `characterise.Experiments` holds beside its record."""
+
+    around: Around
+    relays_s: float
+    pulses_s: tuple[float, float]
+    finished: Finished
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """`identified.json`."""
+
+    identified: Identified
+    quality: Quality
+    data_sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """`proposal.json`: a `design.Proposal` without its loop, which is in the gains file."""
+
+    candidates: tuple[Candidate, ...]
+    least_std_um: float
+    preview: Preview
+    robustness: Robustness
+
+
+@dataclass(frozen=True, slots=True)
+class Previewed:
+    """`preview.json`: the present gains and the proposed ones on the fitted twin, a seed a row."""
+
+    present: tuple[Preview, ...]
+    proposed: tuple[Preview, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """`verified.json`.
+
+    Attributes
+    ----------
+    kept : bool
+        The new gains stay.
+    reason : str
+        Why not.
+    stages : tuple of Stage
+    before, after : LoopConfig
+    """
+
+    kept: bool
+    reason: str
+    stages: tuple[Stage, ...]
+    before: LoopConfig
+    after: LoopConfig
+
+
+def characterise_step(session: SessionFolder, rig: HoldRig, limit_um: float = 10.0) -> Experiments:
+    """Experiments on the mirror. Raises RejectedError naming what would help if none could be completed."""
+    session.begin("characterise")
+    try:
+        done = experiment(rig, limit_um)
+    except (ExperimentError, ValueError) as error:
+        raise RejectedError(f"characterise: {error}") from None
+    save_record(session.file("experiments.npz"), done.record)
+    head = ExperimentsHead(done.around, done.relays_s, done.pulses_s, done.finished)
+    plain.write(session.file("experiments.json"), head)
+    return done
+
+
+def experiments_of(session: SessionFolder) -> Experiments:
+    """What the experiments left."""
+    session.require("characterise")
+    head = plain.read(session.file("experiments.json"), ExperimentsHead)
+    record = load_record(session.file("experiments.npz"))
+    return Experiments(head.around, record, head.relays_s, head.pulses_s, head.finished)
+
+
+def identify_step(session: SessionFolder) -> Found:
+    """Fit and verdict; a refused one is kept too, for the report."""
+    done = experiments_of(session)
+    session.begin("identify")
+    try:
+        all_of_it = fitted(done)
+    except ValueError as error:
+        raise RejectedError(f"identify: {error}") from None
+    found = Found(all_of_it.identified, all_of_it.quality, done.record.sha256())
+    plain.write(session.file("identified.json"), found)
+    return found
+
+
+def found_of(session: SessionFolder) -> Found:
+    """What was identified."""
+    session.require("identify")
+    return plain.read(session.file("identified.json"), Found)
+
+
+def observe_step(session: SessionFolder, rig: HoldRig, duration_s: float = OBSERVE_S) -> Disturbance:
+    """A quiet hold: the laser's noise and the weather."""
+    model = found_of(session).identified.model
+    session.begin("observe")
+    record = rig.hold(duration_s)
+    try:
+        disturbance = observe(record, model, rig.loop)
+    except ValueError as error:
+        raise RejectedError(f"observe: {error}") from None
+    save_record(session.file("quiet.npz"), record)
+    plain.write(session.file("disturbance.json"), disturbance)
+    return disturbance
+
+
+def disturbance_of(session: SessionFolder) -> Disturbance:
+    """What was observed."""
+    session.require("observe")
+    return plain.read(session.file("disturbance.json"), Disturbance)
+
+
+def design_step(session: SessionFolder, reason: str = "tuning session") -> GainsFile:
+    """Candidates and the proposed gains. Raises RejectedError if the data do not carry a proposal."""
+    found, disturbance = found_of(session), disturbance_of(session)
+    session.begin("design")
+    before = session.head.before
+    try:
+        made = propose(found.identified, disturbance, before, pump_of(session), found.quality)
+    except RefusedError as error:
+        raise RejectedError(f"design: {error}") from None
+    assert made.chosen.predicted is not None  # a proposal keeps its margins
+    gains = GainsFile(
+        author=session.head.author,
+        date_utc=session.head.created_utc,
+        reason=reason,
+        source=f"{session.head.source}; session {session.path.name}",
+        data_sha256=found.data_sha256,
+        predicted_std_um=made.chosen.predicted.std_um,
+        least_std_um=made.least_std_um,
+        plant=PlantSection.of(found.identified),
+        loop=made.loop,
+    )
+    write_text_atomic(session.file("candidates.md"), table(made.candidates) + "\n")
+    plain.write(
+        session.file("proposal.json"), Design(made.candidates, made.least_std_um, made.preview, made.robustness)
+    )
+    save_gains(session.file("gains.toml"), gains)
+    return gains
+
+
+def design_of(session: SessionFolder) -> Design:
+    """The candidates."""
+    session.require("design")
+    return plain.read(session.file("proposal.json"), Design)
+
+
+def preview_step(session: SessionFolder) -> Previewed:
+    """Present and proposed gains on the fitted twin with its one-sided pump, over some seeds of weather."""
+    session.require("design")
+    found, disturbance = found_of(session), disturbance_of(session)
+    gains = load_gains(session.file("gains.toml"))
+    session.begin("preview")
+    pump, model = pump_of(session), found.identified.model
+    present, proposed = (
+        tuple(preview(loop, pump, model, disturbance, seed) for seed in range(1, _PREVIEW_SEEDS + 1))
+        for loop in (session.head.before, gains.loop)
+    )
+    done = Previewed(present, proposed)
+    plain.write(session.file("preview.json"), done)
+    return done
+
+
+def pump_of(session: SessionFolder) -> PumpConfig:
+    """The pump as mapped in this session, or as configured."""
+    path = session.file("pump.toml")
+    return config_file.load(path, PumpConfig) if path.exists() else session.config.pump
+
+
+def checked_gains(session: SessionFolder) -> LoopConfig:
+    """The session's gains for its hold. Raises InputError if they must not be applied."""
+    session.require("design")
+    path = session.file("gains.toml")
+    gains = load_gains(path)
+    require_sound(gains, str(path), session.config.loop)
+    return for_hold(gains.loop, session.head.before)
+
+
+def apply_step(session: SessionFolder, rig: HoldRig) -> LoopConfig:
+    """Set the gains, on trial: without `verify` they go back by themselves."""
+    loop = checked_gains(session)
+    session.begin("apply")
+    rig.set_gains(loop, f"session {session.path.name}", _APPLY_S)
+    plain.write(session.file("applied.json"), {"trial_s": _APPLY_S, "loop": loop})
+    return loop
+
+
+def verify_step(
+    session: SessionFolder,
+    rig: HoldRig,
+    told: Callable[[Stage], None] = lambda stage: None,
+    stages: tuple[tuple[float, float], ...] = STAGES,
+) -> Verified:
+    """Hold with the new gains and judge in stages; they are kept, or the old ones are set again at once."""
+    session.require("apply")
+    after, before = checked_gains(session), session.head.before
+    session.begin("verify")
+    trial = Trial(found_of(session).identified.model, disturbance_of(session), before, after)
+    rig.set_gains(after, f"session {session.path.name}: verification", SETTLE_S + stages[-1][0] + _SPARE_S)
+    looks: list[Stage] = []
+    record: Record | None = None
+    setpoint_um = np.empty(0)
+    reason = ""
+    try:
+        rig.hold(SETTLE_S)
+        for until_s, growth_max in stages:
+            more, about_um = rig.hold_about(until_s - setpoint_um.size * rig.dt_s)
+            record = more if record is None else record.followed_by(more)
+            setpoint_um = np.concatenate((setpoint_um, about_um))
+            looks.append(look(record, setpoint_um, trial, growth_max))
+            told(looks[-1])
+            reason = looks[-1].reason
+            if reason:
+                break
+    except HoldError as error:
+        reason = str(error)
+    if reason:
+        rig.set_gains(before, f"verification failed: {reason}"[:250])
+    else:
+        rig.keep()
+    done = Verified(not reason, reason, tuple(looks), before, after)
+    if record is not None:
+        save_record(session.file("verify.npz"), record)
+    plain.write(session.file("verified.json"), done)
+    return done
+
+
+def verified_of(session: SessionFolder) -> Verified:
+    """How the verification ended."""
+    session.require("verify")
+    return plain.read(session.file("verified.json"), Verified)
+
+
+def map_pump(session: SessionFolder, rig: HoldRig) -> PumpConfig:
+    """Measure the pump on the mirror; later steps of this session use what was found.
+
+    Raises RejectedError if the map could not be completed, or is none a pump could have.
+    """
+    around = rig.around(rig.hold(40.0))
+    _, finished, event = rig.performed(spec_of("pump_map", around, 1200.0))
+    if not finished.completed:
+        raise RejectedError(f"pump map: {finished.reason}")
+    values = {name: math.nan if value is None else value for name, value in event["pump_map"].items()}
+    found = plain.built(PumpMap, values)
+    if not (math.isfinite(found.start_fraction) and math.isfinite(found.stall_fraction)):
+        raise RejectedError("pump map: the pump never started or never stalled; check the pump and its supply")
+    mapped = found.applied_to(session.config.pump)
+    write_text_atomic(session.file("pump.toml"), config_file.dump(mapped))
+    plain.write(session.file("pump_map.json"), found)
+    return mapped

@@ -1,0 +1,132 @@
+"""Whether new gains keep what was promised: ten minutes of hold, judged in stages, against the gains before them.
+
+The true centre is not seen, its variance is: the laser's noise is new in each reading and the loop needs its dead
+time to answer it, so readings a few ticks apart share the centre's movement and nothing else,
+
+    var x = mean of cov(y[i], y[i + l]),  0 < l dt < dead time.
+
+The weather of these ten minutes is not that of the hour before. So the comparison is with what the *old* gains would
+have done in it: the weather is taken out of the same record (`observe`) and the old loop's answer to it predicted
+(docs/decisions/95-verified-against-the-old-gains-in-the-same-weather.md).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import welch
+
+from membrane_ctrl.config import LoopConfig
+from tuning.disturbance_model import Disturbance, observe
+from tuning.loop_model import Gains, loop_response
+from tuning.margins import margins
+from tuning.minimum_variance import predict
+from tuning.plant_model import PlantModel
+from tuning.records import Record, Series
+
+# Time of a stage, and growth that ends the trial there: early on only what is plainly wrong, for a minute of weather
+# scatters by a third; at the end the 10 % that are asked for.
+STAGES = ((60.0, 2.0), (180.0, 1.5), (300.0, 1.3), (600.0, 1.10))
+SETTLE_S = 20.0
+_OBSERVE_LEAST_S = 300.0  # before that the weather of the session stands for the present one
+MS_MAX = 2.0  # sensitivity seen; its estimate scatters by a tenth
+_SEGMENT_S = 20.0
+_RESONANCE_LEAST_S = 180.0  # 17 half-overlapping segments: power to a quarter
+_BAND = 1.3  # width of a band in frequency, as a factor
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One look.
+
+    Attributes
+    ----------
+    time_s : float
+    std_um : float
+        Of the centre, from the record.
+    before_um : float
+        What the old gains would have given in this weather.
+    growth, growth_max : float
+        Ratio, and the most that passes.
+    ms : float
+        Sensitivity seen; NaN while the record is too short.
+    lost_fraction : float
+        Readings lost.
+    reason : str
+        Why it fails; empty if it passes.
+    """
+
+    time_s: float
+    std_um: float
+    before_um: float
+    growth: float
+    growth_max: float
+    ms: float
+    lost_fraction: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What is compared with what."""
+
+    model: PlantModel
+    weather: Disturbance
+    before: LoopConfig
+    after: LoopConfig
+
+
+def centre_std_um(off_um: Series, dead_time_s: float, dt_s: float) -> float:
+    """Standard deviation of the centre without the laser's noise; 0 where less than nothing is left.
+
+    Parameters
+    ----------
+    off_um : (n,) array
+        Readings less setpoint.
+    dead_time_s, dt_s : float
+    """
+    off = off_um - off_um.mean()
+    lags = range(1, max(1, math.floor(dead_time_s / dt_s)) + 1)
+    shared = [float(off[lag:] @ off[:-lag]) / (off.size - lag) for lag in lags]
+    return math.sqrt(max(0.0, float(np.mean(shared))))
+
+
+def seen_sensitivity(off_um: Series, trial: Trial) -> float:
+    """Largest sensitivity, from where the spectrum stands out above the one the model predicts.
+
+    A plant whose gain or delay has grown shows as a peak near the crossover. The level of the weather does not
+    matter: only the shape is compared, each band with the median band.
+    """
+    gains, dt_s = Gains.of(trial.after), trial.weather.rest.dt_s
+    frequency_hz, power = welch(off_um, 1 / dt_s, nperseg=round(_SEGMENT_S / dt_s), detrend="constant")
+    w: Series = 2 * np.pi * frequency_hz
+    fastest = math.pi / (2 * (trial.model.delay_s + gains.filter_s + dt_s))
+    used = (w > 2 * np.pi * 3 / _SEGMENT_S) & (w < 2 * fastest)
+    w, power = w[used], power[used]
+    s = np.abs(1 / (1 + loop_response(gains, trial.model, w, dt_s))) ** 2
+    moving = trial.weather.psd(w, trial.model, trial.after)
+    excess = power / (s * (moving + trial.weather.rest.white_psd))
+    bands = np.floor(np.log(w / w[0]) / math.log(_BAND)).astype(int)
+    means = np.array([excess[bands == band].mean() for band in np.unique(bands)])
+    model_ms = margins(gains, trial.model, dt_s).ms
+    return float(model_ms * math.sqrt(max(1.0, means.max() / np.median(means))))
+
+
+def look(record: Record, setpoint_um: Series, trial: Trial, growth_max: float) -> Stage:
+    """Judge what there is of the record; the setpoint of each sample is what the centre is compared with."""
+    off_um = record.filled_displacement_um() - setpoint_um
+    weather = trial.weather
+    if record.duration_s >= _OBSERVE_LEAST_S:
+        weather = observe(record, trial.model, trial.after)
+    std_um = centre_std_um(off_um, trial.model.dead_time_s, record.dt_s)
+    before_um = predict(Gains.of(trial.before), trial.model, weather, trial.before).std_um
+    growth = std_um / before_um
+    ms = seen_sensitivity(off_um, trial) if record.duration_s >= _RESONANCE_LEAST_S else math.nan
+    reason = ""
+    if growth > growth_max:
+        reason = f"the standard deviation is {std_um:.3f} um, {growth:.2f} times that of the gains before"
+    elif ms > MS_MAX:
+        reason = f"the readings show a sensitivity of {ms:.1f} ({MS_MAX:g} is the most): less margin than designed"
+    return Stage(record.duration_s, std_um, before_um, growth, growth_max, ms, record.lost_fraction, reason)
