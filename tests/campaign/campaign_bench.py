@@ -1,0 +1,152 @@
+"""A bench for the campaign with real processes: the emulated board on its own clock, and a witness of its output."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+import os
+import signal
+import sys
+import time
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from firmware_iface.emulators.pump_board import PumpBoardEmulator
+from membrane_ctrl.clock import RunClock
+from membrane_ctrl.config import PumpConfig, TwinConfig
+from membrane_ctrl.twin.bench import BenchSpec, LiveBench
+
+PATIENCE_S = 60.0
+WATCHDOG_S = 0.5
+
+
+@dataclass
+class Output:
+    """What the board gave to the pump, and when by the board's own clock."""
+
+    time_s: float
+    pump_fraction: float
+
+
+@dataclass
+class WatchedPlant:
+    """Stands between board and plant and notes every change of the pump's drive."""
+
+    bench: LiveBench
+    outputs: list[Output] = field(default_factory=list)
+    looked_s: float = math.nan
+    longest_gap_s: float = 0.0  # between two looks of the board: what a busy machine adds to its watchdog
+
+    def sample(self) -> Any:
+        now_s = time.monotonic()
+        if math.isfinite(self.looked_s):
+            self.longest_gap_s = max(self.longest_gap_s, now_s - self.looked_s)
+        self.looked_s = now_s
+        return self.bench.sample()
+
+    def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
+        self.outputs.append(Output(time.monotonic(), pump_fraction))
+        self.bench.actuate(pump_fraction, vent_fraction)
+
+    @property
+    def pumping(self) -> bool:
+        return bool(self.outputs) and self.outputs[-1].pump_fraction > 0
+
+    def pump_ran_on_s(self, since_s: float) -> float:
+        """How long after `since_s` the pump was driven, by the board's own clock."""
+        return max(0.0, next(o.time_s for o in self.outputs if o.time_s > since_s and o.pump_fraction == 0) - since_s)
+
+
+class Run:
+    """A `hold` as its own process against the emulated board."""
+
+    def __init__(self, process: asyncio.subprocess.Process, folder: Path, board: PumpBoardEmulator) -> None:
+        self.process, self.folder, self.board = process, folder, board
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        found = list(self.folder.glob("logs/*/events.jsonl"))
+        if not found:
+            return []
+        return [json.loads(line) for line in found[0].read_text().splitlines() if line.endswith("}")]
+
+    def reached(self, state: str) -> bool:
+        return any(event["kind"] == "state" and event["state"] == state for event in self.events)
+
+    def faults(self) -> list[str]:
+        return [event["name"] for event in self.events if event["kind"] == "fault"]
+
+    def recorder(self) -> psutil.Process:
+        """The child that has the recording open. Raises LookupError."""
+        for child in psutil.Process(self.process.pid).children():
+            if any(str(self.folder) in file.path for file in child.open_files()):
+                return child
+        raise LookupError("no child has the recording open")
+
+    async def until(self, what: Callable[[], bool]) -> None:
+        """Wait for something. Raises AssertionError when it does not come."""
+        give_up_s = time.monotonic() + PATIENCE_S
+        while not what():
+            assert time.monotonic() < give_up_s, f"waited in vain; {self.events[-3:]}"
+            assert self.process.returncode is None or what(), f"ended with {self.process.returncode}"
+            await asyncio.sleep(0.02)
+
+    async def ended(self) -> int:
+        """Its exit code."""
+        return await asyncio.wait_for(self.process.wait(), PATIENCE_S)
+
+    def signal(self, number: signal.Signals) -> float:
+        """Send a signal to the control process alone; the time of it."""
+        os.kill(self.process.pid, number)
+        return time.monotonic()
+
+
+@contextlib.asynccontextmanager
+async def running(folder: Path, plant: WatchedPlant, config: str = "") -> AsyncIterator[Run]:
+    """A board, and a hold of it that is under way; both are gone afterwards."""
+    board = PumpBoardEmulator(plant)
+    await board.start()
+    keep_up = asyncio.create_task(_catch_up(plant.bench))
+    lab = folder / "lab.toml"
+    lab.write_text(f'[devices]\nboard = "tcp://127.0.0.1:{board.port}"\nwatchdog_s = {WATCHDOG_S}\n{config}')
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "membrane_ctrl", "hold", "--config", str(lab), "--logs", str(folder / "logs")),
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.DEVNULL,
+    )
+    children: list[psutil.Process] = []
+    try:
+        run = Run(process, folder, board)
+        await run.until(lambda: plant.pumping and run.reached("inflate"))
+        children = psutil.Process(process.pid).children(recursive=True)
+        yield run
+    finally:
+        if process.returncode is None:
+            process.send_signal(signal.SIGCONT)
+            process.kill()
+        await process.wait()
+        keep_up.cancel()
+        await asyncio.gather(keep_up, return_exceptions=True)
+        await board.stop()
+        _, left = await asyncio.to_thread(psutil.wait_procs, children, 20.0)
+        for child in left:
+            child.kill()
+    assert not left, f"left behind: {left}"
+
+
+async def _catch_up(bench: LiveBench) -> None:
+    while True:
+        bench.catch_up()
+        await asyncio.sleep(0.004)
+
+
+def make_plant() -> WatchedPlant:
+    """A calm bench in real time."""
+    twin = TwinConfig(scenario="calm", start_error_um=-40.0)
+    return WatchedPlant(LiveBench(BenchSpec(twin, PumpConfig(), RunClock.start(), port=0), None))
