@@ -340,6 +340,24 @@ def repair(
     return repair_command(run_dir, in_place, json)
 
 
+@app.command()
+def calibrate(
+    sets: Annotated[list[Path], typer.Argument(metavar="SET...", help="Capture sets at different pressures.")],
+    out: Annotated[Path, typer.Option(help="The new geometry.")] = Path("geometry.toml"),
+    geometry: Annotated[Path | None, typer.Option(help="Measured by hand, instead of the sets'.")] = None,
+    free: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME[=SIGMA]", help="Also calibrate this, as bow_mm; sigma 0 holds it; repeatable."),
+    ] = None,
+    laser_sigma_um: Annotated[float, typer.Option(min=0.001, help="Of a set's mean reading.")] = 1.0,
+    json: JsonOption = False,
+) -> int:
+    """Calibrate the optics: one geometry with its covariance, from sets at several pressures."""
+    from membrane_ctrl.calibrate_command import CalibrateOptions, calibrate_command
+
+    return calibrate_command(CalibrateOptions(sets, geometry, out, tuple(free or ()), laser_sigma_um, json))
+
+
 def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> Config:
     """The configuration, its [devices] from the file of `--devices`; that file alone is a configuration, too."""
     if devices is None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from membrane_ctrl.metrology.calibrate.parameters import LASER, NAMES, OPTICAL, POSE, usual_sigma
+from membrane_ctrl.metrology.calibrate.propagate import disc, surface_response
 from membrane_ctrl.metrology.calibrate.separable import COMMON
 from membrane_ctrl.metrology.calibrate.solve import Solution, prior, step
 
@@ -28,17 +29,42 @@ _LASER_SIGMA = 1.0  # of its scale when the optics alone shall say it
 
 @dataclass(frozen=True)
 class Suspect:
-    """A held parameter that the sets want to move: what it would be, and how sure that is (in sigmas)."""
+    """A held parameter that the sets want to move.
+
+    Attributes
+    ----------
+    value, sigma : float
+        What it would be if it were free.
+    fall : float
+        Of the sum of squares.
+    figure_um : float
+        What freeing it does to a surface, RMS without the best plane.
+    """
 
     name: str
+    value: float
+    sigma: float
+    fall: float
+    figure_um: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether noise would hardly ever ask for as much."""
+        return bool(chi2.sf(self.fall, 1) < SURE)
+
+
+@dataclass(frozen=True)
+class LaserScale:
+    """Scale of the laser and its sigma as the optics alone see it (1: good); the fall is against the prior."""
+
     value: float
     sigma: float
     fall: float
 
     @property
     def sure(self) -> bool:
-        """Whether noise would hardly ever ask for as much."""
-        return bool(chi2.sf(self.fall, 1) < SURE)
+        """As for `Suspect`: whether it is off by more than its data sheet allows."""
+        return bool(chi2.sf(((self.value - 1) / np.hypot(self.sigma, LASER.sigma)) ** 2, 1) < SURE)
 
 
 @dataclass(frozen=True)
@@ -82,6 +108,8 @@ class LeftOut:
 def suspects(solution: Solution) -> tuple[Suspect, ...]:
     """Held optical parameters that would take more than noise out of the residuals, the strongest first."""
     sums = np.sum(_reduced(solution), axis=0)
+    response, (heights, plane) = surface_response(solution, len(solution.states) // 2)[:, :-1], disc(1.0)
+    flat = heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]
     out = []
     for name in NAMES[len(POSE) : OPTICAL]:
         if name in solution.free:
@@ -91,18 +119,21 @@ def suspects(solution: Solution) -> tuple[Suspect, ...]:
         freed[k] = usual_sigma(name)
         moved = step(sums + prior(freed, solution.common), freed)
         fall = _squares(sums, solution.problem.sigmas, solution.common) - moved.squares
-        out.append(Suspect(name, float(moved.delta[k]), float(np.sqrt(moved.covariance[k, k])), fall))
+        sigma = float(np.sqrt(moved.covariance[k, k]))
+        figure_um = 1e3 * float(np.std(flat @ (response @ moved.delta[:OPTICAL])))
+        out.append(Suspect(name, float(moved.delta[k]), sigma, fall, figure_um))
     return tuple(sorted((s for s in out if s.sure), key=lambda s: -s.fall))
 
 
-def laser_scale(solution: Solution) -> tuple[float, float]:
-    """Scale of the laser and its sigma as the optics alone see it: 1 for a good one."""
+def laser_scale(solution: Solution) -> LaserScale:
+    """The laser's scale, nothing known of it beforehand."""
     k = NAMES.index(LASER.name)
     free = solution.problem.sigmas.copy()
     free[k] = _LASER_SIGMA
-    sums = np.sum(_reduced(solution), axis=0) + prior(free, solution.common)
-    moved = step(sums, free)
-    return 1 + float(solution.common[k] + moved.delta[k]), float(np.sqrt(moved.covariance[k, k]))
+    sums = np.sum(_reduced(solution), axis=0)
+    moved = step(sums + prior(free, solution.common), free)
+    fall = _squares(sums, solution.problem.sigmas, solution.common) - moved.squares
+    return LaserScale(1 + float(solution.common[k] + moved.delta[k]), float(np.sqrt(moved.covariance[k, k])), fall)
 
 
 def left_out(solution: Solution) -> tuple[LeftOut, ...]:

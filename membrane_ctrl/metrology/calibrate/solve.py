@@ -13,7 +13,7 @@ from membrane_ctrl.metrology.calibrate.parameters import NAMES, Bench, bench_at,
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, camera_rays
 from membrane_ctrl.metrology.calibrate.separable import COMMON, Equations, SetState, Trust, Witness, equations, rim_of
 from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola
+from membrane_ctrl.metrology.reconstruct import Fit, Points, Tracer, parabola
 from membrane_ctrl.metrology.reconstruct import solve as solve_surface
 from membrane_ctrl.metrology.surface import PARAMETERS, Surface
 
@@ -149,12 +149,17 @@ def solve(
     """
     if not problem.sets:
         raise ValueError("no capture set to calibrate with")
+    with np.errstate(over="ignore", invalid="ignore"):  # a divergence is told by its numbers, below
+        return _solve(problem, progress, start)
+
+
+def _solve(problem: Problem, progress: Callable[[int, float], None] | None, start: Solution | None) -> Solution:
     if start is None and max(phases.sigma_mm.size for phases in problem.sets) > 2 * _FEW:
         some = replace(problem, sets=tuple(phases.thinned(_FEW) for phases in problem.sets))
-        start = solve(some, progress)
+        start = _solve(some, progress, None)
         pairs = zip(problem.sets, start.states, strict=True)
         problem = replace(problem, sets=tuple(averaged(start.bench, *pair, _FEW) for pair in pairs))
-    states = start.states if start is not None else tuple(_first(problem, phases) for phases in problem.sets)
+    states = start.states if start is not None else first_states(problem)
     common = start.common if start is not None else _common(states)
     trust = tuple(Trust.full(phases) for phases in problem.sets)
     changes: list[float] = []
@@ -204,8 +209,12 @@ def _moved(state: SetState, linear: Equations, common_step: FloatArray) -> SetSt
     return SetState(surface, state.vertex_z_mm + float(own[PARAMETERS]))
 
 
+def first_states(problem: Problem) -> tuple[SetState, ...]:
+    """The sets' surfaces as the stated geometry sees them. Raises ValueError if there is none."""
+    return tuple(_first(problem, phases) for phases in problem.sets)
+
+
 def _first(problem: Problem, phases: SetPhases) -> SetState:
-    """The set's surface as the stated geometry sees it."""
     moved_um = phases.displacement_um - problem.witness.reference_um
     vertex_z_mm = -moved_um * 1e-3 if np.isfinite(moved_um) else 0.0
     return SetState(surface_of(Bench(problem.stated), phases, problem.radius_mm, vertex_z_mm), vertex_z_mm)
@@ -213,6 +222,16 @@ def _first(problem: Problem, phases: SetPhases) -> SetState:
 
 def surface_of(bench: Bench, phases: SetPhases, radius_mm: float, vertex_z_mm: float) -> Surface:
     """One set's surface on a bench without bow, as `measure` fits it. Raises ValueError if there is none."""
+    return _fit(bench, phases, radius_mm, vertex_z_mm).surface
+
+
+def slope_residual(solution: Solution, phases: SetPhases, index: int) -> float:
+    """RMS of measured minus fitted slopes of one set's bins on the calibrated bench, as a live cycle states it."""
+    fit = _fit(solution.bench, phases, solution.problem.radius_mm, solution.states[index].vertex_z_mm)
+    return float(np.hypot(fit.residual_x, fit.residual_y) / np.sqrt(2))
+
+
+def _fit(bench: Bench, phases: SetPhases, radius_mm: float, vertex_z_mm: float) -> Fit:
     tracer = Tracer(bench.geometry, radius_mm, vertex_z_mm)
     points = Points.of(camera_rays(bench.geometry, phases), phases.screen_mm * bench.pitch)
-    return solve_surface(tracer, points, parabola(_START_SAG_MM, radius_mm)).surface
+    return solve_surface(tracer, points, parabola(_START_SAG_MM, radius_mm))

@@ -1,0 +1,205 @@
+"""The `calibrate` command: one geometry, with its covariance, from capture sets at several pressures."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from membrane_ctrl.calibrate_report import lines_of, report_of
+from membrane_ctrl.capture_set import read_geometry
+from membrane_ctrl.config import OpticsConfig
+from membrane_ctrl.errors import Exit, InputError
+from membrane_ctrl.metrology.calibrate.artefact import Origin, tables_of
+from membrane_ctrl.metrology.calibrate.determined import condition_number
+from membrane_ctrl.metrology.calibrate.from_checked import phases_of
+from membrane_ctrl.metrology.calibrate.parameters import NAMES, sigmas, usual_sigma
+from membrane_ctrl.metrology.calibrate.residuals import SetPhases
+from membrane_ctrl.metrology.calibrate.separable import Witness
+from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, slope_residual, solve
+from membrane_ctrl.metrology.calibrate.verdict import Finding, after, before
+from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.set_figure import Figures
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """What the command was asked for.
+
+    Attributes
+    ----------
+    folders : sequence of Path
+        Capture sets.
+    geometry : Path or None
+        What was measured by hand, instead of what the sets say.
+    out : Path
+        The new `geometry.toml`.
+    free : sequence of str
+        NAME or NAME=SIGMA; a sigma of 0 holds a parameter.
+    laser_sigma_um : float
+        Of a set's mean reading.
+    as_json : bool
+        Report as JSON.
+    """
+
+    folders: Sequence[Path]
+    geometry: Path | None
+    out: Path
+    free: Sequence[str]
+    laser_sigma_um: float
+    as_json: bool
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Sets that were read: their phases, and the bench that all of them state."""
+
+    sets: tuple[SetPhases, ...]
+    optics: OpticsConfig
+    reference_um: float
+
+
+def calibrate_command(options: CalibrateOptions) -> int:
+    """Read, solve, judge, write. Returns the exit code; raises CommandError for sets that are none."""
+    free = freed(options.free)
+    begin = time.perf_counter()
+    bundle = read_sets(options.folders, options.geometry)
+    read = time.perf_counter()
+    problem = problem_of(bundle, free, options.laser_sigma_um)
+    findings, solution = before(problem), None
+    if not findings:
+        try:
+            solution = solve(problem, _progress())
+            findings = after(solution)
+        except ValueError as error:
+            findings = (Finding(True, str(error)),)
+    timing = {"read": read - begin, "solve": time.perf_counter() - read}
+    usable = solution is not None and not any(finding.fatal for finding in findings)
+    written = _write(options.out, solution, problem, bundle, findings) if usable and solution is not None else ""
+    report = report_of(solution, findings, bundle.optics.mirror.analysis_radius_mm)
+    report |= {"out": str(options.out) if usable else None, "hash": written or None, "timing_s": timing}
+    print(json.dumps(report) if options.as_json else "\n".join(lines_of(report)))
+    if not usable:
+        print(f"calibrate: rejected; {options.out} is not written, the old geometry stays in force", file=sys.stderr)
+    return Exit.DONE if usable else Exit.REJECTED
+
+
+def freed(texts: Sequence[str]) -> dict[str, float]:
+    """`--free NAME[=SIGMA]` as sigmas. Raises InputError."""
+    out = {}
+    for text in texts:
+        name, _, amount = text.partition("=")
+        if name not in NAMES:
+            raise InputError(f"--free {text}: {name} is not a parameter; known are {', '.join(NAMES)}")
+        try:
+            out[name] = float(amount) if amount else usual_sigma(name)
+        except ValueError:
+            raise InputError(f"--free {text}: {amount} is not a number") from None
+        if not (math.isfinite(out[name]) and out[name] >= 0):
+            raise InputError(f"--free {text}: a sigma is 0 (hold it) or more")
+    return out
+
+
+def read_sets(folders: Sequence[Path], geometry: Path | None) -> Bundle:
+    """Read capture sets and their phases.
+
+    Raises
+    ------
+    InputError
+        For a set that is none, or that says it is of another rig than the first.
+    RejectedError
+        For a set that gives no figure.
+    """
+    figures = Figures(None if geometry is None else read_geometry(geometry))
+    if len(set(folders)) < len(folders):
+        raise InputError(f"{next(f for f in folders if list(folders).count(f) > 1)}: given twice")
+    sets: list[SetPhases] = []
+    benches: list[OpticsConfig] = []
+    for folder in folders:
+        figure = figures.of(folder)
+        benches.append(figure.head.optics)
+        _same_rig(folders[0], benches[0], folder, benches[-1])
+        sets.append(phases_of(folder.name, figure.checked, figure.head.optics))
+        if sys.stderr.isatty():
+            print(f"\r{len(sets)} of {len(folders)} sets read", end="", file=sys.stderr)
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    # A set that states none has its own first reading: then the first set's counts for all
+    stated = {bench.geometry.reference_displacement_um for bench in benches}
+    reference = stated.pop() if len(stated) == 1 else None
+    first = sets[0].displacement_um
+    return Bundle(
+        tuple(sets), benches[0], reference if reference is not None else first if math.isfinite(first) else 0.0
+    )
+
+
+def _same_rig(first: Path, optics: OpticsConfig, folder: Path, other: OpticsConfig) -> None:
+    for section in ("camera", "mirror", "pattern", "geometry"):
+        ours, theirs = getattr(optics, section), getattr(other, section)
+        for field in type(ours).model_fields:
+            if field in ("reference_displacement_um", "steps", "noise_adu"):
+                continue
+            if getattr(ours, field) != getattr(theirs, field):
+                raise InputError(
+                    f"{folder / 'capture.toml'}: {section}.{field}: not that of {first}; "
+                    "sets of one calibration are of one rig"
+                )
+
+
+def problem_of(bundle: Bundle, free: dict[str, float], laser_sigma_um: float) -> Problem:
+    """The stated bench with its sigmas. Raises InputError for a geometry that cannot be calibrated."""
+    stated = bundle.optics.geometry
+    own = {
+        name: sigma
+        for name, sigma in (
+            ("a_mm", stated.a_sigma_mm),
+            ("b_mm", stated.b_sigma_mm),
+            ("alpha_deg", stated.alpha_sigma_deg),
+        )
+        if sigma is not None
+    }
+    try:
+        geometry = Geometry.from_config(bundle.optics)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    witness = Witness(bundle.reference_um, laser_sigma_um)
+    return Problem(geometry, bundle.sets, sigmas({**own, **free}), witness, bundle.optics.mirror.radius_mm)
+
+
+def _write(path: Path, solution: Solution, problem: Problem, bundle: Bundle, findings: Sequence[Finding]) -> str:
+    """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
+    residual = np.concatenate([each.residual_mm for each in solution.equations], axis=1)
+    slopes = [slope_residual(solution, phases, k) for k, phases in enumerate(problem.sets)]
+    origin = Origin(
+        date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        sets=tuple(phases.name for phases in problem.sets),
+        screen_residual_um=1e3 * float(np.sqrt(np.mean(residual**2))),
+        slope_residual_urad=1e6 * float(np.median(slopes)),
+        condition=condition_number(solution),
+        notes=tuple(finding.says for finding in findings),
+    )
+    tables = tables_of(solution, bundle.optics, origin)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fresh = path.with_name(path.name + ".new")
+        fresh.write_text(tomli_w.dumps(tables), encoding="utf-8")
+        fresh.replace(path)  # never half a geometry
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+    return str(tables["calibration"]["hash"])
+
+
+def _progress() -> Any:
+    """A line that counts, on a terminal only."""
+    if not sys.stderr.isatty():
+        return None
+    return lambda count, change: print(f"step {count}: {change:.2g} sigma", file=sys.stderr)

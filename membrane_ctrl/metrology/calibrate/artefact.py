@@ -1,0 +1,162 @@
+"""A calibrated geometry as tables for `geometry.toml`, and back.
+
+`[geometry]` is what every command reads. `[covariance]` is what a Monte Carlo draws from: shifts and turns of camera
+and screen in world, twelve of them, made from the eleven parameters (the twelfth direction, a turn of everything
+about z, has no variance: it defines x). `[parameters]` are the calibration's own, `[calibration]` says where all
+that comes from. `[camera]` and `[pattern]` are there if the lens or the screen's pitch were calibrated, `[screen]` if
+its bow was; a measurement with such a file needs them too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.config import CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig, Vector3
+from membrane_ctrl.metrology.calibrate.parameters import BOW_RADIUS_MM, NAMES, POSE, pose_derivatives
+from membrane_ctrl.metrology.calibrate.solve import Solution
+
+FloatArray = NDArray[np.float64]
+
+SCHEMA = "membrane-geometry/1"
+_LENS = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1", "p2")
+_HASHED = ("geometry", "covariance", "parameters", "camera", "pattern", "screen")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What `[calibration]` says of where a geometry comes from.
+
+    Attributes
+    ----------
+    date_utc : str
+        When.
+    sets : tuple of str
+        Sets used.
+    screen_residual_um : float
+        RMS of seen minus predicted screen points.
+    slope_residual_urad : float
+        Median over the sets of the RMS that `measure` states with this geometry: what a drift is seen against.
+    condition : float
+        See `determined.condition_number`.
+    notes : tuple of str
+        What was found on the way.
+    """
+
+    date_utc: str
+    sets: tuple[str, ...]
+    screen_residual_um: float
+    slope_residual_urad: float
+    condition: float
+    notes: tuple[str, ...] = ()
+
+
+def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[str, Any]:
+    """The content of `geometry.toml`.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The stated bench.
+    """
+    free = [NAMES.index(name) for name in solution.free]
+    tables: dict[str, Any] = {
+        "schema": SCHEMA,
+        "geometry": geometry_of(solution).model_dump(exclude_none=True),
+        "covariance": {"names": list(general_names()), "matrix": general_covariance(solution).tolist()},
+        "parameters": {
+            "names": [NAMES[k] for k in free],
+            "values": solution.values[free].tolist(),
+            "sigmas": solution.sigmas[free].tolist(),
+            "covariance": solution.covariance[np.ix_(free, free)].tolist(),
+        },
+    }
+    bench = solution.bench
+    if set(solution.free) & set(_LENS):
+        tables["camera"] = {
+            "focal_mm": bench.geometry.focal_px * optics.camera.pixel_um * 1e-3,
+            "principal_px": list(bench.geometry.principal_px),
+            "distortion": list(bench.geometry.distortion),
+        }
+    if "pitch_relative" in solution.free:
+        tables["pattern"] = {"period_mm": optics.pattern.period_mm * bench.pitch}
+    if "bow_mm" in solution.free:
+        tables["screen"] = {"bow_mm": bench.bow_per_mm * BOW_RADIUS_MM**2}
+    tables["calibration"] = {
+        "date_utc": origin.date_utc,
+        "sets": list(origin.sets),
+        "screen_residual_um": origin.screen_residual_um,
+        "slope_residual_urad": origin.slope_residual_urad,
+        "condition": origin.condition,
+        "notes": list(origin.notes),
+        "hash": content_hash(tables),
+    }
+    return tables
+
+
+def geometry_of(solution: Solution) -> GeometryConfig:
+    """The calibrated geometry in the general form."""
+    geometry = solution.bench.geometry
+    right, down, forward = (_vector(row) for row in geometry.rotation)
+    return GeometryConfig(
+        reference_displacement_um=solution.problem.witness.reference_um,
+        camera=CameraPoseConfig(position_mm=_vector(geometry.pinhole_mm), rotation=(right, down, forward)),
+        screen=ScreenPoseConfig(
+            origin_mm=_vector(geometry.screen_origin_mm),
+            s_x=_vector(geometry.screen_s_x),
+            s_y=_vector(geometry.screen_s_y),
+        ),
+    )
+
+
+def general_names() -> tuple[str, ...]:
+    """Shifts and turns of camera and screen in world."""
+    moves = [
+        (thing, move, unit) for thing in ("camera", "screen") for move, unit in (("shift", "mm"), ("turn", "rad"))
+    ]
+    return tuple(f"{thing}_{move}_{axis}_{unit}" for thing, move, unit in moves for axis in "xyz")
+
+
+def general_covariance(solution: Solution) -> FloatArray:
+    """Covariance (12, 12) of `general_names`.
+
+    Rows r of a body turned by a small w become r + w x r, so that C^T dC is minus the cross-product matrix of w.
+    """
+    geometry = solution.bench.geometry
+    rows = np.stack([geometry.screen_s_x, geometry.screen_s_y, np.cross(geometry.screen_s_x, geometry.screen_s_y)])
+    columns = [
+        np.concatenate(
+            [
+                turn.pinhole_mm,
+                _turn_vector(geometry.rotation.T @ turn.camera),
+                turn.origin_mm,
+                _turn_vector(rows.T @ turn.screen),
+            ]
+        )
+        for turn in pose_derivatives(solution.problem.stated, solution.values)
+    ]
+    matrix = np.stack(columns, axis=1)
+    covariance = matrix @ solution.covariance[: len(POSE), : len(POSE)] @ matrix.T
+    return np.asarray((covariance + covariance.T) / 2)
+
+
+def content_hash(tables: Mapping[str, Any]) -> str:
+    """Sixteen digits that stand for the numbers in a geometry's tables, whatever their order or layout."""
+    content = {key: tables[key] for key in _HASHED if key in tables}
+    text = json.dumps(content, sort_keys=True, default=list)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _turn_vector(cross: FloatArray) -> FloatArray:
+    return -np.array([cross[2, 1] - cross[1, 2], cross[0, 2] - cross[2, 0], cross[1, 0] - cross[0, 1]]) / 2
+
+
+def _vector(values: FloatArray) -> Vector3:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

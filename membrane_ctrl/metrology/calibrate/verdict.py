@@ -1,0 +1,185 @@
+"""May a solution be used? What speaks against it, in one line each, the cause before its consequences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.calibrate.diagnose import bumps, laser_scale, left_out, suspects, without
+from membrane_ctrl.metrology.calibrate.parameters import ALL, LASER, NAMES
+from membrane_ctrl.metrology.calibrate.separable import SetState, rim_of
+from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, solve
+
+# Sets closer together than this say no more than one set: the sag's sigma is then twice that of sets 8 mm apart
+LEAST_SPREAD_UM = 1000.0
+GOOD_SPREAD_UM = 8000.0
+# A wrong geometry changes the sag's slope against the laser by some per cent at most; a wrong unit or sign by more
+_SLOPE_OFF = 0.2
+_LASER_SIGMAS = 10.0  # of one reading: below, the fringes are as likely to be wrong
+_SCATTER = 3.0  # times the others' noise
+# noise of nanometres lets effects be seen that nobody needs to know: what is asked of a figure is 5 um
+_HARMLESS_UM = 2.5
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is not as it should be.
+
+    Attributes
+    ----------
+    fatal : bool
+        Whether the old geometry has to stay in force.
+    says : str
+        One line for a person.
+    sets : tuple of int
+        Sets it is about; empty for all of them.
+    """
+
+    fatal: bool
+    says: str
+    sets: tuple[int, ...] = ()
+
+
+def before(problem: Problem) -> tuple[Finding, ...]:
+    """What can be seen without solving: too few sets, too close together, a laser that counts another way."""
+    moved = np.array([phases.displacement_um for phases in problem.sets])
+    known = np.isfinite(moved)
+    if np.count_nonzero(known) < 2:
+        return (
+            Finding(True, "fewer than two sets carry a laser reading: sets at different pressures need one each"),
+        )
+    spread_um = float(np.ptp(moved[known]))
+    if spread_um < LEAST_SPREAD_UM:
+        return (
+            Finding(
+                True,
+                f"the sets are only {spread_um:.0f} um apart: they say no more than one of them; at least "
+                f"{LEAST_SPREAD_UM / 1000:.0f} mm are needed, {GOOD_SPREAD_UM / 1000:.0f} mm are good",
+            ),
+        )
+    slope = _sag_slope(first_states(problem), moved, known)
+    if slope < 0:
+        return (Finding(True, "the laser counts the wrong way: its reading falls as the bowl deepens"),)
+    if abs(slope - 1) > _SLOPE_OFF:
+        return (Finding(True, f"the laser's unit or scale is wrong: the sag moves by {slope:.3g} um per um of it"),)
+    return ()
+
+
+def _sag_slope(states: Sequence[SetState], moved_um: NDArray[np.float64], known: NDArray[np.bool_]) -> float:
+    """Change of the sag per change of the laser, as the stated geometry sees it."""
+    sag_um = np.array([1e3 * state.surface.sag_mm for state in states])
+    return float(np.polyfit(moved_um[known], sag_um[known], 1)[0])
+
+
+def after(solution: Solution) -> tuple[Finding, ...]:
+    """What the solution says of sets and model.
+
+    One thing that is wrong makes many look wrong. Of all that would explain it the one that takes most out of the
+    sum of squares, less two for each number it frees (Akaike's rule), is the cause; the others wait until it is gone.
+    """
+    if not solution.converged:
+        return (_astray(solution),)
+    causes = [*_sets(solution), *_laser(solution), *_model(solution)]
+    cause = [max(causes, key=lambda each: each[0])[1]] if causes else []
+    return (*cause, *_scatter(solution), *_spread(solution))
+
+
+def _sets(solution: Solution) -> list[tuple[float, Finding]]:
+    """A camera that was bumped, a set that is bad, sets that do not belong together, each with what it explains."""
+    names = [phases.name for phases in solution.problem.sets]
+    out = []
+    for bump in bumps(solution)[:1]:
+        yaw, pitch, roll = bump.turned_deg
+        where = f"in {names[bump.sets[0]]}" if len(bump.sets) == 1 else f"from {names[bump.sets[0]]} on"
+        says = f"the camera stood otherwise {where}: yaw {yaw:+.3f}, pitch {pitch:+.3f}, roll {roll:+.3f} degrees"
+        out.append((bump.fall - 2 * 3, Finding(True, says, bump.sets)))
+    worst = max(left_out(solution), key=lambda each: each.fall)
+    if worst.disagrees:
+        explained = worst.fall - 2 * worst.freedom
+        if len(names) > 2 and not any(each.disagrees for each in left_out(without(solution, worst.index))):
+            says = f"{names[worst.index]} disagrees with all the others: {_why(solution, worst.index)}"
+            out.append((explained, Finding(True, says, (worst.index,))))
+        else:
+            says = "the sets contradict each other: they are not of one bench, or several of them are bad"
+            out.append((explained, Finding(True, says)))
+    return out
+
+
+def _astray(solution: Solution) -> Finding:
+    """No common geometry was found: is there one without one of the sets, or for those before and after a moment?"""
+    problem, count = solution.problem, len(solution.problem.sets)
+    for k in range(count if count > 2 else 0):
+        if _agree(replace(problem, sets=problem.sets[:k] + problem.sets[k + 1 :])):
+            return Finding(
+                True, f"{problem.sets[k].name} disagrees with all the others: it is of another bench", (k,)
+            )
+    for k in range(2, count - 1):
+        if all(_agree(replace(problem, sets=part)) for part in (problem.sets[:k], problem.sets[k:])):
+            says = f"the bench was changed between {problem.sets[k - 1].name} and {problem.sets[k].name}"
+            return Finding(True, says, tuple(range(k, count)))
+    return Finding(True, "the sets do not show one bench: they are of different rigs, or several of them are bad")
+
+
+def _agree(problem: Problem) -> bool:
+    try:
+        solution = solve(problem)
+    except ValueError:
+        return False
+    return solution.converged and not any(each.disagrees for each in left_out(solution))
+
+
+def _why(solution: Solution, index: int) -> str:
+    """Whether it is one set's laser reading that is wrong, or its fringes."""
+    rest, phases = without(solution, index), solution.problem.sets[index]
+    vertex_um = 1e3 * (rest.common[len(NAMES)] - rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0])
+    moved_um = phases.displacement_um - solution.problem.witness.reference_um
+    miss_um = moved_um + vertex_um / (1 + rest.values[NAMES.index(LASER.name)])
+    if abs(miss_um) > _LASER_SIGMAS * solution.problem.witness.laser_sigma_um:
+        return f"its laser reads {miss_um:+.1f} um against the optics"
+    return "its fringes show another bench"
+
+
+def _scatter(solution: Solution) -> list[Finding]:
+    """Sets that hardly count beside the others, because their fringes are so much worse."""
+    ratios = np.sqrt([each.variance for each in solution.equations])
+    worse = np.flatnonzero(ratios > _SCATTER * np.median(ratios))
+    names = [phases.name for phases in solution.problem.sets]
+    return [
+        Finding(False, f"{names[k]} scatters {ratios[k]:.1f} times as much as its camera should", (int(k),))
+        for k in worse
+    ]
+
+
+def _laser(solution: Solution) -> list[tuple[float, Finding]]:
+    laser = laser_scale(solution)
+    if not laser.sure:
+        return []
+    says = f"the laser's scale is wrong: the optics see {laser.value:.4f} +- {laser.sigma:.4f} um per um of it"
+    return [(laser.fall - 2, Finding(True, says))]
+
+
+def _model(solution: Solution) -> list[tuple[float, Finding]]:
+    found = suspects(solution)
+    if not found:
+        return []
+    first, *others = found
+    parameter = ALL[NAMES.index(first.name)]
+    unit = f" {parameter.unit}" if parameter.unit else ""
+    also = f" (or {', '.join(other.name for other in others)})" if others else ""
+    says = (
+        f"the residuals have the pattern of {first.name} = {first.value:.3g} +- {first.sigma:.2g}{unit} "
+        f"({parameter.says}){also}, {first.figure_um:.1f} um of figure: free it with --free {first.name}"
+    )
+    return [(first.fall - 2, Finding(first.figure_um > _HARMLESS_UM, says))]
+
+
+def _spread(solution: Solution) -> tuple[Finding, ...]:
+    moved = np.array([phases.displacement_um for phases in solution.problem.sets])
+    spread_um = float(np.ptp(moved[np.isfinite(moved)]))
+    if spread_um >= GOOD_SPREAD_UM / 2:
+        return ()
+    says = f"the sets are {spread_um / 1000:.1f} mm apart; {GOOD_SPREAD_UM / 1000:.0f} mm would know the sag better"
+    return (Finding(False, says),)
