@@ -180,10 +180,16 @@ def pack_estimate(estimate: ShapeEstimate) -> bytes:
     """A shape estimate as bytes: one line of JSON, then its arrays; of a symmetric covariance one half."""
     covariance = np.asarray(estimate.covariance_um2, dtype="<f8")
     symmetric = np.array_equal(covariance, covariance.T)
-    half = covariance[np.triu_indices(len(covariance))] if symmetric else covariance
+    half = covariance[np.triu_indices(len(covariance))] if symmetric else covariance.ravel()
+    single = np.array_equal(half, half.astype("<f4"), equal_nan=True)  # as the acquisition sends them
     head = {field.name: getattr(estimate, field.name) for field in fields(ShapeEstimate) if field.name not in _ARRAYS}
-    line = json.dumps({**head, "terms": len(covariance), "symmetric": symmetric}, default=float)
-    return line.encode() + b"\n" + np.asarray(estimate.coeffs_um, dtype="<f8").tobytes() + half.tobytes()
+    line = json.dumps({**head, "terms": len(covariance), "symmetric": symmetric, "single": single}, default=float)
+    return (
+        line.encode()
+        + b"\n"
+        + np.asarray(estimate.coeffs_um, dtype="<f8").tobytes()
+        + half.astype("<f4" if single else "<f8").tobytes()
+    )
 
 
 def unpack_estimate(data: bytes) -> ShapeEstimate:
@@ -191,11 +197,12 @@ def unpack_estimate(data: bytes) -> ShapeEstimate:
     line, _, arrays = data.partition(b"\n")
     head = json.loads(line)
     terms, symmetric = head.pop("terms"), head.pop("symmetric")
-    numbers = np.frombuffer(arrays, dtype="<f8")
+    coeffs_um = np.frombuffer(arrays[: 8 * terms], dtype="<f8")
+    numbers = np.frombuffer(arrays[8 * terms :], dtype="<f4" if head.pop("single") else "<f8")
     covariance = np.empty((terms, terms))
     if symmetric:
         rows, columns = np.triu_indices(terms)
-        covariance[rows, columns] = covariance[columns, rows] = numbers[terms:]
+        covariance[rows, columns] = covariance[columns, rows] = numbers
     else:
-        covariance[:] = numbers[terms:].reshape(terms, terms)
-    return ShapeEstimate(**head, coeffs_um=numbers[:terms].copy(), covariance_um2=covariance)
+        covariance[:] = numbers.reshape(terms, terms)
+    return ShapeEstimate(**head, coeffs_um=coeffs_um.copy(), covariance_um2=covariance)

@@ -2,8 +2,7 @@
 
 A file is one line of JSON and then frames, one a second: magic, length, CRC-32, zlib. A frame is whole or it is not
 there: what a crash or a bad sector leaves is read up to the damage and from the next magic on. In a frame the ticks'
-records come first, as the difference (exclusive or) to the tick before and their bytes in columns (the same byte of
-all ticks, then the next byte): together that takes four fifths off; then the rare parts.
+records come first, in columns (`column_codec`), then the rare parts.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.recording.column_codec import decode_columns, encode_columns
 from membrane_ctrl.tick_record import RECORD, Records, TickBatch, pack_estimate, unpack_estimate
 
 SCHEMA = "membrane-inputs/1"
@@ -58,9 +58,7 @@ class InputsFile:
         descriptor = self._descriptor_at(now_s)
         parts = [(_TAIL, tick, tail) for tick, tail in batch.tails.items()]
         parts += [(_SHAPE, 0, pack_estimate(shape)) for shape in shapes]
-        columns = batch.records.view("u1").reshape(-1, RECORD.itemsize).T.copy()
-        columns[:, 1:] ^= columns[:, :-1].copy()
-        body = _COUNT.pack(len(batch.records)) + columns.tobytes()
+        body = _COUNT.pack(len(batch.records)) + encode_columns(batch.records)
         body += b"".join(_PART.pack(kind, tick, len(data)) + data for kind, tick, data in parts)
         packed = zlib.compress(body, 6)
         _write_all(descriptor, _HEAD.pack(_MAGIC, len(packed), zlib.crc32(packed)) + packed)
@@ -187,10 +185,9 @@ def _body_at(data: bytes, place: int) -> tuple[bytes | None, int]:
 
 def _frame_of(body: bytes, kind: np.dtype[np.void]) -> Frame:
     (count,) = _COUNT.unpack_from(body)
-    place = _COUNT.size + count * kind.itemsize
-    columns = np.frombuffer(body[_COUNT.size : place], dtype="u1").reshape(kind.itemsize, count)
-    columns = np.bitwise_xor.accumulate(columns, axis=1)
-    frame = Frame(_known_fields(np.ascontiguousarray(columns.T).view(kind).reshape(count)), {}, {})
+    records, taken = decode_columns(body[_COUNT.size :], kind, count)
+    place = _COUNT.size + taken
+    frame = Frame(_known_fields(records), {}, {})
     while place < len(body):
         part, tick, length = _PART.unpack_from(body, place)
         data = body[place + _PART.size : place + _PART.size + length]

@@ -24,10 +24,11 @@ from membrane_ctrl.recording.streams import (
     Stream,
 )
 
-# A map is 66 kB. The difference every 10 s and the two that hardly change every minute are 0.8 GB a day; nothing is
-# lost, as the coefficients of every cycle are there, from which any map can be made again.
-DIFFERENCE_INTERVAL_S = 10.0
-MAP_INTERVAL_S = 60.0
+# A map is 53 kB on the disk: one difference each minute is 76 MB a day. Nothing is lost, as the coefficients of
+# every cycle are there, from which any map can be made again. In the first minutes somebody is looking.
+DIFFERENCE_INTERVAL_S = 60.0
+DIFFERENCE_EARLY_S, EARLY_S = 10.0, 300.0
+MAP_INTERVAL_S = 600.0
 # The colours of the difference map span at least this, so that noise does not look like a figure.
 _DIFFERENCE_LEAST_UM = 0.5
 
@@ -91,7 +92,8 @@ class ShapeStreams:
             self._send_map("height", time_s, height_mm, "mm", _span(height_mm))
             self._send_map("uncertainty", time_s, sigma_um, "um, 1 sigma", (0.0, _span(sigma_um)[1]))
         if time_s >= self._next_difference_s:
-            self._next_difference_s = time_s + DIFFERENCE_INTERVAL_S
+            early = time_s - reference.time_s < EARLY_S
+            self._next_difference_s = time_s + (DIFFERENCE_EARLY_S if early else DIFFERENCE_INTERVAL_S)
             difference_um = difference_map_um(estimate, reference)
             most_um = max(_DIFFERENCE_LEAST_UM, *(abs(end) for end in _span(difference_um)))
             self._send_map("difference", time_s, difference_um, "um", (-most_um, most_um))

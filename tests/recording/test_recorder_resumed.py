@@ -60,8 +60,8 @@ class Run:
         recording = Recording(self.run_dir, "test", clock, self.config, first)
         self._stack.callback(recording._stream.disconnect)
         readers = {name: RingReader(address) for name, address in self.addresses.items()}
-        for reader in readers.values():
-            self._stack.callback(reader.close)
+        for ring_reader in readers.values():
+            self._stack.callback(ring_reader.close)
         return Recorder(self.run_dir, clock, self.config, readers, recording, None, self.reports.append, resumes)
 
     def second(self, recorder: Recorder, number: int, write: bool = True) -> None:
