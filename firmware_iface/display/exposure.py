@@ -33,13 +33,13 @@ def exposure_problem(
     if saturated > _SATURATED_SHARE:
         return (
             f"{100 * saturated:.1f} % of the pixels are saturated on white; lower exposure_ms = {exposure_ms:g} "
-            f"to about {exposure_ms / 2:.2g}, or the gain"
+            f"to about {_two_digits(exposure_ms / 2)}, or the gain"
         )
     if bright < _LEAST * full_scale_adu:
         wanted_ms = exposure_ms * _TARGET * full_scale_adu / max(bright, 1.0)
         return (
             f"white gives only {bright:.0f} of {full_scale_adu} counts; raise exposure_ms = {exposure_ms:g} to about "
-            f"{wanted_ms:.2g}, open the lens, or is the mirror covered?"
+            f"{_two_digits(wanted_ms)}, open the lens, or is the mirror covered?"
         )
     if bright < _LEAST_CONTRAST * dark:
         return (
@@ -47,3 +47,7 @@ def exposure_problem(
             "the room"
         )
     return ""
+
+
+def _two_digits(number: float) -> str:
+    return f"{float(f'{number:.2g}'):g}"

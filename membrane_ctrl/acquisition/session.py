@@ -75,6 +75,7 @@ def run(spec: AcquisitionSpec, remote: Remote) -> None:
         reconstructor = LiveReconstructor(config.optics, config.shape.bin_px)
         shapes = stack.enter_context(closing(RingWriter(spec.shapes)))
         frames = stack.enter_context(closing(FrameWriter(spec.frames)))
+        stack.callback(bench.close)  # before the ring of frames: an exposure under way holds the pixels of a slot
         laser = stack.enter_context(closing(LaserHistory(spec.telemetry)))
         raw = stack.enter_context(closing(_raw_frames(spec, plan))) if spec.run_dir is not None else None
         cycle = ShapeCycle(

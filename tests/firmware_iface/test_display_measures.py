@@ -161,7 +161,7 @@ def test_checkerboard_shown_as_sent_and_scaled() -> None:
 
 @pytest.mark.parametrize(
     ("white", "black", "words"),
-    [(200, 5, ""), (255, 5, "saturated.*lower exposure_ms = 20"), (30, 2, "raise exposure_ms = 20 to about 1.4e"),
+    [(200, 5, ""), (255, 5, "saturated.*lower exposure_ms = 20"), (30, 2, "raise exposure_ms = 20 to about 140"),
      (180, 90, "other light")],
 )  # fmt: skip
 def test_exposure(white: int, black: int, words: str) -> None:
