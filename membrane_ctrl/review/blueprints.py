@@ -34,7 +34,7 @@ class ReviewBlueprint:
         selection = None
         if self._span_s is not None:
             start, end = (round(1e9 * second) for second in self._span_s)
-            selection = rr.datatypes.AbsoluteTimeRange(rr.datatypes.TimeInt(seq=start), rr.datatypes.TimeInt(seq=end))
+            selection = rr.encodings.AbsoluteTimeRange(rr.encodings.TimeInt(seq=start), rr.encodings.TimeInt(seq=end))
         return rrb.Blueprint(
             rrb.Tabs(*tabs, active_tab=TABS.index(tab)),
             rrb.TimePanel(state="collapsed", timeline="run_time", time_selection=selection),

@@ -39,7 +39,8 @@ def read_file(path: Path, names: Sequence[str] | None, notes: list[str]) -> pa.T
         Gets a line for a file that is damaged, or of a version without a wanted column.
     """
     try:
-        with pa.memory_map(str(path)) as source:
+        # a plain file: the pages of a mapped one would count as ours
+        with pa.OSFile(str(path)) as source:
             schema = pa.ipc.open_stream(source).schema
             wanted = schema.names if names is None else [name for name in names if name in schema.names]
             absent = sorted(set(names or ()) - set(wanted))
@@ -49,6 +50,10 @@ def read_file(path: Path, names: Sequence[str] | None, notes: list[str]) -> pa.T
                 return None
             source.seek(0)
             options = pa.ipc.IpcReadOptions(included_fields=[schema.names.index(name) for name in wanted])
+            try:
+                return pa.ipc.open_stream(source, options=options).read_all().select(wanted)
+            except (pa.ArrowException, OSError):
+                source.seek(0)
             reader = pa.ipc.open_stream(source, options=options)
             return pa.Table.from_batches(list(_batches(reader, path, notes)), schema=reader.schema).select(wanted)
     except (pa.ArrowException, OSError) as error:
@@ -59,7 +64,7 @@ def read_file(path: Path, names: Sequence[str] | None, notes: list[str]) -> pa.T
 def first_s(path: Path, time_name: str) -> float | None:
     """Time of the first row; None if the file does not give it."""
     try:
-        with pa.memory_map(str(path)) as source:
+        with pa.OSFile(str(path)) as source:
             return float(pa.ipc.open_stream(source).read_next_batch().column(time_name)[0].as_py())
     except (pa.ArrowException, OSError, KeyError, StopIteration):
         return None

@@ -129,7 +129,7 @@ def distributions(analysis: Analysis) -> str:
         merged = counts.reshape(-1, 5).sum(axis=1)
         middle = edges[:-1].reshape(-1, 5).mean(axis=1) + (edges[1] - edges[0]) / 2
         share = 100 * merged / max(1, counts.sum())
-        histogram.bar(middle, share, width=5 * (edges[1] - edges[0]), color=BLUE)
+        histogram.bar(middle, share, width=5 * (edges[1] - edges[0]), color=BLUE, lw=0.3, ec=BLUE)
         band_um = analysis.run.config.limits.band_um
         for side in (-band_um, band_um):
             histogram.axvline(side, color=GREEN, lw=1)

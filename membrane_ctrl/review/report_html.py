@@ -125,8 +125,9 @@ def _details(analysis: Analysis) -> str:
 
 
 def _bands(series: Series) -> str:
-    said = [f"{number(b['low_hz'])}–{number(b['high_hz'])} Hz: {number(b['rms_um'])} µm" for b in bands(series)]
-    return "; ".join(said)
+    there = [band for band in bands(series) if band["rms_um"] == band["rms_um"]]
+    said = [f"{number(b['low_hz'])}–{number(b['high_hz'])} Hz: {number(b['rms_um'])} µm" for b in there]
+    return "; ".join(said) or "too short to say"
 
 
 def _pump(analysis: Analysis) -> str:

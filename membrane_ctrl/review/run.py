@@ -168,9 +168,17 @@ def open_run(path: Path | str) -> Run:
     summary = read_summary(folder, notes)
     for files in (column_files(folder, TICKS), rrd_reader.segments(folder)):
         notes += [f"{name}: missing; what it held is left out" for name in missing_files(files)]
-    if not rrd_reader.segments(folder):
-        notes.append("no Rerun segment: there is nothing for the viewer but what the tables hold")
+    there, expected = len(rrd_reader.segments(folder)), _segments(summary)
+    if there < expected:
+        notes.append(f"{expected - there} of {expected} Rerun segments are missing; the tables stand in for them")
     return Run(folder, read_config(folder, notes), events, summary, origin_of(folder, events), notes)
+
+
+def _segments(summary: dict[str, Any] | None) -> int:
+    """Rerun segments that the recorder says it wrote."""
+    account = (summary or {}).get("recorder")
+    count = account.get("segments") if isinstance(account, dict) else 0
+    return count if isinstance(count, int) else 0
 
 
 def origin_of(folder: Path, events: Sequence[dict[str, Any]]) -> datetime:

@@ -146,8 +146,9 @@ class _Area:
 def _pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) -> Pair | None:
     """The pair nearest to the run's middle, and the RMS of all pairs as far apart (within half a cycle)."""
     time_s = good.time_s
-    other = np.minimum(np.searchsorted(time_s, time_s + lag_s), time_s.size - 1)
-    near = np.abs(time_s[other] - time_s - lag_s) <= 0.55 * float(np.median(np.diff(time_s)))
+    half_s = 0.5 * float(np.median(np.diff(time_s)))
+    other = np.minimum(np.searchsorted(time_s, time_s + lag_s - half_s), time_s.size - 1)
+    near = np.abs(time_s[other] - time_s - lag_s) <= 1.1 * half_s
     firsts = np.flatnonzero(near)
     if not firsts.size:
         return None

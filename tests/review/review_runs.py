@@ -33,10 +33,12 @@ def set_summary(folder: Path, **changes: object) -> None:
 
 
 def segment(folder: Path, rows: Rows) -> Path:
-    """A Rerun segment of telemetry in the folder, as the recorder writes it, a block a second."""
-    recording = Recording(folder, "night", RunClock.start(), CONFIG)
+    """A Rerun segment of telemetry in the folder, as the recorder writes it, a block a second and every tick."""
+    every = CONFIG.recording.model_copy(update={"quiet_hz": CONFIG.loop.rate_hz})
+    config = CONFIG.model_copy(update={"recording": every})
+    recording = Recording(folder, "night", RunClock.start(), config)
     recording.next_segment()
-    streams = TelemetryStreams(recording, CONFIG)
+    streams = TelemetryStreams(recording, config)
     for first in range(0, len(rows), 10):
         streams.send(rows[first : first + 10])
     recording.close()

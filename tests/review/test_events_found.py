@@ -1,0 +1,76 @@
+"""Events found in simulated nights, and silence where there are none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.events_found import matched
+from benchmarks.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night
+from membrane_ctrl.recording.levels import TICK_FIELDS, Columns, first_level
+from membrane_ctrl.recording.rows import COLUMN, Rows, column
+from membrane_ctrl.review.found import Found, find_events, noise_changes
+from membrane_ctrl.review.shapes import from_estimates
+from membrane_ctrl.review.steps import confidence, steps
+
+HOURS = 2.0
+
+
+def level_of(rows: Rows) -> Columns:
+    return first_level({name: column(rows, name) for name in TICK_FIELDS})
+
+
+def found_in(events: list[Planted], seed: int = 1, scenario: str = "typical") -> list[Found]:
+    rows, shapes = night(seed, HOURS, scenario, events)
+    return find_events(level_of(rows), from_estimates(shapes))
+
+
+@pytest.mark.parametrize("scenario", ["quiet", "typical", "gusty"])
+def test_a_calm_night_raises_no_alarm(scenario: str) -> None:
+    assert found_in([], scenario=scenario) == []
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        Planted(DOOR, 3000.4, 10.0), Planted(DOOR, 3000.9, -12.0), Planted(LEAK, 3000.0, 30.0),
+        Planted(LEAK, 3000.0, -30.0), Planted(GLITCH, 3000.3, 15.0), Planted(GLITCH, 3000.3, -15.0),
+        Planted(LOST, 3000.0, 2.0), Planted(LATE, 3000.0, 30.0), Planted(JUMP, 3000.0, 1.0),
+    ],
+    ids=lambda event: f"{event.kind} {event.size:g}",
+)  # fmt: skip
+def test_what_was_planted_is_found_and_nothing_else(event: Planted) -> None:
+    found = found_in([event])
+    missed, false = matched([event], found)
+    assert (missed, false) == ([], [])
+    one = next(item for item in found if item.kind == event.kind)
+    assert one.confidence > 0.99
+    assert one.start_s < event.time_s < one.end_s
+    if event.kind in {DOOR, LEAK, GLITCH}:
+        assert one.size == pytest.approx(event.size, rel=0.35)
+
+
+def test_a_change_of_noise_is_found() -> None:
+    rows, _ = night(3, HOURS, "typical", [])
+    later = column(rows, "mono_s") > 3600
+    rows[later, COLUMN["error_um"]] *= 2.5
+    found = noise_changes(level_of(rows))
+    assert [round(item.size, 1) for item in found] == [pytest.approx(2.5, rel=0.2)]
+    assert abs(found[0].time_s - 3600) < 300
+
+
+def test_a_step_and_a_gap() -> None:
+    rng = np.random.default_rng(1)
+    values = rng.normal(size=2000)
+    values[1200:] += 20.0
+    values[500:520] = np.nan
+    found = steps(values, half=3, skip=1, least=5.0, least_sigmas=6.0)
+    assert [step.row for step in found] == [pytest.approx(1200, abs=2)]
+    assert found[0].size == pytest.approx(20.0, abs=2.0)
+    assert steps(values[:5], 3, 1, 1.0, 1.0) == []
+
+
+def test_confidence_falls_with_the_places_looked_at() -> None:
+    assert confidence(6.0, 1000) > 0.99999
+    assert confidence(3.0, 1) == pytest.approx(0.9973, abs=1e-4)
+    assert confidence(3.0, 10_000) == 0.0

@@ -1,0 +1,214 @@
+"""Catalogue, export, marks, moments, and what the viewer is given."""
+
+from __future__ import annotations
+
+import io
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+from rerun.chunk import RrdReader
+from review_runs import same, segment, set_summary, written
+
+from benchmarks.nights import Planted, night
+from membrane_ctrl.cli import run as command
+from membrane_ctrl.errors import DeviceError, InputError
+from membrane_ctrl.recording.rows import column
+from membrane_ctrl.review import open_run
+from membrane_ctrl.review.catalogue import Filter, entries, resolve, to_prune
+from membrane_ctrl.review.export import export
+from membrane_ctrl.review.review_command import ReviewOptions, make_review
+from membrane_ctrl.review.viewer import follow
+from membrane_ctrl.review.words import moment_s, number, span
+
+ORIGIN = datetime(2026, 11, 21, 18, 0, 30, tzinfo=UTC)
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("logs")
+    for day, std in ((21, 0.1), (22, 0.3), (23, 0.2)):
+        run = written(folder, 0.02, seed=day, name=f"202611{day}T180000Z-night")
+        set_summary(run, true_std_um=std, in_band_1s_fraction=1.0)
+    (folder / "notes").mkdir()
+    return folder
+
+
+def test_the_catalogue_lists_and_filters(logs: Path) -> None:
+    assert [entry.std_um for entry in entries(logs)] == [0.1, 0.3, 0.2]
+    since = datetime(2026, 11, 22, tzinfo=UTC)
+    # what is written in a run's events counts as its start, not its name
+    assert len(entries(logs, Filter(since_utc=since))) == 0
+    assert [e.name[:8] for e in entries(logs, Filter(most_std_um=0.2))] == ["20261121", "20261123"]
+    assert entries(logs, Filter(with_faults=True)) == []
+    assert len(entries(logs, Filter(configuration=entries(logs)[0].configuration[:4]))) == 3
+    assert [e.name[:8] for e in entries(logs, Filter(text="1122"))] == ["20261122"]
+
+
+def test_a_run_is_found_by_part_of_its_name(logs: Path) -> None:
+    assert resolve(Path("1122"), logs).name == "20261122T180000Z-night"
+    assert resolve(Path("last"), logs).name == "20261123T180000Z-night"
+    with pytest.raises(InputError, match="more than one"):
+        resolve(Path("night"), logs)
+
+
+def test_runs_commands(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command(["runs", "--logs", str(logs), "--std-um", "0.15", "--json"]) == 0
+    assert [run["name"][:8] for run in json.loads(capsys.readouterr().out)] == ["20261121"]
+    assert command(["runs", "show", str(logs / "20261122T180000Z-night")]) == 0
+    assert "state  hold" in capsys.readouterr().out
+    assert command(["runs", "--logs", str(logs / "absent")]) == 2
+    assert command(["runs", "prune", "--logs", str(logs)]) == 2
+
+
+def test_prune_spares_what_is_kept_and_says_before_it_does(tmp_path: Path) -> None:
+    for day in range(1, 7):
+        written(tmp_path, 0.01, name=f"202611{day:02}T180000Z-night")
+    (tmp_path / "20261101T180000Z-night" / ".keep").touch()
+    (tmp_path / "20261102T180000Z-night" / "summary.json").unlink()
+    gone = to_prune(tmp_path, datetime(2026, 12, 21, tzinfo=UTC), keep_days=30.0, keep_gb=None)
+    assert [run.folder.name[:8] for run, _ in gone] == ["20261102", "20261103"]
+    # by today's clock the one without a summary may still run
+    assert command(["runs", "prune", "--logs", str(tmp_path), "--keep-gb", "0"]) == 0
+    assert len(entries(tmp_path)) == 6
+    assert command(["runs", "prune", "--logs", str(tmp_path), "--keep-gb", "0", "--delete"]) == 0
+    assert [run.name[:8] for run in entries(tmp_path)] == ["20261101", "20261102"]
+
+
+@pytest.mark.parametrize("to", ["parquet", "csv", "hdf5"])
+def test_exports_hold_the_ticks(tmp_path: Path, to: str) -> None:
+    rows, shapes = night(1, 0.03, "typical", [])
+    files = export(open_run(written(tmp_path, 0.03)), to, tmp_path / "out")
+    assert all(path.exists() for path in files)
+    if to == "hdf5":
+        with h5py.File(tmp_path / "out" / "run.h5") as file:
+            error, coeffs = file["ticks/error_um"][:], file["shapes/coeffs_um"][:]
+    else:
+        read = pyarrow.parquet.read_table if to == "parquet" else pyarrow.csv.read_csv
+        error = read(tmp_path / "out" / f"ticks.{to}").column("error_um").to_numpy()
+        table = read(tmp_path / "out" / f"shapes.{to}")
+        coeffs = np.column_stack([table.column(f"z{j}_um").to_numpy() for j in range(1, 37)])
+    assert same(error, column(rows, "error_um"), 1e-4)
+    np.testing.assert_allclose(coeffs, [shape.coeffs_um for shape in shapes])
+
+
+def test_export_of_some_streams_and_a_part(tmp_path: Path) -> None:
+    run = open_run(written(tmp_path, 0.03))
+    files = export(run, "parquet", tmp_path / "o", ["/loop/error", "pump_fraction"], 10.0, 20.0)
+    table = pyarrow.parquet.read_table(files[0])
+    assert ([path.name for path in files], table.num_rows) == (["ticks.parquet"], 100)
+    assert table.column_names == ["mono_s", "error_um", "pump_fraction"]
+    with pytest.raises(InputError, match="/loop/eror"):
+        export(run, "csv", tmp_path / "o", ["/loop/eror"])
+    with pytest.raises(InputError, match="xls"):
+        export(run, "xls", tmp_path / "o")
+    (tmp_path / "file").touch()
+    with pytest.raises(DeviceError, match="cannot be written"):
+        export(run, "csv", tmp_path / "file")
+
+
+def test_a_mark_made_later_is_an_event_and_touches_nothing_else(tmp_path: Path) -> None:
+    folder = written(tmp_path, 0.05)
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert command(["review", "mark", str(folder), "a door", "--at", "+60s"]) == 0
+    assert command(["report", str(folder), "--out", str(tmp_path / "out")]) == 0
+    marks = [event for event in open_run(folder).events if event["kind"] == "mark"]
+    assert [(mark["mono_s"], mark["text"]) for mark in marks] == [(60.0, "a door")]
+    assert {path: path.read_bytes() for path in before} == before
+    assert command(["review", "mark", str(folder)]) == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("18:01", 30.0), ("18:00:45", 15.0), ("03:12", 33_090.0), ("+1h5m", 3900.0), ("2026-11-21T18:01:30", 60.0),
+     ("2026-11-21T19:01:30+01:00", 60.0)],
+)  # fmt: skip
+def test_moments(text: str, seconds: float) -> None:
+    assert moment_s(text, ORIGIN) == seconds
+
+
+@pytest.mark.parametrize("text", ["3 o'clock", "25:00", "+", "12:61"])
+def test_moments_that_are_none(text: str) -> None:
+    with pytest.raises(InputError):
+        moment_s(text, ORIGIN)
+
+
+def test_words() -> None:
+    assert [span(s) for s in (41, 65, 3600, 28_740, 2_606_400)] == [
+        "41 s",
+        "1 min 5 s",
+        "1 h",
+        "7 h 59 min",
+        "30 d 4 h",
+    ]
+    assert (span(float("nan")), number(float("nan")), number(0.12345)) == ("?", "–", "0.123")
+
+
+def entities(path: Path) -> dict[str, int]:
+    """Rows of each entity of a recording."""
+    rows: dict[str, int] = {}
+    for chunk in RrdReader(path).stream():
+        rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.to_record_batch().num_rows
+    return rows
+
+
+def test_the_viewer_is_given_levels_ticks_figure_and_what_was_found(tmp_path: Path) -> None:
+    run = open_run(written(tmp_path, 0.2, [Planted("pressure step", 400.0, 20.0)]))
+    make_review([run], ReviewOptions([run.folder]), tmp_path / "r.rrd")
+    rows = entities(tmp_path / "r.rrd")
+    assert rows["/loop/error"] >= 7200
+    assert rows["/overview/error"] >= 720
+    assert rows["/shape/map"] >= 20
+    assert rows["/found"] >= 1
+
+
+def test_a_window_limits_the_ticks_and_runs_lie_over_each_other(tmp_path: Path) -> None:
+    runs = [open_run(written(tmp_path, 0.1, seed=s, name=f"2026112{s}T180000Z-n")) for s in (1, 2)]
+    options = ReviewOptions([run.folder for run in runs], start="+100s", end="+110s")
+    make_review(runs, options, tmp_path / "r.rrd")
+    rows = entities(tmp_path / "r.rrd")
+    assert 100 <= rows["/run_1/loop/error"] <= 102
+    assert 100 <= rows["/run_2/loop/error"] <= 102
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [({"at": "+9h"}, "not in the run"), ({"around": "explosion"}, "no such event"), ({"tab": "x"}, "--tab"),
+     ({"align": "x"}, "--align"), ({"start": "+20s", "end": "+10s"}, "not before")],
+)  # fmt: skip
+def test_what_is_not_there_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: dict[str, str], said: str
+) -> None:
+    folder = written(tmp_path, 0.02)
+    names = {"start": "--from", "end": "--to"}
+    arguments = [part for key, value in options.items() for part in (names.get(key, f"--{key}"), value)]
+    assert command(["review", str(folder), *arguments, "--save", str(tmp_path / "r.rrd")]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_around_finds_events_and_what_was_found(tmp_path: Path) -> None:
+    folder = written(tmp_path, 0.2, [Planted("pressure step", 400.0, 20.0)])
+    for what in ("pressure", "hold", "end"):
+        assert command(["review", str(folder), "--around", what, "--save", str(tmp_path / "r.rrd")]) == 0
+
+
+def test_following_copies_what_grows_until_the_run_is_over(tmp_path: Path) -> None:
+    whole = segment(tmp_path, night(1, 0.01, "typical", [])[0]).read_bytes()
+    (tmp_path / "night-000.rrd").write_bytes(whole[:5000])
+    out = io.BytesIO()
+
+    def grow(_: float) -> None:
+        if out.tell() < len(whole):
+            (tmp_path / "night-000.rrd").write_bytes(whole)
+        elif not (tmp_path / "night-001.rrd").exists():
+            (tmp_path / "night-001.rrd").write_bytes(b"next")
+        else:
+            (tmp_path / "summary.json").touch()
+
+    follow(tmp_path, out, lambda: True, grow)
+    assert out.getvalue() == whole + b"next"
