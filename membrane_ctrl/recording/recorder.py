@@ -91,7 +91,7 @@ class Recorder:
         self._inputs_file = InputsFile(run_dir, __version__, config.recording.segment_s)
         self._assembler = TickAssembler()
         self._resumes = resumes
-        self._partial = resumes > 0 and handed_on is None
+        self._began_anew = resumes > 0 and handed_on is None
         self._messages: list[bytes] = []
         self._input_messages: list[bytes] = []
         self._shapes: list[ShapeEstimate] = []
@@ -179,7 +179,8 @@ class Recorder:
             "column_rows_lost": self._columns.lost,
             "events_lost": self._events_lost + self._events_file.lost,
             "restarts": self._resumes,
-            "partial": self._partial,
+            # without what the former recorder knew, the statistics begin with what the ring still had
+            "partial": self._began_anew and self._feeds["telemetry"].dropped > 0,
         }
         text = plain_json.dumps(self._summary.as_dict(self._dropped(), account), indent=2) + "\n"
         guarded("summary.json", lambda: write_text_atomic(self._run_dir / "summary.json", text))

@@ -40,12 +40,12 @@ class HandClock(RunClock):
 class Run:
     """Rings of a run that outlive its recorders."""
 
-    def __init__(self, run_dir: Path, stack: ExitStack, config: Config) -> None:
+    def __init__(self, run_dir: Path, stack: ExitStack, config: Config, rows_kept: int = 3000) -> None:
         HandClock.moment_s = 0.0
         self.run_dir, self.config = run_dir, config
         self._stack = stack
         self.addresses: dict[str, RingAddress] = {
-            "telemetry": stack.enter_context(ring(3000, ROW_BYTES)),
+            "telemetry": stack.enter_context(ring(rows_kept, ROW_BYTES)),
             "events": stack.enter_context(ring(64, 4000)),
             "shapes": stack.enter_context(ring(8, 30_000)),
         }
@@ -122,10 +122,11 @@ def test_the_next_recorder_goes_on_and_everything_is_there_once(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("left", [None, b"", b"no pickle", b"\x80\x04N."])
-def test_without_what_the_first_knew_the_statistics_are_marked_partial(
-    tmp_path: Path, stack: ExitStack, left: bytes | None
+@pytest.mark.parametrize(("rows_kept", "partial", "ticks"), [(3000, False, 100), (75, True, 100)])
+def test_without_what_the_first_knew_the_statistics_begin_with_what_the_ring_has_and_say_so(
+    tmp_path: Path, stack: ExitStack, left: bytes | None, rows_kept: int, partial: bool, ticks: int
 ) -> None:
-    run = Run(tmp_path, stack, Config())
+    run = Run(tmp_path, stack, Config(), rows_kept)
     first = run.recorder(0)
     run.second(first, 0)
     state = tmp_path / ".recorder-state"
@@ -137,8 +138,9 @@ def test_without_what_the_first_knew_the_statistics_are_marked_partial(
     run.event("end", 2.0)
     second.drain()
     second.finish()
-    assert run.summary["recorder"]["partial"] is True
-    assert run.summary["ticks"] == 100  # the ring still had them
+    assert run.summary["recorder"]["partial"] is partial
+    assert run.summary["ticks"] == ticks
+    assert run.summary["dropped"]["telemetry"] == max(0, 100 - rows_kept)
     assert [json.loads(line)["mono_s"] for line in (tmp_path / "events.jsonl").read_text().splitlines()] == [0, 1, 2]
 
 
