@@ -12,7 +12,7 @@ from rich.console import Console
 from benchmarks.figures import Figure, as_json, machine, show
 
 # in the order of how much the figure depends on a quiet machine
-NAMES = ("hold_live", "live_cycle", "measure_full", "held", "laser_drift", "links")
+NAMES = ("hold_live", "live_cycle", "measure_full", "held", "laser_drift", "links", "virtual_time", "soak")
 OUT = Path("docs/bench.json")
 
 

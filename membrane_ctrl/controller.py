@@ -36,6 +36,7 @@ _DT_RANGE = (0.2, 5.0)
 
 # a reason that comes and goes faster (a pump that touches its limit) tells nobody anything
 _WHY_STANDS_S = 1.0
+_NO_DIGITS = str.maketrans("", "", "0123456789")
 
 
 class Controller:
@@ -298,7 +299,7 @@ class Controller:
     def _tell_why(self, events: list[Event]) -> None:
         """The one line of the operator, as an event when its words (not its numbers) have changed for good."""
         scene = self._scene
-        words = "".join(c for c in scene.why if not c.isdigit())
+        words = scene.why.translate(_NO_DIGITS)
         if words != self._why_words:
             self._why_words, self._why_since_s = words, scene.now_s
         if words != self._said_why and scene.now_s - self._why_since_s >= _WHY_STANDS_S:

@@ -392,8 +392,10 @@ class SafetyTable:
             if state not in rule.states:
                 self._history[index] = 0
                 continue
-            mask = (1 << rule.window) - 1
-            history = ((self._history[index] << 1) | rule.broken(observation, self._limits)) & mask
+            broken = rule.broken(observation, self._limits)
+            if not broken and not self._history[index]:
+                continue  # nearly always
+            history = ((self._history[index] << 1) | broken) & ((1 << rule.window) - 1)
             self._history[index] = history
             if history.bit_count() >= rule.needed and (tripped is None or rule.rung > tripped.rung):
                 tripped = rule

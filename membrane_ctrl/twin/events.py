@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Series = NDArray[np.float64]
+_DAY_S = 86_400.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +101,41 @@ class LaserDrift:
         on.laser_bias_um[:] += self.rate_um_per_min / 60 * np.clip(on.time_s - self.at_s, 0, self.duration_s)
 
 
-Event = AmbientChange | AirTemperatureChange | LeakChange | LaserDropout | LaserDrift
+@dataclass(frozen=True, slots=True)
+class DailyTemperature:
+    """The room follows the day: a sine of one day, warmest after `warmest_s`."""
+
+    amplitude_k: float
+    warmest_s: float = 54_000.0
+
+    def apply(self, on: Surroundings) -> None:
+        """Add the day's course."""
+        on.air_k[:] += self.amplitude_k * np.cos(2 * math.pi / _DAY_S * (on.time_s - self.warmest_s))
+
+
+@dataclass(frozen=True, slots=True)
+class PressureWeather:
+    """Highs and lows: a sum of sines with periods of 12 h to 10 days and random phases, starting at 0.
+
+    Stateless, so that blocks can be made in any order; equal amplitudes give the slow ones the largest changes and
+    the fast ones the steepest: with 700 Pa (a lively month) some 50 Pa an hour.
+    """
+
+    std_pa: float
+    seed: int = 0
+
+    def apply(self, on: Surroundings) -> None:
+        """Add the weather."""
+        periods_s = np.geomspace(0.5 * _DAY_S, 10 * _DAY_S, 12)
+        phases = np.random.default_rng(self.seed).uniform(0, 2 * math.pi, periods_s.size)
+        for period_s, phase in zip(periods_s, phases, strict=True):
+            wave = np.sin(2 * math.pi / period_s * on.time_s + phase) - math.sin(phase)
+            on.ambient_pa[:] += self.std_pa * math.sqrt(2 / periods_s.size) * wave
+
+
+Event = (
+    AmbientChange | AirTemperatureChange | LeakChange | LaserDropout | LaserDrift | DailyTemperature | PressureWeather
+)
 
 
 def _progress(time_s: Series, at_s: float, over_s: float) -> Series:

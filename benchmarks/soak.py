@@ -1,0 +1,217 @@
+"""Days of simulated hold: weather, a day's temperature, creep, and faults at random; memory must stay flat.
+
+python -m benchmarks.soak [--days 30] [--seed 1]
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.figures import Figure, at_least, at_most, show
+from membrane_ctrl.commands import Command
+from membrane_ctrl.config import Config, LoopConfig, ResumeConfig, StatesConfig, TwinConfig
+from membrane_ctrl.metrology.hencky import zernike_projection
+from membrane_ctrl.names import State
+from membrane_ctrl.twin.events import DailyTemperature, LaserDropout, PressureWeather
+from membrane_ctrl.twin.events import Event as Happening
+from membrane_ctrl.twin.plant import Plant
+from membrane_ctrl.virtual_bench import VirtualBench
+from membrane_ctrl.virtual_run import VirtualRun
+from membrane_ctrl.virtual_shape import TruthShape
+
+DAY_S = 86_400.0
+RATE_HZ = 10.0
+BAND_UM, MINUTE_BAND_UM = 2.0, 0.5
+# something a day of each kind: a glitch of the laser, an answer lost, a network that restarts, a board that does
+_RESUMES = ("link_lost", "device_silent", "watchdog_tripped", "board_fault")
+_FAULTS = (("no_light", 3.0), ("silent", 0.2), ("unreachable", 20.0), ("power", 0.0))
+
+
+@dataclass
+class Means:
+    """Streaming means over a window; counts how many are in a band. Memory does not grow with time."""
+
+    window: int
+    band_um: float
+    count: int = 0
+    inside: int = 0
+    worst_um: float = 0.0
+    _sum_um: float = 0.0
+    _n: int = 0
+
+    def add(self, error_um: float) -> None:
+        """Take one tick."""
+        self._sum_um += error_um
+        self._n += 1
+        if self._n == self.window:
+            mean_um = self._sum_um / self.window
+            self.count += 1
+            self.inside += abs(mean_um) <= self.band_um
+            self.worst_um = max(self.worst_um, abs(mean_um))
+            self.restart()
+
+    def restart(self) -> None:
+        """Begin a window anew."""
+        self._sum_um, self._n = 0.0, 0
+
+    @property
+    def fraction(self) -> float:
+        """Share inside the band."""
+        return self.inside / self.count if self.count else 0.0
+
+
+@dataclass
+class Tally:
+    """What is kept of a soak."""
+
+    second: Means = field(default_factory=lambda: Means(round(RATE_HZ), BAND_UM))
+    minute: Means = field(default_factory=lambda: Means(round(60 * RATE_HZ), MINUTE_BAND_UM))
+    events: Counter[str] = field(default_factory=Counter)
+    event_bytes: int = 0
+    held_s: float = 0.0
+    square_um2: float = 0.0
+    ticks: int = 0
+    rss_after_hour_mb: float = 0.0
+    rss_mb: float = 0.0
+    wall_s: float = 0.0
+
+
+def soak(days: float, seed: int = 1, faults: bool = True, events: tuple[Happening, ...] = ()) -> Tally:
+    """Hold for `days`; with `faults` something goes wrong six times a day and may resume by itself."""
+    config = Config(
+        loop=LoopConfig(rate_hz=RATE_HZ),
+        twin=TwinConfig(seed=seed),
+        states=StatesConfig(stay_after_trip=True),
+        resume=ResumeConfig(faults=_RESUMES, most_per_day=24),
+    )
+    bench = VirtualBench(Plant(config.twin, config.pump, events))
+    run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, seed))
+    upsets = _upsets(seed) if faults else iter(())
+    due_s, name, lasts_s = next(upsets, (np.inf, "", 0.0))
+    until_s, tally, start_s = np.inf, Tally(), time.process_time()
+    run.tick((Command("hold", "soak"),))
+    while run.now_s < days * DAY_S and run.finished is None:
+        if run.now_s >= due_s:
+            _switch(bench, name, True)
+            until_s = run.now_s + lasts_s
+            due_s, following, after_s = next(upsets)
+        if run.now_s >= until_s:
+            _switch(bench, name, False)
+            until_s, name, lasts_s = np.inf, following, after_s
+        _count(run, tally)
+    tally.rss_mb, tally.wall_s = _rss_mb(), time.process_time() - start_s
+    return tally
+
+
+def _count(run: VirtualRun, tally: Tally) -> None:
+    tick = run.tick()
+    if tick is None:
+        return
+    row = tick.row
+    if row.state == State.HOLD:
+        error_um = row.truth_displacement_um - row.target_um
+        tally.held_s += row.dt_s
+        tally.ticks += 1
+        tally.square_um2 += error_um**2
+        tally.second.add(error_um)
+        tally.minute.add(error_um)
+    else:
+        tally.second.restart()
+        tally.minute.restart()
+    for event in tick.events:
+        tally.events[str(event["kind"])] += 1
+        tally.event_bytes += len(str(event))
+    if not tally.rss_after_hour_mb and run.now_s > 3600:
+        tally.rss_after_hour_mb = _rss_mb()
+
+
+def _upsets(seed: int) -> Iterator[tuple[float, str, float]]:
+    """When which fault sets in, and for how long."""
+    rng = np.random.default_rng(seed)
+    at_s = 3600.0
+    while True:
+        at_s += float(rng.uniform(2.0, 6.0)) * 3600
+        name, lasts_s = _FAULTS[int(rng.integers(len(_FAULTS)))]
+        yield at_s, name, lasts_s
+
+
+def _switch(bench: VirtualBench, name: str, on: bool) -> None:
+    if name != "power":
+        setattr(bench.wrong, name, on)
+    elif on:
+        bench.power_cycle()
+
+
+def _rss_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def dropout_excursion_um(seeds: int = 12) -> float:
+    """Largest way of the true centre in 10 s without a laser, over seeds of typical weather."""
+    worst_um = 0.0
+    for seed in range(seeds):
+        config = Config(loop=LoopConfig(rate_hz=RATE_HZ), twin=TwinConfig(seed=seed))
+        plant = Plant(config.twin, config.pump, (LaserDropout(120.0, 10.0),))
+        run = VirtualRun(config, VirtualBench(plant), zernike_projection())
+        run.tick((Command("hold", "soak"),))
+        while run.now_s < 131.0:
+            tick = run.tick()
+            if tick is not None and run.now_s >= 120.0:
+                worst_um = max(worst_um, abs(tick.row.truth_displacement_um))
+    return worst_um
+
+
+def figures(days: float, seed: int = 1) -> list[Figure]:
+    """A soak of `days` with everything, as figures."""
+    weather = (DailyTemperature(1.0), PressureWeather(700.0, seed))
+    tally = soak(days, seed, True, weather)
+    grown = 100 * (tally.rss_mb / tally.rss_after_hour_mb - 1)
+    trips = tally.events["fault"]
+    return [
+        at_most("simulated days, with weather and faults", days, "d"),
+        at_least("times real time", days * DAY_S / tally.wall_s, "", 1000.0),
+        at_least("held", 100 * tally.held_s / (days * DAY_S), "% of the time", 98.0),
+        at_most("faults that were latched or forgiven", trips, ""),
+        at_most("standard deviation of the true centre", (tally.square_um2 / tally.ticks) ** 0.5, "um"),
+        at_least("1 s means within 2 um", 100 * tally.second.fraction, "%", 99.9),
+        at_least("60 s means within 0.5 um", 100 * tally.minute.fraction, "%", 99.0),
+        at_most("memory grown since the first hour", grown, "%", 5.0, "MB then", tally.rss_after_hour_mb),
+        at_most("events", tally.event_bytes / days / 1e3, "kB a day"),
+    ]
+
+
+def run() -> list[Figure]:
+    """A quiet day as the target asks, and two days with everything."""
+    day = soak(1.0, faults=False)
+    return [
+        at_least("24 h typical: 1 s means within 2 um", 100 * day.second.fraction, "%", 99.9),
+        at_most("24 h typical: worst 60 s mean", day.minute.worst_um, "um", MINUTE_BAND_UM),
+        at_most("24 h typical: standard deviation", (day.square_um2 / day.ticks) ** 0.5, "um"),
+        at_most("10 s without laser: way of the true centre", dropout_excursion_um(), "um", 4.0),
+        *figures(2.0),
+    ]
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--days", type=float, default=30.0)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    found = figures(options.days, options.seed)
+    show("soak", found)
+    return int(any(figure.met is False for figure in found))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
