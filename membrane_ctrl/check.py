@@ -15,12 +15,14 @@ from membrane_ctrl.bench import open_bench
 from membrane_ctrl.config import Config, DevicesConfig
 from membrane_ctrl.errors import DeviceError, Exit
 from membrane_ctrl.probe import Probe, probe_board, probe_roles
+from membrane_ctrl.probe_optics import probe_optics
 from membrane_ctrl.role_devices import role_devices
 
 
 def check_config(config: Config, source: str, as_json: bool) -> int:
     """Probe and report. Raises DeviceError (one line, after the report) if a device does not answer as it should."""
     probes = asyncio.run(_probes(config.devices)) if config.devices is not None else []
+    probes += probe_optics(config)
     would = _what_would_happen(config)
     if as_json:
         listed = [{key: _plain(value) for key, value in asdict(probe).items()} for probe in probes]
@@ -56,7 +58,7 @@ def _show(source: str, probes: list[Probe], would: dict[str, str]) -> None:
             table.add_row(*(escape(word) for word in words))
         console.print(table)
     for probe in probes:
-        for word, line in (("wrong", probe.problem), ("watchdog", probe.notes)):
+        for word, line in (("wrong", probe.problem), ("note", probe.notes)):
             if line:
                 console.print(escape(f"{probe.role}: {word}: {line}"), soft_wrap=True)
     table = Table(title=f"{source}: valid", title_justify="left", show_header=False)

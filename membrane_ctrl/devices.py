@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from firmware_iface.links import aravis
 from firmware_iface.links.usb_ports import serial_ports
+from firmware_iface.roles import LinkError
 from membrane_ctrl.errors import Exit
 
 _DRM = Path("/sys/class/drm")
-_NO_ARAVIS = "aravis is not installed: apt install gir1.2-aravis-0.8, then pip install 'PyGObject<3.51'"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,24 +66,12 @@ def find_ports() -> list[Found]:
 def find_cameras() -> tuple[list[Found], list[str]]:
     """GenICam cameras, and a note when they cannot be looked for."""
     try:
-        aravis = _aravis()
-    except (ImportError, ValueError):
-        return [], [_NO_ARAVIS]
-    aravis.update_device_list()
-    count = aravis.get_n_devices()
+        cameras = list(aravis.find_cameras())
+    except LinkError as error:
+        return [], [str(error)]
     return [
-        Found(
-            "camera",
-            f"{aravis.get_device_vendor(index)} {aravis.get_device_model(index)}",
-            f'camera = "{aravis.get_device_id(index)}"',
-        )
-        for index in range(count)
+        Found("camera", f"{camera.vendor} {camera.model}", f'camera = "{camera.camera_id}"') for camera in cameras
     ], []
-
-
-def _aravis() -> Any:
-    importlib.import_module("gi").require_version("Aravis", "0.8")  # an optional extra
-    return importlib.import_module("gi.repository.Aravis")
 
 
 def find_displays(root: Path = _DRM) -> list[Found]:
@@ -96,5 +83,7 @@ def find_displays(root: Path = _DRM) -> list[Found]:
         connector = status.parent.name.split("-", 1)[1]
         modes = (status.parent / "modes").read_text(encoding="ascii").split()
         size = modes[0] if modes else "size unknown"
-        found.append(Found("display", f"{connector}, {size}"))
+        width, _, height = size.partition("x")
+        paste = f"width_px = {width}\nheight_px = {height}" if width.isdigit() and height.isdigit() else ""
+        found.append(Found("display", f"{connector}, {size}", paste))
     return found

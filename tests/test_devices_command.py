@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
+from firmware_iface.links import aravis
 from firmware_iface.links.usb_ports import PortInfo
 from membrane_ctrl import devices
 from membrane_ctrl.cli import run
@@ -35,14 +35,8 @@ def test_connected_displays_are_listed_with_their_size(tmp_path: Path) -> None:
 
 
 def test_cameras_are_listed_by_aravis_when_it_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    aravis = SimpleNamespace(
-        update_device_list=lambda: None,
-        get_n_devices=lambda: 1,
-        get_device_vendor=lambda index: "Hikrobot",
-        get_device_model=lambda index: "MV-CS050-10UC",
-        get_device_id=lambda index: "Hikrobot-00J1",
-    )
-    monkeypatch.setattr(devices, "_aravis", lambda: aravis)
+    there = [aravis.FoundCamera("Hikrobot-00J1", "Hikrobot", "MV-CS050-10UC", "USB3")]
+    monkeypatch.setattr(aravis, "find_cameras", lambda: iter(there))
     (camera,), notes = devices.find_cameras()
     assert (camera.name, camera.paste, notes) == ("Hikrobot MV-CS050-10UC", 'camera = "Hikrobot-00J1"', [])
 
@@ -50,14 +44,13 @@ def test_cameras_are_listed_by_aravis_when_it_is_there(monkeypatch: pytest.Monke
 def test_without_aravis_the_rest_is_listed_and_the_remedy_named(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def missing() -> None:
-        raise ImportError("gi")
-
-    monkeypatch.setattr(devices, "_aravis", missing)
+    monkeypatch.setattr(aravis, "_LIBRARY", "libaravis-not-there.so")
+    aravis.aravis.cache_clear()
     monkeypatch.setattr(devices, "serial_ports", lambda: [PortInfo("/dev/ttyS0", "", "n/a")])
     assert run(["devices", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["devices"][0]["paste"] == 'port = "/dev/ttyS0"'
-    assert "apt install gir1.2-aravis" in found["notes"][0]
+    assert "apt install libaravis-0.8-0" in found["notes"][0]
     assert run(["devices"]) == 0
     assert "/dev/ttyS0" in capsys.readouterr().out
+    aravis.aravis.cache_clear()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -81,8 +80,19 @@ def _camera(config: Config, section: table.CameraTable, clock: CycleClock) -> An
             return FolderCamera(Path(section.folder).expanduser(), width_px, height_px, clock.now)
 
 
-def open_bench(bench: OpticalBench, config: Config, clock: CycleClock, say: Callable[[str], None]) -> None:
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What opening the bench has shown: who the camera is, what was measured, and what is wrong with which remedy."""
+
+    camera: str
+    measured: tuple[str, ...] = ()
+    problems: tuple[str, ...] = ()
+
+
+def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> Findings:
     """Connect camera and screen, and let the camera measure the screen.
+
+    What is found wrong does not keep a run from trying: its cycles are judged one by one.
 
     Parameters
     ----------
@@ -91,51 +101,52 @@ def open_bench(bench: OpticalBench, config: Config, clock: CycleClock, say: Call
     config : Config
     clock : CycleClock
         The run's clock.
-    say : callable
-        Gets what was found, line by line; what is wrong does not keep a run from trying.
 
     Raises
     ------
     LinkError
         If one of them is not there or not usable.
     """
-    say(f"camera: {bench.camera.open().kind}")
+    identity = bench.camera.open()
+    who = " ".join(part for part in (identity.kind, identity.serial, identity.detail) if part)
     section = config.devices.screen if config.devices is not None else None
     if section is None:
-        return
+        return Findings(who)
     screen = bench.screen
     screen.open()
     test = DisplayTest(screen, bench.camera, clock, section.width_px, section.height_px)
-    camera_table = config.devices.camera if config.devices is not None else None
-    full_scale_adu = (1 << config.optics.camera.bits) - 1
-    problems = []
-    if section.self_test and isinstance(camera_table, table.AravisCamera):
-        exposure_ms = camera_table.exposure_ms
-        problems.append(told("camera", lambda: test.exposure(full_scale_adu, exposure_ms)))
+    measured: list[str] = []
+    problems: list[str] = []
     if section.self_test:
-        problems.append(told("screen", test.checkerboard))
+        problems += [_exposure(config, test), told("screen", test.checkerboard)]
     if section.settle_ms is not None:
         screen.settle_s = test.settle_s = section.settle_ms / 1000.0
     else:
-        problems.append(told("screen", lambda: _settle(screen, test, say)))
+        problems.append(told("screen", lambda: _settle(screen, test, measured)))
     if section.linearise:
-        problems.append(told("screen", lambda: _linearise(screen, test, say)))
-    for problem in filter(None, problems):
-        say(problem)
+        problems.append(told("screen", lambda: _linearise(screen, test, measured)))
+    return Findings(who, tuple(measured), tuple(filter(None, problems)))
 
 
-def _settle(screen: PygameScreen, test: DisplayTest, say: Callable[[str], None]) -> str:
+def _exposure(config: Config, test: DisplayTest) -> str:
+    camera = config.devices.camera if config.devices is not None else None
+    if not isinstance(camera, table.AravisCamera):  # another's exposure has no unit
+        return ""
+    return told("camera", lambda: test.exposure((1 << config.optics.camera.bits) - 1, camera.exposure_ms))
+
+
+def _settle(screen: PygameScreen, test: DisplayTest, measured: list[str]) -> str:
     found = test.settling()
     screen.settle_s = found.settle_s
-    say(
+    measured.append(
         f"screen settles in {1000 * found.settle_s:.0f} ms "
         f"(latency {1000 * found.latency_s:.0f} ms, time constant {1000 * found.tau_s:.0f} ms)"
     )
     return ""
 
 
-def _linearise(screen: PygameScreen, test: DisplayTest, say: Callable[[str], None]) -> str:
+def _linearise(screen: PygameScreen, test: DisplayTest, measured: list[str]) -> str:
     response = test.response()
     screen.linearise(response)
-    say(f"screen's response corrected (gamma {response.gamma:.2f})")
+    measured.append(f"screen's response corrected (gamma {response.gamma:.2f})")
     return ""

@@ -115,7 +115,9 @@ def _open(bench: OpticalBench, config: Config, clock: WaitingClock, remote: Remo
     failures = 0
     while not remote.stop:
         try:
-            open_bench(bench, config, clock, lambda line: remote.report("preparing", line))
+            found = open_bench(bench, config, clock)
+            for line in (f"camera: {found.camera}", *found.measured, *found.problems):
+                remote.report("preparing", line)
             return
         except LinkError as error:
             failures += 1
