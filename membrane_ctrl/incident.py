@@ -23,7 +23,7 @@ from membrane_ctrl.errors import InputError
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.recorded_run import RecordedRun
 from membrane_ctrl.recording.inputs_file import Frame, InputsFile, InputsReader
-from membrane_ctrl.replay import Decision, Replay, recorded_ticks, replay, unmatched
+from membrane_ctrl.replay import Decision, Replay, recorded_ticks, replay, unmatched, without_repeats
 from membrane_ctrl.tick_record import TickBatch
 
 SCHEMA = "membrane-incident/1"
@@ -81,7 +81,7 @@ def write_incident(run: RecordedRun, found: Replay, name: str, to_s: float, inci
         "schema": SCHEMA,
         "what": f"replay of {run.folder.resolve().name}",
         "recorded_by": run.inputs.program,
-        "decisions": [{"time_s": round(d.time_s, 3), "what": d.what} for d in found.decisions],
+        "decisions": [{"time_s": round(d.time_s, 3), "what": d.what} for d in without_repeats(found.decisions)],
     }
     (folder / "incident.toml").write_text(tomli_w.dumps(about), encoding="utf-8")
     (folder / "config.toml").write_text(config_file.dump(run.config), encoding="utf-8")

@@ -178,9 +178,21 @@ def differing_fields(today: TelemetryRow, recorded: TelemetryRow) -> dict[str, t
     return fields
 
 
+def without_repeats(decisions: list[Decision]) -> list[Decision]:
+    """Without those of the shape loop that only give another reason for the state it is in."""
+    kept: list[Decision] = []
+    shape = ""
+    for decision in decisions:
+        if decision.what != shape:
+            kept.append(decision)
+        shape = decision.what if decision.what.startswith("shape") else shape
+    return kept
+
+
 def unmatched(recorded: list[Decision], today: list[Decision], slack_s: float) -> list[str]:
     """Where two lists of decisions differ, as sentences; times may differ by `slack_s`."""
     said: list[str] = []
+    recorded, today = without_repeats(recorded), without_repeats(today)
     for place in range(max(len(recorded), len(today))):
         then = recorded[place] if place < len(recorded) else None
         now = today[place] if place < len(today) else None
