@@ -255,6 +255,7 @@ STATES: tuple[State, ...] = (
     State.SETTLE,
     State.HOLD,
     State.MANUAL,
+    State.TUNE,
     State.LOWER,
     State.FAULT,
 )

@@ -20,6 +20,7 @@ from campaign_watch import Watch
 from membrane_ctrl import states
 from membrane_ctrl.commands import Command
 from membrane_ctrl.config import Config, LimitsConfig, LoopConfig, ShapeConfig, StatesConfig, TwinConfig
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.names import Rung, State
 from membrane_ctrl.safety import TABLE
@@ -33,6 +34,7 @@ RATE_HZ = 25.0
 AFTERMATH_S = 30.0
 GIVE_UP_S = 120.0
 _SCENARIOS = ("calm", "quiet", "typical", "gusty")
+_RELAY = ExperimentSpec(kind="relay", duration_s=60.0, limit_um=8.0, holding_flow_um_per_s=1.24, laser_um=1.0)
 _NAMES = {float(rule.code): rule.name for rule in TABLE} | {0.0: ""}
 
 
@@ -179,6 +181,8 @@ class _Script:
             asked += self._once(Command("hold", "campaign"))
         if self._held and self._goal == State.MANUAL:
             asked += self._once(Command("manual", "campaign", value=1.2))
+        if self._held and self._goal == State.TUNE:
+            asked += self._once(Command("tune", "campaign", experiment=_RELAY))
         if self._held and self._goal == State.LOWER:
             asked += self._once(Command("vent", "campaign"))
         return tuple(asked)
