@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 from membrane_ctrl.alarms.apprise_sender import apprise_sender
 from membrane_ctrl.alarms.book import Notice
@@ -35,7 +34,7 @@ def send_test_alarm(config: Config, source: str, escalated: bool, as_json: bool)
         raise InputError(f"{source}: alarms.urls_file: missing; name a file with one Apprise URL a line")
     if escalated and alarms.escalation_urls_file is None:
         raise InputError(f"{source}: alarms.escalation_urls_file: missing; there is nobody to escalate to")
-    send = apprise_sender(alarms, Path.cwd().name)
+    send = apprise_sender(alarms, "none, a test")
     through = send(Notice("raised", "test", "warning", "this is a test; nothing is wrong", escalated))
     if as_json:
         print(json.dumps({"sent": through}))

@@ -45,7 +45,10 @@ class PortClient:
         self._lines = connection.makefile("rb")
         self._number = 0
         greeting = self._next()
-        if greeting is None or "membrane_ctrl" not in greeting:
+        if greeting is None:  # the hold says why in its record; a refused certificate is the usual reason by TLS
+            self.close()
+            raise DeviceError(f"{where}: hung up without a greeting; by TLS: is the certificate valid for this hold?")
+        if "membrane_ctrl" not in greeting:
             self.close()
             raise DeviceError(f"{where}: this is no control port of membrane-ctrl")
         self.greeting = greeting

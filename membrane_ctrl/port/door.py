@@ -15,6 +15,7 @@ from membrane_ctrl.tick import Event
 BACKLOG = 8  # who waits at the door while another comes in; the kernel turns away the rest
 _INSIDE_MOST = 32
 _PAUSE_S = 0.05
+_LEAVE_S = 2.0  # then the run ends without them
 _AGAIN_S, _AGAIN_MOST_S = 1.0, 60.0
 
 Welcome = Callable[[socket.socket], Awaitable[None]]
@@ -52,21 +53,24 @@ class Door:
         tasks = [*self._inside, *([self._task] if self._task else [])]
         for task in tasks:
             task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        if tasks:
+            await asyncio.wait(tasks, timeout=_LEAVE_S)
         self._listener.close()
 
     async def _keep(self) -> None:
         """Accept for ever; what fails is said, and tried again."""
-        again_s = _AGAIN_S
+        again_s = 0.0
         while True:
             try:
                 await self._accept()
-                again_s = _AGAIN_S
             except Exception as error:
+                again_s = min(max(2.0 * again_s, _AGAIN_S), _AGAIN_MOST_S)
                 self._tell({"kind": "port_failed", "port": self._name, "message": str(error), "again_s": again_s})
                 await asyncio.sleep(again_s)
-                again_s = min(2.0 * again_s, _AGAIN_MOST_S)
                 continue
+            if again_s:
+                again_s = 0.0
+                self._tell({"kind": "port_open", "port": self._name})
             await asyncio.sleep(_PAUSE_S)
 
     async def _accept(self) -> None:

@@ -56,7 +56,8 @@ async def serve_metrics(connection: socket.socket, text: Callable[[], str]) -> N
     wire = await Wire.on(connection)
     try:
         with contextlib.suppress(TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError):
-            head = await asyncio.wait_for(wire.until(b"\r\n\r\n"), _REQUEST_S)
+            async with asyncio.timeout(_REQUEST_S):
+                head = await wire.until(b"\r\n\r\n")
             found = head.split(b"\r\n")[0].split(b" ")[:2] == [b"GET", b"/metrics"]
             body = (text() if found else "only /metrics is here\n").encode()
             kind = "text/plain; version=0.0.4; charset=utf-8"

@@ -24,7 +24,7 @@ MESSAGE_BYTES = 8192
 WHO_BYTES, WHY_BYTES, TEXT_BYTES = 64, 300, 500
 
 Errand = Literal["status", "watch", "release", "quiet"]
-Action = Kind | Errand
+Action = Literal[Kind, Errand]
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
 ACTIONS: tuple[str, ...] = (*KINDS, *get_args(Errand))
@@ -105,7 +105,7 @@ def parse(line: bytes) -> Request:
     try:
         return Request.model_validate_json(line, strict=True)
     except ValidationError as error:
-        reason = describe(error.errors(include_url=False)[0], Request)
+        reason = describe(error.errors(include_url=False)[0], Request).removeprefix(": ")
         raise RequestError(_short(reason), _number_in(line)) from None
 
 

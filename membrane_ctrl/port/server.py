@@ -38,6 +38,7 @@ from membrane_ctrl.tick import Event, TickOutputs
 _SESSIONS_MOST, _SESSIONS_EACH = 16, 4
 # A tick takes a command up within its period; a loop that does not in so long has other troubles, and says so
 _ANSWER_S = 5.0
+_OVER = "the run is over"
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +87,7 @@ class Port:
         self._numbers = itertools.count(1)
         self._waiting: dict[int, asyncio.Future[str]] = {}
         self._sessions: list[Session] = []
+        self._over = False
 
     def heard(self, outputs: TickOutputs) -> None:
         """Take in what a tick decided; those who asked for it get their answer."""
@@ -94,7 +96,7 @@ class Port:
             for session in self._sessions:
                 session.event(event)
         for number, refusal in outputs.answers:
-            future = self._waiting.pop(number, None)
+            future = self._waiting.get(number)
             if future is not None and not future.done():
                 future.set_result(refusal)
 
@@ -117,10 +119,12 @@ class Port:
         try:
             yield
         finally:
+            self._over = True
             for future in self._waiting.values():
                 if not future.done():
-                    future.set_result("the run is over")
-            await asyncio.sleep(0.0)  # let the answers out
+                    future.set_result(_OVER)
+            while self._waiting:  # noqa: ASYNC110  an answer is sent in the same step that takes it from here
+                await asyncio.sleep(0.0)
             for door in doors:
                 await door.close()
 
@@ -215,7 +219,7 @@ class Port:
                 self._tell({"kind": "commander", "who": None, "former": who, "why": request.why})
             case "quiet":
                 self._tell({"kind": "alarms_acknowledged", "who": who, "why": request.why})
-        return {"ok": True, "status": self.status()}
+        return {"ok": True, "status": self.status(), "loop": self._hooks.loop().model_dump()}
 
     def _command(self, peer: Peer, request: Request) -> Command:
         """The command of a request. Raises InputError for gains or an experiment that are none."""
@@ -232,11 +236,14 @@ class Port:
 
     async def _obeyed(self, command: Command) -> str:
         """Why the tick that took the command up refused it; empty if it obeyed."""
+        if self._over:
+            return _OVER
         future: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._waiting[command.number] = future
         self._hooks.ask(command)
         try:
-            return await asyncio.wait_for(future, _ANSWER_S)
+            async with asyncio.timeout(_ANSWER_S):
+                return await future
         except TimeoutError:
             return f"no tick took it up within {_ANSWER_S:g} s; it may still be obeyed"
         finally:

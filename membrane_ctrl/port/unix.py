@@ -90,7 +90,7 @@ def _remove_stale(path: Path) -> None:
             return
         except FileNotFoundError:
             return
-        except TimeoutError:
+        except (TimeoutError, BlockingIOError):
             pass
     raise DeviceError(f"{path}: another hold is listening there; stop it, or choose another path with port.socket")
 

@@ -60,7 +60,9 @@ class Wire:
             first = await self._reader.read(1)  # a peer may think for hours between two lines
             if first in (b"", b"\n"):
                 return first or None
-            rest = await asyncio.wait_for(self._reader.readuntil(b"\n"), _LINE_S)
+            # not `wait_for`, which forgets a cancellation that comes together with its result
+            async with asyncio.timeout(_LINE_S):
+                rest = await self._reader.readuntil(b"\n")
         except asyncio.LimitOverrunError:
             raise RequestError(f"a message may have {MESSAGE_BYTES} bytes") from None
         except TimeoutError:
@@ -91,7 +93,8 @@ class Wire:
         """Send what is left, if that goes at once, and end."""
         self._writer.close()
         try:
-            await asyncio.wait_for(self._writer.wait_closed(), 1.0)
+            async with asyncio.timeout(1.0):
+                await self._writer.wait_closed()
         except (TimeoutError, OSError):
             self._writer.transport.abort()
 

@@ -1,0 +1,111 @@
+"""What people are told and when; time is a number here."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from membrane_ctrl.alarms.book import AlarmBook, Notice
+from membrane_ctrl.alarms.signs import Sign
+from membrane_ctrl.port_config import AlarmsConfig
+
+CONFIG = AlarmsConfig(escalate_after_s=900, remind_every_s=3600, clear_after_s=30)
+BAD, GOOD = Sign("leak", True, "warning", "it leaks", for_s=10.0), Sign("leak", False)
+
+
+def kinds(notices: list[Notice]) -> list[str]:
+    return [notice.kind for notice in notices]
+
+
+def book_with_a_told_alarm() -> AlarmBook:
+    book = AlarmBook(CONFIG)
+    book.take(BAD, 0.0)
+    assert kinds(book.step(10.0)) == ["raised"]
+    return book
+
+
+def test_a_condition_must_stand_for_its_time() -> None:
+    book = AlarmBook(CONFIG)
+    book.take(BAD, 0.0)
+    assert book.step(9.9) == []
+    assert book.step(10.0) == [Notice("raised", "leak", "warning", "it leaks")]
+    assert book.step(11.0) == [], "told once"
+
+
+def test_what_goes_before_its_time_is_told_to_nobody() -> None:
+    book = AlarmBook(CONFIG)
+    for start_s in range(0, 100, 10):
+        book.take(BAD, float(start_s))
+        book.take(GOOD, start_s + 9.0)
+        assert book.step(start_s + 9.5) == []
+
+
+def test_it_is_over_when_it_stays_away_and_not_before() -> None:
+    book = book_with_a_told_alarm()
+    for start_s in range(20, 200, 20):  # flaps every 20 s
+        book.take(GOOD, float(start_s))
+        assert book.step(start_s + 9.0) == []
+        book.take(BAD, start_s + 10.0)
+        assert book.step(start_s + 11.0) == []
+    book.take(GOOD, 300.0)
+    book.take(GOOD, 320.0)
+    assert book.step(329.9) == []
+    assert kinds(book.step(330.0)) == ["cleared"]
+    book.take(BAD, 400.0)
+    assert kinds(book.step(410.0)) == ["raised"], "a new alarm"
+
+
+def test_nobody_acknowledges_more_people_are_told() -> None:
+    book = book_with_a_told_alarm()
+    assert book.step(909.0) == []
+    (notice,) = book.step(910.0)
+    assert (notice.kind, notice.escalated) == ("escalated", True)
+    assert book.step(911.0) == []
+    (notice,) = book.step(910.0 + 3600.0)
+    assert (notice.kind, notice.escalated) == ("reminder", True)
+    book.take(GOOD, 5000.0)
+    (notice,) = book.step(5030.0)
+    assert (notice.kind, notice.escalated) == ("cleared", True), "who was woken is told that it is over"
+
+
+def test_acknowledged_it_is_quiet_until_it_is_over() -> None:
+    book = book_with_a_told_alarm()
+    book.acknowledge()
+    assert book.step(1e6) == []
+    book.take(GOOD, 1e6)
+    assert kinds(book.step(1e6 + 30.0)) == ["cleared"]
+
+
+def test_an_acknowledgement_is_not_for_what_comes_later() -> None:
+    book = AlarmBook(CONFIG)
+    book.take(BAD, 0.0)
+    book.acknowledge()  # nobody has been told of it yet
+    assert kinds(book.step(10.0)) == ["raised"]
+    assert kinds(book.step(910.0)) == ["escalated"]
+
+
+def test_a_good_sign_of_nothing_is_nothing() -> None:
+    book = AlarmBook(CONFIG)
+    book.take(GOOD, 0.0)
+    assert book.step(1e6) == []
+    assert not book.standing("leak")
+
+
+@given(st.lists(st.tuples(st.booleans(), st.floats(0.1, 100.0)), max_size=60))
+def test_raised_and_cleared_take_turns(changes: list[tuple[bool, float]]) -> None:
+    book = AlarmBook(CONFIG)
+    now_s, told = 0.0, []
+    for bad, wait_s in changes:
+        book.take(BAD if bad else GOOD, now_s)
+        now_s += wait_s
+        told += [kind for kind in kinds(book.step(now_s)) if kind in ("raised", "cleared")]
+    assert told == (["raised", "cleared"] * len(told))[: len(told)]
+
+
+@pytest.mark.parametrize("name", ["fault", "silent"])
+def test_alarms_stand_beside_each_other(name: str) -> None:
+    book = book_with_a_told_alarm()
+    book.take(Sign(name, True, "critical", "!"), 20.0)
+    (notice,) = book.step(20.0)
+    assert (notice.name, notice.severity) == (name, "critical")

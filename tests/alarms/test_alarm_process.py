@@ -1,0 +1,221 @@
+"""The watcher over real rings, the outbox, and Apprise replaced by a stand-in with its three names."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from membrane_ctrl.alarms.apprise_sender import apprise_sender, read_urls, require_sendable
+from membrane_ctrl.alarms.book import Notice
+from membrane_ctrl.alarms.outbox import Outbox
+from membrane_ctrl.alarms.process import AlarmsSpec, watch
+from membrane_ctrl.alarms.watcher import Watcher
+from membrane_ctrl.cli import run
+from membrane_ctrl.clock import RunClock
+from membrane_ctrl.errors import DeviceError, InputError
+from membrane_ctrl.ipc.ring import RingWriter, ring
+from membrane_ctrl.port_config import AlarmsConfig
+from membrane_ctrl.telemetry import FIELDS, ROW_BYTES, TelemetryRow
+from membrane_ctrl.tick import Event
+
+CONFIG = AlarmsConfig(silent_s=5.0)
+ROW = TelemetryRow(*(0.0 for _ in FIELDS))
+TEST = Notice("raised", "test", "warning", "text")
+
+
+class Post:
+    """Takes notices, unless the network is down."""
+
+    def __init__(self) -> None:
+        self.through: list[Notice] = []
+        self.tried = 0
+        self.down = False
+
+    def __call__(self, notice: Notice) -> bool:
+        self.tried += 1
+        if not self.down:
+            self.through.append(notice)
+        return not self.down
+
+
+def message(**event: object) -> bytes:
+    return json.dumps(event).encode()
+
+
+def told(post: Post) -> list[tuple[str, str]]:
+    return [(notice.name, notice.kind) for notice in post.through]
+
+
+def test_a_fault_is_told_at_once_and_its_end_too() -> None:
+    post = Post()
+    watcher = Watcher(CONFIG, Outbox(post), 0.0)
+    watcher.look([ROW.pack()], [message(kind="fault", name="late", latching=True)], 1.0)
+    watcher.look([ROW.pack()], [message(kind="state", state="standby", **{"from": "fault"})], 2.0)
+    watcher.look([ROW.pack()], [], 33.0)
+    assert told(post) == [("fault", "raised"), ("fault", "cleared")]
+
+
+def test_a_value_out_of_its_limits() -> None:
+    post = Post()
+    watcher = Watcher(CONFIG, Outbox(post), 0.0)
+    bad, good = replace(ROW, error_um=-20.0).pack(), ROW.pack()
+    for now_s in range(30):
+        watcher.look([bad], [], float(now_s))
+    assert told(post) == []
+    watcher.look([bad], [], 30.0)
+    assert told(post) == [("out_of_band", "raised")]
+    watcher.look([good], [], 31.0)
+    watcher.look([good], [], 61.0)
+    assert told(post)[1:] == [("out_of_band", "cleared")]
+
+
+def test_a_loop_that_falls_silent_is_told_and_a_slow_start_is_not() -> None:
+    post = Post()
+    watcher = Watcher(CONFIG, Outbox(post), 0.0)
+    watcher.look([], [], 30.0)
+    watcher.look([ROW.pack()], [], 31.0)
+    watcher.look([], [], 35.9)
+    assert told(post) == []
+    watcher.look([], [], 36.0)
+    assert told(post) == [("silent", "raised")]
+
+
+@pytest.mark.parametrize("event", [{"kind": "alarms_acknowledged"}, {"kind": "command", "command": "ack"}])
+def test_an_acknowledgement_keeps_the_others_asleep(event: Event) -> None:
+    post = Post()
+    watcher = Watcher(CONFIG, Outbox(post), 0.0)
+    watcher.look([ROW.pack()], [message(kind="fault", latching=True)], 0.0)
+    watcher.look([ROW.pack()], [message(**event)], 1.0)
+    watcher.look([ROW.pack()], [], 10_000.0)
+    assert told(post) == [("fault", "raised")]
+
+
+def test_a_network_that_is_down_is_tried_later_and_later_in_order() -> None:
+    post = Post()
+    post.down = True
+    outbox = Outbox(post)
+    for number in range(60):
+        outbox.post(replace(TEST, name=str(number)))
+    assert outbox.dropped == 10
+    for now_s in range(100):
+        outbox.step(float(now_s))
+    assert post.tried == 4, "at 0, 10, 30 and 70 s"
+    assert outbox.failing
+    post.down = False
+    outbox.step(150.0)
+    assert [notice.name for notice in post.through] == [str(n) for n in range(10, 60)]
+    assert outbox.empty
+    assert not outbox.failing
+
+
+def spec(telemetry: object, events: object) -> AlarmsSpec:
+    return AlarmsSpec(RunClock.start(), telemetry, events, CONFIG, "the-run")  # type: ignore[arg-type]
+
+
+def test_the_process_ends_with_the_run_and_says_why_it_ended() -> None:
+    post, reports = Post(), list[Event]()
+    with ring(16, ROW_BYTES) as telemetry, ring(16, 4096) as events:
+        writer = RingWriter(events)
+        writer.put(message(kind="end", exit="safety_trip"))
+        watch(spec(telemetry, events), post, reports.append, lambda: True)
+        writer.close()
+    assert told(post) == [("run_ended", "raised")]
+    assert [(r["kind"], r["alarm"], r["sent"]) for r in reports] == [("alarm", "run_ended", True)]
+
+
+def test_a_control_process_that_vanishes_is_told() -> None:
+    post = Post()
+
+    def broken_pipe(event: Event) -> None:
+        raise BrokenPipeError
+
+    with ring(16, ROW_BYTES) as telemetry, ring(16, 4096) as events:
+        watch(spec(telemetry, events), post, broken_pipe, lambda: False)
+    assert told(post) == [("control_gone", "raised")]
+
+
+class Target:
+    """What Apprise makes of an URL."""
+
+    sent: list[tuple[str, str, str, str]] = []  # noqa: RUF012  one list for all, as the test looks at it
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+
+    def notify(self, title: str, body: str, notify_type: str) -> bool:
+        if "broken" in self.url:
+            raise RuntimeError("plug-in")
+        self.sent.append((self.url, title, body, notify_type))
+        return "refusing" not in self.url
+
+
+@pytest.fixture
+def apprise(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[str, str, str, str]]]:
+    class Apprise:
+        @staticmethod
+        def instantiate(url: str) -> Target | None:
+            return Target(url) if "://" in url else None
+
+    module = ModuleType("apprise")
+    module.Apprise = Apprise  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "apprise", module)
+    Target.sent.clear()
+    yield Target.sent
+    Target.sent.clear()
+
+
+def urls(folder: Path, *lines: str, name: str = "urls.txt") -> str:
+    path = folder / name
+    path.write_text("\n".join(lines) + "\n")
+    return str(path)
+
+
+def test_who_is_told(tmp_path: Path, apprise: list[tuple[str, str, str, str]]) -> None:
+    first = urls(tmp_path, "# people", "", "mail://ann", "broken://x")
+    more = urls(tmp_path, "chat://all", name="more.txt")
+    send = apprise_sender(AlarmsConfig(urls_file=first, escalation_urls_file=more), "the-run")
+    assert send(TEST), "one of two is enough"
+    assert apprise == [("mail://ann", "membrane-ctrl warning raised: test", "text\nrun: the-run", "warning")]
+    assert send(replace(TEST, kind="escalated", escalated=True))
+    assert [sent[0] for sent in apprise[1:]] == ["mail://ann", "chat://all"]
+    assert apprise[-1][3] == "failure"
+
+
+def test_files_of_urls_that_are_none(tmp_path: Path, apprise: list[tuple[str, str, str, str]]) -> None:
+    with pytest.raises(InputError, match="No such file"):
+        read_urls(tmp_path / "none")
+    with pytest.raises(InputError, match="no URL in it"):
+        read_urls(Path(urls(tmp_path, "# nothing")))
+    secret = urls(tmp_path, "mail://ok", "password-and-no-scheme")
+    with pytest.raises(InputError, match="URL 2 is none") as refused:
+        apprise_sender(AlarmsConfig(urls_file=secret), "run")
+    assert "password" not in str(refused.value)
+
+
+def test_without_apprise_a_run_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    require_sendable(AlarmsConfig())
+    with pytest.raises(DeviceError, match=r"pip install 'membrane-ctrl\[alarms\]'"):
+        require_sendable(AlarmsConfig(urls_file=urls(tmp_path, "mail://ann")))
+
+
+def test_alarm_test(
+    tmp_path: Path, apprise: list[tuple[str, str, str, str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "lab.toml"
+    config.write_text(f'[alarms]\nurls_file = "{urls(tmp_path, "mail://ann")}"\n')
+    assert run(["alarm", "test", "--config", str(config), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"sent": True}
+    assert "this is a test" in apprise[0][2]
+    assert run(["alarm", "test", "--config", str(config), "--escalated"]) == 2
+    assert "escalation_urls_file: missing" in capsys.readouterr().err
+    urls(tmp_path, "refusing://ann")
+    assert run(["alarm", "test", "--config", str(config)]) == 4
+    assert run(["alarm", "test"]) == 2
+    assert "urls_file: missing" in capsys.readouterr().err

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import pytest
+
+from membrane_ctrl.alarms.signs import sign_of_value, signs_of
+from membrane_ctrl.config import Config
+from membrane_ctrl.config_file import parse
+from membrane_ctrl.errors import InputError
+from membrane_ctrl.port_config import AlarmRule
+from membrane_ctrl.tick import Event
+
+HIGH = AlarmRule(name="high", field="error_um", raise_at=10.0, clear_at=3.0, magnitude=True)
+LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=200.0)
+
+
+@pytest.mark.parametrize(
+    ("event", "expected"),
+    [
+        ({"kind": "fault", "name": "late", "latching": True}, [("fault", True, "critical")]),
+        ({"kind": "fault", "name": "late", "latching": False}, [("glitch", True, "warning")]),
+        ({"kind": "cleared"}, [("glitch", False, "warning")]),
+        (
+            {"kind": "state", "state": "standby", "from": "fault"},
+            [("fault", False, "warning"), ("glitch", False, "warning")],
+        ),
+        ({"kind": "state", "state": "hold", "from": "settle"}, []),
+        ({"kind": "link", "message": "no answer"}, [("link", True, "warning")]),
+        ({"kind": "link", "message": "connected again"}, [("link", False, "warning")]),
+        ({"kind": "child_ended", "child": "recorder", "exit_code": -9}, [("recorder_ended", True, "warning")]),
+        ({"kind": "child_restarted", "child": "recorder"}, [("recorder_ended", False, "warning")]),
+        ({"kind": "recorder_error", "message": "disk full"}, [("recorder", True, "warning")]),
+        ({"kind": "recorder_recovered"}, [("recorder", False, "warning")]),
+        ({"kind": "port_failed", "message": "x"}, [("port", True, "warning")]),
+        ({"kind": "port_open"}, [("port", False, "warning")]),
+        ({"kind": "end", "exit": "safety_trip"}, [("run_ended", True, "critical")]),
+        ({"kind": "end", "exit": "done"}, []),
+        ({"kind": "end", "exit": "interrupted"}, []),
+        ({"kind": "why", "why": "x"}, []),
+        ({}, []),
+    ],
+)  # fmt: skip
+def test_events_as_signs(event: Event, expected: list[tuple[str, bool, str]]) -> None:
+    assert [(sign.name, sign.bad, sign.severity) for sign in signs_of(event)] == expected
+
+
+@pytest.mark.parametrize(
+    ("rule", "value", "standing", "bad"),
+    [
+        (HIGH, 10.1, False, True),
+        (HIGH, -10.1, False, True),
+        (HIGH, 9.9, False, None),
+        (HIGH, 9.9, True, None),
+        (HIGH, 3.1, True, None),
+        (HIGH, -2.9, True, False),
+        (HIGH, 50.0, True, None),
+        (HIGH, float("nan"), True, None),
+        (LOW, 99.0, False, True),
+        (LOW, 150.0, False, None),
+        (LOW, 150.0, True, None),
+        (LOW, 201.0, True, False),
+    ],
+)
+def test_hysteresis(rule: AlarmRule, value: float, standing: bool, bad: bool | None) -> None:
+    sign = sign_of_value(rule, value, standing)
+    assert (sign.bad if sign else None) is bad
+
+
+def test_the_text_names_value_and_limit() -> None:
+    sign = sign_of_value(HIGH, -12.345, False)
+    assert sign is not None
+    assert sign.text == "error_um = 12.35, above 10 for 30 s"
+
+
+@pytest.mark.parametrize(
+    ("alarms", "says"),
+    [
+        ({"rules": [{"name": "a", "field": "nothing", "raise_at": 1, "clear_at": 0}]}, "no telemetry field"),
+        ({"rules": [{"name": "a", "field": "error_um", "raise_at": 1, "clear_at": 1}]}, "flap"),
+        ({"rules": [{"name": "a", "field": "error_um", "raise_at": 1, "clear_at": 0}] * 2}, "same name"),
+        ({"escalation_urls_file": "x"}, "without urls_file"),
+    ],
+)
+def test_rules_that_are_none_are_one_line(alarms: dict[str, object], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        parse({"alarms": alarms}, Config, "lab.toml")
