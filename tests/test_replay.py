@@ -15,6 +15,7 @@ from virtual_record import CONFIG, kept_ticks, laser_lost, write_record
 
 from membrane_ctrl import replay as replay_module
 from membrane_ctrl.cli import run
+from membrane_ctrl.clock import RunClock
 from membrane_ctrl.commands import Command
 from membrane_ctrl.config import LoopConfig
 from membrane_ctrl.controller import Controller
@@ -22,6 +23,9 @@ from membrane_ctrl.errors import Exit
 from membrane_ctrl.incident import check_incident, read_incident
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.recording.inputs_file import InputsFile, InputsReader
+from membrane_ctrl.recording.rows import unpack
+from membrane_ctrl.recording.sink import Recording
+from membrane_ctrl.recording.telemetry_streams import TelemetryStreams
 from membrane_ctrl.replay import Gap, RecordedTick, recorded_ticks, replay
 from membrane_ctrl.tick import TickInputs, TickOutputs
 from membrane_ctrl.tick_record import (
@@ -280,3 +284,21 @@ def test_a_full_disk_costs_its_frames_and_the_file_goes_on(tmp_path: Path, monke
     file.close()
     found = [item.tick for item in recorded_ticks(InputsReader(tmp_path)) if isinstance(item, RecordedTick)]
     assert found == [*range(1, 51), *range(101, 151)]
+
+
+def test_a_difference_is_shown_with_what_was_recorded(
+    record: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = unpack([outputs.row.pack() for _, outputs in TICKS])
+    recording = Recording(record, "night", RunClock.start(), CONFIG)
+    recording.next_segment()
+    TelemetryStreams(recording, CONFIG).send(rows)
+    recording.close()
+    monkeypatch.setattr(replay_module, "Controller", changed_from(720))
+    assert run(["replay", str(record), "--json"]) == Exit.REJECTED
+    report = report_of(capsys)
+    then = TICKS[719][1].row.pump_fraction
+    assert report["first_different"] == {"tick": 720, "time_s": TICKS[719][0].now_s}
+    assert report["fields"] == {"pump_fraction": [then, then + 1e-12]}
+    assert run(["replay", str(record)]) == Exit.REJECTED
+    assert f"pump_fraction: recorded {then!r}, today {then + 1e-12!r}" in capsys.readouterr().out
