@@ -15,6 +15,7 @@ from membrane_ctrl.config_file import load
 from membrane_ctrl.durations import parse_duration_s
 from membrane_ctrl.errors import CommandError, Exit, InputError
 from membrane_ctrl.review.cli import add_commands as add_review_commands
+from membrane_ctrl.tune.cli import app as tune_app
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -23,6 +24,7 @@ FlatOption = Annotated[
 ]
 alarm_app = typer.Typer(no_args_is_help=True)
 app.add_typer(alarm_app, name="alarm")
+app.add_typer(tune_app, name="tune")
 
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="Configuration, one TOML file.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]

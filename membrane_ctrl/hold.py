@@ -28,6 +28,7 @@ from membrane_ctrl.config import Config, DevicesConfig
 from membrane_ctrl.controller import Controller
 from membrane_ctrl.crew import Crew, Rings, rings_for
 from membrane_ctrl.errors import DeviceError, Exit, InputError
+from membrane_ctrl.ipc.published import publish
 from membrane_ctrl.ipc.ring import RingReader, RingWriter
 from membrane_ctrl.latched import LatchedFile
 from membrane_ctrl.latcher import Latcher
@@ -76,6 +77,7 @@ def hold_mirror(options: HoldOptions) -> int:
         asyncio.run(_identify(open_bench(config.devices), config.devices, options.clear_faults))
         run_dir = create_run_folder(logs_dir, options.name, clock.origin_utc, config)
         rings = rings_for(config, twin.truth if twin else None, stack)
+        publish(run_dir, {"telemetry": rings.telemetry, "events": rings.events, "shapes": rings.shapes})
         crew = Crew(config, clock, rings, run_dir, options.name, options.duration_s)
         crew.start(stack)
         bench = open_bench(config.devices)  # a link belongs to the event loop that opened it

@@ -11,6 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
+import tomli_w
 from pydantic import Field
 
 from membrane_ctrl import config_file
@@ -66,8 +67,9 @@ class GainsFile(Section):
 
 
 def save_gains(path: Path, gains: GainsFile) -> None:
-    """Write a gains file in one step."""
-    write_text_atomic(path, config_file.dump(gains))
+    """Write a gains file in one step; without the setpoint, which is the hold's own."""
+    text = tomli_w.dumps(gains.model_dump(mode="json", exclude={"loop": {"setpoint_um"}}))
+    write_text_atomic(path, text)
 
 
 def load_gains(path: Path) -> GainsFile:

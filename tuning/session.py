@@ -211,6 +211,12 @@ def preview_step(session: SessionFolder) -> Previewed:
     return done
 
 
+def preview_of(session: SessionFolder) -> Previewed:
+    """What the preview showed."""
+    session.require("preview")
+    return plain.read(session.file("preview.json"), Previewed)
+
+
 def pump_of(session: SessionFolder) -> PumpConfig:
     """The pump as mapped in this session, or as configured."""
     path = session.file("pump.toml")

@@ -1,9 +1,9 @@
 """Whether new gains keep what was promised: ten minutes of hold, judged in stages, against the gains before them.
 
-The true centre is not seen, its variance is: the laser's noise is new in each reading and the loop needs its dead
-time to answer it, so readings a few ticks apart share the centre's movement and nothing else,
+The true centre is not seen, and the laser's noise is ten times its movement. What the readings have in common over
+lags of up to a second is nearly all movement; how much is the loop's answer to noise is known from the model:
 
-    var x = mean of cov(y[i], y[i + l]),  0 < l dt < dead time.
+    var x = var x predicted + mean of (cov(y[i], y[i + l]) seen - predicted),  0 < l dt <= 1 s.
 
 The weather of these ten minutes is not that of the hour before. So the comparison is with what the *old* gains would
 have done in it: the weather is taken out of the same record (`observe`) and the old loop's answer to it predicted
@@ -20,7 +20,7 @@ from scipy.signal import welch
 
 from membrane_ctrl.config import LoopConfig
 from tuning.disturbance_model import Disturbance, observe
-from tuning.loop_model import Gains, loop_response
+from tuning.loop_model import Gains, frequencies, loop_response
 from tuning.margins import margins
 from tuning.minimum_variance import predict
 from tuning.plant_model import PlantModel
@@ -34,6 +34,8 @@ _OBSERVE_LEAST_S = 300.0  # before that the weather of the session stands for th
 MS_MAX = 2.0  # sensitivity seen; its estimate scatters by a tenth
 _SEGMENT_S = 20.0
 _RESONANCE_LEAST_S = 180.0  # 17 half-overlapping segments: power to a quarter
+_LAGS_S = 1.0  # shorter than the centre remembers (2 s and more), and 50 times as many pairs as one lag has
+_POINTS = 3000
 _BAND = 1.3  # width of a band in frequency, as a factor
 
 
@@ -78,19 +80,29 @@ class Trial:
     after: LoopConfig
 
 
-def centre_std_um(off_um: Series, dead_time_s: float, dt_s: float) -> float:
+def centre_std_um(off_um: Series, trial: Trial, weather: Disturbance) -> float:
     """Standard deviation of the centre without the laser's noise; 0 where less than nothing is left.
 
     Parameters
     ----------
     off_um : (n,) array
         Readings less setpoint.
-    dead_time_s, dt_s : float
+    trial : Trial
+    weather : Disturbance
+        What the prediction is made with that the readings correct.
     """
+    dt_s = weather.rest.dt_s
     off = off_um - off_um.mean()
-    lags = range(1, max(1, math.floor(dead_time_s / dt_s)) + 1)
-    shared = [float(off[lag:] @ off[:-lag]) / (off.size - lag) for lag in lags]
-    return math.sqrt(max(0.0, float(np.mean(shared))))
+    lags = np.arange(1, round(_LAGS_S / dt_s) + 1)
+    seen = np.array([off[lag:] @ off[:-lag] / (off.size - lag) for lag in lags])
+    gains = Gains.of(trial.after)
+    w = frequencies(dt_s, _POINTS)
+    sensitivity = np.abs(1 / (1 + loop_response(gains, trial.model, w, dt_s))) ** 2
+    noise = weather.rest.white_psd
+    coloured = sensitivity * (weather.psd(w, trial.model, trial.after) + noise) - noise
+    expected = np.trapezoid(coloured * np.cos(np.outer(lags * dt_s, w)), w, axis=1) / np.pi
+    predicted_um = predict(gains, trial.model, weather, trial.after).std_um
+    return math.sqrt(max(0.0, predicted_um**2 + float(np.mean(seen - expected))))
 
 
 def seen_sensitivity(off_um: Series, trial: Trial) -> float:
@@ -120,7 +132,7 @@ def look(record: Record, setpoint_um: Series, trial: Trial, growth_max: float) -
     weather = trial.weather
     if record.duration_s >= _OBSERVE_LEAST_S:
         weather = observe(record, trial.model, trial.after)
-    std_um = centre_std_um(off_um, trial.model.dead_time_s, record.dt_s)
+    std_um = centre_std_um(off_um, trial, weather)
     before_um = predict(Gains.of(trial.before), trial.model, weather, trial.before).std_um
     growth = std_um / before_um
     ms = seen_sensitivity(off_um, trial) if record.duration_s >= _RESONANCE_LEAST_S else math.nan

@@ -1,0 +1,128 @@
+"""The subcommands of `membrane-ctrl tune`: thin, and quick to import."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from membrane_ctrl.config import Config
+from membrane_ctrl.config_file import load
+from membrane_ctrl.durations import parse_duration_s
+
+if TYPE_CHECKING:
+    from membrane_ctrl.tune.command import TuneOptions
+
+app = typer.Typer(no_args_is_help=True, help="Tuning sessions on a running hold, or on the twin.")
+
+TwinOption = Annotated[bool, typer.Option("--twin", help="On the twin, in virtual time.")]
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="With --twin: its configuration.")]
+RunOption = Annotated[Path | None, typer.Option("--run", help="Run folder of the hold.")]
+SocketOption = Annotated[Path | None, typer.Option("--socket", help="Control port of the hold.")]
+LogsOption = Annotated[Path, typer.Option("--logs", help="Sessions are in LOGS/tuning.")]
+SessionOption = Annotated[Path | None, typer.Option("--session", help="Go on with this session folder.")]
+NameOption = Annotated[str, typer.Option("--name", help="Name of a new session.")]
+AuthorOption = Annotated[str | None, typer.Option("--author", help="Who tunes; the one logged in by default.")]
+ReasonOption = Annotated[str, typer.Option("--reason", help="Why; stands in the gains file and the journal.")]
+LimitOption = Annotated[float, typer.Option(min=3, max=30, help="Furthest the centre may go in an experiment, um.")]
+ObserveOption = Annotated[str, typer.Option(help="How long the quiet hold is; 5m to 15m.")]
+VerifyOption = Annotated[str, typer.Option(help="How long the verification is.")]
+TakeOverOption = Annotated[bool, typer.Option("--take-over", help="Take the command from whoever has it.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+_STEPS = {
+    "characterise": "Relay and doublets about the holding flow; begins a session.",
+    "identify": "Gain, dead time and lag with their errors, and whether the data carry a proposal.",
+    "observe": "A quiet hold: laser noise and weather.",
+    "design": "Candidates side by side, and the proposed gains.",
+    "preview": "Present and proposed gains on the fitted twin, before anything is applied.",
+    "apply": "Set the proposed gains, on trial: without `verify` they go back by themselves.",
+    "verify": "Ten minutes of hold with the new gains, judged in stages: kept, or taken back (exit 3).",
+    "run": "All steps that are not done yet.",
+    "pump": "Map the pump (start, stall, gain, leak); later steps of the session use it.",
+    "outer": "Sag sensitivity, noise and drift of the figure; time constant of the outer loop.",
+    "rollback": "Back to the gains before those that were kept last.",
+}
+
+
+def _step(name: str) -> None:
+    """Make the command of a step: all take the same options."""
+
+    def command(
+        twin: TwinOption = False,
+        config: ConfigOption = None,
+        run: RunOption = None,
+        socket: SocketOption = None,
+        logs: LogsOption = Path("logs"),
+        session: SessionOption = None,
+        session_name: NameOption = "session",
+        author: AuthorOption = None,
+        reason: ReasonOption = "tuning session",
+        limit_um: LimitOption = 10.0,
+        observe: ObserveOption = "10m",
+        verify: VerifyOption = "10m",
+        take_over: TakeOverOption = False,
+        json: JsonOption = False,
+    ) -> int:
+        from membrane_ctrl.ctl import Where
+        from membrane_ctrl.port.unix import SOCKET_NAME
+        from membrane_ctrl.tune import command as tune
+
+        if socket is None and run is None:
+            socket = logs / SOCKET_NAME
+        options = tune.TuneOptions(
+            config=Config() if config is None else load(config, Config),
+            twin=twin,
+            where=Where(socket=socket, run=run),
+            logs=logs,
+            session=session,
+            name=session_name,
+            author=author or tune.author_name(),
+            reason=reason,
+            limit_um=limit_um,
+            observe_s=parse_duration_s(observe),
+            verify_s=parse_duration_s(verify),
+            take_over=take_over,
+            json=json,
+        )
+        return _run(name, options)
+
+    app.command(name=name, help=_STEPS[name])(command)
+
+
+def _run(name: str, options: TuneOptions) -> int:
+    from membrane_ctrl.tune import command as tune
+
+    whole = {"run": tune.run_session, "pump": tune.map_pump, "outer": tune.outer, "rollback": tune.rollback}
+    return whole[name](options) if name in whole else tune.one_step(name, options)
+
+
+for _name in _STEPS:
+    _step(_name)
+
+
+@app.command()
+def history(logs: LogsOption = Path("logs"), json: JsonOption = False) -> int:
+    """Which gains were kept, taken back or rolled back, when, by whom and why."""
+    import json as json_module
+
+    from tuning.journal import entries, history_table
+    from tuning.plain import plain
+
+    found = entries(logs)
+    print(json_module.dumps(plain(found)) if json else history_table(found))
+    return 0
+
+
+@app.command()
+def compare(
+    a: Annotated[Path, typer.Argument(metavar="A", help="Session folder.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Session folder.")],
+) -> int:
+    """Two sessions side by side: each one's gains on each one's plant and weather."""
+    from tuning.compare import compare as compared
+    from tuning.session_folder import open_session
+
+    print(compared(open_session(a), open_session(b)))
+    return 0

@@ -1,0 +1,98 @@
+"""A running hold for a session: commands through its control port, ticks, events and shapes from its rings."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import pickle
+import struct
+import time
+from pathlib import Path
+
+from membrane_ctrl import config_file
+from membrane_ctrl.commands import Command
+from membrane_ctrl.config import Config, LoopConfig
+from membrane_ctrl.errors import DeviceError, InputError
+from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.ipc.published import attach
+from membrane_ctrl.port.client import PortClient
+from membrane_ctrl.telemetry import FIELDS, TelemetryRow
+from tuning.hold_link import HoldError, News
+
+_NEWS_S = 0.2
+_SILENT_S = 5.0  # without a tick a run has ended, or is in worse trouble than a session can help with
+_ROW = struct.Struct(f"<{len(FIELDS)}d")
+
+
+class LiveHold:
+    """A `HoldLink` on a run of this machine.
+
+    Parameters
+    ----------
+    client : PortClient
+        Connected to it.
+    run_dir : Path
+        Its folder.
+    take_over : bool
+        Take the command from whoever has it, at the first command.
+
+    Raises
+    ------
+    InputError
+        If the folder is not that of the run the client talks to, or its rings are not there.
+    """
+
+    def __init__(self, client: PortClient, run_dir: Path, take_over: bool = False) -> None:
+        self._client, self._take_over = client, take_over
+        if client.greeting["run"] != run_dir.resolve().name:
+            raise InputError(f"{run_dir}: is not running; {client.greeting['run']} is")
+        loop = LoopConfig.model_validate(client.ask(do="status")["loop"])
+        config = config_file.load(run_dir / "config.toml", Config)
+        self.config = config.model_copy(update={"loop": loop})
+        self.name = run_dir.name
+        try:
+            self._readers = attach(run_dir)
+        except (OSError, ValueError) as error:
+            raise InputError(f"{run_dir}: its rings cannot be read ({error}); is it on this machine?") from None
+        self._heard_s = time.monotonic()
+
+    def ask(self, command: Command) -> None:
+        """Through the port; who asks is what the port makes of us."""
+        request: dict[str, object] = {"do": command.kind, "why": command.why, "take_over": self._take_over}
+        if math.isfinite(command.value):
+            request["value"] = command.value
+        if command.loop is not None:
+            request["loop"] = command.loop.model_dump(exclude={"setpoint_um"})
+        if command.experiment is not None:
+            request["experiment"] = command.experiment.model_dump()
+        try:
+            answer = self._client.ask(**request)
+        except DeviceError as error:
+            raise HoldError(str(error)) from None
+        self._take_over = False
+        if not answer.get("ok"):
+            raise HoldError(f"refused: {answer.get('refused')}")
+
+    def news(self) -> News:
+        """What has come in a fifth of a second."""
+        time.sleep(_NEWS_S)
+        rows = tuple(TelemetryRow(*_ROW.unpack(message)) for message in self._readers["telemetry"].drain())
+        events = tuple(json.loads(message) for message in self._readers["events"].drain())
+        shapes: tuple[ShapeEstimate, ...] = ()
+        if "shapes" in self._readers:
+            shapes = tuple(pickle.loads(message) for message in self._readers["shapes"].drain())
+        now_s = time.monotonic()
+        if rows:
+            self._heard_s = now_s
+        elif now_s - self._heard_s > _SILENT_S:
+            raise HoldError(f"no tick for {_SILENT_S:g} s: has the hold {self.name} ended?")
+        return News(rows, events, shapes)
+
+    def close(self) -> None:
+        """Give the command back and hang up; the hold goes on."""
+        with contextlib.suppress(DeviceError):  # the hold may have gone first
+            self._client.ask(do="release", why="tuning session over")
+        self._client.close()
+        for reader in self._readers.values():
+            reader.close()
