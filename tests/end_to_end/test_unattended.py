@@ -1,0 +1,52 @@
+"""A service as systemd starts it: told of every start, kept down by a latched fault, patient in standby."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+from membrane_ctrl.errors import Exit
+from membrane_ctrl.latched import NAME
+
+CONFIG = "[twin]\nport = 0\n[shape]\nenabled = false\n[states]\nlatch_twin_faults = true\n"
+
+
+def start(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    (folder / "lab.toml").write_text(CONFIG)
+    arguments = ("hold", "--twin", "--config", str(folder / "lab.toml"), "--logs", str(folder / "logs"))
+    return subprocess.run(
+        [sys.executable, "-m", "membrane_ctrl", *arguments, *options],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env={**os.environ, "NOTIFY_SOCKET": str(folder / "notify")},
+    )
+
+
+def test_standby_is_told_to_systemd_and_a_corrupt_latched_file_keeps_the_hold_down(tmp_path: Path) -> None:
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / NAME).write_text("{")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        refused = start(tmp_path)
+        assert refused.returncode == Exit.DEVICE_FAILED
+        (line,) = refused.stderr.strip().splitlines()
+        assert NAME in line
+        assert "--clear-faults" in line
+        waited = start(tmp_path, "--standby", "--duration", "2s")
+        assert waited.returncode == Exit.DONE, waited.stderr
+        first = systemd.recv(4096).decode().splitlines()
+        messages = [first]
+        while True:
+            try:
+                messages.append(systemd.recv(4096).decode().splitlines())
+            except BlockingIOError:
+                break
+    assert first == ["READY=1", "WATCHDOG=1", "STATUS=standby"]
+    assert messages[-1] == ["STOPPING=1"]
+    assert sum("WATCHDOG=1" in message for message in messages) >= 4
+    assert (tmp_path / "logs" / NAME).read_text() == "{"  # nobody has acknowledged it
