@@ -10,6 +10,7 @@ anew, since a late frame would be taken for the answer to the next trigger.
 from __future__ import annotations
 
 import ctypes
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -158,7 +159,7 @@ class AravisCamera:
         try:
             library.call("arv_camera_software_trigger", self._camera)
         except LinkError as error:
-            self._close(reachable=False)
+            self._abandon()
             raise self._told(error, "trigger") from None
         self._pending = time_s, out
         self._sleep(max(0.0, time_s + self.settings.exposure_ms / 1000.0 - self._now()))
@@ -216,13 +217,17 @@ class AravisCamera:
 
     def close(self) -> None:
         """Give the camera back. Never raises."""
-        self._close(reachable=True)
-
-    def _close(self, reachable: bool) -> None:
-        self._stop_stream(reachable)
+        self._stop_stream()
         if self._camera is not None:
             arv.aravis().call("g_object_unref", self._camera)
         self._camera = self._pending = None
+
+    def _abandon(self) -> None:
+        """Let go of a camera that does not answer: the library says goodbye to it for 10 s, so beside the cycle."""
+        left = [instance for instance in (self._stream, self._camera) if instance is not None]
+        self._stream = self._camera = self._pending = None
+        unref = arv.aravis().call
+        threading.Thread(target=lambda: [unref("g_object_unref", instance) for instance in left], daemon=True).start()
 
     def describe(self) -> dict[str, str]:
         """For people: where, settings, what was lost."""
@@ -314,14 +319,22 @@ class AravisCamera:
             library.call("arv_stream_push_buffer", self._stream, buffer)
         library.call("arv_camera_start_acquisition", camera)
         self._sleep(_STREAM_READY_S)
+        self._throw_one_away()
 
-    def _stop_stream(self, reachable: bool = True) -> None:
+    def _throw_one_away(self) -> None:
+        """The first frame after a start may be exposed up to 0.1 s after its trigger, with the next pattern lit."""
+        library = arv.aravis()
+        library.call("arv_camera_software_trigger", self._camera)
+        wait_us = round(1e6 * (self.settings.timeout_s + self.settings.exposure_ms / 1000.0))
+        if buffer := library.call("arv_stream_timeout_pop_buffer", self._stream, wait_us):
+            library.call("arv_stream_push_buffer", self._stream, buffer)
+
+    def _stop_stream(self) -> None:
         if self._stream is None:
             return
         library = arv.aravis()
-        if reachable:  # else each word to it takes 2.5 s
-            with suppress(LinkError):
-                library.call("arv_camera_stop_acquisition", self._camera)
+        with suppress(LinkError):
+            library.call("arv_camera_stop_acquisition", self._camera)
         library.call("g_object_unref", self._stream)
         self._stream = None
 
@@ -331,7 +344,7 @@ class AravisCamera:
         try:
             self._start_stream()
         except LinkError:
-            self.close()
+            self._abandon()
 
     def _pixels(self, buffer: int, out: Pixels | None) -> Pixels:
         """Copy a whole frame's pixels."""

@@ -204,7 +204,7 @@ class PygameScreen:
 
 
 def _pygame() -> Any:
-    """The library, without its greeting and without a GPU. Raises LinkError with the remedy when it is not installed."""
+    """The library, without its greeting and without a GPU. Raises LinkError with the remedy if not installed."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     # Straight into the display's memory: a detour over a software GPU takes 30 ms at 1920 x 1080, this 0.5
     os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
