@@ -7,7 +7,8 @@ Codes (state, shape state, fault, rung) are small integers; their names are in `
 from __future__ import annotations
 
 import struct
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
+from operator import attrgetter
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +53,10 @@ class TelemetryRow:
 
     def pack(self) -> bytes:
         """The row as doubles in field order."""
-        return _STRUCT.pack(*astuple(self))
+        return _STRUCT.pack(*_values(self))
 
 
 FIELDS: tuple[str, ...] = tuple(field.name for field in fields(TelemetryRow))
+_values = attrgetter(*FIELDS)  # astuple would copy deeply: 15 us a tick
 _STRUCT = struct.Struct(f"<{len(FIELDS)}d")
 ROW_BYTES = _STRUCT.size
