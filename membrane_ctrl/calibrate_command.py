@@ -177,12 +177,11 @@ def problem_of(bundle: Bundle, free: dict[str, float], laser_sigma_um: float) ->
 
 def _write(path: Path, solution: Solution, problem: Problem, bundle: Bundle, findings: Sequence[Finding]) -> str:
     """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
-    residual = np.concatenate([each.residual_mm for each in solution.equations], axis=1)
     slopes = [slope_residual(solution, phases, k) for k, phases in enumerate(problem.sets)]
     origin = Origin(
         date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         sets=tuple(phases.name for phases in problem.sets),
-        screen_residual_um=1e3 * float(np.sqrt(np.mean(residual**2))),
+        screen_residual_um=1e3 * float(np.median([each.residual_rms_mm for each in solution.equations])),
         slope_residual_urad=1e6 * float(np.median(slopes)),
         condition=condition_number(solution),
         notes=tuple(finding.says for finding in findings),

@@ -64,7 +64,7 @@ def _sets(solution: Solution) -> list[dict[str, Any]]:
             "displacement_um": phases.displacement_um if np.isfinite(phases.displacement_um) else None,
             "sag_mm": state.surface.sag_mm,
             "noise_ratio": float(np.sqrt(linear.variance)),
-            "screen_residual_um": 1e3 * float(np.sqrt(np.mean(linear.residual_mm**2))),
+            "screen_residual_um": 1e3 * linear.residual_rms_mm,
             "left_out_fall": out.fall,
             "left_out_freedom": out.freedom,
         }

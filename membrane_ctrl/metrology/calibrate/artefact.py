@@ -40,7 +40,7 @@ class Origin:
     sets : tuple of str
         Sets used.
     screen_residual_um : float
-        RMS of seen minus predicted screen points.
+        Median over the sets of the RMS of seen minus predicted screen points.
     slope_residual_urad : float
         Median over the sets of the RMS that `measure` states with this geometry: what a drift is seen against.
     condition : float

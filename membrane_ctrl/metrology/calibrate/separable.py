@@ -92,11 +92,14 @@ class Equations:
         Seen minus predicted screen points.
     trust : Trust
         The points' weights.
+    residual_rms_mm : float
+        RMS of one component, each point counting by its weight.
     """
 
     sums: FloatArray
     residual_mm: FloatArray
     trust: Trust
+    residual_rms_mm: float
 
     @property
     def variance(self) -> float:
@@ -136,7 +139,9 @@ def equations(
         flat = rows.reshape(-1, COLUMNS + 1)
         sums[np.ix_(keep, keep)] += flat.T @ flat
     rows = _witness_rows(phases, state, common, witness)
-    return Equations(sums + rows.T @ rows, residual, trust)
+    weights = trust.weights / phases.sigma_mm**2
+    rms = float(np.sqrt(np.mean(residual**2 @ weights) / np.sum(weights)))
+    return Equations(sums + rows.T @ rows, residual, trust, rms)
 
 
 def _witness_rows(phases: SetPhases, state: SetState, common: FloatArray, witness: Witness) -> FloatArray:

@@ -169,9 +169,9 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
         sums = np.sum([each.reduced() for each in linear], axis=0) + prior(problem.sigmas, common)
         moved = step(sums, problem.sigmas)
         sigmas = np.sqrt(np.diag(moved.covariance))
-        changes.append(float(np.max(np.abs(moved.delta[sigmas > 0]) / sigmas[sigmas > 0], initial=0.0)))
-        if not np.isfinite(changes[-1]):
+        if not (np.isfinite(moved.delta).all() and np.isfinite(sigmas).all()):
             raise ValueError("the sets lead the calibration astray: they do not show the stated bench")
+        changes.append(float(np.max(np.abs(moved.delta[sigmas > 0]) / sigmas[sigmas > 0], initial=0.0)))
         if progress is not None:
             progress(len(changes), changes[-1])
         settled = weighed and changes[-1] < _SETTLED

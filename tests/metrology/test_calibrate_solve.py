@@ -1,0 +1,144 @@
+"""Calibrations of benches whose truth is known: accuracy, covariance, bow; plain fit and no calibration beside."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from calibration_truth import Truth, calibrated_errors_um, make, stated_errors_um
+
+from membrane_ctrl.metrology.calibrate.determined import condition_number, weak_combinations
+from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, sigmas
+from membrane_ctrl.metrology.calibrate.propagate import propagate
+from membrane_ctrl.metrology.calibrate.solve import Solution, solve
+
+SIGMAS = sigmas()
+SEEDS = range(12)
+
+
+def drawn(seed: int) -> np.ndarray:
+    """Parameters off by what is known of them."""
+    return SIGMAS * np.random.default_rng(1000 + seed).normal(size=len(NAMES))
+
+
+@cache
+def solved(seed: int) -> tuple[Truth, Solution]:
+    truth = make(drawn(seed), seed, points=1500)
+    return truth, solve(truth.problem(SIGMAS))
+
+
+def rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def test_sag_and_figure_are_right_after_and_wrong_before() -> None:
+    after = [calibrated_errors_um(solution, truth) for truth, solution in map(solved, SEEDS)]
+    before = [stated_errors_um(solved(seed)[0]) for seed in SEEDS]
+    assert rms([sag for sag, _ in before]) > 20
+    assert rms([figure for _, figure in before]) > 20
+    assert rms([sag for sag, _ in after]) < 5
+    assert rms([figure for _, figure in after]) < 2
+
+
+def test_a_plain_fit_of_a_b_alpha_is_not_enough() -> None:
+    held = {p.name: 0.0 for p in ALL if p.name not in ("a_mm", "b_mm", "alpha_deg")}
+    plain = []
+    for seed in (0, 1, 2):
+        truth = solved(seed)[0]
+        plain.append(calibrated_errors_um(solve(truth.problem(sigmas(held))), truth))
+    assert rms([figure for _, figure in plain]) > 20
+
+
+def test_the_covariance_is_true() -> None:
+    free = SIGMAS > 0
+    errors = np.array([(s.values - t.values)[free] / s.sigmas[free] for t, s in map(solved, SEEDS)])
+    # 12 seeds: the RMS of one parameter scatters by a fifth, that of all by less; `benchmarks` has a hundred
+    assert 0.85 < np.sqrt(np.mean(errors**2)) < 1.2
+    assert np.all(np.sqrt(np.mean(errors**2, axis=0)) < 1.7)
+    assert np.all(np.sqrt(np.mean(errors**2, axis=0)) > 0.45)
+
+
+def test_the_claim_for_a_figure_is_true() -> None:
+    ratios = []
+    for truth, solution in map(solved, SEEDS):
+        claim = propagate(solution, 2, 475.0)
+        sag, figure = calibrated_errors_um(solution, truth)
+        ratios.append((sag / claim.sag_um, figure / claim.figure_rms_um))
+        assert claim.height_rms_um > claim.figure_rms_um
+        # the tilt is what is not known: it stands in the second and third term
+        assert np.argmax(claim.zernike_um[1:]) < 2
+    for column in np.array(ratios).T:
+        assert 0.5 < rms(list(column)) < 1.6
+
+
+def test_a_bow_is_solved_when_it_is_free() -> None:
+    free = sigmas({"bow_mm": 1.5})
+    errors = []
+    for seed in (1, 2, 3):
+        truth = make(drawn(seed), seed, points=1500, bow_mm=1.0)
+        solution = solve(truth.problem(free))
+        k = NAMES.index("bow_mm")
+        assert abs(solution.values[k] - 1.0) < 4 * solution.sigmas[k] < 0.2
+        surface = solution.states[2].surface
+        from calibration_truth import errors_um
+
+        errors.append(errors_um(surface, truth, 2))
+    assert rms([figure for _, figure in errors]) < 4
+    assert rms([sag for sag, _ in errors]) < 6
+
+
+def test_many_bins_are_averaged_and_nothing_is_lost() -> None:
+    values = drawn(5)
+    many = make(values, 5, points=40_000)
+    few = solve(many.problem(SIGMAS))
+    assert max(phases.sigma_mm.size for phases in few.problem.sets) < 10_000
+    claimed = solved(5)[1].sigmas
+    assert np.allclose(few.sigmas[SIGMAS > 0], claimed[SIGMAS > 0], rtol=0.15)
+    assert np.all(np.abs(few.values - values)[SIGMAS > 0] < 4 * few.sigmas[SIGMAS > 0])
+
+
+def test_outliers_do_not_move_the_solution() -> None:
+    truth, clean = solved(1)
+    from dataclasses import replace
+
+    screen_mm = truth.sets[1].screen_mm.copy()
+    screen_mm[:, ::50] += 0.5
+    sets = (truth.sets[0], replace(truth.sets[1], screen_mm=screen_mm), *truth.sets[2:])
+    solution = solve(truth.problem(SIGMAS, sets))
+    moved = np.abs(solution.values - clean.values)[SIGMAS > 0] / clean.sigmas[SIGMAS > 0]
+    assert solution.converged
+    assert moved.max() < 1.0
+
+
+def test_what_is_not_determined_is_named() -> None:
+    solution = solved(0)[1]
+    assert condition_number(solution) > 1e6
+    vague = sigmas({"screen_x_mm": 20.0, "screen_y_mm": 20.0, "camera_roll_deg": 2.0})
+    truth = solved(0)[0]
+    weak = weak_combinations(solve(truth.problem(vague)), 2, 475.0)
+    assert weak
+    assert all(0.5 < each.left <= 1.01 for each in weak)
+    assert "tilt of the surface" in weak[0].words
+    assert any(name.startswith("screen_") for name, _ in weak[0].parts)
+    # the figure hardly sees it
+    assert weak[0].figure_um < 0.1 * weak[0].height_um
+
+
+def test_one_step_settles_from_the_solution() -> None:
+    truth, solution = solved(2)
+    again = solve(truth.problem(SIGMAS), start=solution)
+    assert len(again.changes) <= 4
+    assert np.all(np.abs(again.values - solution.values)[SIGMAS > 0] < 0.05 * solution.sigmas[SIGMAS > 0])
+
+
+def test_progress_is_told() -> None:
+    truth, _ = solved(3)
+    told: list[tuple[int, float]] = []
+    solution = solve(truth.problem(SIGMAS), lambda count, change: told.append((count, change)))
+    assert [count for count, _ in told] == list(range(1, len(solution.changes) + 1))
+
+
+def test_no_sets_is_an_error() -> None:
+    with pytest.raises(ValueError, match="no capture set"):
+        solve(solved(0)[0].problem(SIGMAS, ()))

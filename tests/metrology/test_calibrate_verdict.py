@@ -1,0 +1,146 @@
+"""Bad input of a calibration: each fault is named, and alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from calibration_truth import SAGS_MM, Truth, make
+
+from membrane_ctrl.metrology.calibrate.diagnose import bumps, left_out, suspects
+from membrane_ctrl.metrology.calibrate.drift import CYCLES, DriftMonitor
+from membrane_ctrl.metrology.calibrate.parameters import NAMES, sigmas
+from membrane_ctrl.metrology.calibrate.residuals import SetPhases
+from membrane_ctrl.metrology.calibrate.solve import solve
+from membrane_ctrl.metrology.calibrate.verdict import Finding, after, before
+
+SIGMAS = sigmas()
+VALUES = SIGMAS * np.random.default_rng(3).normal(size=len(NAMES))
+Edit = Callable[[SetPhases], SetPhases]
+
+
+@cache
+def good() -> Truth:
+    return make(VALUES, 3, points=1500)
+
+
+def yawed(degrees: float, *which: int) -> Truth:
+    other = VALUES.copy()
+    other[NAMES.index("camera_yaw_deg")] += degrees
+    return make(VALUES, 3, points=1500, bumped=dict.fromkeys(which, other))
+
+
+def judged(truth: Truth, sets: tuple[SetPhases, ...] | None = None) -> tuple[Finding, ...]:
+    problem = truth.problem(SIGMAS, sets)
+    return before(problem) or after(solve(problem))
+
+
+def edited(edit: Edit, *which: int) -> tuple[SetPhases, ...]:
+    return tuple(edit(phases) if k in which else phases for k, phases in enumerate(good().sets))
+
+
+def reading(change: Callable[[float], float]) -> Edit:
+    return lambda phases: replace(phases, displacement_um=change(phases.displacement_um))
+
+
+ALL_SETS = tuple(range(len(SAGS_MM)))
+
+
+def test_good_sets_have_nothing_against_them() -> None:
+    assert judged(good()) == ()
+    solution = solve(good().problem(SIGMAS))
+    assert suspects(solution) == ()
+    assert bumps(solution) == ()
+    assert all(each.fall < 3 * each.freedom for each in left_out(solution))
+
+
+@pytest.mark.parametrize(
+    ("edit", "which", "says"),
+    [
+        (reading(lambda d: -d), ALL_SETS, "the laser counts the wrong way"),
+        (reading(lambda d: 10 * d), ALL_SETS, "the laser's unit or scale is wrong"),
+        (reading(lambda d: 1.02 * d), ALL_SETS, "the laser's scale is wrong: the optics see 0.98"),
+        (reading(lambda d: d / 20), ALL_SETS, "the sets are only 400 um apart"),
+        (reading(lambda d: d + 50), (1,), "set1 disagrees with all the others: its laser reads +"),
+        (reading(lambda d: float("nan")), (0, 1, 2, 3), "fewer than two sets carry a laser reading"),
+    ],
+)
+def test_laser_faults_are_named(edit: Edit, which: tuple[int, ...], says: str) -> None:
+    (finding,) = judged(good(), edited(edit, *which))
+    assert finding.fatal
+    assert finding.says.startswith(says)
+
+
+def test_a_bumped_camera_is_named_with_its_turn() -> None:
+    (finding,) = judged(yawed(0.02, 3, 4))
+    assert finding.fatal
+    assert finding.sets == (3, 4)
+    assert finding.says.startswith("the camera stood otherwise from set3 on: yaw +0.0")
+
+
+def test_a_camera_bumped_and_put_back_is_named() -> None:
+    (finding,) = judged(yawed(0.02, 2))
+    assert finding.fatal
+    assert finding.says.startswith("the camera stood otherwise in set2")
+
+
+def test_a_camera_that_was_moved_far_is_told_by_the_halves() -> None:
+    (finding,) = judged(yawed(1.0, 3, 4))
+    assert finding.fatal
+    assert "between set2 and set3" in finding.says
+
+
+def test_one_set_of_another_rig_is_named() -> None:
+    other = VALUES + SIGMAS * np.random.default_rng(9).normal(size=len(NAMES))
+    (finding,) = judged(make(VALUES, 3, points=1500, bumped={1: other}))
+    assert finding.fatal
+    assert finding.sets == (1,)
+
+
+def test_sets_of_many_rigs_are_refused() -> None:
+    rng = np.random.default_rng(9)
+    others = {k: VALUES + 2 * SIGMAS * rng.normal(size=len(NAMES)) for k in (1, 2, 4)}
+    (finding,) = judged(make(VALUES, 3, points=1500, bumped=others))
+    assert finding.fatal
+    assert "bench" in finding.says or "one bench" in finding.says
+
+
+def test_a_bow_is_told_by_its_pattern() -> None:
+    bent = make(VALUES, 3, points=1500, bow_mm=1.0)
+    (finding,) = judged(bent)
+    assert finding.fatal
+    assert "the pattern of bow_mm = " in finding.says
+    assert "--free bow_mm" in finding.says
+    solution = solve(bent.problem(SIGMAS))
+    assert suspects(solution)[0].value == pytest.approx(1.0, abs=0.15)
+    # a tenth of a hundredth is seen by nobody
+    assert judged(make(VALUES, 3, points=1500, bow_mm=0.001)) == ()
+
+
+def test_a_set_with_bad_fringes_hardly_counts_and_is_named() -> None:
+    rng = np.random.default_rng(1)
+    noisy = edited(lambda p: replace(p, screen_mm=p.screen_mm + rng.normal(size=p.screen_mm.shape) * 0.2), 3)
+    (finding,) = judged(good(), noisy)
+    assert not finding.fatal
+    assert finding.sets == (3,)
+    assert "scatters" in finding.says
+
+
+def test_sets_that_are_close_are_used_with_a_word() -> None:
+    near = make(VALUES, 3, points=1500, sags_mm=(36.0, 36.5, 37.0, 37.5, 38.0))
+    (finding,) = judged(near)
+    assert not finding.fatal
+    assert "8 mm would know the sag better" in finding.says
+
+
+def test_the_monitor_waits_for_many_cycles_and_forgives_one() -> None:
+    monitor = DriftMonitor(1.0)
+    assert not any(monitor.add(1.05) for _ in range(CYCLES))
+    assert monitor.add(40.0) == ""
+    assert monitor.add(float("nan")) == ""
+    said = [monitor.add(1.4) for _ in range(CYCLES)]
+    assert said[0] == ""
+    assert said[-1].startswith("calibrate again: the fit leaves 1.40 urad")
