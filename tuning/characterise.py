@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from membrane_ctrl.control.experiments.machine import Around, Finished
+from membrane_ctrl.control.experiments.patterns import room
 from membrane_ctrl.control.experiments.spec import ExperimentKind, ExperimentSpec
 from tuning.identify import Identified, identify
 from tuning.quality import Quality, judge, validate
@@ -132,6 +133,7 @@ def experiment(rig: ExperimentRig, limit_um: float = 10.0) -> Experiments:
     """
     rig.hold(_SETTLE_S)
     around = rig.around(rig.hold(_QUIET_S), limit_um)
+    room(around)  # a relay without it would only say that it was stopped
     relays, finished = _relays(rig, around)
     gain = identify(relays).model.gain
     whole = relays

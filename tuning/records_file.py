@@ -28,7 +28,7 @@ def save_record(path: Path, record: Record) -> None:
 def load_record(path: Path) -> Record:
     """Read a record. Raises InputError if it is not there, damaged, or not what was written."""
     try:
-        with np.load(path, allow_pickle=False) as found:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
             record = Record(float(found["dt_s"]), *(found[name] for name in _COLUMNS))
             hashed = str(found["sha256"])
     except FileNotFoundError:

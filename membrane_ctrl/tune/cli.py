@@ -42,6 +42,7 @@ _STEPS = {
     "run": "All steps that are not done yet.",
     "pump": "Map the pump (start, stall, gain, leak); later steps of the session use it.",
     "outer": "Sag sensitivity, noise and drift of the figure; time constant of the outer loop.",
+    "watch": "Look at a hold without touching it, and say whether a session is due (exit 3).",
     "rollback": "Back to the gains before those that were kept last.",
 }
 
@@ -94,7 +95,13 @@ def _step(name: str) -> None:
 def _run(name: str, options: TuneOptions) -> int:
     from membrane_ctrl.tune import command as tune
 
-    whole = {"run": tune.run_session, "pump": tune.map_pump, "outer": tune.outer, "rollback": tune.rollback}
+    whole = {
+        "run": tune.run_session,
+        "pump": tune.map_pump,
+        "outer": tune.outer,
+        "watch": tune.watch,
+        "rollback": tune.rollback,
+    }
     return whole[name](options) if name in whole else tune.one_step(name, options)
 
 

@@ -123,6 +123,34 @@ def outer(options: TuneOptions) -> int:
     return _concluded(folder, options)
 
 
+def watch(options: TuneOptions) -> int:
+    """Look at a hold for the observation time and say whether a session is due (exit 3)."""
+    from tuning.watch import health
+
+    folder = _folder(options, None)
+    folder.require("design")
+    made = load_gains(folder.file("gains.toml"))
+    with _link(options) as link:
+        progress = Progress()
+        rig = HoldRig(link, options.author, progress)
+        progress.begin("watch", options.observe_s, 0.0)
+        try:
+            found = health(*rig.hold_about(options.observe_s), rig.loop, made)
+        except HoldError as error:
+            raise DeviceError(str(error)) from None
+        except ValueError as error:
+            raise InputError(f"watch: {error}") from None
+    if options.json:
+        print(json.dumps(plain.plain(found)))
+    progress.say(
+        f"std {found.std_um:.3f} um, {found.ratio:.2f} of the least possible ({found.ratio_designed:.2f} expected); "
+        f"k {found.gain:.2f} +- {found.gain_sigma:.2f}; leak {found.leak_um_per_s:.2f} um/s"
+    )
+    for suggestion in found.suggestions:
+        progress.say(f"a tuning session is due: {suggestion}")
+    return Exit.REJECTED if found.suggestions else Exit.DONE
+
+
 def rollback(options: TuneOptions) -> int:
     """Back to the gains before those that were kept last."""
     kept = journal.to_roll_back(options.logs)

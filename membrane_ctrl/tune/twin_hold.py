@@ -87,13 +87,15 @@ class TwinHold:
         rows: list[TelemetryRow] = []
         events: list[Event] = []
         for _ in range(ticks):
-            commands, self._pending = self._pending, ()
             if self._run.finished is not None:
-                raise HoldError(f"the run has ended ({self._run.finished.name.lower()})")
+                break
+            commands, self._pending = self._pending, ()
             tick = self._run.tick(commands)
             if tick is not None:
                 rows.append(tick.row)
                 events += tick.events
+        if not rows and self._run.finished is not None:
+            raise HoldError(f"the run has ended ({self._run.finished.name.lower()})")
         self.rows += rows
         shapes, self._shapes = tuple(self._shapes), []
         return News(tuple(rows), tuple(events), shapes)

@@ -19,7 +19,7 @@ _SHARE = 0.25  # of the excursion limit: the weather, the pull and the laser's n
 
 def steps(around: Around, gain: float, hold_s: float = 2.0) -> Pattern:
     """Up, back, down, back, each for `hold_s`: what the eye wants to see."""
-    up, down = _room(around)
+    up, down = room(around)
     size = min(up, down, _SHARE * around.limit_um / (gain * hold_s))
     levels = (size, 0.0, -size, 0.0)
     return lambda time_s: levels[int(time_s / hold_s) % 4]
@@ -30,7 +30,7 @@ def doublets(around: Around, gain: float, pulse_s: float = 0.3) -> Pattern:
 
     The way down is as small as the leak, so it takes longer; the mean flow is the holding flow.
     """
-    up, down = _room(around)
+    up, down = room(around)
     size = min(up, _SHARE * around.limit_um / (gain * pulse_s))
     down = min(down, size)
     period_s = pulse_s * (1 + size / down)
@@ -50,11 +50,11 @@ def multisine(
     time_s = np.arange(0.0, 4 * math.pi / slowest_rad_per_s, 0.05)[:, None]
     flow = (amplitudes * np.sin(w * time_s + phases)).sum(axis=1)
     way = (amplitudes / w * np.cos(w * time_s + phases)).sum(axis=1)
-    scale = min(min(_room(around)) / np.abs(flow).max(), _SHARE * around.limit_um / (gain * np.abs(way).max()))
+    scale = min(min(room(around)) / np.abs(flow).max(), _SHARE * around.limit_um / (gain * np.abs(way).max()))
     return lambda now_s: float(scale * (amplitudes * np.sin(w * now_s + phases)).sum())
 
 
-def _room(around: Around) -> tuple[float, float]:
+def room(around: Around) -> tuple[float, float]:
     """Flow above and below the holding flow. Raises ValueError without any: the mirror is too tight or too leaky."""
     up = around.full_flow_um_per_s - around.holding_flow_um_per_s
     down = around.holding_flow_um_per_s - around.least_flow_um_per_s

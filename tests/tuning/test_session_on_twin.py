@@ -1,0 +1,240 @@
+"""A whole session on the twin, as the command runs it: what it leaves, and how each step goes wrong."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.cli import run as command_line
+from membrane_ctrl.config import Config, ShapeConfig, TwinConfig
+from membrane_ctrl.errors import Exit, InputError
+from membrane_ctrl.names import State
+from membrane_ctrl.tune import command as tune
+from membrane_ctrl.tune.twin_hold import TwinHold
+from tuning import journal, session
+from tuning.compare import compare
+from tuning.gains_file import load_gains
+from tuning.hold_rig import HoldRig
+from tuning.loop_model import Gains
+from tuning.margins import margins
+from tuning.session_folder import STEPS, SessionFolder, open_session
+
+CONFIG = """
+[twin]
+scenario = "typical"
+start_error_um = -5.0
+[shape]
+enabled = false
+[loop]
+feedforward_barometer = false
+feedforward_temperature = false
+"""
+TIMES = ("--observe", "5m", "--verify", "5m")
+
+
+def tune_twin(logs: Path, *words: str, config: str = CONFIG) -> int:
+    logs.mkdir(exist_ok=True)
+    path = logs / "twin.toml"
+    path.write_text(config)
+    return command_line(["tune", *words, "--twin", "--config", str(path), "--logs", str(logs)])
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Logs with one complete session in them."""
+    folder = tmp_path_factory.mktemp("logs")
+    assert tune_twin(folder, "run", "--name", "first", "--author", "eve", "--reason", "new film", *TIMES) == Exit.DONE
+    return folder
+
+
+@pytest.fixture
+def done(logs: Path, tmp_path: Path) -> SessionFolder:
+    """A copy of the complete session, to be spoilt."""
+    (source,) = (logs / "tuning").glob("*-first")
+    return open_session(Path(shutil.copytree(source, tmp_path / "tuning" / source.name)))
+
+
+def test_it_leaves_gains_that_are_kept_and_justified(done: SessionFolder) -> None:
+    assert all(done.done(step) for step in STEPS)
+    verified = session.verified_of(done)
+    assert verified.kept, verified.reason
+    assert all(stage.growth < stage.growth_max for stage in verified.stages)
+    gains = load_gains(done.file("gains.toml"))
+    assert (gains.author, gains.reason) == ("eve", "new film")
+    assert gains.data_sha256 == session.experiments_of(done).record.sha256()
+    assert gains.plant.gain == pytest.approx(1.0, abs=0.06)
+    assert gains.plant.model.delay_s == pytest.approx(0.225, abs=0.05)
+    assert gains.predicted_std_um < 1.2 * gains.least_std_um
+    assert gains.predicted_std_um < 0.98 * next(
+        row.predicted.std_um for row in session.design_of(done).candidates if row.name == "present" and row.predicted
+    )
+    assert verified.stages[-1].std_um == pytest.approx(gains.predicted_std_um, rel=0.3)
+
+
+def test_the_report_stands_alone_and_the_recording_is_there(done: SessionFolder) -> None:
+    text = done.file("report.html").read_text(encoding="utf-8")
+    assert text.count("data:image/png;base64,") == 4
+    assert "http" not in text
+    for word in ("Ziegler-Nichols", "eve", "Verification", "kept"):
+        assert word in text
+    assert done.file("session.rrd").stat().st_size > 100_000
+
+
+def test_calculating_steps_can_be_repeated_without_a_hold(done: SessionFolder) -> None:
+    before = load_gains(done.file("gains.toml"))
+    found = session.identify_step(done)
+    assert not done.done("observe")  # what stood on the old fit is gone
+    assert found.identified.model.gain == pytest.approx(before.plant.gain, rel=1e-6)
+
+
+def test_a_step_whose_data_are_missing_names_the_step_to_run(done: SessionFolder) -> None:
+    done.begin("observe")
+    with pytest.raises(InputError, match="observe is missing; run `membrane-ctrl tune observe` first"):
+        session.design_step(done)
+
+
+@pytest.mark.parametrize("name", ["experiments.npz", "experiments.json", "identified.json"])
+def test_damaged_files_are_named(done: SessionFolder, name: str) -> None:
+    path = done.file(name)
+    path.write_bytes(path.read_bytes()[:-200])
+    step = session.found_of if name == "identified.json" else session.identify_step
+    with pytest.raises(InputError, match=f"{name}: damaged"):
+        step(done)
+
+
+def edited(done: SessionFolder, **changed: float) -> None:
+    """Edit the gains file by hand."""
+    path = done.file("gains.toml")
+    lines = path.read_text().splitlines()
+    path.write_text(
+        "\n".join(f"{k} = {changed[k]}" if (k := line.split(" ")[0]) in changed else line for line in lines)
+    )
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"kp_per_s": 9.0, "ti_s": 0.5}, "unstable on the plant of this very file"),
+        ({"kp_per_s": 3.0, "ti_s": 3.0}, "sensitivity"),
+        ({"kp_per_s": 99.0}, "kp_per_s"),
+        ({"rate_hz": 100.0}, "rate_hz"),
+    ],
+)
+def test_a_gains_file_edited_to_something_bad_is_not_applied(
+    done: SessionFolder, changed: dict[str, float], words: str
+) -> None:
+    edited(done, **changed)
+    with pytest.raises(InputError, match=words) as told:
+        session.checked_gains(done)
+    assert "gains.toml" in str(told.value)
+
+
+def test_gains_that_are_worse_are_taken_back_by_themselves(done: SessionFolder, tmp_path: Path) -> None:
+    """Sluggish gains, with margins that nothing can be said against."""
+    edited(done, kp_per_s=0.1, ti_s=60.0)
+    words = ("apply", "verify")
+    codes = [tune_twin(tmp_path, word, "--session", str(done.path), *TIMES) for word in words]
+    assert codes == [Exit.DONE, Exit.REJECTED]
+    verified = session.verified_of(done)
+    assert not verified.kept
+    assert "times that of the gains before" in verified.reason
+    (noted,) = journal.entries(tmp_path)
+    assert noted.what == "taken_back"
+
+
+def kp_of(link: TwinHold) -> float:
+    rows = [row for row in link.rows[-200:] if abs(row.error_um) > 0.02]
+    return float(np.median([row.p_um_per_s / row.error_um for row in rows]))
+
+
+class Kept(TwinHold):
+    """Remembers the twin of the command that is tested."""
+
+    last: TwinHold
+
+    def __init__(self, *given: object) -> None:
+        super().__init__(*given)  # type: ignore[arg-type]
+        Kept.last = self
+
+    def close(self) -> None:
+        """Leaves the twin as it was left."""
+
+
+@pytest.mark.parametrize(("step", "after_s"), [("characterise", 75.0), ("characterise", 10.0), ("verify", 30.0)])
+def test_an_interrupt_gives_the_mirror_back_with_the_last_good_gains(
+    done: SessionFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, after_s: float
+) -> None:
+    class Interrupted(tune.Progress):
+        heard_s = 0.0
+
+        def __call__(self, seconds: float) -> None:
+            self.heard_s += seconds
+            self.interrupted = self.interrupted or after_s < self.heard_s < after_s + 0.03
+            super().__call__(seconds)
+
+    monkeypatch.setattr(tune, "TwinHold", Kept)
+    monkeypatch.setattr(tune, "Progress", Interrupted)
+    code = tune_twin(tmp_path, step, "--session", str(done.path), *TIMES)
+    assert code == Exit.INTERRUPTED
+    for _ in range(20):
+        Kept.last.news()
+    assert Kept.last.rows[-1].state == State.HOLD
+    assert kp_of(Kept.last) == pytest.approx(done.head.before.kp_per_s, rel=0.02)
+
+
+def test_history_rollback_and_comparison(
+    logs: Path,
+    done: SessionFolder,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    copied = tmp_path / "logs"
+    shutil.copytree(logs, copied)
+    monkeypatch.setattr(tune, "TwinHold", Kept)
+    assert tune_twin(copied, "rollback", "--reason", "did not like it") == Exit.DONE
+    assert [line.what for line in journal.entries(copied)] == ["kept", "rolled_back"]
+    assert tune_twin(copied, "rollback") == Exit.BAD_INPUT
+    capsys.readouterr()
+    assert command_line(["tune", "history", "--logs", str(copied), "--json"]) == Exit.DONE
+    assert json.loads(capsys.readouterr().out)[1]["reason"] == "did not like it"
+
+
+def test_a_comparison_crosses_gains_and_benches(done: SessionFolder, tmp_path: Path) -> None:
+    other = open_session(Path(shutil.copytree(done.path, tmp_path / "other")))
+    edited(other, kp_per_s=0.2)
+    text = compare(done, other)
+    assert "| kp_per_s |" in text
+    assert len([line for line in text.splitlines() if line.startswith(("| A | ", "| B | "))]) == 4
+
+
+def test_rolling_back_sets_the_gains_of_before(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copied = tmp_path / "logs"
+    shutil.copytree(logs, copied)
+    monkeypatch.setattr(tune, "TwinHold", Kept)
+    config = CONFIG + "kp_per_s = 0.3\n"
+    assert tune_twin(copied, "rollback", config=config) == Exit.DONE
+    for _ in range(12):
+        Kept.last.news()
+    assert kp_of(Kept.last) == pytest.approx(0.61, rel=0.02)
+
+
+def test_margins_of_what_is_kept(done: SessionFolder) -> None:
+    gains = load_gains(done.file("gains.toml"))
+    found = margins(Gains.of(gains.loop), gains.plant.model, 0.02)
+    assert found.stable
+    assert found.ms < 1.45
+
+
+def test_a_rig_on_a_hold_records_without_a_gap() -> None:
+    link = TwinHold(Config(twin=TwinConfig(start_error_um=-3.0), shape=ShapeConfig(enabled=False)))
+    rig = HoldRig(link, "tester")
+    first = len(link.rows)
+    parts = [rig.hold(1.3), rig.hold(0.7)]
+    together = parts[0].followed_by(parts[1])
+    read = [row.displacement_um for row in link.rows[first : first + len(together)]]
+    np.testing.assert_array_equal(together.displacement_um, read)
