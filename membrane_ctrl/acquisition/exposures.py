@@ -112,6 +112,13 @@ class Exposures:
         StageError
             "screen" or "camera", and what went wrong there.
         """
+        try:
+            return self._take(patterns, cycle, stopping)
+        finally:
+            if isinstance(self._camera, _Grabbing):  # what a cycle that ended early did not fetch
+                self._camera.forget()
+
+    def _take(self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]) -> list[Frame] | None:
         taken: list[Frame] = []
         pending: tuple[Pattern, FrameSlot] | None = None
         exposed_s = -self._interval_s
@@ -184,6 +191,9 @@ class _Grabbing:
         assert self._frame is not None  # after an exposure
         frame, self._frame = self._frame, None
         return frame
+
+    def forget(self) -> None:
+        self._frame = None
 
 
 class _Showing:

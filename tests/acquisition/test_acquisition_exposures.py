@@ -148,3 +148,18 @@ def test_plain_roles_are_used_step_by_step(frames: tuple[FrameWriter, FrameReade
     assert taken is not None
     assert screen.shown == [pattern.name for pattern in FRINGES]
     assert [int(frame.pixels[0, 0]) for frame in taken] == list(range(8))
+
+
+@pytest.mark.parametrize("plain", [True, False])
+def test_a_stopped_cycle_holds_no_pixels(plain: bool) -> None:
+    ring = FrameRing(19, HEIGHT_PX, WIDTH_PX)
+    clock = VirtualClock()
+    with closing(ring), closing(FrameWriter(ring.address)) as writer:  # which raises while someone holds pixels
+        if plain:
+            camera = FakeCamera(clock)
+            exposures = Exposures(camera, FakeScreen(), writer, clock, FakeLaser(), 0.0)
+            assert exposures.take(FRINGES, 1, lambda: camera.frames == 3) is None
+        else:
+            exposures, split_camera = split(writer, clock)
+            assert exposures.take(FRINGES, 1, lambda: split_camera.exposures == 3) is None
+            split_camera._out = None  # as a camera that is closed
