@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import time
@@ -55,7 +56,8 @@ def alarms_main(spec: AlarmsSpec, status: Any) -> None:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
-    parent_pid = os.getppid()
+    parent = multiprocessing.parent_process()  # who started it, even if that is gone by now
+    parent_pid = os.getppid() if parent is None else parent.pid
     watch(spec, apprise_sender(spec.config, spec.run), status.send, lambda: os.getppid() == parent_pid)
 
 

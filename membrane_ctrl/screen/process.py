@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import pickle
 import signal
@@ -63,7 +64,8 @@ def screen_main(spec: ScreenSpec) -> None:
 
     Target of a `spawn`ed process. SIGINT is left to the control process; the terminal is given back in any case.
     """
-    parent_pid = os.getppid()
+    parent = multiprocessing.parent_process()  # who started it, even if that is gone by now
+    parent_pid = os.getppid() if parent is None or parent.pid is None else parent.pid
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
     console = Console(stderr=True)
