@@ -18,9 +18,9 @@ import numpy as np
 
 from membrane_ctrl.control.sag_change import sag_change
 from membrane_ctrl.estimate import ShapeEstimate
-from tuning.disturbance import fit_noise
 from tuning.hold_link import HoldError
 from tuning.hold_rig import HoldRig
+from tuning.local_level import fit_local_level
 from tuning.records import Series
 
 STEP_UM = 5.0
@@ -49,8 +49,8 @@ class OuterLoop:
         From result to result.
     drift_um_per_sqrt_h : float
         Between laser and deflectometry.
-    drift_sigma : float
-        Relative standard error of its square; above 1 only a bound is known, and used.
+    drift_seen : bool
+        Otherwise no drift was seen, and the figure is the most that there may be.
     time_constant_s : float
         Proposed for `shape.time_constant_s`.
     """
@@ -62,7 +62,7 @@ class OuterLoop:
     sigma_um: float
     cycle_s: float
     drift_um_per_sqrt_h: float
-    drift_sigma: float
+    drift_seen: bool
     time_constant_s: float
 
 
@@ -114,7 +114,7 @@ def evaluate(
     Raises
     ------
     ValueError
-        If the shapes span less than fitting the noise takes.
+        If there are too few shapes to tell noise from drift.
     """
     means = [np.mean([shape.coeffs_um for shape in level], axis=0) for level in levels]
     laser_um = [float(np.mean([shape.displacement_um for shape in level])) for level in levels]
@@ -125,10 +125,8 @@ def evaluate(
     reference = shapes[0]
     gaps_um = np.array([_sag_um(shape, reference, assumed) - shape.displacement_um for shape in shapes])
     cycle_s = float(np.median(np.diff([shape.time_s for shape in shapes])))
-    noise = fit_noise(gaps_um, cycle_s, 0.0)
-    known = noise.fast_sigma < 1
-    walk = noise.fast * (1.0 if known else 1 + 2 * min(noise.fast_sigma, 10.0))
-    best_s = noise.white * math.sqrt(cycle_s / walk) if walk > 0 else math.inf
+    noise = fit_local_level(gaps_um, np.array([shape.time_s for shape in shapes]))
+    best_s = noise.white * math.sqrt(cycle_s / noise.walk)
     kept, wanted = sensitivity[1:], assumed[1:]
     return OuterLoop(
         sensitivity=sensitivity,
@@ -137,8 +135,8 @@ def evaluate(
         scale=float(kept @ wanted / (wanted @ wanted)),
         sigma_um=noise.white,
         cycle_s=cycle_s,
-        drift_um_per_sqrt_h=math.sqrt(3600 * walk),
-        drift_sigma=noise.fast_sigma,
+        drift_um_per_sqrt_h=math.sqrt(3600 * noise.walk),
+        drift_seen=noise.seen,
         time_constant_s=min(max(best_s, _CYCLES_MIN * cycle_s), _TAU_MAX_S),
     )
 

@@ -93,7 +93,7 @@ def one_step(step: str, options: TuneOptions) -> int:
 def map_pump(options: TuneOptions) -> int:
     """Measure the pump; the later steps of the session use it."""
     with _session(options) as (folder, rig, progress):
-        progress.begin("pump map", 400.0, 0.0)
+        progress.begin("pump map", 700.0, 0.0)
         mapped = session.map_pump(folder, rig)
         progress.say(f"[pump] of this bench: {mapped}")
     return _concluded(folder, options)
@@ -117,7 +117,7 @@ def outer(options: TuneOptions) -> int:
         plain.write(folder.file("outer.json"), found)
         progress.say(
             f"sag seen per um of the laser's {found.scale:.3f}, noise {found.sigma_um:.2f} um a cycle of "
-            f"{found.cycle_s:.1f} s, drift {'' if found.drift_sigma < 1 else 'below '}"
+            f"{found.cycle_s:.1f} s, drift {'' if found.drift_seen else 'below '}"
             f"{found.drift_um_per_sqrt_h:.2f} um/sqrt(h): shape.time_constant_s = {found.time_constant_s:.0f}"
         )
     return _concluded(folder, options)
@@ -307,7 +307,7 @@ def _folder(options: TuneOptions, link: HoldLink | None, fresh: bool = False) ->
     if not fresh:
         with contextlib.suppress(InputError):
             newest = newest_session(options.logs)
-            if newest.head.source == link.name and not newest.done("verify"):
+            if (newest.head.source, newest.head.name) == (link.name, options.name) and not newest.done("verify"):
                 return newest
     return create_session(options.logs, options.name, options.author, link.name, link.config, link.config.loop)
 

@@ -1,0 +1,107 @@
+"""A session beside a hold that runs on its own: commands by the port, ticks by the rings, the hold outlives both."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
+from membrane_ctrl.errors import DeviceError, InputError
+from membrane_ctrl.names import State
+from membrane_ctrl.port.client import PortClient
+from membrane_ctrl.tune.live_hold import LiveHold
+from tuning.hold_link import HoldError
+from tuning.hold_rig import HoldRig
+
+CONFIG = '[twin]\nport = 0\nscenario = "quiet"\nstart_error_um = -3.0\n[shape]\nenabled = false\n'
+PATIENCE_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Logs of a running hold of the twin."""
+    folder = tmp_path_factory.mktemp("tune")
+    (folder / "lab.toml").write_text(CONFIG)
+    words = ["hold", "--twin", "--config", str(folder / "lab.toml"), "--logs", str(folder / "logs")]
+    process = subprocess.Popen([sys.executable, "-m", "membrane_ctrl", *words], stderr=subprocess.DEVNULL)
+    try:
+        yield folder / "logs"
+    finally:
+        process.terminate()
+        process.wait(PATIENCE_S)
+
+
+def connected(logs: Path) -> LiveHold:
+    """A link to the hold, once it holds."""
+    give_up_s = time.monotonic() + PATIENCE_S
+    while True:
+        assert time.monotonic() < give_up_s, "the twin was never held"
+        try:
+            client = PortClient.unix(logs / "control.sock", lambda text: None)
+        except DeviceError:
+            time.sleep(0.1)
+            continue
+        if client.ask(do="status")["status"]["state"] == "hold":
+            return LiveHold(client, logs / client.greeting["run"])
+        client.close()
+        time.sleep(0.2)
+
+
+def steps(rig: HoldRig, duration_s: float) -> ExperimentSpec:
+    around = rig.around(rig.hold(2.0), 10.0)
+    flow = min(max(around.holding_flow_um_per_s, 0.8), 1.8)  # two seconds do not tell it well
+    return ExperimentSpec(kind="steps", duration_s=duration_s, holding_flow_um_per_s=flow, laser_um=around.laser_um)
+
+
+def test_an_experiment_and_gains_on_a_live_hold(logs: Path) -> None:
+    link = connected(logs)
+    rig = HoldRig(link, "tester")
+    record, finished, event = rig.performed(steps(rig, 6.0))
+    assert finished.completed, finished.reason
+    assert event["experiment"] == "steps"
+    assert 6.0 <= record.duration_s < 12.0
+    assert record.lost_fraction < 0.2  # a busy machine may skip ticks; they are counted, not hidden
+    rig.set_gains(rig.loop.model_copy(update={"kp_per_s": 0.4}), "test", 60.0)
+    rig.keep()
+    link.close()
+    again = connected(logs)
+    assert again.config.loop.kp_per_s == 0.4  # a later session starts from what runs
+    again.close()
+
+
+def test_the_hold_ends_the_experiment_of_a_session_that_has_gone(logs: Path) -> None:
+    link = connected(logs)
+    rig = HoldRig(link, "tester")
+    spec = steps(rig, 5.0)
+    link._client.ask(do="tune", experiment=spec.model_dump())
+    link._client.close()  # killed: nothing is released
+    watcher = HoldRig(connected_in_any_state(logs), "watcher")
+    states = [watcher._next_held().state for _ in range(400)]
+    assert states[0] == State.TUNE
+    assert states[-1] == State.HOLD
+    watcher._link.close()
+
+
+def connected_in_any_state(logs: Path) -> LiveHold:
+    client = PortClient.unix(logs / "control.sock", lambda text: None)
+    return LiveHold(client, logs / client.greeting["run"])
+
+
+def test_what_is_refused_says_why(logs: Path) -> None:
+    link = connected(logs)
+    rig = HoldRig(link, "tester")
+    with pytest.raises(HoldError, match="refused"):
+        rig.setpoint(5000.0, "test")
+    link.close()
+
+
+def test_a_folder_of_another_run_is_refused(logs: Path, tmp_path: Path) -> None:
+    client = PortClient.unix(logs / "control.sock", lambda text: None)
+    with pytest.raises(InputError, match="is not running"):
+        LiveHold(client, tmp_path)
+    client.close()

@@ -1,0 +1,175 @@
+"""Verification, outer loop, watch and files of a session, each by itself on made-up data."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.config import LoopConfig, PumpConfig
+from membrane_ctrl.errors import InputError
+from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.metrology.hencky import zernike_projection
+from tuning import journal, plain
+from tuning.disturbance import Noise
+from tuning.disturbance_model import Disturbance
+from tuning.gains_file import GainsFile, PlantSection
+from tuning.outer_loop import STEP_UM, evaluate
+from tuning.plant_model import PlantModel
+from tuning.preview import ModelBench
+from tuning.records import Record
+from tuning.rig import Rig
+from tuning.verify import Trial, centre_std_um, look
+from tuning.watch import health
+
+PLANT = PlantModel(1.0, 0.08, 0.15, 1.24)
+WEATHER = Disturbance(Noise(1.0, 0.01, 0.01, 12.0, 0.05, 0.1, 0.1, 0.02), None, None)
+LOOP = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
+
+
+def held(loop: LoopConfig, plant: PlantModel = PLANT, duration_s: float = 600.0) -> tuple[Record, ModelBench]:
+    """A hold of the model's own bench, settled."""
+    bench = ModelBench(plant, WEATHER, PumpConfig(), 3)
+    rig = Rig(bench, loop, PumpConfig(), plant.holding_flow_um_per_s)
+    rig.hold(30.0)
+    return rig.hold(duration_s), bench
+
+
+def test_the_centre_s_deviation_is_seen_through_ten_times_the_noise() -> None:
+    record, bench = held(LOOP)
+    true_um = float(np.std(bench.true_um[1500:]))
+    trial = Trial(PLANT, WEATHER, LOOP, LOOP)
+    assert centre_std_um(record.displacement_um, trial, WEATHER) == pytest.approx(true_um, rel=0.2)
+
+
+def test_a_look_passes_good_gains_and_names_what_is_wrong_with_bad_ones() -> None:
+    record, _ = held(LOOP)
+    about_um = np.zeros(len(record))
+    assert look(record, about_um, Trial(PLANT, WEATHER, LOOP, LOOP), 1.5).reason == ""
+    slow = LOOP.model_copy(update={"kp_per_s": 0.1, "ti_s": 60.0})
+    record, _ = held(slow)
+    stage = look(record, about_um, Trial(PLANT, WEATHER, LOOP, slow), 1.1)
+    assert stage.growth > 1.3
+    assert "times that of the gains before" in stage.reason
+
+
+def test_a_plant_with_less_margin_than_designed_shows_in_the_readings() -> None:
+    """Gain and delay that have grown since: the model is content, the spectrum is not."""
+    loop = LOOP.model_copy(update={"kp_per_s": 1.0, "ti_s": 8.0, "measurement_filter_s": 0.1})
+    changed = replace(PLANT, gain=2.0, dead_time_s=0.35, leak_um_per_s=2.48)
+    record, _ = held(loop, changed)
+    stage = look(record, np.zeros(len(record)), Trial(PLANT, WEATHER, loop, loop), 100.0)
+    assert stage.ms > 2.0
+    assert "less margin than designed" in stage.reason
+
+
+def test_a_setpoint_that_moved_is_no_deviation() -> None:
+    record, _ = held(LOOP)
+    walk_um = 5.0 * np.sin(np.arange(len(record)) * 1e-4)
+    moved = replace(record, displacement_um=record.displacement_um + walk_um)
+    trial = Trial(PLANT, WEATHER, LOOP, LOOP)
+    plain_um = centre_std_um(record.displacement_um, trial, WEATHER)
+    assert centre_std_um(moved.displacement_um - walk_um, trial, WEATHER) == pytest.approx(plain_um, rel=1e-9)
+
+
+def shapes(count: int, start_s: float, sag_um: float, sigma_um: float, drift_um: np.ndarray) -> list[ShapeEstimate]:
+    rng = np.random.default_rng(int(start_s))
+    s = zernike_projection()
+    made = []
+    for k in range(count):
+        seen_um = sag_um + sigma_um * rng.standard_normal()
+        made.append(
+            ShapeEstimate(
+                start_s + 2.0 * k, "fringes", seen_um * s, 0.0, np.outer(s, s), seen_um, 1.0,
+                sag_um + float(drift_um[k]), 1.0, 1.0, 80.0, 0.0, "ok",
+            )
+        )  # fmt: skip
+    return made
+
+
+def test_the_outer_loop_s_sensitivity_noise_and_time_constant() -> None:
+    still = np.zeros(2000)
+    levels = [shapes(60, 10_000.0 + 200 * k, 37_100.0 + at, 0.3, still) for k, at in enumerate((0.0, STEP_UM, 0.0))]
+    drift = np.cumsum(np.random.default_rng(5).standard_normal(2000)) * 0.05 * math.sqrt(2.0)  # 0.05 um/sqrt(s)
+    found = evaluate(levels, shapes(2000, 0.0, 37_100.0, 0.3, drift), zernike_projection())
+    assert found.agreement == pytest.approx(1.0)
+    assert found.scale == pytest.approx(1.0, abs=0.05)
+    assert found.sigma_um == pytest.approx(0.3, rel=0.1)
+    assert found.drift_seen
+    assert found.drift_um_per_sqrt_h == pytest.approx(3.0, rel=0.3)
+    assert found.time_constant_s == pytest.approx(max(20.0, 0.3 * math.sqrt(2.0) / 0.05), rel=0.3)
+
+
+def test_a_drift_that_is_not_seen_asks_for_minutes() -> None:
+    still = np.zeros(400)
+    levels = [shapes(40, 10_000.0 + 200 * k, 37_100.0 + at, 1.0, still) for k, at in enumerate((0.0, STEP_UM, 0.0))]
+    found = evaluate(levels, shapes(400, 0.0, 37_100.0, 1.0, still), zernike_projection())
+    assert not found.drift_seen
+    assert found.drift_um_per_sqrt_h < 2.0
+    assert found.time_constant_s > 60.0
+
+
+def gains_file(plant: PlantModel) -> GainsFile:
+    section = PlantSection(
+        gain=plant.gain, dead_time_s=plant.dead_time_s, lag_s=plant.lag_s, leak_um_per_s=plant.leak_um_per_s,
+        gain_sigma=0.02, delay_sigma_s=0.01,
+    )  # fmt: skip
+    return GainsFile(
+        author="eve", date_utc="2026-01-01", reason="test", source="test", data_sha256="0",
+        predicted_std_um=0.2, least_std_um=0.15, plant=section, loop=LOOP,
+    )  # fmt: skip
+
+
+def test_a_loop_in_order_suggests_nothing_and_an_aged_one_says_why() -> None:
+    record, _ = held(LOOP)
+    about_um = np.zeros(len(record))
+    fresh = health(record, about_um, LOOP, gains_file(PLANT))
+    assert fresh.suggestions == ()
+    assert fresh.leak_um_per_s == pytest.approx(1.24, abs=0.1)
+    assert fresh.gain == pytest.approx(1.0, abs=3 * fresh.gain_sigma)
+    leaky = health(record, about_um, LOOP, gains_file(replace(PLANT, leak_um_per_s=0.8)))
+    assert any("leak" in suggestion for suggestion in leaky.suggestions)
+
+
+def test_a_glance_is_too_short_to_judge() -> None:
+    record, _ = held(LOOP, duration_s=60.0)
+    with pytest.raises(ValueError, match="too short"):
+        health(record, np.zeros(len(record)), LOOP, gains_file(PLANT))
+
+
+@dataclass(frozen=True, slots=True)
+class Inner:
+    values: tuple[float, ...]
+    loop: LoopConfig | None
+
+
+@dataclass(frozen=True, slots=True)
+class Outer:
+    inner: Inner
+    flag: bool
+    name: str
+
+
+def test_results_come_back_from_their_file_as_they_were(tmp_path: Path) -> None:
+    value = Outer(Inner((1.0, math.inf, -2.5), LOOP), True, "x")
+    plain.write(tmp_path / "a.json", value)
+    assert plain.read(tmp_path / "a.json", Outer) == value
+    (tmp_path / "a.json").write_text("{}")
+    with pytest.raises(InputError, match="damaged"):
+        plain.read(tmp_path / "a.json", Outer)
+
+
+def test_the_journal_survives_a_torn_line(tmp_path: Path) -> None:
+    journal.note(tmp_path, journal.entry("kept", "s1", "eve", "why", LOOP, LOOP))
+    with (tmp_path / "tuning" / "journal.jsonl").open("a") as file:
+        file.write('{"time_utc": "2026')
+    assert [line.session for line in journal.entries(tmp_path)] == ["s1"]
+    assert journal.to_roll_back(tmp_path).session == "s1"
+
+
+def test_nothing_to_roll_back_is_said(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no kept gains"):
+        journal.to_roll_back(tmp_path)
