@@ -11,6 +11,7 @@ import importlib
 import multiprocessing
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -68,9 +69,20 @@ class Child:
 
 
 def _main(target: str, args: tuple[Any, ...], nice: int) -> None:
+    """Run the target, then leave without taking the interpreter down piece by piece.
+
+    Arrays that still look into shared memory would otherwise be met by its destructor, which complains on stderr.
+    """
     os.nice(nice)
     module, function = target.split(":")
-    getattr(importlib.import_module(module), function)(*args)
+    code = 0
+    try:
+        getattr(importlib.import_module(module), function)(*args)
+    except SystemExit as leaving:
+        code = leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 @contextlib.contextmanager
