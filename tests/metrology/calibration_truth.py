@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from membrane_ctrl.config import OpticsConfig
-from membrane_ctrl.metrology.calibrate.parameters import NAMES, Bench, bench_at
-from membrane_ctrl.metrology.calibrate.residuals import SetPhases
+from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, Bench, bench_at, sigmas
+from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
 from membrane_ctrl.metrology.calibrate.separable import Witness
-from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, surface_of
+from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, surface_of
 from membrane_ctrl.metrology.geometry import Geometry
 from membrane_ctrl.metrology.surface import Surface
 from membrane_ctrl.twin.film_shape import FilmShape, typical_film
@@ -40,6 +40,19 @@ class Truth:
     def problem(self, sigmas: FloatArray, sets: tuple[SetPhases, ...] | None = None) -> Problem:
         """To be solved."""
         return Problem(STATED, self.sets if sets is None else sets, sigmas, Witness(0.0), 500.0)
+
+
+def plain(truth: Truth) -> Problem:
+    """A fit of a, b and alpha alone, from what the fringes of single sets contradict: no ring, no laser's scale."""
+    held = {p.name: 0.0 for p in ALL if p.name not in ("a_mm", "b_mm", "alpha_deg")}
+    problem = truth.problem(sigmas(held))
+    # what three parameters cannot explain counts as noise, or the hand's measurements would count for nothing
+    left = [
+        np.std(residual_mm(Bench(STATED), phases, state.surface, state.vertex_z_mm))
+        for phases, state in zip(problem.sets, first_states(problem), strict=True)
+    ]
+    sets = [replace(p, sigma_mm=np.full_like(p.sigma_mm, own)) for p, own in zip(problem.sets, left, strict=True)]
+    return replace(problem, sets=tuple(sets), witness=Witness(0.0, 1.0, 1e6))
 
 
 def make(

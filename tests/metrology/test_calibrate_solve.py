@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-from calibration_truth import Truth, calibrated_errors_um, make, stated_errors_um
+from calibration_truth import Truth, calibrated_errors_um, errors_um, make, plain, stated_errors_um
 
 from membrane_ctrl.metrology.calibrate.determined import condition_number, weak_combinations
-from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, sigmas
+from membrane_ctrl.metrology.calibrate.parameters import NAMES, sigmas
 from membrane_ctrl.metrology.calibrate.propagate import propagate
 from membrane_ctrl.metrology.calibrate.solve import Solution, solve
 
@@ -42,12 +43,10 @@ def test_sag_and_figure_are_right_after_and_wrong_before() -> None:
 
 
 def test_a_plain_fit_of_a_b_alpha_is_not_enough() -> None:
-    held = {p.name: 0.0 for p in ALL if p.name not in ("a_mm", "b_mm", "alpha_deg")}
-    plain = []
-    for seed in (0, 1, 2):
-        truth = solved(seed)[0]
-        plain.append(calibrated_errors_um(solve(truth.problem(sigmas(held))), truth))
-    assert rms([figure for _, figure in plain]) > 20
+    truths = [solved(seed)[0] for seed in (0, 1, 2)]
+    errors = [calibrated_errors_um(solve(plain(truth)), truth) for truth in truths]
+    assert rms([figure for _, figure in errors]) > 10
+    assert rms([sag for sag, _ in errors]) > 10
 
 
 def test_the_covariance_is_true() -> None:
@@ -81,8 +80,6 @@ def test_a_bow_is_solved_when_it_is_free() -> None:
         k = NAMES.index("bow_mm")
         assert abs(solution.values[k] - 1.0) < 4 * solution.sigmas[k] < 0.2
         surface = solution.states[2].surface
-        from calibration_truth import errors_um
-
         errors.append(errors_um(surface, truth, 2))
     assert rms([figure for _, figure in errors]) < 4
     assert rms([sag for sag, _ in errors]) < 6
@@ -100,8 +97,6 @@ def test_many_bins_are_averaged_and_nothing_is_lost() -> None:
 
 def test_outliers_do_not_move_the_solution() -> None:
     truth, clean = solved(1)
-    from dataclasses import replace
-
     screen_mm = truth.sets[1].screen_mm.copy()
     screen_mm[:, ::50] += 0.5
     sets = (truth.sets[0], replace(truth.sets[1], screen_mm=screen_mm), *truth.sets[2:])
@@ -112,23 +107,22 @@ def test_outliers_do_not_move_the_solution() -> None:
 
 
 def test_what_is_not_determined_is_named() -> None:
-    solution = solved(0)[1]
-    assert condition_number(solution) > 1e6
-    vague = sigmas({"screen_x_mm": 20.0, "screen_y_mm": 20.0, "camera_roll_deg": 2.0})
-    truth = solved(0)[0]
-    weak = weak_combinations(solve(truth.problem(vague)), 2, 475.0)
-    assert weak
+    assert condition_number(solved(0)[1]) > 1e6
+    near = make(drawn(0), 0, points=1500, sags_mm=(36.5, 37.0, 37.5))
+    weak = weak_combinations(solve(near.problem(SIGMAS)), 1, 475.0)
     assert all(0.5 < each.left <= 1.01 for each in weak)
-    assert "tilt of the surface" in weak[0].words
-    assert any(name.startswith("screen_") for name, _ in weak[0].parts)
+    assert [each.left for each in weak] == sorted((each.left for each in weak), reverse=True)
+    shifted = [each for each in weak if any(name == "screen_x_mm" for name, _ in each.parts)]
+    assert shifted
+    assert "a tilt of the surface" in shifted[0].words
     # the figure hardly sees it
-    assert weak[0].figure_um < 0.1 * weak[0].height_um
+    assert shifted[0].figure_um < 0.1 * shifted[0].height_um
 
 
 def test_one_step_settles_from_the_solution() -> None:
     truth, solution = solved(2)
     again = solve(truth.problem(SIGMAS), start=solution)
-    assert len(again.changes) <= 4
+    assert len(again.changes) < len(solution.changes)
     assert np.all(np.abs(again.values - solution.values)[SIGMAS > 0] < 0.05 * solution.sigmas[SIGMAS > 0])
 
 

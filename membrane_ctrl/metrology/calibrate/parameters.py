@@ -165,7 +165,7 @@ def poses_at(stated: Geometry, values: NDArray[Any]) -> Poses:
     """Poses of a parameter vector (real, or complex for `pose_derivatives`); only the first eleven count."""
     a, b, alpha, x, y, turn_x, turn_y, turn_z, yaw, pitch, roll = _radians(values[: len(POSE)])
     f0, o0 = stated.pinhole_mm, stated.screen_origin_mm
-    hinge = _unit(np.cross(f0, o0))
+    hinge = _hinge(f0, o0)
     up, back = _turn(hinge, alpha), _turn(hinge, -alpha)
     rows = np.stack([stated.screen_s_x, stated.screen_s_y, np.cross(stated.screen_s_x, stated.screen_s_y)])
     i, j, k = np.eye(3)
@@ -198,11 +198,13 @@ def _radians(values: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(values * factors)
 
 
-def _unit(vector: FloatArray) -> FloatArray:
-    length = float(np.linalg.norm(vector))
-    if length == 0:
+def _hinge(pinhole_mm: FloatArray, origin_mm: FloatArray) -> FloatArray:
+    """Unit vector about which alpha turns."""
+    across = np.cross(pinhole_mm, origin_mm)
+    length = float(np.linalg.norm(across))
+    if length < 1e-6 * float(np.linalg.norm(pinhole_mm) * np.linalg.norm(origin_mm)):
         raise ValueError("camera and screen stand in one line with the vertex: alpha has no meaning")
-    return vector / length
+    return across / length
 
 
 def _turn(axis: FloatArray, angle: Any) -> NDArray[Any]:

@@ -16,12 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.polynomial import polynomial as series
 from numpy.typing import NDArray
 
 from membrane_ctrl.metrology import hencky, zernike
+from membrane_ctrl.metrology.calibrate.loops import multiply
 from membrane_ctrl.metrology.calibrate.parameters import BOW_RADIUS_MM, OPTICAL, POSE, Bench, Poses
 from membrane_ctrl.metrology.geometry import Geometry
 from membrane_ctrl.metrology.reconstruct import Points, Tracer
@@ -82,7 +84,7 @@ class Chunk:
         Which points.
     residual_mm : (2, m) array
         Seen minus predicted.
-    derivatives : (2, m, COLUMNS) array
+    derivatives : (2, COLUMNS, m) array
         Of the prediction: 36 of the surface in mm, the vertex' height in mm, the optical parameters in their units.
     """
 
@@ -175,7 +177,7 @@ def _screen_rows(geometry: Geometry) -> FloatArray:
 
 
 def _derivatives(bench: Bench, turns: list[Poses], surface: Surface, m: _Meeting, lens: FloatArray) -> FloatArray:
-    """(2, m, COLUMNS) by the formulas above, right to left: what a change of P, u, n, d does to s."""
+    """(2, COLUMNS, m) by the formulas above, right to left: what a change of P, u, n, d does to s."""
     geometry, d, n, u, k = bench.geometry, m.ray, m.normal, m.leaves, m.reach_mm
     axes = _screen_rows(geometry)
     across, onto = axes[:2] @ u, np.sum(m.face * u, axis=0)  # E u, N u
@@ -191,26 +193,26 @@ def _derivatives(bench: Bench, turns: list[Poses], surface: Surface, m: _Meeting
     by_height = np.einsum("acm,cm->am", by_place, d) / nd
     by_pinhole = by_place - by_height[:, None] * n  # by_place G
     by_ray = by_pinhole * m.t_mm + ray - 2 / nn * along[:, None] * n
-    out = np.empty((2, d.shape[1], COLUMNS))
+    out = np.empty((2, COLUMNS, d.shape[1]))
     height, height_x, height_y = basis(m.place[0] / surface.radius_mm, m.place[1] / surface.radius_mm)
     scale = 1 / surface.radius_mm
     for axis in range(2):
         slope = (by_normal[axis, 0] * height_x + by_normal[axis, 1] * height_y) * scale
-        out[axis, :, :PARAMETERS] = (by_height[axis] * height - slope).T
-    out[:, :, PARAMETERS] = by_height
+        out[axis, :PARAMETERS] = by_height[axis] * height - slope
+    out[:, PARAMETERS] = by_height
     in_camera = geometry.rotation @ d
     for j, turn in enumerate(turns):
         moved = axes.T @ (turn.screen @ m.from_origin) - turn.origin_mm[:, None]
         of_ray = turn.camera.T @ in_camera
         column = np.einsum("acm,c->am", by_pinhole, turn.pinhole_mm)
         column += np.einsum("acm,cm->am", by_ray, of_ray) + np.einsum("acm,cm->am", by_point, moved)
-        out[:, :, LOCAL + j] = column
+        out[:, LOCAL + j] = column
     first = LOCAL + len(POSE)
-    out[:, :, first : first + len(lens)] = np.einsum("acm,lcm->aml", by_ray, lens)
+    out[:, first : first + len(lens)] = np.einsum("acm,lcm->alm", by_ray, lens)
     square = m.screen_mm[0] ** 2 + m.screen_mm[1] ** 2
-    out[:, :, -2] = across * square / onto / BOW_RADIUS_MM**2
+    out[:, -2] = across * square / onto / BOW_RADIUS_MM**2
     out /= bench.pitch
-    out[:, :, -1] = -m.screen_mm / bench.pitch**2
+    out[:, -1] = -m.screen_mm / bench.pitch**2
     return out
 
 
@@ -247,13 +249,31 @@ def basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
     excess = hencky.excess() / hencky.excess_rms()
     bowl = series.polyval(v, excess) - excess[0]
     grows = 2 * series.polyval(v, series.polyder(excess))
-    heights = zernike.values(x, y)[1:] - zernike.at_vertex()[1:, None]
-    slopes_x, slopes_y = zernike.gradients(x, y)
-    return (
-        np.vstack([heights, bowl]),
-        np.vstack([slopes_x[1:], grows * x]),
-        np.vstack([slopes_y[1:], grows * y]),
-    )
+    powers, tables = _monomials(x, y), _tables()
+    heights = multiply(tables[0], powers) - zernike.at_vertex()[1:, None]
+    slopes_x, slopes_y = multiply(tables[1], powers), multiply(tables[2], powers)
+    return np.vstack([heights, bowl]), np.vstack([slopes_x, grows * x]), np.vstack([slopes_y, grows * y])
+
+
+def _monomials(x: FloatArray, y: FloatArray) -> FloatArray:
+    """x^p y^q, p + q <= 7, p outer, (36, n)."""
+    out, column = [], np.ones_like(x)
+    for p in range(zernike.DEGREE + 1):
+        term = column
+        for _ in range(zernike.DEGREE + 1 - p):
+            out.append(term)
+            term = term * y
+        column = column * x
+    return np.stack(out)
+
+
+@cache
+def _tables() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Z_j, dZ_j/dx and dZ_j/dy, j = 2..36, as coefficients (35, 36) of `_monomials`."""
+    p, q = np.array([(p, q) for p in range(zernike.DEGREE + 1) for q in range(zernike.DEGREE + 1 - p)]).T
+    table = zernike.monomial_table()
+    height, of_x, of_y = (t[1:, p, q] for t in (table, *(zernike.differentiate(table, axis) for axis in (1, 2))))
+    return np.ascontiguousarray(height), np.ascontiguousarray(of_x), np.ascontiguousarray(of_y)
 
 
 def slopes(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:

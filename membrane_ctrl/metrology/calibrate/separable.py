@@ -18,6 +18,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from membrane_ctrl.metrology.calibrate.loops import gram
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, OPTICAL, Bench, Poses
 from membrane_ctrl.metrology.calibrate.residuals import COLUMNS, LOCAL, SetPhases, basis, chunks
 from membrane_ctrl.metrology.surface import PARAMETERS, Surface
@@ -134,10 +135,8 @@ def equations(
     residual = np.empty_like(phases.screen_mm)
     for part in chunks(bench, turns, phases, state.surface, state.vertex_z_mm):
         residual[:, part.place] = part.residual_mm
-        rows = np.concatenate([part.derivatives, part.residual_mm[:, :, None]], axis=2)
-        rows *= root[part.place][:, None]
-        flat = rows.reshape(-1, COLUMNS + 1)
-        sums[np.ix_(keep, keep)] += flat.T @ flat
+        for derivatives, left in zip(part.derivatives, part.residual_mm, strict=True):
+            sums[np.ix_(keep, keep)] += gram(np.vstack([derivatives, left]) * root[part.place])
     rows = _witness_rows(phases, state, common, witness)
     weights = trust.weights / phases.sigma_mm**2
     rms = float(np.sqrt(np.mean(residual**2 @ weights) / np.sum(weights)))

@@ -23,6 +23,7 @@ MAX_ITERATIONS = 25
 _SETTLED = 1e-2  # of each parameter's own standard deviation: no reader of the result sees less
 _NEARLY = 0.1  # likewise: the next step is far below the noise
 _FEW = 4000  # points of a set: a hundred times its unknowns
+_FURTHEST = 4.0  # of what is known by hand; sets that contradict each other would lead out of the room
 _START_SAG_MM = 40.0
 _FREE_RING_MM = 1e3  # the ring's form is not known beforehand
 
@@ -162,6 +163,7 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
     states = start.states if start is not None else first_states(problem)
     common = start.common if start is not None else _common(states)
     trust = tuple(Trust.full(phases) for phases in problem.sets)
+    free = problem.sigmas > 0
     changes: list[float] = []
     weighed = False  # whether the step before was the first with new weights
     while True:
@@ -178,10 +180,13 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
         if settled or len(changes) == MAX_ITERATIONS:
             values = common[: len(NAMES)].copy()
             return Solution(problem, values, common, states, linear, moved.covariance, tuple(changes), settled)
-        states = tuple(_moved(s, each, moved.delta) for s, each in zip(states, linear, strict=True))
-        common = common + moved.delta
-        # Weights are renewed where the steps have nearly come to rest: renewed at every step they may chase it
-        weighed = changes[-1] < _NEARLY
+        far = float(np.max(np.abs(moved.delta[: len(NAMES)][free]) / problem.sigmas[free], initial=0.0))
+        delta = moved.delta * min(1.0, _FURTHEST / far) if far > 0 else moved.delta
+        states = tuple(_moved(s, each, delta) for s, each in zip(states, linear, strict=True))
+        common = common + delta
+        # Weights are renewed where the steps have nearly come to rest (renewed at every step they may chase it), and
+        # where points that are believed too much lead astray
+        weighed = changes[-1] < _NEARLY or far > _FURTHEST
         if weighed:
             left = (each.residual_mm for each in linear)
             trust = tuple(Trust.seen(phases, residual) for phases, residual in zip(problem.sets, left, strict=True))

@@ -1,0 +1,101 @@
+"""The geometry file of a calibration: readable by the others, its covariance that of the parameters."""
+
+from __future__ import annotations
+
+import copy
+import tomllib
+
+import numpy as np
+import pytest
+import tomli_w
+from calibration_truth import OPTICS, make
+
+from membrane_ctrl.config import GeometryConfig, OpticsConfig
+from membrane_ctrl.metrology.calibrate.artefact import Origin, content_hash, general_covariance, tables_of
+from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, sigmas
+from membrane_ctrl.metrology.calibrate.solve import Solution, solve
+from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.geometry_spread import GENERAL_NAMES, GeometrySpread, changed
+
+ORIGIN = Origin("2026-01-01T00:00:00+00:00", ("a", "b"), 1.0, 2.0, 3.0, ("a note",))
+FREE = sigmas({"bow_mm": 1.5, "k1": 0.02, "pitch_relative": 1e-3})
+
+
+@pytest.fixture(scope="module")
+def solution() -> Solution:
+    truth = make(FREE * 0.3, seed=4, points=1500)
+    return solve(truth.problem(FREE))
+
+
+def test_the_file_says_the_calibrated_bench(solution: Solution) -> None:
+    tables = tomllib.loads(tomli_w.dumps(tables_of(solution, OPTICS, ORIGIN)))
+    geometry = GeometryConfig.model_validate(tables["geometry"])
+    assert geometry.reference_displacement_um == 0.0
+    there = Geometry.from_config(OpticsConfig(geometry=geometry))
+    bench = solution.bench
+    for field in ("pinhole_mm", "rotation", "screen_origin_mm", "screen_s_x", "screen_s_y"):
+        assert np.array_equal(getattr(there, field), getattr(bench.geometry, field)), field
+    assert tables["screen"]["bow_mm"] == pytest.approx(solution.values[NAMES.index("bow_mm")])
+    assert tables["camera"]["distortion"] == list(bench.geometry.distortion)
+    assert tables["pattern"]["period_mm"] == pytest.approx(OPTICS.pattern.period_mm * bench.pitch)
+    assert tables["calibration"]["sets"] == ["a", "b"]
+    assert tables["parameters"]["names"] == solution.free
+
+
+def test_only_what_was_free_is_written() -> None:
+    truth = make(np.zeros(len(NAMES)), seed=4, points=1200)
+    tables = tables_of(solve(truth.problem(sigmas())), OPTICS, ORIGIN)
+    assert not {"screen", "camera", "pattern"} & set(tables)
+
+
+def test_the_covariance_is_that_of_drawn_parameters(solution: Solution) -> None:
+    covariance = general_covariance(solution)
+    spread = GeometrySpread(GENERAL_NAMES, covariance)  # refuses what is no covariance
+    # a change along one parameter, and the poses' own change by the twelve numbers that stand for it
+    config = GeometryConfig.model_validate(tables_of(solution, OPTICS, ORIGIN)["geometry"])
+    rng = np.random.default_rng(0)
+    inverse = np.linalg.pinv(spread.correlation(), rcond=1e-10)
+    k = len(solution.values)
+    root = np.linalg.cholesky(solution.covariance[np.ix_(FREE > 0, FREE > 0)][:11, :11])
+    far = []
+    for _ in range(40):
+        values = solution.values.copy()
+        values[:11] += root @ rng.normal(size=11)
+        there = bench_at(solution.problem.stated, values).geometry
+        here = solution.bench.geometry
+        shift = there.pinhole_mm - here.pinhole_mm, there.screen_origin_mm - here.screen_origin_mm
+        turns = (
+            _turn(here.rotation, there.rotation),
+            _turn(_rows(here), _rows(there)),
+        )
+        change = np.concatenate([shift[0], turns[0], shift[1], turns[1]])
+        moved = Geometry.from_config(OpticsConfig(geometry=changed(config, GENERAL_NAMES, change)))
+        assert np.allclose(moved.rotation, there.rotation, atol=1e-9)
+        assert np.allclose(moved.screen_s_x, there.screen_s_x, atol=1e-9)
+        scaled = change / np.where(spread.sigmas > 0, spread.sigmas, 1.0)
+        far.append(scaled @ inverse @ scaled)
+    # a chi-square of eleven degrees of freedom
+    assert k >= 11
+    assert 9 < np.mean(far) < 13
+
+
+def _rows(geometry: Geometry) -> np.ndarray:
+    normal = np.cross(geometry.screen_s_x, geometry.screen_s_y)
+    return np.stack([geometry.screen_s_x, geometry.screen_s_y, normal])
+
+
+def _turn(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(after.T @ before).as_rotvec()
+
+
+def test_the_hash_stands_for_the_numbers_alone(solution: Solution) -> None:
+    tables = tables_of(solution, OPTICS, ORIGIN)
+    there_and_back = tomllib.loads(tomli_w.dumps(tables))
+    assert content_hash(there_and_back) == tables["calibration"]["hash"]
+    later = tables_of(solution, OPTICS, Origin("2027-01-01T00:00:00+00:00", ("c",), 1.0, 2.0, 3.0))
+    assert later["calibration"]["hash"] == tables["calibration"]["hash"]
+    edited = copy.deepcopy(there_and_back)
+    edited["geometry"]["camera"]["position_mm"][0] += 0.001
+    assert content_hash(edited) != tables["calibration"]["hash"]

@@ -1,0 +1,145 @@
+"""The calibrate command from folders to a geometry that `measure` uses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.cli import run
+from membrane_ctrl.config import CameraConfig, GeometryConfig, OpticsConfig
+from membrane_ctrl.twin.film_shape import typical_film
+from membrane_ctrl.twin.rays import ScreenError
+from membrane_ctrl.twin.simulate import simulate_set
+from membrane_ctrl.twin.simulation_spec import Motion, SimulationSpec
+
+# 16-bit frames of large pixels with the noise of the 64 that each stands for: what the paper's camera says
+SHRINK = 8
+NOISE = 256 * float(np.hypot(0.4, np.sqrt(1 / 12))) / SHRINK
+CAMERA = CameraConfig(
+    width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK, bits=16, noise_adu=NOISE
+)
+STATED = GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9)
+TRUE = GeometryConfig(a_mm=2674.0, b_mm=2869.0, alpha_deg=81.2, reference_displacement_um=0.0)
+FILM = typical_film(37.1, 500.0, seed=1)
+MOVED_UM = (-4000.0, -2000.0, 0.0, 2000.0, 4000.0)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    root = tmp_path_factory.mktemp("calibrate")
+    stated = STATED.model_copy(update={"reference_displacement_um": 0.0})
+    for k, moved_um in enumerate(MOVED_UM):
+        spec = SimulationSpec(
+            OpticsConfig(geometry=TRUE, camera=CAMERA),
+            FILM,
+            motion=Motion(start_um=moved_um),
+            laser_noise_um=1.0,
+            stated_geometry=stated,
+            screen_error=ScreenError(0.5, -0.5),
+            seed=k + 1,
+        )
+        simulate_set(root / f"set{k}", spec)
+    return [root / f"set{k}" for k in range(len(MOVED_UM))]
+
+
+def figure_error_um(height: Path, truth: Path) -> float:
+    """RMS error without the best plane; the truth is the twin's film, sampled where it was measured."""
+    measured, moved = np.load(height), float(np.load(truth)["displacement_um"][0])
+    x, y = np.meshgrid(measured["x_mm"], measured["y_mm"])
+    seen = np.isfinite(measured["h_mm"])
+    error = measured["h_mm"][seen] - FILM.height_mm(x[seen], y[seen], moved)
+    plane = np.stack([np.ones(seen.sum()), x[seen], y[seen]], axis=1)
+    return 1e3 * float(np.std(error - plane @ np.linalg.lstsq(plane, error, rcond=None)[0]))
+
+
+def test_from_folders_to_a_better_figure(
+    folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "geometry.toml"
+    assert run(["calibrate", *map(str, folders), "--out", str(out), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["verdict"] == "ok"
+    assert report["findings"] == []
+    assert report["hash"] == tomllib.loads(out.read_text())["calibration"]["hash"]
+    found = {row["name"]: row for row in report["parameters"]}
+    for name, true in (("a_mm", 2.0), ("alpha_deg", 0.3), ("screen_turn_x_deg", 0.5), ("screen_turn_y_deg", -0.5)):
+        # the signs of the twin's turns are the parameters' but for the rows' own sense
+        assert abs(abs(found[name]["value"]) - abs(true)) < 4 * found[name]["sigma"] < 2.0, name
+    before, after = (tmp_path / name for name in ("before", "after"))
+    assert run(["measure", str(folders[2]), "--out", str(before), "--no-pictures"]) == 0
+    assert run(["measure", str(folders[2]), "--geometry", str(out), "--out", str(after), "--no-pictures"]) == 0
+    truth = folders[2] / "truth.npz"
+    assert figure_error_um(before / "height.npz", truth) > 10
+    assert figure_error_um(after / "height.npz", truth) < 2
+
+
+def test_uncertainty_draws_from_the_file(folders: list[Path], tmp_path: Path) -> None:
+    out, where = tmp_path / "geometry.toml", tmp_path / "uncertainty"
+    assert run(["calibrate", *map(str, folders[::2]), "--out", str(out)]) == 0
+    words = ["uncertainty", str(folders[2]), "--geometry", str(out), "--out", str(where), "--trials", "20"]
+    assert run([*words, "--workers", "1"]) == 0
+    assert where.is_dir()
+
+
+def test_a_rejected_calibration_leaves_the_old_geometry(
+    folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "geometry.toml"
+    out.write_text("old")
+    backwards = []
+    for k, folder in enumerate(folders[:3]):
+        copy = tmp_path / f"set{k}"
+        shutil.copytree(folder, copy)
+        text = (copy / "capture.toml").read_text()
+        lines = [
+            f"displacement_um = {-float(line.split('=')[1])}" if line.startswith("displacement_um") else line
+            for line in text.splitlines()
+        ]
+        (copy / "capture.toml").write_text("\n".join(lines))
+        backwards.append(copy)
+    assert run(["calibrate", *map(str, backwards), "--out", str(out)]) == 3
+    printed = capsys.readouterr()
+    assert "the laser counts the wrong way" in printed.out
+    assert "old geometry stays in force" in printed.err
+    assert out.read_text() == "old"
+
+
+def test_one_pressure_is_not_enough(folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["calibrate", str(folders[0]), "--out", str(tmp_path / "g.toml"), "--json"]) == 3
+    assert "fewer than two sets" in json.loads(capsys.readouterr().out)["findings"][0]["says"]
+
+
+def test_sets_of_different_rigs_are_named(
+    folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(folders[1], other)
+    text = (other / "capture.toml").read_text().replace("a_mm = 2672.0", "a_mm = 2600.0")
+    (other / "capture.toml").write_text(text)
+    assert run(["calibrate", str(folders[0]), str(other), "--out", str(tmp_path / "g.toml")]) == 2
+    assert "other/capture.toml: geometry.a_mm: not that of" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--free", "radius_mm"], "radius_mm is not a parameter"),
+        (["--free", "bow_mm=wide"], "wide is not a number"),
+        (["--free", "bow_mm=-1"], "a sigma is 0"),
+    ],
+)
+def test_wrong_options_are_said(
+    folders: list[Path], capsys: pytest.CaptureFixture[str], arguments: list[str], says: str
+) -> None:
+    assert run(["calibrate", str(folders[0]), *arguments]) == 2
+    assert says in capsys.readouterr().err
+
+
+def test_a_set_given_twice_is_refused(folders: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["calibrate", str(folders[0]), str(folders[0])]) == 2
+    assert "given twice" in capsys.readouterr().err
