@@ -10,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.signal import welch
 
+from membrane_ctrl.config import LoopConfig
 from tuning.disturbance_model import Disturbance
 from tuning.identify import Identified
 from tuning.loop_model import Gains, frequencies, loop_response
@@ -52,10 +53,11 @@ def draw_weather(path: Path, record: Record, model: PlantModel, weather: Disturb
     w: Series = 2 * np.pi * frequency_hz[1:]
     back = 1 / np.abs(1 - np.exp(-1j * w * record.dt_s)) ** 2  # from increments to readings
     axes.loglog(frequency_hz[1:], power[1:] * back, linewidth=0.7, color="tab:gray", label="readings, pump taken out")
-    rest_psd = 2 * weather.rest.moving_psd(w)  # one-sided
-    axes.loglog(frequency_hz[1:], rest_psd, label="movement that no weather sensor explains")
+    blind = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
+    axes.loglog(frequency_hz[1:], 2 * weather.psd(w, model, blind), label="movement, fitted")  # one-sided
+    axes.loglog(frequency_hz[1:], 2 * weather.rest.moving_psd(w), label="movement that no weather sensor explains")
     axes.axhline(2 * weather.rest.white_psd, color="tab:red", linestyle="--", label="laser noise")
-    axes.set(xlabel="frequency (Hz)", ylabel="um^2/Hz")
+    axes.set(xlabel="frequency (Hz)", ylabel="um^2/Hz", ylim=(1e-4 * weather.rest.white_psd, None))
     axes.legend()
     _save(path, figure)
 

@@ -287,7 +287,7 @@ def verified_of(session: SessionFolder) -> Verified:
     return plain.read(session.file("verified.json"), Verified)
 
 
-def map_pump(session: SessionFolder, rig: HoldRig) -> PumpConfig:
+def map_pump(session: SessionFolder, rig: HoldRig) -> PumpMap:
     """Measure the pump on the mirror; later steps of this session use what was found.
 
     Raises RejectedError if the map could not be completed, or is none a pump could have.
@@ -303,4 +303,4 @@ def map_pump(session: SessionFolder, rig: HoldRig) -> PumpConfig:
     mapped = found.applied_to(session.config.pump)
     write_text_atomic(session.file("pump.toml"), config_file.dump(mapped))
     plain.write(session.file("pump_map.json"), found)
-    return mapped
+    return found

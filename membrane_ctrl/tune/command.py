@@ -27,6 +27,7 @@ from tuning.report import write_report
 from tuning.session_folder import STEPS, SessionFolder, create_session, newest_session, open_session
 from tuning.verify import SETTLE_S, STAGES, Stage
 
+_TOO_TIGHT = "the mirror is too tight to be held within its band: open the bleed (loop.bleed_fraction)"
 _MOVES = frozenset({"characterise", "observe", "apply", "verify"})
 
 
@@ -94,8 +95,14 @@ def map_pump(options: TuneOptions) -> int:
     """Measure the pump; the later steps of the session use it."""
     with _session(options) as (folder, rig, progress):
         progress.begin("pump map", 700.0, 0.0)
-        mapped = session.map_pump(folder, rig)
-        progress.say(f"[pump] of this bench: {mapped}")
+        found = session.map_pump(folder, rig)
+        progress.say(
+            f"starts at {found.start_fraction:.3f}, stalls at {found.stall_fraction:.3f} (sticks by "
+            f"{found.sticks_by:.3f}), full flow {found.flow_full_um_per_s:.2f} um/s, leak {found.leak_um_per_s:.2f} "
+            f"+- {found.leak_sigma_um_per_s:.2f} um/s; [pump] for the configuration: {folder.file('pump.toml')}"
+        )
+        if found.too_tight:
+            progress.say(_TOO_TIGHT)
     return _concluded(folder, options)
 
 
@@ -210,11 +217,11 @@ def _in_a_line(step: str, folder: SessionFolder) -> str:
             found = session.found_of(folder)
             model, sigma = found.identified.model, found.identified.sigma
             reasons = "".join(f"; {reason}" for reason in found.quality.reasons)
+            tight = f"; {_TOO_TIGHT}" if model.leak_um_per_s < TOO_TIGHT_UM_PER_S else ""
             return (
                 f"k {model.gain:.3f} +- {sigma.gain:.3f}, delay {model.delay_s:.3f} +- {sigma.delay_s:.3f} s "
                 f"(dead time {model.dead_time_s:.3f} +- {sigma.dead_time_s:.3f} s), "
-                f"leak {model.leak_um_per_s:.2f} um/s: "
-                f"{found.quality.verdict}{reasons}"
+                f"leak {model.leak_um_per_s:.2f} um/s: {found.quality.verdict}{reasons}{tight}"
             )
         case "observe":
             weather = session.disturbance_of(folder)
