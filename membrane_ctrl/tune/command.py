@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from membrane_ctrl.config import Config, LoopConfig
+from membrane_ctrl.control.leak import TOO_TIGHT_UM_PER_S
 from membrane_ctrl.ctl import Where, socket_path
 from membrane_ctrl.errors import DeviceError, Exit, InputError, RejectedError
 from membrane_ctrl.port.client import PortClient
