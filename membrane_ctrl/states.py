@@ -179,6 +179,7 @@ def manual(scene: Scene) -> State:
     if scene.hold_wanted:
         scene.manual_wanted = False
         scene.why = f"{scene.asked_by} asked to hold the mirror again"
+        _keep_flowing(scene)
         return State.INFLATE
     output = scene.output = scene.loop.follow(_given(scene, scene.setpoint_um), scene.manual_um_per_s, scene.dt_s)
     scene.pump_fraction = output.pump_fraction
@@ -286,6 +287,12 @@ def _go_down(scene: Scene) -> State:
     return State.LOWER
 
 
+def _keep_flowing(scene: Scene) -> None:
+    """Go on as in the last tick: the state that was just chosen takes over in the next one."""
+    scene.pump_fraction = scene.last_pump_fraction
+    scene.vent_fraction = scene.loop_config.bleed_fraction
+
+
 def _asked_elsewhere(scene: Scene) -> State | None:
     """The state that somebody has asked for, if it is another one than a hold."""
     if scene.way_down is not None:
@@ -297,6 +304,7 @@ def _asked_elsewhere(scene: Scene) -> State | None:
     if scene.manual_wanted:
         scene.hold_wanted = False
         scene.why = f"{scene.asked_by} has taken the pump"
+        _keep_flowing(scene)
         return State.MANUAL
     return None
 

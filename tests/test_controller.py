@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 
 from firmware_iface.roles import BenchReading
+from membrane_ctrl.commands import Command
 from membrane_ctrl.config import Config, LimitsConfig, LoopConfig, StatesConfig, TwinConfig
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.names import Rung, State
 from membrane_ctrl.tick import Event
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_run import VirtualTick, run_virtual
+from membrane_ctrl.virtual_bench import VirtualBench
+from membrane_ctrl.virtual_run import VirtualRun, VirtualTick, run_virtual
 
 CALM = Config(twin=TwinConfig(scenario="calm", laser_noise_um=0.3))
 Alter = Callable[[float, BenchReading], BenchReading | None]
@@ -80,6 +82,21 @@ def test_ten_seconds_without_a_laser_are_held_on_the_mean_flow_and_forgiven() ->
     gone = (run.value("mono_s") > 25.1) & (run.value("mono_s") < 34.9)
     assert np.ptp(run.value("pump_fraction")[gone]) < 0.02  # the mean flow, and nothing else
     assert np.max(np.abs(run.value("truth_displacement_um")[gone])) < 4.0
+
+
+def test_the_pump_is_handed_over_to_a_person_and_back_without_a_gap() -> None:
+    plant = Plant(CALM.twin, CALM.pump)
+    run = VirtualRun(CALM, VirtualBench(plant, 0.5), zernike_projection())
+    rows = []
+    asked = {1: "hold", 1000: "manual", 1500: "hold"}
+    for number in range(1, 2000):
+        commands = (Command(asked[number], "engineer", value=1.2),) if number in asked else ()
+        tick = run.tick(commands)
+        assert tick is not None
+        rows.append(tick.row)
+    assert {State(row.state) for row in rows[1000:1499]} == {State.MANUAL}
+    assert State(rows[-1].state) == State.HOLD
+    assert min(row.pump_fraction for row in rows[990:]) > 0.2
 
 
 def test_a_repeated_sample_or_two_are_no_fault() -> None:
