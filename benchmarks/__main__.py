@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import subprocess
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -30,6 +31,7 @@ NAMES = (
     "report_month",
     "events_found",
     "links",
+    "calibration",
     "soak",
 )
 OUT = Path("docs/bench.json")
@@ -41,16 +43,17 @@ def main(names: list[str]) -> int:
     if unknown:
         print(f"benchmarks: unknown {', '.join(unknown)}; known are {', '.join(NAMES)}", file=sys.stderr)
         return 2
-    missed = False
-    for name in names or NAMES:
-        about = machine()
-        Console(width=150).print(", ".join(f"{key} {value}" for key, value in about.items()))
-        figures = importlib.import_module(f"benchmarks.{name}").run()
-        show(name, figures)
-        _record(name, {"date_utc": f"{datetime.now(UTC):%Y-%m-%d}", "machine": about, "figures": as_json(figures)})
-        missed |= any(figure.met is False for figure in figures)
+    if len(names) != 1:  # each in a process of its own: memory and compiled code of one are no figure of another
+        command = [sys.executable, "-m", "benchmarks"]
+        return max(subprocess.run([*command, name], check=False).returncode for name in names or NAMES)
+    (name,) = names
+    about = machine()
+    Console(width=150).print(", ".join(f"{key} {value}" for key, value in about.items()))
+    figures = importlib.import_module(f"benchmarks.{name}").run()
+    show(name, figures)
+    _record(name, {"date_utc": f"{datetime.now(UTC):%Y-%m-%d}", "machine": about, "figures": as_json(figures)})
     print(f"written to {OUT}")
-    return int(missed)
+    return int(any(figure.met is False for figure in figures))
 
 
 def _record(name: str, entry: dict[str, Any]) -> None:
