@@ -21,9 +21,11 @@ SHAPES = "shapes"
 # are finer in a single than the sensor behind them (1 mm to 0.1 nm), at half the size and half the reading time.
 _DOUBLES = frozenset({"mono_s", "tick", "sample_counter", "device_time_s", "ambient_pressure_pa"})
 _TICK_BATCH_S = 60.0
+# Rerun holds what a killed recorder had not written yet; reading back costs as much a batch as a thousand rows.
+_SHAPE_BATCH_S = 300.0
 # A batch costs about 6 kB whatever is in it: the coarser a level, the longer its rows wait. A reader takes the tail
 # that a killed recorder left unwritten from the next finer table.
-_LEVEL_BATCH_S = {1.0: 60.0, 10.0: 600.0, 60.0: 3600.0}
+_LEVEL_BATCH_S = {1.0: 300.0, 10.0: 600.0, 60.0: 3600.0}
 # A covariance is 5 kB and changes little from cycle to cycle.
 COVARIANCE_INTERVAL_S = 600.0
 
@@ -65,7 +67,7 @@ class ColumnTables:
 
     def __init__(self, run_dir: Path) -> None:
         self._ticks = ColumnFile(run_dir, TICKS, tick_schema(), "mono_s", _TICK_BATCH_S)
-        self._shapes = ColumnFile(run_dir, SHAPES, shape_schema(), "time_s", _TICK_BATCH_S)
+        self._shapes = ColumnFile(run_dir, SHAPES, shape_schema(), "time_s", _SHAPE_BATCH_S)
         self._levels = {
             window_s: ColumnFile(run_dir, level_table(window_s), level_schema(), "time_s", _LEVEL_BATCH_S[window_s])
             for window_s in WINDOWS_S

@@ -17,6 +17,7 @@ from membrane_ctrl.review.found import LEVEL_COLUMNS, Found, find_events
 from membrane_ctrl.review.hold_pass import KEPT_AWAY, READING, TRUE, HoldPass, hold_pass
 from membrane_ctrl.review.psd import Spectrum, power_spectrum
 from membrane_ctrl.review.run import Block, Run
+from membrane_ctrl.review.settled import held_at
 from membrane_ctrl.review.shape_review import ShapeReview, review_shapes
 from membrane_ctrl.review.windows import WindowStatistics, describe, window_means
 
@@ -121,23 +122,31 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
     if not seconds["time_s"].size:
         raise InputError(f"{run.folder}: nothing to report: no telemetry in this part of the run")
     span_s = (float(seconds["time_s"][0]), float(seconds["time_s"][-1]) + 1.0)
+    found, shape = _found_and_shape(run, seconds, start_s, end_s)
+    del seconds  # of a month a quarter of a GB, and what comes needs more
     ticks = hold_pass(run, span_s, (start_s, end_s))
-    shapes = run.shapes()
-    shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
-    found = tuple(find_events(seconds, shapes))
-    held = _held_at(seconds, shapes.time_s)
-    mirror = run.config.optics.mirror
     level_s = _level_for(span_s[1] - span_s[0])
     level = run.level(level_s, start_s, end_s)
     reading = _series(run, ticks, READING)
     true = _series(run, ticks, TRUE)
     benefit = _benefit(run, ticks, true is not None)
-    shape = review_shapes(shapes, held, mirror.analysis_radius_mm / mirror.radius_mm)
     leak = _leak(level)
     odd = anomalies(run, ticks, reading, true, leak[0], found, shape)
     return Analysis(
         run, (start_s, end_s), ticks, level, level_s, reading, true, benefit, leak, found, shape, odd
     )  # fmt: skip
+
+
+def _found_and_shape(
+    run: Run, seconds: Block, start_s: float, end_s: float
+) -> tuple[tuple[Found, ...], ShapeReview | None]:
+    """What needs the cycles; they are let go again before the ticks are read."""
+    shapes = run.shapes()
+    shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
+    mirror = run.config.optics.mirror
+    held = held_at(seconds, shapes.time_s)
+    shape = review_shapes(shapes, held, mirror.analysis_radius_mm / mirror.radius_mm)
+    return tuple(find_events(seconds, shapes)), shape
 
 
 def _series(run: Run, ticks: HoldPass, which: int) -> Series | None:
@@ -191,13 +200,6 @@ def _leak(level: Block) -> tuple[float, float, float]:
     if not leak.size:
         return (math.nan, math.nan, math.nan)
     return float(np.median(leak)), float(leak.min()), float(leak.max())
-
-
-def _held_at(seconds: Block, time_s: Column) -> NDArray[np.bool_]:
-    """Whether the second that holds each time, and the one before, were in `hold`."""
-    place = np.clip(np.searchsorted(seconds["time_s"], time_s, side="right") - 1, 0, None)
-    hold = seconds["state"] == State.HOLD
-    return np.asarray(hold[place] & hold[np.maximum(place - 1, 0)])
 
 
 def _level_for(span_s: float) -> float:

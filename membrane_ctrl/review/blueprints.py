@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.blueprint.components import AbsoluteTimeRange
 
 TABS = ("overview", "loop", "shape", "faults", "tuning")
 
@@ -34,7 +35,7 @@ class ReviewBlueprint:
         selection = None
         if self._span_s is not None:
             start, end = (round(1e9 * second) for second in self._span_s)
-            selection = rr.encodings.AbsoluteTimeRange(rr.encodings.TimeInt(seq=start), rr.encodings.TimeInt(seq=end))
+            selection = AbsoluteTimeRange(start, end)
         return rrb.Blueprint(
             rrb.Tabs(*tabs, active_tab=TABS.index(tab)),
             rrb.TimePanel(state="collapsed", timeline="run_time", time_selection=selection),

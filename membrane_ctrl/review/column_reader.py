@@ -49,7 +49,9 @@ def read_file(path: Path, names: Sequence[str] | None, notes: list[str]) -> pa.T
             if not wanted:
                 return None
             source.seek(0)
-            options = pa.ipc.IpcReadOptions(included_fields=[schema.names.index(name) for name in wanted])
+            fields = [schema.names.index(name) for name in wanted]
+            # one thread: buffers of a minute are too small to hand around
+            options = pa.ipc.IpcReadOptions(included_fields=fields, use_threads=False)
             try:
                 return pa.ipc.open_stream(source, options=options).read_all().select(wanted)
             except (pa.ArrowException, OSError):

@@ -18,8 +18,10 @@ from membrane_ctrl.recording.event_streams import event_text, event_time_s
 from membrane_ctrl.recording.lanes import TELEMETRY_LANES
 from membrane_ctrl.recording.rows import changes
 from membrane_ctrl.recording.streams import BLUE, GREEN, GREY, LOW_ORDERS, ORANGE, RED, STREAMS, VIOLET, Colour
+from membrane_ctrl.review.annotations import MARK
 from membrane_ctrl.review.found import LEVEL_COLUMNS, Found, find_events
 from membrane_ctrl.review.run import Block, Run
+from membrane_ctrl.review.settled import held_at
 from membrane_ctrl.review.shapes import Shapes, height_basis
 from membrane_ctrl.telemetry import FIELDS
 
@@ -126,7 +128,7 @@ class Layer:
         self._ticks(run, part_s)
         self._lanes(level)
         self._events(run, found)
-        self._figure(shapes)
+        self._figure(shapes.select(held_at(level, shapes.time_s)))
         return found
 
     def _overviews(self, level: Block, band_um: float) -> None:
@@ -166,7 +168,7 @@ class Layer:
         told = [event for event in run.events if event.get("kind") not in {"why"}]
         if told:
             levels = ["ERROR" if event.get("kind") == "fault" else "INFO" for event in told]
-            texts = [event_text(event) for event in told]
+            texts = [f"mark: {e.get('text')}" if e.get("kind") == MARK else event_text(e) for e in told]
             times = np.array([event_time_s(event) for event in told])
             self._columns("/events", times, rr.TextLog.columns(text=texts, level=levels))
         if found:
@@ -193,13 +195,17 @@ class Layer:
         self._maps(shown, parameters)
 
     def _maps(self, shown: Shapes, parameters: Column) -> None:
-        """Height changes against the first cycle, on one scale, so that they may be played."""
+        """Height changes against the first cycle of the hold, on one scale, so that they may be played."""
         axis = (np.arange(_MAP_PX) + 0.5) * 2 / _MAP_PX - 1
         x, y = np.meshgrid(axis, -axis)
         inside = np.hypot(x, y) <= 1.0
         wanted = np.flatnonzero(_some(len(shown), MAPS_MOST))
         heights = parameters[wanted] @ height_basis(x[inside], y[inside])
         most = max(0.5, float(np.abs(heights).max()))
+        context = rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (1, "", (24, 24, 24, 255))])
+        self._stream.log(self._prefix + "/shape", context, static=True)
+        outside = rr.SegmentationImage((~inside).astype(np.uint8), opacity=1.0, draw_order=1.0)
+        self._stream.log(self._prefix + "/shape/map/outside", outside, static=True)
         for row, height in zip(wanted, heights, strict=True):
             picture = np.zeros((_MAP_PX, _MAP_PX), dtype=np.float32)
             picture[inside] = height

@@ -53,7 +53,7 @@ def review_command(options: ReviewOptions) -> int:
     if options.live:
         if len(runs) != 1:
             raise InputError("--live: one run at a time")
-        return viewer.live(runs[0].folder, ["--serve-web"] if options.web else [])
+        return viewer.live(runs[0].folder, options.web, options.port)
     with tempfile.TemporaryDirectory(prefix="membrane-review-") as folder:
         file = options.save or Path(folder) / "review.rrd"
         make_review(runs, options, file)

@@ -123,7 +123,7 @@ class Run:
 
     def shapes(self) -> Shapes:
         """Every measured figure of the run."""
-        tables = [read_file(path, None, self.notes) for path in column_files(self.folder, SHAPES)]
+        tables = (read_file(path, shapes.TABLE_COLUMNS, self.notes) for path in column_files(self.folder, SHAPES))
         found = [shapes.from_table(table) for table in tables if table is not None and table.num_rows]
         if not found:
             columns = [rrd_reader.read_shapes(path, self.notes) for path in rrd_reader.segments(self.folder)]

@@ -37,3 +37,12 @@ class Settled:
         if time_s.size:
             self._since_s = float(since_s[-1]) if hold[-1] else math.nan
         return np.asarray(settled)
+
+
+def held_at(level: Mapping[str, Column], time_s: Column) -> NDArray[np.bool_]:
+    """(n,) whether the window of a level that holds each time, and the one before, were in `hold`."""
+    if not level["time_s"].size:
+        return np.zeros(time_s.size, dtype=bool)
+    place = np.clip(np.searchsorted(level["time_s"], time_s, side="right") - 1, 0, None)
+    hold = level["state"] == State.HOLD
+    return np.asarray(hold[place] & hold[np.maximum(place - 1, 0)])

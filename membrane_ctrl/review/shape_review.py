@@ -106,7 +106,7 @@ def review_shapes(shapes: Shapes, held: NDArray[np.bool_], analysis_share: float
         return None
     area = _Area(analysis_share)
     parameters = good.parameters_um()
-    parameters = parameters - parameters[0]
+    parameters -= parameters[0].copy()
     sd_um = np.sqrt(np.maximum(_quadratic(area.basis, np.cov(parameters.T)), 0.0))
     x, y = (np.array([point[axis] for point in POINTS.values()]) for axis in (0, 1))
     points = parameters @ height_basis(x, y)

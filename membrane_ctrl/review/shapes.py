@@ -48,6 +48,8 @@ class Shapes:
 
     def select(self, wanted: NDArray[np.bool_]) -> Shapes:
         """The cycles for which `wanted` (n,) is true; the covariances stay all."""
+        if wanted.all():
+            return self  # a month of coefficients is 190 MB
         parts = {name: getattr(self, name)[wanted] for name in (*_NUMBERS, "coeffs_um", "verdict")}
         return Shapes(**parts, covariance_time_s=self.covariance_time_s, covariance_um2=self.covariance_um2)
 
@@ -90,19 +92,22 @@ def from_estimates(estimates: Sequence[ShapeEstimate]) -> Shapes:
     )
 
 
+# Columns of the recorder's table that are read.
+TABLE_COLUMNS = (*_NUMBERS, "verdict", "coeffs_um", "covariance_um2")
+
+
 def from_table(table: pa.Table) -> Shapes:
     """Shapes of the recorder's table, whatever columns it has."""
     count = table.num_rows
-    covariances = _lists(table, "covariance_um2")
-    kept = [(place, values) for place, values in enumerate(covariances) if len(values) == 36 * 36]
+    kept, covariances = _covariances(table)
     time_s = _numbers(table, "time_s")
     coeffs = table.column("coeffs_um").combine_chunks() if "coeffs_um" in table.column_names else None
     return Shapes(
         **{name: _numbers(table, name) for name in _NUMBERS},
         coeffs_um=np.full((count, 36), np.nan) if coeffs is None else _matrix(coeffs, count),
         verdict=np.array(table.column("verdict").to_pylist() if "verdict" in table.column_names else ["ok"] * count),
-        covariance_time_s=time_s[[place for place, _ in kept]],
-        covariance_um2=np.array([values for _, values in kept], dtype=np.float64).reshape(-1, 36, 36),
+        covariance_time_s=time_s[kept],
+        covariance_um2=covariances,
     )
 
 
@@ -137,7 +142,12 @@ def _matrix(cells: pa.Array, count: int) -> Column:
     return np.asarray(cells.flatten().to_numpy(zero_copy_only=False), dtype=np.float64).reshape(count, 36)
 
 
-def _lists(table: pa.Table, name: str) -> list[NDArray[np.float32]]:
-    if name not in table.column_names:
-        return []
-    return [np.asarray(cell.values.to_numpy()) for chunk in table.column(name).chunks for cell in chunk]
+def _covariances(table: pa.Table) -> tuple[NDArray[np.int64], Column]:
+    """Rows that have one, and the (k, 36, 36) matrices."""
+    if "covariance_um2" not in table.column_names:
+        return np.empty(0, dtype=np.int64), np.empty((0, 36, 36))
+    cells = table.column("covariance_um2").combine_chunks()
+    lengths = np.diff(np.asarray(cells.offsets))
+    values = np.asarray(cells.flatten(), dtype=np.float64)
+    whole = lengths == 36 * 36
+    return np.flatnonzero(whole), values[np.repeat(whole, lengths)].reshape(-1, 36, 36)

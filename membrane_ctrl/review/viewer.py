@@ -28,8 +28,7 @@ def viewer_command(*arguments: str) -> list[str]:
 
 def show(files: list[Path]) -> int:
     """Open files on this machine's screen; returns when the window is closed."""
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise DeviceError("no screen here: use --web and open the address in a browser, or --screenshot FILE")
+    _require_screen()
     paths = [str(path) for path in files]
     return _run(viewer_command("--bind", "127.0.0.1", "--port", str(free_port()), *paths))
 
@@ -47,8 +46,7 @@ def serve(files: list[Path], bind: str, port: int) -> int:
     port = port or free_port()
     data_port = free_port()
     host = "127.0.0.1" if bind == "127.0.0.1" else socket.gethostname()
-    address = f"http://{host}:{port}/?url=rerun%2Bhttp%3A%2F%2F{host}%3A{data_port}%2Fproxy"
-    print(f"open {address}", file=sys.stderr)
+    print(f"open {_page(host, port, data_port)}", file=sys.stderr)
     if bind == "127.0.0.1":
         tunnel = f"ssh -L {port}:127.0.0.1:{port} -L {data_port}:127.0.0.1:{data_port} {socket.gethostname()}"
         print(f"from another machine first: {tunnel}", file=sys.stderr)
@@ -56,21 +54,49 @@ def serve(files: list[Path], bind: str, port: int) -> int:
     return _run(viewer_command(*options, *(str(path) for path in files)))
 
 
-def live(folder: Path, options: list[str]) -> int:
-    """Show a run that is still going, by reading behind its recorder: the run does not know that it is watched."""
-    command = viewer_command("--bind", "127.0.0.1", "--port", str(free_port()), *options, "-")
+def live(folder: Path, web: bool, port: int = 0) -> int:
+    """Show a run that is still going, by reading behind its recorder: the run does not know that it is watched.
+
+    The segments are piped into a server of their own, which the viewer (or, with `web`, a browser) connects to: a
+    viewer that reads its standard input itself draws nothing before the input ends.
+    """
+    data_port, port = free_port(), port or free_port()
+    kind = ["--serve-web", "--web-viewer-port", str(port)] if web else ["--serve-grpc"]
+    server = viewer_command(*kind, "--bind", "127.0.0.1", "--port", str(data_port), "-")
+    proxy = f"rerun+http://127.0.0.1:{data_port}/proxy"
+    if web:
+        print(f"open {_page('127.0.0.1', port, data_port)}", file=sys.stderr)
+    else:
+        _require_screen()
     try:
-        with subprocess.Popen(command, stdin=subprocess.PIPE, env=_environment()) as viewer:
-            assert viewer.stdin is not None
+        with subprocess.Popen(server, stdin=subprocess.PIPE, env=_environment()) as served:
+            watched = served if web else _connected(proxy)
+            assert served.stdin is not None
             try:
-                follow(folder, viewer.stdin, lambda: viewer.poll() is None)
+                follow(folder, served.stdin, lambda: watched.poll() is None)
+                watched.wait()
             except (BrokenPipeError, KeyboardInterrupt):
                 pass
             finally:
-                viewer.terminate()
+                watched.terminate()
+                served.terminate()
     except OSError as error:
         raise DeviceError(f"the viewer did not start: {error}") from None
     return 0
+
+
+def _connected(proxy: str) -> subprocess.Popen[bytes]:
+    command = viewer_command("--bind", "127.0.0.1", "--port", str(free_port()), "--connect", proxy)
+    return subprocess.Popen(command, env=_environment())
+
+
+def _require_screen() -> None:
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise DeviceError("no screen here: use --web and open the address in a browser, or --screenshot FILE")
+
+
+def _page(host: str, port: int, data_port: int) -> str:
+    return f"http://{host}:{port}/?url=rerun%2Bhttp%3A%2F%2F{host}%3A{data_port}%2Fproxy"
 
 
 def follow(

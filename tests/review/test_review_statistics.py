@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import allantools
 import numpy as np
 import pytest
 from scipy import signal
@@ -11,6 +10,7 @@ from membrane_ctrl.review.allan import allan_deviation
 from membrane_ctrl.review.drift import slope
 from membrane_ctrl.review.psd import power_spectrum
 
+allantools = pytest.importorskip("allantools", reason="the reference for the Allan deviation is not installed")
 RATE_HZ = 10.0
 
 
