@@ -49,6 +49,8 @@ class CalibrateOptions:
         Of a set's mean reading.
     as_json : bool
         Report as JSON.
+    pictures : bool
+        Draw what is left of the screen points, beside the geometry.
     """
 
     folders: Sequence[Path]
@@ -57,6 +59,7 @@ class CalibrateOptions:
     free: Sequence[str]
     laser_sigma_um: float
     as_json: bool
+    pictures: bool = True
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,8 @@ def calibrate_command(options: CalibrateOptions) -> int:
     timing = {"read": read - begin, "solve": time.perf_counter() - read}
     usable = solution is not None and not any(finding.fatal for finding in findings)
     written = _write(options.out, solution, problem, bundle, findings) if usable and solution is not None else ""
+    if solution is not None and options.pictures:
+        _draw(options.out.with_name(f"{options.out.stem}-residuals.png"), solution)
     report = report_of(solution, findings, bundle.optics.mirror.analysis_radius_mm)
     report |= {"out": str(options.out) if usable else None, "hash": written or None, "timing_s": timing}
     print(json.dumps(report) if options.as_json else "\n".join(lines_of(report)))
@@ -195,6 +200,17 @@ def _write(path: Path, solution: Solution, problem: Problem, bundle: Bundle, fin
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
     return str(tables["calibration"]["hash"])
+
+
+def _draw(path: Path, solution: Solution) -> None:
+    """The residuals' maps, also of a solution that is refused: there they are wanted most."""
+    from membrane_ctrl.calibrate_pictures import draw_residuals
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draw_residuals(path, solution)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
 def _progress() -> Any:

@@ -352,12 +352,14 @@ def calibrate(
         typer.Option(metavar="NAME[=SIGMA]", help="Also calibrate this, as bow_mm; sigma 0 holds it; repeatable."),
     ] = None,
     laser_sigma_um: Annotated[float, typer.Option(min=0.001, help="Of a set's mean reading.")] = 1.0,
+    pictures: Annotated[bool, typer.Option(help="Draw the residuals beside the geometry.")] = True,
     json: JsonOption = False,
 ) -> int:
     """Calibrate the optics: one geometry with its covariance, from sets at several pressures."""
     from membrane_ctrl.calibrate_command import CalibrateOptions, calibrate_command
 
-    return calibrate_command(CalibrateOptions(sets, geometry, out, tuple(free or ()), laser_sigma_um, json))
+    options = CalibrateOptions(sets, geometry, out, tuple(free or ()), laser_sigma_um, json, pictures)
+    return calibrate_command(options)
 
 
 def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> Config:

@@ -65,6 +65,7 @@ def test_from_folders_to_a_better_figure(
     report = json.loads(capsys.readouterr().out)
     assert report["verdict"] == "ok"
     assert report["findings"] == []
+    assert (tmp_path / "geometry-residuals.png").stat().st_size > 10_000
     assert report["hash"] == tomllib.loads(out.read_text())["calibration"]["hash"]
     found = {row["name"]: row for row in report["parameters"]}
     for name, true in (("a_mm", 2.0), ("alpha_deg", 0.3), ("screen_turn_x_deg", 0.5), ("screen_turn_y_deg", -0.5)):
