@@ -155,8 +155,11 @@ async def _numbers(
     number = 0
     while audit.transactions < transactions:
         unit, address = place = dice.choice(list(possible))
-        if not devices[unit].connected:
-            await devices[unit].connect()
+        while not devices[unit].connected:
+            try:
+                await devices[unit].connect()
+            except LinkDownError:  # the time-out is short: on a busy machine a connection may take longer
+                await asyncio.sleep(TCP_TIMEOUT_S)
         number += 1
         if write := dice.random() < 0.5:
             possible[place].add(number)
