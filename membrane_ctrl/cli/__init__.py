@@ -1,0 +1,47 @@
+"""The command line: one thin function a command; errors end in one line and an exit code (INTERFACES section 4)."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from membrane_ctrl import __version__
+from membrane_ctrl.cli import calibrating, devices, holding, optics, records
+from membrane_ctrl.errors import CommandError, Exit
+from membrane_ctrl.review.cli import add_commands as add_review_commands
+from membrane_ctrl.tune.cli import app as tune_app
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command and return its exit code; every expected failure is one line on stderr."""
+    try:
+        result = app(list(arguments), prog_name="membrane-ctrl", standalone_mode=False)
+    except CommandError as error:
+        print(f"membrane-ctrl: {error}", file=sys.stderr)
+        return error.exit
+    except typer.TyperException as error:
+        print(f"membrane-ctrl: {error.format_message()} (see --help)", file=sys.stderr)
+        return Exit.BAD_INPUT
+    except (KeyboardInterrupt, typer.Abort):
+        print("membrane-ctrl: interrupted", file=sys.stderr)
+        return Exit.INTERRUPTED
+    return int(result or 0)
+
+
+@app.callback(invoke_without_command=True)
+def top(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    """Hold a pneumatic membrane mirror to the micrometre and measure its figure while it is held."""
+    if version:
+        print(__version__)
+        raise typer.Exit
+
+
+for _family in (holding, devices, optics, calibrating, records):
+    _family.add_commands(app)
+app.add_typer(tune_app, name="tune")
+add_review_commands(app)

@@ -1,0 +1,44 @@
+"""The commands that talk to devices without holding a mirror."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from membrane_ctrl.cli.options import ConfigArgument, JsonOption, configured
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add `check`, `devices`, `conformance`."""
+    app.command()(check)
+    app.command()(devices)
+    app.command()(conformance)
+
+
+def check(
+    config: ConfigArgument,
+    json: JsonOption = False,
+) -> int:
+    """Validate a configuration, probe the devices it names, and say what would happen."""
+    from membrane_ctrl.check import check_config
+
+    return check_config(configured(config), str(config), json)
+
+
+def devices(json: JsonOption = False) -> int:
+    """List serial ports, cameras and displays, with the text to paste into a configuration."""
+    from membrane_ctrl.devices import list_devices
+
+    return list_devices(json)
+
+
+def conformance(
+    url: Annotated[str, typer.Argument(help="The board: tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200.")],
+    unit_id: Annotated[int, typer.Option(min=1, max=247, help="Modbus unit.")] = 1,
+    json: JsonOption = False,
+) -> int:
+    """Test whether a board does what a pump board must do. The pump runs at a few per cent: vent the mirror first."""
+    from membrane_ctrl.conformance import run_conformance
+
+    return run_conformance(url, unit_id, json)

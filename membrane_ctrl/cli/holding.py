@@ -1,0 +1,147 @@
+"""The commands that hold a mirror, or talk to a hold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, configured
+from membrane_ctrl.config import Config
+from membrane_ctrl.durations import parse_duration_s
+from membrane_ctrl.errors import InputError
+
+alarm_app = typer.Typer(no_args_is_help=True)
+
+FlatOption = Annotated[
+    bool, typer.Option("--from-flat", help="The simulated mirror starts flat: a fill takes two hours.")
+]
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add `hold`, `twin`, `safe`, `ctl`, `alarm`."""
+    app.command()(hold)
+    app.command()(twin)
+    app.command()(safe)
+    app.command(context_settings={"ignore_unknown_options": True})(ctl)  # a negative setpoint is no option
+    app.add_typer(alarm_app, name="alarm")
+
+
+def hold(
+    config: ConfigOption = None,
+    twin: Annotated[bool, typer.Option("--twin", help="Hold the simulated bench instead of devices.")] = False,
+    devices: Annotated[
+        Path | None,
+        typer.Option(help="With --twin: emulate the instruments of this configuration's [devices], in bytes."),
+    ] = None,
+    duration: Annotated[str | None, typer.Option(help="Stop after this long, e.g. 90s, 3m, 2h30m.")] = None,
+    name: Annotated[str, typer.Option(help="Name of the run folder.")] = "hold",
+    logs: Annotated[Path | None, typer.Option(help="Where run folders go.")] = None,
+    clear_faults: Annotated[
+        bool,
+        typer.Option("--clear-faults", help="Clear what board or an earlier run has latched, once you know why."),
+    ] = False,
+    standby: Annotated[bool, typer.Option("--standby", help="Wait for `ctl hold`.")] = False,
+    from_flat: FlatOption = False,
+    json: JsonOption = False,
+) -> int:
+    """Hold the mirror until told to stop: the main job."""
+    from membrane_ctrl.hold import HoldOptions, hold_mirror
+
+    options = HoldOptions(
+        config=_started(_with_devices(config, devices, twin), from_flat),
+        source=str(config or devices or "the defaults"),
+        twin=twin,
+        duration_s=None if duration is None else parse_duration_s(duration),
+        name=name,
+        logs_dir=logs,
+        clear_faults=clear_faults,
+        json=json,
+        standby=standby,
+        lab=devices is not None,
+    )
+    return hold_mirror(options)
+
+
+def twin(
+    config: ConfigOption = None,
+    speed: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Simulated seconds a second.")] = 1.0,
+    from_flat: FlatOption = False,
+) -> int:
+    """Serve the simulated bench on its real protocol, for any client, until interrupted."""
+    from membrane_ctrl.serve_twin import serve_twin
+
+    return serve_twin(_started(configured(config), from_flat), speed)
+
+
+def safe(config: ConfigArgument) -> int:
+    """Stop the pump of the devices that a configuration names, whatever runs or ran; the vent stays as it is."""
+    from membrane_ctrl.safe_state import make_safe
+
+    return make_safe(configured(config), str(config))
+
+
+def ctl(
+    action: Annotated[
+        str,
+        typer.Argument(
+            metavar="ACTION",
+            help="status, watch, setpoint UM, hold, pause, resume, manual FLOW, gains FILE, keep, shape on|off, "
+            'mark "text", ack, lower, vent, stop, release, quiet.',
+        ),
+    ],
+    argument: Annotated[str | None, typer.Argument(metavar="[VALUE]")] = None,
+    why: Annotated[str, typer.Option(help="Recorded with the command.")] = "",
+    take_over: Annotated[bool, typer.Option("--take-over", help="Take the command from who has it.")] = False,
+    every: Annotated[str, typer.Option(help="watch: a line this often.")] = "1s",
+    trial: Annotated[str, typer.Option(help="gains: back to the old ones after this, unless `keep` comes.")] = "",
+    run: Annotated[Path | None, typer.Option(help="The run's folder.")] = None,
+    socket: Annotated[Path | None, typer.Option(help="The hold's socket; logs/control.sock by default.")] = None,
+    tls: Annotated[str, typer.Option(metavar="HOST:PORT", help="By TCP, with the certificate below.")] = "",
+    certificate: Annotated[Path | None, typer.Option(help="With --tls: the own certificate.")] = None,
+    key: Annotated[Path | None, typer.Option(help="With --tls: its key.")] = None,
+    authority: Annotated[Path | None, typer.Option(help="With --tls: who signed the hold's certificate.")] = None,
+    json: JsonOption = False,
+) -> int:
+    """Talk to a running hold: ask how it is, or tell it what to do."""
+    from membrane_ctrl.ctl import CtlOptions, Where
+    from membrane_ctrl.ctl import ctl as ask
+
+    where = Where(socket, run, tls, certificate, key, authority)
+    return ask(CtlOptions(action, argument, why, take_over, every, trial, json, where))
+
+
+@alarm_app.callback()
+def alarm() -> None:
+    """Who is told when nobody looks."""
+
+
+@alarm_app.command("test")
+def alarm_test(
+    config: ConfigOption = None,
+    escalated: Annotated[bool, typer.Option("--escalated", help="Also to those of the escalation.")] = False,
+    json: JsonOption = False,
+) -> int:
+    """Send a test notice to all whom an alarm would reach."""
+    from membrane_ctrl.alarms.command import send_test_alarm
+
+    return send_test_alarm(configured(config), str(config or "the defaults"), escalated, json)
+
+
+def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> Config:
+    """The configuration, its [devices] from the file of `--devices`; that file alone is a configuration, too."""
+    if devices is None:
+        return configured(config)
+    lab = configured(devices)
+    if not twin:
+        raise InputError("--devices: only with --twin; without it --config names the devices")
+    if lab.devices is None:
+        raise InputError(f"{devices}: devices: missing; there is nothing to emulate")
+    return lab if config is None else configured(config).model_copy(update={"devices": lab.devices})
+
+
+def _started(config: Config, from_flat: bool) -> Config:
+    if not from_flat:
+        return config
+    return config.model_copy(update={"twin": config.twin.model_copy(update={"from_flat": True})})

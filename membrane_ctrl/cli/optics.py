@@ -1,0 +1,132 @@
+"""The commands over capture sets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from membrane_ctrl.cli.options import ConfigOption, JsonOption, SeedOption, SetArgument, TrialsOption, configured
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add `measure`, `uncertainty`, `stability`, `simulate`."""
+    app.command()(measure)
+    app.command()(uncertainty)
+    app.command()(stability)
+    app.command()(simulate)
+
+
+def measure(
+    capture_set: SetArgument,
+    geometry: Annotated[Path | None, typer.Option(help="Geometry to use instead of the set's own.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Where the result goes; SET/result by default.")] = None,
+    pictures: Annotated[bool, typer.Option(help="Draw pictures beside the result.")] = True,
+    rerun: Annotated[bool, typer.Option("--rerun", help="Write measurement.rrd beside the result.")] = False,
+    json: JsonOption = False,
+) -> int:
+    """Measure one capture set: height, Zernike coefficients, quality."""
+    from membrane_ctrl.measure import measure_command
+
+    return measure_command(capture_set, geometry, out, json, pictures, rerun)
+
+
+def uncertainty(
+    capture_set: SetArgument,
+    against: Annotated[
+        Path | None, typer.Option(metavar="SET", help="Of the change since this set, instead of the height.")
+    ] = None,
+    trials: TrialsOption = 100,
+    seed: SeedOption = 1,
+    geometry: Annotated[
+        Path | None, typer.Option(help="Geometry to use instead of the set's own, with its covariance.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes; by default as many as the trials are worth.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Run on this Dask scheduler, e.g. tcp://host:8786.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Where the result goes; SET/uncertainty by default.")] = None,
+    json: JsonOption = False,
+) -> int:
+    """Monte Carlo over geometry and pixel noise: RMSE of the height, or of the change between two sets."""
+    from membrane_ctrl.uncertainty_command import UncertaintyOptions, uncertainty_command
+
+    options = UncertaintyOptions(
+        folder=capture_set,
+        against=against,
+        geometry=geometry,
+        trials=trials,
+        seed=seed,
+        workers=workers,
+        scheduler=scheduler,
+        out=out,
+        as_json=json,
+    )
+    return uncertainty_command(options)
+
+
+def stability(
+    run_of_sets: Annotated[Path, typer.Argument(metavar="RUN_OF_SETS", help="Folder of capture sets.")],
+    out: Annotated[Path | None, typer.Option(help="Where the result goes; RUN_OF_SETS/stability by default.")] = None,
+    point: Annotated[
+        list[str] | None, typer.Option(help="NAME=X,Y in mm: a point to follow, instead of A, B and C; repeatable.")
+    ] = None,
+    trials: Annotated[int, typer.Option(min=2, help="Monte Carlo trials, for every set.")] = 100,
+    seed: SeedOption = 1,
+    json: JsonOption = False,
+) -> int:
+    """Stability of a run of sets: standard deviation, points in time, pairs with their uncertainty."""
+    from membrane_ctrl.stability_command import StabilityOptions, stability_command
+
+    options = StabilityOptions(run_of_sets, out, tuple(point or ()), trials, seed, json)
+    return stability_command(options)
+
+
+def simulate(
+    set_dir: Annotated[Path, typer.Argument(metavar="SET_DIR", help="New folder for the set, or for the run.")],
+    config: ConfigOption = None,
+    sag_mm: Annotated[float, typer.Option(help="Depth of the bowl.")] = 37.1,
+    figure: Annotated[bool, typer.Option(help="The astigmatism, coma and so on of a mounted film.")] = True,
+    steps: Annotated[int | None, typer.Option(min=3, max=64, help="Phase steps.")] = None,
+    bits: Annotated[int | None, typer.Option(min=8, max=16, help="Depth of the frames.")] = None,
+    noise_adu: Annotated[float | None, typer.Option(min=0.0, help="Noise of a pixel.")] = None,
+    shrink: Annotated[int, typer.Option(min=1, max=16, help="Larger pixels, fewer of them.")] = 1,
+    gamma: Annotated[float, typer.Option(help="Of the display.")] = 1.0,
+    motion_um: Annotated[float, typer.Option(help="Amplitude of the film's motion.")] = 0.0,
+    motion_hz: Annotated[float, typer.Option(help="Its frequency.")] = 0.3,
+    drift_um_per_s: Annotated[float, typer.Option(help="Drift of the film.")] = 0.0,
+    laser_noise_um: Annotated[float, typer.Option(min=0.0, help="Noise of the laser's readings.")] = 0.0,
+    exact: Annotated[bool, typer.Option("--exact", help="Trace every pixel: slow, true to the last bit.")] = False,
+    seed: SeedOption = 1,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="kind:frame[:amount], as stale:x_sin_2; repeatable.")
+    ] = None,
+    sets: Annotated[int, typer.Option(min=1, help="More than one: a run, 0000 full, the others fringes.")] = 1,
+    interval_s: Annotated[float, typer.Option(min=0.0, help="From set to set of a run.")] = 4.0,
+) -> int:
+    """Write a capture set, or a run of sets, with its truth beside it."""
+    from membrane_ctrl.simulate_command import SimulateOptions, simulate_command
+    from membrane_ctrl.twin.simulation_spec import Motion
+
+    options = SimulateOptions(
+        folder=set_dir,
+        config=configured(config),
+        sag_mm=sag_mm,
+        figure=figure,
+        steps=steps,
+        bits=bits,
+        noise_adu=noise_adu,
+        shrink=shrink,
+        gamma=gamma,
+        motion=Motion(drift_um_per_s=drift_um_per_s, amplitude_um=motion_um, frequency_hz=motion_hz),
+        laser_noise_um=laser_noise_um,
+        exact=exact,
+        seed=seed,
+        faults=tuple(fault or ()),
+        sets=sets,
+        interval_s=interval_s,
+    )
+    return simulate_command(options)

@@ -1,0 +1,48 @@
+"""The commands over recorded inputs: run them again, mend them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from membrane_ctrl.cli.options import JsonOption, RunArgument
+from membrane_ctrl.durations import parse_duration_s
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add `replay`, `repair`."""
+    app.command()(replay)
+    app.command()(repair)
+
+
+def replay(
+    run_dir: RunArgument,
+    start: Annotated[
+        str | None, typer.Option("--from", help="Compare from this time of the run on, e.g. 3m.")
+    ] = None,
+    end: Annotated[str | None, typer.Option("--to", help="End at this time of the run.")] = None,
+    to_test: Annotated[str | None, typer.Option(help="Make a regression test of it, tests/incidents/NAME.")] = None,
+    json: JsonOption = False,
+) -> int:
+    """Run a run's recorded inputs through today's control code and say what is not the same (exit 3)."""
+    import math
+
+    from membrane_ctrl.replay_command import replay_command
+
+    from_s = 0.0 if start is None else parse_duration_s(start)
+    to_s = math.inf if end is None else parse_duration_s(end)
+    return replay_command(run_dir, from_s, to_s, to_test, json)
+
+
+def repair(
+    run_dir: RunArgument,
+    in_place: Annotated[
+        bool, typer.Option("--in-place", help="Put what was repaired in place of the torn files.")
+    ] = False,
+    json: JsonOption = False,
+) -> int:
+    """Mend what a crash left of a run: torn segments, a torn event log, a missing summary."""
+    from membrane_ctrl.repair import repair_command
+
+    return repair_command(run_dir, in_place, json)
