@@ -1,4 +1,4 @@
-"""Run benchmarks, print a table each, and put the figures with the machine's description into a JSON file.
+"""Run benchmarks, print a table each, and put the figures with the machine's description into a JSON file and a page.
 
 Each benchmark's entry carries its own date and machine, so that a part can be measured again by itself.
 """
@@ -16,6 +16,7 @@ from typing import Any
 from rich.console import Console
 
 from benchmarks.figures import as_json, machine, show
+from benchmarks.page import page
 
 # those that need a quiet machine first, those that take long last
 NAMES = (
@@ -35,6 +36,7 @@ NAMES = (
     "soak",
 )
 OUT = Path("docs/bench.json")
+PAGE = Path("docs/bench.md")
 
 
 def main(names: list[str]) -> int:
@@ -52,7 +54,7 @@ def main(names: list[str]) -> int:
     figures = importlib.import_module(f"benchmarks.{name}").run()
     show(name, figures)
     _record(name, {"date_utc": f"{datetime.now(UTC):%Y-%m-%d}", "machine": about, "figures": as_json(figures)})
-    print(f"written to {OUT}")
+    print(f"written to {OUT} and {PAGE}")
     return int(any(figure.met is False for figure in figures))
 
 
@@ -61,6 +63,7 @@ def _record(name: str, entry: dict[str, Any]) -> None:
     report[name] = entry
     ordered = {known: report[known] for known in NAMES if known in report}
     OUT.write_text(json.dumps(ordered, indent=1) + "\n", encoding="utf-8")
+    PAGE.write_text(page(ordered), encoding="utf-8")
 
 
 if __name__ == "__main__":
