@@ -7,8 +7,8 @@ from typing import Any
 HEAD = """# Measured figures
 
 Made by `make bench` (or one part by `python -m benchmarks NAME`) from [bench.json](bench.json); not written by hand.
-Each figure stands beside what it is compared with, measured in the same run; *ratio* is value over reference. A target
-that was missed says so. `load` is that of the machine when the part began: other work was running where it is above 1.
+Each figure stands beside what it is compared with, measured in the same run; *ratio* is value over reference.
+A target that was missed says so. `load` is that of the machine when the part began.
 """
 COLUMNS = ("figure", "value", "unit", "reference", "ratio", "target", "met")
 
@@ -39,7 +39,7 @@ def _cells(figure: dict[str, Any]) -> list[str]:
     if figure["reference_value"] is not None:
         reference = f"{reference} {figure['reference_value']:.4g}".strip()
     return [
-        figure["name"],
+        figure["name"].replace("|", "\\|"),
         f"{figure['value']:.4g}",
         figure["unit"],
         reference,
