@@ -26,7 +26,8 @@ types: $(STAMP)
 	$(BIN)/mypy
 
 unit: $(STAMP)
-	$(BIN)/pytest -m "not campaign"
+	$(BIN)/pytest -m "not campaign and not real_time" -n 2 --dist loadfile
+	$(BIN)/pytest -m "real_time and not campaign"
 
 bench: $(STAMP)  ## measured figures, each against a reference of the same run
 	$(BIN)/python -m benchmarks

@@ -25,6 +25,8 @@ from membrane_ctrl.metrology.patterns import fringe_sequence
 from membrane_ctrl.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.twin.truth import TRUTH_BYTES, Truth
 
+pytestmark = pytest.mark.real_time
+
 PATIENCE_S = 60.0  # the kernels may have to be compiled
 CONFIG = Config(
     shape=ShapeConfig(period_s=0.3, frame_interval_s=0.0),

@@ -30,6 +30,8 @@ from membrane_ctrl.telemetry import ROW_BYTES
 from membrane_ctrl.twin.film_shape import typical_film
 from membrane_ctrl.twin.render import OpticsRenderer
 
+pytestmark = pytest.mark.real_time
+
 PATIENCE_S = 60.0  # the kernels may have to be compiled
 SCREEN = {"width_px": 420, "height_px": 300, "pixel_mm": 1.6}
 SCREEN_TABLE = "[devices.screen]\nwidth_px = 420\nheight_px = 300\npixel_mm = 1.6\n"

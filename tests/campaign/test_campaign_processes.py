@@ -15,6 +15,8 @@ from campaign_bench import PATIENCE_S, WATCHDOG_S, Run, WatchedPlant, make_plant
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.latched import NAME, LatchedFile
 
+pytestmark = pytest.mark.real_time
+
 
 def start_again(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
     arguments = ("hold", "--config", str(folder / "lab.toml"), "--logs", str(folder / "logs"), "--duration", "1s")

@@ -16,6 +16,8 @@ import pytest
 
 from membrane_ctrl.cli import run
 
+pytestmark = pytest.mark.real_time
+
 COMMAND = [sys.executable, "-m", "membrane_ctrl"]
 PATIENCE_S = 60.0
 

@@ -19,6 +19,8 @@ from rerun.chunk import RrdReader
 
 from firmware_iface.register_map import default_map
 
+pytestmark = pytest.mark.real_time
+
 COMMAND = [sys.executable, "-m", "membrane_ctrl"]
 PATIENCE_S = 60.0
 SMALL_CAMERA = "width_px = 306\nheight_px = 256\npixel_um = 27.6\n"

@@ -7,6 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.real_time
+
 EXAMPLE = Path(__file__).parents[2] / "examples" / "all-serial.toml"
 HOLD = [sys.executable, "-m", "membrane_ctrl", "hold", "--devices", str(EXAMPLE)]
 

@@ -16,6 +16,8 @@ import pytest
 from membrane_ctrl.cli import run
 from membrane_ctrl.errors import Exit
 
+pytestmark = pytest.mark.real_time
+
 PATIENCE_S = 40.0
 
 

@@ -18,6 +18,8 @@ from membrane_ctrl.tune.live_hold import LiveHold
 from tuning.hold_link import HoldError
 from tuning.hold_rig import HoldRig
 
+pytestmark = pytest.mark.real_time
+
 CONFIG = '[twin]\nport = 0\nscenario = "quiet"\nstart_error_um = -3.0\n[shape]\nenabled = false\n'
 PATIENCE_S = 60.0
 

@@ -8,8 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.latched import NAME
+
+pytestmark = pytest.mark.real_time
 
 CONFIG = "[twin]\nport = 0\n[shape]\nenabled = false\n[states]\nlatch_twin_faults = true\n"
 

@@ -19,6 +19,8 @@ from firmware_iface.emulators.gige_camera import GigeCameraEmulator
 from firmware_iface.links import aravis
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 
+pytestmark = pytest.mark.real_time
+
 WIDTH_PX, HEIGHT_PX = 306, 256
 SETTINGS = AravisSettings("127.0.0.1", WIDTH_PX, HEIGHT_PX, exposure_ms=2.0, packet_bytes=8000, timeout_s=0.3)
 

@@ -33,6 +33,8 @@ from membrane_ctrl.recording.run_folder import create_run_folder
 from membrane_ctrl.recording.streams import STREAMS
 from membrane_ctrl.telemetry import ROW_BYTES
 
+pytestmark = pytest.mark.real_time
+
 SPAWN = multiprocessing.get_context("spawn")
 DEADLINE_S = 30.0
 

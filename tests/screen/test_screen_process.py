@@ -22,6 +22,8 @@ from membrane_ctrl.ipc.ring import RingWriter, ring
 from membrane_ctrl.screen.process import ScreenSpec, screen_main
 from membrane_ctrl.telemetry import ROW_BYTES
 
+pytestmark = pytest.mark.real_time
+
 PATIENCE_S = 20.0
 
 

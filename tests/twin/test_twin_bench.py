@@ -24,6 +24,8 @@ from membrane_ctrl.twin.bench import BenchReport, BenchSpec, LiveBench, serve
 from membrane_ctrl.twin.events import AmbientChange
 from membrane_ctrl.twin.truth import TRUTH_BYTES, Truth
 
+pytestmark = pytest.mark.real_time
+
 SPAWN = multiprocessing.get_context("spawn")
 START_S = 30.0  # a loaded machine imports slowly
 
