@@ -90,7 +90,7 @@ class Crew:
     def start(self, stack: ExitStack) -> None:
         """Start all; the stack ends whatever `take_down` has not."""
         for post in self._posts:
-            post.start()
+            post.start(self._clock.now())
         self._screen.start()
         stack.callback(self._stop)
 
@@ -106,8 +106,10 @@ class Crew:
         """Stop the acquisition, then let recorder and screen finish by themselves: the "end" event is their sign."""
         if self._acquisition is not None:
             self._acquisition.child.stop(_CHILD_STOPS_S)
-        self._recorder.child.join(_RECORDER_CLOSES_S)
-        if self._recorder.child.exit_code not in (0, None):  # it died near the end: another writes the end down
+        recorder = self._recorder.child
+        if not recorder.join(_RECORDER_CLOSES_S):
+            recorder.stop(0.0)  # stopped, or its disk takes nothing any more
+        if recorder.exit_code != 0:  # it died near the end: another writes the end down
             self._recorder.replace(self._clock.now())
             self._recorder.child.join(_RECORDER_CLOSES_S)
         self._screen.join(_CHILD_STOPS_S)

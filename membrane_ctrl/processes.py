@@ -58,6 +58,10 @@ class Child:
         self._process.join(timeout_s)
         return not self.alive
 
+    def kill(self) -> None:
+        """SIGKILL, which a stopped process obeys as well; does not wait for its end."""
+        self._process.kill()
+
     def stop(self, timeout_s: float) -> None:
         """SIGTERM, and SIGKILL if that does not end it in time."""
         if self._process.pid is None:

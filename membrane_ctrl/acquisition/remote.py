@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import os
 import select
+import time
 from multiprocessing.connection import Connection
 from typing import Literal
+
+from membrane_ctrl.child_report import alive
 
 AcquisitionState = Literal["preparing", "running", "paused", "retrying", "failed", "stopped"]
 
 _PARENT_CHECK_S = 0.2  # how soon a dead parent is noticed
+_ALIVE_EVERY_S = 1.0
+# Between two looks at the line: one exposure (up to 10 s), one reconstruction, a camera that is opened again
+_STEP_S = 60.0
+# Compiling kernels on a slow machine, and the self-test of a real screen and camera, do not look at it at all
+_PREPARING_S = 900.0
 
 
 class Remote:
@@ -33,6 +41,8 @@ class Remote:
         self._parent_pid = parent_pid
         self._full = False
         self._said = ("", "")
+        self._step_s = _PREPARING_S
+        self._alive_due_s = 0.0
         self.stop = False
         self.paused = False
 
@@ -41,6 +51,7 @@ class Remote:
         if os.getppid() != self._parent_pid:
             self.stop = True
             return
+        self._say_alive()
         try:
             while self._control.poll(min(timeout_s, _PARENT_CHECK_S)):
                 self._obey(self._control.recv())
@@ -70,10 +81,23 @@ class Remote:
         if (state, message) == self._said:
             return
         self._said = (state, message)
-        status = {"kind": "acquisition", "state": state, "message": message, **details}
+        self._send({"kind": "acquisition", "state": state, "message": message, **details})
+
+    def prepared(self) -> None:
+        """From now on the line is looked at between any two exposures."""
+        self._step_s = _STEP_S
+        self._alive_due_s = 0.0
+        self._say_alive()
+
+    def _say_alive(self) -> None:
+        if time.monotonic() >= self._alive_due_s:
+            self._alive_due_s = time.monotonic() + _ALIVE_EVERY_S
+            self._send(alive(self._step_s))
+
+    def _send(self, event: dict[str, object]) -> None:
         try:
             if select.select([], [self._control.fileno()], [], 0)[1]:
-                self._control.send(status)
+                self._control.send(event)
         except OSError:
             self.stop = True
 

@@ -55,6 +55,7 @@ def run(spec: AcquisitionSpec, remote: Remote) -> None:
     LinkError
         If no camera is configured, or its patterns do not fit on the screen.
     """
+    remote.listen()  # the first word, which promises the next one for when all this is over
     remote.report("preparing", "tracing the first picture, compiling what is not compiled yet")
     config, clock = spec.config, WaitingClock(spec.clock)
     pattern = config.optics.pattern
@@ -87,6 +88,7 @@ def run(spec: AcquisitionSpec, remote: Remote) -> None:
             if raw is not None:
                 raw.after(estimate)
 
+        remote.prepared()
         remote.report("running", "first cycle")
         keep_cycling(cycle, remote, publish, clock, config.shape.period_s)
 

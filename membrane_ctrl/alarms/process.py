@@ -7,7 +7,7 @@ import os
 import signal
 import time
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from types import FrameType
 from typing import Any
@@ -16,6 +16,7 @@ from membrane_ctrl.alarms.apprise_sender import apprise_sender
 from membrane_ctrl.alarms.book import Notice
 from membrane_ctrl.alarms.outbox import Outbox, Send
 from membrane_ctrl.alarms.watcher import Watcher
+from membrane_ctrl.child_report import alive, reporter
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.ipc.ring import RingAddress, RingReader
 from membrane_ctrl.port_config import AlarmsConfig
@@ -24,6 +25,7 @@ from membrane_ctrl.tick import Event
 _LOOK_S = 0.5
 # After the run's end, for the last notices; a longer one would keep a service manager from restarting
 _LAST_S = 8.0
+_SENDING_S = 300.0  # a list of mail servers, each with a minute of time-out
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +60,7 @@ def alarms_main(spec: AlarmsSpec, status: Any) -> None:
     signal.signal(signal.SIGTERM, _leave)
     parent = multiprocessing.parent_process()  # who started it, even if that is gone by now
     parent_pid = os.getppid() if parent is None else parent.pid
-    watch(spec, apprise_sender(spec.config, spec.run), status.send, lambda: os.getppid() == parent_pid)
+    watch(spec, apprise_sender(spec.config, spec.run), reporter(status), lambda: os.getppid() == parent_pid)
 
 
 def watch(spec: AlarmsSpec, send: Send, report: Callable[[Event], None], parent_lives: Callable[[], bool]) -> None:
@@ -71,7 +73,7 @@ def watch(spec: AlarmsSpec, send: Send, report: Callable[[Event], None], parent_
     send : callable
         Tells people; see `Outbox`.
     report : callable
-        Tells the run's record what was sent.
+        Tells the run's record what was sent, and the control process that this one is alive; never waits.
     parent_lives : callable
         Whether the control process is still there.
     """
@@ -81,6 +83,7 @@ def watch(spec: AlarmsSpec, send: Send, report: Callable[[Event], None], parent_
     with closing(RingReader(spec.telemetry)) as telemetry, closing(RingReader(spec.events)) as events:
         while True:
             lives = parent_lives()  # before the rings: who ends puts the last word in first
+            report(alive(_SENDING_S))
             watcher.look(telemetry.drain(), events.drain(), clock.now())
             if watcher.ended or not lives:
                 break
@@ -97,8 +100,7 @@ def _reporting(send: Send, report: Callable[[Event], None]) -> Send:
     def sending(notice: Notice) -> bool:
         through = send(notice)
         event = {"kind": "alarm", "alarm": notice.name, "what": notice.kind, "severity": notice.severity}
-        with suppress(OSError):  # the control process is gone: that is what the notice is about
-            report({**event, "text": notice.text, "sent": through, "escalated": notice.escalated})
+        report({**event, "text": notice.text, "sent": through, "escalated": notice.escalated})
         return through
 
     return sending

@@ -57,6 +57,14 @@ def signs_of(event: Event) -> list[Sign]:
             child, code = event.get("child"), event.get("exit_code")
             text = f"the {child} process ended with {code}; the hold goes on without it"
             return [Sign(f"{child}_ended", True, "warning", text, _GLITCH_S)]
+        case "child_silent":
+            text = f"the {event.get('child')} process does not answer; the hold goes on without it"
+            return [Sign(f"{event.get('child')}_ended", True, "warning", text, _GLITCH_S)]
+        case "child_given_up":
+            text = (
+                f"the {event.get('child')} process has ended too often and is left alone for an hour; look at the run"
+            )
+            return [Sign(f"{event.get('child')}_ended", True, "warning", text)]
         case "child_restarted":
             return [Sign(f"{event.get('child')}_ended", False)]
         case "recorder_error" | "disk_low":

@@ -18,12 +18,16 @@ from threading import Event as Flag
 from typing import Any
 
 from membrane_ctrl.acquisition.frame_address import FrameAddress
+from membrane_ctrl.child_report import alive, reporter
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.ipc.ring import RingAddress, RingReader
 
 # Rings are emptied this often: the telemetry ring has to hold a few of these.
 _POLL_S = 0.25
+# A recorder that has not got round for so long is replaced: half of what the rings hold, so that the next one
+# still finds everything. A disk that is slower than this for one second of a run is as good as gone.
+_ROUND_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +80,7 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
         What to record and where.
     status : Connection or None
         Gets small dicts {"kind": "recorder_error" | "recorder_recovered" | "disk_low" | "recorder_done", "message":
-        ...}; one that cannot be taken at once is given up.
+        ...} and each second that it is alive; one that cannot be taken at once is given up.
     """
     asked = Flag()
     # ctrl-C reaches the whole terminal group: the supervisor decides when the run is over, with the "end" event
@@ -120,6 +124,7 @@ def _record(
         elif recorder.urgent or time.monotonic() >= next_write_s:
             next_write_s = time.monotonic() + spec.flush_s
             recorder.write()
+            report(alive(_ROUND_S))
         if not recorder.ended:
             time.sleep(_POLL_S)
     recorder.finish()
@@ -139,23 +144,3 @@ def parent_died() -> bool:
     """Whether the process that started this one is gone: its children get another parent."""
     started_by = multiprocessing.parent_process()
     return started_by is not None and os.getppid() != started_by.pid
-
-
-def reporter(status: Connection | None) -> Callable[[dict[str, Any]], None]:
-    """A function that sends a dict over `status` if there is room for it now, and otherwise lets it go."""
-    if status is None:
-        return lambda message: None
-    os.set_blocking(status.fileno(), False)
-
-    def report(message: dict[str, Any]) -> None:
-        try:
-            status.send({key: _short(value) for key, value in message.items()})
-        except OSError:  # full, or nobody at the other end: recording goes on
-            return
-
-    return report
-
-
-def _short(value: Any) -> Any:
-    """A message this short goes into a pipe whole or not at all, so that the other end never sees half of one."""
-    return value[:1000] if isinstance(value, str) else value

@@ -7,7 +7,9 @@ import math
 from membrane_ctrl.screen.model import Event, View, text
 from membrane_ctrl.screen.words import duration, number, percent
 
-_AT_ONCE = frozenset({"fault", "cleared", "state", "link", "child_ended", "end"})
+_AT_ONCE = frozenset(
+    {"fault", "cleared", "state", "link", "child_ended", "child_silent", "child_restarted", "child_given_up", "end"}
+)
 
 
 def line(view: View) -> str:

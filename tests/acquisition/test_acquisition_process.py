@@ -80,7 +80,7 @@ class Run:
             self.estimates += [pickle.loads(message) for message in self._shapes.drain()]
 
     def states(self) -> list[str]:
-        return [report["state"] for report in self.reports]
+        return [report["state"] for report in self.reports if report["kind"] != "alive"]
 
     def _tick(self) -> None:
         self._ticks += 1

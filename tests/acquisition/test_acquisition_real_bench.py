@@ -117,7 +117,8 @@ class Run:
 
     def said(self, state: str, words: str) -> bool:
         """Whether a report says so."""
-        return any(report["state"] == state and words in report["message"] for report in self.reports)
+        reports = (report for report in self.reports if report["kind"] != "alive")
+        return any(report["state"] == state and words in report["message"] for report in reports)
 
     def _end(self) -> None:
         self.process.kill()

@@ -153,7 +153,20 @@ def test_unknown_command_is_answered(line: tuple[Connection, Connection]) -> Non
     ours, theirs = line
     ours.send("dance")
     Remote(theirs, os.getppid()).listen()
+    assert ours.recv()["kind"] == "alive"
     assert "unknown command 'dance'" in ours.recv()["message"]
+
+
+def test_it_promises_its_next_word_sooner_once_it_is_prepared(line: tuple[Connection, Connection]) -> None:
+    ours, theirs = line
+    remote = Remote(theirs, os.getppid())
+    for _ in range(5):
+        remote.listen()
+    remote.prepared()
+    words = [ours.recv() for _ in range(2)]
+    assert not ours.poll(), "not more than one a second"
+    assert [word["kind"] for word in words] == ["alive", "alive"]
+    assert words[0]["for_s"] > 10 * words[1]["for_s"]
 
 
 def test_closed_line_and_dead_parent_stop_the_process(line: tuple[Connection, Connection]) -> None:

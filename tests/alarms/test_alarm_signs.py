@@ -27,6 +27,8 @@ LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=
         ({"kind": "link", "message": "no answer"}, [("link", True, "warning")]),
         ({"kind": "link", "message": "connected again"}, [("link", False, "warning")]),
         ({"kind": "child_ended", "child": "recorder", "exit_code": -9}, [("recorder_ended", True, "warning")]),
+        ({"kind": "child_silent", "child": "recorder"}, [("recorder_ended", True, "warning")]),
+        ({"kind": "child_given_up", "child": "recorder"}, [("recorder_ended", True, "warning")]),
         ({"kind": "child_restarted", "child": "recorder"}, [("recorder_ended", False, "warning")]),
         ({"kind": "recorder_error", "message": "disk full"}, [("recorder", True, "warning")]),
         ({"kind": "recorder_recovered"}, [("recorder", False, "warning")]),

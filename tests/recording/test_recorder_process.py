@@ -24,10 +24,11 @@ import pytest
 from rrd_reading import has_footer, scalars, strings
 from synthetic_run import rows_of, shape_of
 
+from membrane_ctrl.child_report import reporter
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.ipc.ring import RingWriter, ring
-from membrane_ctrl.recording.process import RecorderSpec, parent_died, recorder_main, reporter
+from membrane_ctrl.recording.process import RecorderSpec, parent_died, recorder_main
 from membrane_ctrl.recording.rows import COLUMN, unpack
 from membrane_ctrl.recording.run_folder import create_run_folder
 from membrane_ctrl.recording.streams import STREAMS
@@ -92,13 +93,15 @@ def recorder(spec: RecorderSpec, file_bytes_max: int | None = None) -> Iterator[
 
 
 def received(status: Connection) -> list[dict[str, Any]]:
-    """All reports of a recorder that has ended."""
+    """All reports of a recorder that has ended, but for those that it is alive."""
     reports = []
     while True:
         try:
             reports.append(status.recv())
         except EOFError:
-            return reports
+            break
+    assert sum(report["kind"] == "alive" for report in reports) >= 1
+    return [report for report in reports if report["kind"] != "alive"]
 
 
 def summary_of(run_dir: Path) -> dict[str, Any]:
