@@ -99,7 +99,7 @@ def soak(days: float, seed: int = 1, faults: bool = True, events: tuple[Happenin
         resume=ResumeConfig(faults=_RESUMES, most_per_day=24),
     )
     bench = VirtualBench(Plant(config.twin, config.pump, events))
-    run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, seed))
+    run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, config, seed))
     upsets = _upsets(seed) if faults else iter(())
     due_s, name, lasts_s = next(upsets, (np.inf, "", 0.0))
     until_s, tally, start_s = np.inf, Tally(), time.process_time()

@@ -37,7 +37,7 @@ def _hold(shape: bool) -> None:
     from membrane_ctrl.commands import Command
 
     bench = VirtualBench(plant)
-    run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, 1))
+    run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, config, 1))
     run.tick((Command("hold", "benchmark"),))
     while run.now_s < VIRTUAL_S:
         run.tick()

@@ -77,12 +77,13 @@ class Register:
         """The number on the wire. Raises ValueError if the type cannot hold the value."""
         if self.type == "f32":
             return value
+        counts = value * self.counts_per_unit
+        low, high = _RANGES[self.type]
+        if low <= counts <= high:  # False for NaN
+            return round(counts)
         if math.isnan(value) and self.type == "i32":
             return I32_NO_VALUE
-        low, high = _RANGES[self.type]
-        if not low <= value * self.counts_per_unit <= high:  # also False for NaN
-            raise ValueError(f"{self.name} = {value:g} {self.unit} does not fit its {self.type}")
-        return round(value * self.counts_per_unit)
+        raise ValueError(f"{self.name} = {value:g} {self.unit} does not fit its {self.type}")
 
     def to_value(self, raw: float) -> float:
         """The value in the register's unit; NaN for "no value"."""

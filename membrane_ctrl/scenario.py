@@ -163,7 +163,7 @@ def play(scenario: Scenario) -> Outcome:
     steps = sorted(scenario.at, key=lambda at: at.time_s)
     plant = Plant(config.twin, config.pump, tuple(_MAKE[at.event](at) for at in steps if at.event in _MAKE))
     bench = VirtualBench(plant, config.devices.watchdog_s if config.devices else 0.5)
-    shape = TruthShape(bench, config.twin.seed) if scenario.shapes else None
+    shape = TruthShape(bench, config, config.twin.seed) if scenario.shapes else None
     run = VirtualRun(config, bench, zernike_projection(), shape)
     wish = Command("hold", "scenario")
     agenda = [(0.0, wish), *_agenda(steps), (scenario.duration_s, Command("stop", "duration"))]

@@ -45,6 +45,8 @@ class BoardState:
         self.map_version = registers.map_version
         self._registers = registers
         self._by_address = {register.address: register for register in registers}
+        # what drivers ask for is whole blocks, over and over: found at once
+        self._by_span = {(block.address, block.count): block for block in registers.blocks}
         self._command = registers.block("command")
         self._watchdog_mask = registers.fault_mask("watchdog")
         self._over_pressure_mask = registers.fault_mask("over_pressure")
@@ -103,8 +105,11 @@ class BoardState:
 
     def read(self, address: int, count: int) -> list[int]:
         """Words of one instant. Raises RegisterRefusal (illegal address) if one of them does not exist."""
-        end = address + count
         values = self._values()
+        whole = self._by_span.get((address, count))
+        if whole is not None:
+            return whole.encode(values)
+        end = address + count
         words: dict[int, int] = {}
         for block in self._registers.blocks:
             if block.address < end and address < block.address + block.count:
@@ -129,6 +134,9 @@ class BoardState:
         self._apply(written, whole_command=target.registers == self._command.registers)
 
     def _written_block(self, address: int, count: int) -> Block:
+        whole = self._by_span.get((address, count))
+        if whole is not None and whole.access == "rw":
+            return whole
         found: list[Register] = []
         end = address + count
         while address < end:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 # 0.05 um RMS over the disc is 0.17 um of sag, which is what a cycle gives.
 MODEL_FLOOR_UM = 0.05
 
-PISTON = 0  # set by the surface being 0 at the vertex: not measured
+MEASURED = slice(1, None)  # all but piston, which is set by the surface being 0 at the vertex
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +48,9 @@ def sag_change(
     sensitivity : (36,) array
         Coefficients' change per um of sag.
     """
-    keep = np.arange(len(coeffs_um)) != PISTON
-    s = sensitivity[keep]
-    covariance = covariance_um2[np.ix_(keep, keep)] + MODEL_FLOOR_UM**2 * np.eye(s.size)
+    s = sensitivity[MEASURED]
+    covariance = covariance_um2[MEASURED, MEASURED] + MODEL_FLOOR_UM**2 * np.eye(s.size)
     weighted = np.linalg.solve(covariance, s)
     information = float(weighted @ s)
-    change_um = float(weighted @ (coeffs_um - reference_um)[keep]) / information
+    change_um = float(weighted @ (coeffs_um - reference_um)[MEASURED]) / information
     return SagChange(change_um, information**-0.5)

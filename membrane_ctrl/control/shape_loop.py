@@ -158,17 +158,7 @@ class ShapeLoop:
             return "no laser reading to compare the shape with"
         if moved_um > config.disagreement_max_um:
             return f"the laser has moved by {moved_um:.1f} um since the exposures"
-        return self._disagreement(estimate)
-
-    def _disagreement(self, estimate: ShapeEstimate) -> str:
-        """Whether camera and laser tell different stories; empty without a reference."""
-        if not self._reference.complete:
-            return ""
-        _, drift_um = self._seen_drift(estimate)
-        apart_um = drift_um - self._drift.at(estimate.time_s)
-        if abs(apart_um) <= self._config.disagreement_max_um:
-            return ""
-        return f"camera and laser disagree by {apart_um:+.1f} um: check the laser's mount, or lock anew"
+        return ""
 
     def _refuse(self, reason: str) -> None:
         """Hold the trim and say why."""
@@ -177,9 +167,9 @@ class ShapeLoop:
         self._reason = reason
 
     def _admit(self, estimate: ShapeEstimate) -> None:
-        """Learn from an estimate: the reference first, the drift then."""
-        self._admitted_s = estimate.time_s
+        """Learn from an estimate: the reference first, the drift then, unless camera and laser disagree on it."""
         if self._state == ShapeState.WAITING:
+            self._admitted_s = estimate.time_s
             self._reference.take(estimate)
             self._reason = f"reference: shape {self._reference.count} of {self._reference.wanted}"
             if self._reference.complete:
@@ -187,15 +177,15 @@ class ShapeLoop:
                 self._base_um = self._trim_um
                 self._drift.begin(self._reference.time_s)
             return
-        self._change, drift_um = self._seen_drift(estimate)
+        change = sag_change(estimate.coeffs_um, self._reference.coeffs_um, estimate.covariance_um2, self._sensitivity)
+        drift_um = estimate.displacement_um - self._reference.displacement_um - change.change_um
+        apart_um = drift_um - self._drift.at(estimate.time_s)
+        if abs(apart_um) > self._config.disagreement_max_um:
+            self._refuse(f"camera and laser disagree by {apart_um:+.1f} um: check the laser's mount, or lock anew")
+            return
+        self._admitted_s, self._change = estimate.time_s, change
         self._drift.take(drift_um, estimate.time_s)
         self._state, self._reason = ShapeState.TRACKING, ""
-
-    def _seen_drift(self, estimate: ShapeEstimate) -> tuple[SagChange, float]:
-        """Change of sag since lock, and the drift of the laser that follows from it, um."""
-        reference = self._reference
-        change = sag_change(estimate.coeffs_um, reference.coeffs_um, estimate.covariance_um2, self._sensitivity)
-        return change, estimate.displacement_um - reference.displacement_um - change.change_um
 
     def _move_trim(self, now_s: float, dt_s: float) -> None:
         """Bring the trim to the drift, bounded in rate and range."""

@@ -45,7 +45,7 @@ class TwinHold:
     def __init__(self, config: Config, events: Sequence[TwinEvent] = ()) -> None:
         self.config = config
         self.bench = VirtualBench(Plant(config.twin, config.pump, events))
-        source = TruthShape(self.bench, config.twin.seed) if config.shape.enabled else None
+        source = TruthShape(self.bench, config, config.twin.seed) if config.shape.enabled else None
         self._shapes: list[ShapeEstimate] = []
 
         def shape(now_s: float) -> ShapeEstimate | None:

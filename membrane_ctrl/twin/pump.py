@@ -55,7 +55,8 @@ class Pump:
     def step(self, command: float) -> float:
         """One time step with the command 0..1; the flow that reaches the films in it, mL/s."""
         self._running = command >= (self._stall if self._running else self._start)
-        target = self._ml_per_s_per_fraction * (command - self._dead) if self._running else 0.0
-        self._flow_ml_per_s += (max(0.0, target) - self._flow_ml_per_s) * self._follow
+        delivers = self._running and command > self._dead
+        target = self._ml_per_s_per_fraction * (command - self._dead) if delivers else 0.0
+        self._flow_ml_per_s += (target - self._flow_ml_per_s) * self._follow
         self._tube.append(self._flow_ml_per_s)
         return self._tube.popleft()

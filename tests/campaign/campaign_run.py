@@ -92,7 +92,7 @@ def run_case(case: Case, state: State, seed: int) -> Result:
     begins_s = _begins_s(config, state, delay_s)
     plant = Plant(config.twin, config.pump, _events(case, begins_s))
     bench = VirtualBench(plant)
-    run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, seed))
+    run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, config, seed))
     injection, watch = Injection(case, bench), Watch(case, bench, config)
     script = _Script(state)
     with _raising(case, injection):
