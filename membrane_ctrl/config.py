@@ -6,6 +6,7 @@ refused, so that a wrong unit (metres for millimetres) is seen when the file is 
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -202,6 +203,7 @@ class OpticsConfig(Section):
     camera: CameraConfig = CameraConfig()
     pattern: PatternConfig = PatternConfig()
     mirror: MirrorConfig = MirrorConfig()
+    geometry_file: Path | None = None  # of `calibrate`: used instead of `geometry` (a path from the file's folder)
 
 
 class TwinConfig(Section):
