@@ -10,7 +10,7 @@ import resource
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,26 +18,26 @@ import numpy as np
 
 from benchmarks.figures import Figure, at_least, at_most, show
 from membrane_ctrl.commands import Command
-from membrane_ctrl.config import Config, LoopConfig, ResumeConfig, ShapeConfig, StatesConfig, TwinConfig
+from membrane_ctrl.config import Config, LoopConfig, ResumeConfig, StatesConfig, TwinConfig
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.names import State
 from membrane_ctrl.twin.events import DailyTemperature, LaserDropout, PressureWeather
 from membrane_ctrl.twin.events import Event as Happening
 from membrane_ctrl.twin.plant import Plant
 from membrane_ctrl.virtual_bench import VirtualBench
-from membrane_ctrl.virtual_run import VirtualRun
+from membrane_ctrl.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.virtual_shape import TruthShape
 
 DAY_S = 86_400.0
 RATE_HZ = 10.0
-# The shapes here have 1 um of noise each: tau = sigma sqrt(T) / q_drift is then minutes (docs/physics.md).
-# The default of 40 s is for the rendered camera, which is far better; with it the camera's noise is the largest part
-# of the minutes' means (std 0.33 um in place of the laser's own 0.2).
-SHAPE_TIME_CONSTANT_S = 300.0
 BAND_UM, MINUTE_BAND_UM = 2.0, 0.5
+TYPICAL_SEEDS = (1, 2, 3)
 # something a day of each kind: a glitch of the laser, an answer lost, a network that restarts, a board that does
 _RESUMES = ("link_lost", "device_silent", "watchdog_tripped", "board_fault")
 _FAULTS = (("no_light", 3.0), ("silent", 0.2), ("unreachable", 20.0), ("power", 0.0))
+LASER_LOST_S, LASER_BACK_S = 120.0, 130.0
+
+Take = Callable[[VirtualTick], None]
 
 
 @dataclass
@@ -89,22 +89,32 @@ class Tally:
     wall_s: float = 0.0
 
 
-def soak(days: float, seed: int = 1, faults: bool = True, events: tuple[Happening, ...] = ()) -> Tally:
-    """Hold for `days`; with `faults` something goes wrong six times a day and may resume by itself."""
-    config = Config(
+def soak_config(seed: int) -> Config:
+    """The defaults at 10 Hz; what the faults here do may resume by itself."""
+    return Config(
         loop=LoopConfig(rate_hz=RATE_HZ),
-        shape=ShapeConfig(time_constant_s=SHAPE_TIME_CONSTANT_S),
         twin=TwinConfig(seed=seed),
         states=StatesConfig(stay_after_trip=True),
         resume=ResumeConfig(faults=_RESUMES, most_per_day=24),
     )
+
+
+def soak(
+    days: float, seed: int, faults: bool = True, events: tuple[Happening, ...] = (), take: Take | None = None
+) -> Tally:
+    """Hold for `days`; with `faults` something goes wrong six times a day. `take` gets every tick."""
+    config = soak_config(seed)
     bench = VirtualBench(Plant(config.twin, config.pump, events))
     run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, config, seed))
     upsets = _upsets(seed) if faults else iter(())
     due_s, name, lasts_s = next(upsets, (np.inf, "", 0.0))
     until_s, tally, start_s = np.inf, Tally(), time.process_time()
-    run.tick((Command("hold", "soak"),))
+    tick = run.tick((Command("hold", "soak"),))
     while run.now_s < days * DAY_S and run.finished is None:
+        if tick is not None:
+            _count(tick, tally)
+            if take is not None:
+                take(tick)
         if run.now_s >= due_s:
             _switch(bench, name, True)
             until_s = run.now_s + lasts_s
@@ -112,15 +122,12 @@ def soak(days: float, seed: int = 1, faults: bool = True, events: tuple[Happenin
         if run.now_s >= until_s:
             _switch(bench, name, False)
             until_s, name, lasts_s = np.inf, following, after_s
-        _count(run, tally)
-    tally.rss_mb, tally.wall_s = _rss_mb(), time.process_time() - start_s
+        tick = run.tick()
+    tally.rss_mb, tally.wall_s = rss_mb(), time.process_time() - start_s
     return tally
 
 
-def _count(run: VirtualRun, tally: Tally) -> None:
-    tick = run.tick()
-    if tick is None:
-        return
+def _count(tick: VirtualTick, tally: Tally) -> None:
     row = tick.row
     if row.state == State.HOLD:
         error_um = row.truth_displacement_um - row.target_um
@@ -135,8 +142,8 @@ def _count(run: VirtualRun, tally: Tally) -> None:
     for event in tick.events:
         tally.events[str(event["kind"])] += 1
         tally.event_bytes += len(str(event))
-    if not tally.rss_after_hour_mb and run.now_s > 3600:
-        tally.rss_after_hour_mb = _rss_mb()
+    if not tally.rss_after_hour_mb and row.mono_s > 3600:
+        tally.rss_after_hour_mb = rss_mb()
 
 
 def _upsets(seed: int) -> Iterator[tuple[float, str, float]]:
@@ -156,37 +163,39 @@ def _switch(bench: VirtualBench, name: str, on: bool) -> None:
         bench.power_cycle()
 
 
-def _rss_mb() -> float:
+def rss_mb() -> float:
+    """Memory of this process."""
     pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
     return pages * resource.getpagesize() / 1e6
 
 
-def dropout_excursion_um(seeds: int = 12) -> float:
-    """Largest way of the true centre in 10 s without a laser, over seeds of typical weather."""
+def dropout_excursions_um(seeds: range = range(12)) -> list[float]:
+    """Way of the true centre from its place in 10 s without a laser, a figure a seed of typical weather."""
+    return [_dropout_excursion_um(seed) for seed in seeds]
+
+
+def _dropout_excursion_um(seed: int) -> float:
+    config = Config(loop=LoopConfig(rate_hz=RATE_HZ), twin=TwinConfig(seed=seed))
+    plant = Plant(config.twin, config.pump, (LaserDropout(LASER_LOST_S, LASER_BACK_S - LASER_LOST_S),))
+    run = VirtualRun(config, VirtualBench(plant), zernike_projection())
+    run.tick((Command("hold", "soak"),))
     worst_um = 0.0
-    for seed in range(seeds):
-        config = Config(loop=LoopConfig(rate_hz=RATE_HZ), twin=TwinConfig(seed=seed))
-        plant = Plant(config.twin, config.pump, (LaserDropout(120.0, 10.0),))
-        run = VirtualRun(config, VirtualBench(plant), zernike_projection())
-        run.tick((Command("hold", "soak"),))
-        while run.now_s < 131.0:
-            tick = run.tick()
-            if tick is not None and run.now_s >= 120.0:
-                worst_um = max(worst_um, abs(tick.row.truth_displacement_um))
+    while run.now_s < LASER_BACK_S + 1.0:
+        tick = run.tick()
+        if tick is not None and run.now_s >= LASER_LOST_S:
+            worst_um = max(worst_um, abs(tick.row.truth_displacement_um - tick.row.target_um))
     return worst_um
 
 
 def figures(days: float, seed: int = 1) -> list[Figure]:
     """A soak of `days` with everything, as figures."""
-    weather = (DailyTemperature(1.0), PressureWeather(700.0, seed))
-    tally = soak(days, seed, True, weather)
+    tally = soak(days, seed, True, everything(seed))
     grown = 100 * (tally.rss_mb / tally.rss_after_hour_mb - 1)
-    trips = tally.events["fault"]
     return [
         at_most("simulated days, with weather and faults", days, "d"),
         at_least("times real time", days * DAY_S / tally.wall_s, "", 1000.0),
         at_least("held", 100 * tally.held_s / (days * DAY_S), "% of the time", 98.0),
-        at_most("faults that were latched or forgiven", trips, ""),
+        at_most("faults that were latched or forgiven", tally.events["fault"], ""),
         at_most("standard deviation of the true centre", (tally.square_um2 / tally.ticks) ** 0.5, "um"),
         at_least("1 s means within 2 um", 100 * tally.second.fraction, "%", 99.9),
         at_least("60 s means within 0.5 um", 100 * tally.minute.fraction, "%", 99.0),
@@ -195,14 +204,22 @@ def figures(days: float, seed: int = 1) -> list[Figure]:
     ]
 
 
+def everything(seed: int) -> tuple[Happening, ...]:
+    """A day's temperature and the pressure of passing weather, on top of the scenario's own."""
+    return (DailyTemperature(1.0), PressureWeather(700.0, seed))
+
+
 def run() -> list[Figure]:
-    """A quiet day as the target asks, and two days with everything."""
-    day = soak(1.0, faults=False)
+    """Days of typical weather as the target asks, the laser lost, and two days with everything."""
+    days = [soak(1.0, seed, faults=False) for seed in TYPICAL_SEEDS]
+    seeds = f"24 h typical, worst of {len(days)} seeds"
+    excursions_um = dropout_excursions_um()
     return [
-        at_least("24 h typical: 1 s means within 2 um", 100 * day.second.fraction, "%", 99.9),
-        at_most("24 h typical: worst 60 s mean", day.minute.worst_um, "um", MINUTE_BAND_UM),
-        at_most("24 h typical: standard deviation", (day.square_um2 / day.ticks) ** 0.5, "um"),
-        at_most("10 s without laser: way of the true centre", dropout_excursion_um(), "um", 4.0),
+        at_least(f"{seeds}: 1 s means within 2 um", 100 * min(day.second.fraction for day in days), "%", 99.9),
+        at_most(f"{seeds}: worst 60 s mean", max(day.minute.worst_um for day in days), "um", MINUTE_BAND_UM),
+        at_most(f"{seeds}: standard deviation", max((day.square_um2 / day.ticks) ** 0.5 for day in days), "um"),
+        at_most("10 s without laser, worst of 12 seeds: way of the true centre", max(excursions_um), "um", 4.0),
+        at_most("10 s without laser, mean of 12 seeds", float(np.mean(excursions_um)), "um"),
         *figures(2.0),
     ]
 

@@ -187,7 +187,7 @@ def play(scenario: Scenario) -> Outcome:
 
 def complaints(expect: Expectation, outcome: Outcome) -> Iterator[str]:
     """What did not come as expected, a line each."""
-    finished = outcome.ticks[-1].finished
+    finished = outcome.ticks[-1].outputs.finished
     exit_name = "none" if finished is None else finished.name.lower()
     found: list[tuple[str, Any, Any]] = [
         ("exit", expect.exit, exit_name),

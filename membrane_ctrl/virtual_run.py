@@ -30,11 +30,20 @@ Alter = Callable[[float, BenchReading], BenchReading | None]
 
 @dataclass(frozen=True, slots=True)
 class VirtualTick:
-    """What one tick left behind."""
+    """One tick: what went in, and what came out."""
 
-    row: TelemetryRow
-    events: tuple[Event, ...]
-    finished: Exit | None
+    inputs: TickInputs
+    outputs: TickOutputs
+
+    @property
+    def row(self) -> TelemetryRow:
+        """For the record."""
+        return self.outputs.row
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """For the record."""
+        return self.outputs.events
 
 
 class VirtualRun:
@@ -97,10 +106,11 @@ class VirtualRun:
         reading = self._read()
         if reading is not None and self._alter is not None:
             reading = self._alter(self.now_s, reading)
-        outputs = self._controller.tick(self._inputs(reading, commands))
+        inputs = self._inputs(reading, commands)
+        outputs = self._controller.tick(inputs)
         self._last_s = self.now_s
         self._act(outputs)
-        return VirtualTick(outputs.row, outputs.events, outputs.finished)
+        return VirtualTick(inputs, outputs)
 
     def _inputs(self, reading: BenchReading | None, commands: tuple[Command, ...]) -> TickInputs:
         wrong, truth = self._bench.wrong, self._bench.plant.truth()

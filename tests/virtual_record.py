@@ -6,13 +6,11 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 from synthetic_shape import shape_at
 
 from firmware_iface.roles import BenchReading
-from membrane_ctrl import __version__, config_file, virtual_run
+from membrane_ctrl import __version__, config_file
 from membrane_ctrl.config import Config, TwinConfig
-from membrane_ctrl.controller import Controller
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.recording.inputs_file import InputsFile
 from membrane_ctrl.tick import TickInputs, TickOutputs
@@ -23,26 +21,10 @@ from membrane_ctrl.virtual_run import Alter, run_virtual
 CONFIG = Config(twin=TwinConfig(laser_noise_um=0.5))
 
 
-class RecordedController(Controller):
-    """A controller whose ticks are kept."""
-
-    ticks: list[tuple[TickInputs, TickOutputs]] = []  # noqa: RUF012  # of the one run that is being recorded
-
-    def tick(self, inputs: TickInputs) -> TickOutputs:
-        outputs = super().tick(inputs)
-        self.ticks.append((inputs, outputs))
-        return outputs
-
-
 def kept_ticks(duration_s: float, alter: Alter | None = None) -> list[tuple[TickInputs, TickOutputs]]:
     """Inputs and outputs of every tick of a hold of the twin."""
-    RecordedController.ticks = ticks = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(virtual_run, "Controller", RecordedController)
-        plant = Plant(CONFIG.twin, CONFIG.pump)
-        for _ in run_virtual(CONFIG, plant, duration_s, zernike_projection(), shape_at, alter):
-            pass
-    return ticks
+    run = run_virtual(CONFIG, Plant(CONFIG.twin, CONFIG.pump), duration_s, zernike_projection(), shape_at, alter)
+    return [(tick.inputs, tick.outputs) for tick in run]
 
 
 def write_record(folder: Path, ticks: list[tuple[TickInputs, TickOutputs]], lost: range = range(0)) -> None:
