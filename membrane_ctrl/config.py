@@ -9,11 +9,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from membrane_ctrl.camera_config import AravisCamera, UvcCamera
 from membrane_ctrl.device_config import DevicesConfig as DevicesConfig
 from membrane_ctrl.port_config import AlarmsConfig, PortConfig
+from membrane_ctrl.screen_config import HeightMapConfig as HeightMapConfig
+from membrane_ctrl.screen_config import ScreenPoseConfig as ScreenPoseConfig
 from membrane_ctrl.section import Section as Section
 
 Positive = Annotated[float, Field(gt=0)]
@@ -132,17 +135,20 @@ class CameraPoseConfig(Section):
     position_mm: Vector3
     rotation: tuple[Vector3, Vector3, Vector3]
 
-
-class ScreenPoseConfig(Section):
-    """Any screen pose: O' in world and the two unit vectors of `s_x` and `s_y`."""
-
-    origin_mm: Vector3
-    s_x: Vector3
-    s_y: Vector3
+    @model_validator(mode="after")
+    def _is_rotation(self) -> CameraPoseConfig:
+        rows = np.array(self.rotation)
+        # 1e-6: what rounding to seven digits leaves
+        if not np.allclose(rows @ rows.T, np.eye(3), atol=1e-6) or np.linalg.det(rows) < 0:
+            raise ValueError("rotation is not a rotation (rows: right, down, forward in world)")
+        return self
 
 
 class GeometryConfig(Section):
-    """Camera and screen: the paper's a, b, alpha, or two general poses (INTERFACES section 1)."""
+    """Camera and screen: the paper's a, b, alpha, or two general poses (INTERFACES section 1).
+
+    Either form may say in `screen` how the screen's face stands off its plane.
+    """
 
     a_mm: Annotated[float, Field(ge=100, le=100_000)] | None = None
     b_mm: Annotated[float, Field(ge=100, le=100_000)] | None = None
@@ -157,7 +163,7 @@ class GeometryConfig(Section):
     @model_validator(mode="after")
     def _one_form(self) -> GeometryConfig:
         short = (self.a_mm, self.b_mm, self.alpha_deg)
-        general = (self.camera, self.screen)
+        general = (self.camera, None if self.screen is None else self.screen.pose)
         if all(v is not None for v in short) and all(v is None for v in general):
             return self
         if all(v is None for v in short) and all(v is not None for v in general):
@@ -204,6 +210,15 @@ class OpticsConfig(Section):
     pattern: PatternConfig = PatternConfig()
     mirror: MirrorConfig = MirrorConfig()
     geometry_file: Path | None = None  # of `calibrate`: used instead of `geometry` (a path from the file's folder)
+
+    @model_validator(mode="after")
+    def _map_covers_pattern(self) -> OpticsConfig:
+        half_mm = self.pattern.periods * self.pattern.period_mm / 2
+        if self.geometry.screen is not None and not self.geometry.screen.covers(half_mm):
+            raise ValueError(
+                f"geometry.screen.height_map must reach over the pattern, {half_mm:g} mm from O' each way"
+            )
+        return self
 
 
 class TwinConfig(Section):

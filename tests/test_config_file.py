@@ -49,6 +49,42 @@ def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
         load(tmp_path, Config)
 
 
+OPTICS = "[optics.geometry]\na_mm = 2672.0\nb_mm = 2871.0\nalpha_deg = 80.9\n"
+GRID = "[optics.geometry.screen.height_map]\ns_x_mm = [-250, 250]\ns_y_mm = [-250, 0, 250]\n"
+
+
+def test_a_screens_height_map_may_be_a_file(tmp_path: Path) -> None:
+    (tmp_path / "screen.txt").write_text("# mm\n0.1, 0.2\n0.3 0.4\n\n0.5, 0.6  # top\n")
+    (tmp_path / "lab.toml").write_text(f"{OPTICS}{GRID}file = 'screen.txt'\n")
+    config = load(tmp_path / "lab.toml", Config)
+    screen = config.optics.geometry.screen
+    assert screen is not None
+    assert screen.height_map is not None
+    assert screen.height_map.heights_mm == ((0.1, 0.2), (0.3, 0.4), (0.5, 0.6))
+    # the run's own configuration holds the numbers
+    (tmp_path / "screen.txt").unlink()
+    (tmp_path / "config.toml").write_text(dump(config))
+    assert load(tmp_path / "config.toml", Config) == config
+
+
+@pytest.mark.parametrize(
+    ("tail", "words"),
+    [
+        ("file = 'none.txt'\n", ["height_map.file", "none.txt", "No such file"]),
+        ("file = 'lab.toml'\n", ["height_map.file", "could not convert"]),
+        ("file = 'a'\nheights_mm = [[0, 0]]\n", ["give either the file or heights_mm"]),
+        ("heights_mm = [[0, 0]]\n", ["screen.height_map", "1 rows of 2"]),
+        ("", ["heights_mm", "required"]),
+    ],
+)
+def test_a_wrong_height_map_is_one_line(tmp_path: Path, tail: str, words: list[str]) -> None:
+    (tmp_path / "lab.toml").write_text(OPTICS + GRID + tail)
+    with pytest.raises(InputError) as caught:
+        load(tmp_path / "lab.toml", Config)
+    for word in [str(tmp_path / "lab.toml"), *words]:
+        assert word in str(caught.value)
+
+
 def test_what_is_written_reads_back_the_same() -> None:
     config = Config.model_validate({"loop": {"rate_hz": 20}, "devices": {"board": "tcp://10.0.0.9:502"}})
     assert Config.model_validate(tomllib.loads(dump(config))) == config

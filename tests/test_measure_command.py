@@ -232,3 +232,18 @@ def test_a_simulated_fault_is_found_by_measure(tmp_path: Path) -> None:
     assert code == 0
     (flag,) = result["quality"]["flagged_frames"]
     assert flag == {"file": "y_sin_3.png", "reason": "stale: the same picture as y_sin_2"}
+
+
+def test_a_geometry_file_with_a_crooked_screen(capture_set: Path, tmp_path: Path) -> None:
+    short = tomllib.loads((capture_set / "capture.toml").read_text())["geometry"]
+    (tmp_path / "screen.txt").write_text("\n".join(" ".join(["0.5"] * 4) for _ in range(3)))
+    grid = {"s_x_mm": [-300, -100, 100, 300], "s_y_mm": [-300, 0, 300], "file": "screen.txt"}
+    raised = tmp_path / "geometry.toml"
+    raised.write_text(tomli_w.dumps({"geometry": {**short, "screen": {"height_map": grid}}}))
+    code, found = measured(capture_set, tmp_path / "raised", "--geometry", str(raised))
+    assert code == 0
+    # a face that stands 0.5 mm off everywhere is a screen 0.5 mm nearer
+    nearer = tmp_path / "nearer.toml"
+    nearer.write_text(tomli_w.dumps({"geometry": {**short, "b_mm": short["b_mm"] - 0.5}}))
+    _, expected = measured(capture_set, tmp_path / "nearer", "--geometry", str(nearer))
+    assert found["zernike"]["coeffs_um"] == pytest.approx(expected["zernike"]["coeffs_um"], abs=1e-6)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from membrane_ctrl.config import GeometryConfig, OpticsConfig
+from membrane_ctrl.metrology.face import Face
 
 FloatArray = NDArray[np.float64]
 
@@ -39,6 +40,8 @@ class Geometry:
         O' in world.
     screen_s_x, screen_s_y : (3,) arrays
         Unit vectors of s_x and s_y in world.
+    face : Face
+        How the screen stands off the plane of s_x and s_y.
     """
 
     pinhole_mm: FloatArray
@@ -49,18 +52,11 @@ class Geometry:
     screen_origin_mm: FloatArray
     screen_s_x: FloatArray
     screen_s_y: FloatArray
-
-    def __post_init__(self) -> None:
-        """Refuse poses that are no rotations: they would bend every ray without a word."""
-        if not np.allclose(self.rotation @ self.rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(self.rotation) < 0:
-            raise ValueError("geometry.camera.rotation is not a rotation (rows: right, down, forward in world)")
-        axes = np.stack([self.screen_s_x, self.screen_s_y])
-        if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-6):
-            raise ValueError("geometry.screen.s_x and s_y are not two unit vectors at a right angle")
+    face: Face
 
     @classmethod
     def from_config(cls, optics: OpticsConfig) -> Geometry:
-        """The geometry a configuration describes. Raises ValueError for poses that are no rotations."""
+        """The geometry a configuration describes."""
         camera = optics.camera
         pinhole, rotation, origin, s_x, s_y = _poses(optics.geometry)
         return cls(
@@ -72,6 +68,7 @@ class Geometry:
             screen_origin_mm=origin,
             screen_s_x=s_x,
             screen_s_y=s_y,
+            face=Face.of(optics.geometry.screen),
         )
 
     def rays(self, columns_px: ArrayLike, rows_px: ArrayLike) -> FloatArray:
@@ -85,18 +82,23 @@ class Geometry:
         camera /= np.linalg.norm(camera, axis=0)
         return np.asarray(np.tensordot(self.rotation.T, camera, axes=1))
 
+    @property
+    def screen_axes(self) -> FloatArray:
+        """Unit vectors of s_x, s_y and of the normal towards the mirror, as rows (3, 3) in world."""
+        return np.stack([self.screen_s_x, self.screen_s_y, np.cross(self.screen_s_x, self.screen_s_y)])
+
     def screen_points(self, screen_mm: FloatArray) -> FloatArray:
-        """World points (3, ...) of screen coordinates (2, ...) in mm from O'."""
+        """World points (3, ...) on the face at screen coordinates (2, ...) in mm from O'."""
         origin = self.screen_origin_mm.reshape(3, *[1] * (screen_mm.ndim - 1))
-        across = np.multiply.outer(self.screen_s_x, screen_mm[0]) + np.multiply.outer(self.screen_s_y, screen_mm[1])
-        return np.asarray(origin + across)
+        in_screen = np.concatenate([screen_mm, self.face.heights(screen_mm)[:1]])
+        return np.asarray(origin + np.tensordot(self.screen_axes.T, in_screen, axes=1))
 
 
 def _poses(config: GeometryConfig) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Pinhole, rotation, O', s_x, s_y in world from either form."""
-    if config.camera is not None and config.screen is not None:
-        camera, screen = config.camera, config.screen
-        general = (camera.position_mm, camera.rotation, screen.origin_mm, screen.s_x, screen.s_y)
+    screen = None if config.screen is None else config.screen.pose
+    if config.camera is not None and screen is not None:
+        general = (config.camera.position_mm, config.camera.rotation, *screen)
         pinhole, rotation, origin, s_x, s_y = (np.array(value, float) for value in general)
         return pinhole, rotation, origin, s_x, s_y
     if config.a_mm is None or config.b_mm is None or config.alpha_deg is None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from membrane_ctrl.config import CameraPoseConfig, GeometryConfig, ScreenPoseConfig, Vector3
+from membrane_ctrl.config import CameraPoseConfig, GeometryConfig, Vector3
 
 FloatArray = NDArray[np.float64]
 
@@ -102,23 +102,26 @@ def changed(geometry: GeometryConfig, names: tuple[str, ...], change: ArrayLike)
     amounts = dict(zip(names, np.asarray(change, float).tolist(), strict=True))
     if not amounts:
         return geometry
-    if geometry.camera is None or geometry.screen is None:
+    camera, screen = geometry.camera, geometry.screen
+    if camera is None or screen is None or screen.pose is None:
         if unknown := set(names) - set(SHORT_NAMES):
             raise ValueError(f"{min(unknown)}: the geometry is given by a, b and alpha")
         return geometry.model_copy(update={n: getattr(geometry, n) + d for n, d in amounts.items()})
     if unknown := set(names) - set(GENERAL_NAMES):
         raise ValueError(f"{min(unknown)}: the geometry is given by two poses")
-    camera, screen = geometry.camera, geometry.screen
     turn = _turn(amounts, "camera")
     rows = [_vector(turn @ np.array(row)) for row in camera.rotation]
     moved_camera = CameraPoseConfig(
         position_mm=_shifted(camera.position_mm, amounts, "camera"), rotation=(rows[0], rows[1], rows[2])
     )
     turn = _turn(amounts, "screen")
-    moved_screen = ScreenPoseConfig(
-        origin_mm=_shifted(screen.origin_mm, amounts, "screen"),
-        s_x=_vector(turn @ np.array(screen.s_x)),
-        s_y=_vector(turn @ np.array(screen.s_y)),
+    origin_mm, s_x, s_y = screen.pose
+    moved_screen = screen.model_copy(
+        update={
+            "origin_mm": _shifted(origin_mm, amounts, "screen"),
+            "s_x": _vector(turn @ np.array(s_x)),
+            "s_y": _vector(turn @ np.array(s_y)),
+        }
     )
     return geometry.model_copy(update={"camera": moved_camera, "screen": moved_screen})
 

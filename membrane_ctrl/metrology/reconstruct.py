@@ -99,9 +99,9 @@ class Tracer:
         self.geometry = geometry
         self.radius_mm = radius_mm
         self.vertex_z_mm = vertex_z_mm
-        normal = np.cross(geometry.screen_s_x, geometry.screen_s_y)
         self._pinhole = geometry.pinhole_mm
-        self._plane = np.stack([geometry.screen_origin_mm, geometry.screen_s_x, geometry.screen_s_y, normal])
+        self._plane = np.vstack([geometry.screen_origin_mm, geometry.screen_axes])
+        self._face = geometry.face
 
     def start(self, points: Points, height: HeightFunction) -> None:
         """Put the points on a starting shape, by t <- (vertex_z + h - F_z) / d_z.
@@ -130,7 +130,7 @@ class Tracer:
         def run(start: int, stop: int) -> FloatArray:
             rays, t = points.rays, points.t_mm
             kernels.intersect(rays, t, self._pinhole, *shape, self.vertex_z_mm, newton, start, stop)
-            fixed = (rays, t, points.screen_mm, points.weights, self._pinhole, self._plane)
+            fixed = (rays, t, points.screen_mm, points.weights, self._pinhole, self._plane, self._face)
             return np.asarray(kernels.residual_sums(*fixed, *shape, start, stop))
 
         return np.asarray(np.sum(split(run, points.t_mm.size), axis=0))
@@ -150,7 +150,7 @@ class Tracer:
         out = np.empty((6, points.t_mm.size))
 
         def run(start: int, stop: int) -> None:
-            fixed = (points.rays, points.t_mm, points.screen_mm, self._pinhole, self._plane)
+            fixed = (points.rays, points.t_mm, points.screen_mm, self._pinhole, self._plane, self._face)
             kernels.slope_field(*fixed, *shape, out, start, stop)
 
         split(run, points.t_mm.size)
@@ -162,7 +162,8 @@ class Tracer:
         out = np.empty((2, points.t_mm.size))
 
         def run(start: int, stop: int) -> None:
-            kernels.predict_screen(points.rays, points.t_mm, self._pinhole, self._plane, *shape, out, start, stop)
+            fixed = (points.rays, points.t_mm, self._pinhole, self._plane, self._face)
+            kernels.predict_screen(*fixed, *shape, out, start, stop)
 
         split(run, points.t_mm.size)
         return out

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from membrane_ctrl.metrology.display import DisplayResponse, MeasuredScreen, RectangularScreen, ScreenShape
+from membrane_ctrl.metrology.face import Face
 from membrane_ctrl.metrology.geometry import Geometry
 
 FloatArray = NDArray[np.float64]
@@ -116,6 +117,7 @@ class SofastResult:
             screen_origin_mm=self.r_cam_optic @ (self.v_cam_screen_mm - self.v_cam_optic_mm),
             screen_s_x=r_screen_optic[:, 0],
             screen_s_y=r_screen_optic[:, 1],
+            face=Face.of(None),
         )
 
 

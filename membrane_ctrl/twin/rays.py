@@ -11,7 +11,7 @@ from math import cos, radians, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.config import CameraConfig, GeometryConfig
+from membrane_ctrl.config import CameraConfig, GeometryConfig, HeightMapConfig, ScreenPoseConfig
 
 FloatArray = NDArray[np.float64]
 _UNDISTORT_STEPS = 200  # each gains a digit or so on a usual lens
@@ -28,15 +28,17 @@ class CameraPose:
 
 @dataclass(frozen=True, slots=True)
 class ScreenPose:
-    """O' as `origin_mm` and the unit vectors of `s_x` and `s_y`, each (3,), in world; `bow_per_mm` is the bow.
+    """O' as `origin_mm` and the unit vectors of `s_x` and `s_y`, each (3,), in world; bow and height map of the face.
 
-    The face stands off the plane by bow_per_mm (s_x^2 + s_y^2) towards s_x x s_y, which points at the mirror.
+    The face stands off the plane by bow_per_mm (s_x^2 + s_y^2) and the map, towards s_x x s_y, which points at the
+    mirror.
     """
 
     origin_mm: FloatArray
     s_x: FloatArray
     s_y: FloatArray
     bow_per_mm: float = 0.0
+    height_map: HeightMapConfig | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,18 +69,18 @@ def camera_pose(geometry: GeometryConfig) -> CameraPose:
 
 def screen_pose(geometry: GeometryConfig, error: ScreenError | None = None) -> ScreenPose:
     """Pose of the screen: as given, or O' = b (-cos alpha, 0, sin alpha) and perpendicular to OO'; then the error."""
-    if geometry.screen is not None:
-        given = geometry.screen
-        pose = ScreenPose(np.array(given.origin_mm), np.array(given.s_x), np.array(given.s_y))
+    face = geometry.screen or ScreenPoseConfig()
+    given = face.pose
+    if given is not None:
+        origin, s_x, s_y = (np.array(vector) for vector in given)
     else:
         _, b_mm, alpha = _short(geometry)
         origin = b_mm * np.array([-cos(alpha), 0.0, sin(alpha)])
-        pose = ScreenPose(origin, np.array([-sin(alpha), 0.0, -cos(alpha)]), np.array([0.0, 1.0, 0.0]))
-    if error is None:
-        return pose
-    s_y = _turned(pose.s_y, pose.s_x, radians(error.tilt_about_x_deg))
-    s_x = _turned(pose.s_x, s_y, radians(error.tilt_about_y_deg))
-    return ScreenPose(pose.origin_mm, s_x, s_y, error.bow_mm / _BOW_RADIUS_MM**2)
+        s_x, s_y = np.array([-sin(alpha), 0.0, -cos(alpha)]), np.array([0.0, 1.0, 0.0])
+    error = error or ScreenError()
+    s_y = _turned(s_y, s_x, radians(error.tilt_about_x_deg))
+    s_x = _turned(s_x, s_y, radians(error.tilt_about_y_deg))
+    return ScreenPose(origin, s_x, s_y, (face.bow_mm + error.bow_mm) / _BOW_RADIUS_MM**2, face.height_map)
 
 
 def pixel_directions(camera: CameraConfig, pose: CameraPose, columns: FloatArray, rows: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from membrane_ctrl.twin.face import onto_face
 from membrane_ctrl.twin.film_terms import FilmTerms, height_and_slopes
 from membrane_ctrl.twin.rays import CameraPose, ScreenPose
 
@@ -16,7 +17,6 @@ FloatArray = NDArray[np.float64]
 _BEYOND = 1.1  # rays that pass further out than this share of the radius are not traced: polynomials run away there
 _TOLERANCE_MM = 1e-11  # of the path's length; doubles carry 5e-13 at 3 m
 _MAX_STEPS = 20  # Newton needs 4 on any bowl; a ray grazing the film may never settle
-_X, _Y, _SX, _SY = range(4)  # columns of the result
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,9 +62,9 @@ def trace(
         vertex_z_mm,
         screen.origin_mm,
         np.stack([screen.s_x, screen.s_y, np.cross(screen.s_x, screen.s_y)]),
-        screen.bow_per_mm,
     )
-    return Trace(hits[_X], hits[_Y], hits[_SX], hits[_SY])
+    s_x_mm, s_y_mm = onto_face(hits[2:4], hits[4:6], screen.bow_per_mm, screen.height_map)
+    return Trace(hits[0], hits[1], s_x_mm, s_y_mm)
 
 
 @njit(cache=True)
@@ -87,26 +87,18 @@ def _film_distance(
 
 
 @njit(cache=True)
-def _screen_point(
-    p: FloatArray, direction: FloatArray, origin: FloatArray, axes: FloatArray, bow_per_mm: float
-) -> tuple[float, float]:
-    """s_x and s_y where a ray from `p` meets the (bowed) screen; NaN if it runs away from it.
+def _plane_point(
+    p: FloatArray, direction: FloatArray, origin: FloatArray, axes: FloatArray
+) -> tuple[float, float, float, float]:
+    """s_x and s_y where a ray from `p` crosses the screen's plane, and its tangents; NaN if it runs away from it.
 
-    In the screen's axes the ray is q + t r; a bow c makes the face w = c (u^2 + v^2), met by Newton from the plane.
+    In the screen's axes the ray is q + t r.
     """
     q, r = axes @ (p - origin), axes @ direction
     if q[2] * r[2] >= 0.0:
-        return np.nan, np.nan
+        return np.nan, np.nan, np.nan, np.nan
     t = -q[2] / r[2]
-    if bow_per_mm != 0.0:
-        for _ in range(_MAX_STEPS):
-            u, v = q[0] + t * r[0], q[1] + t * r[1]
-            miss = q[2] + t * r[2] - bow_per_mm * (u * u + v * v)
-            step = miss / (r[2] - 2.0 * bow_per_mm * (u * r[0] + v * r[1]))
-            t -= step
-            if abs(step) < _TOLERANCE_MM:
-                break
-    return q[0] + t * r[0], q[1] + t * r[1]
+    return q[0] + t * r[0], q[1] + t * r[1], r[0] / r[2], r[1] / r[2]
 
 
 @njit(cache=True)
@@ -118,9 +110,9 @@ def _trace(
     vertex_z_mm: float,
     origin: FloatArray,
     axes: FloatArray,
-    bow_per_mm: float,
 ) -> FloatArray:
-    hits = np.zeros((4, directions.shape[0]))
+    """(6, N): x and y on the film, s_x and s_y on the screen's plane, tangents of the ray there."""
+    hits = np.zeros((6, directions.shape[0]))
     rim_z_mm = vertex_z_mm + sag_mm
     beyond = (_BEYOND * film.radius_mm) ** 2
     normal, p = np.empty(3), np.empty(3)
@@ -135,7 +127,7 @@ def _trace(
             continue
         t = _film_distance(start, d, film, sag_mm, vertex_z_mm, to_rim_mm)
         if np.isnan(t):
-            hits[2, n], hits[3, n] = np.nan, np.nan
+            hits[2:, n] = np.nan
             continue
         for axis in range(3):
             p[axis] = start[axis] + t * d[axis]
@@ -144,5 +136,5 @@ def _trace(
         # law of reflection: r = d - 2 (d n) n / (n n)
         reflected = d - (2.0 * np.dot(d, normal) / np.dot(normal, normal)) * normal
         hits[0, n], hits[1, n] = p[0], p[1]
-        hits[2, n], hits[3, n] = _screen_point(p, reflected, origin, axes, bow_per_mm)
+        hits[2, n], hits[3, n], hits[4, n], hits[5, n] = _plane_point(p, reflected, origin, axes)
     return hits

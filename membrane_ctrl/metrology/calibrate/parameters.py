@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from membrane_ctrl.metrology.face import BOW_RADIUS_MM
 from membrane_ctrl.metrology.geometry import Geometry
 
 FloatArray = NDArray[np.float64]
 
-BOW_RADIUS_MM = 200.0  # where the bow is counted: half the paper's pattern, rounded
 _COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
 
 
@@ -120,14 +120,11 @@ class Bench:
     ----------
     geometry : Geometry
         Camera and screen.
-    bow_per_mm : float
-        The screen's face stands off its plane by bow_per_mm (s_x^2 + s_y^2), towards the mirror.
     pitch : float
         True length of what the screen calls a millimetre.
     """
 
     geometry: Geometry
-    bow_per_mm: float = 0.0
     pitch: float = 1.0
 
 
@@ -157,8 +154,9 @@ def bench_at(stated: Geometry, values: FloatArray) -> Bench:
         screen_origin_mm=poses.origin_mm,
         screen_s_x=poses.screen[0],
         screen_s_y=poses.screen[1],
+        face=stated.face._replace(bow_per_mm=stated.face.bow_per_mm + bow_mm / BOW_RADIUS_MM**2),
     )
-    return Bench(geometry, bow_mm / BOW_RADIUS_MM**2, 1 + pitch)
+    return Bench(geometry, 1 + pitch)
 
 
 def poses_at(stated: Geometry, values: NDArray[Any]) -> Poses:

@@ -8,8 +8,8 @@ u = d - 2 (d n) / (n n) n and meets the screen at S = P + k u. For small changes
     du = (1 - 2 n n^T / (n n)) dd + B dn                 B = -2 / (n n) (n d^T + (d n) 1 - 2 (d n) / (n n) n n^T)
     ds = T (dP + k du - dO' + X^T dX (S - O')) + (E u) s^2 dc / (N u)
 
-with X the screen's rows, E the first two, N = (third row) - 2 c (s_x e_x + s_y e_y) the normal of a face bowed by
-w = c s^2 (a plane for c = 0) and T = E (1 - u N^T / (N u)), which lets the ray run to the face.
+with X the screen's rows, E the first two, N = (third row) - w_x e_x - w_y e_y the normal of a face that stands off by
+w = c s^2 + map (see `metrology.face`) and T = E (1 - u N^T / (N u)), which lets the ray run to the face.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.metrology import hencky, zernike
 from membrane_ctrl.metrology.calibrate.loops import multiply
-from membrane_ctrl.metrology.calibrate.parameters import BOW_RADIUS_MM, OPTICAL, POSE, Bench, Poses
+from membrane_ctrl.metrology.calibrate.parameters import OPTICAL, POSE, Bench, Poses
+from membrane_ctrl.metrology.face import BOW_RADIUS_MM
 from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.kernels import FACE_STEPS
 from membrane_ctrl.metrology.reconstruct import Points, Tracer
 from membrane_ctrl.metrology.surface import PARAMETERS, Surface
 
@@ -152,34 +154,29 @@ class _Meeting:
 
 
 def _meet(bench: Bench, points: Points, surface: Surface, part: slice) -> _Meeting:
-    """Reflect the rays and follow them to the face, by Newton's steps from the plane if it is bowed."""
+    """Reflect the rays and follow them to the face, by Newton's steps from the plane unless it is one."""
     geometry, d, t = bench.geometry, points.rays[:, part], points.t_mm[part]
     place = geometry.pinhole_mm[:, None] + t * d
     hx, hy = slopes(surface, place[0], place[1])
     n = np.stack([-hx, -hy, np.ones_like(hx)])
     u = d - 2 * np.sum(d * n, axis=0) / np.sum(n * n, axis=0) * n
-    axes = _screen_rows(geometry)
+    axes = geometry.screen_axes
     start, along = axes @ (place - geometry.screen_origin_mm[:, None]), axes @ u
     k = -start[2] / along[2]
-    c = bench.bow_per_mm
-    for _ in range(4 if c else 0):  # quadratic: 1 mm of bow is met to 1e-12 mm after three
+    for _ in range(0 if geometry.face.is_plane else FACE_STEPS):
         at = start + k * along
-        slope = along[2] - 2 * c * (at[0] * along[0] + at[1] * along[1])
-        k = k - (at[2] - c * (at[0] ** 2 + at[1] ** 2)) / slope
+        w, by_x, by_y = geometry.face.heights(at[:2])
+        k = k - (at[2] - w) / (along[2] - by_x * along[0] - by_y * along[1])
     at = start + k * along
-    face = axes[2][:, None] - 2 * c * (at[0] * axes[0][:, None] + at[1] * axes[1][:, None])
+    _w, by_x, by_y = geometry.face.heights(at[:2])
+    face = axes[2][:, None] - by_x * axes[0][:, None] - by_y * axes[1][:, None]
     return _Meeting(d, t, place, n, u, k, axes.T @ at, face, at[:2])
-
-
-def _screen_rows(geometry: Geometry) -> FloatArray:
-    normal = np.cross(geometry.screen_s_x, geometry.screen_s_y)
-    return np.stack([geometry.screen_s_x, geometry.screen_s_y, normal])
 
 
 def _derivatives(bench: Bench, turns: list[Poses], surface: Surface, m: _Meeting, lens: FloatArray) -> FloatArray:
     """(2, COLUMNS, m) by the formulas above, right to left: what a change of P, u, n, d does to s."""
     geometry, d, n, u, k = bench.geometry, m.ray, m.normal, m.leaves, m.reach_mm
-    axes = _screen_rows(geometry)
+    axes = geometry.screen_axes
     across, onto = axes[:2] @ u, np.sum(m.face * u, axis=0)  # E u, N u
     by_point = axes[:2, :, None] - across[:, None] * (m.face / onto)  # T
     nn, nd = np.sum(n * n, axis=0), np.sum(n * d, axis=0)
