@@ -74,6 +74,7 @@ class Crew:
         from membrane_ctrl.screen.process import ScreenSpec
 
         self._clock = clock
+        self._summary = run_dir / "summary.json"
         screen_spec = ScreenSpec(clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s)
         self._screen = Child("screen", "membrane_ctrl.screen.process:screen_main", (screen_spec,), nice=5)
         self.children = [self._screen]
@@ -109,7 +110,7 @@ class Crew:
         recorder = self._recorder.child
         if not recorder.join(_RECORDER_CLOSES_S):
             recorder.stop(0.0)  # stopped, or its disk takes nothing any more
-        if recorder.exit_code != 0:  # it died near the end: another writes the end down
+        if recorder.exit_code != 0 and not self._summary.exists():  # another writes the end down
             self._recorder.replace(self._clock.now())
             self._recorder.child.join(_RECORDER_CLOSES_S)
         self._screen.join(_CHILD_STOPS_S)

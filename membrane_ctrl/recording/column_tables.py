@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,9 @@ SHAPES = "shapes"
 # are finer in a single than the sensor behind them (1 mm to 0.1 nm), at half the size and half the reading time.
 _DOUBLES = frozenset({"mono_s", "tick", "sample_counter", "device_time_s", "ambient_pressure_pa"})
 _TICK_BATCH_S = 60.0
-# Rerun holds what a killed recorder had not written yet; reading back costs as much a batch as a thousand rows.
+# Reading back costs as much a batch as a thousand rows.
 _SHAPE_BATCH_S = 300.0
-# A batch costs about 6 kB whatever is in it: the coarser a level, the longer its rows wait. A reader takes the tail
-# that a killed recorder left unwritten from the next finer table.
+# A batch costs about 6 kB whatever is in it: the coarser a level, the longer its rows wait.
 _LEVEL_BATCH_S = {1.0: 300.0, 10.0: 600.0, 60.0: 3600.0}
 # A covariance is 5 kB and changes little from cycle to cycle.
 COVARIANCE_INTERVAL_S = 600.0
@@ -62,26 +62,53 @@ def shape_schema() -> pa.Schema:
     )
 
 
-class ColumnTables:
-    """All tables of a run; takes in what the recorder takes in."""
+@dataclass(frozen=True, slots=True)
+class OpenWindows:
+    """Windows of the overview that are not over: what the recorder after a dead one needs to end them.
 
-    def __init__(self, run_dir: Path) -> None:
-        self._ticks = ColumnFile(run_dir, TICKS, tick_schema(), "mono_s", _TICK_BATCH_S)
-        self._shapes = ColumnFile(run_dir, SHAPES, shape_schema(), "time_s", _SHAPE_BATCH_S)
+    Attributes
+    ----------
+    ticks : dict
+        Rows of the open window of 1 s.
+    levels : dict
+        By the coarser window in s: rows of the finer level that are in its open window.
+    """
+
+    ticks: Columns = field(default_factory=lambda: {name: np.empty(0) for name in TICK_FIELDS})
+    levels: dict[float, Columns] = field(default_factory=dict)
+
+
+class ColumnTables:
+    """All tables of a run; takes in what the recorder takes in.
+
+    Parameters
+    ----------
+    run_dir : Path
+        Folder of the run.
+    resumed : OpenWindows or None
+        From the recorder that died; None at the start of a run.
+    """
+
+    def __init__(self, run_dir: Path, resumed: OpenWindows | None = None) -> None:
+        def table(name: str, schema: pa.Schema, time_name: str, batch_s: float) -> ColumnFile:
+            return ColumnFile(run_dir, name, schema, time_name, batch_s, resumed is not None)
+
+        self._ticks = table(TICKS, tick_schema(), "mono_s", _TICK_BATCH_S)
+        self._shapes = table(SHAPES, shape_schema(), "time_s", _SHAPE_BATCH_S)
         self._levels = {
-            window_s: ColumnFile(run_dir, level_table(window_s), level_schema(), "time_s", _LEVEL_BATCH_S[window_s])
+            window_s: table(level_table(window_s), level_schema(), "time_s", _LEVEL_BATCH_S[window_s])
             for window_s in WINDOWS_S
         }
-        self._open_ticks: Columns = {name: np.empty(0) for name in TICK_FIELDS}
-        self._open_levels: dict[float, Columns] = {}
+        windows = resumed or OpenWindows()
+        self._open_ticks, self._open_levels = windows.ticks, dict(windows.levels)
         self._covariance_due_s = -math.inf
 
     def add_rows(self, rows: Rows) -> None:
         """Take in telemetry rows in their order. Raises OSError (full disk)."""
         if not len(rows):
             return
-        self._advance({name: column(rows, name) for name in TICK_FIELDS})
         self._ticks.add({name: column(rows, name) for name in FIELDS})
+        self._advance({name: column(rows, name) for name in TICK_FIELDS})
 
     def add_shape(self, estimate: ShapeEstimate) -> None:
         """Take in the result of a measurement cycle. Raises OSError (full disk)."""
@@ -95,16 +122,30 @@ class ColumnTables:
         row["coeffs_um"] = [list(estimate.coeffs_um)]
         self._shapes.add({**row, "covariance_um2": [covariance]})
 
+    @property
+    def open_windows(self) -> OpenWindows:
+        """To hand on."""
+        return OpenWindows(self._open_ticks, self._open_levels)
+
+    def sync(self) -> None:
+        """Wait until the disk has all rows, also those of batches that are not full. Raises OSError (full disk)."""
+        for file in self._files:
+            file.sync()
+
     def close(self) -> None:
         """Write the windows still open and end all files. Raises OSError."""
         self._advance(None)
-        for file in (self._ticks, self._shapes, *self._levels.values()):
+        for file in self._files:
             file.close()
 
     @property
     def lost(self) -> int:
         """Rows of all tables given up."""
-        return sum(file.lost for file in (self._ticks, self._shapes, *self._levels.values()))
+        return sum(file.lost for file in self._files)
+
+    @property
+    def _files(self) -> tuple[ColumnFile, ...]:
+        return (self._ticks, self._shapes, *self._levels.values())
 
     def _advance(self, new: Columns | None) -> None:
         """Close the windows that are over (all, if nothing new comes) and hand them to the next coarser level."""

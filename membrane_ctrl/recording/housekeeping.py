@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from pathlib import Path
 
 from membrane_ctrl.clock import RunClock
@@ -15,6 +16,10 @@ from membrane_ctrl.recording.thrift import Thrift, thrift
 
 # Counting the bytes of a hundred runs takes a second of disk.
 RETENTION_INTERVAL_S = 3600.0
+# At the run's end a person waits for the prompt, and a service manager is about to kill what is left. A segment of an
+# hour takes a few seconds (docs/recording.md).
+_OPTIMISE_LAST_S = 20.0
+_LOOK_S = 0.05
 
 
 class Housekeeping:
@@ -31,16 +36,29 @@ class Housekeeping:
         self._clock = clock
         self._config = config
         self._complaints = complaints
-        self._optimizer = Optimizer()
+        self._optimizer = Optimizer(run_dir)
         self._retention_due_s = 0.0
         self.thrift = Thrift.ALL
+
+    def finish(self, closed: list[Path]) -> None:
+        """The run is over: optimise what is closed; what takes too long stays as it is."""
+        give_up_s = time.monotonic() + _OPTIMISE_LAST_S
+        self._take(closed)
+        while True:
+            self._complaints.guarded("optimise", self._optimizer.poll)
+            if not self._optimizer.busy or time.monotonic() > give_up_s:
+                return
+            time.sleep(_LOOK_S)
+
+    def _take(self, closed: list[Path]) -> None:
+        if self.thrift == Thrift.ALL:  # a second copy of a segment needs room
+            for path in closed:
+                self._optimizer.add(path)
 
     def look(self, now_s: float, closed: list[Path]) -> None:
         """Watch the disk, go on with what is under way; `closed` are segments to optimise."""
         self._complaints.guarded("disk check", self._watch_disk)
-        if self.thrift == Thrift.ALL:  # a second copy of a segment needs room
-            for path in closed:
-                self._optimizer.add(path)
+        self._take(closed)
         self._complaints.guarded("optimise", self._optimizer.poll)
         if now_s >= self._retention_due_s:
             self._retention_due_s = now_s + RETENTION_INTERVAL_S

@@ -31,9 +31,17 @@ def quiet_environment() -> dict[str, str]:
 
 
 class Optimizer:
-    """Works through closed segments beside the recorder; call `poll` now and then."""
+    """Works through closed segments beside the recorder; call `poll` now and then.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    run_dir : Path
+        Where the segments are; what a recorder that was killed has left half done there is removed.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        for half_done in run_dir.glob(".*.rrd.part"):
+            half_done.unlink(missing_ok=True)
         self._waiting: deque[Path] = deque()
         self._process: subprocess.Popen[bytes] | None = None
         self._source = self._part = Path()

@@ -127,7 +127,7 @@ def _record(
             report(alive(_ROUND_S))
         if not recorder.ended:
             time.sleep(_POLL_S)
-    recorder.finish()
+    recorder.finish(in_haste=asked())
     if thumbnails is not None:
         thumbnails.close()
     for ring in rings.values():

@@ -87,7 +87,7 @@ class Recorder:
         self._events_file = EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
         self._events_lost = before.events_lost
         self._summary = before.summary
-        self._columns = ColumnTables(run_dir)
+        self._columns = ColumnTables(run_dir, before.windows if resumes else None)
         self._inputs_file = InputsFile(run_dir, __version__, config.recording.segment_s)
         self._assembler = TickAssembler()
         self._resumes = resumes
@@ -135,6 +135,7 @@ class Recorder:
         guarded("inputs file", lambda: self._write_inputs(now_s, shapes))
         guarded("summary", lambda: self._summary.add_rows(rows))
         guarded("tick columns", lambda: self._columns.add_rows(rows))
+        guarded("columns", self._columns.sync)
         closed, self._rerun.closed = self._rerun.closed, []
         self._housekeeping.look(now_s, closed)
         if not self._rerun.send(now_s, rows, new_events, shapes, self._housekeeping.thrift):
@@ -155,6 +156,7 @@ class Recorder:
             self._dropped(),
             self._rerun.shapes.reference,
             self._rerun.state,
+            self._columns.open_windows,
             self._complaints.errors,
             self._rows_lost,
             self._events_lost + self._events_file.lost,
@@ -164,14 +166,13 @@ class Recorder:
     def _dropped(self) -> dict[str, int]:
         return {name: feed.dropped for name, feed in self._feeds.items()}
 
-    def finish(self) -> None:
-        """Last drain, close the recording with its footer, write `summary.json`."""
+    def finish(self, in_haste: bool = False) -> None:
+        """Last drain, close the recording with its footer, write `summary.json`, optimise unless `in_haste`."""
         self.drain()
         self.write()
         guarded = self._complaints.guarded
         guarded("recording", self._rerun.close)
         guarded("columns", self._columns.close)
-        self._housekeeping.close()
         account = {
             "segments": self._rerun.segments,
             "errors": self._complaints.errors,
@@ -187,5 +188,10 @@ class Recorder:
         self._events_file.close()
         self._inputs_file.close()
         remove_state(self._run_dir)
+        # last, as nobody needs it: whoever is in a hurry may kill this process now
+        closed, self._rerun.closed = self._rerun.closed, []
+        if not in_haste:
+            self._housekeeping.finish(closed)
+        self._housekeeping.close()
         done: dict[str, Any] = {"kind": "recorder_done", "dropped": self._dropped(), **account}
         self._complaints.report(done)

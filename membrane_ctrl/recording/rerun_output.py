@@ -147,5 +147,8 @@ class RerunOutput:
         self.state = float(state[-1])
 
     def close(self) -> None:
-        """Write the footer. Raises RecordingError."""
+        """Write the footer; the last segment is then among `closed`. Raises RecordingError."""
+        last = self._recording.path
         self._recording.close()
+        if last is not None:
+            self.closed.append(last)

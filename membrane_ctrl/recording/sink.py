@@ -10,7 +10,6 @@ kept and left alone, and the process has to end without exit handlers.
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
@@ -22,6 +21,7 @@ from rerun.chunk import RrdReader
 
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
+from membrane_ctrl.recording.atomic import sync_data
 from membrane_ctrl.recording.blueprint import run_blueprint
 from membrane_ctrl.recording.height_map import outside_disc
 from membrane_ctrl.recording.lanes import LANES
@@ -159,13 +159,8 @@ class Recording:
 
     def sync(self) -> None:
         """Wait until the disk has what was flushed: Rerun never asks it to. Raises OSError."""
-        if self.path is None:
-            return
-        descriptor = os.open(self.path, os.O_RDONLY)
-        try:
-            os.fdatasync(descriptor)
-        finally:
-            os.close(descriptor)
+        if self.path is not None:
+            sync_data(self.path)
 
     def close(self) -> None:
         """Write the footer and close the file.

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.recording.column_tables import OpenWindows
 from membrane_ctrl.recording.summary import Summary
 
 _NAME = ".recorder-state"
@@ -30,6 +31,8 @@ class RecorderState:
         What changes of the figure are told against.
     state : float
         The controller's state in the last row.
+    windows : OpenWindows
+        Of the overview tables.
     errors, rows_lost, events_lost : int
         The recorder's own account.
     """
@@ -39,6 +42,7 @@ class RecorderState:
     dropped: dict[str, int] = field(default_factory=dict)
     reference: ShapeEstimate | None = None
     state: float = math.nan
+    windows: OpenWindows = field(default_factory=OpenWindows)
     errors: int = 0
     rows_lost: int = 0
     events_lost: int = 0

@@ -26,6 +26,8 @@ from membrane_ctrl.telemetry import FIELDS
 
 Column = NDArray[np.float64]
 Block = dict[str, Column]
+# Rerun rounds the time of a tick to the nanosecond; the next one is milliseconds away
+_SAME_TICK_S = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +92,7 @@ class Run:
         paths = rrd_reader.segments(self.folder)
         for path in paths if last_s == -np.inf else paths[-2:]:
             block = _cut(rrd_reader.read_ticks(path, wanted, self.notes), "mono_s", start_s, end_s)
-            block = _cut(block, "mono_s", np.nextafter(last_s, np.inf) if last_s > -np.inf else -np.inf, np.inf)
+            block = _cut(block, "mono_s", last_s + _SAME_TICK_S, np.inf)
             if block["mono_s"].size:
                 yield block
 
@@ -136,6 +138,7 @@ class Run:
         files = column_files(self.folder, table)
         limited = np.isfinite(start_s) or np.isfinite(end_s)
         starts = [first_s(path, time_name) if limited else None for path in files]
+        last_s = -np.inf
         for place, path in enumerate(files):
             begins, ends = starts[place], next((s for s in starts[place + 1 :] if s is not None), None)
             if (begins is not None and begins >= end_s) or (ends is not None and ends <= start_s):
@@ -144,8 +147,10 @@ class Run:
             if read is None or time_name not in read.column_names:
                 continue
             block = {name: _array(read, name) for name in names}
-            block = _cut(block, time_name, start_s, end_s)
+            # a journal may repeat what the recorder had just written when it was killed
+            block = _cut(block, time_name, max(start_s, np.nextafter(last_s, np.inf)), end_s)
             if block[time_name].size:
+                last_s = float(block[time_name][-1])
                 yield block
 
 

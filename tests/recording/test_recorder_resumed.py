@@ -221,16 +221,29 @@ def test_closed_segments_are_optimised_beside_the_recording(tmp_path: Path, stac
     run.second(recorder, 12)
     assert not optimizer.busy
     recorder.finish()
-    assert chunks(tmp_path / "test-000.rrd") == 1
-    assert is_whole(tmp_path / "test-000.rrd")
+    for name in ("test-000.rrd", "test-001.rrd"):  # the last one as well
+        assert chunks(tmp_path / name) == 1
+        assert is_whole(tmp_path / name)
     assert np.array_equal(np.sort(recorded(tmp_path)[:, 1]), np.arange(600))
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_in_haste_the_last_segment_is_left_as_it_is(tmp_path: Path, stack: ExitStack) -> None:
+    (tmp_path / ".test-000.rrd.part").write_bytes(b"left by a recorder that was killed")
+    run = Run(tmp_path, stack, Config())
+    recorder = run.recorder(0)
+    for number in range(10):
+        run.second(recorder, number)
+    recorder.finish(in_haste=True)
+    assert chunks(tmp_path / "test-000.rrd") >= 10
+    assert run.summary["ticks"] == 500
     assert not list(tmp_path.glob(".*"))
 
 
 def test_a_segment_that_cannot_be_optimised_stays_as_it_is(tmp_path: Path) -> None:
     path = tmp_path / "test-000.rrd"
     path.write_bytes(b"no recording")
-    optimizer = Optimizer()
+    optimizer = Optimizer(tmp_path)
     optimizer.add(path)
     optimizer.poll()
     assert optimizer._process is not None
@@ -244,7 +257,7 @@ def test_a_segment_that_cannot_be_optimised_stays_as_it_is(tmp_path: Path) -> No
 def test_what_is_under_way_at_the_end_is_given_up(tmp_path: Path) -> None:
     path = tmp_path / "test-000.rrd"
     path.write_bytes(b"no recording")
-    optimizer = Optimizer()
+    optimizer = Optimizer(tmp_path)
     optimizer.add(path)
     optimizer.poll()
     optimizer.close()

@@ -52,6 +52,7 @@ def tables(folder: Path, rows: Rows, shapes: list[ShapeEstimate], close: bool = 
         made.add_rows(rows[first : first + 10])
     for estimate in shapes:
         made.add_shape(estimate)
+    made.sync()
     if close:
         made.close()
 

@@ -80,6 +80,8 @@ def test_a_killed_run_ends_in_its_rerun_segment(tmp_path: Path) -> None:
     rows, shapes = night(3, 0.05, "typical", [])
     tables(tmp_path, rows, shapes, close=False)
     segment(tmp_path, rows)
+    for path in (tmp_path / "columns").glob("*-waiting.arrows"):
+        path.unlink()
     run = open_run(tmp_path)
     table = run.ticks(fields_recorded())
     assert table.num_rows == len(rows)
@@ -89,6 +91,17 @@ def test_a_killed_run_ends_in_its_rerun_segment(tmp_path: Path) -> None:
         level = run.level(window_s)
         assert level["rows"].sum() == len(rows)
         assert (np.diff(level["time_s"]) > 0).all()
+
+
+def test_a_killed_run_is_whole_in_its_tables(tmp_path: Path) -> None:
+    rows, shapes = night(3, 0.05, "typical", [])
+    tables(tmp_path, rows, shapes, close=False)
+    run = open_run(tmp_path)
+    assert run.ticks().num_rows == len(rows)
+    assert run.level(60.0)["rows"].sum() == len(rows)
+    assert len(run.shapes()) == len(shapes)
+    files = {path.name for path in (tmp_path / "columns").iterdir()}
+    assert {"ticks-waiting.arrows", "ticks-000.arrows", "levels_60s-waiting.arrows"} <= files
 
 
 def test_a_run_without_tables_is_read_from_rerun(tmp_path: Path) -> None:
