@@ -187,9 +187,9 @@ def _dropout_excursion_um(seed: int) -> float:
     return worst_um
 
 
-def figures(days: float, seed: int = 1) -> list[Figure]:
+def figures(days: float, seed: int = 1, take: Take | None = None) -> list[Figure]:
     """A soak of `days` with everything, as figures."""
-    tally = soak(days, seed, True, everything(seed))
+    tally = soak(days, seed, True, everything(seed), take)
     grown = 100 * (tally.rss_mb / tally.rss_after_hour_mb - 1)
     return [
         at_most("simulated days, with weather and faults", days, "d"),
@@ -224,13 +224,20 @@ def run() -> list[Figure]:
     ]
 
 
+def _tell_days(tick: VirtualTick) -> None:
+    """A line a simulated day, for who waits."""
+    day, second = divmod(tick.row.mono_s, DAY_S)
+    if second < tick.row.dt_s / 2:
+        print(f"day {day:.0f}: {tick.row.state.name.lower()}, {rss_mb():.1f} MB", file=sys.stderr, flush=True)
+
+
 def main() -> int:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--days", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    found = figures(options.days, options.seed)
+    found = figures(options.days, options.seed, _tell_days)
     show("soak", found)
     return int(any(figure.met is False for figure in found))
 

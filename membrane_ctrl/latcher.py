@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
@@ -23,7 +24,7 @@ class Latcher:
     utc : callable
         UTC of a moment on the run's clock.
     tell : callable
-        Takes an event, for a file that could not be written.
+        Takes an event, for a file that could not be written, or can again.
     """
 
     def __init__(
@@ -32,7 +33,8 @@ class Latcher:
         self._file, self._run, self._utc, self._tell = file, run, utc, tell
         # one thread, so that a fault and its acknowledgement stay in order; it exists only once there is a fault
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="latched-fault")
-        self._failed = ""
+        self._news: deque[Event] = deque()  # from the disk's thread
+        self._failing = False
         self._fault: Event = {}
 
     @property
@@ -78,9 +80,13 @@ class Latcher:
         try:
             act()
         except OSError as error:
-            self._failed = str(error)
+            self._news.append({"kind": "latch_failed", "message": str(error)})
+            self._failing = True
+        else:
+            if self._failing:
+                self._news.append({"kind": "latch_written"})
+                self._failing = False
 
     def _report(self) -> None:
-        if self._failed:
-            self._tell({"kind": "latch_failed", "message": self._failed})
-            self._failed = ""
+        while self._news:
+            self._tell(self._news.popleft())

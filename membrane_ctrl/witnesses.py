@@ -54,17 +54,17 @@ class Witnesses:
             self._setpoint_um = setpoint_um
             self._health.setpoint_moved()
         if state != State.HOLD:
-            if self._liar != Liar.NOBODY or self._plausibility.watching:
+            if self._plausibility.watching:
                 self._plausibility.reset()
-            self._liar, self.laser_lies, self.camera_lies = Liar.NOBODY, "", ""
-            return []
+            return self._judge(Liar.NOBODY)
         reading = inputs.reading
         good = reading is not None and reading.displacement_quality == 0
         laser_um = reading.displacement_um if reading is not None and good else math.nan
         gauge_pa = reading.gauge_pressure_pa if reading is not None else math.nan
         events = self._judge(self._plausibility.step(dt_s, laser_um, gauge_pa, inputs.estimate))
         for warning in self._health.step(dt_s, leak_um_per_s, gauge_pa):
-            events.append({"kind": "maintenance", "name": warning.name, "message": warning.message})
+            kind = "maintenance" if warning.bad else "maintenance_over"
+            events.append({"kind": kind, "name": warning.name, "message": warning.message})
         return events
 
     def _judge(self, liar: Liar) -> list[Event]:

@@ -37,7 +37,7 @@ class Run:
         self.events: list[Event] = [
             {**event, "mono_s": tick.row.mono_s} for tick in self.ticks for event in tick.events
         ]
-        self.finished = self.ticks[-1].finished
+        self.finished = self.ticks[-1].outputs.finished
 
     def of(self, kind: str) -> list[Event]:
         return [event for event in self.events if event["kind"] == kind]

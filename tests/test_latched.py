@@ -104,6 +104,18 @@ def test_a_disk_that_fails_is_told(tmp_path: Path) -> None:
     assert [event["kind"] for event in told] == ["latch_failed"]
 
 
+def test_a_disk_that_takes_files_again_is_told_once(tmp_path: Path) -> None:
+    told: list[Event] = []
+    with make(tmp_path / "later", told) as latcher:
+        latcher.heard(outputs(*TRIP))
+        while not told:
+            latcher.heard(outputs())
+        (tmp_path / "later").mkdir()
+        latcher.heard(outputs(*TRIP))
+        latcher.heard(outputs(*TRIP))
+    assert [event["kind"] for event in told] == ["latch_failed", "latch_written"]
+
+
 def test_the_twin_latches_nothing(tmp_path: Path) -> None:
     with Latcher(None, "run", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), lambda event: None) as latcher:
         latcher.heard(outputs(*TRIP))

@@ -13,6 +13,7 @@ Severity = Literal["warning", "critical"]
 
 # a fault that holds the flow for a few samples and is over again wakes nobody
 _GLITCH_S = 5.0
+_LIARS = {"laser": "the laser", "optics": "the camera"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +76,19 @@ def signs_of(event: Event) -> list[Sign]:
             return [Sign("port", True, "warning", f"the control port failed: {event.get('message')}", _GLITCH_S)]
         case "port_open":
             return [Sign("port", False)]
+        case "maintenance" | "maintenance_over":
+            bad = event.get("kind") == "maintenance"
+            return [Sign(f"maintenance_{event.get('name')}", bad, "warning", str(event.get("message")))]
+        case "plausibility":
+            bad = event.get("liar") != "nobody"
+            who = _LIARS.get(str(event.get("liar")), "one of them")
+            text = f"laser and camera do not agree; {who} is wrong ({event.get('seen')})"
+            return [Sign("plausibility", bad, "warning", text)]
+        case "latch_failed":
+            text = f"the fault may be forgotten at the next start: {event.get('message')}"
+            return [Sign("latch", True, "critical", text)]
+        case "latch_written":
+            return [Sign("latch", False)]
         case "end":
             return _end_signs(event)
     return []

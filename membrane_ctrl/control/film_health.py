@@ -36,10 +36,11 @@ class Hour:
 
 @dataclass(frozen=True, slots=True)
 class Maintenance:
-    """Something that a person should look at before it fails."""
+    """Something that a person should look at before it fails; or, no longer `bad`, need not any more."""
 
     name: str
     message: str
+    bad: bool = True
 
 
 class FilmHealth:
@@ -59,7 +60,7 @@ class FilmHealth:
         self._begin_hour()
 
     def step(self, dt_s: float, leak_um_per_s: float, gauge_pressure_pa: float) -> tuple[Maintenance, ...]:
-        """One tick of a held mirror; what is newly worth a warning, at the end of an hour."""
+        """One tick of a held mirror; what is newly worth a warning, or no longer, at the end of an hour."""
         if not (math.isfinite(leak_um_per_s) and math.isfinite(gauge_pressure_pa)):
             return ()
         self._held_s += dt_s
@@ -71,7 +72,7 @@ class FilmHealth:
         self._begin_hour()
         self._hours.append(hour)
         self._first = self._first or hour
-        return tuple(self._newly_bad(hour, self._first))
+        return tuple(self._news(hour, self._first))
 
     def setpoint_moved(self) -> None:
         """The sag is another one from now on: pressures before and after cannot be compared."""
@@ -81,7 +82,7 @@ class FilmHealth:
     def _begin_hour(self) -> None:
         self._held_s = self._leak_um = self._pressure_pa_s = 0.0
 
-    def _newly_bad(self, hour: Hour, first: Hour) -> list[Maintenance]:
+    def _news(self, hour: Hour, first: Hour) -> list[Maintenance]:
         leak, most = hour.leak_um_per_s, self._flow_max_um_per_s
         creep = self._creep_per_day()
         found = (
@@ -94,9 +95,14 @@ class FilmHealth:
             ),
             ("creep", creep / CREEP_PER_DAY, f"the film's compliance grows by {100 * creep:.1f} % a day"),
         )
-        new = [Maintenance(name, says) for name, over, says in found if over > 1 and name not in self._warned]
-        self._warned = {name for name, over, _ in found if over > (BETTER if name in self._warned else 1.0)}
-        return new
+        bad = {name for name, over, _ in found if over > (BETTER if name in self._warned else 1.0)}
+        changed = bad ^ self._warned
+        self._warned = bad
+        return [
+            Maintenance(name, says if name in bad else "no longer so", name in bad)
+            for name, _, says in found
+            if name in changed
+        ]
 
     def _says_leak(self, leak_um_per_s: float) -> str:
         """How bad, and until when the pump can keep up if it goes on like this."""

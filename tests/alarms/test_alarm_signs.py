@@ -34,6 +34,12 @@ LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=
         ({"kind": "recorder_recovered"}, [("recorder", False, "warning")]),
         ({"kind": "port_failed", "message": "x"}, [("port", True, "warning")]),
         ({"kind": "port_open"}, [("port", False, "warning")]),
+        ({"kind": "maintenance", "name": "creep", "message": "x"}, [("maintenance_creep", True, "warning")]),
+        ({"kind": "maintenance_over", "name": "creep"}, [("maintenance_creep", False, "warning")]),
+        ({"kind": "plausibility", "liar": "laser", "seen": "x"}, [("plausibility", True, "warning")]),
+        ({"kind": "plausibility", "liar": "nobody"}, [("plausibility", False, "warning")]),
+        ({"kind": "latch_failed", "message": "disk full"}, [("latch", True, "critical")]),
+        ({"kind": "latch_written"}, [("latch", False, "warning")]),
         ({"kind": "end", "exit": "safety_trip"}, [("run_ended", True, "critical")]),
         ({"kind": "end", "exit": "done"}, []),
         ({"kind": "end", "exit": "interrupted"}, []),
@@ -43,6 +49,15 @@ LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=
 )  # fmt: skip
 def test_events_as_signs(event: Event, expected: list[tuple[str, bool, str]]) -> None:
     assert [(sign.name, sign.bad, sign.severity) for sign in signs_of(event)] == expected
+
+
+@pytest.mark.parametrize(
+    ("liar", "says"), [("laser", "the laser is wrong"), ("optics", "the camera is"), ("unsure", "one of them is")]
+)
+def test_who_is_wrong_is_said_in_the_operators_words(liar: str, says: str) -> None:
+    (sign,) = signs_of({"kind": "plausibility", "liar": liar, "seen": "laser +20.0 um, camera +0.1 um"})
+    assert says in sign.text
+    assert "laser +20.0 um" in sign.text
 
 
 @pytest.mark.parametrize(
