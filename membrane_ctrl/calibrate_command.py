@@ -16,11 +16,12 @@ import numpy as np
 import tomli_w
 
 from membrane_ctrl.calibrate_report import lines_of, report_of
-from membrane_ctrl.capture_set import read_geometry
 from membrane_ctrl.config import OpticsConfig
 from membrane_ctrl.errors import Exit, InputError
+from membrane_ctrl.geometry_file import read_geometry
 from membrane_ctrl.metrology.calibrate.artefact import Origin, tables_of
 from membrane_ctrl.metrology.calibrate.determined import condition_number
+from membrane_ctrl.metrology.calibrate.drift import noise_urad
 from membrane_ctrl.metrology.calibrate.from_checked import phases_of
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, sigmas, usual_sigma
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases
@@ -183,11 +184,13 @@ def problem_of(bundle: Bundle, free: dict[str, float], laser_sigma_um: float) ->
 def _write(path: Path, solution: Solution, problem: Problem, bundle: Bundle, findings: Sequence[Finding]) -> str:
     """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
     slopes = [slope_residual(solution, phases, k) for k, phases in enumerate(problem.sets)]
+    noises = [_noise_urad(solution, phases, k) for k, phases in enumerate(problem.sets)]
     origin = Origin(
         date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         sets=tuple(phases.name for phases in problem.sets),
         screen_residual_um=1e3 * float(np.median([each.residual_rms_mm for each in solution.equations])),
         slope_residual_urad=1e6 * float(np.median(slopes)),
+        slope_noise_urad=float(np.median(noises)),
         condition=condition_number(solution),
         notes=tuple(finding.says for finding in findings),
     )
@@ -200,6 +203,11 @@ def _write(path: Path, solution: Solution, problem: Problem, bundle: Bundle, fin
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
     return str(tables["calibration"]["hash"])
+
+
+def _noise_urad(solution: Solution, phases: SetPhases, index: int) -> float:
+    sigma_mm = float(np.sqrt(np.mean(phases.sigma_mm**2)))
+    return noise_urad(solution.bench.geometry, solution.states[index].surface, sigma_mm)
 
 
 def _draw(path: Path, solution: Solution) -> None:

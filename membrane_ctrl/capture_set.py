@@ -12,17 +12,18 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig, PatternConfig, Section
-from membrane_ctrl.config_file import parse, read_toml
+from membrane_ctrl.config_file import parse, prune, read_toml, with_height_map
 from membrane_ctrl.errors import InputError
+from membrane_ctrl.geometry_file import GeometryFile, GeometryOrigin, origin_of
 from membrane_ctrl.metrology.patterns import AXES, GRAY_BITS
 
 FloatArray = NDArray[np.float64]
@@ -81,6 +82,8 @@ class CaptureHead:
         NaN where the set says nothing.
     ignored : tuple of str
         Keys of the file that are not known.
+    geometry : GeometryOrigin
+        Which geometry is in `optics`.
     """
 
     folder: Path
@@ -93,6 +96,7 @@ class CaptureHead:
     time_s: FloatArray
     displacement_um: FloatArray
     ignored: tuple[str, ...]
+    geometry: GeometryOrigin
 
 
 @dataclass(frozen=True)
@@ -117,15 +121,15 @@ class CaptureSet:
     lost: tuple[int, ...] = ()
 
 
-def read_head(folder: Path, geometry: GeometryConfig | None = None) -> CaptureHead:
+def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead:
     """Read `capture.toml`.
 
     Parameters
     ----------
     folder : Path
         The set.
-    geometry : GeometryConfig, optional
-        Used instead of the set's own.
+    geometry : GeometryFile, optional
+        Used instead of the set's own, with the lens and the pitch that were calibrated with it.
 
     Raises
     ------
@@ -136,9 +140,10 @@ def read_head(folder: Path, geometry: GeometryConfig | None = None) -> CaptureHe
     if not folder.is_dir():
         raise InputError(f"{folder}: no such capture set")
     tables = read_toml(path)
-    ignored = _prune(tables, CaptureFile)
+    with_height_map(tables.get("geometry"), path)
+    ignored = prune(tables, CaptureFile)
     if geometry is not None:
-        tables["geometry"] = geometry.model_dump(exclude_none=True)
+        tables["geometry"] = geometry.geometry.model_dump(exclude_none=True)
     bits_stated = isinstance(tables.get("camera"), dict) and "bits" in tables["camera"]
     content = parse(tables, CaptureFile, str(path))
     rows = _ordered(content, path)
@@ -147,9 +152,10 @@ def read_head(folder: Path, geometry: GeometryConfig | None = None) -> CaptureHe
         if content.reference is None:
             raise InputError(f"{path}: reference: a fringes set names the full set that anchors it")
         reference = (folder / content.reference).resolve()
-    optics = OpticsConfig(
-        geometry=content.geometry, camera=content.camera, pattern=content.pattern, mirror=content.mirror
-    )
+    sections = ("geometry", "camera", "pattern", "mirror")
+    optics = parse({name: getattr(content, name) for name in sections}, OpticsConfig, str(path))
+    if geometry is not None:
+        optics = geometry.over(optics)
     return CaptureHead(
         folder=folder,
         kind=content.kind,
@@ -161,10 +167,11 @@ def read_head(folder: Path, geometry: GeometryConfig | None = None) -> CaptureHe
         time_s=_column([row.time_s for row, _ in rows]),
         displacement_um=_column([row.displacement_um for row, _ in rows]),
         ignored=ignored,
+        geometry=origin_of(optics) if geometry is None else geometry.origin,
     )
 
 
-def read_set(folder: Path, geometry: GeometryConfig | None = None) -> CaptureSet:
+def read_set(folder: Path, geometry: GeometryFile | None = None) -> CaptureSet:
     """Read a capture set with its images. Raises InputError as `read_head`, and if no frame is usable."""
     head = read_head(folder, geometry)
     with ThreadPoolExecutor(_READERS) as pool:
@@ -206,15 +213,6 @@ def assemble(head: CaptureHead, images: Sequence[Frames | str]) -> CaptureSet:
     optics = head.optics.model_copy(update={"camera": camera.model_copy(update={"bits": bits})})
     lost = tuple(k for k, image in enumerate(images) if isinstance(image, str))
     return CaptureSet(replace(head, optics=optics), frames, unusable, lost)
-
-
-def read_geometry(path: Path) -> GeometryConfig:
-    """A geometry file: a `[geometry]` table as in `capture.toml`, or its keys alone. Raises InputError."""
-    tables = read_toml(path)
-    table = tables.get("geometry", tables)
-    if isinstance(table, dict):
-        _prune(table, GeometryConfig)
-    return parse(table, GeometryConfig, str(path))
 
 
 def anchored(head: CaptureHead, reference: CaptureHead) -> CaptureHead:
@@ -310,20 +308,3 @@ def _column(values: list[float | None]) -> FloatArray:
 
 def _most(values: list[Any]) -> Any:
     return Counter(values).most_common(1)[0][0]
-
-
-def _prune(table: dict[str, Any], model: type[BaseModel], prefix: str = "") -> tuple[str, ...]:
-    """Take out keys that are not known, so that a newer writer's sets are read; returns their names."""
-    ignored: list[str] = []
-    known = {(field.alias or name): field.annotation for name, field in model.model_fields.items()}
-    for key in list(table):
-        if key not in known:
-            del table[key]
-            ignored.append(prefix + key)
-            continue
-        nested = [t for t in (known[key], *get_args(known[key])) if isinstance(t, type) and issubclass(t, BaseModel)]
-        inner = table[key] if isinstance(table[key], list) else [table[key]]
-        for item in inner:
-            if nested and isinstance(item, dict):
-                ignored += _prune(item, nested[0], f"{prefix}{key}.")
-    return tuple(dict.fromkeys(ignored))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import tomli_w
 from pydantic import BaseModel, ValidationError
@@ -31,7 +31,11 @@ def load(path: Path, model: type[Model]) -> Model:
     InputError
         One line that names the file, the field and what would be right.
     """
-    return parse(read_toml(path), model, str(path))
+    tables = read_toml(path)
+    optics = tables.get("optics")
+    if isinstance(optics, dict):
+        with_height_map(optics.get("geometry"), path)
+    return parse(tables, model, str(path))
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -48,12 +52,54 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: not valid TOML: {error}") from None
 
 
+def with_height_map(geometry: Any, where: Path) -> None:
+    """Put the numbers of `screen.height_map.file` in its place, in the tables of a geometry that came from `where`.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or if it holds anything but rows of numbers.
+    """
+    screen = geometry.get("screen") if isinstance(geometry, dict) else None
+    table = screen.get("height_map") if isinstance(screen, dict) else None
+    if not isinstance(table, dict) or "file" not in table:
+        return
+    field = f"{where}: geometry.screen.height_map.file"
+    if "heights_mm" in table:
+        raise InputError(f"{field}: give either the file or heights_mm")
+    path = where.parent / str(table.pop("file"))
+    try:
+        lines = path.read_text(encoding="utf-8").replace(",", " ").splitlines()
+        rows = [[float(word) for word in line.split("#")[0].split()] for line in lines]
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise InputError(f"{field}: {path}: {reason}") from None
+    table["heights_mm"] = [row for row in rows if row]
+
+
 def parse(tables: dict[str, Any], model: type[Model], where: str) -> Model:
     """Validate tables that came from `where`. Raises InputError like `load`."""
     try:
         return model.model_validate(tables)
     except ValidationError as error:
         raise InputError(f"{where}: {describe(error.errors()[0], model)}") from None
+
+
+def prune(table: dict[str, Any], model: type[BaseModel], prefix: str = "") -> tuple[str, ...]:
+    """Take out keys that are not known, so that a newer writer's sets are read; returns their names."""
+    ignored: list[str] = []
+    known = {(field.alias or name): field.annotation for name, field in model.model_fields.items()}
+    for key in list(table):
+        if key not in known:
+            del table[key]
+            ignored.append(prefix + key)
+            continue
+        nested = [t for t in (known[key], *get_args(known[key])) if isinstance(t, type) and issubclass(t, BaseModel)]
+        inner = table[key] if isinstance(table[key], list) else [table[key]]
+        for item in inner:
+            if nested and isinstance(item, dict):
+                ignored += prune(item, nested[0], f"{prefix}{key}.")
+    return tuple(dict.fromkeys(ignored))
 
 
 def dump(config: BaseModel) -> str:

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.capture_set import read_geometry
 from membrane_ctrl.errors import Exit, InputError
+from membrane_ctrl.geometry_file import read_geometry
 from membrane_ctrl.measurement import Measurement, measure_set
 from membrane_ctrl.metrology.outline import Outline, find_outline
 from membrane_ctrl.metrology.radial import RadialProfile, radial_profile

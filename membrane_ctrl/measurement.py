@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from membrane_ctrl.capture_set import CaptureHead, CaptureSet, anchored, read_set
-from membrane_ctrl.config import GeometryConfig
 from membrane_ctrl.errors import InputError
 from membrane_ctrl.estimate import Verdict
+from membrane_ctrl.geometry_file import GeometryFile
 from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, check
 from membrane_ctrl.metrology.frame_stack import FrameStack
 from membrane_ctrl.metrology.full import FullResult, measure_pixels, reconstruct_full
@@ -57,7 +57,7 @@ class Measurement:
 
 def measure_set(
     folder: Path,
-    geometry: GeometryConfig | None = None,
+    geometry: GeometryFile | None = None,
     anchor: Anchor | None = None,
     start: HeightFunction | None = None,
 ) -> Measurement:
@@ -67,7 +67,7 @@ def measure_set(
     ----------
     folder : Path
         The set.
-    geometry : GeometryConfig, optional
+    geometry : GeometryFile, optional
         Instead of the set's own.
     anchor : Anchor, optional
         For a fringes set: its reference, if it has been read already (see `read_anchor`).
@@ -88,7 +88,7 @@ def measure_set(
     return measure_capture(capture, anchor, start, load_s=time.perf_counter() - begin)
 
 
-def read_anchor(folder: Path, geometry: GeometryConfig | None = None) -> tuple[CaptureHead, Anchor]:
+def read_anchor(folder: Path, geometry: GeometryFile | None = None) -> tuple[CaptureHead, Anchor]:
     """The reference of fringes sets. Raises InputError if it gives no figure."""
     capture = read_set(folder, geometry)
     if capture.head.kind != "full":

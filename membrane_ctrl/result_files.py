@@ -40,6 +40,7 @@ def result_table(measurement: Measurement) -> dict[str, Any]:
         },
         "fit": _fit_table(full),
         "quality": quality,
+        "geometry": measurement.head.geometry.table(),
         "timing_s": measurement.timing_s,
     }
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from membrane_ctrl.capture_set import CaptureHead, anchored, read_set
-from membrane_ctrl.config import GeometryConfig
 from membrane_ctrl.errors import CommandError, RejectedError
 from membrane_ctrl.estimate import Verdict
+from membrane_ctrl.geometry_file import GeometryFile
 from membrane_ctrl.measurement import read_anchor, stack_of
 from membrane_ctrl.metrology.bin_figure import BinFigure, bin_figure
 from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, check
@@ -53,11 +53,11 @@ class Figures:
 
     Parameters
     ----------
-    geometry : GeometryConfig, optional
+    geometry : GeometryFile, optional
         Used instead of the sets' own.
     """
 
-    def __init__(self, geometry: GeometryConfig | None = None) -> None:
+    def __init__(self, geometry: GeometryFile | None = None) -> None:
         self._geometry = geometry
         self._reference: Path | None = None
         self._anchor: tuple[CaptureHead, Anchor] | CommandError = CommandError("no reference read yet")

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.capture_set import read_geometry
 from membrane_ctrl.errors import InputError
+from membrane_ctrl.geometry_file import read_geometry
 from membrane_ctrl.geometry_spread_file import spread_of
 from membrane_ctrl.metrology.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.monte_carlo import TrialBench
@@ -111,7 +111,8 @@ def _table(
         "verdicts": [{"set": str(one.head.folder), "verdict": one.verdict, "reason": one.reason} for one in sets],
         "trials": options.trials,
         "seed": options.seed,
-        "geometry": {"names": list(spread.names), "sigmas": spread.sigmas.tolist(), "source": source},
+        "geometry": sets[0].head.geometry.table()
+        | {"names": list(spread.names), "sigmas": spread.sigmas.tolist(), "source": source},
         "rmse_um": {"mean": float(rmse.mean()), "max": float(rmse.max())},
         "linear_um": {"mean": float(linear.mean()), "max": float(linear.max())},
         "noise_um": {"mean": float(noise.mean()), "max": float(noise.max())},

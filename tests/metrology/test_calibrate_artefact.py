@@ -10,14 +10,15 @@ import pytest
 import tomli_w
 from calibration_truth import OPTICS, make
 
-from membrane_ctrl.config import GeometryConfig, OpticsConfig
-from membrane_ctrl.metrology.calibrate.artefact import Origin, content_hash, general_covariance, tables_of
+from membrane_ctrl.config import GeometryConfig, OpticsConfig, ScreenPoseConfig
+from membrane_ctrl.metrology.calibrate.artefact import Origin, general_covariance, tables_of
+from membrane_ctrl.metrology.calibrate.content_hash import content_hash
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, sigmas
 from membrane_ctrl.metrology.calibrate.solve import Solution, solve
 from membrane_ctrl.metrology.geometry import Geometry
 from membrane_ctrl.metrology.geometry_spread import GENERAL_NAMES, GeometrySpread, changed
 
-ORIGIN = Origin("2026-01-01T00:00:00+00:00", ("a", "b"), 1.0, 2.0, 3.0, ("a note",))
+ORIGIN = Origin("2026-01-01T00:00:00+00:00", ("a", "b"), 1.0, 2.0, 1.5, 3.0, ("a note",))
 FREE = sigmas({"bow_mm": 1.5, "k1": 0.02, "pitch_relative": 1e-3})
 
 
@@ -35,7 +36,8 @@ def test_the_file_says_the_calibrated_bench(solution: Solution) -> None:
     bench = solution.bench
     for field in ("pinhole_mm", "rotation", "screen_origin_mm", "screen_s_x", "screen_s_y"):
         assert np.array_equal(getattr(there, field), getattr(bench.geometry, field)), field
-    assert tables["screen"]["bow_mm"] == pytest.approx(solution.values[NAMES.index("bow_mm")])
+    assert tables["geometry"]["screen"]["bow_mm"] == pytest.approx(solution.values[NAMES.index("bow_mm")])
+    assert there.face.bow_per_mm == pytest.approx(bench.geometry.face.bow_per_mm, rel=1e-14)
     assert tables["camera"]["distortion"] == list(bench.geometry.distortion)
     assert tables["pattern"]["period_mm"] == pytest.approx(OPTICS.pattern.period_mm * bench.pitch)
     assert tables["calibration"]["sets"] == ["a", "b"]
@@ -45,7 +47,20 @@ def test_the_file_says_the_calibrated_bench(solution: Solution) -> None:
 def test_only_what_was_free_is_written() -> None:
     truth = make(np.zeros(len(NAMES)), seed=4, points=1200)
     tables = tables_of(solve(truth.problem(sigmas())), OPTICS, ORIGIN)
-    assert not {"screen", "camera", "pattern"} & set(tables)
+    assert not {"camera", "pattern"} & set(tables)
+    assert tables["geometry"]["screen"]["bow_mm"] == 0
+
+
+def test_a_stated_bow_and_map_are_kept() -> None:
+    stated_map = {"s_x_mm": [-300, 0, 300], "s_y_mm": [-300, 300], "heights_mm": [[0.1, 0, 0.1], [0, 0, 0]]}
+    stated = OPTICS.geometry.model_copy(update={"screen": ScreenPoseConfig(bow_mm=0.5, height_map=stated_map)})
+    optics = OPTICS.model_copy(update={"geometry": stated})
+    bench = bench_at(Geometry.from_config(optics), FREE)
+    assert bench.geometry.face.bow_per_mm * 200.0**2 == pytest.approx(2.0)
+    assert bench.geometry.face.cells_mm.size
+    truth = make(np.zeros(len(NAMES)), seed=4, points=1200)
+    screen = tables_of(solve(truth.problem(sigmas())), optics, ORIGIN)["geometry"]["screen"]
+    assert ScreenPoseConfig.model_validate(screen).height_map == stated.screen.height_map
 
 
 def test_the_covariance_is_that_of_drawn_parameters(solution: Solution) -> None:
@@ -94,7 +109,7 @@ def test_the_hash_stands_for_the_numbers_alone(solution: Solution) -> None:
     tables = tables_of(solution, OPTICS, ORIGIN)
     there_and_back = tomllib.loads(tomli_w.dumps(tables))
     assert content_hash(there_and_back) == tables["calibration"]["hash"]
-    later = tables_of(solution, OPTICS, Origin("2027-01-01T00:00:00+00:00", ("c",), 1.0, 2.0, 3.0))
+    later = tables_of(solution, OPTICS, Origin("2027-01-01T00:00:00+00:00", ("c",), 1.0, 2.0, 1.5, 3.0))
     assert later["calibration"]["hash"] == tables["calibration"]["hash"]
     edited = copy.deepcopy(there_and_back)
     edited["geometry"]["camera"]["position_mm"][0] += 0.001

@@ -137,10 +137,34 @@ def test_sets_that_are_close_are_used_with_a_word() -> None:
 
 
 def test_the_monitor_waits_for_many_cycles_and_forgives_one() -> None:
-    monitor = DriftMonitor(1.0)
-    assert not any(monitor.add(1.05) for _ in range(CYCLES))
-    assert monitor.add(40.0) == ""
-    assert monitor.add(float("nan")) == ""
-    said = [monitor.add(1.4) for _ in range(CYCLES)]
-    assert said[0] == ""
-    assert said[-1].startswith("calibrate again: the fit leaves 1.40 urad")
+    monitor = DriftMonitor(1.0, 0.6)  # 0.8 of it is film and geometry
+    for residual_urad in [1.05] * CYCLES + [40.0, float("nan")]:
+        monitor.add(residual_urad, 0.6)
+        assert monitor.says == ""
+    monitor.add(1.4, 0.6)
+    assert monitor.says == ""
+    for _ in range(CYCLES):
+        monitor.add(1.4, 0.6)
+    assert monitor.says.startswith("calibrate again: the fit leaves 1.40 urad")
+    assert monitor.says.endswith("promises 1.00")
+
+
+def test_the_monitor_tells_the_cameras_noise_from_the_film() -> None:
+    noisy = DriftMonitor(1.0, 0.6)
+    for _ in range(CYCLES):
+        noisy.add(2.15, 2.0)  # 0.8 of film and 2.0 of noise
+    assert noisy.says == ""
+    binned = DriftMonitor(1.0, 0.9)
+    for _ in range(CYCLES):
+        binned.add(0.9, 0.1)  # less than was calibrated, but the noise has gone
+    assert binned.says
+
+
+def test_a_warning_ends_well_below_where_it_began() -> None:
+    monitor = DriftMonitor(1.0, 0.0)
+    said = []
+    for residual_urad in (1.3, 1.2, 1.05):
+        for _ in range(CYCLES):
+            monitor.add(residual_urad, 0.0)
+        said.append(bool(monitor.says))
+    assert said == [True, True, False]

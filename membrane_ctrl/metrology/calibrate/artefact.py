@@ -3,15 +3,12 @@
 `[geometry]` is what every command reads. `[covariance]` is what a Monte Carlo draws from: shifts and turns of camera
 and screen in world, twelve of them, made from the eleven parameters (the twelfth direction, a turn of everything
 about z, has no variance: it defines x). `[parameters]` are the calibration's own, `[calibration]` says where all
-that comes from. `[camera]` and `[pattern]` are there if the lens or the screen's pitch were calibrated, `[screen]` if
-its bow was; a measurement with such a file needs them too.
+that comes from. The screen's bow is in `[geometry.screen]`. `[camera]` and `[pattern]` are there if the lens or the
+screen's pitch were calibrated; a measurement with such a file needs them too.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from membrane_ctrl.config import CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig, Vector3
-from membrane_ctrl.metrology.calibrate.parameters import BOW_RADIUS_MM, NAMES, POSE, pose_derivatives
+from membrane_ctrl.metrology.calibrate.content_hash import SCHEMA, content_hash
+from membrane_ctrl.metrology.calibrate.parameters import NAMES, POSE, pose_derivatives
 from membrane_ctrl.metrology.calibrate.solve import Solution
+from membrane_ctrl.metrology.face import BOW_RADIUS_MM
 
 FloatArray = NDArray[np.float64]
 
-SCHEMA = "membrane-geometry/1"
 _LENS = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1", "p2")
-_HASHED = ("geometry", "covariance", "parameters", "camera", "pattern", "screen")
 
 
 @dataclass(frozen=True)
@@ -43,6 +40,8 @@ class Origin:
         Median over the sets of the RMS of seen minus predicted screen points.
     slope_residual_urad : float
         Median over the sets of the RMS that `measure` states with this geometry: what a drift is seen against.
+    slope_noise_urad : float
+        What the camera's noise is in it.
     condition : float
         See `determined.condition_number`.
     notes : tuple of str
@@ -53,6 +52,7 @@ class Origin:
     sets: tuple[str, ...]
     screen_residual_um: float
     slope_residual_urad: float
+    slope_noise_urad: float
     condition: float
     notes: tuple[str, ...] = ()
 
@@ -68,7 +68,7 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
     free = [NAMES.index(name) for name in solution.free]
     tables: dict[str, Any] = {
         "schema": SCHEMA,
-        "geometry": geometry_of(solution).model_dump(exclude_none=True),
+        "geometry": geometry_of(solution, optics).model_dump(exclude_none=True),
         "covariance": {"names": list(general_names()), "matrix": general_covariance(solution).tolist()},
         "parameters": {
             "names": [NAMES[k] for k in free],
@@ -79,20 +79,20 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
     }
     bench = solution.bench
     if set(solution.free) & set(_LENS):
-        tables["camera"] = {
+        of_camera = {key: getattr(optics.camera, key) for key in ("width_px", "height_px", "pixel_um")}
+        tables["camera"] = of_camera | {
             "focal_mm": bench.geometry.focal_px * optics.camera.pixel_um * 1e-3,
             "principal_px": list(bench.geometry.principal_px),
             "distortion": list(bench.geometry.distortion),
         }
     if "pitch_relative" in solution.free:
         tables["pattern"] = {"period_mm": optics.pattern.period_mm * bench.pitch}
-    if "bow_mm" in solution.free:
-        tables["screen"] = {"bow_mm": bench.bow_per_mm * BOW_RADIUS_MM**2}
     tables["calibration"] = {
         "date_utc": origin.date_utc,
         "sets": list(origin.sets),
         "screen_residual_um": origin.screen_residual_um,
         "slope_residual_urad": origin.slope_residual_urad,
+        "slope_noise_urad": origin.slope_noise_urad,
         "condition": origin.condition,
         "notes": list(origin.notes),
         "hash": content_hash(tables),
@@ -100,8 +100,9 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
     return tables
 
 
-def geometry_of(solution: Solution) -> GeometryConfig:
-    """The calibrated geometry in the general form."""
+def geometry_of(solution: Solution, optics: OpticsConfig) -> GeometryConfig:
+    """The calibrated geometry in the general form; the screen's height map is the stated bench's."""
+    stated = optics.geometry.screen
     geometry = solution.bench.geometry
     right, down, forward = (_vector(row) for row in geometry.rotation)
     return GeometryConfig(
@@ -111,6 +112,8 @@ def geometry_of(solution: Solution) -> GeometryConfig:
             origin_mm=_vector(geometry.screen_origin_mm),
             s_x=_vector(geometry.screen_s_x),
             s_y=_vector(geometry.screen_s_y),
+            bow_mm=geometry.face.bow_per_mm * BOW_RADIUS_MM**2,
+            height_map=None if stated is None else stated.height_map,
         ),
     )
 
@@ -144,13 +147,6 @@ def general_covariance(solution: Solution) -> FloatArray:
     matrix = np.stack(columns, axis=1)
     covariance = matrix @ solution.covariance[: len(POSE), : len(POSE)] @ matrix.T
     return np.asarray((covariance + covariance.T) / 2)
-
-
-def content_hash(tables: Mapping[str, Any]) -> str:
-    """Sixteen digits that stand for the numbers in a geometry's tables, whatever their order or layout."""
-    content = {key: tables[key] for key in _HASHED if key in tables}
-    text = json.dumps(content, sort_keys=True, default=list)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _turn_vector(cross: FloatArray) -> FloatArray:
