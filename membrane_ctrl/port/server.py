@@ -153,12 +153,15 @@ class Port:
         except OSError as error:  # no certificate, an expired one, one of a stranger, no TLS at all, too slow
             self._refusals.record("tls:unknown", "", f"handshake: {error}")
             return
-        await self._serve(wire, self._listeners.tls.peer(wire.certificate))
+        tls, certificate = self._listeners.tls, wire.certificate
+        await self._serve(wire, tls.peer(certificate), tls.lasts_s(certificate))
 
-    async def _serve(self, wire: Wire, peer: Peer) -> None:
+    async def _serve(self, wire: Wire, peer: Peer, lasts_s: float | None = None) -> None:
         self._make_room(peer)
         session = Session(wire, peer, self.status)
         self._sessions.append(session)
+        loop = asyncio.get_running_loop()
+        expiry = None if lasts_s is None else loop.call_later(lasts_s, self._expire, session)
         greeting = {
             "membrane_ctrl": VERSION,
             "run": self._run,
@@ -170,6 +173,13 @@ class Port:
             await session.run(greeting, self._answer, self._refusals.record)
         finally:
             self._sessions.remove(session)
+            if expiry is not None:
+                expiry.cancel()
+
+    def _expire(self, session: Session) -> None:
+        reason = "the certificate has expired"
+        self._refusals.record(session.peer.who, "", reason)
+        session.drop(reason)
 
     def _make_room(self, peer: Peer) -> None:
         own = [session for session in self._sessions if session.peer.who == peer.who]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import socket
 import ssl
+import time
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,10 @@ class TlsListener:
         name = "".join(c for c in subject.get("commonName", "nameless") if c.isprintable())
         who = f"tls:{name}".encode()[:WHO_BYTES].decode(errors="ignore")
         return Peer(who, _ROLES.get(subject.get("organizationalUnitName", ""), "read"))
+
+    def lasts_s(self, certificate: dict[str, Any]) -> float:
+        """How long the certificate is valid from now on: a connection must not outlive it."""
+        return ssl.cert_time_to_seconds(certificate["notAfter"]) - time.time()
 
     def close(self) -> None:
         """Close the socket."""

@@ -7,6 +7,7 @@ import shutil
 import socket
 import ssl
 import subprocess
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -128,6 +129,34 @@ async def test_an_expired_certificate_stays_out_and_is_recorded(
             await asyncio.to_thread(greet, run, pair, lab.own)
         (refused,) = run.of_kind("refused")
         assert "certificate has expired" in refused["reason"]
+
+
+async def test_a_connection_does_not_outlive_its_certificate(
+    tmp_path: Path, lab: Authority, config: PortConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = client_context(*lab.certificate("brief", "operate"), lab.own)
+    monkeypatch.setattr(TlsListener, "lasts_s", lambda *_: 0.3)
+    notices: list[str] = []
+
+    def talk() -> None:
+        with PortClient.tls(*address_of(run), context, notices.append) as client:
+            while True:
+                client.ask(do="status")
+
+    async with port_run(tmp_path, config) as run:
+        with pytest.raises(DeviceError):
+            await asyncio.to_thread(talk)
+        (refused,) = run.of_kind("refused")
+    assert (refused["who"], refused["reason"]) == ("tls:brief", "the certificate has expired")
+    assert notices == ["the certificate has expired"]
+
+
+def test_how_long_a_certificate_lasts(config: PortConfig) -> None:
+    assert config.tls is not None
+    listener = TlsListener(config.tls)
+    in_an_hour = time.strftime("%b %d %H:%M:%S %Y GMT", time.gmtime(time.time() + 3600))
+    assert listener.lasts_s({"notAfter": in_an_hour}) == pytest.approx(3600, abs=60)
+    listener.close()
 
 
 async def test_a_strangers_certificate_stays_out(tmp_path: Path, lab: Authority, config: PortConfig) -> None:
