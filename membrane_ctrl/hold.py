@@ -19,15 +19,17 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from firmware_iface.register_map import default_map
 from firmware_iface.roles import Bench, LinkError
 from membrane_ctrl.alarms.apprise_sender import require_sendable
 from membrane_ctrl.bench import connect, open_bench
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.commands import Command
-from membrane_ctrl.config import Config, DevicesConfig
+from membrane_ctrl.config import Config
 from membrane_ctrl.controller import Controller
 from membrane_ctrl.crew import Crew, Rings, rings_for
 from membrane_ctrl.errors import DeviceError, Exit, InputError
+from membrane_ctrl.geometry_in_force import geometry_in_force
 from membrane_ctrl.ipc.published import publish
 from membrane_ctrl.ipc.ring import RingReader, RingWriter
 from membrane_ctrl.latched import LatchedFile
@@ -66,6 +68,7 @@ def hold_mirror(options: HoldOptions) -> int:
     if options.config.devices is None and not options.twin:
         raise InputError(f"{options.source}: devices: missing; name the pump board in [devices], or use --twin")
     require_sendable(options.config.alarms)
+    geometry = geometry_in_force(options.config)
     clock = RunClock.start()
     with ExitStack() as stack:
         twin = TwinProcess.started(options.config, clock, stack, options.lab) if options.twin else None
@@ -74,8 +77,9 @@ def hold_mirror(options: HoldOptions) -> int:
         logs_dir = options.logs_dir or Path(config.recording.logs_dir)
         listeners = listeners_for(config.port, logs_dir, stack)  # a second hold ends here, no device touched
         latched = _latched(config, logs_dir, options)
-        asyncio.run(_identify(open_bench(config.devices), config.devices, options.clear_faults))
+        board = asyncio.run(_identify(open_bench(config.devices), config, options))
         run_dir = create_run_folder(logs_dir, options.name, clock.origin_utc, config)
+        geometry.keep(run_dir)
         rings = rings_for(config, twin.truth if twin else None, stack)
         publish(run_dir, {"telemetry": rings.telemetry, "events": rings.events, "shapes": rings.shapes})
         crew = Crew(config, clock, rings, run_dir, options.name, options.duration_s)
@@ -83,7 +87,7 @@ def hold_mirror(options: HoldOptions) -> int:
         bench = open_bench(config.devices)  # a link belongs to the event loop that opened it
         port = partial(Port, config.port, listeners, run_dir.name)
         latcher = partial(Latcher, latched, run_dir.name, clock.utc)
-        exit_code = asyncio.run(_run(bench, config, options, clock, rings, crew, twin, port, latcher))
+        exit_code = asyncio.run(_run(bench, config, options, clock, rings, crew, twin, port, latcher, board))
         crew.take_down()
     _report(run_dir, options.json)
     return exit_code
@@ -98,30 +102,44 @@ def _latched(config: Config, logs_dir: Path, options: HoldOptions) -> LatchedFil
         return None
     file = LatchedFile(logs_dir)
     fault = file.read()
-    if fault is None or options.standby:
-        return file
-    if not options.clear_faults:
+    if fault is not None and options.clear_faults:
+        file.clear()
+    elif fault is not None and not options.standby:
         raise DeviceError(f"a fault is latched: {fault}; {fault.remedy}, then start with --clear-faults")
-    file.clear()
     return file
 
 
-async def _identify(bench: Bench, devices: DevicesConfig, clear_faults: bool) -> None:
+@dataclass(frozen=True, slots=True)
+class BoardAtStart:
+    """What the board itself had latched before this run."""
+
+    latched: str = ""  # and has still: nobody asks to hold the mirror yet
+    cleared: str = ""  # as the resume rule allows
+
+
+async def _identify(bench: Bench, config: Config, options: HoldOptions) -> BoardAtStart:
     """Who is there, and is it fit to run, before a run folder exists. Raises DeviceError."""
+    devices = config.devices
+    assert devices is not None
     try:
         await connect(bench, devices)
-        if clear_faults:
+        if options.clear_faults:
             await bench.clear_faults()
-        reading = await bench.read()
-        if reading.latched_faults:
-            raise DeviceError(
-                f"{devices.name}: the board has latched faults {reading.latched_faults:#x} (docs/registers.md); "
-                "find out why, then start with --clear-faults"
-            )
+        faults = (await bench.read()).latched_faults
+        if not faults:
+            return BoardAtStart()
+        what = f"{devices.name}: the board has latched faults {faults:#x} (docs/registers.md)"
+        # the controller before this one was killed: no more than that, if nothing else is latched
+        if faults == default_map().fault_mask("watchdog") and "watchdog_tripped" in config.resume.faults:
+            await bench.clear_faults()
+            return BoardAtStart(cleared="its watchdog had stopped the pump; cleared, as resume.faults allows")
     except LinkError as error:
         raise DeviceError(f"{devices.name}: {error}") from None
     finally:
         await bench.close()
+    if not options.standby:
+        raise DeviceError(f"{what}; find out why, then start with --clear-faults")
+    return BoardAtStart(latched=what)
 
 
 async def _run(
@@ -134,6 +152,7 @@ async def _run(
     twin: TwinProcess | None,
     port_for: Callable[[RunHooks], Port],
     latcher_for: Callable[[Callable[[Event], None]], Latcher],
+    board: BoardAtStart,
 ) -> Exit:
     from membrane_ctrl.metrology.hencky import zernike_projection
 
@@ -144,17 +163,17 @@ async def _run(
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         port = port_for(RunHooks(supervisor.ask, supervisor.tell, clock.now, lambda: controller.loop_config))
         latcher, systemd = latcher_for(supervisor.tell), SystemdNotify()
-        wiring.heard = (port.heard, latcher.heard, systemd.heard)
+        wiring.heard, wiring.told = (port.heard, latcher.heard, systemd.heard), (port.told,)
         devices = config.devices.name if config.devices else ""
-        supervisor.tell({"kind": "start", "devices": devices, "priority": raise_priority()})
+        supervisor.tell({"kind": "start", "devices": devices, "priority": raise_priority(), "message": board.cleared})
         exit_code = Exit.DEVICE_FAILED
         try:
             assert config.devices is not None
             await connect(bench, config.devices)
             if not options.standby:
                 supervisor.ask(Command("hold", "command line"))
-            elif latcher.latched:
-                supervisor.ask(Command("latch", "command line", text=latcher.latched))
+            elif latched := "; ".join(part for part in (latcher.latched, board.latched) if part):
+                supervisor.ask(Command("latch", "command line", text=latched))
             gc.collect()
             gc.freeze()  # what lives for the whole run need not be looked at again between two ticks
             async with port.open():

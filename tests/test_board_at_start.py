@@ -1,0 +1,82 @@
+"""What the board itself has latched when a hold begins: refused, waited for, or cleared as the resume rule allows."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+import pytest_asyncio
+
+from firmware_iface.emulators.pump_board import BoardSample, PumpBoardEmulator
+from firmware_iface.register_map import default_map
+from membrane_ctrl.bench import open_bench
+from membrane_ctrl.config import Config, DevicesConfig, ResumeConfig
+from membrane_ctrl.errors import DeviceError
+from membrane_ctrl.hold import BoardAtStart, HoldOptions, _identify, _latched
+from membrane_ctrl.latched import NAME, LatchedFile
+
+WATCHDOG, OVER_PRESSURE = (default_map().fault_mask(name) for name in ("watchdog", "over_pressure"))
+
+
+class Still:
+    """A plant on which nothing happens."""
+
+    def sample(self) -> BoardSample:
+        return BoardSample(0.0, 0, 600.0, 101325.0, 23.0, 21.0, 1, 0.0)
+
+    def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
+        assert pump_fraction == 0.0
+
+
+@pytest_asyncio.fixture
+async def board() -> AsyncIterator[PumpBoardEmulator]:
+    emulator = PumpBoardEmulator(Still())
+    await emulator.start()
+    yield emulator
+    await emulator.stop()
+
+
+def options(standby: bool = False, clear_faults: bool = False) -> HoldOptions:
+    return HoldOptions(Config(), "lab.toml", False, None, "test", None, clear_faults, False, standby)
+
+
+async def identified(board: PumpBoardEmulator, asked: HoldOptions, resumes: tuple[str, ...] = ()) -> BoardAtStart:
+    devices = DevicesConfig(board=f"tcp://127.0.0.1:{board.port}")
+    return await _identify(open_bench(devices), Config(devices=devices, resume=ResumeConfig(faults=resumes)), asked)
+
+
+async def test_a_board_without_faults_is_taken(board: PumpBoardEmulator) -> None:
+    assert await identified(board, options()) == BoardAtStart()
+
+
+async def test_a_latched_board_is_refused_and_in_standby_waited_for(board: PumpBoardEmulator) -> None:
+    board.state._latch(OVER_PRESSURE)
+    with pytest.raises(DeviceError, match=f"latched faults {OVER_PRESSURE:#x}.*--clear-faults"):
+        await identified(board, options())
+    assert f"{OVER_PRESSURE:#x}" in (await identified(board, options(standby=True))).latched
+    assert await identified(board, options(clear_faults=True)) == BoardAtStart()
+    assert await identified(board, options()) == BoardAtStart()
+
+
+async def test_the_watchdogs_own_trip_is_cleared_only_if_the_resume_rule_names_it(board: PumpBoardEmulator) -> None:
+    board.state._latch(WATCHDOG)
+    with pytest.raises(DeviceError, match="latched"):
+        await identified(board, options(), ("link_lost",))
+    found = await identified(board, options(), ("watchdog_tripped",))
+    assert (found.latched, "watchdog" in found.cleared) == ("", True)
+    assert await identified(board, options()) == BoardAtStart()
+
+
+async def test_the_watchdog_beside_another_fault_is_not_cleared(board: PumpBoardEmulator) -> None:
+    board.state._latch(WATCHDOG | OVER_PRESSURE)
+    with pytest.raises(DeviceError, match="latched"):
+        await identified(board, options(), ("watchdog_tripped",))
+
+
+@pytest.mark.parametrize("standby", [False, True])
+def test_clear_faults_clears_the_file_in_standby_as_well(tmp_path: Path, standby: bool) -> None:
+    (tmp_path / NAME).write_text("{")
+    file = _latched(Config(), tmp_path, options(standby, clear_faults=True))
+    assert file is not None
+    assert LatchedFile(tmp_path).read() is None
