@@ -32,6 +32,9 @@ class ShapeEstimate:
         Height at `mirror.radius_mm`, mean over azimuth, above the vertex.
     sag_sigma_um : float
         Its standard deviation from `covariance_um2`.
+    geometry_sag_sigma_um : float
+        Its standard deviation from how well the geometry is known, which all cycles have in common; NaN if that is
+        not stated.
     displacement_um : float
         Mean laser reading during the exposures (NaN without a laser).
     slope_residual_urad : float
@@ -64,3 +67,4 @@ class ShapeEstimate:
     reason: str = ""
     latency_s: float = float("nan")
     cycle: int = 0
+    geometry_sag_sigma_um: float = float("nan")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.config import PatternConfig
 from membrane_ctrl.metrology.patterns import GRAY_BITS
-from membrane_ctrl.metrology.phase import equal_shifts, modulation, phasors, wrapped_phase
+from membrane_ctrl.metrology.phase import modulation, phasors, wrapped_phase
 from membrane_ctrl.metrology.unwrap import absolute_phase, gray_orders, inside_pattern
 
 FloatArray = NDArray[np.float64]
@@ -73,10 +73,18 @@ class Decoded:
     valid: NDArray[np.bool_]
 
 
-def decode_full(images: FloatArray, pattern: PatternConfig) -> Decoded:
+def decode_full(images: FloatArray, pattern: PatternConfig, shifts_rad: FloatArray) -> Decoded:
     """Decode the images of a full cycle (2 (N + 4) + 2, ...), in `patterns.full_sequence`'s order.
 
-    Raises ValueError if their number is another.
+    Parameters
+    ----------
+    shifts_rad : (2, N) array
+        Phase steps of x and y.
+
+    Raises
+    ------
+    ValueError
+        If there are more or fewer images.
     """
     slots = FullSlots(pattern.steps)
     if len(images) != slots.count:
@@ -85,8 +93,8 @@ def decode_full(images: FloatArray, pattern: PatternConfig) -> Decoded:
     contrast = white - black
     valid = contrast > CONTRAST_SHARE * np.percentile(contrast, 95)
     phases, swings = [], []
-    for sinusoids, gray in zip(slots.sinusoids, slots.gray, strict=True):
-        z = phasors(images[sinusoids], equal_shifts(pattern.steps))
+    for sinusoids, gray, shifts in zip(slots.sinusoids, slots.gray, shifts_rad, strict=True):
+        z = phasors(images[sinusoids], shifts)
         k1, k2 = gray_orders(images[gray], white, black)
         phase = absolute_phase(wrapped_phase(z), k1, k2)
         swing = modulation(z)

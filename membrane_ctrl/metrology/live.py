@@ -21,13 +21,16 @@ from membrane_ctrl.metrology.bins import BinGrid
 from membrane_ctrl.metrology.covariance import parameter_covariance, pixel_sigma_adu, slope_per_screen
 from membrane_ctrl.metrology.decode import FRINGE_SHARE, FullSlots, decode_full
 from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.geometry_spread import GeometrySpread
+from membrane_ctrl.metrology.monte_carlo import TrialBench
 from membrane_ctrl.metrology.motion import combine_steps, worth_correcting
 from membrane_ctrl.metrology.phase import equal_shifts, phase_sigma_rad, step_weights
 from membrane_ctrl.metrology.phasor import Binner, Image, track
 from membrane_ctrl.metrology.quality import Quality, judge
 from membrane_ctrl.metrology.reconstruct import Fit, Tracer, solve
-from membrane_ctrl.metrology.surface import Surface, parameter_to_coeffs, sag_gradient
+from membrane_ctrl.metrology.surface import PARAMETERS, Surface, parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.tracking import TrackedPoints, establish
+from membrane_ctrl.metrology.uncertainty import geometry_covariance, geometry_jacobian
 from membrane_ctrl.metrology.unwrap import mm_per_rad
 from membrane_ctrl.metrology.zernike import TERMS
 
@@ -45,6 +48,8 @@ TILT_GUARD_RAD = 0.3 * math.pi
 MATRIX_KEPT_SHARE = 0.99
 # the plane z = 0 is crossed this far at most from where a ray meets the film
 _FILM_BESIDE_PLANE_MM = 25.0
+# a wrong geometry bends the figure smoothly: 40 points a parameter give its covariance to a few per cent
+_GEOMETRY_POINTS = 1500
 
 
 class LiveReconstructor:
@@ -59,15 +64,35 @@ class LiveReconstructor:
     laser_noise_um : float
         Noise of one displacement as given (an average over an exposure has less than a sample); motion that is not
         clearly above it is not corrected.
+    shifts_rad : (N,) or (2, N) array, optional
+        Phase steps, of x and y if they differ; equal ones if not given.
+    spread : GeometrySpread, optional
+        How well the geometry is known; with it each full cycle renews `geometry_covariance_um2`.
+
+    Raises
+    ------
+    ValueError
+        If the phase steps do not determine a phase, or are not the pattern's in number.
     """
 
-    def __init__(self, optics: OpticsConfig, bin_px: int = 4, *, laser_noise_um: float = 0.3) -> None:
+    def __init__(
+        self,
+        optics: OpticsConfig,
+        bin_px: int = 4,
+        *,
+        laser_noise_um: float = 0.3,
+        shifts_rad: ArrayLike | None = None,
+        spread: GeometrySpread | None = None,
+    ) -> None:
         self._optics = optics
         self._geometry = Geometry.from_config(optics)
         self._bin_px = bin_px
         self._laser_noise_um = laser_noise_um
-        self._shifts_rad = equal_shifts(optics.pattern.steps)
-        self._weights = step_weights(self._shifts_rad)
+        given = equal_shifts(optics.pattern.steps) if shifts_rad is None else np.asarray(shifts_rad, float)
+        self._shifts_rad = np.broadcast_to(given, (2, optics.pattern.steps))
+        self._weights = [step_weights(shifts) for shifts in self._shifts_rad]
+        self._spread = spread
+        self._geometry_covariance_mm2 = np.full((PARAMETERS, PARAMETERS), np.nan)
         self._slots = FullSlots(optics.pattern.steps)
         self._full_scale_adu = 2**optics.camera.bits - 1
         size = (optics.camera.height_px, optics.camera.width_px)
@@ -107,7 +132,7 @@ class LiveReconstructor:
         self._binner.add(frames, range(len(frames)), watched=sinusoids)
         optics = self._optics
         images = self._binner.sums.reshape(self._slots.count, -1)[:, self._near] / self._bin_px**2
-        phase_rad = decode_full(images, optics.pattern).phase_rad
+        phase_rad = decode_full(images, optics.pattern, self._shifts_rad).phase_rad
         phase_rad[:, self._binner.saturated.ravel()[self._near] > 0] = np.nan
         times, readings = times[sinusoids], readings[sinusoids]
         self._tracked = None  # until this cycle is accepted
@@ -116,6 +141,8 @@ class LiveReconstructor:
             state = establish(self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm)
         except ValueError as error:
             return _rejected("full", times, readings, str(error))
+        if self._spread is not None:
+            self._geometry_covariance_mm2 = self._from_geometry(self._spread, tracer, state)
         return self._follow("full", state, times, readings)
 
     def fringes(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
@@ -141,6 +168,16 @@ class LiveReconstructor:
         h[x**2 + y**2 > mirror.analysis_radius_mm**2] = np.nan
         return axis, axis.copy(), h
 
+    @property
+    def geometry_covariance_um2(self) -> FloatArray:
+        """Covariance (36, 36) of the coefficients from how well the geometry is known, as of the last full cycle.
+
+        It is common to all cycles: to be added to a cycle's own for a figure that stands alone, and not for changes.
+        NaN before the first full cycle and without a spread.
+        """
+        to_coeffs = parameter_to_coeffs()
+        return np.asarray(1e6 * to_coeffs @ self._geometry_covariance_mm2 @ to_coeffs.T)
+
     def sag_sensitivity(self) -> FloatArray:
         """Change of the 36 coefficients (um) per um of sag of a Hencky bowl."""
         return hencky.zernike_projection().copy()
@@ -151,6 +188,18 @@ class LiveReconstructor:
         known = self._reference_um is not None and math.isfinite(mean)
         z = -(mean - self._reference_um) * 1e-3 if known and self._reference_um is not None else 0.0
         return Tracer(self._geometry, self._optics.mirror.radius_mm, z)
+
+    def _from_geometry(self, spread: GeometrySpread, tracer: Tracer, state: TrackedPoints) -> FloatArray:
+        """Covariance (36, 36) of the parameters; NaN if the spread is so wide that a fit at its end fails."""
+        place_px = np.stack([self._grid.column_px, self._grid.row_px])[:, state.index]
+        exact = np.zeros((2, state.index.size))
+        bench = TrialBench.of_points(
+            self._optics, tracer, state.surface, state.points, place_px, exact, _GEOMETRY_POINTS
+        )
+        try:
+            return geometry_covariance(geometry_jacobian(bench, spread), spread)
+        except ArithmeticError:
+            return np.full((PARAMETERS, PARAMETERS), np.nan)
 
     def _follow(self, kind: Kind, state: TrackedPoints, times: FloatArray, readings: FloatArray) -> ShapeEstimate:
         """Phases of the points against the last accepted ones, and the figure from them."""
@@ -188,7 +237,7 @@ class LiveReconstructor:
         for axis, slots in enumerate(self._slots.sinusoids):
             sums.append(self._binner.sums[slots].reshape(steps, -1))
             part = None if motion_um is None else motion_um[axis]
-            combined.append(combine_steps(self._weights, self._shifts_rad, self._bin_px, part))
+            combined.append(combine_steps(self._weights[axis], self._shifts_rad[axis], self._bin_px, part))
         track(sums, state.index, combined, state.sensitivity_rad_per_um, state.accepted, state.fresh)
 
     def _fit(self, state: TrackedPoints, usable: NDArray[np.bool_], readings: FloatArray) -> Fit:
@@ -205,9 +254,10 @@ class LiveReconstructor:
     ) -> ShapeEstimate:
         """The result in micrometres, with its covariance and verdict."""
         modulation_adu = quality.modulation_share * self._full_scale_adu
-        sigma_mm = self._mm_per_rad * phase_sigma_rad(self._shifts_rad, self._pixel_sigma_adu, modulation_adu)
+        sigmas_rad = [phase_sigma_rad(d, self._pixel_sigma_adu, modulation_adu) for d in self._shifts_rad]
+        sigma_mm = self._mm_per_rad * np.array(sigmas_rad) / self._bin_px
         gain = slope_per_screen(self._geometry, fit.surface.radius_mm, fit.surface.sag_mm)
-        covariance = parameter_covariance(fit, gain.sum(axis=1) * (sigma_mm / self._bin_px) ** 2)
+        covariance = parameter_covariance(fit, gain @ sigma_mm**2)
         to_coeffs = parameter_to_coeffs()
         gradient = sag_gradient()
         verdict, reason = judge(quality)
@@ -219,6 +269,7 @@ class LiveReconstructor:
             covariance_um2=1e6 * to_coeffs @ covariance @ to_coeffs.T,
             sag_um=1e3 * fit.surface.sag_mm,
             sag_sigma_um=1e3 * math.sqrt(gradient @ covariance @ gradient),
+            geometry_sag_sigma_um=1e3 * math.sqrt(gradient @ self._geometry_covariance_mm2 @ gradient),
             displacement_um=_finite_mean(readings),
             slope_residual_urad=quality.residual_urad,
             valid_fraction=quality.valid_fraction,

@@ -66,20 +66,37 @@ class TrialBench:
 
     @classmethod
     def of(cls, optics: OpticsConfig, checked: Checked, figure: BinFigure, count: int = TRIAL_POINTS) -> TrialBench:
-        """Thin the points of a set's figure to about `count`."""
-        tracer, surface = checked.tracer, figure.fit.surface
-        chosen = _spread_evenly(figure.index.size, count)
-        points = figure.points.subset(chosen)
-        row, column = np.divmod(figure.index[chosen], checked.phase_rad.shape[2])
+        """Of a set's figure, its points thinned to about `count`."""
+        row, column = np.divmod(figure.index, checked.phase_rad.shape[2])
         side = checked.binned.bin_px
-        thinning = figure.index.size / np.count_nonzero(chosen)
+        place_px = side * np.stack([column, row]) + (side - 1) / 2
+        return cls.of_points(
+            optics, checked.tracer, figure.fit.surface, figure.points, place_px, figure.sigma_mm, count
+        )
+
+    @classmethod
+    def of_points(
+        cls,
+        optics: OpticsConfig,
+        tracer: Tracer,
+        surface: Surface,
+        points: Points,
+        place_px: FloatArray,
+        sigma_mm: FloatArray,
+        count: int,
+    ) -> TrialBench:
+        """Of points that stand on a surface, seen at `place_px` (2, n), thinned to about `count`."""
+        chosen = _spread_evenly(points.t_mm.size, count)
+        thinning = points.t_mm.size / np.count_nonzero(chosen)
+        points = points.subset(chosen)
+        column_px, row_px = place_px[:, chosen]
         return cls(
             optics=optics,
             vertex_z_mm=tracer.vertex_z_mm,
-            column_px=side * column + (side - 1) / 2,
-            row_px=side * row + (side - 1) / 2,
+            column_px=column_px,
+            row_px=row_px,
             screen_mm=tracer.predict_screen(points, surface),
-            sigma_mm=figure.sigma_mm[:, chosen] / np.sqrt(thinning),
+            sigma_mm=sigma_mm[:, chosen] / np.sqrt(thinning),
             t_mm=points.t_mm,
             surface=surface,
             normal=tracer.normal_matrix(points),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
@@ -67,10 +68,11 @@ def find_outline(light: FloatArray, geometry: Geometry, rim_mm: float, rim_z_mm:
     reach = np.linspace(_FROM, _TO, _SAMPLES)
     lines = middle[:, None, None] + (expected - middle[:, None])[:, :, None] * reach
     values = map_coordinates(light, [lines[1], lines[0]], order=1, mode="constant", cval=np.nan)
-    inside = np.nanmedian(values[:, :10], axis=1) if np.isfinite(values[:, :10]).any() else np.zeros(_POINTS)
+    whole = np.isfinite(values).all(axis=1)  # a line that leaves the picture tells nothing
+    inside = np.where(whole, np.median(values[:, :10], axis=1), 0.0)
     below = values < inside[:, None] / 2
     first = np.argmax(below, axis=1)
-    found = below.any(axis=1) & (first > 0) & np.isfinite(values).all(axis=1) & (inside > np.max(inside) / 4)
+    found = whole & below.any(axis=1) & (first > 0) & (inside > np.max(inside) / 4)
     if np.count_nonzero(found) < _LEAST_FOUND * _POINTS:
         return None
     scale = reach[first] - (reach[1] - reach[0]) / 2
@@ -95,7 +97,11 @@ def find_outline(light: FloatArray, geometry: Geometry, rim_mm: float, rim_z_mm:
 
 
 def project(geometry: Geometry, world_mm: FloatArray) -> FloatArray:
-    """Column and row (2, n) of world points (3, n), without the lens' distortion: the rim is a check, no measure."""
+    """Column and row (2, n) of world points (3, n), through the lens."""
     camera = geometry.rotation @ (world_mm - geometry.pinhole_mm[:, None])
-    column, row = geometry.focal_px * camera[:2] / camera[2]
+    through = (camera / camera[2]).T
+    if any(geometry.distortion):
+        straight, lens = np.eye(3), np.array(geometry.distortion)
+        through = cv2.projectPoints(through, np.zeros(3), np.zeros(3), straight, lens)[0][:, 0]
+    column, row = geometry.focal_px * through[:, :2].T
     return np.stack([column + geometry.principal_px[0], row + geometry.principal_px[1]])

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from membrane_ctrl.config import OpticsConfig
 from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.metrology.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.live import LiveReconstructor, _rejected
 from membrane_ctrl.metrology.phasor import Image
 
@@ -28,8 +29,16 @@ class SlidingWindow(LiveReconstructor):
     "tracking lost" take a full cycle again. Whole fringes-only cycles (`fringes`) may be mixed in.
     """
 
-    def __init__(self, optics: OpticsConfig, bin_px: int = 4, *, laser_noise_um: float = 0.3) -> None:
-        super().__init__(optics, bin_px, laser_noise_um=laser_noise_um)
+    def __init__(
+        self,
+        optics: OpticsConfig,
+        bin_px: int = 4,
+        *,
+        laser_noise_um: float = 0.3,
+        shifts_rad: ArrayLike | None = None,
+        spread: GeometrySpread | None = None,
+    ) -> None:
+        super().__init__(optics, bin_px, laser_noise_um=laser_noise_um, shifts_rad=shifts_rad, spread=spread)
         self._fringe_slots: list[int] = np.r_[self._slots.sinusoids].tolist()
         count = len(self._fringe_slots)
         self._times, self._readings = np.full(count, np.nan), np.full(count, np.nan)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,8 +13,10 @@ from metrology_truth import SMALL
 
 from membrane_ctrl.config import OpticsConfig, PatternConfig
 from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.metrology.geometry_spread import PAPER_SPREAD, changed
 from membrane_ctrl.metrology.live import LiveReconstructor
 from membrane_ctrl.metrology.patterns import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.sliding import SlidingWindow
 from membrane_ctrl.twin.film_shape import FilmShape
 from membrane_ctrl.twin.illumination import Light
 from membrane_ctrl.twin.render import OpticsRenderer
@@ -293,3 +296,63 @@ def test_wrong_size_of_frame() -> None:
     frames, times, where = _render("fringes")
     with pytest.raises(ValueError, match="305, 256"):
         live.fringes([frame[:, :-1] for frame in frames], times, where)
+
+
+UNEQUAL = np.array([[0.0, 1.3, 2.9, 4.4], [0.2, 1.7, 3.4, 4.9]])
+
+
+def _render_unequal(kind: str, displacement_um: float) -> Frames:
+    patterns = full_sequence(OPTICS.pattern) if kind == "full" else fringe_sequence(OPTICS.pattern)
+    shown = [
+        replace(p, shift_rad=float(UNEQUAL["xy".index(p.axis), p.index])) if p.role == "sin" else p for p in patterns
+    ]
+    return [_renderer().render(pattern, displacement_um).copy() for pattern in shown]
+
+
+def test_unequal_steps() -> None:
+    live = LiveReconstructor(OPTICS, 1, shifts_rad=UNEQUAL)
+    assert _error_um(live, live.full(_render_unequal("full", 0.0), np.zeros(18), np.zeros(18)), 0.0)[0] < 0.05
+    estimate = live.fringes(_render_unequal("fringes", 3.0), np.zeros(8), np.full(8, 3.0))
+    assert estimate.verdict == "ok"
+    assert _error_um(live, estimate, 3.0)[0] < 0.05
+
+
+def test_a_frame_in_a_window_of_unequal_steps() -> None:
+    window = SlidingWindow(OPTICS, 1, shifts_rad=UNEQUAL)
+    window.full(_render_unequal("full", 0.0), np.zeros(18), np.zeros(18))
+    for step, frame in enumerate(_render_unequal("fringes", 3.0)):
+        estimate = window.frame(frame, step, 0.1 * step, 3.0)
+    assert _error_um(window, estimate, 3.0)[0] < 0.05
+
+
+def test_steps_that_determine_no_phase_are_refused() -> None:
+    with pytest.raises(ValueError, match="do not determine a phase"):
+        LiveReconstructor(OPTICS, 1, shifts_rad=[0, 0.1, 0.2, 0.3])
+    with pytest.raises(ValueError, match="broadcast"):
+        LiveReconstructor(OPTICS, 1, shifts_rad=[0, 2, 4])
+
+
+def test_the_geometrys_covariance_is_what_wrong_geometries_do() -> None:
+    frames, times, where = _render("full")
+    live = LiveReconstructor(OPTICS, 2, spread=PAPER_SPREAD)
+    estimate = live.full(frames, times, where)
+    far = np.zeros((36, 36))
+    for name, sigma in zip(PAPER_SPREAD.names, PAPER_SPREAD.sigmas, strict=True):
+        ends = []
+        for sign in (1.0, -1.0):
+            geometry = changed(OPTICS.geometry, (name,), [sign * sigma])
+            wrong = LiveReconstructor(OPTICS.model_copy(update={"geometry": geometry}), 2)
+            ends.append(wrong.full(frames, times, where).coeffs_um)
+        far += np.outer(ends[0] - ends[1], ends[0] - ends[1]) / 4
+    sigmas, expected = np.sqrt(np.diag(live.geometry_covariance_um2)), np.sqrt(np.diag(far))
+    strong = expected > 0.05 * expected.max()
+    assert strong.sum() >= 4
+    assert sigmas[strong] == pytest.approx(expected[strong], rel=0.1)
+    assert 10 < estimate.geometry_sag_sigma_um < 500  # the paper's: tens of micrometres
+    assert estimate.sag_sigma_um < 1  # the cycle's own is noise alone
+
+
+def test_without_a_spread_nothing_is_said_of_the_geometry() -> None:
+    live = LiveReconstructor(OPTICS, 2)
+    assert np.isnan(live.full(*_render("full")).geometry_sag_sigma_um)
+    assert np.isnan(live.geometry_covariance_um2).all()

@@ -32,6 +32,43 @@ def test_a_camera_that_was_turned_is_seen() -> None:
     assert shift == pytest.approx([-12, 8], abs=1.0)
 
 
+def test_the_rim_is_looked_for_through_the_lens() -> None:
+    straight = bench(shrink=4)
+    # 1 % at the rim, 0.19 from the axis: 5 mm on the mirror, were the lens not known
+    camera = straight.camera.model_copy(update={"distortion": (-0.3, 0.05, 1e-3, -5e-4)})
+    optics = straight.model_copy(update={"camera": camera})
+    stack = good_set(optics)
+    light = stack.frames[-2].astype(float) - stack.frames[-1]
+    outline = find_outline(light, Geometry.from_config(optics), 500.0, FILM.sag_mm)
+    assert outline is not None
+    assert outline.offset_mm < 2
+    assert outline.size_ratio == pytest.approx(1.0, abs=0.003)
+    ignored = find_outline(light, Geometry.from_config(straight), 500.0, FILM.sag_mm)
+    assert ignored is not None
+    assert ignored.size_ratio < 0.995
+
+
+def test_points_are_projected_along_their_rays() -> None:
+    camera = bench().camera.model_copy(update={"distortion": (-0.12, 0.02, 1e-3, -5e-4)})
+    geometry = Geometry.from_config(bench().model_copy(update={"camera": camera}))
+    columns, rows = np.array([10.0, 150, 290]), np.array([12.0, 100, 240])
+    there = geometry.pinhole_mm[:, None] + 2000 * geometry.rays(columns, rows)
+    assert project(geometry, there) == pytest.approx(np.stack([columns, rows]), abs=1e-6)
+
+
+def test_a_rim_that_is_half_outside_the_picture_is_found_by_its_other_half() -> None:
+    optics = bench(shrink=4)
+    column, row = optics.camera.principal
+    aside = optics.camera.model_copy(update={"principal_px": (column + 150, row)})
+    optics = optics.model_copy(update={"camera": aside})
+    stack = good_set(optics)
+    light = stack.frames[-2].astype(float) - stack.frames[-1]
+    outline = find_outline(light, Geometry.from_config(optics), 500.0, FILM.sag_mm)
+    assert outline is not None
+    assert outline.offset_mm < 4
+    assert outline.rim_px.shape[1] < 170
+
+
 def test_no_rim_in_the_dark_or_in_even_light() -> None:
     geometry = Geometry.from_config(bench(shrink=4))
     assert find_outline(np.zeros((512, 612)), geometry, 500.0, 37.0) is None
