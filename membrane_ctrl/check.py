@@ -14,6 +14,7 @@ from rich.table import Table
 from membrane_ctrl.bench import open_bench
 from membrane_ctrl.config import Config, DevicesConfig
 from membrane_ctrl.errors import DeviceError, Exit
+from membrane_ctrl.geometry_in_force import geometry_in_force
 from membrane_ctrl.probe import Probe, probe_board, probe_roles
 from membrane_ctrl.probe_optics import probe_optics
 from membrane_ctrl.role_devices import role_devices
@@ -80,5 +81,16 @@ def _what_would_happen(config: Config) -> dict[str, str]:
         f"{limits.displacement_max_um:g} um and {limits.gauge_pressure_max_pa:g} Pa",
         "gains": f"Kp {loop.kp_per_s:g} 1/s, Ti {loop.ti_s:g} s, Td {loop.td_s:g} s",
         "feed-forward": " and ".join(feedforward) or "off",
+        "geometry": _geometry(config),
         "shape loop": f"a cycle every {shape.period_s:g} s" if shape.enabled else "off",
     }
+
+
+def _geometry(config: Config) -> str:
+    """What the cycles would measure with. Raises InputError for a file that cannot be used."""
+    there = geometry_in_force(config)
+    origin = there.origin
+    if there.note or not origin.file:
+        return there.note or "as [optics.geometry] states it"
+    made = f", calibrated {origin.calibrated_utc}" if origin.calibrated_utc else ""
+    return f"{origin.file} (hash {origin.hash}{made})"

@@ -117,8 +117,17 @@ def status_lines(status: dict[str, Any]) -> list[str]:
         }
         lines += [f"  {name:15}{_shown(row.get(field))} {unit}" for name, (field, unit) in shown.items()]
         lines.append(f"  {'shape loop':15}{status['shape']} {status['shape_reason']}".rstrip())
+        lines.append(f"  {'geometry':15}{_geometry(status.get('geometry'))}")
+    lines += [f"  {'maintenance':15}{message}" for message in status.get("maintenance", {}).values()]
     lines.append(f"  {'commander':15}{status.get('commander') or 'nobody'}")
     return lines
+
+
+def _geometry(geometry: dict[str, Any] | None) -> str:
+    if geometry is None:
+        return "nothing measures with one yet"
+    made = f"{geometry['file']}, calibrated {geometry['calibrated_utc']}" if geometry["file"] else "as configured"
+    return geometry["message"] or f"{made} (hash {geometry['hash']})"
 
 
 def _watch(client: PortClient, first: dict[str, Any], options: CtlOptions) -> int:

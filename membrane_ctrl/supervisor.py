@@ -43,6 +43,7 @@ class Wiring:
     reports: Callable[[], list[Event]] = list  # what the children have said since the last call
     tasks: dict[str, asyncio.Task[None]] = field(default_factory=dict)
     heard: Sequence[Callable[[TickOutputs], None]] = ()  # who wants to know what each tick decided; must not raise
+    told: Sequence[Callable[[Event], None]] = ()  # who wants to know what the children report; must not raise
 
 
 class Supervisor:
@@ -218,3 +219,5 @@ class Supervisor:
                 self.tell({"kind": "child_ended", "child": child.name, "exit_code": child.exit_code})
         for report in self._wiring.reports():
             self.tell(report)
+            for told in self._wiring.told:
+                told(report)

@@ -9,6 +9,7 @@ from multiprocessing.connection import Connection
 from typing import Literal
 
 from membrane_ctrl.child_report import alive
+from membrane_ctrl.tick import Event
 
 AcquisitionState = Literal["preparing", "running", "paused", "retrying", "failed", "stopped"]
 
@@ -82,6 +83,10 @@ class Remote:
             return
         self._said = (state, message)
         self._send({"kind": "acquisition", "state": state, "message": message, **details})
+
+    def tell(self, event: Event) -> None:
+        """Put an event on record; it is dropped like a report."""
+        self._send(event)
 
     def prepared(self) -> None:
         """From now on the line is looked at between any two exposures."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from firmware_iface.roles import LinkError
 from membrane_ctrl.acquisition.cycle import CyclePlan, ShapeCycle, pause_s
 from membrane_ctrl.acquisition.frames import FrameWriter
+from membrane_ctrl.acquisition.geometry_watch import LiveDrift, geometry_event
 from membrane_ctrl.acquisition.laser import LaserHistory
 from membrane_ctrl.acquisition.optical_bench import OpticalBench, configured_bench, open_bench
 from membrane_ctrl.acquisition.process import AcquisitionSpec
@@ -19,9 +20,11 @@ from membrane_ctrl.acquisition.twin_bench import TwinTruth
 from membrane_ctrl.acquisition.warm_up import TYPICAL_FILM, small, warm_up
 from membrane_ctrl.acquisition.worker import estimate_message, keep_cycling
 from membrane_ctrl.clock import RunClock
-from membrane_ctrl.config import Config
+from membrane_ctrl.config import Config, OpticsConfig
 from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.geometry_in_force import KEPT, geometry_of_run
 from membrane_ctrl.ipc.ring import RingAddress, RingWriter
+from membrane_ctrl.metrology.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.live import LiveReconstructor
 from membrane_ctrl.metrology.patterns import fringe_sequence, full_sequence
 from membrane_ctrl.twin.camera import FilmPosition, TwinOptics
@@ -58,7 +61,9 @@ def run(spec: AcquisitionSpec, remote: Remote) -> None:
     remote.listen()  # the first word, which promises the next one for when all this is over
     remote.report("preparing", "tracing the first picture, compiling what is not compiled yet")
     config, clock = spec.config, WaitingClock(spec.clock)
-    pattern = config.optics.pattern
+    geometry = geometry_of_run(spec.run_dir, config)
+    remote.tell(geometry_event(geometry))
+    pattern = geometry.optics.pattern
     plan = CyclePlan(full_sequence(pattern), fringe_sequence(pattern), config.shape.frame_interval_s)
     with ExitStack() as stack:
         if spec.truth is None:
@@ -73,18 +78,26 @@ def run(spec: AcquisitionSpec, remote: Remote) -> None:
             stack.callback(bench.close)
         if remote.stop:
             return
-        reconstructor = LiveReconstructor(config.optics, config.shape.bin_px)
+        spread = _spread(spec.run_dir, geometry.optics)
+        reconstructor = LiveReconstructor(geometry.optics, config.shape.bin_px, spread=spread)
+        drift = LiveDrift(geometry, config.shape.bin_px)
         shapes = stack.enter_context(closing(RingWriter(spec.shapes)))
         frames = stack.enter_context(closing(FrameWriter(spec.frames)))
         stack.callback(bench.close)  # before the ring of frames: an exposure under way holds the pixels of a slot
         laser = stack.enter_context(closing(LaserHistory(spec.telemetry)))
-        raw = stack.enter_context(closing(_raw_frames(spec, plan))) if spec.run_dir is not None else None
+        raw = (
+            stack.enter_context(closing(_raw_frames(spec, geometry.optics, plan)))
+            if spec.run_dir is not None
+            else None
+        )
         cycle = ShapeCycle(
             bench.camera, bench.screen, reconstructor, plan, frames, clock, laser, stopping=remote.interrupts
         )
 
         def publish(estimate: ShapeEstimate) -> None:
             shapes.put(estimate_message(estimate))
+            if (notice := drift.after(estimate)) is not None:
+                remote.tell(notice)
             if raw is not None:
                 raw.after(estimate)
 
@@ -129,7 +142,13 @@ def _open(bench: OpticalBench, config: Config, clock: WaitingClock, remote: Remo
             remote.listen(remaining_s)
 
 
-def _raw_frames(spec: AcquisitionSpec, plan: CyclePlan) -> RawFrames:
+def _spread(run_dir: Path | None, optics: OpticsConfig) -> GeometrySpread | None:
+    """How well the run's geometry is known; None if nothing is stated of it."""
+    kept = None if run_dir is None else run_dir / KEPT
+    spread, _said = spread_of(optics.geometry, kept if kept is not None and kept.exists() else None)
+    return spread if spread.names else None
+
+
+def _raw_frames(spec: AcquisitionSpec, optics: OpticsConfig, plan: CyclePlan) -> RawFrames:
     assert spec.run_dir is not None
-    config = spec.config
-    return RawFrames(spec.run_dir / "raw", config.optics, plan, config.recording, spec.frames, spec.telemetry)
+    return RawFrames(spec.run_dir / "raw", optics, plan, spec.config.recording, spec.frames, spec.telemetry)

@@ -20,5 +20,14 @@ TrialsOption = Annotated[int, typer.Option(min=2, help="Monte Carlo trials.")]
 
 
 def configured(path: Path | None) -> Config:
-    """Return the configuration of a file, or the defaults without one; raises `InputError`."""
-    return Config() if path is None else load(path, Config)
+    """Return the configuration of a file, or the defaults without one; raises `InputError`.
+
+    Its geometry file is looked for beside it, wherever the command is called.
+    """
+    if path is None:
+        return Config()
+    config = load(path, Config)
+    if config.optics.geometry_file is None:
+        return config
+    beside = path.resolve().parent / config.optics.geometry_file.expanduser()
+    return config.model_copy(update={"optics": config.optics.model_copy(update={"geometry_file": beside})})

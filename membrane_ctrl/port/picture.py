@@ -25,11 +25,14 @@ class Picture:
         self._since_s = 0.0
         self._why = self._shape_reason = ""
         self._fault: Event | None = None
+        self._maintenance: dict[str, str] = {}
+        self._geometry: Event = {}
 
     def take(self, outputs: TickOutputs) -> None:
         """Remember a tick; this is all the port costs the tick when nobody asks."""
         self.row = outputs.row
         for event in outputs.events:
+            self.note(event)
             match event["kind"]:
                 case "why":
                     self._why = event["why"]
@@ -39,6 +42,16 @@ class Picture:
                     self._shape_reason = event["reason"]
                 case "fault":
                     self._fault = event
+
+    def note(self, event: Event) -> None:
+        """Remember what stands until it is over: what a person should look at, and which geometry is used."""
+        match event["kind"]:
+            case "maintenance":
+                self._maintenance[event["name"]] = event["message"]
+            case "maintenance_over":
+                self._maintenance.pop(event["name"], None)
+            case "geometry":
+                self._geometry = event
 
     def status(self) -> dict[str, Any]:
         """For people and programs: names for codes, None for what is not there."""
@@ -54,5 +67,7 @@ class Picture:
             "rung": Rung(int(row.rung)).name.lower(),
             "shape": ShapeState(int(row.shape_state)).name.lower(),
             "shape_reason": self._shape_reason,
+            "geometry": {key: value for key, value in self._geometry.items() if key != "kind"} or None,
+            "maintenance": self._maintenance,
             "row": {key: value if math.isfinite(value) else None for key, value in asdict(row).items()},
         }

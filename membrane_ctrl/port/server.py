@@ -100,6 +100,12 @@ class Port:
             if future is not None and not future.done():
                 future.set_result(refusal)
 
+    def told(self, event: Event) -> None:
+        """Take in what a child process reports."""
+        self._picture.note(event)
+        for session in self._sessions:
+            session.event(event)
+
     @contextlib.asynccontextmanager
     async def open(self) -> AsyncIterator[None]:
         """Let clients in for the length of a `with` block."""

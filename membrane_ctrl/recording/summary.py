@@ -49,6 +49,7 @@ class Summary:
         self._transitions = 0
         self._faults: list[Event] = []
         self._fault_count = 0
+        self._geometry: Event = {}
         self._end: Event = {}
 
     def add_rows(self, rows: Rows) -> None:
@@ -90,11 +91,13 @@ class Summary:
         return settled
 
     def add_event(self, event: Event) -> None:
-        """Take in one event; "fault" and "end" matter here."""
+        """Take in one event; "fault", "geometry" and "end" matter here."""
         if event.get("kind") == "fault":
             self._fault_count += 1
             if len(self._faults) < _LISTED_MAX:
                 self._faults.append(event)
+        elif event.get("kind") == "geometry":
+            self._geometry = {key: event.get(key) for key in ("hash", "file", "calibrated_utc")}
         elif event.get("kind") == "end":
             self._end = event
 
@@ -133,6 +136,7 @@ class Summary:
             "cycles": self._cycles,
             "cycles_rejected": self._rejected,
             "cycle_latency_ms": _quantiles(self._latency_ms),
+            "geometry": self._geometry,
             "states": self._states,
             "transitions": self._transitions,
             "faults": self._faults,

@@ -15,6 +15,10 @@ from membrane_ctrl.review.verdict import verdict
 
 SCHEMA = "membrane-report/1"
 
+_TOLD = frozenset(
+    ["start", "geometry", "state", "fault", "cleared", "maintenance", "maintenance_over", "command", "mark", "end"]
+)
+
 
 def report_table(analysis: Analysis) -> dict[str, Any]:
     """All figures of the report (`membrane-report/1`); NaN where there is nothing to say."""
@@ -57,8 +61,7 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
 def timeline(analysis: Analysis) -> list[dict[str, Any]]:
     """State changes, faults, commands and marks in their order; without events, states from the telemetry."""
     start_s, end_s = analysis.part_s
-    kinds = {"start", "state", "fault", "cleared", "command", "mark", "end"}
-    events = [event for event in analysis.run.events if event.get("kind") in kinds]
+    events = [event for event in analysis.run.events if event.get("kind") in _TOLD]
     if not any(event.get("kind") == "state" for event in events):
         level = analysis.level
         codes = level["state"]
