@@ -6,6 +6,7 @@ import signal
 import time
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from pathlib import Path
 
 from firmware_iface.roles import LinkError
 from membrane_ctrl.acquisition.cycle import CyclePlan, ShapeCycle, pause_s
@@ -23,6 +24,7 @@ from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config, OpticsConfig
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.geometry_in_force import KEPT, geometry_of_run
+from membrane_ctrl.geometry_spread_file import spread_of
 from membrane_ctrl.ipc.ring import RingAddress, RingWriter
 from membrane_ctrl.metrology.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.live import LiveReconstructor

@@ -117,10 +117,12 @@ def _legend(estimate: ShapeEstimate, colours: dict[str, tuple[float, float]]) ->
     """Markdown: what the maps' colours mean, and the cycle in one line each."""
     rows = "\n".join(f"| {name} | {low:.4g} | {high:.4g} |" for name, (low, high) in colours.items())
     reason = f" ({estimate.reason})" if estimate.reason else ""
+    of_geometry = estimate.geometry_sag_sigma_um
+    geometry = f", ± {of_geometry:.3g} um of the geometry" if math.isfinite(of_geometry) else ""
     return (
         f"| map | blue | red |\n|---|---|---|\n{rows}\n\n"
         f"- cycle {estimate.cycle}, {estimate.kind}: {estimate.verdict}{reason}\n"
-        f"- sag {estimate.sag_um / 1e3:.4f} mm ± {estimate.sag_sigma_um:.3f} um\n"
+        f"- sag {estimate.sag_um / 1e3:.4f} mm ± {estimate.sag_sigma_um:.3f} um of noise{geometry}\n"
         f"- slope residual {estimate.slope_residual_urad:.2f} urad, {100 * estimate.valid_fraction:.1f} % valid\n"
     )
 
