@@ -6,6 +6,7 @@ replaced as a whole, so that a reader sees the old one or the new one; one that 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from dataclasses import asdict, dataclass
@@ -13,6 +14,8 @@ from pathlib import Path
 
 NAME = "latched-fault.json"
 SCHEMA = "membrane-latched-fault/1"
+# More than a fault takes; the least that a disk gives.
+_RESERVE_BYTES = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +46,7 @@ class LatchedFile:
 
     def __init__(self, logs_dir: Path) -> None:
         self.path = logs_dir / NAME
+        self._reserve = logs_dir / f".{NAME}.reserve"
 
     def read(self) -> LatchedFault | None:
         """The latched fault, None if there is none. Never raises: what cannot be read is latched."""
@@ -62,9 +66,22 @@ class LatchedFile:
 
     def write(self, fault: LatchedFault) -> None:
         """Latch, in place of an older fault. Raises OSError."""
-        beside = self.path.with_suffix(".new")
-        beside.write_text(json.dumps({"schema": SCHEMA, **asdict(fault)}, indent=1) + "\n", encoding="utf-8")
-        beside.replace(self.path)
+        text = json.dumps({"schema": SCHEMA, **asdict(fault)}, indent=1) + "\n"
+        with self._reserve.open("r+b" if self._reserve.exists() else "wb") as file:
+            file.write(text.encode())
+            file.truncate()
+        self._reserve.replace(self.path)
+        with contextlib.suppress(OSError):
+            self.reserve()
+
+    def reserve(self) -> None:
+        """Take the room for a fault while there is some: one on a full disk is latched as well. Raises OSError."""
+        self._reserve.write_bytes(bytes(_RESERVE_BYTES))
+
+    def release(self) -> None:
+        """Give that room back."""
+        with contextlib.suppress(OSError):
+            self._reserve.unlink(missing_ok=True)
 
     def sync(self) -> None:
         """Wait until it is on the disk, power cut or not; for the end of a run. Raises OSError."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -44,6 +45,9 @@ class Latcher:
         return "" if fault is None else str(fault)
 
     def __enter__(self) -> Latcher:
+        if self._file is not None:
+            with contextlib.suppress(OSError):  # then it is tried without when it matters, and a failure is told
+                self._file.reserve()
         return self
 
     def __exit__(
@@ -51,6 +55,7 @@ class Latcher:
     ) -> None:
         if self._file is not None:
             self._disk.submit(self._try, self._file.sync)
+            self._disk.submit(self._file.release)
         self._disk.shutdown()
         self._report()
 

@@ -120,3 +120,24 @@ def test_the_twin_latches_nothing(tmp_path: Path) -> None:
     with Latcher(None, "run", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), lambda event: None) as latcher:
         latcher.heard(outputs(*TRIP))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_fault_on_a_full_disk_is_latched_in_the_room_that_was_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Event] = []
+
+    def full(self: Path, data: bytes) -> int:
+        raise OSError(28, "No space left on device")
+
+    with make(tmp_path, told) as latcher:
+        (reserve,) = tmp_path.iterdir()
+        monkeypatch.setattr(Path, "write_bytes", full)  # nothing new finds room from here on
+        latcher.heard(outputs(*TRIP))
+        latcher._disk.submit(lambda: None).result()
+        assert not reserve.exists()
+    assert told == []
+    latched = LatchedFile(tmp_path).read()
+    assert latched is not None
+    assert latched.name == TRIP[0]["name"]
+    assert [path.name for path in tmp_path.iterdir()] == [NAME]
