@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
+from functools import partial
 from types import TracebackType
 
 from membrane_ctrl.latched import LatchedFault, LatchedFile
@@ -36,6 +37,7 @@ class Latcher:
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="latched-fault")
         self._news: deque[Event] = deque()  # from the disk's thread
         self._failing = False
+        self._last: Callable[[], None] = lambda: None
         self._fault: Event = {}
 
     @property
@@ -54,8 +56,7 @@ class Latcher:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._file is not None:
-            self._disk.submit(self._try, self._file.sync)
-            self._disk.submit(self._file.release)
+            self._disk.submit(self._settle, self._file)
         self._disk.shutdown()
         self._report()
 
@@ -78,14 +79,23 @@ class Latcher:
             return
         words = {key: str(self._fault.get(key, "")) for key in ("name", "cause", "seen", "remedy")}
         fault = LatchedFault(**words, time_utc=self._utc(now_s).isoformat(timespec="seconds"), run=self._run)
-        file = self._file
-        self._disk.submit(self._try, lambda: file.write(fault))
+        self._last = partial(self._file.write, fault)
+        self._disk.submit(self._try, self._last)
+
+    def _settle(self, file: LatchedFile) -> None:
+        """The run is over: what the disk did not take is tried once more, and the disk is waited for."""
+        if self._failing:
+            self._try(self._last)
+        if not self._failing:
+            self._try(file.sync)
+        file.release()
 
     def _try(self, act: Callable[[], None]) -> None:
         try:
             act()
         except OSError as error:
-            self._news.append({"kind": "latch_failed", "message": str(error)})
+            if not self._failing:
+                self._news.append({"kind": "latch_failed", "message": str(error)})
             self._failing = True
         else:
             if self._failing:
