@@ -9,6 +9,7 @@ from pathlib import Path
 
 from membrane_ctrl.config import Config, OpticsConfig
 from membrane_ctrl.errors import InputError
+from membrane_ctrl.geometry_file import read_geometry
 from membrane_ctrl.twin.film_shape import FilmShape, typical_film
 from membrane_ctrl.twin.frame_faults import FrameFault
 from membrane_ctrl.twin.illumination import Light
@@ -31,6 +32,7 @@ class SimulateOptions:
     gamma: float
     motion: Motion
     laser_noise_um: float
+    stated: Path | None
     exact: bool
     seed: int
     faults: tuple[str, ...]
@@ -66,6 +68,7 @@ def specification(options: SimulateOptions) -> SimulationSpec:
         mounted if options.figure else FilmShape(options.sag_mm, radius_mm),
         motion=options.motion,
         laser_noise_um=options.laser_noise_um,
+        stated_geometry=None if options.stated is None else read_geometry(options.stated).geometry,
         light=Light(gamma=options.gamma),
         exact=options.exact,
         seed=options.seed,

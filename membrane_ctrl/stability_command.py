@@ -14,6 +14,7 @@ from rich.progress import Progress
 
 from membrane_ctrl.capture_set import read_head
 from membrane_ctrl.errors import CommandError, InputError, RejectedError
+from membrane_ctrl.geometry_file import read_geometry
 from membrane_ctrl.metrology.stability import default_points_mm
 from membrane_ctrl.result_files import write_json
 from membrane_ctrl.set_figure import Figures
@@ -27,26 +28,31 @@ class StabilityOptions:
     folder: Path
     out: Path | None
     points: tuple[str, ...]
+    geometry: Path | None
     trials: int
     seed: int
     as_json: bool
+    rerun: bool
 
 
 def stability_command(options: StabilityOptions) -> int:
     """Analyse a run, write tables and pictures, say what came out. Raises CommandError."""
     out = options.out or options.folder / "stability"
+    figures = Figures(None if options.geometry is None else read_geometry(options.geometry))
     folders = set_folders(options.folder, out)
     size_px, analysis_radius_mm = common_size(folders)
     points = points_mm(options.points, analysis_radius_mm)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        with StabilityRun(out, points, options.trials, options.seed) as run:
-            _analyse(folders, run)
+        with StabilityRun(out, points, options.trials, options.seed, options.geometry) as run:
+            _analyse(folders, figures, run)
         if run.used == 0:
             raise RejectedError(f"{options.folder}: none of {len(folders)} sets gave a figure ({run.first_reason})")
         table = {"schema": "membrane-stability/1", "run": str(options.folder), "size_px": size_px} | run.table()
         write_json(out / "stability.json", table)
-        run.draw()
+        pictures = run.draw()
+        if options.rerun:
+            run.record(pictures)
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror or error}") from None
     print(f"written to {out}", file=sys.stderr)
@@ -116,9 +122,8 @@ def points_mm(given: tuple[str, ...], analysis_radius_mm: float) -> dict[str, tu
     return points or default_points_mm(analysis_radius_mm)
 
 
-def _analyse(folders: list[Path], run: StabilityRun) -> None:
+def _analyse(folders: list[Path], figures: Figures, run: StabilityRun) -> None:
     """Every set, one after the other, with a bar on a terminal; a bad one is named and passed over."""
-    figures = Figures()
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
         task = progress.add_task("sets", total=len(folders))
         for number, folder in enumerate(folders):

@@ -41,6 +41,8 @@ class StabilityRun:
         Where the height is followed.
     trials, seed : int
         Of the Monte Carlo, for every set.
+    geometry : Path, optional
+        The file that the sets' geometry is from, with its covariance.
 
     Attributes
     ----------
@@ -48,10 +50,17 @@ class StabilityRun:
         Sets that gave a figure with a reservation.
     """
 
-    def __init__(self, out: Path, points_mm: Mapping[str, tuple[float, float]], trials: int, seed: int) -> None:
+    def __init__(
+        self,
+        out: Path,
+        points_mm: Mapping[str, tuple[float, float]],
+        trials: int,
+        seed: int,
+        geometry: Path | None = None,
+    ) -> None:
         self._out = out
         self._points_mm = dict(points_mm)
-        self._trials, self._seed = trials, seed
+        self._trials, self._seed, self._geometry = trials, seed, geometry
         self._series = SeriesFile(out / SERIES, list(points_mm))
         self._pair_file = (out / "pairs.csv").open("w", newline="", encoding="utf-8")
         self._pair_rows = csv.writer(self._pair_file, lineterminator="\n")
@@ -60,6 +69,7 @@ class StabilityRun:
         self._point_matrix: FloatArray = np.zeros((len(points_mm), PARAMETERS))
         self._spread: GeometrySpread | None = None
         self._source = ""
+        self._origin: dict[str, str | None] = {}
         self._parameters = RunningCovariance(PARAMETERS)
         self._heights = {name: Tally() for name in points_mm}
         self._rmse, self._time = Tally(), Tally()
@@ -146,7 +156,8 @@ class StabilityRun:
             },
             "trials": self._trials,
             "seed": self._seed,
-            "geometry": {
+            "geometry": self._origin
+            | {
                 "names": list(self._spread.names) if self._spread else [],
                 "sigmas": self._spread.sigmas.tolist() if self._spread else [],
                 "source": self._source,
@@ -169,23 +180,40 @@ class StabilityRun:
         out += [_pair_line(pair) for pair in table["pairs"]]
         return [*out, f"height    RMSE {table['rmse_um']['mean']:.4g} um, shared by all sets ({self._source})"]
 
-    def draw(self) -> None:
-        """Write the SD map and the pictures; the series must be closed. Raises OSError."""
+    def draw(self) -> list[Path]:
+        """Write the SD map and the pictures, and name these; the series must be closed. Raises OSError."""
         from membrane_ctrl.stability_pictures import draw_pairs, draw_stability, draw_zernike
 
         grid = self._grid
         if grid is None:
-            return
+            return []
         axis, sd = grid.axis_mm, grid.picture(self._sd_um())
         np.savez(self._out / "sd.npz", x_mm=axis, y_mm=axis, sd_um=sd)
+        times, heights, coeffs = self._followed()
+        drawn = [self._out / f"{name}.png" for name in ("stability", "zernike", "pairs")]
+        draw_stability(drawn[0], axis, sd, times, self._points_mm, heights)
+        draw_zernike(drawn[1], times, coeffs)
+        if not self._shown:
+            return drawn[:2]
+        draw_pairs(drawn[2], axis, {lag: self._pair_maps(grid, pair) for lag, pair in self._shown.items()})
+        return drawn
+
+    def record(self, pictures: list[Path]) -> None:
+        """Write `stability.rrd`; the series must be closed. Raises OSError."""
+        from membrane_ctrl.stability_rerun import log_stability
+
+        if self._grid is None:
+            return
+        sd_um = self._grid.picture(self._sd_um())
+        followed = (list(self._points_mm), *self._followed())
+        log_stability(self._out / "stability.rrd", *followed, sd_um, self.lines(), pictures)
+
+    def _followed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Times, heights of the points and terms of the sets that gave a figure."""
         times, heights, coeffs = read_series(self._out / SERIES, len(self._points_mm))
         if not np.isfinite(times).all():  # sets without times: count them
             times = np.arange(len(times), dtype=float)
-        draw_stability(self._out / "stability.png", axis, sd, times, self._points_mm, heights)
-        draw_zernike(self._out / "zernike.png", times, coeffs)
-        if self._shown:
-            maps = {lag: self._pair_maps(grid, pair) for lag, pair in self._shown.items()}
-            draw_pairs(self._out / "pairs.png", axis, maps)
+        return times, heights, coeffs
 
     def _grid_for(self, one: SetFigure) -> HeightMap:
         if self._grid is None:
@@ -197,7 +225,8 @@ class StabilityRun:
 
     def _spread_for(self, one: SetFigure) -> GeometrySpread:
         if self._spread is None:
-            self._spread, self._source = spread_of(one.head.optics.geometry, None)
+            self._spread, self._source = spread_of(one.head.optics.geometry, self._geometry)
+            self._origin = one.head.geometry.table()
         return self._spread
 
     def _sd_um(self) -> FloatArray:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import tomli_w
+from rerun.chunk import RrdReader
 
 from membrane_ctrl.cli import run
 
@@ -41,7 +42,7 @@ def result(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the analysis of all of it leaves."""
     out = tmp_path_factory.mktemp("result") / "deep" / "out"
     points = ["--point", "rim=474,0", "--point", "vertex=0,0"]
-    assert run(["stability", str(made), "--out", str(out), "--trials", "20", *points]) == 0
+    assert run(["stability", str(made), "--out", str(out), "--trials", "20", "--rerun", *points]) == 0
     return out
 
 
@@ -59,6 +60,12 @@ def analysed(folder: Path, out: Path, *options: str) -> tuple[int, dict[str, Any
 def rows(path: Path) -> list[dict[str, str]]:
     with path.open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
+
+
+def keep_two(folder: Path) -> None:
+    """Fewer sets where two will do."""
+    for name in ("0002", "0003"):
+        shutil.rmtree(folder / name)
 
 
 def test_a_sinking_film(made: Path, result: Path) -> None:
@@ -101,6 +108,36 @@ def test_files_and_pictures(result: Path) -> None:
     assert np.nanmean(sd["sd_um"]) == pytest.approx(table["sd_um"]["mean"])
     z4_um = np.array([float(row["z4_um"]) for row in rows(result / "series.csv")])
     assert z4_um.std(ddof=1) == pytest.approx(table["zernike"]["sd_um"][3], rel=1e-6)
+
+
+def test_the_recording_holds_the_series(result: Path) -> None:
+    entities = {chunk.entity_path for chunk in RrdReader(result / "stability.rrd").stream()}
+    assert {"/stability/points_um", "/stability/zernike_um", "/stability/sd_um", "/stability/report"} <= entities
+    assert {f"/stability/pictures/{name}" for name in ("stability", "zernike", "pairs")} <= entities
+
+
+def test_a_recording_that_cannot_be_written(
+    spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "out" / "stability.rrd").mkdir(parents=True)
+    keep_two(spoiled)
+    assert run(["stability", str(spoiled), "--out", str(tmp_path / "out"), "--trials", "2", "--rerun"]) == 2
+    assert "stability.rrd" in capsys.readouterr().err
+
+
+def test_a_geometry_of_its_own(spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    keep_two(spoiled)
+    path = tmp_path / "geometry.toml"
+    geometry = tomllib.loads((spoiled / "0000" / "capture.toml").read_text())["geometry"]
+    covariance = {"names": ["a_mm"], "matrix": [[0.25]]}
+    path.write_text(tomli_w.dumps({"geometry": {**geometry, "a_mm": 2680.0}, "covariance": covariance}))
+    _, own = analysed(spoiled, tmp_path / "own")
+    code, table = analysed(spoiled, tmp_path / "out", "--geometry", str(path))
+    assert code == 0
+    assert (table["geometry"]["names"], table["geometry"]["sigmas"]) == (["a_mm"], [0.5])
+    assert table["geometry"]["file"] == str(path)
+    assert table["rmse_um"]["mean"] < 0.5 * own["rmse_um"]["mean"]
+    assert abs(table["zernike"]["mean_um"][3] - own["zernike"]["mean_um"][3]) > 1
 
 
 def test_runs_repeat_and_do_not_take_their_results_for_sets(

@@ -74,14 +74,18 @@ def stability(
     point: Annotated[
         list[str] | None, typer.Option(help="NAME=X,Y in mm: a point to follow, instead of A, B and C; repeatable.")
     ] = None,
+    geometry: Annotated[
+        Path | None, typer.Option(help="Geometry to use instead of the sets' own, with its covariance.")
+    ] = None,
     trials: Annotated[int, typer.Option(min=2, help="Monte Carlo trials, for every set.")] = 100,
     seed: SeedOption = 1,
+    rerun: Annotated[bool, typer.Option("--rerun", help="Write stability.rrd beside the result.")] = False,
     json: JsonOption = False,
 ) -> int:
     """Stability of a run of sets: standard deviation, points in time, pairs with their uncertainty."""
     from membrane_ctrl.stability_command import StabilityOptions, stability_command
 
-    options = StabilityOptions(run_of_sets, out, tuple(point or ()), trials, seed, json)
+    options = StabilityOptions(run_of_sets, out, tuple(point or ()), geometry, trials, seed, json, rerun)
     return stability_command(options)
 
 
@@ -98,7 +102,11 @@ def simulate(
     motion_um: Annotated[float, typer.Option(help="Amplitude of the film's motion.")] = 0.0,
     motion_hz: Annotated[float, typer.Option(help="Its frequency.")] = 0.3,
     drift_um_per_s: Annotated[float, typer.Option(help="Drift of the film.")] = 0.0,
+    displacement_um: Annotated[float, typer.Option(help="How far the bowl is from that depth at the start.")] = 0.0,
     laser_noise_um: Annotated[float, typer.Option(min=0.0, help="Noise of the laser's readings.")] = 0.0,
+    stated: Annotated[
+        Path | None, typer.Option(help="Geometry that the set states; the truth is the configuration's.")
+    ] = None,
     exact: Annotated[bool, typer.Option("--exact", help="Trace every pixel: slow, true to the last bit.")] = False,
     seed: SeedOption = 1,
     fault: Annotated[
@@ -121,8 +129,9 @@ def simulate(
         noise_adu=noise_adu,
         shrink=shrink,
         gamma=gamma,
-        motion=Motion(drift_um_per_s=drift_um_per_s, amplitude_um=motion_um, frequency_hz=motion_hz),
+        motion=Motion(displacement_um, drift_um_per_s, motion_um, motion_hz),
         laser_noise_um=laser_noise_um,
+        stated=stated,
         exact=exact,
         seed=seed,
         faults=tuple(fault or ()),
