@@ -17,7 +17,7 @@ from membrane_ctrl.safety import MOVING
 
 Kind = Literal[
     "hold", "stop", "pause", "resume", "manual", "setpoint", "gains",
-    "shape_on", "shape_off", "mark", "ack", "lower", "vent", "tune", "keep", "latch",
+    "shape_on", "shape_off", "mark", "ack", "lower", "vent", "tune", "keep", "latch", "capture",
 ]  # fmt: skip
 Role = Literal["read", "operate", "tune"]
 
@@ -85,6 +85,7 @@ TABLE: dict[Kind, Rule] = {
     "latch": Rule("operate", {State.STANDBY}),  # a fault of an earlier run, or a person's lock: no hold before `ack`
     "lower": Rule("operate", RUNNING),
     "vent": Rule("operate", ANY),
+    "capture": Rule("operate", {State.HOLD}),  # a full set, written by the acquisition
 }
 
 

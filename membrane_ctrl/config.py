@@ -235,6 +235,7 @@ class TwinConfig(Section):
     leak_time_constant_s: Annotated[float, Field(ge=10, le=1e8)] = 1.0e4
     barometer_noise_pa: Annotated[float, Field(ge=0, le=100)] = 0.05
     thermometer_noise_k: Annotated[float, Field(ge=0, le=10)] = 0.002
+    geometry: GeometryConfig | None = None  # where camera and screen really stand; none: as [optics.geometry] states
 
 
 class RecordingConfig(Section):

@@ -169,7 +169,7 @@ class Controller:
                 scene.stop_exit = Exit.DONE if command.who == "duration" else Exit.INTERRUPTED
             case "lower" | "vent":
                 self._go_down(command.kind)
-        if command.kind != "mark":
+        if command.kind not in ("mark", "capture"):
             scene.asked_by = command.who
 
     def _prepare(self, command: Command) -> str:

@@ -103,6 +103,14 @@ class Crew:
         """What the children have said since the last call, and who was replaced; never waits."""
         return [event for post in self._posts for event in post.look(self._clock.now())]
 
+    def capture(self) -> Event | None:
+        """Have the acquisition take a full set to disk, which its own event names; an event if that cannot be."""
+        if self._acquisition is None:
+            return {"kind": "capture", "failed": "no camera measures in this run"}
+        if not self._acquisition.send("capture"):
+            return {"kind": "capture", "failed": "the acquisition does not answer; is it being replaced?"}
+        return None
+
     def take_down(self) -> None:
         """Stop the acquisition, then let recorder and screen finish by themselves: the "end" event is their sign."""
         if self._acquisition is not None:

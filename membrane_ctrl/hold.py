@@ -41,7 +41,7 @@ from membrane_ctrl.recording.run_folder import create_run_folder
 from membrane_ctrl.simulated import TwinProcess
 from membrane_ctrl.supervisor import Supervisor, Wiring
 from membrane_ctrl.systemd import SystemdNotify
-from membrane_ctrl.tick import Event
+from membrane_ctrl.tick import Event, TickOutputs
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +163,8 @@ async def _run(
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         port = port_for(RunHooks(supervisor.ask, supervisor.tell, clock.now, lambda: controller.loop_config))
         latcher, systemd = latcher_for(supervisor.tell), SystemdNotify()
-        wiring.heard, wiring.told = (port.heard, latcher.heard, systemd.heard), (port.told,)
+        wiring.heard = (port.heard, latcher.heard, systemd.heard, partial(_capture, crew, supervisor.tell))
+        wiring.told = (port.told,)
         devices = config.devices.name if config.devices else ""
         supervisor.tell({"kind": "start", "devices": devices, "priority": raise_priority(), "message": board.cleared})
         exit_code = Exit.DEVICE_FAILED
@@ -194,6 +195,14 @@ async def _run(
                 }
             )
     return exit_code
+
+
+def _capture(crew: Crew, tell: Callable[[Event], None], outputs: TickOutputs) -> None:
+    """A set that was asked for, and not refused, is the acquisition's to take."""
+    for event in outputs.events:
+        asked = event["kind"] == "command" and event["command"] == "capture" and "refused" not in event
+        if asked and (failed := crew.capture()) is not None:
+            tell(failed)
 
 
 @contextlib.contextmanager

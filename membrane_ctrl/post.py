@@ -8,6 +8,7 @@ takes its place.
 from __future__ import annotations
 
 import math
+import select
 from collections import deque
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -56,6 +57,16 @@ class Post:
         """Start the first child."""
         self._expected_s = now_s + _STARTS_S
         self.child.start()
+
+    def send(self, word: str) -> bool:
+        """Hand a word to the child; False if nobody takes it now. Never waits."""
+        try:
+            if not (self.child.alive and select.select([], [self._line.fileno()], [], 0)[1]):
+                return False
+            self._line.send(word)
+        except OSError:
+            return False
+        return True
 
     def look(self, now_s: float) -> list[Event]:
         """What it has said since the last call, and what became of it; starts another when that is due.

@@ -61,6 +61,14 @@ def test_what_the_child_says_is_handed_on() -> None:
     assert post.look(0.5) == []
 
 
+def test_a_word_reaches_the_child_that_is_there_and_no_other() -> None:
+    post, agency = make_post()
+    assert post.send("capture")
+    assert agency.theirs[0].recv() == "capture"
+    post.child.kill()
+    assert not post.send("capture")
+
+
 def test_a_dead_child_is_replaced_at_once_and_told() -> None:
     post, agency = make_post()
     agency.theirs[0].send({"kind": "last words"})

@@ -10,7 +10,7 @@ from __future__ import annotations
 import shutil
 import struct
 from collections.abc import Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -101,6 +101,16 @@ class RawFrames:
                 self._writer.submit(shutil.rmtree, self._reference, ignore_errors=True)
             self._reference, self._reference_needed = kept, bool(due)
 
+    def capture(self, estimate: ShapeEstimate) -> Path:
+        """Have a cycle's frames written and wait for it; returns the set's folder. Raises OSError."""
+        kept = self._keep(estimate.cycle)
+        wait(self._writing)
+        if kept is None or not (kept / "capture.toml").exists():
+            raise OSError("the set could not be written whole: is the disk full, or slower than the cycles?")
+        if kept == self._reference:
+            self._reference_needed = True  # it is somebody's now
+        return kept
+
     def look_for_fault(self) -> None:
         """Keep the last cycles if a fault has come up since the last call."""
         message = self._telemetry.latest()
@@ -160,7 +170,8 @@ class RawFrames:
 def _write(folder: Path, table: dict[str, Any], content: _Set) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for head, pixels in zip(content.heads, content.pixels, strict=True):
-        cv2.imwrite(str(folder / f"{head.pattern}.png"), pixels, _FASTEST)
+        if not cv2.imwrite(str(folder / f"{head.pattern}.png"), pixels, _FASTEST):
+            raise OSError(f"{folder / head.pattern}.png: cannot be written")
     (folder / "capture.toml").write_text(
         tomli_w.dumps(table), encoding="utf-8"
     )  # last: a set is whole when it is there

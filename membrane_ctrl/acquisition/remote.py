@@ -22,7 +22,7 @@ _PREPARING_S = 900.0
 
 
 class Remote:
-    """Commands "pause", "resume", "full" and "stop" over a Connection; reports as dicts.
+    """Commands "pause", "resume", "full", "capture" and "stop" over a Connection; reports as dicts.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Remote:
     def __init__(self, control: Connection, parent_pid: int) -> None:
         self._control = control
         self._parent_pid = parent_pid
-        self._full = False
+        self._full = self._capture = False
         self._said = ("", "")
         self._step_s = _PREPARING_S
         self._alive_due_s = 0.0
@@ -72,6 +72,11 @@ class Remote:
     def take_full(self) -> bool:
         """Whether a full cycle was asked for since the last call."""
         wanted, self._full = self._full, False
+        return wanted
+
+    def take_capture(self) -> bool:
+        """Whether a full cycle to be kept on disk was asked for since the last call."""
+        wanted, self._capture = self._capture, False
         return wanted
 
     def report(self, state: AcquisitionState, message: str = "", **details: object) -> None:
@@ -114,7 +119,9 @@ class Remote:
                 self.paused = False
             case "full":
                 self._full = True
+            case "capture":
+                self._capture = True
             case "stop":
                 self.stop = True
             case _:
-                self.report("running", f"unknown command {command!r}: use pause, resume, full or stop")
+                self.report("running", f"unknown command {command!r}: use pause, resume, full, capture or stop")

@@ -103,9 +103,14 @@ def run(spec: AcquisitionSpec, remote: Remote) -> None:
             if raw is not None:
                 raw.after(estimate)
 
+        def keep(estimate: ShapeEstimate) -> Path:
+            if raw is None:
+                raise OSError("the run has no folder")
+            return raw.capture(estimate)
+
         remote.prepared()
         remote.report("running", "first cycle")
-        keep_cycling(cycle, remote, publish, clock, config.shape.period_s)
+        keep_cycling(cycle, remote, publish, clock, config.shape.period_s, keep)
 
 
 def _twin_bench(

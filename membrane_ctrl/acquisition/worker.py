@@ -6,12 +6,14 @@ import math
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from membrane_ctrl.acquisition.cycle import CycleClock, CycleDone, CycleFailed, ShapeCycle
 from membrane_ctrl.acquisition.remote import Remote
 from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.tick import Event
 
 
 def keep_cycling(
@@ -20,6 +22,7 @@ def keep_cycling(
     publish: Callable[[ShapeEstimate], None],
     clock: CycleClock,
     period_s: float,
+    keep: Callable[[ShapeEstimate], Path],
 ) -> None:
     """Take cycles until told to stop.
 
@@ -35,6 +38,8 @@ def keep_cycling(
         The run's clock.
     period_s : float
         From deadline to deadline. A cycle that takes longer costs the deadlines it covers; they are not made up.
+    keep : callable
+        Writes the frames of a cycle and returns the set's folder; OSError says why not.
     """
     due_s = clock.now()
     while not remote.stop:
@@ -48,10 +53,13 @@ def keep_cycling(
         if remaining_s > 0:
             remote.listen(remaining_s)
             continue
-        if remote.take_full():
+        captures = remote.take_capture()
+        if remote.take_full() or captures:
             cycle.want_full()
         result = cycle.take()
         _tell(result, remote, publish)
+        if captures:
+            remote.tell(_captured(result, keep))
         pause_s = result.pause_s if result is not None else 0.0
         due_s = next_deadline_s(due_s, period_s, clock.now() + pause_s)
 
@@ -69,6 +77,25 @@ def estimate_message(estimate: ShapeEstimate) -> bytes:
     """
     covariance_um2 = estimate.covariance_um2.astype(np.float32).astype(np.float64)
     return pickle.dumps(replace(estimate, covariance_um2=covariance_um2), pickle.HIGHEST_PROTOCOL)
+
+
+def _captured(result: CycleDone | CycleFailed | None, keep: Callable[[ShapeEstimate], Path]) -> Event:
+    """What became of a set that was asked for; a rejected one is not worth its room on the disk."""
+    match result:
+        case None:
+            return {"kind": "capture", "failed": "the cycle was stopped"}
+        case CycleFailed(number, stage, message, _):
+            return {"kind": "capture", "cycle": number, "failed": f"{stage}: {message}"}
+    estimate = result.estimate
+    if estimate.verdict == "rejected":
+        return {"kind": "capture", "cycle": estimate.cycle, "failed": f"rejected: {estimate.reason}"}
+    try:
+        folder = keep(estimate)
+    except OSError as error:
+        return {"kind": "capture", "cycle": estimate.cycle, "failed": error.strerror or str(error)}
+    told: Event = {"kind": "capture", "cycle": estimate.cycle, "set": f"{folder.parent.name}/{folder.name}"}
+    moved_um = {"displacement_um": estimate.displacement_um} if math.isfinite(estimate.displacement_um) else {}
+    return {**told, **moved_um, "verdict": estimate.verdict, "reason": estimate.reason}
 
 
 def _tell(result: CycleDone | CycleFailed | None, remote: Remote, publish: Callable[[ShapeEstimate], None]) -> None:

@@ -42,10 +42,10 @@ class TwinOptics:
     Parameters
     ----------
     optics : OpticsConfig
-        The bench's optics, taken as true. Without a reference displacement in the geometry, it holds for the film as
-        it was at the first look.
+        The bench's optics, taken as true but for the geometry if `twin` has its own. Without a reference displacement
+        in the geometry, it holds for the film as it was at the first look.
     twin : TwinConfig
-        For its seed.
+        For its seed and its true geometry.
     truth : callable
         Gives the film's true position now.
     clock : Clock
@@ -67,7 +67,7 @@ class TwinOptics:
         clock: Clock,
         film: FilmShape | None = None,
     ) -> None:
-        self._optics = optics
+        self._optics = optics if twin.geometry is None else optics.model_copy(update={"geometry": twin.geometry})
         self._seed = twin.seed
         self._truth = truth
         self._clock = clock

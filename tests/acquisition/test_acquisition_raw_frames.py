@@ -46,6 +46,9 @@ class Keeping:
         if whole:
             self.raw.after(estimate(kind, cycle=self.cycle))
 
+    def capture(self, cycle: int) -> Path:
+        return self.raw.capture(estimate("full", cycle=cycle))
+
     def fault(self, code: int) -> None:
         nothing = TelemetryRow(**dict.fromkeys(FIELDS, 0.0))
         values = {**{name: getattr(nothing, name) for name in FIELDS}, "fault": float(code)}
@@ -105,6 +108,22 @@ def test_an_anchor_that_nothing_refers_to_makes_room(stack: ExitStack, tmp_path:
     for _ in range(3):
         keeping.take("full")
     assert keeping.kept() == ["cycle-000003"]
+
+
+def test_a_set_that_was_asked_for_is_there_at_once_and_stays(stack: ExitStack, tmp_path: Path) -> None:
+    keeping = Keeping(stack, tmp_path)
+    keeping.take("full")
+    assert read_head(keeping.capture(1)).kind == "full"
+    keeping.take("full")  # the next anchor
+    assert keeping.kept() == ["cycle-000001", "cycle-000002"]
+
+
+def test_a_set_that_was_asked_for_and_cannot_be_written_is_an_error(stack: ExitStack, tmp_path: Path) -> None:
+    keeping = Keeping(stack, tmp_path, min_free_mb=1e9)
+    keeping.take("full")
+    with pytest.raises(OSError, match="disk full"):
+        keeping.capture(1)
+    assert keeping.kept() == []
 
 
 def test_half_a_cycle_is_no_set(stack: ExitStack, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 import pytest
 from acquisition_fakes import VirtualClock, estimate
@@ -23,7 +24,8 @@ class ScriptedRemote(Remote):
         self.clock = clock
         self.script = sorted(script.items())
         self.told: list[tuple[str, str]] = []
-        self.stop = self.paused = self._full = False
+        self.stop = self.paused = self._full = self._capture = False
+        self.events: list[dict[str, object]] = []
 
     def listen(self, timeout_s: float = 0.0) -> None:
         assert self.script, "nothing more will happen"
@@ -37,6 +39,9 @@ class ScriptedRemote(Remote):
 
     def report(self, state: str, message: str = "", **details: object) -> None:
         self.told.append((state, message))
+
+    def tell(self, event: dict[str, object]) -> None:
+        self.events.append(event)
 
 
 class ScriptedCycle:
@@ -64,9 +69,15 @@ class Loop:
         self.remote = ScriptedRemote(self.clock, script)
         self.cycle = ScriptedCycle(self.clock, duration_s)
         self.published: list[ShapeEstimate] = []
+        self.disk_full = False
 
     def run(self) -> None:
-        keep_cycling(self.cycle, self.remote, self.published.append, self.clock, 2.0)  # type: ignore[arg-type]
+        keep_cycling(self.cycle, self.remote, self.published.append, self.clock, 2.0, self.keep)  # type: ignore[arg-type]
+
+    def keep(self, estimate: ShapeEstimate) -> Path:
+        if self.disk_full:
+            raise OSError(28, "No space left on device")
+        return Path("raw") / f"cycle-{estimate.cycle}"
 
 
 def test_cycles_start_on_absolute_deadlines() -> None:
@@ -93,6 +104,31 @@ def test_full_on_request_goes_to_the_next_cycle() -> None:
     loop = Loop({1.0: "full", 5.0: "stop"})
     loop.run()
     assert loop.cycle.full_wanted_at_s == [2]
+
+
+def test_a_set_on_request_is_a_full_cycle_that_is_kept_and_named() -> None:
+    loop = Loop({1.0: "capture", 5.0: "stop"})
+    loop.run()
+    assert loop.cycle.full_wanted_at_s == [2]
+    assert loop.remote.events == [
+        {"kind": "capture", "cycle": 2, "set": "raw/cycle-2", "displacement_um": 0.0, "verdict": "ok", "reason": ""}
+    ]
+
+
+@pytest.mark.parametrize(
+    ("result", "failed"),
+    [
+        (None, "the cycle was stopped"),
+        (CycleFailed(7, "camera", "LinkError: no trigger", 1.0), "camera: LinkError: no trigger"),
+        (CycleDone(estimate("full", verdict="rejected", reason="no mirror"), 0.0), "rejected: no mirror"),
+        (CycleDone(estimate("full"), 0.0), "No space left on device"),
+    ],
+)
+def test_a_set_that_cannot_be_had_says_why(result: CycleDone | CycleFailed | None, failed: str) -> None:
+    loop = Loop({1.0: "capture", 3.0: "stop"})
+    loop.cycle.results, loop.disk_full = [CycleDone(estimate(), 0.0), result], True
+    loop.run()
+    assert [event["failed"] for event in loop.remote.events] == [failed]
 
 
 def test_failure_is_reported_and_waits_out_its_pause() -> None:
