@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import ssl
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from membrane_ctrl.port.unix import short
 
 Message = dict[str, Any]
 _ANSWER_S = 10.0
+_TURN = struct.pack("ll", 10, 0)  # to wait at the door: s and us, as the kernel takes a time-out
 
 
 class PortClient:
@@ -57,13 +59,19 @@ class PortClient:
     def unix(cls, path: Path, notice: Callable[[str], None]) -> PortClient:
         """Connect to a socket file."""
         connection = socket.socket(socket.AF_UNIX)
-        connection.settimeout(_ANSWER_S)
+        # While others crowd the door, connecting waits its turn only if it blocks; with Python's own time-out it
+        # would be refused at once.
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TURN)
         try:
             with short(path) as address:
                 connection.connect(address)
+            connection.settimeout(_ANSWER_S)
         except (FileNotFoundError, ConnectionRefusedError):
             connection.close()
             raise DeviceError(f"{path}: no hold is listening there; name its run with --run or --socket") from None
+        except BlockingIOError:
+            connection.close()
+            raise DeviceError(f"{path}: too many wait there to be let in; try again") from None
         except OSError as error:
             connection.close()
             raise DeviceError(f"{path}: {(error.strerror or str(error)).lower()}") from None

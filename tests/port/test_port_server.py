@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import struct
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -311,3 +313,27 @@ def test_a_client_of_something_else(tmp_path: Path) -> None:
             with pytest.raises(DeviceError, match="no control port of membrane-ctrl"):
                 PortClient(caller, "there", print)
             accepted.close()
+
+
+def test_a_client_waits_its_turn_at_a_crowded_door(tmp_path: Path) -> None:
+    path = tmp_path / "control.sock"
+    with socket.socket(socket.AF_UNIX) as door, socket.socket(socket.AF_UNIX) as first:
+        door.bind(str(path))
+        door.listen(0)
+        first.connect(str(path))  # nobody else fits
+        with ThreadPoolExecutor(1) as elsewhere:
+            second = elsewhere.submit(PortClient.unix, path, print)
+            with door.accept()[0], door.accept()[0] as accepted:
+                accepted.sendall(b'{"membrane_ctrl": 1}\n')
+                with second.result() as client:
+                    assert client.greeting == {"membrane_ctrl": 1}
+
+
+def test_a_door_that_stays_crowded_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("membrane_ctrl.port.client._TURN", struct.pack("ll", 0, 50_000))
+    with socket.socket(socket.AF_UNIX) as door, socket.socket(socket.AF_UNIX) as first:
+        door.bind(str(tmp_path / "control.sock"))
+        door.listen(0)
+        first.connect(str(tmp_path / "control.sock"))
+        with pytest.raises(DeviceError, match="too many wait"):
+            PortClient.unix(tmp_path / "control.sock", print)
