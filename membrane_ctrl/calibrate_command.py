@@ -7,7 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from membrane_ctrl.metrology.calibrate.artefact import Origin, tables_of
 from membrane_ctrl.metrology.calibrate.determined import condition_number
 from membrane_ctrl.metrology.calibrate.drift import noise_urad
 from membrane_ctrl.metrology.calibrate.from_checked import phases_of
-from membrane_ctrl.metrology.calibrate.parameters import NAMES, sigmas, usual_sigma
+from membrane_ctrl.metrology.calibrate.parameters import LASER, NAMES, sigmas, usual_sigma
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases
 from membrane_ctrl.metrology.calibrate.separable import Witness
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, slope_residual, solve
@@ -139,13 +139,22 @@ def read_sets(folders: Sequence[Path], geometry: Path | None) -> Bundle:
             print(f"\r{len(sets)} of {len(folders)} sets read", end="", file=sys.stderr)
     if sys.stderr.isatty():
         print(file=sys.stderr)
-    # A set that states none has its own first reading: then the first set's counts for all
+    reference_um = _reference_um(sets, benches)
+    if not any(math.isfinite(phases.displacement_um) for phases in sets):
+        # no laser: the world's origin is the vertex of the first set
+        sets[0] = replace(sets[0], displacement_um=reference_um)
+    return Bundle(tuple(sets), benches[0], reference_um)
+
+
+def _reference_um(sets: Sequence[SetPhases], benches: Sequence[OpticsConfig]) -> float:
+    """Reading at which the vertex is the world's origin: what all sets state, else the first one that there is.
+
+    A set that states none has its own first reading there: then the sets differ.
+    """
     stated = {bench.geometry.reference_displacement_um for bench in benches}
-    reference = stated.pop() if len(stated) == 1 else None
-    first = sets[0].displacement_um
-    return Bundle(
-        tuple(sets), benches[0], reference if reference is not None else first if math.isfinite(first) else 0.0
-    )
+    if len(stated) == 1 and (reference_um := stated.pop()) is not None:
+        return reference_um
+    return next((phases.displacement_um for phases in sets if math.isfinite(phases.displacement_um)), 0.0)
 
 
 def _same_rig(first: Path, optics: OpticsConfig, folder: Path, other: OpticsConfig) -> None:
@@ -178,6 +187,8 @@ def problem_of(bundle: Bundle, free: dict[str, float], laser_sigma_um: float) ->
     except ValueError as error:
         raise InputError(str(error)) from None
     witness = Witness(bundle.reference_um, laser_sigma_um)
+    if sum(math.isfinite(phases.displacement_um) for phases in bundle.sets) < 2:
+        own[LASER.name] = 0.0  # a scale of nothing
     return Problem(geometry, bundle.sets, sigmas({**own, **free}), witness, bundle.optics.mirror.radius_mm)
 
 

@@ -14,6 +14,8 @@ from membrane_ctrl.metrology.calibrate.propagate import propagate
 from membrane_ctrl.metrology.calibrate.solve import Solution
 from membrane_ctrl.metrology.calibrate.verdict import Finding
 
+_SOME_LASER = 0.5  # sigma of the laser's scale without any reading: 1
+
 
 def report_of(solution: Solution | None, findings: Sequence[Finding], analysis_radius_mm: float) -> dict[str, Any]:
     """The report, schema membrane-calibration/1; without a solution only what was found."""
@@ -98,7 +100,8 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         f"a figure made with it: sag +- {claim['sag_um']:.2f} um, figure +- {claim['figure_rms_um']:.2f} um RMS, "
         f"with its tilt +- {claim['height_rms_um']:.1f} um RMS"
     )
-    lines.append(f"laser against optics: {report['laser']['scale']:.5f} +- {report['laser']['sigma']:.5f}")
+    if report["laser"]["sigma"] < _SOME_LASER:
+        lines.append(f"laser against optics: {report['laser']['scale']:.5f} +- {report['laser']['sigma']:.5f}")
     lines.append(f"condition number {report['condition']:.2g}; not determined by the sets:")
     lines += [f"  {each['sigma_left']:.0%} left: {each['says']}" for each in report["not_determined"]] or [
         "  nothing"

@@ -112,7 +112,7 @@ def test_a_rejected_calibration_leaves_the_old_geometry(
 
 def test_one_pressure_is_not_enough(folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["calibrate", str(folders[0]), "--out", str(tmp_path / "g.toml"), "--json"]) == 3
-    assert "fewer than two sets" in json.loads(capsys.readouterr().out)["findings"][0]["says"]
+    assert "only 0 um apart" in json.loads(capsys.readouterr().out)["findings"][0]["says"]
 
 
 def test_sets_of_different_rigs_are_named(

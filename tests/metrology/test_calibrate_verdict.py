@@ -63,15 +63,41 @@ def test_good_sets_have_nothing_against_them() -> None:
         (reading(lambda d: -d), ALL_SETS, "the laser counts the wrong way"),
         (reading(lambda d: 10 * d), ALL_SETS, "the laser's unit or scale is wrong"),
         (reading(lambda d: 1.02 * d), ALL_SETS, "the laser's scale is wrong: the optics see 0.98"),
-        (reading(lambda d: d / 20), ALL_SETS, "the sets are only 400 um apart"),
+        (
+            reading(lambda d: d / 1000),
+            ALL_SETS,
+            "the laser's unit or scale is wrong, or it is stuck: its readings are 8",
+        ),
+        (
+            reading(lambda d: 7.0),
+            ALL_SETS,
+            "the laser's unit or scale is wrong, or it is stuck: its readings are 0 um",
+        ),
         (reading(lambda d: d + 50), (1,), "set1 disagrees with all the others: its laser reads +"),
-        (reading(lambda d: float("nan")), (0, 1, 2, 3), "fewer than two sets carry a laser reading"),
     ],
 )
 def test_laser_faults_are_named(edit: Edit, which: tuple[int, ...], says: str) -> None:
     (finding,) = judged(good(), edited(edit, *which))
     assert finding.fatal
     assert finding.says.startswith(says)
+
+
+def test_sets_that_are_too_close_are_refused() -> None:
+    (finding,) = judged(make(VALUES, 3, points=800, sags_mm=(36.8, 37.0, 37.2)))
+    assert finding.fatal
+    assert finding.says.startswith("the sets are only 400 um apart")
+    assert "at least 1 mm" in finding.says
+
+
+def test_without_a_laser_fringes_and_ring_say_it() -> None:
+    silent = edited(reading(lambda d: float("nan")), 1, 2, 3, 4)
+    held = good().problem(sigmas({"laser_relative": 0.0}), silent)
+    solution = solve(held)
+    (finding,) = before(held) or after(solution)
+    assert not finding.fatal
+    assert "the sag rests on fringes and ring alone" in finding.says
+    error = (solution.values - VALUES)[:11] / solution.sigmas[:11]
+    assert np.sqrt(np.mean(error**2)) < 2
 
 
 def test_a_bumped_camera_is_named_with_its_turn() -> None:
@@ -93,6 +119,18 @@ def test_a_camera_that_was_moved_far_is_told_by_the_halves() -> None:
     assert "between set2 and set3" in finding.says
 
 
+def test_bins_are_not_averaged_about_a_bench_that_was_not_found() -> None:
+    """What is asked afterwards of each half must find the points as they were seen."""
+    other = VALUES.copy()
+    other[NAMES.index("camera_yaw_deg")] += 1.0
+    mixed = make(VALUES, 3, points=8200, sags_mm=(34.0, 36.0, 40.0), bumped={2: other})
+    solution = solve(mixed.problem(SIGMAS))
+    assert not solution.converged
+    kept = solution.problem.sets[2].screen_mm
+    assert kept.shape[1] > 1000
+    assert np.isin(kept, mixed.sets[2].screen_mm).all()
+
+
 def test_one_set_of_another_rig_is_named() -> None:
     other = VALUES + SIGMAS * np.random.default_rng(9).normal(size=len(NAMES))
     (finding,) = judged(make(VALUES, 3, points=1500, bumped={1: other}))
@@ -103,7 +141,7 @@ def test_one_set_of_another_rig_is_named() -> None:
 def test_sets_of_many_rigs_are_refused() -> None:
     rng = np.random.default_rng(9)
     others = {k: VALUES + 2 * SIGMAS * rng.normal(size=len(NAMES)) for k in (1, 2, 4)}
-    (finding,) = judged(make(VALUES, 3, points=1500, bumped=others))
+    (finding,) = judged(make(VALUES, 3, points=600, bumped=others))
     assert finding.fatal
     assert "bench" in finding.says or "one bench" in finding.says
 

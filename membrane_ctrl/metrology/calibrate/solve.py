@@ -158,6 +158,8 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
     if start is None and max(phases.sigma_mm.size for phases in problem.sets) > 2 * _FEW:
         some = replace(problem, sets=tuple(phases.thinned(_FEW) for phases in problem.sets))
         start = _solve(some, progress, None)
+        if not start.converged:
+            return start  # means about a bench that is none would be no points of any
         pairs = zip(problem.sets, start.states, strict=True)
         problem = replace(problem, sets=tuple(averaged(start.bench, *pair, _FEW) for pair in pairs))
     states = start.states if start is not None else first_states(problem)
