@@ -16,7 +16,7 @@ import numpy as np
 import tomli_w
 
 from membrane_ctrl.calibrate_report import lines_of, report_of
-from membrane_ctrl.config import OpticsConfig
+from membrane_ctrl.config import GeometryConfig, OpticsConfig
 from membrane_ctrl.errors import Exit, InputError
 from membrane_ctrl.geometry_file import read_geometry
 from membrane_ctrl.metrology.calibrate.artefact import Origin, tables_of
@@ -52,6 +52,8 @@ class CalibrateOptions:
         Report as JSON.
     pictures : bool
         Draw what is left of the screen points, beside the geometry.
+    reference_um : float or None
+        Laser reading for which the hand's measurements hold, if the sets do not say; None: the first set's.
     """
 
     folders: Sequence[Path]
@@ -61,6 +63,7 @@ class CalibrateOptions:
     laser_sigma_um: float
     as_json: bool
     pictures: bool = True
+    reference_um: float | None = None
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ def calibrate_command(options: CalibrateOptions) -> int:
     """Read, solve, judge, write. Returns the exit code; raises CommandError for sets that are none."""
     free = freed(options.free)
     begin = time.perf_counter()
-    bundle = read_sets(options.folders, options.geometry)
+    bundle = read_sets(options.folders, options.geometry, options.reference_um)
     read = time.perf_counter()
     problem = problem_of(bundle, free, options.laser_sigma_um)
     findings, solution = before(problem), None
@@ -115,7 +118,7 @@ def freed(texts: Sequence[str]) -> dict[str, float]:
     return out
 
 
-def read_sets(folders: Sequence[Path], geometry: Path | None) -> Bundle:
+def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: float | None = None) -> Bundle:
     """Read capture sets and their phases.
 
     Raises
@@ -139,21 +142,23 @@ def read_sets(folders: Sequence[Path], geometry: Path | None) -> Bundle:
             print(f"\r{len(sets)} of {len(folders)} sets read", end="", file=sys.stderr)
     if sys.stderr.isatty():
         print(file=sys.stderr)
-    reference_um = _reference_um(sets, benches)
+    reference_um = _reference_um(sets, benches, reference_um)
     if not any(math.isfinite(phases.displacement_um) for phases in sets):
         # no laser: the world's origin is the vertex of the first set
         sets[0] = replace(sets[0], displacement_um=reference_um)
     return Bundle(tuple(sets), benches[0], reference_um)
 
 
-def _reference_um(sets: Sequence[SetPhases], benches: Sequence[OpticsConfig]) -> float:
-    """Reading at which the vertex is the world's origin: what all sets state, else the first one that there is.
+def _reference_um(sets: Sequence[SetPhases], benches: Sequence[OpticsConfig], known_um: float | None) -> float:
+    """Reading at which the vertex is the world's origin: what all sets state, else as known, else the first there is.
 
     A set that states none has its own first reading there: then the sets differ.
     """
     stated = {bench.geometry.reference_displacement_um for bench in benches}
     if len(stated) == 1 and (reference_um := stated.pop()) is not None:
         return reference_um
+    if known_um is not None:
+        return known_um
     return next((phases.displacement_um for phases in sets if math.isfinite(phases.displacement_um)), 0.0)
 
 
@@ -170,18 +175,15 @@ def _same_rig(first: Path, optics: OpticsConfig, folder: Path, other: OpticsConf
                 )
 
 
+def stated_sigmas(stated: GeometryConfig) -> dict[str, float]:
+    """Those of the hand's measurements that are stated."""
+    given = {"a_mm": stated.a_sigma_mm, "b_mm": stated.b_sigma_mm, "alpha_deg": stated.alpha_sigma_deg}
+    return {name: sigma for name, sigma in given.items() if sigma is not None}
+
+
 def problem_of(bundle: Bundle, free: dict[str, float], laser_sigma_um: float) -> Problem:
     """The stated bench with its sigmas. Raises InputError for a geometry that cannot be calibrated."""
-    stated = bundle.optics.geometry
-    own = {
-        name: sigma
-        for name, sigma in (
-            ("a_mm", stated.a_sigma_mm),
-            ("b_mm", stated.b_sigma_mm),
-            ("alpha_deg", stated.alpha_sigma_deg),
-        )
-        if sigma is not None
-    }
+    own = stated_sigmas(bundle.optics.geometry)
     try:
         geometry = Geometry.from_config(bundle.optics)
     except ValueError as error:

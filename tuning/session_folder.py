@@ -77,25 +77,33 @@ class SessionFolder:
                 self.file(name).unlink(missing_ok=True)
 
 
-def create_session(
-    logs: Path, name: str, author: str, source: str, config: Config, before: LoopConfig
-) -> SessionFolder:
-    """Make a session's folder. Raises InputError for a bad name, DeviceError if it cannot be written."""
+def fresh_folder(parent: Path, name: str, now: datetime) -> Path:
+    """Make `<UTC>-<name>` in a folder. Raises InputError for a bad name, DeviceError if it cannot be made."""
     if not _NAME.fullmatch(name):
         raise InputError(
             f"session name {name!r}: use letters, digits, '.', '-' and '_' (at most 64, no '.' in front)"
         )
-    now = datetime.now(UTC)
     stem = f"{now:%Y%m%dT%H%M%SZ}-{name}"
+    for number in range(1, 1000):
+        path = parent / (stem if number == 1 else f"{stem}-{number}")
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise DeviceError(f"{parent}: cannot be written ({(error.strerror or str(error)).lower()})") from None
+        return path
+    raise DeviceError(f"{parent}: has a thousand sessions {stem} already")
+
+
+def create_session(
+    logs: Path, name: str, author: str, source: str, config: Config, before: LoopConfig
+) -> SessionFolder:
+    """Make a session's folder. Raises InputError for a bad name, DeviceError if it cannot be written."""
+    now = datetime.now(UTC)
+    path = fresh_folder(logs / "tuning", name, now)
     head = Head(FORMAT, name, author, source, now.isoformat(timespec="seconds"), before)
     try:
-        for number in range(1, 1000):
-            path = logs / "tuning" / (stem if number == 1 else f"{stem}-{number}")
-            try:
-                path.mkdir(parents=True)
-            except FileExistsError:
-                continue
-            break
         plain.write(path / "session.json", head)
         write_text_atomic(path / "config.toml", config_file.dump(config))
     except OSError as error:

@@ -50,7 +50,7 @@ class LiveHold:
         loop = LoopConfig.model_validate(client.ask(do="status")["loop"])
         config = config_file.load(run_dir / "config.toml", Config)
         self.config = config.model_copy(update={"loop": loop})
-        self.name = run_dir.name
+        self.name, self.run_dir = run_dir.name, run_dir
         try:
             self._readers = attach(run_dir)
         except (OSError, ValueError) as error:

@@ -1,0 +1,1 @@
+"""The command `calibrate --live`: sets at several pressures, taken from a running hold and solved."""

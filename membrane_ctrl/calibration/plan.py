@@ -1,0 +1,130 @@
+"""Where the mirror goes for a calibration, whether it may, and how long that takes. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from membrane_ctrl.config import Config
+from membrane_ctrl.control.setpoint import RAMP_SHARE
+from membrane_ctrl.errors import InputError
+from membrane_ctrl.metrology.calibrate.verdict import GOOD_SPREAD_UM, LEAST_SPREAD_UM
+
+# Of the limit's pressure: the sag of a Hencky bowl is known from it to a per cent, the pressure of a sag to three;
+# a film with tension of its own needs less pressure for more depth than said here
+_PRESSURE_SHARE = 0.95
+SETTLE_S = 15.0  # at a setpoint: the gas has found the air's temperature again (12 s), the ramp's end is forgotten
+# A cycle under way ends first, then 18 frames, their reconstruction and the disk
+_SET_S = 15.0
+_PIECES = 8  # of a way, for its time: the leak grows with the cube of the depth
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """The mirror as it is held before anything moves.
+
+    Attributes
+    ----------
+    setpoint_um : float
+        Without the trim.
+    sag_mm : float
+        As the camera sees it with the geometry in force.
+    pressure_pa : float
+        Of the gauge.
+    leak_um_per_s : float
+        Speed at which the centre sinks without the pump.
+    swing_adu : float
+        Amplitude of the fringes.
+    shape_on : bool
+        Whether the outer loop is on.
+    """
+
+    setpoint_um: float
+    sag_mm: float
+    pressure_pa: float
+    leak_um_per_s: float
+    swing_adu: float
+    shape_on: bool
+
+    def sag_at_mm(self, setpoint_um: float) -> float:
+        """Sag at another setpoint: the ring stays where it is."""
+        return self.sag_mm + 1e-3 * (setpoint_um - self.setpoint_um)
+
+    def leak_at_um_per_s(self, setpoint_um: float) -> float:
+        """Leak there: as the pressure, it goes with the cube of the sag (Hencky)."""
+        return self.leak_um_per_s * float(self.sag_at_mm(setpoint_um) / self.sag_mm) ** 3
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """How far the setpoint may go, and what keeps it from going further."""
+
+    low_um: float
+    high_um: float
+    low_why: str
+    high_why: str
+
+
+def reach_of(held: Held, config: Config) -> Reach:
+    """The safety table's limits, less what it forgives: a mirror that lags must not trip them on its way."""
+    limits, margin_um = config.limits, config.limits.following_error_max_um
+    high_um, why = limits.displacement_max_um - margin_um, "limits.displacement_max_um"
+    if held.pressure_pa > 0:
+        share = _PRESSURE_SHARE * limits.gauge_pressure_max_pa / held.pressure_pa
+        by_pressure_um = held.setpoint_um + 1e3 * held.sag_mm * (share ** (1 / 3) - 1)
+        if by_pressure_um < high_um:
+            high_um, why = by_pressure_um, "limits.gauge_pressure_max_pa"
+    return Reach(limits.displacement_min_um + margin_um, high_um, "limits.displacement_min_um", why)
+
+
+def setpoints_um(held: Held, reach: Reach, range_um: float | None, sets: int) -> tuple[float, ...]:
+    """Setpoints of the sets, evenly spaced about where the mirror is held, nearer end first.
+
+    Parameters
+    ----------
+    held : Held
+    reach : Reach
+        The range is moved to fit into it.
+    range_um : float or None
+        From the first to the last; None: 8 mm, or what there is.
+    sets : int
+        How many.
+
+    Raises
+    ------
+    InputError
+        If there is no room for what is asked, or for less than 1 mm.
+    """
+    room_um = reach.high_um - reach.low_um
+    allowed = f"{reach.low_why} and {reach.high_why} leave {max(room_um, 0.0):.0f} um"
+    if range_um is not None and range_um > room_um:
+        raise InputError(f"--range-um {range_um:g}: {allowed}; ask for less, or widen them if the films allow it")
+    wide_um = min(GOOD_SPREAD_UM, room_um) if range_um is None else range_um
+    if wide_um < LEAST_SPREAD_UM:
+        what = allowed if range_um is None else f"--range-um {range_um:g}"
+        raise InputError(
+            f"{what}: sets closer together than {LEAST_SPREAD_UM:.0f} um say no more than one set; "
+            f"{GOOD_SPREAD_UM:.0f} um are good"
+        )
+    low_um = min(max(held.setpoint_um - wide_um / 2, reach.low_um), reach.high_um - wide_um)
+    ascending = [float(each) for each in np.round(np.linspace(low_um, low_um + wide_um, sets), 1)]
+    return tuple(sorted(ascending, reverse=held.setpoint_um - low_um > wide_um / 2))
+
+
+def way_s(held: Held, from_um: float, to_um: float, config: Config) -> float:
+    """How long the setpoint's ramp takes; inf if the mirror does not sink by itself, or the pump has no reserve."""
+    loop, most_um_per_s = config.loop, min(config.loop.flow_max_um_per_s, config.pump.flow_full_um_per_s)
+    total_s = 0.0
+    for a_um, b_um in pairwise(np.linspace(from_um, to_um, _PIECES + 1).tolist()):
+        leak_um_per_s = held.leak_at_um_per_s((a_um + b_um) / 2)
+        free_um_per_s = most_um_per_s - leak_um_per_s if b_um > a_um else leak_um_per_s
+        speed_um_per_s = min(loop.setpoint_ramp_um_per_s, RAMP_SHARE * free_um_per_s)
+        total_s += abs(b_um - a_um) / speed_um_per_s if speed_um_per_s > 0 else float("inf")
+    return total_s
+
+
+def step_s(held: Held, from_um: float, to_um: float, config: Config) -> float:
+    """The way, settling, and the set."""
+    return way_s(held, from_um, to_um, config) + SETTLE_S + _SET_S

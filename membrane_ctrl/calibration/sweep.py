@@ -1,0 +1,175 @@
+"""A running hold under the hand of a calibration: look, go, settle, take a set. The supervisor stays in charge."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+from membrane_ctrl.calibration.plan import SETTLE_S, Held
+from membrane_ctrl.commands import Command, Kind
+from membrane_ctrl.config import LimitsConfig
+from membrane_ctrl.errors import DeviceError, RejectedError
+from membrane_ctrl.names import ShapeState, State
+from membrane_ctrl.telemetry import TelemetryRow
+from membrane_ctrl.tick import Event
+from tuning.hold_link import HoldError, HoldLink, News
+
+WHY = "calibration of the optics"
+_LOOK_S = 10.0  # at the pressure and the leak, which are noisy
+_SHAPE_WITHIN_S = 90.0  # a camera that was rejected waits up to a minute
+_SET_WITHIN_S = 180.0  # likewise, and a slow machine reconstructs for seconds
+_ARRIVED_UM = 0.5  # the ramp's end is exponential
+_MEAN_S = 5.0  # over which the mirror must be inside the band
+_LATE = 2.0, 300.0  # times what was foreseen, and seconds more: then something else is wrong
+
+
+class CaptureLink(HoldLink, Protocol):
+    """A hold whose run folder can be read, for its sets are there."""
+
+    @property
+    def run_dir(self) -> Path:
+        """The run's folder."""
+        ...
+
+
+class Sweep:
+    """Moves and looks; every wait ends by itself.
+
+    Parameters
+    ----------
+    link : CaptureLink
+    limits : LimitsConfig
+        For the band.
+    progress : callable
+        Told the seconds of the hold that have passed; may raise KeyboardInterrupt.
+    """
+
+    def __init__(self, link: CaptureLink, limits: LimitsConfig, progress: Callable[[float], None]) -> None:
+        self._link, self._limits, self._progress = link, limits, progress
+        self._last_s = math.nan
+        self._why = "no reason was told"
+
+    def look(self) -> Held:
+        """The mirror as it is held, over some seconds and at least one shape.
+
+        Raises
+        ------
+        HoldError
+            If it is not held.
+        DeviceError
+            If no camera measures it.
+        """
+        rows: deque[TelemetryRow] = deque()
+        shape = None
+        while shape is None or rows[-1].mono_s - rows[0].mono_s < _LOOK_S:
+            news = self._news()
+            rows.extend(news.rows)
+            shape = next((each for each in reversed(news.shapes) if each.verdict != "rejected"), shape)
+            if shape is None and rows and rows[-1].mono_s - rows[0].mono_s > _SHAPE_WITHIN_S:
+                raise DeviceError(
+                    f"{self._link.name}: no shape within {_SHAPE_WITHIN_S:.0f} s; "
+                    "has this run a camera that sees the mirror? (ctl status)"
+                )
+        newest = rows[-1]
+        leaks = [row.leak_um_per_s for row in rows if math.isfinite(row.leak_um_per_s)]
+        return Held(
+            setpoint_um=newest.target_um,
+            sag_mm=1e-3 * shape.sag_um,
+            pressure_pa=_mean([row.gauge_pressure_pa for row in rows]),
+            # the mean flow makes up for the leak, which is estimated only after a while of hold
+            leak_um_per_s=_mean(leaks or [row.i_um_per_s for row in rows]),
+            swing_adu=shape.modulation_median_adu,
+            shape_on=newest.shape_state != ShapeState.OFF,
+        )
+
+    def go(self, setpoint_um: float, expected_s: float) -> None:
+        """Ramp there and settle.
+
+        Raises
+        ------
+        HoldError
+            If the mirror is no longer held, or somebody else moves it.
+        DeviceError
+            If it does not arrive.
+        """
+        self._ask("setpoint", setpoint_um)
+        patience_s = _LATE[0] * expected_s + _LATE[1]
+        there: deque[TelemetryRow] = deque()
+        begin_s, obeyed = self._last_s, False
+        while True:
+            for row in self._news().rows:
+                obeyed = obeyed or row.target_um == setpoint_um
+                if obeyed and row.target_um != setpoint_um:
+                    raise HoldError(f"somebody else has moved the setpoint to {row.target_um:g} um")
+                begin_s = row.mono_s if math.isnan(begin_s) else begin_s
+                ramping = abs(row.setpoint_um - row.trim_um - setpoint_um) > _ARRIVED_UM
+                if not obeyed or ramping:
+                    there.clear()
+                    continue
+                there.append(row)
+            if there and there[-1].mono_s - there[0].mono_s >= SETTLE_S and self._inside(there):
+                return
+            if self._last_s - begin_s > patience_s:
+                raise DeviceError(
+                    f"the mirror does not settle at {setpoint_um:g} um in {patience_s:.0f} s; paused, or too tight?"
+                )
+
+    def take(self) -> Event:
+        """Have a set taken; one that is bad is taken again, once.
+
+        Raises
+        ------
+        HoldError
+            If the hold refuses, or the mirror is no longer held.
+        RejectedError
+            If the second is bad, too.
+        """
+        first = self._capture()
+        event = first if "set" in first else self._capture()
+        if "set" not in event:
+            raise RejectedError(f"no good set in two attempts: {first['failed']}; {event['failed']}")
+        return event
+
+    def shape_loop(self, on: bool) -> None:
+        """Switch the outer loop."""
+        self._ask("shape_on" if on else "shape_off")
+
+    def _capture(self) -> Event:
+        self._ask("capture")
+        begin_s = self._last_s
+        while self._last_s - begin_s < _SET_WITHIN_S:
+            told = [event for event in self._news().events if event["kind"] == "capture"]
+            if told:
+                return told[-1]
+        return {"kind": "capture", "failed": f"no set within {_SET_WITHIN_S:.0f} s"}
+
+    def _inside(self, rows: deque[TelemetryRow]) -> bool:
+        last = [row.error_um for row in rows if rows[-1].mono_s - row.mono_s <= _MEAN_S]
+        return abs(_mean(last)) < self._limits.band_um
+
+    def _ask(self, kind: Kind, value: float = math.nan) -> None:
+        self._link.ask(Command(kind, "calibration", WHY, value=value))
+
+    def _news(self) -> News:
+        """What has come; raises HoldError if the mirror is not held any more."""
+        news = self._link.news()
+        for event in news.events:
+            if event["kind"] == "state":
+                self._why = str(event["why"])
+        for row in news.rows:
+            if row.state != State.HOLD:
+                name = State(int(row.state)).name.lower()
+                raise HoldError(f"the mirror is not held (state {name}): {self._why}; start or resume the hold first")
+        if news.rows:
+            passed_s = news.rows[-1].mono_s - self._last_s
+            self._last_s = news.rows[-1].mono_s
+            self._progress(passed_s if passed_s > 0 else 0.0)
+        return news
+
+
+def _mean(values: list[float]) -> float:
+    finite = [value for value in values if math.isfinite(value)]
+    return sum(finite) / len(finite) if finite else math.nan
