@@ -245,6 +245,8 @@ def _read_image(path: Path) -> Frames | str:
     """The image, or why there is none."""
     if not path.is_file():
         return "missing: no such file"
+    if _cut_short(path):
+        return "unreadable: the file ends too early"
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if image is None:
         return "unreadable: not an image"
@@ -253,6 +255,14 @@ def _read_image(path: Path) -> Frames | str:
     if image.dtype not in (np.uint8, np.uint16):
         return f"wrong bit depth: {image.dtype} pixels"
     return image  # type: ignore[return-value]  # checked above
+
+
+def _cut_short(path: Path) -> bool:
+    """Whether a PNG lacks its end. The decoder would write to the terminal, and might fill the rest with black."""
+    with path.open("rb") as file:
+        png = file.read(8) == b"\x89PNG\r\n\x1a\n"
+        file.seek(max(0, path.stat().st_size - 12))
+        return png and b"IEND" not in file.read()
 
 
 def _depth(head: CaptureHead, frames: Frames, path: Path) -> int:

@@ -19,6 +19,9 @@ from membrane_ctrl.result_files import details_table, result_table, write_result
 
 FloatArray = NDArray[np.float64]
 
+# A good pose leaves 0.4 mm and 0.0007 (simulated, a fifth of the sensor's pixels); a ring is round to 1 mm or so.
+_RIM_OFF_MM, _RIM_SIZE = 3.0, 0.005
+
 
 def measure_command(
     folder: Path, geometry: Path | None, out: Path | None, as_json: bool, pictures: bool, rerun: bool
@@ -90,7 +93,9 @@ def _lines(measurement: Measurement, profile: RadialProfile | None, outline: Out
         f"{np.count_nonzero(full.weights)} pixels",
     ]
     if outline is not None:
+        off = abs(outline.offset_mm) > _RIM_OFF_MM or abs(outline.size_ratio - 1) > _RIM_SIZE
         lines.append(
             f"rim       {outline.offset_mm:.1f} mm from where the pose puts it, {outline.size_ratio:.4f} of its size"
+            + (": is the camera's pose right, and mirror.radius_mm?" if off else "")
         )
     return lines

@@ -247,3 +247,22 @@ def test_a_geometry_file_with_a_crooked_screen(capture_set: Path, tmp_path: Path
     nearer.write_text(tomli_w.dumps({"geometry": {**short, "b_mm": short["b_mm"] - 0.5}}))
     _, expected = measured(capture_set, tmp_path / "nearer", "--geometry", str(nearer))
     assert found["zernike"]["coeffs_um"] == pytest.approx(expected["zernike"]["coeffs_um"], abs=1e-6)
+
+
+def test_an_image_that_ends_too_early(capture_set: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    picture = (capture_set / "x_sin_1.png").read_bytes()
+    (capture_set / "x_sin_1.png").write_bytes(picture[: len(picture) // 2])
+    code, result = measured(capture_set, tmp_path)
+    assert code == 3
+    assert result["quality"]["flagged_frames"][0]["reason"] == "unreadable: the file ends too early"
+    assert "libpng" not in capfd.readouterr().err
+
+
+def test_a_pose_that_the_rim_contradicts_is_asked_about(
+    capture_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert measured(capture_set, tmp_path / "good")[0] == 0
+    assert "is the camera's pose right" not in capsys.readouterr().out
+    rewrite(capture_set, lambda table: table["geometry"].update(a_mm=2640.0))
+    assert measured(capture_set, tmp_path / "wrong")[0] == 0
+    assert "is the camera's pose right" in capsys.readouterr().out

@@ -8,7 +8,8 @@ Then every pixel, its period taken from its bin.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from membrane_ctrl.metrology.geometry import Geometry
 from membrane_ctrl.metrology.integrity import Flag, inspect, obvious
 from membrane_ctrl.metrology.orders import Orders, gray_bit, orders
 from membrane_ctrl.metrology.patterns import AXES
+from membrane_ctrl.metrology.quality import RESIDUAL_REJECTED_URAD
 from membrane_ctrl.metrology.reconstruct import Tracer
 from membrane_ctrl.metrology.tracking import TrackedPoints, establish
 from membrane_ctrl.metrology.unwrap import centre_phase_rad, mm_per_rad
@@ -132,6 +134,50 @@ def check(stack: FrameStack, optics: OpticsConfig, anchor: Anchor | None = None)
         If the frames do not give a figure.
     """
     binned = bin_frames(stack, 2**optics.camera.bits - 1)
+    try:
+        found = _check(stack, binned, optics, anchor)
+    except RejectedSetError:
+        put_back = _put_back(stack, binned, optics, anchor)
+        if put_back is None:
+            raise
+        return put_back
+    return found if _believable_surface(found) else _put_back(stack, binned, optics, anchor) or found
+
+
+def _believable_surface(checked: Checked) -> bool:
+    """Whether the slopes are those of one surface: steps that run backwards disagree with no frame, but with that."""
+    field = checked.tracer.slope_field(checked.state.points, checked.state.surface)
+    return 1e6 * float(np.sqrt(np.mean(np.square(field[2:4] - field[4:6])))) <= RESIDUAL_REJECTED_URAD
+
+
+def _put_back(stack: FrameStack, binned: Binned, optics: OpticsConfig, anchor: Anchor | None) -> Checked | None:
+    """The set with two sinusoids of an axis exchanged, if one exchange alone makes all frames agree.
+
+    Three steps that run backwards predict every frame wrongly, so that nobody can be blamed by what it shows. But the
+    Gray code and the surface still know: of all exchanges only the right one leaves no frame to be flagged.
+    """
+    if stack.unusable or len(stack.sinusoids(AXES[0])) > 3:  # the good ones of four steps name a swapped pair
+        return None
+    found: list[Checked] = []
+    for axis in AXES:
+        for a, b in combinations(stack.sinusoids(axis), 2):
+            order = list(range(len(stack.patterns)))
+            order[a], order[b] = b, a
+            try:
+                checked = _check(stack.reordered(order), binned.reordered(order), optics, anchor, rounds=1)
+            except RejectedSetError:
+                continue
+            if not checked.flags and _believable_surface(checked):
+                pair = ((a, b), (b, a))
+                flags = (Flag(k, f"swapped with {stack.patterns[j].name}", math.inf, j) for k, j in pair)
+                found.append(replace(checked, flags=tuple(flags)))
+    return found[0] if len(found) == 1 else None
+
+
+def _check(
+    stack: FrameStack, binned: Binned, optics: OpticsConfig, anchor: Anchor | None, rounds: int = _ROUNDS
+) -> Checked:
+    """The set as it is, frames that do not belong left out in so many rounds. Raises RejectedSetError."""
     geometry = Geometry.from_config(optics)
     grid = BinGrid(geometry, optics.camera, binned.bin_px)
     near = grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
@@ -139,7 +185,7 @@ def check(stack: FrameStack, optics: OpticsConfig, anchor: Anchor | None = None)
     known |= {flag.frame: flag for flag in obvious(stack, binned)}
     excluded = set(known)
     flags: list[Flag] = []
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         try:
             attempt = _attempt(stack, binned, optics, geometry, grid, near, excluded, anchor)
         except (NoFigureError, ValueError) as error:

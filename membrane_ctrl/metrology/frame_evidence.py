@@ -81,6 +81,8 @@ class Evidence:
         Share of bins with a saturated pixel.
     shows : int
         Frame whose pattern this one fits best.
+    lit : float
+        Share of the bins where a Gray frame is predicted bright: 0 or 1 where the mirror shows no edge of that bit.
     """
 
     level: float
@@ -90,6 +92,7 @@ class Evidence:
     rest: float
     saturated: float
     shows: int
+    lit: float = 1.0
 
 
 def gather(stack: FrameStack, binned: Binned, scene: Scene, readable: list[int]) -> dict[int, Evidence]:
@@ -151,7 +154,8 @@ def _evidence(seen: FloatArray, template: _Template, light: FloatArray, saturate
         step = float(np.arctan2(solved[2], solved[1]))
         return Evidence(float(solved[0]), swing, step, float(solved[3]) / max(swing, 1e-9), rest, saturated, shows)
     if template.role == "gray":
-        return Evidence(float(solved.sum()), float(solved[1]), 0.0, 0.0, rest, saturated, shows)
+        lit = float(np.mean(template.columns[1][template.sure]))
+        return Evidence(float(solved.sum()), float(solved[1]), 0.0, 0.0, rest, saturated, shows, lit)
     return Evidence(float(solved[0]), 0.0, 0.0, 0.0, rest, saturated, shows)
 
 

@@ -32,6 +32,8 @@ GRAY_SHARE = 0.04
 WHITE_SHARE = 0.08
 GRAY_REST = 0.15
 FLAT_REST = 0.08
+# Fewer bins than this beyond a Gray frame's only edge leave no more than FLAT_REST of light that is not flat.
+_NO_EDGE = 0.005
 _SCATTERS = 6.0  # of the good frames' scatter
 _DARK = 0.4  # less than this share of the light is no flicker
 
@@ -166,13 +168,16 @@ def _sinusoid_reason(kind: str, e: Evidence, level: float, moved_um: float) -> s
 def _judge_gray(stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[int, Evidence]) -> list[Flag]:
     """Gray frames against each other, white against them, black against white."""
     gray = [k for axis in AXES for k in stack.gray(axis) if k in evidence]
-    good = [evidence[k] for k in gray if k in trusted]
+    good = [evidence[k] for k in gray if k in trusted and evidence[k].lit > _NO_EDGE]
     if not good:
         return []
     bright_limit, bright = _limit([e.level for e in good], 0.0)
     flags = []
     for k in gray:
         e = evidence[k]
+        if not _NO_EDGE < e.lit < 1 - _NO_EDGE:
+            flags += _judge_flat(k, e, bright, white=e.lit > 0.5)
+            continue
         light = abs(e.level / max(bright, 1e-9) - 1) / max(GRAY_SHARE, bright_limit / max(bright, 1e-9))
         content = max(e.rest / (GRAY_REST * bright), 2.0 if e.shows != k else 0.0, 0.5 * bright / max(e.swing, 1e-9))
         if max(light, content) > 1:

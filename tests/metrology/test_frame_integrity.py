@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rendered_sets import FILM, bench, faulty_set, good_set, patterns
 
+from membrane_ctrl.config import OpticsConfig, PatternConfig
 from membrane_ctrl.metrology.checked import RejectedSetError, check
 from membrane_ctrl.metrology.integrity import identical_frames
 from membrane_ctrl.metrology.surface import Surface
@@ -86,11 +87,24 @@ def test_a_film_that_moved_during_a_gray_frame_does_no_harm(frame: str) -> None:
 
 
 @pytest.mark.parametrize("frame", ["x_sin_1"])
-@pytest.mark.parametrize("kind", ["stale", "dark", "flicker", "moved"])
+@pytest.mark.parametrize(
+    "kind", ["stale", "moved", *(pytest.param(k, marks=pytest.mark.campaign) for k in ("dark", "flicker"))]
+)
 def test_three_steps_have_nothing_to_spare(kind: str, frame: str) -> None:
     flagged, _, wrong = named(kind, frame, steps=3)
     assert frame in flagged
     assert wrong is None
+
+
+@pytest.mark.parametrize(
+    "frame", ["x_sin_1", "y_sin_0", *(pytest.param(f, marks=pytest.mark.campaign) for f in ("x_sin_0", "y_sin_1"))]
+)
+def test_two_of_three_steps_that_were_swapped_are_put_back(frame: str) -> None:
+    flagged, reasons, wrong = named("swapped", frame, steps=3)
+    assert flagged == {frame, f"{frame[:-1]}{int(frame[-1]) + 1}"}
+    assert all(reason.startswith("swapped") for reason in reasons)
+    assert wrong is not None
+    assert wrong < 0.05
 
 
 @pytest.mark.parametrize("kind", ["stale", "swapped", "flicker", "moved"])
@@ -99,6 +113,24 @@ def test_faults_are_seen_through_the_displays_gamma(kind: str, steps: int, gamma
     flagged, _, wrong = named(kind, "x_sin_1", steps, gamma)
     assert flagged == ({"x_sin_1", "x_sin_2"} if kind == "swapped" else {"x_sin_1"})
     assert wrong is not None
+
+
+def _coarse(periods: int) -> OpticsConfig:
+    """The pattern's size with fewer periods: its first Gray frames show one level all over."""
+    pattern = PatternConfig(periods=periods, period_mm=398.56 / periods)
+    return bench().model_copy(update={"pattern": pattern})
+
+
+@pytest.mark.parametrize("periods", [1, 4])
+def test_no_alarm_for_a_gray_frame_without_an_edge(periods: int) -> None:
+    assert check(good_set(_coarse(periods)), _coarse(periods)).flags == ()
+
+
+def test_a_wrong_picture_instead_of_a_gray_frame_without_an_edge_is_named() -> None:
+    stack = good_set(_coarse(4))
+    frame = NAMES.index("x_gray_1")
+    stack.frames[frame] = stack.frames[frame - 1] + np.uint8(1)  # the same to the eye alone
+    assert [flag.frame for flag in check(stack, _coarse(4)).flags] == [frame]
 
 
 @pytest.mark.parametrize("steps", [3, 4, 5, 8])
