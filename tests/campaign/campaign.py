@@ -17,10 +17,12 @@ from pathlib import Path
 
 from campaign_cases import CASES, STATES, Case
 from campaign_run import RATE_HZ, Result, run_case
+from process_run import ProcessResult, process_table
 
 from membrane_ctrl.names import Rung, State
 
 SEEDS = range(1, 5)
+_BEGIN, _END = "## With real processes\n", "<!-- end of the part with real processes -->"
 DOCUMENT = Path(__file__).parents[2] / "docs" / "fault-matrix.md"
 _BY_NAME = {case.name: case for case in CASES}
 
@@ -66,7 +68,7 @@ def document(results: list[Result]) -> str:
         f"| {case.name} | " + " | ".join(_cell(by_cell[case.name, state]) for state in STATES) + " |"
         for case in CASES
     ]
-    lines += ["", "## Invariants, looked at on every tick", "", *_INVARIANTS, ""]
+    lines += ["", "## Invariants, looked at on every tick", "", *_INVARIANTS, "", *_processes()]
     if violations:
         lines += ["## Violations", ""]
         lines += [f"- {r.case}, {r.state.name.lower()}, seed {r.seed}: {what}" for r, what in violations] + [""]
@@ -86,6 +88,32 @@ _INVARIANTS = (
     "- Without ticks the board's pump stands after its watchdog period.",
     "- Every event can be recorded.",
 )
+
+
+def _processes() -> list[str]:
+    """The part about real processes, as it was written last."""
+    found = DOCUMENT.read_text(encoding="utf-8").partition(_BEGIN)[2].partition(_END)[0]
+    return [_BEGIN + found + _END, ""]
+
+
+def write_processes(results: list[ProcessResult]) -> None:
+    """Put the results with real processes into the document."""
+    violations = sum(len(result.violations) for result in results)
+    lines = [
+        f"**{len(results)} runs with real processes and sockets, {violations} violations.** A hold in its own "
+        "process against the emulated board (watchdog 0.5 s), in real time at 50 Hz; the fault sets in while the mirror is "
+        "inflated. Looked at: exit, first cause and latched-fault file, the board's own output, sag and pressure, "
+        "every tick in the tables once, UTC of all events, no process left behind.",
+        "",
+        *process_table(results),
+        "",
+        "Disk full: a small file system that is filled to the last byte. Files that may not grow: `RLIMIT_FSIZE` of "
+        "the recorder's process. Wall clock: a library preloaded into all processes of the hold. Event loop: a "
+        "signal handler that sleeps. One of them again: "
+        "`python -m pytest -m campaign tests/campaign/test_campaign_processes.py -k NAME`.",
+    ]
+    before, _, rest = DOCUMENT.read_text(encoding="utf-8").partition(_BEGIN)
+    DOCUMENT.write_text(before + "\n".join([_BEGIN, "", *lines, "", ""]) + _END + rest.partition(_END)[2], "utf-8")
 
 
 def _cell(results: list[Result]) -> str:

@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -36,19 +36,25 @@ class Output:
 
 @dataclass
 class WatchedPlant:
-    """Stands between board and plant and notes every change of the pump's drive."""
+    """Stands between board and plant and notes every change of the pump's drive, and how far the mirror went."""
 
     bench: LiveBench
     outputs: list[Output] = field(default_factory=list)
     looked_s: float = math.nan
     longest_gap_s: float = 0.0  # between two looks of the board: what a busy machine adds to its watchdog
 
+    displacement_max_um: float = -math.inf
+    gauge_pressure_max_pa: float = -math.inf
+
     def sample(self) -> Any:
         now_s = time.monotonic()
         if math.isfinite(self.looked_s):
             self.longest_gap_s = max(self.longest_gap_s, now_s - self.looked_s)
         self.looked_s = now_s
-        return self.bench.sample()
+        sample = self.bench.sample()
+        self.displacement_max_um = max(self.displacement_max_um, sample.displacement_um)
+        self.gauge_pressure_max_pa = max(self.gauge_pressure_max_pa, sample.gauge_pressure_pa)
+        return sample
 
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
         self.outputs.append(Output(time.monotonic(), pump_fraction))
@@ -66,8 +72,10 @@ class WatchedPlant:
 class Run:
     """A `hold` as its own process against the emulated board."""
 
-    def __init__(self, process: asyncio.subprocess.Process, folder: Path, board: PumpBoardEmulator) -> None:
-        self.process, self.folder, self.board = process, folder, board
+    def __init__(
+        self, process: asyncio.subprocess.Process, folder: Path, board: PumpBoardEmulator, plant: WatchedPlant
+    ) -> None:
+        self.process, self.folder, self.board, self.plant = process, folder, board, plant
 
     @property
     def events(self) -> list[dict[str, Any]]:
@@ -82,12 +90,20 @@ class Run:
     def faults(self) -> list[str]:
         return [event["name"] for event in self.events if event["kind"] == "fault"]
 
+    def happened(self, kind: str, **words: Any) -> bool:
+        """Whether an event of this kind, and with these words in it, is on record."""
+        return any(event["kind"] == kind and words.items() <= event.items() for event in self.events)
+
     def recorder(self) -> psutil.Process:
         """The child that has the recording open. Raises LookupError."""
         for child in psutil.Process(self.process.pid).children():
             if any(str(self.folder) in file.path for file in child.open_files()):
                 return child
         raise LookupError("no child has the recording open")
+
+    def acquisition(self) -> psutil.Process:
+        """The child that steps back furthest: the one that measures the shape."""
+        return max(psutil.Process(self.process.pid).children(), key=lambda child: child.nice())
 
     async def until(self, what: Callable[[], bool]) -> None:
         """Wait for something. Raises AssertionError when it does not come."""
@@ -108,7 +124,9 @@ class Run:
 
 
 @contextlib.asynccontextmanager
-async def running(folder: Path, plant: WatchedPlant, config: str = "") -> AsyncIterator[Run]:
+async def running(
+    folder: Path, plant: WatchedPlant, config: str = "", environment: Mapping[str, str] | None = None
+) -> AsyncIterator[Run]:
     """A board, and a hold of it that is under way; both are gone afterwards."""
     board = PumpBoardEmulator(plant)
     await board.start()
@@ -119,10 +137,11 @@ async def running(folder: Path, plant: WatchedPlant, config: str = "") -> AsyncI
         *(sys.executable, "-m", "membrane_ctrl", "hold", "--config", str(lab), "--logs", str(folder / "logs")),
         stdout=asyncio.subprocess.DEVNULL,
         stderr=asyncio.subprocess.DEVNULL,
+        env={**os.environ, **(environment or {})},
     )
     children: list[psutil.Process] = []
     try:
-        run = Run(process, folder, board)
+        run = Run(process, folder, board, plant)
         await run.until(lambda: plant.pumping and run.reached("inflate"))
         children = psutil.Process(process.pid).children(recursive=True)
         yield run
