@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import signal
 import socket
@@ -10,6 +11,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import psutil
@@ -18,6 +20,7 @@ from pymodbus.client import ModbusTcpClient
 from rerun.chunk import RrdReader
 
 from firmware_iface.register_map import default_map
+from membrane_ctrl.cli import run
 
 pytestmark = pytest.mark.real_time
 
@@ -108,9 +111,9 @@ def running(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def test_a_short_hold_with_the_camera_loop_leaves_everything_it_should(tmp_path: Path) -> None:
-    camera = f"[optics.camera]\n{SMALL_CAMERA}[shape]\nperiod_s = 1.0\n"
+    camera = f"start_error_um = -2.0\n[optics.camera]\n{SMALL_CAMERA}[shape]\nperiod_s = 1.0\n"
     done = subprocess.run(
-        hold(tmp_path, "--duration", "25s", config=camera), capture_output=True, text=True, timeout=120, check=False
+        hold(tmp_path, "--duration", "20s", config=camera), capture_output=True, text=True, timeout=120, check=False
     )
     assert done.returncode == 0, done.stderr
     summary = json.loads((run_dir(tmp_path) / "summary.json").read_text())
@@ -127,7 +130,7 @@ def test_a_short_hold_with_the_camera_loop_leaves_everything_it_should(tmp_path:
     assert config["loop"]["rate_hz"] == 50.0
     assert str(run_dir(tmp_path)) in done.stderr
     assert "Traceback" not in done.stderr
-    assert rows_in(tmp_path) > 1000
+    assert rows_in(tmp_path) > 800
 
 
 def test_sigint_stops_cleanly_with_130(tmp_path: Path, running: subprocess.Popen[str]) -> None:
@@ -161,11 +164,14 @@ def test_another_client_reads_along_and_sigkill_stops_the_pump_and_loses_nothing
 
 
 def run_refused(arguments: list[str], exit_code: int) -> str:
-    done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
-    assert done.returncode == exit_code, done.stderr
-    lines = done.stderr.strip().splitlines()
-    assert len(lines) == 1, done.stderr
-    assert done.stdout == ""
+    """In the test's own process: a start of Python takes longer than a refusal."""
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        code = run(arguments)
+    assert code == exit_code, err.getvalue()
+    lines = err.getvalue().strip().splitlines()
+    assert len(lines) == 1, lines
+    assert out.getvalue() == ""
     return lines[0]
 
 
@@ -218,7 +224,8 @@ def test_a_full_disk_is_refused_before_anything_exists(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("logs/*"))
 
 
-def test_nobody_at_the_address_is_a_device_failure(tmp_path: Path) -> None:
+def test_nobody_at_the_address_is_a_device_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("membrane_ctrl.bench._PATIENCE_S", 0.3)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -242,7 +249,7 @@ def test_the_served_twin_can_be_held_by_another_process(tmp_path: Path) -> None:
         report = json.loads(checked.stdout)
         assert report["devices"][0]["identity"].startswith("membrane pump board")
         held = subprocess.run(
-            [*COMMAND, "hold", "--config", str(lab), "--logs", str(tmp_path / "logs"), "--duration", "4s", "--json"],
+            [*COMMAND, "hold", "--config", str(lab), "--logs", str(tmp_path / "logs"), "--duration", "2s", "--json"],
             capture_output=True,
             text=True,
             timeout=PATIENCE_S,

@@ -17,9 +17,9 @@ HOLD = [sys.executable, "-m", "membrane_ctrl", "hold", "--devices", str(EXAMPLE)
 
 def test_the_mirror_is_held_through_serial_instruments(tmp_path: Path) -> None:
     near = tmp_path / "near.toml"
-    near.write_text(EXAMPLE.read_text() + "\n[twin]\nstart_error_um = -4.0\n")
+    near.write_text(EXAMPLE.read_text() + "\n[twin]\nstart_error_um = -2.0\n")
     done = subprocess.run(
-        [*HOLD[:-1], str(near), "--twin", "--duration", "22s", "--logs", str(tmp_path / "logs"), "--json"],
+        [*HOLD[:-1], str(near), "--twin", "--duration", "14s", "--logs", str(tmp_path / "logs"), "--json"],
         capture_output=True,
         text=True,
         timeout=120,

@@ -20,7 +20,17 @@ from tuning.hold_rig import HoldRig
 
 pytestmark = pytest.mark.real_time
 
-CONFIG = '[twin]\nport = 0\nscenario = "quiet"\nstart_error_um = -3.0\n[shape]\nenabled = false\n'
+CONFIG = """
+[twin]
+port = 0
+scenario = "quiet"
+start_error_um = -3.0
+[shape]
+enabled = false
+[states]
+actuator_test = false
+check_s = 0.5
+"""
 PATIENCE_S = 60.0
 
 
