@@ -11,10 +11,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from membrane_ctrl.alarms.apprise_sender import require_sendable
 from membrane_ctrl.bench import open_bench
 from membrane_ctrl.config import Config, DevicesConfig
 from membrane_ctrl.errors import DeviceError, Exit
 from membrane_ctrl.geometry_in_force import geometry_in_force
+from membrane_ctrl.port.tls import server_context
+from membrane_ctrl.port.unix import SOCKET_NAME
+from membrane_ctrl.port_config import AlarmsConfig, PortConfig
 from membrane_ctrl.probe import Probe, probe_board, probe_roles
 from membrane_ctrl.probe_optics import probe_optics
 from membrane_ctrl.role_devices import role_devices
@@ -83,7 +87,30 @@ def _what_would_happen(config: Config) -> dict[str, str]:
         "feed-forward": " and ".join(feedforward) or "off",
         "geometry": _geometry(config),
         "shape loop": f"a cycle every {shape.period_s:g} s" if shape.enabled else "off",
+        "control port": _port(config.port),
+        "alarms": _alarms(config.alarms),
     }
+
+
+def _port(port: PortConfig) -> str:
+    """Where a hold could be asked. Raises InputError for certificates that cannot be used."""
+    if not port.enabled:
+        return "off"
+    ways = [port.socket or f"{SOCKET_NAME} beside the run folders"]
+    if port.tls is not None:
+        server_context(port.tls)
+        ways.append(f"TLS on {port.tls.host}:{port.tls.port}")
+    if port.metrics_port is not None:
+        ways.append(f"metrics on 127.0.0.1:{port.metrics_port}")
+    return ", ".join(ways)
+
+
+def _alarms(alarms: AlarmsConfig) -> str:
+    """Who would be told. Raises InputError or DeviceError for what could not be sent."""
+    require_sendable(alarms)
+    if alarms.urls_file is None:
+        return "nobody is told: no alarms.urls_file"
+    return f"{len(alarms.rules)} rules besides faults, to those in {alarms.urls_file}"
 
 
 def _geometry(config: Config) -> str:

@@ -22,8 +22,10 @@ def read_urls(path: Path) -> list[str]:
     """The URLs of a file, one a line; empty lines and those after `#` are passed over. Raises InputError."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: {error}") from None
+    except OSError as error:
+        raise InputError(f"alarms: {path}: {(error.strerror or str(error)).lower()}") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"alarms: {path}: {error}") from None
     urls = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not urls:
         raise InputError(f"{path}: no URL in it; one a line, e.g. mailto://user:password@example.org")
