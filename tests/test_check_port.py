@@ -25,8 +25,10 @@ def test_the_defaults(capsys: pytest.CaptureFixture[str]) -> None:
     assert said["alarms"] == "nobody is told: no alarms.urls_file"
 
 
-def test_what_is_configured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("apprise")
+def test_what_is_configured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)  # as if Apprise were installed
     urls = tmp_path / "urls.txt"
     urls.write_text("json://localhost\n")
     port = PortConfig(socket="/run/m.sock", metrics_port=9464)

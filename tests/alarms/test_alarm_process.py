@@ -191,7 +191,7 @@ def test_who_is_told(tmp_path: Path, apprise: list[tuple[str, str, str, str]]) -
 
 
 def test_files_of_urls_that_are_none(tmp_path: Path, apprise: list[tuple[str, str, str, str]]) -> None:
-    with pytest.raises(InputError, match="No such file"):
+    with pytest.raises(InputError, match="no such file"):
         read_urls(tmp_path / "none")
     with pytest.raises(InputError, match="no URL in it"):
         read_urls(Path(urls(tmp_path, "# nothing")))
