@@ -11,12 +11,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.roles import BenchCommand
+from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.commands import Command, refusal
 from membrane_ctrl.config import Config, LoopConfig
 from membrane_ctrl.control.experiments.machine import Finished
 from membrane_ctrl.control.experiments.trial import Trial
-from membrane_ctrl.control.inner_loop import InnerLoop
+from membrane_ctrl.control.inner_loop import NO_OUTPUT, InnerLoop
 from membrane_ctrl.control.shape_loop import ShapeLoop, ShapeOutput
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.gains_trial import GainsTrial
@@ -37,6 +37,21 @@ _DT_RANGE = (0.2, 5.0)
 # a reason that comes and goes faster (a pump that touches its limit) tells nobody anything
 _WHY_STANDS_S = 1.0
 _NO_DIGITS = str.maketrans("", "", "0123456789")
+# for the record of a tick without an answer; its whole numbers, which have no NaN, are not used
+_NO_READING = BenchReading(
+    displacement_um=math.nan,
+    displacement_quality=0,
+    gauge_pressure_pa=math.nan,
+    ambient_pressure_pa=math.nan,
+    air_temperature_c=math.nan,
+    gas_temperature_c=math.nan,
+    pump_fraction=math.nan,
+    vent_fraction=math.nan,
+    sample_counter=0,
+    device_time_s=math.nan,
+    watchdog_tripped=False,
+    latched_faults=0,
+)
 
 
 class Controller:
@@ -81,9 +96,9 @@ class Controller:
         scene = self._scene
         events: list[Event] = []
         self._begin(inputs, events)
-        error_um = scene.output.error_um if scene.output is not None and self.state in MOVING else math.nan
-        leak_um_per_s = scene.output.leak_um_per_s if scene.output is not None else math.nan
-        events += self._witnesses.ask(inputs, self.state, scene.dt_s, scene.setpoint_um, leak_um_per_s)
+        last = scene.output or NO_OUTPUT
+        error_um = last.error_um if self.state in MOVING else math.nan
+        events += self._witnesses.ask(inputs, self.state, scene.dt_s, scene.setpoint_um, last.leak_um_per_s)
         observation = scene.observer.observe(
             inputs, error_um, self._tick_error, scene.overdue, scene.unfit, self._witnesses.laser_lies
         )
@@ -307,8 +322,8 @@ class Controller:
             events.append({"kind": "why", "why": scene.why})
 
     def _row(self, inputs: TickInputs, observation: Observation, shape: ShapeOutput) -> TelemetryRow:
-        scene, reading, out = self._scene, inputs.reading, self._scene.output
-        nan = math.nan
+        scene, reading = self._scene, inputs.reading or _NO_READING
+        out = scene.output or NO_OUTPUT
         return TelemetryRow(
             mono_s=inputs.now_s,
             tick=self._ticks,
@@ -320,28 +335,28 @@ class Controller:
             rung=scene.ladder.rung,
             fault=self.fault.code if self.fault else 0,
             target_um=scene.setpoint_um,
-            setpoint_um=out.setpoint_um if out else nan,
+            setpoint_um=out.setpoint_um,
             displacement_um=observation.displacement_um,
-            filtered_um=out.filtered_um if out else nan,
-            error_um=out.error_um if out else nan,
-            p_um_per_s=out.p_um_per_s if out else nan,
-            i_um_per_s=out.i_um_per_s if out else nan,
-            d_um_per_s=out.d_um_per_s if out else nan,
-            feedforward_um_per_s=out.feedforward_um_per_s if out else nan,
-            flow_wanted_um_per_s=out.flow_wanted_um_per_s if out else nan,
-            flow_um_per_s=out.flow_um_per_s if out else nan,
+            filtered_um=out.filtered_um,
+            error_um=out.error_um,
+            p_um_per_s=out.p_um_per_s,
+            i_um_per_s=out.i_um_per_s,
+            d_um_per_s=out.d_um_per_s,
+            feedforward_um_per_s=out.feedforward_um_per_s,
+            flow_wanted_um_per_s=out.flow_wanted_um_per_s,
+            flow_um_per_s=out.flow_um_per_s,
             pump_fraction=scene.pump_fraction,
             vent_fraction=scene.vent_fraction,
-            pump_readback_fraction=reading.pump_fraction if reading else nan,
-            vent_readback_fraction=reading.vent_fraction if reading else nan,
+            pump_readback_fraction=reading.pump_fraction,
+            vent_readback_fraction=reading.vent_fraction,
             gauge_pressure_pa=observation.gauge_pressure_pa,
-            ambient_pressure_pa=reading.ambient_pressure_pa if reading else nan,
-            air_temperature_c=reading.air_temperature_c if reading else nan,
-            gas_temperature_c=reading.gas_temperature_c if reading else nan,
-            displacement_quality=reading.displacement_quality if reading else nan,
-            sample_counter=reading.sample_counter if reading else nan,
-            device_time_s=reading.device_time_s if reading else nan,
-            leak_um_per_s=out.leak_um_per_s if out else nan,
+            ambient_pressure_pa=reading.ambient_pressure_pa,
+            air_temperature_c=reading.air_temperature_c,
+            gas_temperature_c=reading.gas_temperature_c,
+            displacement_quality=reading.displacement_quality if inputs.reading else math.nan,
+            sample_counter=reading.sample_counter if inputs.reading else math.nan,
+            device_time_s=reading.device_time_s,
+            leak_um_per_s=out.leak_um_per_s,
             trim_um=shape.trim_um,
             truth_displacement_um=inputs.truth_displacement_um,
             truth_laser_bias_um=inputs.truth_laser_bias_um,

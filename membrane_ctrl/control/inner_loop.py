@@ -81,6 +81,24 @@ class LoopOutput:
     too_tight: bool
 
 
+# of a tick in which the loop has not run
+NO_OUTPUT = LoopOutput(
+    setpoint_um=math.nan,
+    filtered_um=math.nan,
+    error_um=math.nan,
+    p_um_per_s=math.nan,
+    i_um_per_s=math.nan,
+    d_um_per_s=math.nan,
+    feedforward_um_per_s=math.nan,
+    flow_wanted_um_per_s=math.nan,
+    flow_um_per_s=math.nan,
+    pump_fraction=0.0,
+    saturated=False,
+    leak_um_per_s=math.nan,
+    too_tight=False,
+)
+
+
 class InnerLoop:
     """Two-degree-of-freedom PI(D) with feed-forward, on flow as a speed of the mirror's centre.
 
