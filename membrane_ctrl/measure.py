@@ -27,6 +27,10 @@ def measure_command(
     folder: Path, geometry: Path | None, out: Path | None, as_json: bool, pictures: bool, rerun: bool
 ) -> int:
     """Measure one set, write the result, say what came out. Returns the exit code; raises InputError."""
+    if folder.suffix == ".h5":
+        from membrane_ctrl.facet_command import facet_command
+
+        return facet_command(folder, as_json)
     measurement = measure_set(folder, None if geometry is None else read_geometry(geometry))
     for key in measurement.head.ignored:
         print(f"{folder / 'capture.toml'}: {key}: not known, ignored", file=sys.stderr)

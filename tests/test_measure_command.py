@@ -266,3 +266,22 @@ def test_a_pose_that_the_rim_contradicts_is_asked_about(
     rewrite(capture_set, lambda table: table["geometry"].update(a_mm=2640.0))
     assert measured(capture_set, tmp_path / "wrong")[0] == 0
     assert "is the camera's pose right" in capsys.readouterr().out
+
+
+FACET = Path(__file__).parents[1].parent / "shared" / "data" / "sofast" / "measurement_facet.h5"
+
+
+@pytest.mark.skipif(not FACET.is_file(), reason="no measured facet")
+def test_frames_of_a_measured_facet(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("h5py")
+    assert run(["measure", str(FACET), "--json"]) == 0
+    table = json.loads(capsys.readouterr().out)
+    assert table["quality"] == {"verdict": "ok", "reason": "", "flagged_frames": []}
+
+
+def test_what_is_no_facet_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("h5py")
+    (tmp_path / "x.h5").write_text("no")
+    for name in ("x.h5", "none.h5"):
+        assert run(["measure", str(tmp_path / name)]) == 2
+        assert name in capsys.readouterr().err

@@ -15,11 +15,13 @@ from membrane_ctrl.metrology.display import DisplayResponse, ScreenShape
 from membrane_ctrl.metrology.facet import Sight
 from membrane_ctrl.metrology.multifrequency import Unwrapped, unwrap
 from membrane_ctrl.metrology.phase import equal_shifts, phasors, wrapped_phase
+from membrane_ctrl.metrology.series_integrity import Series
 from membrane_ctrl.metrology.sofast import STEPS, SofastCamera, SofastMeasurement
 
 FloatArray = NDArray[np.float64]
 
 SHIFTS_RAD = -equal_shifts(STEPS)
+_LIT_SHARE = 0.3  # of the swing of the bright pixels
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,21 @@ class Decoded:
     def consistent(self) -> NDArray[np.bool_]:
         """Pixels whose frequencies agree on both axes."""
         return self.x.consistent & self.y.consistent
+
+
+def lit_pixels(measurement: SofastMeasurement) -> NDArray[np.bool_]:
+    """Pixels (H, W) that see fringes: the median over the series of their swing, which no single frame can spoil."""
+    series = (*measurement.frames_y, *measurement.frames_x)
+    swing = np.median([np.abs(phasors(steps, SHIFTS_RAD)) for steps in series], axis=0)
+    return np.asarray(swing > _LIT_SHARE * np.percentile(swing, 95))
+
+
+def series_of(measurement: SofastMeasurement, mask: NDArray[np.bool_]) -> tuple[Series, Series]:
+    """The axes of a measurement at the pixels in `mask`, in the order in which they were taken."""
+    return (
+        Series("y", measurement.frames_y[..., mask], measurement.periods_y, SHIFTS_RAD),
+        Series("x", measurement.frames_x[..., mask], measurement.periods_x, SHIFTS_RAD),
+    )
 
 
 def wrapped_phases(
