@@ -29,6 +29,7 @@ from membrane_ctrl.metrology.calibrate.separable import Witness
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, slope_residual, solve
 from membrane_ctrl.metrology.calibrate.verdict import Finding, after, before
 from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.prior_file import Prior, read_prior
 from membrane_ctrl.set_figure import Figures
 
 
@@ -54,6 +55,8 @@ class CalibrateOptions:
         Draw what is left of the screen points, beside the geometry.
     reference_um : float or None
         Laser reading for which the hand's measurements hold, if the sets do not say; None: the first set's.
+    priors : sequence of Path
+        What auxiliary calibrations have found; the last one counts.
     """
 
     folders: Sequence[Path]
@@ -64,6 +67,7 @@ class CalibrateOptions:
     as_json: bool
     pictures: bool = True
     reference_um: float | None = None
+    priors: Sequence[Path] = ()
 
 
 @dataclass(frozen=True)
@@ -77,9 +81,10 @@ class Bundle:
 
 def calibrate_command(options: CalibrateOptions) -> int:
     """Read, solve, judge, write. Returns the exit code; raises CommandError for sets that are none."""
-    free = freed(options.free)
+    priors = [read_prior(path) for path in options.priors]
+    free = {name: sigma for prior in priors for name, sigma in prior.content.sigmas.items()} | freed(options.free)
     begin = time.perf_counter()
-    bundle = read_sets(options.folders, options.geometry, options.reference_um)
+    bundle = with_priors(read_sets(options.folders, options.geometry, options.reference_um), priors)
     read = time.perf_counter()
     problem = problem_of(bundle, free, options.laser_sigma_um)
     findings, solution = before(problem), None
@@ -147,6 +152,14 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
         # no laser: the world's origin is the vertex of the first set
         sets[0] = replace(sets[0], displacement_um=reference_um)
     return Bundle(tuple(sets), benches[0], reference_um)
+
+
+def with_priors(bundle: Bundle, priors: Sequence[Prior]) -> Bundle:
+    """The sets with the bench as auxiliary calibrations have it. Raises InputError for another camera's."""
+    optics = bundle.optics
+    for prior in priors:
+        optics = prior.over(optics)
+    return replace(bundle, optics=optics)
 
 
 def _reference_um(sets: Sequence[SetPhases], benches: Sequence[OpticsConfig], known_um: float | None) -> float:

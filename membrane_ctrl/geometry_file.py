@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from membrane_ctrl.config import GeometryConfig, OpticsConfig, Section
+from membrane_ctrl.config import CameraConfig, GeometryConfig, OpticsConfig, Section
 from membrane_ctrl.config_file import parse, prune, read_toml, with_height_map
 from membrane_ctrl.errors import InputError
 from membrane_ctrl.metrology.calibrate.content_hash import SCHEMA, content_hash
@@ -27,6 +27,16 @@ class LensTable(Section):
     focal_mm: float
     principal_px: tuple[float, float]
     distortion: tuple[float, ...] = ()
+
+    def over(self, camera: CameraConfig, where: Path) -> CameraConfig:
+        """The camera with this lens; raises InputError, naming the file, if it is another camera."""
+        for key in ("width_px", "height_px", "pixel_um"):
+            if getattr(self, key) != getattr(camera, key):
+                raise InputError(
+                    f"{where}: camera.{key} = {getattr(self, key):g}, the frames' camera has "
+                    f"{getattr(camera, key):g}; a calibrated lens is good for its own camera alone"
+                )
+        return camera.model_copy(update=self.model_dump())
 
 
 class PitchTable(Section):
@@ -94,13 +104,7 @@ class GeometryFile:
         """The bench with this geometry instead of its own. Raises InputError if it is of another camera."""
         camera, pattern = optics.camera, optics.pattern
         if self.lens is not None:
-            for key in ("width_px", "height_px", "pixel_um"):
-                if getattr(self.lens, key) != getattr(camera, key):
-                    raise InputError(
-                        f"{self.path}: camera.{key} = {getattr(self.lens, key):g}, the frames' camera has "
-                        f"{getattr(camera, key):g}; a calibrated lens is good for its own camera alone"
-                    )
-            camera = camera.model_copy(update=self.lens.model_dump())
+            camera = self.lens.over(camera, self.path)
         if self.pitch is not None:
             pattern = pattern.model_copy(update=self.pitch.model_dump())
         parts = {"geometry": self.geometry, "camera": camera, "pattern": pattern}

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from membrane_ctrl import __version__
-from membrane_ctrl.cli import calibrating, devices, holding, optics, records
+from membrane_ctrl.cli import auxiliary, calibrating, devices, holding, optics, records
 from membrane_ctrl.errors import CommandError, Exit
 from membrane_ctrl.review.cli import add_commands as add_review_commands
 from membrane_ctrl.tune.cli import app as tune_app
@@ -41,7 +41,7 @@ def top(version: Annotated[bool, typer.Option("--version", help="Print the versi
         raise typer.Exit
 
 
-for _family in (holding, devices, optics, calibrating, records):
+for _family in (holding, devices, optics, calibrating, auxiliary, records):
     _family.add_commands(app)
 app.add_typer(tune_app, name="tune")
 add_review_commands(app)

@@ -13,6 +13,10 @@ from membrane_ctrl.config_file import load
 ConfigArgument = Annotated[Path, typer.Argument(help="Configuration, one TOML file.", metavar="CONFIG")]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="Configuration, one TOML file.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+PriorOption = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="FILE", help="Of calibrate-camera or calibrate-pose; repeatable, the last one counts."),
+]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")]
 SetArgument = Annotated[Path, typer.Argument(metavar="SET", help="Folder with capture.toml and its images.")]
 SeedOption = Annotated[int, typer.Option(min=0, help="Of all that is random.")]

@@ -20,6 +20,7 @@ from membrane_ctrl.metrology.calibrate.content_hash import SCHEMA, content_hash
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, POSE, pose_derivatives
 from membrane_ctrl.metrology.calibrate.solve import Solution
 from membrane_ctrl.metrology.face import BOW_RADIUS_MM
+from membrane_ctrl.metrology.geometry import Geometry
 
 FloatArray = NDArray[np.float64]
 
@@ -102,11 +103,16 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
 
 def geometry_of(solution: Solution, optics: OpticsConfig) -> GeometryConfig:
     """The calibrated geometry in the general form; the screen's height map is the stated bench's."""
+    reference = {"reference_displacement_um": solution.problem.witness.reference_um}
+    return general_form(solution.bench.geometry, optics).model_copy(update=reference)
+
+
+def general_form(geometry: Geometry, optics: OpticsConfig) -> GeometryConfig:
+    """A geometry as two poses; the height map and the reference displacement are the stated bench's."""
     stated = optics.geometry.screen
-    geometry = solution.bench.geometry
     right, down, forward = (_vector(row) for row in geometry.rotation)
     return GeometryConfig(
-        reference_displacement_um=solution.problem.witness.reference_um,
+        reference_displacement_um=optics.geometry.reference_displacement_um,
         camera=CameraPoseConfig(position_mm=_vector(geometry.pinhole_mm), rotation=(right, down, forward)),
         screen=ScreenPoseConfig(
             origin_mm=_vector(geometry.screen_origin_mm),

@@ -1,0 +1,135 @@
+"""Focal length, principal point and distortion from photographs of a board (OpenCV's calibration).
+
+The model is the one that the self-calibration frees: one focal length, k1, k2, p1, p2. Views that fit much worse than
+the others (blurred, a corner taken for its neighbour) are left out and named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from membrane_ctrl.config import CameraConfig
+
+FloatArray = NDArray[np.float64]
+
+LEAST_VIEWS = 4  # each has a pose of its own; with fewer the lens hides in the poses
+LEAST_CORNERS = 12  # of a view
+_WORSE = 3.0  # times the median view's error
+_FLAGS = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_K3
+_NAMES = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1", "p2")
+
+
+@dataclass(frozen=True)
+class View:
+    """Corners of one photograph: place (n, 3) on the board in any unit, (n, 2) in px."""
+
+    name: str
+    place: FloatArray
+    seen_px: FloatArray
+
+
+@dataclass(frozen=True)
+class Lens:
+    """What the views say.
+
+    Attributes
+    ----------
+    focal_px, principal_px, distortion
+        Of the lens; distortion is k1, k2, p1, p2.
+    sigmas : dict of float
+        By the calibration's names of the parameters.
+    rms_px, stated_rms_px : float
+        What is left of a corner (both components), with this lens and with the stated one.
+    used, left_out : tuple of str
+        Names of views.
+    """
+
+    focal_px: float
+    principal_px: tuple[float, float]
+    distortion: tuple[float, ...]
+    sigmas: dict[str, float]
+    rms_px: float
+    stated_rms_px: float
+    used: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def calibrate_lens(views: Sequence[View], stated: CameraConfig) -> Lens:
+    """Fit the lens.
+
+    Parameters
+    ----------
+    stated : CameraConfig
+        Where to begin, and what the result is compared with.
+
+    Raises
+    ------
+    ValueError
+        With fewer than `LEAST_VIEWS` views of `LEAST_CORNERS` corners, or if nothing fits.
+    """
+    good = [view for view in views if len(view.place) >= LEAST_CORNERS]
+    while True:
+        if len(good) < LEAST_VIEWS:
+            raise ValueError(
+                f"the board is seen in {len(good)} photographs; at least {LEAST_VIEWS} are needed, tilted both ways"
+            )
+        rms, matrix, lens, sigmas, errors = _fit(good, stated)
+        worst = int(np.argmax(errors))
+        if errors[worst] <= _WORSE * float(np.median(errors)):
+            break
+        good = good[:worst] + good[worst + 1 :]
+    focal_px = float(matrix[0, 0])
+    names = {view.name for view in good}
+    values = [sigmas[1] / focal_px, *sigmas[2:8]]  # OpenCV's order: fx, fy, cx, cy, k1, k2, p1, p2
+    return Lens(
+        focal_px=focal_px,
+        principal_px=(float(matrix[0, 2]), float(matrix[1, 2])),
+        distortion=tuple(float(k) for k in lens[:4]),
+        sigmas=dict(zip(_NAMES, map(float, values), strict=True)),
+        rms_px=rms,
+        stated_rms_px=_rms_px(good, _matrix(stated), np.array(stated.distortion, float)),
+        used=tuple(view.name for view in good),
+        left_out=tuple(view.name for view in views if view.name not in names),
+    )
+
+
+def _fit(views: Sequence[View], stated: CameraConfig) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """RMS, camera matrix, distortion, sigmas of the intrinsics, RMS of each view."""
+    places = [view.place.astype(np.float32)[:, None] for view in views]
+    seen = [view.seen_px.astype(np.float32)[:, None] for view in views]
+    size = (stated.width_px, stated.height_px)
+    try:
+        rms, matrix, lens, _, _, sigmas, _, errors = cv2.calibrateCameraExtended(
+            places, seen, size, _matrix(stated), np.zeros(5), flags=_FLAGS
+        )
+    except cv2.error as error:
+        raise ValueError(f"no lens fits the photographs: {str(error).splitlines()[0]}") from None
+    if not np.isfinite(rms):
+        raise ValueError("no lens fits the photographs")
+    return float(rms), np.asarray(matrix, float), _row(lens), _row(sigmas), _row(errors)
+
+
+def _row(values: ArrayLike) -> FloatArray:
+    return np.asarray(values, float).ravel()
+
+
+def _rms_px(views: Sequence[View], matrix: FloatArray, lens: FloatArray) -> float:
+    """What a given lens leaves of the corners, each view with its own best pose."""
+    squares, count = 0.0, 0
+    for view in views:
+        _, turn, shift = cv2.solvePnP(view.place, view.seen_px, matrix, lens)
+        expected = cv2.projectPoints(view.place, turn, shift, matrix, lens)[0][:, 0]
+        squares += float(np.sum((expected - view.seen_px) ** 2))
+        count += len(expected)
+    return float(np.sqrt(squares / count))
+
+
+def _matrix(camera: CameraConfig) -> FloatArray:
+    focal_px = camera.focal_mm / (camera.pixel_um * 1e-3)
+    column, row = camera.principal
+    return np.array([[focal_px, 0.0, column], [0.0, focal_px, row], [0.0, 0.0, 1.0]])

@@ -1,0 +1,172 @@
+"""The camera's pose from the ring: a circle of known radius is seen as an ellipse, whose five numbers are its pose.
+
+The sixth, a turn of everything about z, is seen by nothing and defines x (`parameters`). What is fitted is the
+distance to the ring of the points where the rim's rays meet its plane, over a, alpha, yaw, pitch and roll.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+from scipy.optimize import least_squares
+
+from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, usual_sigma
+from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.reconstruct import HeightFunction
+
+FloatArray = NDArray[np.float64]
+
+POSE_NAMES = ("a_mm", "alpha_deg", "camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg")
+_PLACES = [NAMES.index(name) for name in POSE_NAMES]
+_UNITS = np.array([usual_sigma(name) for name in POSE_NAMES])  # so that the solver's steps are of one size
+_POINTS = 720
+_REACH_PX = 8.0  # each way from where the rim was seen roughly
+_STEP_PX = 0.25
+_LEAST_FOUND = 0.5  # of the rim: less is no ellipse
+# A threshold on a blurred edge stands off by the blur's own asymmetry: what a whole rim may have in common
+EDGE_SIGMA_PX = 0.1
+
+
+@dataclass(frozen=True)
+class RingPose:
+    """What the rim says.
+
+    Attributes
+    ----------
+    values, sigmas : (5,) arrays
+        Of `POSE_NAMES`, 0 for the stated bench.
+    rms_px : float
+        What is left of an edge.
+    points : int
+        Edges that were used.
+    """
+
+    values: FloatArray
+    sigmas: FloatArray
+    rms_px: float
+    points: int
+
+    def bench(self, stated: Geometry) -> Geometry:
+        """The stated bench, the camera where the rim says, the screen moved with alpha."""
+        return _bench(stated, self.values)
+
+
+def ring_pose(
+    light: FloatArray,
+    stated: Geometry,
+    rough_px: FloatArray,
+    radius_mm: float,
+    rim_z: HeightFunction,
+    radius_sigma_mm: float,
+) -> RingPose:
+    """Fit the pose, and weigh it with what is known by hand (`parameters.POSE`).
+
+    Parameters
+    ----------
+    light : (H, W) array
+        White minus black.
+    stated : Geometry
+        Where to begin; its lens is taken as it is.
+    rough_px : (2, n) array
+        The rim as `outline.find_outline` sees it, to within `_REACH_PX`.
+    radius_mm : float
+        Of the ring.
+    rim_z : height function
+        Where the rim stands in world; a ring is flat, the rim of a mounted film nearly.
+    radius_sigma_mm : float
+        How well the radius is known: that goes into `a_mm`.
+
+    Raises
+    ------
+    ValueError
+        If half of the rim, or more, is not to be seen.
+    """
+    edges = rim_edges(light, rough_px)
+    if edges.shape[1] < _LEAST_FOUND * _POINTS:
+        raise ValueError(f"only {edges.shape[1] / _POINTS:.0%} of the rim is seen as an edge of light")
+    mm_per_px = radius_mm / float(np.mean(np.hypot(*_from_middle(edges))))
+
+    def miss_px(x: FloatArray) -> FloatArray:
+        return np.asarray((_radii_mm(_bench(stated, x * _UNITS), edges, rim_z) - radius_mm) / mm_per_px)
+
+    fit = least_squares(miss_px, np.zeros(len(POSE_NAMES)), loss="soft_l1", f_scale=0.3)
+    slopes, found = np.asarray(fit.jac, float), np.asarray(fit.x, float)
+    rms_px = float(np.sqrt(np.mean(miss_px(found) ** 2)))
+    inverse = np.linalg.inv(slopes.T @ slopes)
+    shared = inverse @ slopes.T @ _shared(edges, radius_sigma_mm / mm_per_px)
+    seen = np.linalg.inv(inverse * rms_px**2 + shared @ shared.T)
+    both = np.linalg.inv(seen + np.eye(len(POSE_NAMES)))  # in units of the hand's sigmas
+    return RingPose(both @ seen @ found * _UNITS, np.sqrt(np.diag(both)) * _UNITS, rms_px, edges.shape[1])
+
+
+def _bench(stated: Geometry, own: FloatArray) -> Geometry:
+    values = np.zeros(len(NAMES))
+    values[_PLACES] = own
+    return bench_at(stated, values).geometry
+
+
+def _radii_mm(geometry: Geometry, edges: FloatArray, rim_z: HeightFunction) -> FloatArray:
+    """Distance from the axis at which the rays of the edges meet the rim's height."""
+    rays, z = geometry.rays(*edges), np.zeros(edges.shape[1])
+    x = y = z
+    for _ in range(4):  # the height at the rim hardly changes with the place: each step gains three digits
+        t = (z - geometry.pinhole_mm[2]) / rays[2]
+        x, y = geometry.pinhole_mm[:2, None] + t * rays[:2]
+        z = rim_z(x, y)
+    return np.asarray(np.hypot(x, y))
+
+
+def rim_edges(light: FloatArray, rough_px: FloatArray) -> FloatArray:
+    """Edges of the light (2, n), to a fraction of a pixel, along normals of the ellipse through the rough rim."""
+    ellipse = _ellipse(rough_px)
+    ahead = np.roll(ellipse, -1, axis=1) - np.roll(ellipse, 1, axis=1)
+    normal = np.stack([ahead[1], -ahead[0]]) / np.hypot(*ahead)
+    normal *= np.sign(np.sum(normal * (ellipse - ellipse.mean(axis=1, keepdims=True)), axis=0))
+    reach = np.arange(-_REACH_PX, _REACH_PX + _STEP_PX / 2, _STEP_PX)
+    lines = ellipse[:, :, None] + normal[:, :, None] * reach
+    values = map_coordinates(light, [lines[1], lines[0]], order=1, mode="constant", cval=np.nan)
+    ends = reach.size // 4
+    inside, outside = np.median(values[:, :ends], axis=1), np.median(values[:, -ends:], axis=1)
+    half = (inside + outside) / 2
+    below = values < half[:, None]
+    k = np.argmax(below, axis=1)
+    seen = np.isfinite(values).all(axis=1) & (k > 0) & (inside - outside > np.nanmax(inside) / 4)
+    # one edge and no more: a line that is lit again further out crosses something else
+    seen &= (np.diff(below.astype(int), axis=1) != 0).sum(axis=1) == 1
+    n = np.flatnonzero(seen)
+    k = k[n]
+    high, low = values[n, k - 1], values[n, k]
+    at = reach[k - 1] + _STEP_PX * (high - half[n]) / (high - low)
+    return np.asarray(ellipse[:, n] + normal[:, n] * at)
+
+
+def _ellipse(points_px: FloatArray) -> FloatArray:
+    """(2, _POINTS) on the ellipse nearest to the points: the conic through them, by least squares."""
+    middle, size = points_px.mean(axis=1), float(np.std(points_px))
+    x, y = (points_px - middle[:, None]) / size
+    a, b, c, d, e = np.linalg.lstsq(np.stack([x * x, x * y, y * y, x, y], axis=1), np.ones(x.size), rcond=None)[0]
+    form = np.array([[a, b / 2], [b / 2, c]])
+    centre = np.linalg.solve(form, [-d / 2, -e / 2])
+    values, axes = np.linalg.eigh(form / (1 + centre @ form @ centre))
+    if values.min() <= 0:
+        raise ValueError("the rim is no ellipse")
+    theta = 2 * np.pi * np.arange(_POINTS) / _POINTS
+    round_ = axes @ (np.stack([np.cos(theta), np.sin(theta)]) / np.sqrt(values)[:, None])
+    return np.asarray(middle[:, None] + size * (centre[:, None] + round_))
+
+
+def _shared(edges: FloatArray, radius_sigma_px: float) -> FloatArray:
+    """Misses that the edges have in common, one sigma each, (n, 3).
+
+    The radius; and the edge's own error as a rim that is larger, longer across, or longer along a diagonal.
+    """
+    x, y = _from_middle(edges) / np.hypot(*_from_middle(edges))
+    alike = np.full(x.size, np.hypot(radius_sigma_px, EDGE_SIGMA_PX))
+    return np.stack([alike, EDGE_SIGMA_PX * (x * x - y * y), EDGE_SIGMA_PX * 2 * x * y], axis=1)
+
+
+def _from_middle(edges: FloatArray) -> FloatArray:
+    return np.asarray(edges - edges.mean(axis=1, keepdims=True))

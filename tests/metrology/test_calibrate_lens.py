@@ -1,0 +1,109 @@
+"""The lens from photographs of a board, against a lens that is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from board_photograph import Photographer
+
+from membrane_ctrl.config import CameraConfig
+from membrane_ctrl.metrology.calibrate.board import Board, on_screen
+from membrane_ctrl.metrology.calibrate.lens import LEAST_VIEWS, View, calibrate_lens
+
+STATED = CameraConfig(width_px=408, height_px=342, pixel_um=20.7, focal_mm=16.0)  # 773 px
+TRUE = Photographer(408, 342, 781.3, (206.9, 167.4), (-0.12, 0.08, 4e-4, -6e-4))
+BOARD = Board.parse("charuco:11x9")
+SQUARE_PX = 48
+TURNS_DEG = (
+    (0, 0, 0),
+    (35, 0, 5),
+    (-35, 5, 0),
+    (0, 35, -5),
+    (5, -35, 90),
+    (25, 25, 10),
+    (-25, 25, 180),
+    (20, -30, 3),
+)
+
+
+def photographs(camera: Photographer, board: Board, count: int, seed: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    picture = board.draw(SQUARE_PX)
+    middle = np.array([board.columns / 2, board.rows / 2, 0.0])
+    out = []
+    for degrees in TURNS_DEG[:count]:
+        turn = cv2.Rodrigues(np.radians(np.array(degrees, float)))[0]
+        shift = np.array([*rng.uniform(-0.6, 0.6, 2), rng.uniform(24, 28)]) - turn @ middle
+        out.append(camera.take(picture, SQUARE_PX, turn, shift, rng))
+    return out
+
+
+def views_of(board: Board, images: list[np.ndarray]) -> list[View]:
+    return [View(f"{k}.png", *board.corners(image)) for k, image in enumerate(images)]
+
+
+@pytest.fixture(scope="module")
+def views() -> list[View]:
+    return views_of(BOARD, photographs(TRUE, BOARD, len(TURNS_DEG), 1))
+
+
+def test_the_lens_is_found_within_its_sigmas(views: list[View]) -> None:
+    lens = calibrate_lens(views, STATED)
+    assert lens.left_out == ()
+    assert lens.rms_px < 0.3
+    assert lens.stated_rms_px > 1.2 * lens.rms_px  # poses take most of a wrong focal length
+    true = (TRUE.focal_px, *TRUE.principal_px, *TRUE.lens)
+    found = (lens.focal_px, *lens.principal_px, *lens.distortion)
+    sigmas = np.array(list(lens.sigmas.values())) * np.array([lens.focal_px, *[1.0] * 6])
+    assert np.all(np.abs(np.subtract(found, true)) < 5 * sigmas)
+    assert lens.sigmas["focal_relative"] < 2e-3
+
+
+def test_a_plain_chessboard_says_the_same() -> None:
+    board = Board.parse("chessboard:11x9")
+    lens = calibrate_lens(views_of(board, photographs(TRUE, board, 5, 2)), STATED)
+    assert lens.focal_px == pytest.approx(TRUE.focal_px, rel=3e-3)
+
+
+def test_a_view_that_does_not_fit_is_left_out_and_named(views: list[View]) -> None:
+    rng = np.random.default_rng(0)
+    bad = replace(views[3], name="blurred.png", seen_px=views[3].seen_px + rng.normal(0, 3.0, views[3].seen_px.shape))
+    lens = calibrate_lens([*views, bad], STATED)
+    assert lens.left_out == ("blurred.png",)
+    assert lens.rms_px < 0.3
+
+
+def test_too_few_views_are_refused(views: list[View]) -> None:
+    with pytest.raises(ValueError, match=f"seen in {LEAST_VIEWS - 1} photographs; at least {LEAST_VIEWS}"):
+        calibrate_lens(views[: LEAST_VIEWS - 1], STATED)
+
+
+def test_no_board_has_no_corners() -> None:
+    assert BOARD.corners(np.full((100, 100), 90, np.uint8))[0].shape == (0, 3)
+
+
+def test_the_picture_is_exact_to_the_pixel() -> None:
+    levels = on_screen(BOARD, SQUARE_PX, 640, 480)
+    assert levels.shape == (480, 640)
+    assert set(np.unique(levels)) == {0, 255}
+    drawn = levels[24:-24, 56:-56]
+    assert drawn.shape == (9 * SQUARE_PX, 11 * SQUARE_PX)
+    blocks = drawn.reshape(9 * 8, SQUARE_PX // 8, 11 * 8, SQUARE_PX // 8)  # a module is one level throughout
+    assert np.array_equal(blocks.min(axis=(1, 3)), blocks.max(axis=(1, 3)))
+
+
+@pytest.mark.parametrize(
+    ("text", "square_px", "says"),
+    [
+        ("charuco:11", 48, "no board"),
+        ("charuco:3x9", 48, "at least 4 squares"),
+        ("charuco:11x9", 50, "a multiple of 8"),
+        ("charuco:11x9", 80, "880 x 720 pixels, the screen 640 x 480"),
+    ],
+)
+def test_boards_that_cannot_be_are_said(text: str, square_px: int, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        on_screen(Board.parse(text), square_px, 640, 480)
