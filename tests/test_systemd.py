@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import configparser
 import math
+import shutil
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -86,3 +89,15 @@ def test_the_unit_stops_what_it_must_and_never_restarts_into_a_fault() -> None:
     assert " safe " in service["ExecStopPost"]
     assert {"2", "4", "5"} <= set(service["RestartPreventExitStatus"].split())
     assert float(service["WatchdogSec"]) >= 5.0
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze on this machine")
+def test_the_unit_file_is_one_that_systemd_takes_and_calls_protected(tmp_path: Path) -> None:
+    example = Path(__file__).parents[1] / "examples" / "membrane-ctrl.service"
+    unit = tmp_path / example.name
+    unit.write_text(example.read_text().replace("/opt/membrane-ctrl/.venv/bin/membrane-ctrl", sys.executable))
+    for words in (["verify", str(unit)], ["security", "--offline=true", "--threshold=40", str(unit)]):
+        done = subprocess.run(["systemd-analyze", *words], capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert str(unit) not in done.stderr  # a complaint names the file
+        assert unit.name + ":" not in done.stderr
