@@ -33,6 +33,8 @@ NAMES = (
     "events_found",
     "links",
     "calibration",
+    "recording",
+    "memory",
     "soak",
 )
 OUT = Path("docs/bench.json")

@@ -44,6 +44,11 @@ class Child:
             self._process.start()
 
     @property
+    def pid(self) -> int | None:
+        """Its number; None before it was started."""
+        return self._process.pid
+
+    @property
     def alive(self) -> bool:
         """It has not ended."""
         return self._process.is_alive()

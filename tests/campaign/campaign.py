@@ -101,8 +101,8 @@ def write_processes(results: list[ProcessResult]) -> None:
     violations = sum(len(result.violations) for result in results)
     lines = [
         f"**{len(results)} runs with real processes and sockets, {violations} violations.** A hold in its own "
-        "process against the emulated board (watchdog 0.5 s), in real time at 50 Hz; the fault sets in while the mirror is "
-        "inflated. Looked at: exit, first cause and latched-fault file, the board's own output, sag and pressure, "
+        "process against the emulated board (watchdog 0.5 s), in real time at 50 Hz; the fault sets in while the "
+        "mirror is inflated. Looked at: exit, first cause and latched-fault file, the board's own output, sag and pressure, "
         "every tick in the tables once, UTC of all events, no process left behind.",
         "",
         *process_table(results),

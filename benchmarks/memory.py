@@ -1,0 +1,191 @@
+"""Memory of the processes of a run after a week of telemetry, against that after an hour.
+
+python -m benchmarks memory [the whole takes about a quarter of an hour]
+
+Recorder, live screen and alarms are the real processes on the real rings. They get a week of a hold at 10 Hz as fast
+as the recorder takes it: 20 minutes of run a round, two writes of the recorder a round. The run's clock is a number
+in shared memory. Shapes come once a minute of run. The acquisition measures frames of its twin (306 x 256 pixels) at
+five cycles a second; a week of its cycles is not run, so its figure says over how many cycles it was seen to grow.
+The control process in virtual time is in `soak`.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import struct
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from multiprocessing.connection import Connection
+from multiprocessing.shared_memory import SharedMemory
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from benchmarks.figures import Figure, at_most
+from benchmarks.memory_acquisition import acquisition_figures
+from benchmarks.recorded_hold import Second, seconds_of
+from membrane_ctrl.clock import RunClock
+from membrane_ctrl.config import Config, LoopConfig, RecordingConfig, ShapeConfig
+from membrane_ctrl.ipc.ring import RingAddress, RingWriter, ring
+from membrane_ctrl.processes import Child, pipe
+from membrane_ctrl.recording.process import RecorderSpec
+from membrane_ctrl.recording.run_folder import create_run_folder
+from membrane_ctrl.screen.process import ScreenSpec, screen_main
+from membrane_ctrl.telemetry import FIELDS, ROW_BYTES
+from membrane_ctrl.tick_record import MESSAGE_BYTES
+
+HOUR_S, WEEK_S = 3600.0, 7 * 86_400.0
+ROUND_S = 1200.0
+RATE_HZ = 10.0
+_KEPT = round(2.5 * ROUND_S * RATE_HZ)
+_DOUBLE = struct.Struct("<d")
+_TICK_HEAD = struct.Struct("<cqd")  # of an inputs message: kind, tick, now_s
+_TIME, _TICK = FIELDS.index("mono_s"), FIELDS.index("tick")
+
+
+@dataclass(frozen=True, slots=True)
+class SharedClock(RunClock):
+    """The run's clock as a number in shared memory."""
+
+    memory: str = ""
+
+    def now(self) -> float:
+        """What the feeder has put there."""
+        memory = _attached(self.memory)
+        assert memory.buf is not None
+        return float(_DOUBLE.unpack_from(memory.buf, 0)[0])
+
+
+_memories: dict[str, SharedMemory] = {}
+
+
+def _attached(name: str) -> SharedMemory:
+    if name not in _memories:
+        _memories[name] = SharedMemory(name)
+    return _memories[name]
+
+
+def quiet_screen(spec: ScreenSpec) -> None:
+    """The live screen without a terminal, and without anybody who reads it."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    screen_main(spec)
+
+
+def run() -> list[Figure]:
+    """The benchmark."""
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        found = _fed_figures(Path(folder), stack)
+    return [*found, *acquisition_figures()]
+
+
+def _fed_figures(folder: Path, stack: ExitStack) -> list[Figure]:
+    config = Config(
+        loop=LoopConfig(rate_hz=RATE_HZ), shape=ShapeConfig(period_s=60.0), recording=RecordingConfig(min_free_mb=1.0)
+    )
+    clock_memory = SharedMemory(create=True, size=8)
+    stack.callback(clock_memory.unlink)
+    stack.callback(clock_memory.close)
+    clock = SharedClock(0.0, datetime.now(UTC), clock_memory.name)
+    run_dir = create_run_folder(folder, "week", clock.origin_utc, config)
+    sizes = {
+        "telemetry": (_KEPT, ROW_BYTES),
+        "inputs": (_KEPT, MESSAGE_BYTES),
+        "shapes": (256, 1 << 16),
+        "events": (1024, 4096),
+    }
+    rings = {name: stack.enter_context(ring(*size)) for name, size in sizes.items()}
+    writers = {name: RingWriter(address) for name, address in rings.items()}
+    for writer in writers.values():
+        stack.callback(writer.close)
+    children, status = _children(config, clock, rings, run_dir)
+    for child in children:
+        child.start()
+        stack.callback(child.stop, 10.0)
+    after_hour: dict[str, float] = {}
+    for now_s, second in _rounds(config):
+        second.put(writers)
+        assert clock_memory.buf is not None
+        _DOUBLE.pack_into(clock_memory.buf, 0, now_s)
+        _wait_for_writes(status, 2)
+        _thin_out(run_dir)
+        if not after_hour and now_s >= HOUR_S:
+            after_hour = _rss_mb(children)
+    return list(_compared(after_hour, _rss_mb(children)))
+
+
+def _children(
+    config: Config, clock: RunClock, rings: dict[str, RingAddress], run_dir: Path
+) -> tuple[list[Child], Connection]:
+    ours, theirs = pipe()
+    spec = RecorderSpec(
+        run_dir, "week", clock, config, rings["telemetry"], rings["events"], rings["shapes"], None, rings["inputs"],
+        flush_s=0.0,
+    )  # fmt: skip
+    screen = ScreenSpec(clock, rings["telemetry"], rings["events"], rings["shapes"], run_dir, config)
+    return [
+        Child("recorder", "membrane_ctrl.recording.process:recorder_main", (spec, theirs), nice=5),
+        Child("live screen", "benchmarks.memory:quiet_screen", (screen,), nice=5),
+    ], ours
+
+
+def _rounds(config: Config) -> Iterator[tuple[float, Second]]:
+    """A week of rounds: the way to the hold once, and then the same 20 minutes of it, each time later."""
+    first, again = Second(), Second()
+    for number, second in enumerate(seconds_of(config, round(2 * ROUND_S))):
+        target = first if number < ROUND_S else again
+        for name in ("telemetry", "inputs", "shapes", "events"):
+            getattr(target, name).extend(getattr(second, name))
+    yield ROUND_S, first
+    for number in range(round(WEEK_S / ROUND_S) - 1):
+        yield (number + 2) * ROUND_S, _later(again, number * ROUND_S)
+
+
+def _later(second: Second, by_s: float) -> Second:
+    ticks = round(by_s * RATE_HZ)
+    rows = np.frombuffer(b"".join(second.telemetry), dtype="<f8").reshape(-1, len(FIELDS)).copy()
+    rows[:, _TIME] += by_s
+    rows[:, _TICK] += ticks
+    return Second(
+        [row.tobytes() for row in rows],
+        [_tick_later(message, ticks, by_s) for message in second.inputs],
+        [_shape_later(message, by_s) for message in second.shapes],
+        second.events,
+    )
+
+
+def _shape_later(message: bytes, by_s: float) -> bytes:
+    estimate = pickle.loads(message)
+    return pickle.dumps(replace(estimate, time_s=estimate.time_s + by_s))
+
+
+def _tick_later(message: bytes, ticks: int, by_s: float) -> bytes:
+    kind, tick, now_s = _TICK_HEAD.unpack_from(message)
+    return message if kind != b"T" else _TICK_HEAD.pack(kind, tick + ticks, now_s + by_s) + message[_TICK_HEAD.size :]
+
+
+def _wait_for_writes(status: Connection, count: int) -> None:
+    """The recorder says that it is alive after each write."""
+    while count:
+        count -= status.recv()["kind"] == "alive"
+
+
+def _thin_out(run_dir: Path) -> None:
+    """A week is some GB: what is closed and optimised is not needed here."""
+    for pattern in ("*.rrd", "inputs-*.bin"):
+        for path in sorted(run_dir.glob(pattern))[:-30]:
+            path.unlink()
+
+
+def _rss_mb(children: list[Child]) -> dict[str, float]:
+    return {child.name: psutil.Process(child.pid).memory_info().rss / 1e6 for child in children}
+
+
+def _compared(before_mb: dict[str, float], after_mb: dict[str, float]) -> Iterator[Figure]:
+    for name, value in after_mb.items():
+        grown = 100.0 * (value / before_mb[name] - 1.0)
+        yield at_most(f"{name}: memory grown from an hour to a week", grown, "%", 5.0, "MB then", before_mb[name])

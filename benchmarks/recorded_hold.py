@@ -1,0 +1,94 @@
+"""A held mirror in virtual time as the messages that a recorder gets: rows, inputs, shapes, events."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from membrane_ctrl.acquisition.worker import estimate_message
+from membrane_ctrl.commands import Command
+from membrane_ctrl.config import Config
+from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.ipc.ring import RingWriter
+from membrane_ctrl.metrology.hencky import zernike_projection
+from membrane_ctrl.tick_record import pack_tick
+from membrane_ctrl.twin.plant import Plant
+from membrane_ctrl.virtual_bench import VirtualBench
+from membrane_ctrl.virtual_run import VirtualRun, VirtualTick
+from membrane_ctrl.virtual_shape import TruthShape
+
+Rings = dict[str, RingWriter]
+
+
+@dataclass(slots=True)
+class Second:
+    """What goes into the rings in one second of a run."""
+
+    telemetry: list[bytes] = field(default_factory=list)
+    inputs: list[bytes] = field(default_factory=list)
+    shapes: list[bytes] = field(default_factory=list)
+    events: list[bytes] = field(default_factory=list)
+
+    def put(self, rings: Rings) -> None:
+        """Into the rings of these names."""
+        for name, ring in rings.items():
+            for message in getattr(self, name):
+                ring.put(message)
+
+
+class RealisticShapes:
+    """Shapes of the truth with the noise and the full covariance of a reconstruction, which do not compress."""
+
+    def __init__(self, bench: VirtualBench, config: Config) -> None:
+        self._truth = TruthShape(bench, config, seed=1)
+        self._rng = np.random.default_rng(1)
+        mixed = self._rng.normal(size=(36, 36)) * 1e-3
+        self._covariance_um2 = mixed @ mixed.T
+
+    def __call__(self, now_s: float) -> ShapeEstimate | None:
+        """One cycle."""
+        estimate = self._truth(now_s)
+        if estimate is None:
+            return None
+        noisy = estimate.coeffs_um + 1e-3 * self._rng.normal(size=36)
+        scaled = self._covariance_um2 * (1 + 1e-3 * self._rng.normal())
+        return pickle_trip(replace(estimate, coeffs_um=noisy, covariance_um2=scaled))
+
+
+def pickle_trip(estimate: ShapeEstimate) -> ShapeEstimate:
+    """As the control process gets it from the ring."""
+    found = pickle.loads(estimate_message(estimate))
+    assert isinstance(found, ShapeEstimate)
+    return found
+
+
+def seconds_of(config: Config, duration_s: int) -> Iterator[Second]:
+    """The run second by second, from standby on."""
+    bench = VirtualBench(Plant(config.twin, config.pump))
+    run = VirtualRun(config, bench, zernike_projection(), RealisticShapes(bench, config))
+    number = 0
+    for second in range(duration_s):
+        made = Second()
+        for _ in range(round(config.loop.rate_hz)):
+            tick = run.tick((Command("hold", "benchmark"),) if number == 0 else ())
+            if tick is not None:
+                number += 1
+                _take(made, tick, number)
+        yield made if second else _begun(made)
+
+
+def _begun(first: Second) -> Second:
+    return replace(first, events=[json.dumps({"kind": "start", "mono_s": 0.0}).encode(), *first.events])
+
+
+def _take(made: Second, tick: VirtualTick, number: int) -> None:
+    row = tick.row.pack()
+    made.telemetry.append(row)
+    made.inputs += pack_tick(number, tick.inputs, tick.outputs, row)
+    if tick.inputs.estimate is not None:
+        made.shapes.append(estimate_message(tick.inputs.estimate))
+    made.events += [json.dumps({"mono_s": tick.row.mono_s, **event}, default=str).encode() for event in tick.events]

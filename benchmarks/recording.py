@@ -1,0 +1,84 @@
+"""Bytes of a day: an hour of hold at 50 Hz with a shape each 2 s through the real recorder, a write a second.
+
+python -m benchmarks recording
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from contextlib import ExitStack
+from datetime import UTC, datetime
+from pathlib import Path
+
+from benchmarks.figures import Figure, at_most
+from benchmarks.recorded_hold import seconds_of
+from membrane_ctrl.clock import RunClock
+from membrane_ctrl.config import Config
+from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
+from membrane_ctrl.recording.recorder import Recorder
+from membrane_ctrl.recording.run_folder import create_run_folder
+from membrane_ctrl.recording.sink import Recording
+from membrane_ctrl.telemetry import ROW_BYTES
+from membrane_ctrl.tick_record import MESSAGE_BYTES
+
+DAY_S = 86_400.0
+DURATION_S = 3600  # one whole segment
+_RINGS = {
+    "telemetry": (400, ROW_BYTES),
+    "inputs": (400, MESSAGE_BYTES),
+    "shapes": (16, 1 << 16),
+    "events": (64, 4096),
+}
+
+
+class HandClock(RunClock):
+    """A clock moved by hand."""
+
+    moment_s = 0.0
+
+    def now(self) -> float:
+        """Where the hand has put it."""
+        return HandClock.moment_s
+
+
+def run() -> list[Figure]:
+    """The benchmark."""
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        return _measured(Path(folder), stack)
+
+
+def _measured(folder: Path, stack: ExitStack) -> list[Figure]:
+    config, clock = Config(), HandClock(0.0, datetime.now(UTC))
+    run_dir = create_run_folder(folder, "day", clock.origin_utc, config)
+    addresses = {name: stack.enter_context(ring(*size)) for name, size in _RINGS.items()}
+    readers = {name: RingReader(address) for name, address in addresses.items()}
+    writers = {name: RingWriter(address) for name, address in addresses.items()}
+    for end in (*readers.values(), *writers.values()):
+        stack.callback(end.close)
+    recording = Recording(run_dir, "day", clock, config)
+    recorder = Recorder(run_dir, clock, config, readers, recording, None, lambda report: None)
+    busy_s = 0.0
+    for number, second in enumerate(seconds_of(config, DURATION_S)):
+        HandClock.moment_s = number + 1.0
+        second.put(writers)
+        begun_s = time.process_time()
+        recorder.drain()
+        recorder.write()
+        busy_s += time.process_time() - begun_s
+    writers["events"].put(b'{"kind": "end", "exit": "done", "mono_s": 3600.0}')
+    before = _bytes(run_dir, "*.rrd")
+    recorder.finish()
+    days = DURATION_S / DAY_S
+    mb = {pattern: _bytes(run_dir, pattern) / 1e6 / days for pattern in ("*.rrd", "inputs-*.bin", "columns/*")}
+    return [
+        at_most("recording, optimised, without frames", sum(mb.values()), "MB a day", 1000.0),
+        at_most("of it Rerun segments", mb["*.rrd"], "MB a day", None, "before optimising", before / 1e6 / days),
+        at_most("of it inputs", mb["inputs-*.bin"], "MB a day"),
+        at_most("of it columns", mb["columns/*"], "MB a day"),
+        at_most("recorder, share of a core", 100 * busy_s / DURATION_S, "%"),
+    ]
+
+
+def _bytes(run_dir: Path, pattern: str) -> int:
+    return sum(path.stat().st_size for path in run_dir.glob(pattern))
