@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.geometry_in_force import InForce
 from membrane_ctrl.metrology.calibrate.drift import DriftMonitor, noise_urad
@@ -41,14 +39,16 @@ class LiveDrift:
         self._monitor = None if known is None else DriftMonitor(known.slope_residual_urad, known.slope_noise_urad)
         self._said = False
 
+    def noise_urad(self, estimate: ShapeEstimate) -> float:
+        """What the camera's noise is in a cycle's residual."""
+        surface = Surface(estimate.coeffs_um / 1e3, estimate.hencky_um / 1e3, self._radius_mm)
+        return noise_urad(self._geometry, surface, self._sigma_mm_adu / estimate.modulation_median_adu)
+
     def after(self, estimate: ShapeEstimate) -> Event | None:
         """A notice when it is time to calibrate again, and when it no longer is."""
         if self._monitor is None or estimate.verdict == "rejected":
             return None
-        surface = Surface(estimate.coeffs_um / 1e3, estimate.hencky_um / 1e3, self._radius_mm)
-        sigma_mm = self._sigma_mm_adu / estimate.modulation_median_adu
-        noise = noise_urad(self._geometry, surface, sigma_mm) if sigma_mm > 0 else np.nan
-        self._monitor.add(estimate.slope_residual_urad, noise)
+        self._monitor.add(estimate.slope_residual_urad, self.noise_urad(estimate))
         if bool(self._monitor.says) == self._said:
             return None
         self._said = not self._said

@@ -1,0 +1,78 @@
+"""The live cycle's residual against the calibrated one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.acquisition.geometry_watch import LiveDrift, geometry_event
+from membrane_ctrl.config import OpticsConfig
+from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.geometry_file import CalibrationTable, origin_of
+from membrane_ctrl.geometry_in_force import InForce
+from membrane_ctrl.metrology.calibrate.drift import CYCLES
+from membrane_ctrl.metrology.hencky import zernike_projection
+
+OPTICS = OpticsConfig()
+CALIBRATION = CalibrationTable(date_utc="2026", hash="x", slope_residual_urad=3.0, slope_noise_urad=1.0)
+CYCLE = ShapeEstimate(
+    time_s=0.0,
+    kind="fringes",
+    coeffs_um=37_100.0 * zernike_projection(),
+    hencky_um=0.0,
+    covariance_um2=np.zeros((36, 36)),
+    sag_um=37_100.0,
+    sag_sigma_um=0.1,
+    displacement_um=0.0,
+    slope_residual_urad=2.9,
+    valid_fraction=1.0,
+    modulation_median_adu=80.0,
+    saturated_fraction=0.0,
+    verdict="ok",
+)
+
+
+def in_force(calibration: CalibrationTable | None = CALIBRATION) -> InForce:
+    return InForce(OPTICS, origin_of(OPTICS), calibration)
+
+
+def test_a_residual_that_has_grown_is_said_once_and_its_end_too() -> None:
+    drift = LiveDrift(in_force(), 4)
+    told = []
+    for residual_urad in (2.9, 4.5, 2.9):
+        cycle = replace(CYCLE, slope_residual_urad=residual_urad)
+        told += [event for _ in range(CYCLES) if (event := drift.after(cycle)) is not None]
+    assert [event["kind"] for event in told] == ["maintenance", "maintenance_over"]
+    assert {event["name"] for event in told} == {"calibrate"}
+    assert told[0]["message"].startswith("calibrate again: the fit leaves 4.50 urad")
+
+
+def test_the_noise_of_weaker_fringes_is_no_drift() -> None:
+    weak = LiveDrift(in_force(), 4)
+    # 2.83 urad of film, and 1.5 urad of a noise that was calibrated at 1.0 and grows as the light fades
+    faded = replace(CYCLE, modulation_median_adu=4.0)
+    noise_urad = weak.noise_urad(faded)
+    assert noise_urad == pytest.approx(20 * weak.noise_urad(CYCLE))
+    cycle = replace(faded, slope_residual_urad=float(np.hypot(2.83, noise_urad)))
+    assert not any(weak.after(cycle) for _ in range(2 * CYCLES))
+
+
+def test_rejected_cycles_and_stated_geometries_say_nothing() -> None:
+    rejected = replace(CYCLE, verdict="rejected", slope_residual_urad=900.0)
+    drift = LiveDrift(in_force(), 4)
+    assert not any(drift.after(rejected) for _ in range(2 * CYCLES))
+    by_hand = LiveDrift(in_force(None), 4)
+    assert not any(by_hand.after(replace(CYCLE, slope_residual_urad=50.0)) for _ in range(2 * CYCLES))
+
+
+def test_the_record_names_the_geometry() -> None:
+    event = geometry_event(in_force())
+    assert event == {
+        "kind": "geometry",
+        "hash": origin_of(OPTICS).hash,
+        "file": None,
+        "calibrated_utc": None,
+        "message": "",
+    }
