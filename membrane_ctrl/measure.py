@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from membrane_ctrl.error_bars import ErrorBars, error_bars
 from membrane_ctrl.errors import Exit, InputError
 from membrane_ctrl.geometry_file import read_geometry
 from membrane_ctrl.measurement import Measurement, measure_set
@@ -37,14 +38,15 @@ def measure_command(
     target = out or folder / "result"
     light, outline = _outline(measurement)
     profile = _profile(measurement)
+    bars = error_bars(measurement, geometry)
     begin = time.perf_counter()
     try:
-        write_result(target, measurement, details_table(measurement, profile, outline))
+        write_result(target, measurement, details_table(measurement, profile, outline, bars), bars)
         drawn: list[Path] = []
         if pictures:
             from membrane_ctrl.pictures import draw_all
 
-            drawn = draw_all(target, measurement, light, profile, outline)
+            drawn = draw_all(target, measurement, light, profile, outline, bars)
         if rerun:
             from membrane_ctrl.measurement_rerun import log_measurement
 
@@ -55,7 +57,7 @@ def measure_command(
     if as_json:
         print(json.dumps(result_table(measurement)))
     else:
-        print("\n".join(_lines(measurement, profile, outline)))
+        print("\n".join(_lines(measurement, profile, outline, bars)))
     return int(Exit.REJECTED if measurement.verdict == "rejected" else Exit.DONE)
 
 
@@ -78,17 +80,22 @@ def _profile(measurement: Measurement) -> RadialProfile | None:
     return radial_profile(full.grid.axis_mm, full.height_mm(), measurement.head.optics.mirror.radius_mm)
 
 
-def _lines(measurement: Measurement, profile: RadialProfile | None, outline: Outline | None) -> list[str]:
+def _lines(
+    measurement: Measurement, profile: RadialProfile | None, outline: Outline | None, bars: ErrorBars | None
+) -> list[str]:
     """What a person wants to read."""
     full = measurement.full
     lines = [f"verdict   {measurement.verdict}{': ' + measurement.reason if measurement.reason else ''}"]
     lines += [f"flagged   {item['file']}: {item['reason']}" for item in measurement.flagged_files()]
-    if full is None or profile is None:
+    if full is None or profile is None or bars is None:
         return lines
+    of_noise, of_geometry = bars.sag_um
     residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
     coeffs = 1e3 * full.surface.coeffs_mm
     lines += [
-        f"sag       {full.surface.sag_mm:.4f} mm",
+        f"sag       {full.surface.sag_mm:.4f} mm, 1 sigma {of_noise:.2g} um of noise"
+        + (f", {of_geometry:.3g} um of the geometry" if of_geometry else ""),
+        f"geometry  its spread: {bars.source}",
         f"Hencky    {profile.sag_mm:.4f} mm, {profile.pressure_pa:.0f} Pa under the paper's film",
         f"figure    astigmatism {np.hypot(*coeffs[4:6]):.2f} um, coma {np.hypot(*coeffs[6:8]):.2f} um, "
         f"trefoil {np.hypot(*coeffs[8:10]):.2f} um (RMS)",

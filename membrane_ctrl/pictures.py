@@ -10,15 +10,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from membrane_ctrl.error_bars import ErrorBars
 from membrane_ctrl.measurement import Measurement
-from membrane_ctrl.metrology.covariance import parameter_covariance, pixel_sigma_adu, slope_per_screen
 from membrane_ctrl.metrology.full import FullResult
 from membrane_ctrl.metrology.outline import Outline
-from membrane_ctrl.metrology.phase import phase_sigma_rad
 from membrane_ctrl.metrology.radial import RadialProfile
-from membrane_ctrl.metrology.surface import parameter_to_coeffs
-from membrane_ctrl.metrology.unwrap import mm_per_rad
-from membrane_ctrl.metrology.zernike import values
 
 FloatArray = NDArray[np.float64]
 
@@ -27,7 +23,12 @@ _SHOWN_PX = 600  # a side, of maps of pixels
 
 
 def draw_all(
-    out: Path, measurement: Measurement, light: FloatArray, profile: RadialProfile | None, outline: Outline | None
+    out: Path,
+    measurement: Measurement,
+    light: FloatArray,
+    profile: RadialProfile | None,
+    outline: Outline | None,
+    bars: ErrorBars | None,
 ) -> list[Path]:
     """Draw everything there is to draw; returns the files.
 
@@ -49,28 +50,19 @@ def draw_all(
         _save(out / "modulation.png", _modulation(measurement, full, light, outline)),
         _save(out / "profile.png", _profile(profile)),
         _save(out / "convergence.png", _convergence(full)),
-        _save(out / "uncertainty.png", _map("1 sigma of pixel noise (nm)", *uncertainty_nm(measurement), "magma")),
     ]
-    return files
+    return files if bars is None else [*files, _save(out / "uncertainty.png", _uncertainty(bars))]
 
 
-def uncertainty_nm(measurement: Measurement, n: int = 201) -> tuple[FloatArray, FloatArray]:
-    """Axis (n,) and 1 sigma (n, n) of the fitted height in nm, from the noise of the pixels alone."""
-    full, checked, optics = measurement.full, measurement.checked, measurement.head.optics
-    if full is None or checked is None:
-        raise ValueError("a set without a figure has no uncertainty")
-    swing = full.quality.modulation_share * (2**optics.camera.bits - 1)
-    shifts = np.array([measurement.head.patterns[k].shift_rad for k in checked.view.used[0]])
-    sigma_mm = mm_per_rad(optics.pattern) * phase_sigma_rad(shifts, pixel_sigma_adu(optics.camera.noise_adu), swing)
-    gain = slope_per_screen(checked.tracer.geometry, full.surface.radius_mm, full.surface.sag_mm)
-    covariance = parameter_covariance(full.fit, gain.sum(axis=1) * sigma_mm**2)
-    spread = parameter_to_coeffs() @ covariance @ parameter_to_coeffs().T
-    radius = optics.mirror.analysis_radius_mm
-    axis: FloatArray = np.linspace(-radius, radius, n)
-    x, y = np.meshgrid(axis, axis)
-    terms = values(x.ravel() / optics.mirror.radius_mm, y.ravel() / optics.mirror.radius_mm)
-    sigma = np.sqrt(np.maximum(np.einsum("jp,jp->p", terms, spread @ terms), 0.0)).reshape(n, n)
-    return axis, np.where(np.hypot(x, y) <= radius, 1e6 * sigma, np.nan)
+def _uncertainty(bars: ErrorBars) -> Figure:
+    """1 sigma from noise and, if its spread is one, from the geometry."""
+    figure = Figure(figsize=(12, 4.8), layout="constrained")
+    of_noise, of_geometry = bars.maps_um()
+    left, right = figure.subplots(1, 2)
+    _image(left, "1 sigma of pixel noise (nm)", bars.grid.axis_mm, 1e3 * of_noise, "magma")
+    if np.isfinite(of_geometry).any():
+        _image(right, "1 sigma of the geometry (um)", bars.grid.axis_mm, of_geometry, "magma")
+    return figure
 
 
 def _map(title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False) -> Figure:

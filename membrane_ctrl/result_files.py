@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from membrane_ctrl.error_bars import ErrorBars
 from membrane_ctrl.measurement import Measurement, noise_seen_adu
 from membrane_ctrl.metrology.full import FullResult
 from membrane_ctrl.metrology.outline import Outline
@@ -57,7 +58,9 @@ def _fit_table(full: FullResult | None) -> dict[str, Any]:
     }
 
 
-def details_table(measurement: Measurement, profile: RadialProfile | None, outline: Outline | None) -> dict[str, Any]:
+def details_table(
+    measurement: Measurement, profile: RadialProfile | None, outline: Outline | None, bars: ErrorBars | None
+) -> dict[str, Any]:
     """What a person also asks for: sag, pressure, zonal residual, noise, the rim in the picture."""
     full = measurement.full
     table: dict[str, Any] = {
@@ -78,6 +81,13 @@ def details_table(measurement: Measurement, profile: RadialProfile | None, outli
         }
     if profile is not None:
         table |= {"hencky_sag_mm": profile.sag_mm, "pressure_equivalent_pa": profile.pressure_pa}
+    if bars is not None:
+        of_noise, of_geometry = bars.sag_um
+        table["sag_sigma_um"] = {
+            "noise": _number(of_noise),
+            "geometry": _number(of_geometry),
+            "geometry_spread": bars.source,
+        }
     if outline is not None:
         table["rim"] = {
             "centre_px": list(outline.centre_px),
@@ -88,14 +98,18 @@ def details_table(measurement: Measurement, profile: RadialProfile | None, outli
     return table
 
 
-def write_result(out: Path, measurement: Measurement, details: dict[str, Any]) -> None:
-    """Write `result.json`, `details.json` and, if there is a figure to be used, `height.npz`. Raises OSError."""
+def write_result(out: Path, measurement: Measurement, details: dict[str, Any], bars: ErrorBars | None) -> None:
+    """Write `result.json`, `details.json` and, if there is a figure to be used, two maps. Raises OSError."""
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / "result.json", result_table(measurement))
     write_json(out / "details.json", details)
     if measurement.full is not None and measurement.verdict != "rejected":
         axis = measurement.full.grid.axis_mm
         np.savez(out / "height.npz", x_mm=axis, y_mm=axis, h_mm=measurement.full.height_mm())
+        if bars is not None:
+            axis, (of_noise, of_geometry) = bars.grid.axis_mm, bars.maps_um()
+            file = out / "sigma.npz"
+            np.savez(file, x_mm=axis, y_mm=axis, sigma_noise_um=of_noise, sigma_geometry_um=of_geometry)
 
 
 def write_json(path: Path, table: dict[str, Any]) -> None:

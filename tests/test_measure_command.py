@@ -285,3 +285,33 @@ def test_what_is_no_facet_file(tmp_path: Path, capsys: pytest.CaptureFixture[str
     for name in ("x.h5", "none.h5"):
         assert run(["measure", str(tmp_path / name)]) == 2
         assert name in capsys.readouterr().err
+
+
+def test_error_bars(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert measured(made / "0000", tmp_path)[0] == 0
+    said = capsys.readouterr().out
+    assert "of noise" in said
+    assert "the paper's 2 mm, 2 mm and 0.3 degrees assumed" in said
+    details = json.loads((tmp_path / "details.json").read_text())["sag_sigma_um"]
+    sigma = np.load(tmp_path / "sigma.npz")
+    assert (
+        sigma["sigma_noise_um"].shape == sigma["sigma_geometry_um"].shape == (sigma["y_mm"].size, sigma["x_mm"].size)
+    )
+    assert np.isnan(sigma["sigma_noise_um"][0, 0])
+    middle = sigma["x_mm"].size // 2
+    assert sigma["sigma_geometry_um"][middle, middle] == pytest.approx(0, abs=1e-9)  # counted from the vertex
+    # what the Monte Carlo of the same set says
+    assert run(["uncertainty", str(made / "0000"), "--out", str(tmp_path / "mc"), "--trials", "300"]) == 0
+    trials = json.loads((tmp_path / "mc" / "uncertainty.json").read_text())
+    assert details["geometry"] == pytest.approx(trials["sag_sigma_um"], rel=0.15)  # of 300 trials: 4 % sigma
+    assert np.nanmean(sigma["sigma_geometry_um"]) == pytest.approx(trials["rmse_um"]["mean"], rel=0.15)
+
+
+def test_a_geometrys_own_covariance_makes_the_error_bars(made: Path, tmp_path: Path) -> None:
+    geometry = tomllib.loads((made / "0000" / "capture.toml").read_text())["geometry"]
+    covariance = {"names": ["a_mm"], "matrix": [[1e-8]]}
+    (tmp_path / "g.toml").write_text(tomli_w.dumps({"geometry": geometry, "covariance": covariance}))
+    assert measured(made / "0000", tmp_path / "out", "--geometry", str(tmp_path / "g.toml"))[0] == 0
+    details = json.loads((tmp_path / "out" / "details.json").read_text())["sag_sigma_um"]
+    assert details["geometry"] < 0.01
+    assert "g.toml" in details["geometry_spread"]

@@ -183,7 +183,7 @@ def _mend(axis: Series, index: int, limit: float, axes: tuple[Series, ...]) -> t
 
 
 def _witnesses(axis: Series, index: int) -> tuple[Closure, Closure]:
-    """Closures that can name a frame: with the phase of the other frequencies known, and with the level of the next."""
+    """Closures that can name a frame: with the other frequencies' phase known, and with the level of the next."""
     neighbour = index - 1 if index + 1 == len(axis.periods) else index + 1
     steps, near = axis.frames[index], axis.frames[neighbour]
     amplitude = np.abs(phasors(near, axis.shifts_rad))
