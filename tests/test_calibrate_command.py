@@ -74,6 +74,8 @@ def test_from_folders_to_a_better_figure(
     before, after = (tmp_path / name for name in ("before", "after"))
     assert run(["measure", str(folders[2]), "--out", str(before), "--no-pictures"]) == 0
     assert run(["measure", str(folders[2]), "--geometry", str(out), "--out", str(after), "--no-pictures"]) == 0
+    used = json.loads((after / "result.json").read_text())["geometry"]
+    assert (used["hash"], used["file"]) == (report["hash"], str(out))
     truth = folders[2] / "truth.npz"
     assert figure_error_um(before / "height.npz", truth) > 10
     assert figure_error_um(after / "height.npz", truth) < 2
@@ -85,6 +87,22 @@ def test_uncertainty_draws_from_the_file(folders: list[Path], tmp_path: Path) ->
     words = ["uncertainty", str(folders[2]), "--geometry", str(out), "--out", str(where), "--trials", "20"]
     assert run([*words, "--workers", "1"]) == 0
     assert where.is_dir()
+
+
+def test_the_ring_says_where_the_camera_stands(
+    folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pose, out = tmp_path / "pose.toml", tmp_path / "geometry.toml"
+    assert run(["calibrate-pose", str(folders[2]), "--out", str(pose), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert abs(found["values"]["a_mm"] - 2.0) < 3 * found["sigmas"]["a_mm"]
+    assert found["sigmas"]["camera_pitch_deg"] < 0.01
+    words = ["calibrate", *map(str, folders[::2]), "--prior", str(pose), "--out", str(out), "--json", "--no-pictures"]
+    assert run(words) == 0
+    report = json.loads(capsys.readouterr().out)
+    pitch = next(row for row in report["parameters"] if row["name"] == "camera_pitch_deg")
+    assert pitch["sigma_before"] == found["sigmas"]["camera_pitch_deg"]
+    assert abs(pitch["value"]) < 4 * pitch["sigma_before"]  # the pose is now what is stated
 
 
 def test_a_rejected_calibration_leaves_the_old_geometry(

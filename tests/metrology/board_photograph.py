@@ -7,8 +7,21 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.float64]
+Image = NDArray[np.uint8]
+# about the axes of the board, in degrees
+_TURNS_DEG = (
+    (0, 0, 0),
+    (35, 0, 5),
+    (-35, 5, 0),
+    (0, 35, -5),
+    (5, -35, 90),
+    (25, 25, 10),
+    (-25, 25, 180),
+    (20, -30, 3),
+)
 _SIDE = 2  # rays a pixel, each way
 
 
@@ -67,3 +80,17 @@ class Photographer:
                 (yd - p1 * (r2 + 2 * y * y) - 2 * p2 * x * y) / radial,
             )
         return x, y
+
+
+def photographs(
+    camera: Photographer, picture: NDArray[np.uint8], unit_px: float, count: int, seed: int
+) -> list[Image]:
+    """The picture turned this way and that, some 26 units away."""
+    rng = np.random.default_rng(seed)
+    middle = np.array([picture.shape[1], picture.shape[0], 0.0]) / (2 * unit_px)
+    out = []
+    for degrees in _TURNS_DEG[:count]:
+        turn = Rotation.from_rotvec(degrees, degrees=True).as_matrix()
+        shift = np.array([*rng.uniform(-0.6, 0.6, 2), rng.uniform(24, 28)]) - turn @ middle
+        out.append(camera.take(picture, unit_px, turn, shift, rng))
+    return out

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
-from board_photograph import Photographer
+from board_photograph import Photographer, photographs
 
 from membrane_ctrl.config import CameraConfig
 from membrane_ctrl.metrology.calibrate.board import Board, on_screen
@@ -17,28 +16,6 @@ STATED = CameraConfig(width_px=408, height_px=342, pixel_um=20.7, focal_mm=16.0)
 TRUE = Photographer(408, 342, 781.3, (206.9, 167.4), (-0.12, 0.08, 4e-4, -6e-4))
 BOARD = Board.parse("charuco:11x9")
 SQUARE_PX = 48
-TURNS_DEG = (
-    (0, 0, 0),
-    (35, 0, 5),
-    (-35, 5, 0),
-    (0, 35, -5),
-    (5, -35, 90),
-    (25, 25, 10),
-    (-25, 25, 180),
-    (20, -30, 3),
-)
-
-
-def photographs(camera: Photographer, board: Board, count: int, seed: int) -> list[np.ndarray]:
-    rng = np.random.default_rng(seed)
-    picture = board.draw(SQUARE_PX)
-    middle = np.array([board.columns / 2, board.rows / 2, 0.0])
-    out = []
-    for degrees in TURNS_DEG[:count]:
-        turn = cv2.Rodrigues(np.radians(np.array(degrees, float)))[0]
-        shift = np.array([*rng.uniform(-0.6, 0.6, 2), rng.uniform(24, 28)]) - turn @ middle
-        out.append(camera.take(picture, SQUARE_PX, turn, shift, rng))
-    return out
 
 
 def views_of(board: Board, images: list[np.ndarray]) -> list[View]:
@@ -47,7 +24,7 @@ def views_of(board: Board, images: list[np.ndarray]) -> list[View]:
 
 @pytest.fixture(scope="module")
 def views() -> list[View]:
-    return views_of(BOARD, photographs(TRUE, BOARD, len(TURNS_DEG), 1))
+    return views_of(BOARD, photographs(TRUE, BOARD.draw(SQUARE_PX), SQUARE_PX, 8, 1))
 
 
 def test_the_lens_is_found_within_its_sigmas(views: list[View]) -> None:
@@ -64,7 +41,7 @@ def test_the_lens_is_found_within_its_sigmas(views: list[View]) -> None:
 
 def test_a_plain_chessboard_says_the_same() -> None:
     board = Board.parse("chessboard:11x9")
-    lens = calibrate_lens(views_of(board, photographs(TRUE, board, 5, 2)), STATED)
+    lens = calibrate_lens(views_of(board, photographs(TRUE, board.draw(SQUARE_PX), SQUARE_PX, 5, 2)), STATED)
     assert lens.focal_px == pytest.approx(TRUE.focal_px, rel=3e-3)
 
 

@@ -95,6 +95,22 @@ def test_status_for_a_person() -> None:
     assert any("unix:ann" in line for line in lines)
 
 
+def test_what_stands_until_it_is_over_is_shown() -> None:
+    picture = Picture()
+    maintenance = {"kind": "maintenance", "name": "calibrate", "message": "calibrate again: too much is left"}
+    picture.take(TickOutputs(BenchCommand(0.0, 0.0), ROW, (maintenance,), None))
+    lines = status_lines({"run": "r", **picture.status()})
+    assert any(line.split(maxsplit=1) == ["maintenance", maintenance["message"]] for line in lines)
+    assert any("nothing measures with one yet" in line for line in lines)
+    picture.note(
+        {"kind": "geometry", "hash": "12ab", "file": "g.toml", "calibrated_utc": "2026-01-02", "message": ""}
+    )
+    picture.note({"kind": "maintenance_over", "name": "calibrate", "message": "the geometry fits again"})
+    lines = status_lines({"run": "r", **picture.status()})
+    assert not any("maintenance" in line for line in lines)
+    assert "  geometry       g.toml, calibrated 2026-01-02 (hash 12ab)" in lines
+
+
 def test_nobody_there_is_one_line_and_exit_code_4(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["ctl", "status", "--socket", str(tmp_path / "control.sock")]) == 4
     assert "no hold is listening there" in capsys.readouterr().err

@@ -1,0 +1,120 @@
+"""The calibrate-camera and calibrate-board commands, from pictures to a prior that calibrate takes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from board_photograph import Photographer, photographs
+
+from membrane_ctrl.cli import run
+from membrane_ctrl.config import CameraConfig, OpticsConfig
+from membrane_ctrl.errors import InputError
+from membrane_ctrl.prior_file import read_prior
+
+CONFIG = """
+[optics.camera]
+width_px = 408
+height_px = 342
+pixel_um = 20.7
+focal_mm = 16.0
+"""
+TRUE = Photographer(408, 342, 781.3, (206.9, 167.4), (-0.12, 0.08, 4e-4, -6e-4))
+SQUARE_PX = 48
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A configuration, and photographs of the board as `calibrate-board` draws it."""
+    root = tmp_path_factory.mktemp("camera")
+    (root / "lab.toml").write_text(CONFIG)
+    size = ["--width-px", str(11 * SQUARE_PX), "--height-px", str(9 * SQUARE_PX), "--square-px", str(SQUARE_PX)]
+    assert run(["calibrate-board", str(root / "board.png"), *size, "--board", "charuco:11x9"]) == 0
+    picture = np.asarray(cv2.imread(str(root / "board.png"), cv2.IMREAD_UNCHANGED), np.uint8)
+    (root / "photographs").mkdir()
+    for k, image in enumerate(photographs(TRUE, picture, SQUARE_PX, 6, 3)):
+        deep = image.astype(np.uint16) * 16 if k == 2 else image  # a 12-bit camera's picture among the others
+        cv2.imwrite(str(root / "photographs" / f"{k}.png"), deep)
+    cv2.imwrite(str(root / "photographs" / "wall.png"), np.full((342, 408), 77, np.uint8))
+    return root
+
+
+def words(bench: Path, out: Path, board: str = "charuco:11x9") -> list[str]:
+    names = ["--config", str(bench / "lab.toml"), "--board", board, "--out", str(out)]
+    return ["calibrate-camera", str(bench / "photographs"), *names]
+
+
+def test_from_photographs_to_a_prior(bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "camera.toml"
+    assert run([*words(bench, out), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["left_out"] == ["wall.png"]
+    prior = read_prior(out)
+    assert prior.content.sigmas == report["sigmas"]
+    camera = CameraConfig(width_px=408, height_px=342, pixel_um=20.7, noise_adu=0.7)
+    found = prior.over(OpticsConfig(camera=camera)).camera
+    assert found.noise_adu == 0.7
+    focal_px = found.focal_mm / 20.7e-3
+    assert abs(focal_px - TRUE.focal_px) < 5 * focal_px * report["sigmas"]["focal_relative"]
+    with pytest.raises(InputError, match="a calibrated lens is good for its own camera alone"):
+        prior.over(OpticsConfig())
+
+
+def test_what_was_gained_is_said(bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(words(bench, tmp_path / "camera.toml")) == 0
+    said = capsys.readouterr().out
+    assert "known before" in said
+    assert "left out, no board or a bad fit: wall.png" in said
+    assert f"calibrate --prior {tmp_path / 'camera.toml'}" in said
+
+
+def test_bad_input_is_one_line(bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "camera.toml"
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    cases = (
+        (["calibrate-camera", str(empty)], 2, "holds no photographs"),
+        (["calibrate-camera", str(tmp_path / "none")], 2, "no such folder"),
+        (["calibrate-camera", str(bench / "photographs")], 2, "408 x 342 pixels, the configuration's optics.camera"),
+        (words(bench, out, "charuco:9x11"), 3, "at least 4 are needed"),
+        (words(bench, out, "circles:9x11"), 2, "circles:9x11 is no board"),
+        (
+            ["calibrate-board", str(tmp_path / "b.png"), "--width-px", "90", "--height-px", "90", "--square-px", "9"],
+            2,
+            "a multiple of 8",
+        ),
+        (
+            [
+                "calibrate-board",
+                str(tmp_path / "b"),
+                "--width-px",
+                "1920",
+                "--height-px",
+                "1080",
+                "--square-px",
+                "72",
+            ],
+            2,
+            "cannot be written",
+        ),
+    )
+    for arguments, code, says in cases:
+        assert run(arguments) == code, arguments
+        error = capsys.readouterr().err
+        assert says in error
+        assert len(error.splitlines()) == 1, error
+    assert not out.exists()
+
+
+def test_priors_that_are_none_are_refused(tmp_path: Path) -> None:
+    for text, says in (
+        ('schema = "membrane-geometry/1"', "a geometry goes by --geometry"),
+        ('schema = "membrane-prior/1"\n[sigmas]\nb_m = 1.0', "sigmas.b_m: not a parameter"),
+        ('schema = "membrane-prior/1"\n[sigmas]\nb_mm = 0.0', "sigmas.b_mm"),
+    ):
+        (tmp_path / "p.toml").write_text(text)
+        with pytest.raises(InputError, match=says):
+            read_prior(tmp_path / "p.toml")
