@@ -15,6 +15,7 @@ import asyncio
 import math
 import re
 
+from firmware_iface.drivers.linked_device import LinkedDevice
 from firmware_iface.drivers.step_gate import StepGate
 from firmware_iface.links.lines import LineFence, LineLink
 from firmware_iface.links.serial_port import BytePort, SerialSettings, as_port
@@ -38,7 +39,7 @@ QUALITY_AMPLIFIER_ERROR, QUALITY_OUT_OF_RANGE = 1, 2
 _STEPS_UM = {3: 1.0, 2: 10.0, 1: 100.0}  # decimals of the millimetre
 
 
-class KeyenceDlRs1a:
+class KeyenceDlRs1a(LinkedDevice):
     """A `DisplacementSensor`.
 
     Displacement = direction * (value - zero).
@@ -94,19 +95,10 @@ class KeyenceDlRs1a:
         self._errors_answer = re.compile(rf"(?:SR,{number},033,(\d{{5}})|ER,SR,(\d\d))\r\n")
         # the fence has to differ from a reading also when it is refused, as when the amplifier is pulled off: `M0`
         self._link = LineLink(as_port(port, self._settings), "\r\n", timeout_s, LineFence("M0", _ALL, _ALL_CHARS))
+        super().__init__(self._link)
         self._gate = StepGate(step_max_um)
         self._decimals = 3
         self._readings = 0
-
-    @property
-    def reconnects(self) -> int:
-        """Times the port was opened after the first."""
-        return self._link.reconnects
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until `open` will try."""
-        return self._link.retry_in_s
 
     async def open(self) -> DeviceIdentity:
         """Open the port, see that the amplifier is there and well. The unit has no settings of its own to apply.

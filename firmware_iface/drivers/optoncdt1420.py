@@ -17,6 +17,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_iface.drivers.linked_device import LinkedDevice
 from firmware_iface.drivers.optoncdt_stream import BYTES, RAW_MAX, StreamParser, distance_mm
 from firmware_iface.drivers.step_gate import StepGate
 from firmware_iface.links.serial_port import BytePort, SerialSettings, as_port
@@ -42,7 +43,7 @@ _BATCHES_MAX = 1024  # of a caller that stays away; old ones go first
 _SILENT_MAX = 3  # readings without a single value: the sensor restarted or lost its power
 
 
-class Optoncdt1420:
+class Optoncdt1420(LinkedDevice):
     """A `DisplacementSensor`.
 
     Displacement = direction * (distance - zero). The sensor stands behind the mirror: when the bowl deepens the
@@ -93,6 +94,7 @@ class Optoncdt1420:
         if (needed := 1000 * rate_khz * BYTES * settings.char_s) > 0.9:
             raise ValueError(f"baud = {baud} cannot carry rate_khz = {rate_khz:g} (line {needed:.0%} busy)")
         self._port = as_port(port, settings)
+        super().__init__(self._port)
         self._rate_khz = rate_khz
         self._range_wanted_mm, self._zero_wanted_mm = range_mm, zero_mm
         self._direction = direction
@@ -110,16 +112,6 @@ class Optoncdt1420:
         self._counted = 0
         self._arrived_s = 0.0
         self._silent = 0
-
-    @property
-    def reconnects(self) -> int:
-        """Times the port was opened after the first."""
-        return self._port.reconnects
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until `open` will try."""
-        return self._port.retry_in_s
 
     async def open(self) -> DeviceIdentity:
         """Open the port, stop the stream, check who it is, set it and read it back, start the stream.

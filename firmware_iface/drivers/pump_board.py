@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from firmware_iface.drivers.linked_device import LinkedDevice
 from firmware_iface.links.modbus_links import ModbusLinks
 from firmware_iface.links.modbus_rules import ModbusLink
 from firmware_iface.register_map import default_map
@@ -18,7 +19,7 @@ _KIND = "membrane pump board"
 _HEARTBEATS = 2**16
 
 
-class PumpBoard:
+class PumpBoard(LinkedDevice):
     """All sensors, pump and vent of the bench on one board.
 
     After a lost link (LinkDownError) call `open` again, as often as wanted: it tries when its back-off allows.
@@ -71,16 +72,7 @@ class PumpBoard:
         self._watchdog_s = watchdog_s
         self._heartbeat = 0
         self._link = link
-
-    @property
-    def reconnects(self) -> int:
-        """Connections made after the first."""
-        return self._link.reconnects
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until `open` will try to connect."""
-        return self._link.retry_in_s
+        super().__init__(self._link)
 
     async def open(self) -> BenchIdentity:
         """Connect, check kind and map version, arm the watchdog and read it back.

@@ -15,6 +15,7 @@ import math
 import re
 from dataclasses import dataclass
 
+from firmware_iface.drivers.linked_device import LinkedDevice
 from firmware_iface.links.lines import LineFence, LineLink
 from firmware_iface.links.serial_port import BytePort, SerialSettings, as_port
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
@@ -42,7 +43,7 @@ class Message:
     serial: str
 
 
-class VaisalaPtb330:
+class VaisalaPtb330(LinkedDevice):
     """A `Barometer`. A task of its own asks as fast as `period_s` says and serves the newest value.
 
     Parameters
@@ -69,22 +70,13 @@ class VaisalaPtb330:
     ) -> None:
         self._settings = SerialSettings(baud, data_bits=7, parity="E")
         self._link = LineLink(as_port(port, self._settings), "\r\n", timeout_s, LineFence("VERS", _VERSION))
+        super().__init__(self._link)
         self._period_s, self._age_max_s = period_s, age_max_s
         self._task: asyncio.Task[None] | None = None
         self._newest = Message(math.nan, -1, "")
         self._newest_s = -math.inf
         self._down: LinkDownError | None = None
         self._identity: DeviceIdentity | None = None
-
-    @property
-    def reconnects(self) -> int:
-        """Times the port was opened after the first."""
-        return self._link.reconnects
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until `open` will try."""
-        return self._link.retry_in_s
 
     async def open(self) -> DeviceIdentity:
         """Open the port, stop what it sends by itself, check who it is, set unit and format, start to ask.

@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import re
 
+from firmware_iface.drivers.linked_device import LinkedDevice
 from firmware_iface.links.lines import LineFence, LineLink
 from firmware_iface.links.serial_port import BytePort, SerialSettings, as_port
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
@@ -29,7 +30,7 @@ _NUMBER = r"-?\d+(?:\.\d+)?"
 _STEP_MW = 0.0011  # values are written with three decimals
 
 
-class Ventus:
+class Ventus(LinkedDevice):
     """A `Pump`: the fraction is that of `power_max_mw`.
 
     Parameters
@@ -55,17 +56,8 @@ class Ventus:
         fence = LineFence(f"#R{DEVICE_TYPE}", re.compile(rf"(?:#S[^\n]*\n)*#R{DEVICE_TYPE},({_NUMBER})\r?\n"))
         self._settings = SerialSettings(115_200)
         self._link = LineLink(as_port(port, self._settings), "\n", timeout_s, fence)
+        super().__init__(self._link)
         self._commanded_mw = 0.0
-
-    @property
-    def reconnects(self) -> int:
-        """Times the port was opened after the first."""
-        return self._link.reconnects
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until `open` will try."""
-        return self._link.retry_in_s
 
     async def open(self) -> DeviceIdentity:
         """Open the port, stop the pump, check who it is, apply the settings and read them back.
