@@ -14,12 +14,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import tomli_w
 
 from membrane_ctrl import __version__, config_file
 from membrane_ctrl.config import Config
+from membrane_ctrl.controller_memory import UnknownMemoryError
 from membrane_ctrl.errors import InputError
+from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.recorded_run import RecordedRun
 from membrane_ctrl.recording.inputs_file import Frame, InputsFile, InputsReader
@@ -44,17 +45,21 @@ class Incident:
     expected: list[Decision]
 
 
-def write_incident(run: RecordedRun, found: Replay, name: str, to_s: float, incidents: Path = INCIDENTS) -> Path:
+def write_incident(
+    run: RecordedRun, found: Replay, name: str, begin: int, to_s: float, incidents: Path = INCIDENTS
+) -> Path:
     """Make a test of a replay.
 
     Parameters
     ----------
     run : RecordedRun
-        Its inputs are copied from its first tick on (a controller has a memory) to `to_s`.
+        Its inputs are copied.
     found : Replay
         Its decisions are what the test expects.
     name : str
         Of the folder: small letters, digits, dash and underscore.
+    begin : int
+        Tick the test begins with: the run's first, or one that has the controller's memory with it.
     to_s : float
         Where the test ends.
     incidents : Path
@@ -74,8 +79,8 @@ def write_incident(run: RecordedRun, found: Replay, name: str, to_s: float, inci
         raise InputError(f"{folder}: is there already; choose another name")
     folder.mkdir()
     file = InputsFile(folder, __version__)
-    for frame in _until(run.inputs, to_s):
-        file.append(TickBatch(frame.records, frame.tails), list(frame.estimates.values()))
+    for frame in _between(run.inputs.since(found.begin_s), begin, to_s):
+        file.append(TickBatch(frame.records, frame.tails, frame.memories), list(frame.estimates.values()))
     file.close()
     about = {
         "schema": SCHEMA,
@@ -90,16 +95,22 @@ def write_incident(run: RecordedRun, found: Replay, name: str, to_s: float, inci
         for path in folder.iterdir():
             path.unlink()
         folder.rmdir()
-        raise InputError(f"--to-test: {size / 1e6:.0f} MB is too much for a test; end it earlier with --to")
+        raise InputError(f"--to-test: {size / 1e6:.0f} MB is too much for a test; narrow it with --from and --to")
     return folder
 
 
-def _until(frames: InputsReader, to_s: float) -> Iterator[Frame]:
+def _between(frames: InputsReader, begin: int, to_s: float) -> Iterator[Frame]:
+    before: dict[float, ShapeEstimate] = {}  # a shape may have come a frame ahead of the tick that used it
     for frame in frames:
-        wanted = frame.records["now_s"] <= to_s
-        if not np.any(wanted) and len(frame.records):
+        if len(frame.records) and frame.records["now_s"][0] > to_s:
             return
-        yield Frame(frame.records[wanted], frame.tails, frame.estimates)
+        wanted = (frame.records["now_s"] <= to_s) & (frame.records["tick"] >= begin)
+        ticks = set(frame.records["tick"][wanted].tolist())
+        tails = {tick: tail for tick, tail in frame.tails.items() if tick in ticks}
+        memories = {tick: memory for tick, memory in frame.memories.items() if tick == begin}
+        if ticks:
+            yield Frame(frame.records[wanted], tails, memories, before | frame.estimates)
+        before = {} if ticks else frame.estimates
 
 
 def read_incident(folder: Path) -> Incident:
@@ -116,5 +127,9 @@ def check_incident(incident: Incident) -> list[str]:
     """Replay an incident; where today's decisions are not the expected ones, as sentences."""
     inputs = InputsReader(incident.folder)
     config = config_file.load(incident.folder / "config.toml", Config)
-    found = replay(config, recorded_ticks(inputs), zernike_projection(), 0.0, math.inf)
+    begin = next((int(frame.records["tick"][0]) for frame in inputs if len(frame.records)), 1)
+    try:
+        found = replay(config, recorded_ticks(inputs, begin), zernike_projection(), 0.0, math.inf)
+    except UnknownMemoryError as error:
+        return [f"{error}: make the incident again from its run"]
     return [*inputs.damage, *unmatched(incident.expected, found.decisions, _SLACK_S)]

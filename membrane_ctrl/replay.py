@@ -1,7 +1,8 @@
 """Replay: the recorded inputs of a run through today's control code, on the run's own clock.
 
 A tick is a pure function of its inputs and of the ticks before it, so the same code gives the same outputs to the
-last bit; what differs is a change of the code. Each tick's outputs are compared by their checksum. Where ticks are
+last bit; what differs is a change of the code. A replay begins with the run, or in the middle of it with a recorded
+memory of the controller (`controller_memory`). Each tick's outputs are compared by their checksum. Where ticks are
 missing in the record, what follows starts from a controller that missed them, too: from there on only decisions
 (states, faults) are compared.
 """
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.config import Config
 from membrane_ctrl.controller import Controller
+from membrane_ctrl.controller_memory import recall
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.recording.inputs_file import Frame
@@ -40,11 +42,12 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class RecordedTick:
-    """One tick of the record: its inputs, and the checksum of what came out of it."""
+    """One tick of the record: its inputs, the checksum of what came out of it, what was remembered before it."""
 
     tick: int
     inputs: TickInputs
     output_crc: int
+    memory: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +66,8 @@ class Replay:
 
     Attributes
     ----------
+    begin_s : float
+        Time of the first tick replayed.
     ticks : int
         Replayed.
     compared : int
@@ -80,6 +85,7 @@ class Replay:
         How today's code ended the run.
     """
 
+    begin_s: float = math.nan
     ticks: int = 0
     compared: int = 0
     different: int = 0
@@ -104,11 +110,16 @@ def replay(
     config : Config
         As the run had it.
     record : iterable
-        From the run's first tick on: a controller has a memory.
+        From the run's first tick on, or from one that has its memory with it.
     sag_sensitivity : (36,) array
         See `Controller`.
     from_s, to_s : float
         What is compared bit by bit; ticks before it run all the same.
+
+    Raises
+    ------
+    UnknownMemoryError
+        The record begins with a memory that today's code cannot take up.
     """
     controller = Controller(config, sag_sensitivity)
     found = Replay()
@@ -119,6 +130,10 @@ def replay(
             continue
         if item.inputs.now_s > to_s or found.finished is not None:
             break
+        if not found.ticks:
+            found.begin_s = item.inputs.now_s
+            if item.tick > 1 and item.memory:
+                controller = recall(item.memory, controller)
         outputs = controller.tick(item.inputs)
         found.ticks += 1
         found.last_s = item.inputs.now_s
@@ -147,13 +162,25 @@ def decisions_of(events: Iterable[Event], time_s: float | None = None) -> list[D
     ]
 
 
-def recorded_ticks(frames: Iterable[Frame]) -> Iterator[RecordedTick | Gap]:
-    """The ticks of a record in order, and a `Gap` wherever some are missing."""
+def tick_to_begin_with(frames: Iterable[Frame], from_s: float) -> int:
+    """The last tick before a time of the run that has its memory with it; 1 if there is none."""
+    begin = 1
+    for frame in frames:
+        for record in frame.records[np.isin(frame.records["tick"], list(frame.memories))]:
+            if record["now_s"] <= from_s:
+                begin = int(record["tick"])
+        if len(frame.records) and frame.records["now_s"][-1] > from_s:
+            break
+    return begin
+
+
+def recorded_ticks(frames: Iterable[Frame], begin: int = 1) -> Iterator[RecordedTick | Gap]:
+    """The ticks of a record in order from the tick `begin` on, and a `Gap` wherever some are missing."""
     estimates: dict[float, ShapeEstimate] = {}
-    last, last_s = 0, 0.0
+    last, last_s = begin - 1, 0.0
     for frame in frames:
         estimates |= frame.estimates
-        for record in frame.records:
+        for record in frame.records[frame.records["tick"] >= begin]:
             tick = int(record["tick"])
             try:
                 inputs = unpack_tick(record, frame.tails.get(tick, b""), estimates)
@@ -162,7 +189,7 @@ def recorded_ticks(frames: Iterable[Frame]) -> Iterator[RecordedTick | Gap]:
             else:
                 if tick > last + 1:
                     yield Gap(last, last_s, tick - last - 1, "not recorded")
-                yield RecordedTick(tick, inputs, int(record["output_crc"]))
+                yield RecordedTick(tick, inputs, int(record["output_crc"]), frame.memories.get(tick, b""))
             last, last_s = tick, float(record["now_s"])
         while len(estimates) > _SHAPES_KEPT:
             del estimates[next(iter(estimates))]

@@ -9,11 +9,12 @@ import time
 from pathlib import Path
 from typing import Any
 
+from membrane_ctrl.controller_memory import UnknownMemoryError
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.incident import write_incident
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.recorded_run import RecordedRun, open_run
-from membrane_ctrl.replay import Replay, differing_fields, recorded_ticks, replay, unmatched
+from membrane_ctrl.replay import Replay, differing_fields, recorded_ticks, replay, tick_to_begin_with, unmatched
 
 # An event is stamped when it is told, at the end of its tick.
 DECISION_SLACK_S = 0.5
@@ -28,9 +29,9 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
         Not a run that can be replayed, or (with `to_test`) a name that is taken.
     """
     run = open_run(folder)
-    begin = time.perf_counter()
-    found = replay(run.config, recorded_ticks(run.inputs), zernike_projection(), from_s, to_s)
-    took_s = time.perf_counter() - begin
+    started_s = time.perf_counter()
+    begin, found = _replayed(run, from_s, to_s)
+    took_s = time.perf_counter() - started_s
     report = _report(run, found, to_s)
     if as_json:
         print(json.dumps(report))
@@ -39,16 +40,30 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
     rate = found.ticks / took_s if took_s else math.inf
     print(f"{found.ticks} ticks in {took_s:.1f} s ({rate:.0f} a second)", file=sys.stderr)
     if to_test is not None:
-        target = write_incident(run, found, to_test, to_s)
+        target = write_incident(run, found, to_test, begin, to_s)
         print(f"written: {target}; say in its incident.toml what happened", file=sys.stderr)
     return int(Exit.DONE if report["verdict"] == "identical" else Exit.REJECTED)
+
+
+def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, Replay]:
+    """Begin at the last memory before `from_s`; with the run, if there is none or it is not of today's layout."""
+    inputs = run.inputs.since(from_s)
+    begin = tick_to_begin_with(inputs, from_s)
+    if begin > 1:
+        try:
+            return begin, replay(run.config, recorded_ticks(inputs, begin), zernike_projection(), from_s, to_s)
+        except UnknownMemoryError as error:
+            print(f"from the run's start: {error}", file=sys.stderr)
+        finally:
+            run.inputs.program = inputs.program
+    return 1, replay(run.config, recorded_ticks(run.inputs), zernike_projection(), from_s, to_s)
 
 
 def _report(run: RecordedRun, found: Replay, to_s: float) -> dict[str, Any]:
     # where the log or the inputs end early, nothing is said of what came then
     end_s = min(to_s, run.told_until_s, found.last_s)
     today = [decision for decision in found.decisions if decision.time_s <= end_s]
-    recorded = [decision for decision in run.decisions if decision.time_s <= end_s + DECISION_SLACK_S]
+    recorded = [d for d in run.decisions if found.begin_s <= d.time_s <= end_s + DECISION_SLACK_S]
     in_time = sum(decision.time_s <= end_s for decision in recorded)
     decisions = unmatched(recorded[: max(in_time, len(today))], today, DECISION_SLACK_S)
     first = found.first_different
@@ -58,6 +73,7 @@ def _report(run: RecordedRun, found: Replay, to_s: float) -> dict[str, Any]:
     return {
         "verdict": _verdict(found, bool(decisions), bool(run.inputs.damage)),
         "recorded_by": run.inputs.program,
+        "begin_s": found.begin_s,
         "ticks": found.ticks,
         "compared": found.compared,
         "different": found.different,
@@ -82,6 +98,8 @@ def _lines(report: dict[str, Any]) -> list[str]:
     """What a person wants to read."""
     lines = [f"verdict    {report['verdict']}: {report['compared']} of {report['ticks']} ticks compared bit by bit"]
     lines.append(f"recorded   by {report['recorded_by'] or 'an unknown program'}")
+    if report["begin_s"] > 1.0:
+        lines.append(f"begins     at {report['begin_s']:.2f} s, with the controller's recorded memory")
     first = report["first_different"]
     if first is not None:
         lines.append(

@@ -18,6 +18,7 @@ from firmware_iface.roles import Bench, BenchCommand, BenchReading, LinkDownErro
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.commands import Command
 from membrane_ctrl.controller import Controller
+from membrane_ctrl.controller_memory import remember
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.ipc.ring import RingReader, RingWriter
@@ -27,6 +28,9 @@ from membrane_ctrl.tick_record import pack_tick
 
 # Looking after a child costs a system call; half a second late is soon enough, the loop does not need them
 _CHILD_WATCH_S = 0.5
+# A replay has to run through half of this on the way to its part, in some seconds; a memory takes half a millisecond
+# of a tick and 8 kB
+MEMORY_EVERY_S = 600.0
 
 
 @dataclass(slots=True)
@@ -72,6 +76,7 @@ class Supervisor:
         self._inputs_error = ""
         self._dead: set[str] = set()
         self._next_watch_s = 0.0
+        self._next_memory_s = MEMORY_EVERY_S
         self._vent_fraction = 0.0
         self.ticks = 0
         self.missed_ticks = 0
@@ -134,26 +139,34 @@ class Supervisor:
             truth_displacement_um=truth_um,
             truth_laser_bias_um=bias_um,
         )
+        memory = self._remember(now_s)
         outputs = self._controller.tick(inputs)
         self._vent_fraction = outputs.command.vent_fraction
         if outputs.clear_board:
             await self._clear_board()
         await self._write(outputs.command)
-        self._record(inputs, outputs)
+        self._record(inputs, outputs, memory)
         for event in outputs.events:
             self.tell(event)
         for hear in wiring.heard:
             hear(outputs)
         return outputs.finished
 
-    def _record(self, inputs: TickInputs, outputs: TickOutputs) -> None:
+    def _remember(self, now_s: float) -> bytes:
+        """Now and then the controller's memory, so that a replay need not begin with the run."""
+        if self._wiring.inputs is None or now_s < self._next_memory_s:
+            return b""
+        self._next_memory_s = now_s + MEMORY_EVERY_S
+        return remember(self._controller)
+
+    def _record(self, inputs: TickInputs, outputs: TickOutputs, memory: bytes) -> None:
         """The row for people, the inputs for a replay; a value of a wrong kind costs the replay, not the run."""
         row = outputs.row.pack()
         self._wiring.telemetry.put(row)
         if self._wiring.inputs is None:
             return
         try:
-            messages = pack_tick(self.ticks, inputs, outputs, row)
+            messages = pack_tick(self.ticks, inputs, outputs, row, memory)
         except (struct.error, TypeError, ValueError) as error:
             if not self._inputs_error:
                 self._inputs_error = str(error)

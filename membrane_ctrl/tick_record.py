@@ -26,7 +26,7 @@ from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.tick import TickInputs, TickOutputs
 
 # First bytes of the messages of the inputs ring.
-TICK, PIECE = b"T", b"P"
+TICK, PIECE, MEMORY = b"T", b"P", b"M"
 MESSAGE_BYTES = 512  # a slot of the ring: a tick takes less, a longer command comes in pieces
 
 _FORMATS = {
@@ -55,7 +55,7 @@ _reading_values = attrgetter(*_READING)  # ten times as fast as `astuple`
 _NO_READING = tuple(0 if name in _FORMATS else math.nan for name in _READING)
 
 
-def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes) -> list[bytes]:
+def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes, memory: bytes = b"") -> list[bytes]:
     """Messages for the inputs ring, in their order; the last one is the tick.
 
     Parameters
@@ -66,6 +66,8 @@ def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes) -
         Of `Controller.tick`.
     row : bytes
         The outputs' telemetry row, packed: it has been packed for its own ring already.
+    memory : bytes
+        The controller's memory before this tick, if a replay shall be able to begin with it.
     """
     tail = _tail(inputs)
     reading, estimate = inputs.reading, inputs.estimate
@@ -83,9 +85,12 @@ def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes) -
         output_crc(outputs, row),
         len(tail),
     )
-    step = MESSAGE_BYTES - len(PIECE)
-    pieces = [PIECE + tail[start : start + step] for start in range(0, len(tail), step)]
-    return [*pieces, TICK + record]
+    return [*_pieces(MEMORY, memory), *_pieces(PIECE, tail), TICK + record]
+
+
+def _pieces(kind: bytes, data: bytes) -> list[bytes]:
+    step = MESSAGE_BYTES - len(kind)
+    return [kind + data[start : start + step] for start in range(0, len(data), step)]
 
 
 def output_crc(outputs: TickOutputs, row: bytes) -> int:
@@ -146,10 +151,11 @@ def unpack_tick(record: np.void, tail: bytes, estimates: Mapping[float, ShapeEst
 
 @dataclass(frozen=True, slots=True)
 class TickBatch:
-    """Ticks taken from the ring, and the tails of those that have one."""
+    """Ticks taken from the ring, and the tails and memories of those that have one."""
 
     records: Records
     tails: dict[int, bytes]
+    memories: dict[int, bytes]
 
 
 class TickAssembler:
@@ -157,20 +163,24 @@ class TickAssembler:
 
     def __init__(self) -> None:
         self._pieces: list[bytes] = []
+        self._memory: list[bytes] = []
 
     def take(self, messages: list[bytes]) -> TickBatch:
         """Take in messages in their order; a tick may end in a later call than its pieces begin."""
         ticks: list[bytes] = []
         tails: dict[int, bytes] = {}
+        memories: dict[int, bytes] = {}
         for message in messages:
-            if message[:1] == PIECE:
-                self._pieces.append(message[1:])
-                continue
-            ticks.append(message[1:])
-            if self._pieces:
-                tails[int.from_bytes(message[1:9], "little")] = b"".join(self._pieces)
-                self._pieces = []
-        return TickBatch(np.frombuffer(b"".join(ticks), dtype=RECORD), tails)
+            if message[:1] == TICK:
+                ticks.append(message[1:])
+                tick = int.from_bytes(message[1:9], "little")
+                for pieces, wholes in ((self._pieces, tails), (self._memory, memories)):
+                    if pieces:
+                        wholes[tick] = b"".join(pieces)
+                        pieces.clear()
+            else:
+                (self._memory if message[:1] == MEMORY else self._pieces).append(message[1:])
+        return TickBatch(np.frombuffer(b"".join(ticks), dtype=RECORD), tails, memories)
 
 
 _ARRAYS = ("coeffs_um", "covariance_um2")

@@ -241,7 +241,7 @@ def test_an_incident_too_large_for_a_repository_is_refused_and_leaves_nothing(
     monkeypatch.setattr("membrane_ctrl.incident._BYTES_MAX", 1000)
     (tmp_path / "tests" / "incidents").mkdir(parents=True)
     assert run(["replay", str(record), "--to-test", "long"]) == Exit.BAD_INPUT
-    assert "end it earlier with --to" in capsys.readouterr().err
+    assert "narrow it with --from and --to" in capsys.readouterr().err
     assert not list((tmp_path / "tests" / "incidents").iterdir())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from synthetic_shape import shape_at
 from firmware_iface.roles import BenchReading
 from membrane_ctrl import __version__, config_file
 from membrane_ctrl.config import Config, TwinConfig
+from membrane_ctrl.controller import Controller
+from membrane_ctrl.controller_memory import remember
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.recording.inputs_file import InputsFile
 from membrane_ctrl.tick import TickInputs, TickOutputs
@@ -27,7 +30,20 @@ def kept_ticks(duration_s: float, alter: Alter | None = None) -> list[tuple[Tick
     return [(tick.inputs, tick.outputs) for tick in run]
 
 
-def write_record(folder: Path, ticks: list[tuple[TickInputs, TickOutputs]], lost: range = range(0)) -> None:
+def memory_at(ticks: list[tuple[TickInputs, TickOutputs]], tick: int) -> bytes:
+    """What the run's controller remembered before a tick."""
+    controller = Controller(CONFIG, zernike_projection())
+    for inputs, _ in ticks[: tick - 1]:
+        controller.tick(inputs)
+    return remember(controller)
+
+
+def write_record(
+    folder: Path,
+    ticks: list[tuple[TickInputs, TickOutputs]],
+    lost: range = range(0),
+    memories: Mapping[int, bytes] | None = None,
+) -> None:
     """The run's folder: configuration, inputs a frame a second, events; ticks of `lost` are not in it."""
     (folder / "config.toml").write_text(config_file.dump(CONFIG))
     file, assembler = InputsFile(folder, __version__), TickAssembler()
@@ -37,7 +53,7 @@ def write_record(folder: Path, ticks: list[tuple[TickInputs, TickOutputs]], lost
         shapes = []
         for place, (inputs, outputs) in enumerate(ticks[first : first + 50], start=first + 1):
             if place not in lost:
-                messages += pack_tick(place, inputs, outputs, outputs.row.pack())
+                messages += pack_tick(place, inputs, outputs, outputs.row.pack(), (memories or {}).get(place, b""))
             if inputs.estimate is not None:
                 shapes.append(inputs.estimate)
             lines += [json.dumps({"mono_s": inputs.now_s + 1e-4, **event}) for event in outputs.events]

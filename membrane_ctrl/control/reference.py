@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,8 @@ class ReferenceMean:
 
     def __init__(self) -> None:
         self._taken: list[ShapeEstimate] = []
+        self.coeffs_um: NDArray[np.float64] = np.empty(0)
+        self.displacement_um = self.time_s = math.nan
 
     @property
     def wanted(self) -> int:
@@ -36,6 +40,6 @@ class ReferenceMean:
     def take(self, estimate: ShapeEstimate) -> None:
         """Take one more."""
         self._taken.append(estimate)
-        self.coeffs_um: NDArray[np.float64] = np.mean([e.coeffs_um for e in self._taken], axis=0)
+        self.coeffs_um = np.mean([e.coeffs_um for e in self._taken], axis=0)
         self.displacement_um = float(np.mean([e.displacement_um for e in self._taken]))
         self.time_s = float(np.mean([e.time_s for e in self._taken]))

@@ -27,7 +27,8 @@ _MAGIC = b"MBRNin01"
 _HEAD = struct.Struct("<8sII")  # magic, bytes that follow, their CRC-32
 _COUNT = struct.Struct("<I")
 _PART = struct.Struct("<cqI")  # kind, tick, bytes that follow
-_TAIL, _SHAPE = b"C", b"S"
+_TAIL, _SHAPE, _MEMORY = b"C", b"S", b"M"
+_LOOK_BYTES = 1 << 20  # holds a first frame, whatever is in it
 
 
 class InputsFile:
@@ -57,6 +58,7 @@ class InputsFile:
             return
         descriptor = self._descriptor_at(now_s)
         parts = [(_TAIL, tick, tail) for tick, tail in batch.tails.items()]
+        parts += [(_MEMORY, tick, memory) for tick, memory in batch.memories.items()]
         parts += [(_SHAPE, 0, pack_estimate(shape)) for shape in shapes]
         body = _COUNT.pack(len(batch.records)) + encode_columns(batch.records)
         body += b"".join(_PART.pack(kind, tick, len(data)) + data for kind, tick, data in parts)
@@ -94,10 +96,11 @@ def _write_all(descriptor: int, data: bytes) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """About a second of a run: ticks by number, tails by tick, shape estimates by time."""
+    """About a second of a run: ticks by number, tails and memories by tick, shape estimates by time."""
 
     records: Records
     tails: dict[int, bytes]
+    memories: dict[int, bytes]
     estimates: dict[float, ShapeEstimate]
 
 
@@ -118,6 +121,7 @@ class InputsReader:
     """
 
     def __init__(self, folder: Path) -> None:
+        self._folder = folder
         self.paths = sorted(folder.glob("inputs-*.bin"))
         self.program = ""
         self.damage: list[str] = []
@@ -135,7 +139,23 @@ class InputsReader:
                 fresh = frame.records[frame.records["tick"] > last]
                 if len(fresh):
                     last = int(fresh["tick"][-1])
-                yield Frame(fresh, frame.tails, frame.estimates)
+                yield Frame(fresh, frame.tails, frame.memories, frame.estimates)
+
+    def since(self, time_s: float) -> InputsReader:
+        """A reader that begins a file or two before this time of the run."""
+        found = InputsReader(self._folder)
+        begun = [place for place, path in enumerate(self.paths) if found._first_s(path) <= time_s]
+        found.paths = self.paths[max(0, max(begun, default=0) - 1) :]
+        found.damage.clear()  # it is told again when the file is read
+        return found
+
+    def _first_s(self, path: Path) -> float:
+        with path.open("rb") as file:
+            data = file.read(_LOOK_BYTES)
+        kind = self._kind_of(data, path.name)
+        body = next(self._bodies(data, path.name), None)
+        frame = None if kind is None or body is None else _frame_of(body, kind)
+        return math.inf if frame is None or not len(frame.records) else float(frame.records["now_s"][0])
 
     def _kind_of(self, data: bytes, name: str) -> np.dtype[np.void] | None:
         """The file's own record: one of an older program may lack a field, one of a newer have more."""
@@ -187,13 +207,15 @@ def _frame_of(body: bytes, kind: np.dtype[np.void]) -> Frame:
     (count,) = _COUNT.unpack_from(body)
     records, taken = decode_columns(body[_COUNT.size :], kind, count)
     place = _COUNT.size + taken
-    frame = Frame(_known_fields(records), {}, {})
+    frame = Frame(_known_fields(records), {}, {}, {})
     while place < len(body):
         part, tick, length = _PART.unpack_from(body, place)
         data = body[place + _PART.size : place + _PART.size + length]
         place += _PART.size + length
         if part == _TAIL:
             frame.tails[tick] = data
+        elif part == _MEMORY:
+            frame.memories[tick] = data
         elif part == _SHAPE:
             estimate = unpack_estimate(data)
             frame.estimates[estimate.time_s] = estimate
