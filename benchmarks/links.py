@@ -19,10 +19,13 @@ from functools import partial
 from typing import Any
 
 from benchmarks.figures import Figure, at_least, at_most
+from firmware_iface.drivers.bronkhorst import BronkhorstFlow
+from firmware_iface.drivers.bronkhorst_propar import ProparParameters
 from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
 from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
 from firmware_iface.drivers.ventus import Ventus
+from firmware_iface.emulators.bronkhorst import Instrument, ProparDevice
 from firmware_iface.emulators.keyence_dl_rs1a import KeyenceDlRs1aEmulator
 from firmware_iface.emulators.modbus_rtu import RtuBusEmulator
 from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer, respond
@@ -36,7 +39,7 @@ from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.modbus_rules import ModbusLink
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp
 from firmware_iface.links.serial_port import SerialSettings
-from firmware_iface.roles import Device, DisplacementSensor, LinkDownError, LinkError
+from firmware_iface.roles import Device, DisplacementSensor, LinkDownError, LinkError, Pump
 
 TIMEOUT_S = 0.05
 TCP_TIMEOUT_S = 0.01  # of real time
@@ -233,10 +236,32 @@ async def _displacements(
 
 
 async def _ventus(transactions: int, audit: Audit, seed: int) -> None:
-    """A command that was confirmed has to be what drives the gas."""
-    dice, driven = random.Random(seed), [0.0]
+    """A disc pump; its power has three decimals."""
+    driven = [0.0]
     emulator = VentusEmulator(lambda fraction: driven.__setitem__(0, fraction), seed=seed)
-    driver = Ventus(MemoryWire(emulator), timeout_s=TIMEOUT_S)
+    await _pump(Ventus(MemoryWire(emulator), timeout_s=TIMEOUT_S), emulator, driven, 1e-5, transactions, audit, seed)
+
+
+async def _propar(transactions: int, audit: Audit, seed: int) -> None:
+    """A flow controller with steps of 1/32000, on a line without checksums."""
+    driven = [0.0]
+    flow = Instrument("DMFC", "M1", 360.0, "mln/min", actuate=lambda fraction: driven.__setitem__(0, fraction))
+    emulator = ProparDevice(flow, SerialSettings(38_400), seed=seed)
+    driver = BronkhorstFlow(ProparParameters(MemoryWire(emulator), timeout_s=TIMEOUT_S))
+    await _pump(driver, emulator, driven, 1 / 32_000, transactions, audit, seed)
+
+
+async def _pump(
+    driver: Pump,
+    emulator: SerialDevice,
+    driven: list[float],
+    tolerance: float,
+    transactions: int,
+    audit: Audit,
+    seed: int,
+) -> None:
+    """A command that was confirmed has to be what drives the gas (`driven[0]`, 0..1)."""
+    dice = random.Random(seed)
     await driver.open()
     emulator.draw_faults = random_faults(seed)
     while audit.transactions < transactions:
@@ -254,7 +279,7 @@ async def _ventus(transactions: int, audit: Audit, seed: int) -> None:
         except LinkError:
             audit.refused += 1
         else:
-            audit.judge(abs(fraction - driven[0]), 1e-5)
+            audit.judge(abs(fraction - driven[0]), tolerance)
     await driver.close()
 
 
@@ -297,6 +322,7 @@ LINKS = {
     "Modbus RTU": (_rtu, ""),
     "optoNCDT 1420": (_optoncdt, "um"),
     "Keyence DL-RS1A": (_keyence, "um"),
+    "ProPar": (_propar, ""),
     "Ventus": (_ventus, ""),
     "PTB330": (_ptb330, "Pa"),
 }
