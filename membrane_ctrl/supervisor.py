@@ -28,8 +28,8 @@ from membrane_ctrl.tick_record import pack_tick
 
 # Looking after a child costs a system call; half a second late is soon enough, the loop does not need them
 _CHILD_WATCH_S = 0.5
-# A replay has to run through half of this on the way to its part, in some seconds; a memory takes half a millisecond
-# of a tick and 8 kB
+# A replay has to run through half of this on the way to its part, in some seconds; a memory takes 0.6 ms of a
+# tick and 7 kB
 MEMORY_EVERY_S = 600.0
 
 
