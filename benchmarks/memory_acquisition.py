@@ -11,9 +11,8 @@ import psutil
 from benchmarks.figures import Figure, at_most
 from membrane_ctrl.acquisition.frames import FrameRing
 from membrane_ctrl.acquisition.process import AcquisitionSpec
-from membrane_ctrl.camera_config import CameraConfig
 from membrane_ctrl.clock import RunClock
-from membrane_ctrl.config import Config, OpticsConfig, ShapeConfig
+from membrane_ctrl.config import CameraConfig, Config, OpticsConfig, ShapeConfig
 from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
 from membrane_ctrl.processes import Child, pipe
 from membrane_ctrl.telemetry import FIELDS, ROW_BYTES, TelemetryRow
