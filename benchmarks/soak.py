@@ -224,7 +224,7 @@ def run() -> list[Figure]:
     ]
 
 
-def tell_days(tick: VirtualTick) -> None:
+def _tell_days(tick: VirtualTick) -> None:
     """A line a simulated day, for who waits."""
     day, second = divmod(tick.row.mono_s, DAY_S)
     if second < tick.row.dt_s / 2:
@@ -237,7 +237,7 @@ def main() -> int:
     parser.add_argument("--days", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    found = figures(options.days, options.seed, tell_days)
+    found = figures(options.days, options.seed, _tell_days)
     show("soak", found)
     return int(any(figure.met is False for figure in found))
 
