@@ -153,7 +153,8 @@ def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead
             raise InputError(f"{path}: reference: a fringes set names the full set that anchors it")
         reference = (folder / content.reference).resolve()
     sections = ("geometry", "camera", "pattern", "mirror")
-    optics = parse({name: getattr(content, name) for name in sections}, OpticsConfig, str(path))
+    blamed = path if geometry is None else geometry.path  # what may not fit together is the screen and the pattern
+    optics = parse({name: getattr(content, name) for name in sections}, OpticsConfig, str(blamed))
     if geometry is not None:
         optics = geometry.over(optics)
     return CaptureHead(

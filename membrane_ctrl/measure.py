@@ -94,7 +94,7 @@ def _lines(
     coeffs = 1e3 * full.surface.coeffs_mm
     lines += [
         f"sag       {full.surface.sag_mm:.4f} mm, 1 sigma {of_noise:.2g} um of noise"
-        + (f", {of_geometry:.3g} um of the geometry" if of_geometry else ""),
+        + (f", {of_geometry:.3g} um of the geometry" if of_geometry > 0 else ""),
         f"geometry  its spread: {bars.source}",
         f"Hencky    {profile.sag_mm:.4f} mm, {profile.pressure_pa:.0f} Pa under the paper's film",
         f"figure    astigmatism {np.hypot(*coeffs[4:6]):.2f} um, coma {np.hypot(*coeffs[6:8]):.2f} um, "

@@ -64,11 +64,12 @@ def set_folders(run: Path, out: Path) -> list[Path]:
     """The sets of a run, sorted by name, without results of earlier analyses. Raises InputError if there are none."""
     if not run.is_dir():
         raise InputError(f"{run}: no such run of sets")
+    if (run / "capture.toml").is_file():
+        raise InputError(f"{run}: holds no capture sets; it is a capture set itself, give the folder above it")
     found = sorted(path for path in run.iterdir() if path.is_dir() and path.resolve() != out.resolve())
     folders = [path for path in found if not (path / SERIES).is_file()]
     if not folders:
-        hint = "; it is a capture set itself, give the folder above it" if (run / "capture.toml").is_file() else ""
-        raise InputError(f"{run}: holds no capture sets{hint}")
+        raise InputError(f"{run}: holds no capture sets")
     return folders
 
 

@@ -223,6 +223,7 @@ def test_no_set_gives_a_figure(spoiled: Path, tmp_path: Path, capsys: pytest.Cap
 )
 def test_bad_usage(spoiled: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], text: str) -> None:
     (spoiled.parent / "empty").mkdir()
+    (spoiled / "0000" / "result").mkdir()
     assert run(["stability", str(spoiled.parent / arguments[0]), *arguments[1:]]) == 2
     said = capsys.readouterr().err.strip().splitlines()
     assert len(said) == 1

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.geometry import Geometry, distort
 
 FloatArray = NDArray[np.float64]
 
@@ -99,9 +98,8 @@ def find_outline(light: FloatArray, geometry: Geometry, rim_mm: float, rim_z_mm:
 def project(geometry: Geometry, world_mm: FloatArray) -> FloatArray:
     """Column and row (2, n) of world points (3, n), through the lens."""
     camera = geometry.rotation @ (world_mm - geometry.pinhole_mm[:, None])
-    through = (camera / camera[2]).T
+    through = camera[:2] / camera[2]
     if any(geometry.distortion):
-        straight, lens = np.eye(3), np.array(geometry.distortion)
-        through = cv2.projectPoints(through, np.zeros(3), np.zeros(3), straight, lens)[0][:, 0]
-    column, row = geometry.focal_px * through[:, :2].T
+        through = distort(through[0], through[1], geometry.distortion)
+    column, row = geometry.focal_px * through
     return np.stack([column + geometry.principal_px[0], row + geometry.principal_px[1]])

@@ -65,3 +65,9 @@ def test_a_pose_that_is_no_rotation_is_refused() -> None:
         CameraPoseConfig(position_mm=(0, 0, 2672), rotation=((1, 0, 0), (0, 1, 0), (0, 0, -1)))
     with pytest.raises(ValueError, match="unit vectors"):
         ScreenPoseConfig(origin_mm=(0, 0, 2871), s_x=(-2, 0, 0), s_y=(0, 1, 0))
+
+
+def test_a_lens_that_folds_the_picture_has_no_rays_there() -> None:
+    folding = Geometry.from_config(OpticsConfig(camera=CameraConfig(distortion=(-3.0, 0.0, 0.0, 0.0))))
+    assert np.isnan(folding.rays(0.0, 0.0)).all()
+    assert folding.rays(COLUMN, ROW) == pytest.approx(GEOMETRY.rays(COLUMN, ROW))
