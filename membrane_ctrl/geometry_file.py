@@ -52,6 +52,7 @@ class CalibrationTable(Section):
     hash: str
     slope_residual_urad: float
     slope_noise_urad: float
+    ring_um: tuple[float, ...]
 
 
 @dataclass(frozen=True)

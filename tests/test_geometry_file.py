@@ -30,6 +30,7 @@ def calibrated(path: Path, **more: object) -> Path:
         "sets": ["a"],
         "slope_residual_urad": 2.0,
         "slope_noise_urad": 1.5,
+        "ring_um": [0.0] * 14,
         "hash": content_hash(tables),
     }
     path.write_text(tomli_w.dumps(tables))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.geometry_in_force import InForce
-from membrane_ctrl.metrology.calibrate.drift import DriftMonitor, noise_urad
+from membrane_ctrl.metrology.calibrate.drift import DriftMonitor, RingMonitor, noise_urad
 from membrane_ctrl.metrology.covariance import pixel_sigma_adu
 from membrane_ctrl.metrology.geometry import Geometry
 from membrane_ctrl.metrology.phase import equal_shifts, phase_sigma_rad
@@ -19,7 +21,7 @@ def geometry_event(geometry: InForce) -> Event:
 
 
 class LiveDrift:
-    """Compares the residual of each cycle with the calibrated one; without a calibration it says nothing.
+    """Compares residual and ring of each cycle with the calibrated ones; without a calibration it says nothing.
 
     Parameters
     ----------
@@ -36,21 +38,31 @@ class LiveDrift:
         sigma_rad = phase_sigma_rad(shifts, pixel_sigma_adu(optics.camera.noise_adu), 1.0)
         self._sigma_mm_adu = mm_per_rad(optics.pattern) * sigma_rad / bin_px  # over the modulation
         known = geometry.calibration
-        self._monitor = None if known is None else DriftMonitor(known.slope_residual_urad, known.slope_noise_urad)
+        self._monitors: tuple[DriftMonitor, RingMonitor] | None = None
+        if known is not None:
+            residual = DriftMonitor(known.slope_residual_urad, known.slope_noise_urad)
+            self._monitors = residual, RingMonitor(np.array(known.ring_um))
         self._said = False
 
     def noise_urad(self, estimate: ShapeEstimate) -> float:
         """What the camera's noise is in a cycle's residual."""
-        surface = Surface(estimate.coeffs_um / 1e3, estimate.hencky_um / 1e3, self._radius_mm)
-        return noise_urad(self._geometry, surface, self._sigma_mm_adu / estimate.modulation_median_adu)
+        return noise_urad(
+            self._geometry, self._surface(estimate), self._sigma_mm_adu / estimate.modulation_median_adu
+        )
 
     def after(self, estimate: ShapeEstimate) -> Event | None:
         """A notice when it is time to calibrate again, and when it no longer is."""
-        if self._monitor is None or estimate.verdict == "rejected":
+        if self._monitors is None or estimate.verdict == "rejected":
             return None
-        self._monitor.add(estimate.slope_residual_urad, self.noise_urad(estimate))
-        if bool(self._monitor.says) == self._said:
+        residual, ring = self._monitors
+        residual.add(estimate.slope_residual_urad, self.noise_urad(estimate))
+        ring.add(self._surface(estimate))
+        says = ring.says or residual.says
+        if bool(says) == self._said:
             return None
         self._said = not self._said
         kind = "maintenance" if self._said else "maintenance_over"
-        return {"kind": kind, "name": "calibrate", "message": self._monitor.says or "the geometry fits again"}
+        return {"kind": kind, "name": "calibrate", "message": says or "the geometry fits again"}
+
+    def _surface(self, estimate: ShapeEstimate) -> Surface:
+        return Surface(estimate.coeffs_um / 1e3, estimate.hencky_um / 1e3, self._radius_mm)

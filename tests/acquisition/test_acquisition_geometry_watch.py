@@ -12,11 +12,11 @@ from membrane_ctrl.config import OpticsConfig
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.geometry_file import CalibrationTable, origin_of
 from membrane_ctrl.geometry_in_force import InForce
-from membrane_ctrl.metrology.calibrate.drift import CYCLES
+from membrane_ctrl.metrology.calibrate.drift import CYCLES, ring_um
 from membrane_ctrl.metrology.hencky import zernike_projection
+from membrane_ctrl.metrology.surface import Surface
 
 OPTICS = OpticsConfig()
-CALIBRATION = CalibrationTable(date_utc="2026", hash="x", slope_residual_urad=3.0, slope_noise_urad=1.0)
 CYCLE = ShapeEstimate(
     time_s=0.0,
     kind="fringes",
@@ -33,6 +33,11 @@ CYCLE = ShapeEstimate(
     verdict="ok",
 )
 
+RING_UM = ring_um(Surface(CYCLE.coeffs_um / 1e3, 0.0, 500.0))
+CALIBRATION = CalibrationTable(
+    date_utc="2026", hash="x", slope_residual_urad=3.0, slope_noise_urad=1.0, ring_um=tuple(RING_UM.tolist())
+)
+
 
 def in_force(calibration: CalibrationTable | None = CALIBRATION) -> InForce:
     return InForce(OPTICS, origin_of(OPTICS), calibration)
@@ -47,6 +52,17 @@ def test_a_residual_that_has_grown_is_said_once_and_its_end_too() -> None:
     assert [event["kind"] for event in told] == ["maintenance", "maintenance_over"]
     assert {event["name"] for event in told} == {"calibrate"}
     assert told[0]["message"].startswith("calibrate again: the fit leaves 4.50 urad")
+
+
+def test_a_ring_that_seems_to_tilt_is_said_and_a_deeper_bowl_is_not() -> None:
+    drift = LiveDrift(in_force(), 4)
+    deeper = replace(CYCLE, coeffs_um=CYCLE.coeffs_um + 2000.0 * zernike_projection())
+    assert not any(drift.after(deeper) for _ in range(CYCLES))
+    tilted = CYCLE.coeffs_um.copy()
+    tilted[1] += 4.0  # 2 x of the radius a unit: 8 um at the rim, 5.7 um RMS around it
+    told = [event for _ in range(CYCLES) if (event := drift.after(replace(CYCLE, coeffs_um=tilted))) is not None]
+    assert [event["name"] for event in told] == ["calibrate"]
+    assert "the ring is seen 5.7 um RMS from where it was" in told[0]["message"]
 
 
 def test_the_noise_of_weaker_fringes_is_no_drift() -> None:

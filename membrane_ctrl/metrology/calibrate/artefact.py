@@ -94,6 +94,7 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
         "screen_residual_um": origin.screen_residual_um,
         "slope_residual_urad": origin.slope_residual_urad,
         "slope_noise_urad": origin.slope_noise_urad,
+        "ring_um": (1e3 * solution.common[len(NAMES) + 1 :]).tolist(),
         "condition": origin.condition,
         "notes": list(origin.notes),
         "hash": content_hash(tables),

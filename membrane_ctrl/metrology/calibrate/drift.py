@@ -1,9 +1,13 @@
 """When to calibrate again: what the fit leaves now, against what it left when the geometry was calibrated.
 
 A geometry that has become wrong bends the fringes in a way that no surface can explain: the slopes' residual grows.
-One bad cycle is no drift (a door, a hand before the screen); the median of many is. A live cycle bins otherwise than
-the sets of a calibration and sees other light, so that the camera's noise is taken out of the one residual and put
-into the other: what is compared is the film and the geometry.
+A live cycle bins otherwise than the sets of a calibration and sees other light, so that the camera's noise is taken
+out of the one residual and put into the other: what is compared is the film and the geometry.
+
+Some errors are no surface's (a camera that rolls), others are (a camera that turns: the surface tilts and bends with
+it). Those are seen by the ring, which cannot have tilted.
+
+One bad cycle is no drift (a door, a hand before the screen); the median of many is.
 """
 
 from __future__ import annotations
@@ -12,14 +16,21 @@ from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
+from membrane_ctrl.metrology.calibrate.separable import rim_harmonics
 from membrane_ctrl.metrology.covariance import slope_per_screen
 from membrane_ctrl.metrology.geometry import Geometry
 from membrane_ctrl.metrology.surface import Surface
 
+FloatArray = NDArray[np.float64]
+
 CYCLES = 60  # two minutes of cycles
 GROWN = 1.25  # times what is expected: 0.75 of it more, added in squares
 FINE = 1.1  # times what is expected: a warning ends here
+# What is asked of a figure. A camera that turned by 0.02 degrees moves the ring by 5.6 um and bends the figure by 4
+RING_MOVED_UM = 5.0
+RING_BACK_UM = 3.0
 
 
 def noise_urad(geometry: Geometry, surface: Surface, screen_sigma_mm: float) -> float:
@@ -63,4 +74,44 @@ class DriftMonitor:
             self.says = (
                 f"calibrate again: the fit leaves {now_urad:.2f} urad of slope, "
                 f"the calibrated geometry promises {now_urad / ratio:.2f}"
+            )
+
+
+def ring_um(surface: Surface) -> FloatArray:
+    """Harmonics (14,) of the rim's height but its mean: cosines 1 to 7, then sines."""
+    return np.asarray(1e3 * (rim_harmonics() @ surface.parameters)[1:])
+
+
+@dataclass
+class RingMonitor:
+    """Watches where the live cycles see the ring, which stays where it is.
+
+    Parameters
+    ----------
+    calibrated_um : (14,) array
+        `ring_um` of the geometry's `[calibration]`.
+
+    Attributes
+    ----------
+    says : str
+        As for `DriftMonitor`.
+    """
+
+    calibrated_um: FloatArray
+    says: str = ""
+    _seen: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=CYCLES))
+
+    def add(self, surface: Surface) -> None:
+        """Take one cycle's surface."""
+        self._seen.append(ring_um(surface))
+        if len(self._seen) < CYCLES:
+            return
+        change = np.median(np.array(self._seen), axis=0) - self.calibrated_um
+        moved_um = float(np.sqrt(np.sum(change**2) / 2))  # RMS around the rim
+        if moved_um < RING_BACK_UM:
+            self.says = ""
+        elif moved_um > RING_MOVED_UM and not self.says:
+            self.says = (
+                f"calibrate again: the ring is seen {moved_um:.1f} um RMS from where it was when the geometry was "
+                "calibrated; camera or screen stand otherwise"
             )
