@@ -98,7 +98,8 @@ class Controller:
         self._begin(inputs, events)
         last = scene.output or NO_OUTPUT
         error_um = last.error_um if self.state in MOVING else math.nan
-        events += self._witnesses.ask(inputs, self.state, scene.dt_s, scene.setpoint_um, last.leak_um_per_s)
+        left_um = scene.setpoint_um + scene.trim_um - last.setpoint_um
+        events += self._witnesses.ask(inputs, self.state, scene.dt_s, scene.setpoint_um, left_um, last.leak_um_per_s)
         observation = scene.observer.observe(
             inputs, error_um, self._tick_error, scene.overdue, scene.unfit, self._witnesses.laser_lies
         )

@@ -24,13 +24,20 @@ class Witnesses:
 
     def __init__(self, config: Config) -> None:
         self._plausibility = Plausibility(config.shape.disagreement_max_um)
+        self._far_um = config.shape.disagreement_max_um
         self._health = FilmHealth(min(config.loop.flow_max_um_per_s, config.pump.flow_full_um_per_s))
         self._setpoint_um = config.loop.setpoint_um
         self._liar = Liar.NOBODY
         self.laser_lies = self.camera_lies = ""
 
     def ask(
-        self, inputs: TickInputs, state: State, dt_s: float, setpoint_um: float, leak_um_per_s: float
+        self,
+        inputs: TickInputs,
+        state: State,
+        dt_s: float,
+        setpoint_um: float,
+        ramp_left_um: float,
+        leak_um_per_s: float,
     ) -> list[Event]:
         """One tick.
 
@@ -42,6 +49,9 @@ class Witnesses:
         dt_s : float
         setpoint_um : float
             What it is held at, without the trim.
+        ramp_left_um : float
+            How far the setpoint's ramp has still to go. A camera sees the film of a cycle ago, and the gauge is
+            linear only about its reference: on a long way they would contradict a laser that is right.
         leak_um_per_s : float
             As the inner loop estimates it, NaN without.
 
@@ -53,7 +63,7 @@ class Witnesses:
         if setpoint_um != self._setpoint_um:
             self._setpoint_um = setpoint_um
             self._health.setpoint_moved()
-        if state != State.HOLD:
+        if state != State.HOLD or abs(ramp_left_um) > self._far_um:
             if self._plausibility.watching:
                 self._plausibility.reset()
             return self._judge(Liar.NOBODY)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -76,7 +77,8 @@ def reach_of(held: Held, config: Config) -> Reach:
         by_pressure_um = held.setpoint_um + 1e3 * held.sag_mm * (share ** (1 / 3) - 1)
         if by_pressure_um < high_um:
             high_um, why = by_pressure_um, "limits.gauge_pressure_max_pa"
-    return Reach(limits.displacement_min_um + margin_um, high_um, "limits.displacement_min_um", why)
+    low_um = limits.displacement_min_um + margin_um
+    return Reach(math.ceil(low_um), math.floor(high_um), "limits.displacement_min_um", why)
 
 
 def setpoints_um(held: Held, reach: Reach, range_um: float | None, sets: int) -> tuple[float, ...]:

@@ -85,6 +85,10 @@ class Sweep:
             shape_on=newest.shape_state != ShapeState.OFF,
         )
 
+    def claim(self, setpoint_um: float) -> None:
+        """Take the command without a motion: its own setpoint again. Raises HoldError if it is refused."""
+        self._ask("setpoint", setpoint_um)
+
     def go(self, setpoint_um: float, expected_s: float) -> None:
         """Ramp there and settle.
 
@@ -98,7 +102,7 @@ class Sweep:
         self._ask("setpoint", setpoint_um)
         patience_s = _LATE[0] * expected_s + _LATE[1]
         there: deque[TelemetryRow] = deque()
-        begin_s, obeyed = self._last_s, False
+        begin_s, obeyed = math.nan, False
         while True:
             for row in self._news().rows:
                 obeyed = obeyed or row.target_um == setpoint_um

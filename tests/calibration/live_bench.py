@@ -1,0 +1,124 @@
+"""A held mirror in virtual time whose sets are rendered on a bench that stands otherwise than stated."""
+
+from __future__ import annotations
+
+import signal
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from membrane_ctrl.commands import Command
+from membrane_ctrl.config import (
+    CameraConfig,
+    Config,
+    GeometryConfig,
+    LimitsConfig,
+    LoopConfig,
+    OpticsConfig,
+    PumpConfig,
+    ShapeConfig,
+    TwinConfig,
+)
+from membrane_ctrl.tick import Event
+from membrane_ctrl.tune.twin_hold import TwinHold
+from membrane_ctrl.twin.film_shape import typical_film
+from membrane_ctrl.twin.simulate import simulate_set
+from membrane_ctrl.twin.simulation_spec import Motion, SimulationSpec
+from tuning.hold_link import News
+
+# 16-bit frames of large pixels with the noise of the 144 that each stands for
+SHRINK = 12
+NOISE = 256 * float(np.hypot(0.4, np.sqrt(1 / 12))) / SHRINK
+CAMERA = CameraConfig(
+    width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK, bits=16, noise_adu=NOISE
+)
+TRUE = GeometryConfig(a_mm=2674.0, b_mm=2869.0, alpha_deg=81.2, reference_displacement_um=0.0)
+FILM = typical_film(37.1, 500.0, seed=4)
+
+
+def config(place: Path | None = None, **limits: float) -> Config:
+    """A mirror that loses and gets gas twenty times as fast as a real one: a minute instead of twenty."""
+    return Config(
+        twin=TwinConfig(scenario="quiet", start_error_um=-3.0, leak_time_constant_s=500.0),
+        pump=PumpConfig(flow_full_um_per_s=60.0),
+        loop=LoopConfig(
+            rate_hz=20.0, flow_max_um_per_s=60.0, setpoint_ramp_um_per_s=40.0, flow_rate_limit_um_per_s2=100.0
+        ),
+        limits=LimitsConfig(**{"displacement_min_um": -4500.0, "displacement_max_um": 4500.0, **limits}),
+        shape=ShapeConfig(period_s=2.0),
+        optics=OpticsConfig(camera=CAMERA, geometry_file=place),
+    )
+
+
+@dataclass
+class LiveBench:
+    """A `CaptureLink`.
+
+    Attributes
+    ----------
+    run_dir : Path
+        Where the sets are.
+    fails : list of str
+        What the next captures say instead of taking a set.
+    interrupt_at : int
+        Ctrl-C while this capture is under way.
+    dark_at : int
+        The laser is lost for good after this capture.
+    meddles_at : int
+        After so many commands somebody else moves the setpoint.
+    blind : bool
+        No shapes come.
+    asked : list of Command
+        Everything so far.
+    """
+
+    run_dir: Path
+    config: Config
+    fails: list[str] = field(default_factory=list)
+    interrupt_at: int = -1
+    dark_at: int = -1
+    meddles_at: int = -1
+    blind: bool = False
+    asked: list[Command] = field(default_factory=list)
+    captures: int = 0
+
+    def __post_init__(self) -> None:
+        self.hold = TwinHold(self.config)
+        self.name = self.run_dir.name
+        self._told: tuple[Event, ...] = ()
+
+    def ask(self, command: Command) -> None:
+        self.asked.append(command)
+        self.hold.ask(command)
+        if command.kind == "capture":
+            self._capture()
+        if len(self.asked) == self.meddles_at:
+            self.hold.ask(Command("setpoint", "another", value=77.0))
+
+    def news(self) -> News:
+        told, self._told = self._told, ()
+        news = self.hold.news()
+        return News(news.rows, news.events + told, () if self.blind else news.shapes)
+
+    def close(self) -> None:
+        pass
+
+    def _capture(self) -> None:
+        self.captures += 1
+        if self.captures == self.interrupt_at:
+            signal.raise_signal(signal.SIGINT)
+        self.hold.bench.wrong.no_light = self.captures == self.dark_at
+        if self.fails and (failed := self.fails.pop(0)):
+            self._told = ({"kind": "capture", "failed": failed},)
+            return
+        spec = SimulationSpec(
+            self.config.optics.model_copy(update={"geometry": TRUE}),
+            FILM,
+            motion=Motion(start_um=self.hold.bench.plant.truth().displacement_um),
+            laser_noise_um=1.0,
+            stated_geometry=self.config.optics.geometry.model_copy(update={"reference_displacement_um": 0.0}),
+            seed=self.captures,
+        )
+        simulate_set(self.run_dir / "raw" / f"cycle-{self.captures}", spec)
+        self._told = ({"kind": "capture", "set": f"raw/cycle-{self.captures}", "verdict": "ok", "reason": ""},)
