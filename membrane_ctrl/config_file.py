@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -82,7 +83,7 @@ def parse(tables: dict[str, Any], model: type[Model], where: str) -> Model:
     try:
         return model.model_validate(tables)
     except ValidationError as error:
-        raise InputError(f"{where}: {describe(error.errors()[0], model)}") from None
+        raise InputError(f"{where}: {describe(_telling(error.errors()), model)}") from None
 
 
 def prune(table: dict[str, Any], model: type[BaseModel], prefix: str = "") -> tuple[str, ...]:
@@ -109,12 +110,15 @@ def dump(config: BaseModel) -> str:
 
 def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
     """One line for a validation error: the field, what is wrong with it, and what would be right."""
-    field = ".".join(str(part) for part in error["loc"])
+    path, parent = _walk(model, error["loc"])
+    field = ".".join(str(part) for part in path)
     if error["type"] == "extra_forbidden":
-        known = _fields_at(model, error["loc"][:-1])
-        near = difflib.get_close_matches(str(error["loc"][-1]), known, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}" if known else "remove it"
-        return f"{field}: unknown key; {hint}"
+        return (
+            f"{field}: unknown key; {_hint(str(error['loc'][-1]), [] if parent is None else [*parent.model_fields])}"
+        )
+    if error["type"] == "union_tag_invalid":
+        tag, known = str(error["ctx"]["tag"]), re.findall(r"'([^']*)'", error["ctx"]["expected_tags"])
+        return f"{field}.driver: {tag!r} is not known here; {_hint(tag, known)}"
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "value_error":
         return f"{field}: {message}" if field else message
@@ -123,14 +127,47 @@ def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
     return f"{field}: {message[:1].lower()}{message[1:]}{shown}"
 
 
-def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    for part in location:
-        field = model.model_fields.get(str(part))
-        if field is None:
-            return []
-        candidates = [field.annotation, *getattr(field.annotation, "__args__", ())]
-        nested = [c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)]
-        if not nested:
-            return []
-        model = nested[0]
-    return list(model.model_fields)
+def _hint(word: str, known: list[str]) -> str:
+    near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    return f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}" if known else "remove it"
+
+
+def _telling(errors: list[ErrorDetails]) -> ErrorDetails:
+    """The error that says most: a key that is not known is often the misspelt one that another error misses."""
+    misspelt = [error for error in errors if error["type"] == "extra_forbidden"]
+    return misspelt[0] if misspelt and errors[0]["type"] == "missing" else errors[0]
+
+
+def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[int | str], type[BaseModel] | None]:
+    """The path of a key as in the file, and the section that it is in; None if that is not known.
+
+    In a location, the tag of a union's member (`driver = "ventus"`) stands between the table and its key.
+    """
+    path: list[int | str] = []
+    inside: type[BaseModel] | None = model
+    members: list[type[BaseModel]] = []
+    for place, part in enumerate(location):
+        last = place + 1 == len(location)
+        if tagged := [m for m in members if part in _tags(m)]:
+            inside, members = tagged[0], []
+            continue
+        path.append(part)
+        if last or isinstance(part, int):
+            continue
+        field = None if inside is None else inside.model_fields.get(part)
+        members = [] if field is None else _sections(field.annotation)
+        inside = members[0] if members else None
+    return path, inside
+
+
+def _sections(annotation: Any) -> list[type[BaseModel]]:
+    """All sections that a field may hold."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [section for inner in get_args(annotation) for section in _sections(inner)]
+
+
+def _tags(section: type[BaseModel]) -> tuple[Any, ...]:
+    """Values of `driver` that mean this section."""
+    driver = section.model_fields.get("driver")
+    return () if driver is None else get_args(driver.annotation)

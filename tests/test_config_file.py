@@ -28,6 +28,13 @@ from membrane_ctrl.errors import InputError
         ("[optics.geometry]\na_mm = 2672.0\n", ["optics.geometry", "alpha_deg"]),
         ("[limits]\ndisplacement_min_um = 10\ndisplacement_max_um = 5\n", ["displacement_min_um", "below"]),
         ("[loop\n", ["not valid TOML", "line 1"]),
+        (
+            "[devices.displacement]\ndriver = 'optoncdt1420'\nprot = '/dev/x'\n",
+            ["devices.displacement.prot", "did you mean port?"],
+        ),
+        ("[devices.pump]\ndriver = 'vents'\n", ["devices.pump.driver", "did you mean ventus?"]),
+        ("[devices.camera]\ndriver = 'aravis'\nexposre_ms = 3\n", ["devices.camera.exposre_ms", "exposure_ms?"]),
+        ("[[alarms.rules]]\nnam = 'x'\n", ["alarms.rules.0.nam", "did you mean name?"]),
     ],
 )
 def test_each_mistake_is_one_line_naming_file_and_field(tmp_path: Path, text: str, words: list[str]) -> None:

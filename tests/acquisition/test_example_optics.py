@@ -1,0 +1,104 @@
+"""The example with camera and screen: `check` measures a real X display through an emulated GigE camera."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from virtual_display import screenshot, virtual_display
+
+from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.gige_camera import GigeCameraEmulator
+from firmware_iface.roles import LinkError
+from membrane_ctrl.config import Config
+from membrane_ctrl.config_file import dump, load
+from membrane_ctrl.twin.lab import Lab
+
+pytestmark = pytest.mark.real_time
+
+EXAMPLE = load(Path(__file__).parents[2] / "examples" / "paper-bench.toml", Config)
+GAMMA = 2.2
+LIGHT = (np.arange(256) / 255.0) ** GAMMA  # of a level
+BLOCK_PX = 16  # each block of camera pixels sees the mean light of its part of the display
+
+
+class StillPlant:
+    """A mirror that stands."""
+
+    def sample(self) -> BoardSample:
+        return BoardSample(12.5, 0, 600.0, 101_325.0, 22.5, 23.0, 1, 0.0)
+
+    def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
+        assert pump_fraction == 0.0
+
+
+class Sight:
+    """A camera that photographs the display; `exposure_ms` 20 is right for it."""
+
+    def __init__(self, framebuffer: Path, width_px: int, height_px: int) -> None:
+        self._framebuffer = framebuffer
+        self._blocks = (width_px // BLOCK_PX, height_px // BLOCK_PX)
+
+    def expose(self, exposure_ms: float, gain: int) -> Any:
+        light = LIGHT.astype(np.float32)[screenshot(self._framebuffer)[:, :, 0]]
+        seen = cv2.resize(light, self._blocks, interpolation=cv2.INTER_AREA)
+        counts = np.clip(np.rint(8 + 200 * seen * exposure_ms / 20.0), 0, 255).astype(np.uint8)
+        return np.repeat(np.repeat(counts, BLOCK_PX, axis=0), BLOCK_PX, axis=1)
+
+
+@pytest.fixture
+def camera(tmp_path: Path) -> Iterator[GigeCameraEmulator]:
+    assert EXAMPLE.devices is not None
+    assert EXAMPLE.devices.screen is not None
+    optics, screen = EXAMPLE.optics.camera, EXAMPLE.devices.screen
+    with virtual_display(tmp_path, screen.width_px, screen.height_px) as framebuffer:
+        sight = Sight(framebuffer, optics.width_px, optics.height_px)
+        try:
+            emulator = GigeCameraEmulator(sight.expose, optics.width_px, optics.height_px)
+            with emulator:
+                yield emulator
+        except LinkError as error:  # the library is not there, or another run of the tests has the one port
+            pytest.skip(str(error))
+
+
+async def check(config: Config, path: Path) -> tuple[int, dict[str, Any], str]:
+    """Exit code, the camera's probe, standard error."""
+    path.write_text(dump(config), encoding="utf-8")  # noqa: ASYNC240
+    command = [sys.executable, "-m", "membrane_ctrl", "check", str(path), "--json"]
+    pipe = asyncio.subprocess.PIPE
+    process = await asyncio.create_subprocess_exec(*command, stdout=pipe, stderr=pipe)
+    out, err = await process.communicate()
+    probes = {probe["role"]: probe for probe in json.loads(out)["devices"]}
+    assert process.returncode is not None
+    return process.returncode, probes["camera"], err.decode()
+
+
+async def test_the_example_passes_check_with_camera_and_screen(camera: GigeCameraEmulator, tmp_path: Path) -> None:
+    assert EXAMPLE.devices is not None
+    lab = Lab(StillPlant(), EXAMPLE.devices)
+    devices = await lab.start()
+    assert devices.camera is not None
+    table = devices.camera.model_copy(update={"camera": "127.0.0.1", "packet_bytes": 8000})
+    config = EXAMPLE.model_copy(update={"devices": devices.model_copy(update={"camera": table})})
+    try:
+        code, probe, errors = await check(config, tmp_path / "moved.toml")
+        assert (code, probe["problem"]) == (0, ""), errors
+        assert "gamma 2.2" in probe["notes"]
+        assert "settles in" in probe["notes"]
+
+        bright = table.model_copy(update={"exposure_ms": 200.0})
+        quick = devices.screen.model_copy(update={"settle_ms": 50.0, "linearise": False})  # type: ignore[union-attr]
+        changed = devices.model_copy(update={"camera": bright, "screen": quick})
+        code, probe, errors = await check(config.model_copy(update={"devices": changed}), tmp_path / "bright.toml")
+        assert code == 4
+        assert "saturated" in probe["problem"]
+        assert "lower exposure_ms" in probe["problem"]
+    finally:
+        await lab.stop()
