@@ -32,6 +32,7 @@ from membrane_ctrl.metrology.view import NoFigureError, View, look
 FloatArray = NDArray[np.float64]
 
 _ROUNDS = 8
+_MANY_BLAMED = 3
 # A point whose phase moved further than this between two sets may have been taken for its neighbour a period away
 _GUARD_RAD = 0.9 * math.pi
 _LOST_SHARE = 0.01
@@ -136,12 +137,24 @@ def check(stack: FrameStack, optics: OpticsConfig, anchor: Anchor | None = None)
     binned = bin_frames(stack, 2**optics.camera.bits - 1)
     try:
         found = _check(stack, binned, optics, anchor)
-    except RejectedSetError:
+    except RejectedSetError as error:
         put_back = _put_back(stack, binned, optics, anchor)
         if put_back is None:
-            raise
+            raise RejectedSetError(str(error) + _doubt(stack, error.flags), error.flags) from None
         return put_back
     return found if _believable_surface(found) else _put_back(stack, binned, optics, anchor) or found
+
+
+def _doubt(stack: FrameStack, flags: tuple[Flag, ...]) -> str:
+    """What else may be wrong where many frames differ from a prediction: the prediction, that is the geometry.
+
+    Pictures that are the same, unreadable or dark need no prediction.
+    """
+    by_prediction = ("moved", "differs", "stale or wrong", "flicker")
+    blamed = [f for f in flags if stack.patterns[f.frame].role == "sin" and f.reason.startswith(by_prediction)]
+    if len(blamed) < _MANY_BLAMED:
+        return ""
+    return "; with so many frames blamed, is this the geometry, and are these the axes, of these pictures?"
 
 
 def _believable_surface(checked: Checked) -> bool:

@@ -227,3 +227,10 @@ def test_geometry_that_sees_no_mirror_is_rejected() -> None:
     stack.frames[:] = 7
     with pytest.raises(RejectedSetError):
         check(stack, blind)
+
+
+def test_a_picture_upside_down_is_asked_about() -> None:
+    stack = good_set(bench())
+    stack.frames[:] = stack.frames[:, ::-1].copy()
+    with pytest.raises(RejectedSetError, match="is this the geometry"):
+        check(stack, bench())

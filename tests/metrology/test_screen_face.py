@@ -14,6 +14,8 @@ from membrane_ctrl.config import (
     OpticsConfig,
     ScreenPoseConfig,
 )
+from membrane_ctrl.metrology.calibrate.parameters import Bench
+from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
 from membrane_ctrl.metrology.checked import check
 from membrane_ctrl.metrology.face import Face
 from membrane_ctrl.metrology.full import measure_pixels, reconstruct_full
@@ -101,6 +103,21 @@ def test_rays_meet_the_face_where_the_twin_says() -> None:
     points.screen_mm[:] = there
     field = tracer.slope_field(points, surface)
     assert np.abs(field[2:4] - field[4:6]).max() < 1e-12
+
+
+def test_the_calibration_follows_rays_to_the_same_face() -> None:
+    geometry = Geometry.from_config(_optics(CROOKED))
+    surface, tracer = Surface.hencky_bowl(37.1, 500.0), Tracer(geometry, 500.0)
+    columns, rows = pixel_grid(SMALL, stride=5)
+    rays = geometry.rays(columns, rows)
+    plane = geometry.pinhole_mm[:2, None] - geometry.pinhole_mm[2] * rays[:2] / rays[2]
+    inside = np.hypot(*plane) < 450
+    points = Points.of(rays[:, inside], np.zeros((2, int(inside.sum()))))
+    tracer.start(points, surface.height)
+    tracer.intersect(points, surface, newton=3)
+    seen = tracer.predict_screen(points, surface)
+    phases = SetPhases("set", columns[inside], rows[inside], seen, np.ones(inside.sum()), 0.0)
+    assert np.abs(residual_mm(Bench(geometry), phases, surface, 0.0)).max() < 1e-9
 
 
 def test_world_points_lie_on_the_face() -> None:
