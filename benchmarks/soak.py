@@ -31,7 +31,6 @@ from membrane_ctrl.virtual_shape import TruthShape
 DAY_S = 86_400.0
 RATE_HZ = 10.0
 BAND_UM, MINUTE_BAND_UM = 2.0, 0.5
-TYPICAL_SEEDS = (1, 2, 3)
 # something a day of each kind: a glitch of the laser, an answer lost, a network that restarts, a board that does
 _RESUMES = ("link_lost", "device_silent", "watchdog_tripped", "board_fault")
 _FAULTS = (("no_light", 3.0), ("silent", 0.2), ("unreachable", 20.0), ("power", 0.0))
@@ -210,17 +209,16 @@ def everything(seed: int) -> tuple[Happening, ...]:
 
 
 def run() -> list[Figure]:
-    """Days of typical weather as the target asks, the laser lost, and two days with everything."""
-    days = [soak(1.0, seed, faults=False) for seed in TYPICAL_SEEDS]
-    seeds = f"24 h typical, worst of {len(days)} seeds"
+    """A day of typical weather as the target asks (more seeds: tests/campaign), the laser lost, a day with everything."""
+    day = soak(1.0, 1, faults=False)
     excursions_um = dropout_excursions_um()
     return [
-        at_least(f"{seeds}: 1 s means within 2 um", 100 * min(day.second.fraction for day in days), "%", 99.9),
-        at_most(f"{seeds}: worst 60 s mean", max(day.minute.worst_um for day in days), "um", MINUTE_BAND_UM),
-        at_most(f"{seeds}: standard deviation", max((day.square_um2 / day.ticks) ** 0.5 for day in days), "um"),
+        at_least("24 h typical: 1 s means within 2 um", 100 * day.second.fraction, "%", 99.9),
+        at_most("24 h typical: worst 60 s mean", day.minute.worst_um, "um", MINUTE_BAND_UM),
+        at_most("24 h typical: standard deviation", (day.square_um2 / day.ticks) ** 0.5, "um"),
         at_most("10 s without laser, worst of 12 seeds: way of the true centre", max(excursions_um), "um", 4.0),
         at_most("10 s without laser, mean of 12 seeds", float(np.mean(excursions_um)), "um"),
-        *figures(2.0),
+        *figures(1.0),
     ]
 
 
