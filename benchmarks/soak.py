@@ -209,7 +209,7 @@ def everything(seed: int) -> tuple[Happening, ...]:
 
 
 def run() -> list[Figure]:
-    """A day of typical weather as the target asks (more seeds: tests/campaign), the laser lost, a day with everything."""
+    """A day of typical weather (more seeds: tests/campaign), the laser lost, a day with everything."""
     day = soak(1.0, 1, faults=False)
     excursions_um = dropout_excursions_um()
     return [
