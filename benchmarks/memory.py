@@ -28,7 +28,7 @@ import psutil
 
 from benchmarks.figures import Figure, at_most
 from benchmarks.memory_acquisition import acquisition_figures
-from benchmarks.recorded_hold import Second, seconds_of
+from benchmarks.recorded_hold import Part, parts_of
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config, LoopConfig, RecordingConfig, ShapeConfig
 from membrane_ctrl.ipc.ring import RingAddress, RingWriter, ring
@@ -108,8 +108,8 @@ def _fed_figures(folder: Path, stack: ExitStack) -> list[Figure]:
         stack.callback(child.stop, 10.0)
     # the recorder's memory rises with its segment and falls with the next: the largest of two hours is compared
     seen: list[tuple[float, dict[str, float]]] = []
-    for now_s, second in _rounds(config):
-        second.put(writers)
+    for now_s, part in _rounds(config):
+        part.put(writers)
         assert clock_memory.buf is not None
         _DOUBLE.pack_into(clock_memory.buf, 0, now_s)
         _wait_for_writes(status, 2)
@@ -133,28 +133,28 @@ def _children(
     ], ours
 
 
-def _rounds(config: Config) -> Iterator[tuple[float, Second]]:
+def _rounds(config: Config) -> Iterator[tuple[float, Part]]:
     """A week of rounds: the way to the hold once, and then the same 20 minutes of it, each time later."""
-    first, again = Second(), Second()
-    for number, second in enumerate(seconds_of(config, round(2 * ROUND_S))):
+    first, again = Part(), Part()
+    for number, part in enumerate(parts_of(config, 2 * ROUND_S, 1.0)):
         target = first if number < ROUND_S else again
         for name in ("telemetry", "inputs", "shapes", "events"):
-            getattr(target, name).extend(getattr(second, name))
+            getattr(target, name).extend(getattr(part, name))
     yield ROUND_S, first
     for number in range(round(WEEK_S / ROUND_S) - 1):
         yield (number + 2) * ROUND_S, _later(again, number * ROUND_S)
 
 
-def _later(second: Second, by_s: float) -> Second:
+def _later(part: Part, by_s: float) -> Part:
     ticks = round(by_s * RATE_HZ)
-    rows = np.frombuffer(b"".join(second.telemetry), dtype="<f8").reshape(-1, len(FIELDS)).copy()
+    rows = np.frombuffer(b"".join(part.telemetry), dtype="<f8").reshape(-1, len(FIELDS)).copy()
     rows[:, _TIME] += by_s
     rows[:, _TICK] += ticks
-    return Second(
+    return Part(
         [row.tobytes() for row in rows],
-        [_tick_later(message, ticks, by_s) for message in second.inputs],
-        [_shape_later(message, by_s) for message in second.shapes],
-        second.events,
+        [_tick_later(message, ticks, by_s) for message in part.inputs],
+        [_shape_later(message, by_s) for message in part.shapes],
+        part.events,
     )
 
 

@@ -25,8 +25,8 @@ Rings = dict[str, RingWriter]
 
 
 @dataclass(slots=True)
-class Second:
-    """What goes into the rings in one second of a run."""
+class Part:
+    """What goes into the rings in some time of a run."""
 
     telemetry: list[bytes] = field(default_factory=list)
     inputs: list[bytes] = field(default_factory=list)
@@ -66,26 +66,26 @@ def pickle_trip(estimate: ShapeEstimate) -> ShapeEstimate:
     return found
 
 
-def seconds_of(config: Config, duration_s: int) -> Iterator[Second]:
-    """The run second by second, from standby on."""
+def parts_of(config: Config, duration_s: float, part_s: float) -> Iterator[Part]:
+    """The run part by part, from standby on."""
     bench = VirtualBench(Plant(config.twin, config.pump))
     run = VirtualRun(config, bench, zernike_projection(), RealisticShapes(bench, config))
     number = 0
-    for second in range(duration_s):
-        made = Second()
-        for _ in range(round(config.loop.rate_hz)):
+    for place in range(round(duration_s / part_s)):
+        made = Part()
+        for _ in range(round(part_s * config.loop.rate_hz)):
             tick = run.tick((Command("hold", "benchmark"),) if number == 0 else ())
             if tick is not None:
                 number += 1
                 _take(made, tick, number)
-        yield made if second else _begun(made)
+        yield made if place else _begun(made)
 
 
-def _begun(first: Second) -> Second:
+def _begun(first: Part) -> Part:
     return replace(first, events=[json.dumps({"kind": "start", "mono_s": 0.0}).encode(), *first.events])
 
 
-def _take(made: Second, tick: VirtualTick, number: int) -> None:
+def _take(made: Part, tick: VirtualTick, number: int) -> None:
     row = tick.row.pack()
     made.telemetry.append(row)
     made.inputs += pack_tick(number, tick.inputs, tick.outputs, row)

@@ -1,4 +1,4 @@
-"""Bytes of a day: an hour of hold at 50 Hz with a shape each 2 s through the real recorder, a write a second.
+"""Bytes of a day: an hour of hold at 50 Hz with a shape each 2 s through the real recorder, a write each 0.8 s.
 
 python -m benchmarks recording
 """
@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from benchmarks.figures import Figure, at_most
-from benchmarks.recorded_hold import seconds_of
+from benchmarks.recorded_hold import parts_of
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
@@ -23,6 +23,7 @@ from membrane_ctrl.telemetry import ROW_BYTES
 from membrane_ctrl.tick_record import MESSAGE_BYTES
 
 DAY_S = 86_400.0
+WRITE_S = 0.8  # the recorder's rounds: 0.75 s and a little
 DURATION_S = 3600  # one whole segment
 _RINGS = {
     "telemetry": (400, ROW_BYTES),
@@ -59,9 +60,9 @@ def _measured(folder: Path, stack: ExitStack) -> list[Figure]:
     recording = Recording(run_dir, "day", clock, config)
     recorder = Recorder(run_dir, clock, config, readers, recording, None, lambda report: None)
     busy_s = 0.0
-    for number, second in enumerate(seconds_of(config, DURATION_S)):
-        HandClock.moment_s = number + 1.0
-        second.put(writers)
+    for number, part in enumerate(parts_of(config, DURATION_S, WRITE_S)):
+        HandClock.moment_s = (number + 1) * WRITE_S
+        part.put(writers)
         begun_s = time.process_time()
         recorder.drain()
         recorder.write()

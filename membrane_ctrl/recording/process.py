@@ -55,7 +55,7 @@ class RecorderSpec:
     resumes : int
         How many recorders of this run have died before this one; it goes on where they stopped.
     flush_s : float
-        What a killed recorder may lose.
+        From one write to the next: with the round it waits for, what a power cut may lose.
     """
 
     run_dir: Path
@@ -68,7 +68,7 @@ class RecorderSpec:
     frames: FrameAddress | None = None
     inputs: RingAddress | None = None
     resumes: int = 0
-    flush_s: float = 1.0
+    flush_s: float = 1.0 - _POLL_S
 
 
 def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:

@@ -101,9 +101,9 @@ def write_processes(results: list[ProcessResult]) -> None:
     violations = sum(len(result.violations) for result in results)
     lines = [
         f"**{len(results)} runs with real processes and sockets, {violations} violations.** A hold in its own "
-        "process against the emulated board (watchdog 0.5 s), in real time at 50 Hz; the fault sets in while the "
-        "mirror is inflated. Looked at: exit, first cause and latched-fault file, the board's own output, sag and pressure, "
-        "every tick in the tables once, UTC of all events, no process left behind.",
+        "process against the emulated board (watchdog 0.5 s), in real time at 50 Hz; the fault sets in while "
+        "the mirror is inflated, and recorded. Looked at: exit, first cause and latched-fault file, the board's own "
+        "output, sag and pressure, every tick in the tables once, UTC of all events, no process left behind.",
         "",
         *process_table(results),
         "",
@@ -113,7 +113,7 @@ def write_processes(results: list[ProcessResult]) -> None:
         "`python -m pytest -m campaign tests/campaign/test_campaign_processes.py -k NAME`.",
     ]
     before, _, rest = DOCUMENT.read_text(encoding="utf-8").partition(_BEGIN)
-    DOCUMENT.write_text(before + "\n".join([_BEGIN, "", *lines, "", ""]) + _END + rest.partition(_END)[2], "utf-8")
+    DOCUMENT.write_text(before + "\n".join([_BEGIN, *lines, "", ""]) + _END + rest.partition(_END)[2], "utf-8")
 
 
 def _cell(results: list[Result]) -> str:

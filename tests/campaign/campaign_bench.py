@@ -76,6 +76,7 @@ class Run:
         self, process: asyncio.subprocess.Process, folder: Path, board: PumpBoardEmulator, plant: WatchedPlant
     ) -> None:
         self.process, self.folder, self.board, self.plant = process, folder, board, plant
+        self.killed_utc_s: float | None = None
 
     @property
     def events(self) -> list[dict[str, Any]]:
@@ -83,6 +84,11 @@ class Run:
         if not found:
             return []
         return [json.loads(line) for line in found[0].read_text().splitlines() if line.endswith("}")]
+
+    @property
+    def recorded(self) -> bool:
+        """The recorder has made its first round; until then what was measured is in the rings alone."""
+        return any(self.folder.glob("logs/*/.recorder-state"))
 
     def reached(self, state: str) -> bool:
         return any(event["kind"] == "state" and event["state"] == state for event in self.events)
@@ -120,6 +126,8 @@ class Run:
     def signal(self, number: signal.Signals) -> float:
         """Send a signal to the control process alone; the time of it."""
         os.kill(self.process.pid, number)
+        if number == signal.SIGKILL:
+            self.killed_utc_s = time.time()
         return time.monotonic()
 
 
@@ -142,7 +150,7 @@ async def running(
     children: list[psutil.Process] = []
     try:
         run = Run(process, folder, board, plant)
-        await run.until(lambda: plant.pumping and run.reached("inflate"))
+        await run.until(lambda: plant.pumping and run.reached("inflate") and run.recorded)
         children = psutil.Process(process.pid).children(recursive=True)
         yield run
     finally:

@@ -23,6 +23,7 @@ from membrane_ctrl.latched import LatchedFile
 from membrane_ctrl.repair import repair
 from membrane_ctrl.review.run import open_run
 
+RATE_HZ = 50.0
 _SMALL_DISK_MB = 24
 _GAUGE_SLACK_PA = 1.5  # three sigma of the gauge
 
@@ -99,7 +100,7 @@ def judged(case: ProcessCase, run: Run, code: int, pump_s: float) -> ProcessResu
     faults = run.faults()
     said = faults[0] if faults else ""
     latched = LatchedFile(run.folder / "logs").read()
-    lost_s = lost_telemetry_s(run_dir)
+    lost_s = lost_telemetry_s(run_dir, run.killed_utc_s)
     checks = {
         f"exit {code} in place of {case.exit}": code == case.exit,
         f"first cause {said!r}": said in case.faults if case.faults else not said,
@@ -119,15 +120,21 @@ def judged(case: ProcessCase, run: Run, code: int, pump_s: float) -> ProcessResu
     return ProcessResult(case.name, str(summary["exit"]), said, pump_s, lost_s, restarts, violations)
 
 
-def lost_telemetry_s(run_dir: Path) -> float:
-    """Ticks that no table has, between the first and the last that the run made, as seconds."""
-    ticks = open_run(run_dir).ticks(["tick"]).column("tick").to_numpy()
+def lost_telemetry_s(run_dir: Path, killed_utc_s: float | None = None) -> float:
+    """Seconds of ticks that no table has, up to the run's last tick, or to the moment when it was killed."""
+    run = open_run(run_dir)
+    table = run.ticks(["tick"])
+    ticks = table.column("tick").to_numpy()
     if not len(ticks):
         return math.inf
     ends = [json.loads(line) for line in (run_dir / "events.jsonl").read_text().splitlines() if '"end"' in line]
     last = max([ticks[-1], *(event["ticks"] for event in ends if "ticks" in event)])
     assert len(np.unique(ticks)) == len(ticks), "a tick is there twice"
-    return float(last - len(ticks)) / 50.0
+    gaps_s = float(last - len(ticks)) / RATE_HZ
+    if killed_utc_s is None:
+        return gaps_s
+    killed_s = killed_utc_s - run.utc(0.0).timestamp()
+    return gaps_s + max(0.0, killed_s - float(table.column("mono_s")[-1].as_py()) - 1.0 / RATE_HZ)
 
 
 def utc_is_steady(run: Run) -> bool:
