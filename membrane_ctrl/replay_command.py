@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.controller_memory import UnknownMemoryError
-from membrane_ctrl.errors import Exit
+from membrane_ctrl.errors import Exit, InputError
 from membrane_ctrl.incident import write_incident
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.recorded_run import RecordedRun, open_run
@@ -26,12 +26,16 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
     Raises
     ------
     InputError
-        Not a run that can be replayed, or (with `to_test`) a name that is taken.
+        Not a run that can be replayed, a part that it does not have, or (with `to_test`) a name that is taken.
     """
+    if from_s >= to_s:
+        raise InputError(f"--from {from_s:g}s is not before --to {to_s:g}s")
     run = open_run(folder)
     started_s = time.perf_counter()
     begin, found = _replayed(run, from_s, to_s)
     took_s = time.perf_counter() - started_s
+    if found.last_s < from_s:
+        raise InputError(f"{folder}: --from {from_s:g}s: the record ends at {found.last_s:.1f} s")
     report = _report(run, found, to_s)
     if as_json:
         print(json.dumps(report))

@@ -94,6 +94,20 @@ def test_a_replay_begins_with_the_last_memory_before(
     assert report["begin_s"] == TICKS[first - 1][0].now_s
 
 
+@pytest.mark.parametrize(
+    ("window", "says"),
+    [
+        (("--from", "99h"), "the record ends at 20.0 s"),
+        (("--from", "9s", "--to", "8s"), "--from 9s is not before --to 8s"),
+    ],
+)
+def test_a_part_that_the_run_has_not_is_one_line(
+    record: Path, window: tuple[str, ...], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["replay", str(record), *window]) == Exit.BAD_INPUT
+    assert says in capsys.readouterr().err
+
+
 def test_a_memory_of_another_layout_is_told_and_the_replay_begins_with_the_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
