@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,16 @@ from membrane_ctrl.errors import Exit, InputError
 from membrane_ctrl.recording import events as event_lines
 from membrane_ctrl.recording import plain_json
 from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.recording.column_tables import TICKS
 from membrane_ctrl.recording.inputs_file import InputsReader
 from membrane_ctrl.recording.optimizer import optimize_command, quiet_environment
 from membrane_ctrl.recording.read_back import read_rows
 from membrane_ctrl.recording.rows import COLUMN, Rows, column
 from membrane_ctrl.recording.sink import is_whole
 from membrane_ctrl.recording.summary import Summary
+from membrane_ctrl.review.column_reader import column_files
+from membrane_ctrl.review.run import open_run
+from membrane_ctrl.telemetry import FIELDS
 
 FOLDER = "repaired"
 # A recorder writes each second: what has changed since is a run that is still going on.
@@ -186,7 +190,7 @@ def _repair_summary(run_dir: Path, in_place: bool) -> Finding:
 def rebuild_summary(run_dir: Path) -> dict[str, Any]:
     """`summary.json` from what is on the disk; `"rebuilt": true` says so.
 
-    Ticks the recording thinned out in quiet times are not in the statistics, and neither is what was lost.
+    Of a run without tables the ticks that Rerun does not have (in quiet times) are not in the statistics.
     """
     summary = Summary(load(run_dir / "config.toml", Config))
     path = run_dir / "events.jsonl"
@@ -216,12 +220,14 @@ def _segments(run_dir: Path) -> Sequence[Path]:
     return [repaired / path.name if (repaired / path.name).exists() else path for path in paths]
 
 
-def _all_rows(run_dir: Path) -> Sequence[Rows]:
-    """Rows of all segments that can be read."""
-    found = []
+def _all_rows(run_dir: Path) -> Iterator[Rows]:
+    """Every tick of the tables; without them the rows of all segments that can be read."""
+    if column_files(run_dir, TICKS):
+        for block in open_run(run_dir).tick_blocks(FIELDS):
+            yield np.column_stack([block[name] for name in FIELDS])
+        return
     for path in _segments(run_dir):
         try:
-            found.append(read_rows(path))
+            yield read_rows(path)
         except (RuntimeError, ValueError, OSError):  # Rerun's own ways to say that nothing can be read
             continue
-    return found

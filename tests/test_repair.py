@@ -13,6 +13,7 @@ from virtual_record import CONFIG, kept_ticks, write_record
 from membrane_ctrl.cli import run
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.errors import Exit, InputError
+from membrane_ctrl.recording.column_tables import ColumnTables
 from membrane_ctrl.recording.read_back import read_rows
 from membrane_ctrl.recording.rows import COLUMN, unpack
 from membrane_ctrl.recording.sink import Recording, is_whole
@@ -195,3 +196,18 @@ def test_what_is_thinned_out_in_quiet_is_still_counted(folder: Path) -> None:
     for path in folder.glob("*.rrd"):
         path.unlink()
     assert rebuild_summary(folder)["ticks"] == len(TICKS)
+
+
+def test_with_tables_the_statistics_are_of_every_tick(folder: Path) -> None:
+    tables = ColumnTables(folder)
+    tables.add_rows(ROWS)
+    tables.sync()  # and then it was killed
+    expected = Summary(CONFIG)
+    expected.add_rows(ROWS)
+    wanted = expected.as_dict({}, {})
+    for path in folder.glob("*.rrd"):
+        path.unlink()
+    found = rebuild_summary(folder)
+    assert found["ticks"] == len(ROWS)
+    for key in ("true_std_um", "true_bias_um", "leak_um_per_s"):
+        assert found[key] == pytest.approx(wanted[key], rel=1e-4), key  # a table holds singles
