@@ -50,7 +50,7 @@ class Sweep:
     def __init__(self, link: CaptureLink, limits: LimitsConfig, progress: Callable[[float], None]) -> None:
         self._link, self._limits, self._progress = link, limits, progress
         self._last_s = math.nan
-        self._why = "no reason was told"
+        self._why = ""
 
     def look(self) -> Held:
         """The mirror as it is held, over some seconds and at least one shape.
@@ -162,11 +162,13 @@ class Sweep:
         news = self._link.news()
         for event in news.events:
             if event["kind"] == "state":
-                self._why = str(event["why"])
+                self._why = f" ({event['why']})"
         for row in news.rows:
             if row.state != State.HOLD:
                 name = State(int(row.state)).name.lower()
-                raise HoldError(f"the mirror is not held (state {name}): {self._why}; start or resume the hold first")
+                raise HoldError(
+                    f"the mirror is not held but in state {name}{self._why}; start or resume the hold first"
+                )
         if news.rows:
             passed_s = news.rows[-1].mono_s - self._last_s
             self._last_s = news.rows[-1].mono_s

@@ -118,7 +118,7 @@ def test_a_fault_on_the_way_is_left_to_the_safety_table(
     bench.dark_at = 1
     assert run([*live, "--range-um", "1000", "--sets", "2", "--yes"]) == 4
     said = capsys.readouterr().err
-    assert "the mirror is not held (state fault)" in said
+    assert "the mirror is not held but in state fault (" in said
     assert "the mirror is left to whoever has it; the shape loop is off" in said
     assert bench.asked[-1].value == 500.0  # on its way to the second set; nothing was asked for after the fault
 
