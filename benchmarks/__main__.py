@@ -33,6 +33,7 @@ NAMES = (
     "events_found",
     "links",
     "calibration",
+    "calibration_time",
     "recording",
     "memory",
     "soak",

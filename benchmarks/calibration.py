@@ -1,4 +1,4 @@
-"""The mirror calibrates its optics: accuracy over seeds, truth of the covariance, bow, and time.
+"""The mirror calibrates its optics: accuracy over seeds, truth of the covariance, bow.
 
 Accuracy: five sets a seed, rendered and decoded as `calibrate` does, at a quarter of the camera's resolution with the
 noise of the sixteen pixels that each large one stands for (16-bit frames). The true bench is off by what is known of
@@ -9,17 +9,11 @@ Covariance: a hundred seeds of traced points with the information of all pixels.
 from __future__ import annotations
 
 import math
-import resource
-import statistics
-import tempfile
-import time
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import Figure, at_least, at_most
-from membrane_ctrl.calibrate_command import CalibrateOptions, problem_of, read_sets
 from membrane_ctrl.config import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
 from membrane_ctrl.metrology.calibrate.diagnose import suspects
 from membrane_ctrl.metrology.calibrate.from_checked import phases_of
@@ -35,8 +29,6 @@ from membrane_ctrl.twin.film_shape import FilmShape, typical_film
 from membrane_ctrl.twin.illumination import pattern_sequence
 from membrane_ctrl.twin.rays import CameraPose, ScreenError, ScreenPose
 from membrane_ctrl.twin.render import OpticsRenderer
-from membrane_ctrl.twin.simulate import simulate_set
-from membrane_ctrl.twin.simulation_spec import Motion, SimulationSpec
 from membrane_ctrl.twin.trace import trace
 
 FloatArray = NDArray[np.float64]
@@ -53,7 +45,7 @@ _PIXEL_NOISE_ADU = math.hypot(0.4, math.sqrt(1 / 12))
 
 def run() -> list[Figure]:
     """All figures."""
-    return [*_accuracy(), *_bowed(), *_covariance(), *_time()]
+    return [*_accuracy(), *_bowed(), *_covariance()]
 
 
 def _camera(shrink: int) -> CameraConfig:
@@ -227,29 +219,3 @@ def _traced(values: FloatArray, seed: int) -> tuple[SetPhases, ...]:
         sigma = np.full(seen.shape[1], sigma_mm)
         sets.append(SetPhases(f"{k}", column[inside], row[inside], seen, sigma, reading_um))
     return tuple(sets)
-
-
-def _time() -> list[Figure]:
-    """Five full-resolution sets from files, and ten of a quarter of the resolution, read and solved."""
-    rows = []
-    for shrink, count, limit_s in ((4, 10, 10.0), (1, 5, 60.0)):
-        with tempfile.TemporaryDirectory() as folder:
-            folders = [Path(folder) / f"{k}" for k in range(count)]
-            camera = CameraConfig(width_px=2448 // shrink, height_px=2048 // shrink, pixel_um=3.45 * shrink)
-            optics = OpticsConfig(geometry=STATED, camera=camera)
-            film = typical_film(37.1, 500.0, 1)
-            for k, path in enumerate(folders):
-                motion = Motion(start_um=-4000.0 + 8000.0 * k / (count - 1))
-                simulate_set(path, SimulationSpec(optics, film, motion=motion, laser_noise_um=1.0, seed=k))
-            options = CalibrateOptions(folders, None, Path("geometry.toml"), (), 1.0, False)
-            seconds = []
-            for _ in range(2):  # the first compiles
-                begin = time.perf_counter()
-                bundle = read_sets(options.folders, options.geometry)
-                solve(problem_of(bundle, {}, options.laser_sigma_um))
-                seconds.append(time.perf_counter() - begin)
-        what = "full-resolution sets" if shrink == 1 else "sets of a quarter of the resolution"
-        rows.append(at_most(f"{count} {what}, files to geometry", statistics.median(seconds[1:]), "s", limit_s))
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    rows.append(at_most("memory of the process", peak_mb, "MB", 2000))
-    return rows

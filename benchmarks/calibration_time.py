@@ -1,0 +1,49 @@
+"""How long a calibration takes from files to the geometry, by the clock and of the processors.
+
+The clock is what a person waits for; on a busy machine the processors' seconds are what can be compared.
+"""
+
+from __future__ import annotations
+
+import resource
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks.figures import Figure, at_most
+from membrane_ctrl.calibrate_command import problem_of, read_sets
+from membrane_ctrl.config import CameraConfig, GeometryConfig, OpticsConfig
+from membrane_ctrl.metrology.calibrate.solve import solve
+from membrane_ctrl.twin.film_shape import typical_film
+from membrane_ctrl.twin.simulate import simulate_set
+from membrane_ctrl.twin.simulation_spec import Motion, SimulationSpec
+
+STATED = GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9, reference_displacement_um=0.0)
+
+
+def run() -> list[Figure]:
+    """Ten sets of a quarter of the resolution, and five full ones, read and solved."""
+    rows = [*_time(4, 10, 10.0), *_time(1, 5, 60.0)]
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return [*rows, at_most("memory of the process", peak_mb, "MB", 2000)]
+
+
+def _time(shrink: int, count: int, limit_s: float) -> list[Figure]:
+    with tempfile.TemporaryDirectory() as folder:
+        folders = [Path(folder) / f"{k}" for k in range(count)]
+        camera = CameraConfig(width_px=2448 // shrink, height_px=2048 // shrink, pixel_um=3.45 * shrink)
+        optics = OpticsConfig(geometry=STATED, camera=camera)
+        film = typical_film(37.1, 500.0, 1)
+        for k, path in enumerate(folders):
+            motion = Motion(start_um=-4000.0 + 8000.0 * k / (count - 1))
+            simulate_set(path, SimulationSpec(optics, film, motion=motion, laser_noise_um=1.0, seed=k))
+        seconds = processors = 0.0
+        for _ in range(2):  # the first compiles
+            begin, busy = time.perf_counter(), time.process_time()
+            solve(problem_of(read_sets(folders, None), {}, 1.0))
+            seconds, processors = time.perf_counter() - begin, time.process_time() - busy
+    what = f"{count} {'full-resolution sets' if shrink == 1 else 'sets of a quarter of the resolution'}"
+    return [
+        at_most(f"{what}, files to geometry", seconds, "s", limit_s),
+        Figure(f"{what}, processors' seconds", processors, "s"),
+    ]
