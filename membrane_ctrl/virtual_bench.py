@@ -101,6 +101,8 @@ class VirtualBench:
         Switches.
     board : BoardState
         The board itself: what it gives to pump and vent, and what it has latched.
+    truth : Truth
+        What really was when the board last took its sample, or would have.
     """
 
     def __init__(self, plant: Plant, watchdog_s: float = 0.5) -> None:
@@ -156,9 +158,10 @@ class VirtualBench:
 
     def _sampled(self, last: BoardSample | None) -> BoardSample:
         wrong = self.wrong
+        self.truth = self.plant.truth()
         if wrong.samples_frozen and last is not None:
             return last
-        sample = self.plant.sample()
+        sample = self.plant.sample_of(self.truth)
         displacement_um = sample.displacement_um + wrong.laser_offset_um
         if wrong.laser_stuck and last is not None:
             displacement_um = last.displacement_um

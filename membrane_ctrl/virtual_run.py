@@ -113,7 +113,7 @@ class VirtualRun:
         return VirtualTick(inputs, outputs)
 
     def _inputs(self, reading: BenchReading | None, commands: tuple[Command, ...]) -> TickInputs:
-        wrong, truth = self._bench.wrong, self._bench.plant.truth()
+        wrong, truth = self._bench.wrong, self._bench.truth
         dt_s = self.now_s - self._last_s
         return TickInputs(
             now_s=self.now_s,

@@ -105,7 +105,11 @@ class Plant:
 
     def sample(self) -> PlantSample:
         """What the sensors say now, with noise of its own in each call."""
-        return self._sensors.read(self.truth(), self._pump_fraction, self._vent_fraction)
+        return self.sample_of(self.truth())
+
+    def sample_of(self, truth: Truth) -> PlantSample:
+        """The same, for who has the truth of now already."""
+        return self._sensors.read(truth, self._pump_fraction, self._vent_fraction)
 
     def truth(self) -> Truth:
         """What really is."""
