@@ -33,7 +33,7 @@ from tuning.records import Record
 from tuning.records_file import load_record, save_record
 from tuning.robustness import Robustness
 from tuning.session_folder import SessionFolder
-from tuning.verify import SETTLE_S, STAGES, Stage, Trial, look
+from tuning.verify import STAGES, Stage, Trial, look, settle_s
 
 OBSERVE_S = 600.0
 _PREVIEW_SEEDS = 3
@@ -252,13 +252,13 @@ def verify_step(
     after, before = checked_gains(session), session.head.before
     session.begin("verify")
     trial = Trial(found_of(session).identified.model, disturbance_of(session), before, after)
-    rig.set_gains(after, f"session {session.path.name}: verification", SETTLE_S + stages[-1][0] + _SPARE_S)
+    rig.set_gains(after, f"session {session.path.name}: verification", settle_s(after) + stages[-1][0] + _SPARE_S)
     looks: list[Stage] = []
     record: Record | None = None
     setpoint_um = np.empty(0)
     reason = ""
     try:
-        rig.hold(SETTLE_S)
+        rig.hold(settle_s(after))
         for until_s, growth_max in stages:
             more, about_um = rig.hold_about(until_s - setpoint_um.size * rig.dt_s)
             record = more if record is None else record.followed_by(more)

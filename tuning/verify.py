@@ -29,7 +29,8 @@ from tuning.records import Record, Series
 # Time of a stage, and growth that ends the trial there: early on only what is plainly wrong, for a minute of weather
 # scatters by a third; at the end the 10 % that are asked for.
 STAGES = ((60.0, 2.0), (180.0, 1.5), (300.0, 1.3), (600.0, 1.10))
-SETTLE_S = 20.0
+SETTLE_LEAST_S, _SETTLE_MOST_S = 20.0, 120.0
+_SETTLE_TIME_CONSTANTS = 4.0  # of the loop's slowest mode: 2 % is left of what the change of gains stirred up
 _OBSERVE_LEAST_S = 300.0  # before that the weather of the session stands for the present one
 MS_MAX = 2.0  # sensitivity seen; its estimate scatters by a tenth
 _SEGMENT_S = 20.0
@@ -68,6 +69,18 @@ class Stage:
     ms: float
     lost_fraction: float
     reason: str
+
+
+def settle_s(loop: LoopConfig) -> float:
+    """How long the centre needs to forget the change to these gains.
+
+    Without delay and filter the loop around the film's integral is s^2 + K s + K / Ti = 0 (Td is small beside both);
+    its slowest root has the real part (K - sqrt(K^2 - 4 K / Ti)) / 2, or K / 2 where it swings.
+    """
+    k, ti_s = loop.kp_per_s, loop.ti_s
+    slowest_per_s = (k - math.sqrt(max(0.0, k * k - 4 * k / ti_s))) / 2
+    slowest_s = 1 / slowest_per_s if slowest_per_s > 0 else math.inf
+    return min(max(SETTLE_LEAST_S, _SETTLE_TIME_CONSTANTS * slowest_s), _SETTLE_MOST_S)
 
 
 @dataclass(frozen=True, slots=True)

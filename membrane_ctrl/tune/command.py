@@ -26,7 +26,7 @@ from tuning.hold_link import HoldError, HoldLink
 from tuning.hold_rig import HoldRig
 from tuning.report import write_report
 from tuning.session_folder import STEPS, SessionFolder, create_session, newest_session, open_session
-from tuning.verify import SETTLE_S, STAGES, Stage
+from tuning.verify import SETTLE_LEAST_S, STAGES, Stage
 
 _TOO_TIGHT = "the mirror is too tight to be held within its band: open the bleed (loop.bleed_fraction)"
 _MOVES = frozenset({"characterise", "observe", "apply", "verify"})
@@ -249,7 +249,7 @@ def _begin(progress: Progress, options: TuneOptions, step: str, after: list[str]
     planned = {
         "characterise": TYPICAL_S,
         "observe": options.observe_s,
-        "verify": SETTLE_S + options.verify_s,
+        "verify": SETTLE_LEAST_S + options.verify_s,
     }
     progress.begin(step, planned.get(step, 0.0), sum(planned.get(later, 0.0) for later in after))
 

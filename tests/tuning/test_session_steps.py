@@ -22,7 +22,7 @@ from tuning.plant_model import PlantModel
 from tuning.preview import ModelBench
 from tuning.records import Record
 from tuning.rig import Rig
-from tuning.verify import Trial, centre_std_um, look
+from tuning.verify import SETTLE_LEAST_S, Trial, centre_std_um, look, settle_s
 from tuning.watch import health
 
 PLANT = PlantModel(1.0, 0.08, 0.15, 1.24)
@@ -43,6 +43,14 @@ def test_the_centre_s_deviation_is_seen_through_ten_times_the_noise() -> None:
     true_um = float(np.std(bench.true_um[1500:]))
     trial = Trial(PLANT, WEATHER, LOOP, LOOP)
     assert centre_std_um(record.displacement_um, trial, WEATHER) == pytest.approx(true_um, rel=0.2)
+
+
+def test_a_slow_loop_is_given_longer_to_forget_the_change() -> None:
+    assert settle_s(LOOP) == SETTLE_LEAST_S
+    slow = LOOP.model_copy(update={"kp_per_s": 0.247, "ti_s": 19.94})
+    # the slowest root of s^2 + 0.247 s + 0.01239 is at 0.0701 per s
+    assert settle_s(slow) == pytest.approx(4 / 0.0701, rel=0.01)
+    assert settle_s(slow.model_copy(update={"ti_s": 3600.0})) <= 120.0
 
 
 def test_a_look_passes_good_gains_and_names_what_is_wrong_with_bad_ones() -> None:
