@@ -17,6 +17,7 @@ from membrane_ctrl.controller_memory import UnknownMemoryError, recall, remember
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.incident import check_incident, read_incident
 from membrane_ctrl.metrology.hencky import zernike_projection
+from membrane_ctrl.recording.inputs_file import InputsFile
 
 TICKS = kept_ticks(20.0, laser_lost)
 MIDDLE = 650  # 13 s: held, the laser is lost a second later
@@ -62,6 +63,11 @@ def test_another_layout_is_refused_by_name() -> None:
         (as_memory(os.system), r"posix\.system"),
         (as_memory(run), r"membrane_ctrl\.cli.*run"),
         (as_memory(Path("x")), "pathlib"),
+        (
+            zlib.compress(b"{}\n\x80\x04\x8c\x15membrane_ctrl.systemd\x8c\x0dsocket.socket\x93."),
+            "no part of a controller",
+        ),
+        (zlib.compress(b"{}\n" + pickle.dumps(InputsFile)), "InputsFile, which is no part"),
     ],
 )
 def test_what_is_no_memory_is_refused(memory: bytes, says: str) -> None:
