@@ -20,6 +20,7 @@ from pymodbus.client import ModbusTcpClient
 from rerun.chunk import RrdReader
 
 from firmware_iface.register_map import default_map
+from membrane_ctrl.capture_set import read_head
 from membrane_ctrl.cli import run
 
 pytestmark = pytest.mark.real_time
@@ -112,10 +113,20 @@ def running(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
 
 def test_a_short_hold_with_the_camera_loop_leaves_everything_it_should(tmp_path: Path) -> None:
     camera = f"start_error_um = -2.0\n[optics.camera]\n{SMALL_CAMERA}[shape]\nperiod_s = 1.0\n"
-    done = subprocess.run(
-        hold(tmp_path, "--duration", "20s", config=camera), capture_output=True, text=True, timeout=120, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    words = hold(tmp_path, "--duration", "20s", config=camera)
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        wait_for(lambda: reached(tmp_path, "hold"))
+        assert run(["ctl", "capture", "--socket", str(tmp_path / "logs" / "control.sock")]) == 0
+        stderr = process.communicate(timeout=120)[1]
+    finally:
+        process.kill()
+    assert process.returncode == 0, stderr
+    (captured,) = (event for event in events(tmp_path) if event["kind"] == "capture")
+    assert captured["verdict"] == "ok"
+    head = read_head(run_dir(tmp_path) / str(captured["set"]))
+    assert (head.kind, len(head.patterns)) == ("full", 18)
+    assert abs(head.displacement_um.mean()) < 5.0
     summary = json.loads((run_dir(tmp_path) / "summary.json").read_text())
     assert summary["exit"] == "done"
     assert [s["state"] for s in summary["states"]] == ["check", "inflate", "settle", "hold", "lower"]
@@ -128,8 +139,8 @@ def test_a_short_hold_with_the_camera_loop_leaves_everything_it_should(tmp_path:
     config = tomllib.loads((run_dir(tmp_path) / "config.toml").read_text())
     assert config["optics"]["camera"]["width_px"] == 306
     assert config["loop"]["rate_hz"] == 50.0
-    assert str(run_dir(tmp_path)) in done.stderr
-    assert "Traceback" not in done.stderr
+    assert str(run_dir(tmp_path)) in stderr
+    assert "Traceback" not in stderr
     assert rows_in(tmp_path) > 800
 
 

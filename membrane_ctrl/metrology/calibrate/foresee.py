@@ -69,6 +69,9 @@ def _set(geometry: Geometry, optics: OpticsConfig, sag_mm: float, moved_mm: floa
     phase_rad = phase_sigma_rad(equal_shifts(pattern.steps), pixel_sigma_adu(camera.noise_adu), swing_adu)
     sigma_mm = phase_rad * mm_per_rad(pattern) / every_px
     column, row = _towards_mirror(geometry, optics, every_px, sag_mm)
+    blind = f"at a sag of {sag_mm:.1f} mm the camera as stated sees no fringes in the mirror"
+    if column.size == 0:
+        raise ValueError(blind)
     dark = SetPhases(
         f"{sag_mm:.2f} mm", column, row, np.zeros((2, column.size)), np.full(column.size, sigma_mm), 1e3 * moved_mm
     )
@@ -79,7 +82,7 @@ def _set(geometry: Geometry, optics: OpticsConfig, sag_mm: float, moved_mm: floa
     inside = np.hypot(x_mm, y_mm) < mirror.analysis_radius_mm
     seen = inside & (np.abs(screen_mm) < pattern.periods * pattern.period_mm / 2).all(axis=0)
     if np.count_nonzero(seen) < PARAMETERS:
-        raise ValueError(f"at a sag of {sag_mm:.1f} mm the camera as stated sees no fringes in the mirror")
+        raise ValueError(blind)
     return SetPhases(
         dark.name, column[seen], row[seen], screen_mm[:, seen], dark.sigma_mm[seen], dark.displacement_um
     )

@@ -1,0 +1,25 @@
+"""What sets will determine, foreseen, against what rendered sets of a rippled film claim."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.config import CameraConfig, OpticsConfig
+from membrane_ctrl.metrology.calibrate.foresee import foresee
+from membrane_ctrl.metrology.calibrate.parameters import sigmas
+
+
+# docs/calibration.md: claims of calibrations of the twin's film, sag and figure in um
+@pytest.mark.parametrize(("range_mm", "sag_um", "figure_um"), [(8.0, 3.3, 0.9), (2.0, 6.2, 1.6)])
+def test_within_a_tenth_of_what_rippled_sets_claim(range_mm: float, sag_um: float, figure_um: float) -> None:
+    sags_mm = (37.0 + range_mm * np.linspace(-0.5, 0.5, 5)).tolist()
+    claim = foresee(OpticsConfig(), sigmas(), sags_mm, 80.0, 1.0)
+    assert claim.sag_um == pytest.approx(sag_um, rel=0.1)
+    assert claim.figure_rms_um == pytest.approx(figure_um, rel=0.12)
+
+
+def test_a_bench_that_sees_no_fringes_is_named() -> None:
+    optics = OpticsConfig(camera=CameraConfig(principal_px=(-9000.0, 1023.5)))  # looks past the mirror
+    with pytest.raises(ValueError, match="sees no fringes in the mirror"):
+        foresee(optics, sigmas(), [36.0, 38.0], 80.0, 1.0)
