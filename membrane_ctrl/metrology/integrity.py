@@ -19,10 +19,12 @@ from membrane_ctrl.metrology.patterns import AXES
 
 FloatArray = NDArray[np.float64]
 
-# Floors. A step wrong by 0.1 rad, or a light wrong by 3 %, moves the phase by some 0.03 rad: 0.2 mm on the screen.
-STEP_RAD = 0.1
-LEVEL_SHARE = 0.03
-SWING_SHARE = 0.05
+# Floors. Good frames of simulated sets (gamma 2.2, a rippled film, 20 um of motion) differ by up to 0.005 rad of step
+# and 0.005 of swing. A twentieth of the frame before left in one by a slow display is 0.05 rad, and 4 um of figure.
+STEP_RAD = 0.03
+LEVEL_SHARE = 0.015
+SWING_SHARE = 0.03
+_FLICKER = 0.03  # of light is called flicker whatever else is wrong
 # A frame taken 15 um off bends the figure by a few um at most; a laser that is off by less is usual.
 MOVED_UM = 15.0
 REST_SHARE = 0.015
@@ -156,7 +158,7 @@ def _sinusoid_reason(kind: str, e: Evidence, level: float, moved_um: float) -> s
         return f"saturated: {e.saturated:.0%} of the bins"
     if light < _DARK:
         return f"dark: {light:.2f} of the light of the others"
-    if abs(light - 1) > LEVEL_SHARE:
+    if kind == "light" or abs(light - 1) > _FLICKER:
         return f"flicker: {light:.3f} of the light of the others"
     if kind in ("moved", "rest") and abs(e.moved_um - moved_um) > MOVED_UM:
         return f"moved: the film stood {e.moved_um - moved_um:+.0f} um from where the others saw it"

@@ -52,6 +52,17 @@ def test_a_stale_frame_is_named_and_done_without(kind: str, frame: str) -> None:
     assert wrong < 0.05
 
 
+@pytest.mark.parametrize("frame", ["x_sin_2", pytest.param("y_sin_1", marks=pytest.mark.campaign)])
+def test_a_twentieth_of_the_frame_before_is_seen(frame: str) -> None:
+    stack = good_set(bench())
+    place = NAMES.index(frame)
+    before, own = stack.frames[place - 1 : place + 1].astype(float)
+    stack.frames[place] = np.rint(0.95 * own + 0.05 * before)  # 4 um of figure if nobody notices
+    checked = check(stack, bench())
+    assert [NAMES[flag.frame] for flag in checked.flags] == [frame]
+    assert error_um(checked.state.surface) < 0.05
+
+
 @pytest.mark.parametrize("frame", EVERY[:-1])
 @pytest.mark.parametrize(("kind", "word"), [("dark", "dark"), ("flicker", "flicker"), ("saturated", "")])
 def test_a_wrong_exposure_is_named(kind: str, word: str, frame: str) -> None:
