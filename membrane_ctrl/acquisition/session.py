@@ -87,11 +87,7 @@ def run(spec: AcquisitionSpec, remote: Remote) -> None:
         frames = stack.enter_context(closing(FrameWriter(spec.frames)))
         stack.callback(bench.close)  # before the ring of frames: an exposure under way holds the pixels of a slot
         laser = stack.enter_context(closing(LaserHistory(spec.telemetry)))
-        raw = (
-            stack.enter_context(closing(_raw_frames(spec, geometry.optics, plan)))
-            if spec.run_dir is not None
-            else None
-        )
+        raw = _raw_frames(spec, geometry.optics, plan, stack)
         cycle = ShapeCycle(
             bench.camera, bench.screen, reconstructor, plan, frames, clock, laser, stopping=remote.interrupts
         )
@@ -156,6 +152,9 @@ def _spread(run_dir: Path | None, optics: OpticsConfig) -> GeometrySpread | None
     return spread if spread.names else None
 
 
-def _raw_frames(spec: AcquisitionSpec, optics: OpticsConfig, plan: CyclePlan) -> RawFrames:
-    assert spec.run_dir is not None
-    return RawFrames(spec.run_dir / "raw", optics, plan, spec.config.recording, spec.frames, spec.telemetry)
+def _raw_frames(spec: AcquisitionSpec, optics: OpticsConfig, plan: CyclePlan, stack: ExitStack) -> RawFrames | None:
+    """What keeps frames, if there is a place for them."""
+    if spec.run_dir is None:
+        return None
+    raw = RawFrames(spec.run_dir / "raw", optics, plan, spec.config.recording, spec.frames, spec.telemetry)
+    return stack.enter_context(closing(raw))

@@ -63,6 +63,8 @@ class LiveBench:
         What the next captures say instead of taking a set.
     interrupt_at : int
         Ctrl-C while this capture is under way.
+    interrupts_again : bool
+        And once more on the way back.
     dark_at : int
         The laser is lost for good after this capture.
     meddles_at : int
@@ -77,6 +79,7 @@ class LiveBench:
     config: Config
     fails: list[str] = field(default_factory=list)
     interrupt_at: int = -1
+    interrupts_again: bool = False
     dark_at: int = -1
     meddles_at: int = -1
     blind: bool = False
@@ -93,6 +96,8 @@ class LiveBench:
         self.hold.ask(command)
         if command.kind == "capture":
             self._capture()
+        if self.interrupts_again and self.captures and command.kind == "setpoint":
+            signal.raise_signal(signal.SIGINT)
         if len(self.asked) == self.meddles_at:
             self.hold.ask(Command("setpoint", "another", value=77.0))
 

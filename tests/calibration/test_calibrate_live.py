@@ -76,11 +76,19 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
     assert (tmp_path / "bench.toml").read_text() == OLD
 
     bench.fails = ["rejected: somebody walked by"]
-    assert run([*live, "--session", str(session), "--yes"]) == 0
+    answer(monkeypatch, "y\nno\n")
+    assert run([*live, "--session", str(session)]) == 0
     said = capsys.readouterr()
     assert "2 of 3 sets" in said.err
     assert bench.captures == 2 + 3  # the bad one again, the set that was there not
     assert bench.hold.rows[-1].target_um == 0.0
+    assert not [row for row in bench.hold.rows if row.fault]
+    assert "not adopted; `membrane-ctrl calibrate --live --session" in said.err
+    assert (tmp_path / "bench.toml").read_text() == OLD
+
+    monkeypatch.setattr(command, "_link", None)  # all sets are there: no hold is needed
+    assert run([*live, "--session", str(session), "--yes"]) == 0
+    said = capsys.readouterr()
     new = tomllib.loads((tmp_path / "bench.toml").read_text())
     assert new["geometry"]["reference_displacement_um"] == 0.0
     found = {name: (value, sigma) for name, value, sigma in rows_of(said.out)}
@@ -88,7 +96,6 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
         value, sigma = found[name]
         assert abs(value - true) < 4 * sigma, name
         assert sigma < known / 2, name
-    assert not [row for row in bench.hold.rows if row.fault]
     assert "in force: by hand" in said.err
     assert f"adopted: {tmp_path / 'bench.toml'}; the one before it is {tmp_path / 'bench-'}" in said.err
     assert next(tmp_path.glob("bench-*.toml")).read_text() == OLD
@@ -121,6 +128,28 @@ def test_a_fault_on_the_way_is_left_to_the_safety_table(
     assert "the mirror is not held but in state fault (" in said
     assert "the mirror is left to whoever has it; the shape loop is off" in said
     assert bench.asked[-1].value == 500.0  # on its way to the second set; nothing was asked for after the fault
+
+
+def test_who_cannot_wait_for_the_way_back_leaves_the_hold_on_it(
+    bench: LiveBench, live: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.interrupt_at = 1
+    bench.interrupts_again = True
+    assert run([*live, "--range-um", "1000", "--sets", "2", "--yes"]) == 130
+    said = capsys.readouterr().err
+    assert "left: the hold ramps on to 0 um by itself; then switch the shape loop on" in said
+    assert bench.hold.rows[-1].target_um == 0.0
+    assert bench.hold.rows[-1].displacement_um < -100.0
+
+
+def test_setpoints_that_are_out_of_reach_now_are_refused(
+    bench: LiveBench, live: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.fails = ["camera: no trigger"] * 2
+    assert run([*live, "--range-um", "2000", "--sets", "2", "--yes"]) == 3
+    bench.config = config(displacement_max_um=500.0)
+    assert run([*live, "--session", str(session_in(tmp_path)), "--yes"]) == 2
+    assert "the sets from -1000 to 1000 um are beyond -4440 to 440" in capsys.readouterr().err
 
 
 def test_nothing_moves_unless_somebody_says_yes(
