@@ -6,6 +6,7 @@ python -m benchmarks.soak [--days 30] [--seed 1]
 from __future__ import annotations
 
 import argparse
+import contextlib
 import resource
 import sys
 import time
@@ -85,6 +86,7 @@ class Tally:
     ticks: int = 0
     rss_after_hour_mb: float = 0.0
     rss_mb: float = 0.0
+    days: float = 0.0
     wall_s: float = 0.0
 
 
@@ -101,7 +103,7 @@ def soak_config(seed: int) -> Config:
 def soak(
     days: float, seed: int, faults: bool = True, events: tuple[Happening, ...] = (), take: Take | None = None
 ) -> Tally:
-    """Hold for `days`; with `faults` something goes wrong six times a day. `take` gets every tick."""
+    """Hold for `days` or until ctrl-C; with `faults` something goes wrong six times a day. `take` gets every tick."""
     config = soak_config(seed)
     bench = VirtualBench(Plant(config.twin, config.pump, events))
     run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, config, seed))
@@ -109,19 +111,21 @@ def soak(
     due_s, name, lasts_s = next(upsets, (np.inf, "", 0.0))
     until_s, tally, start_s = np.inf, Tally(), time.process_time()
     tick = run.tick((Command("hold", "soak"),))
-    while run.now_s < days * DAY_S and run.finished is None:
-        if tick is not None:
-            _count(tick, tally)
-            if take is not None:
-                take(tick)
-        if run.now_s >= due_s:
-            _switch(bench, name, True)
-            until_s = run.now_s + lasts_s
-            due_s, following, after_s = next(upsets)
-        if run.now_s >= until_s:
-            _switch(bench, name, False)
-            until_s, name, lasts_s = np.inf, following, after_s
-        tick = run.tick()
+    with contextlib.suppress(KeyboardInterrupt):
+        while run.now_s < days * DAY_S and run.finished is None:
+            if tick is not None:
+                _count(tick, tally)
+                if take is not None:
+                    take(tick)
+            if run.now_s >= due_s:
+                _switch(bench, name, True)
+                until_s = run.now_s + lasts_s
+                due_s, following, after_s = next(upsets)
+            if run.now_s >= until_s:
+                _switch(bench, name, False)
+                until_s, name, lasts_s = np.inf, following, after_s
+            tick = run.tick()
+    tally.days = run.now_s / DAY_S
     tally.rss_mb, tally.wall_s = rss_mb(), time.process_time() - start_s
     return tally
 
@@ -189,6 +193,7 @@ def _dropout_excursion_um(seed: int) -> float:
 def figures(days: float, seed: int = 1, take: Take | None = None) -> list[Figure]:
     """A soak of `days` with everything, as figures."""
     tally = soak(days, seed, True, everything(seed), take)
+    days = tally.days  # fewer, if somebody has stopped it
     grown = 100 * (tally.rss_mb / tally.rss_after_hour_mb - 1)
     return [
         at_most("simulated days, with weather and faults", days, "d"),
