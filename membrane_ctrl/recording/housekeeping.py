@@ -12,6 +12,7 @@ from membrane_ctrl.recording.complaints import Complaints
 from membrane_ctrl.recording.optimizer import Optimizer
 from membrane_ctrl.recording.retention import deletable_runs, delete_run, expired, size_bytes
 from membrane_ctrl.recording.run_folder import free_mb
+from membrane_ctrl.recording.sink import LAYOUT
 from membrane_ctrl.recording.thrift import Thrift, thrift
 
 # Counting the bytes of a hundred runs takes a second of disk.
@@ -88,3 +89,4 @@ class Housekeeping:
         """End what is under way."""
         with contextlib.suppress(OSError):
             self._optimizer.close()
+            (self._run_dir / LAYOUT).unlink(missing_ok=True)

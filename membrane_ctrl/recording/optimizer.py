@@ -12,7 +12,7 @@ import subprocess
 from collections import deque
 from pathlib import Path
 
-from membrane_ctrl.recording.sink import is_whole
+from membrane_ctrl.recording.sink import LAYOUT, is_whole
 
 _PACKAGE = importlib.util.find_spec("rerun_cli")
 assert _PACKAGE is not None
@@ -21,7 +21,10 @@ _RERUN = Path(_PACKAGE.origin).parent / "rerun"
 
 
 def optimize_command(source: Path, target: Path, *options: str) -> list[str]:
-    """The command that writes `target` from `source`; the binary itself, as its Python wrapper outlives a kill."""
+    """The command that writes `target` from `source`; the binary itself, as its Python wrapper outlives a kill.
+
+    An option may be another source.
+    """
     return ["nice", "-n", "19", str(_RERUN), "rrd", "optimize", *options, str(source), "-o", str(target)]
 
 
@@ -61,8 +64,10 @@ class Optimizer:
         if self._waiting:
             self._source = self._waiting.popleft()
             self._part = self._source.with_name(f".{self._source.name}.part")
+            # the run's layout, which only its first segment has
+            layout = [str(path) for path in (self._source.with_name(LAYOUT),) if path.exists()]
             self._process = subprocess.Popen(
-                optimize_command(self._source, self._part),
+                optimize_command(self._source, self._part, *layout),
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 env=quiet_environment(),

@@ -1,8 +1,10 @@
 """The Rerun file: segments, time axes, statics, and a flush that says when the writer has died.
 
 Rerun facts behind this module (0.41, all reproduced): on a full disk `log` and `send_columns` go on without a
-word, only `flush` raises; `save` on a healthy stream starts a new file at once and loses no row; statics,
-properties and blueprint have to be sent again after each `save`; segments with the same recording id are one
+word, only `flush` raises; `save` on a healthy stream starts a new file at once and loses no row; statics
+and properties have to be sent again after each `save`, and so would the blueprint, but each sending of one keeps 3 MB
+for ever (of a week of hours that would be 0.5 GB): it goes into the first file, and to the others when they are
+optimised (`optimizer`); segments with the same recording id are one
 recording in the viewer. When the writer died between taking a flush and answering it, `flush` times out, and then
 `save`, `disconnect`, the stream's destructor and Rerun's own exit handler wait for it for ever: such a stream is
 kept and left alone, and the process has to end without exit handlers.
@@ -31,6 +33,7 @@ APPLICATION = "membrane_ctrl"
 RUN_TIME = "run_time"
 UTC = "utc"
 OUTSIDE_CLASS = 1
+LAYOUT = ".layout.rbl"  # the blueprint in a file of its own, while the run is recorded
 
 # A disk that takes longer than this to take a second of data (tens of kB) is as good as gone.
 _FLUSH_TIMEOUT_S = 5.0
@@ -79,6 +82,7 @@ class Recording:
         self.stuck = False
         self.path: Path | None = None
         self.segments = first_segment
+        self._laid_out = False
 
     def next_segment(self) -> None:
         """Close the file there is and go on in a new one. Raises RecordingError; then call it again later."""
@@ -106,7 +110,11 @@ class Recording:
 
     def _send_statics(self) -> None:
         stream = self._stream
-        stream.send_blueprint(run_blueprint(self._config))
+        if not self._laid_out:
+            self._laid_out = True
+            blueprint = run_blueprint(self._config)
+            stream.send_blueprint(blueprint)
+            blueprint.save(APPLICATION, str(self._run_dir / LAYOUT))
         stream.send_recording_name(self._run_dir.name)
         stream.send_property("run", rr.AnyValues(name=self._run_name, started_utc=str(self._origin)))
         for block in (*STREAMS, *DERIVED, *SHAPE_STREAMS):

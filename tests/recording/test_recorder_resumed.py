@@ -207,6 +207,10 @@ def chunks(path: Path) -> int:
     return sum("Scalars:scalars" in batch.schema.names for batch in found)
 
 
+def has_layout(path: Path) -> bool:
+    return b"ViewportBlueprint" in path.read_bytes()
+
+
 def test_closed_segments_are_optimised_beside_the_recording(tmp_path: Path, stack: ExitStack) -> None:
     run = Run(tmp_path, stack, Config(recording=RecordingConfig(segment_s=10)))
     recorder = run.recorder(0)
@@ -215,6 +219,7 @@ def test_closed_segments_are_optimised_beside_the_recording(tmp_path: Path, stac
     assert chunks(tmp_path / "test-000.rrd") >= 10
     for number in range(10, 12):
         run.second(recorder, number)
+    assert not has_layout(tmp_path / "test-001.rrd")  # sent once only: each sending keeps 3 MB
     optimizer = recorder._housekeeping._optimizer
     assert optimizer._process is not None
     optimizer._process.wait(30.0)
@@ -224,6 +229,7 @@ def test_closed_segments_are_optimised_beside_the_recording(tmp_path: Path, stac
     for name in ("test-000.rrd", "test-001.rrd"):  # the last one as well
         assert chunks(tmp_path / name) == 1
         assert is_whole(tmp_path / name)
+        assert has_layout(tmp_path / name)
     assert np.array_equal(np.sort(recorded(tmp_path)[:, 1]), np.arange(600))
     assert not list(tmp_path.glob(".*"))
 
