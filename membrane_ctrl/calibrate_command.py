@@ -72,11 +72,12 @@ class CalibrateOptions:
 
 @dataclass(frozen=True)
 class Bundle:
-    """Sets that were read: their phases, and the bench that all of them state."""
+    """Sets that were read: their phases, the bench that all of them state, and what is wrong with single frames."""
 
     sets: tuple[SetPhases, ...]
     optics: OpticsConfig
     reference_um: float
+    notes: tuple[str, ...] = ()
 
 
 def calibrate_command(options: CalibrateOptions) -> int:
@@ -91,7 +92,7 @@ def calibrate_command(options: CalibrateOptions) -> int:
     if not findings:
         try:
             solution = solve(problem, _progress())
-            findings = after(solution)
+            findings = (*after(solution), *(Finding(False, note) for note in bundle.notes))
         except ValueError as error:
             findings = (Finding(True, str(error)),)
     timing = {"read": read - begin, "solve": time.perf_counter() - read}
@@ -138,11 +139,14 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
         raise InputError(f"{next(f for f in folders if list(folders).count(f) > 1)}: given twice")
     sets: list[SetPhases] = []
     benches: list[OpticsConfig] = []
+    notes: list[str] = []
     for folder in folders:
         figure = figures.of(folder)
         benches.append(figure.head.optics)
         _same_rig(folders[0], benches[0], folder, benches[-1])
         sets.append(phases_of(folder.name, figure.checked, figure.head.optics))
+        files = figure.head.files
+        notes += [f"{folder.name}: {files[flag.frame]} left out: {flag.reason}" for flag in figure.checked.flags]
         if sys.stderr.isatty():
             print(f"\r{len(sets)} of {len(folders)} sets read", end="", file=sys.stderr)
     if sys.stderr.isatty():
@@ -151,7 +155,7 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
     if not any(math.isfinite(phases.displacement_um) for phases in sets):
         # no laser: the world's origin is the vertex of the first set
         sets[0] = replace(sets[0], displacement_um=reference_um)
-    return Bundle(tuple(sets), benches[0], reference_um)
+    return Bundle(tuple(sets), benches[0], reference_um, tuple(notes))
 
 
 def with_priors(bundle: Bundle, priors: Sequence[Prior]) -> Bundle:

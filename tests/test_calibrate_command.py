@@ -128,6 +128,20 @@ def test_a_rejected_calibration_leaves_the_old_geometry(
     assert out.read_text() == "old"
 
 
+def test_a_set_with_a_bad_frame_is_used_with_a_word(
+    folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spoilt = tmp_path / "spoilt"
+    shutil.copytree(folders[4], spoilt)
+    shutil.copy(spoilt / "x_sin_1.png", spoilt / "x_sin_2.png")  # as a camera gives that was not triggered
+    words = ["calibrate", str(folders[0]), str(folders[2]), str(spoilt), "--out", str(tmp_path / "g.toml")]
+    assert run([*words, "--json", "--no-pictures"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    (finding,) = report["findings"]
+    assert not finding["fatal"]
+    assert finding["says"].startswith("spoilt: x_sin_2.png left out: "), finding
+
+
 def test_one_pressure_is_not_enough(folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["calibrate", str(folders[0]), "--out", str(tmp_path / "g.toml"), "--json"]) == 3
     assert "only 0 um apart" in json.loads(capsys.readouterr().out)["findings"][0]["says"]

@@ -159,3 +159,11 @@ def test_an_empty_run_has_a_summary_of_nulls() -> None:
 def test_json_has_null_for_what_is_not_a_number() -> None:
     text = plain_json.dumps({"a": math.nan, "b": [math.inf, 1.0], "c": {"d": (-math.inf,)}})
     assert json.loads(text) == {"a": None, "b": [None, 1.0], "c": {"d": [None]}}
+
+
+def test_the_geometry_that_was_measured_with_is_named() -> None:
+    summary = Summary(Config())
+    assert summary.as_dict({}, {})["geometry"] == {}
+    origin = {"hash": "12ab", "file": "g.toml", "calibrated_utc": "2026-01-02"}
+    summary.add_event({"kind": "geometry", **origin, "message": "", "mono_s": 3.0})
+    assert summary.as_dict({}, {})["geometry"] == origin
