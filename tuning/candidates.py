@@ -6,6 +6,7 @@ what the rules are made for, and the pump's lag of a tenth of the loop's time co
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ _FILTERS_S = (0.03, 0.05, 0.1, 0.2, 0.4)
 # Bounds of the search in K times delay and Ti over delay.
 _GAIN_RANGE = (0.01, 1.0)
 _TI_RANGE = (2.0, 400.0)
+RECOVERED_UM = 0.5  # a load step is over when the centre stays this near: the most a mean of 60 s may be off
+_LONGEST_S, _LOOK_S = 600.0, 0.02  # a recovery is looked for this long, this finely
 _STEEP = 1e3  # a loop that breaks a demand costs more than any variance
 
 
@@ -74,6 +77,24 @@ def load_peak_um(gains: Gains, model: PlantModel, step_um_per_s: float) -> float
         angle = math.acosh(max(zeta, 1 + 1e-9))
         peak = math.exp(-zeta / math.sinh(angle) * angle)
     return step_um_per_s * (peak / natural + model.delay_s + gains.filter_s)
+
+
+def load_recovery_s(gains: Gains, model: PlantModel, step_um_per_s: float) -> float:
+    """Time after a step of the leak until the centre stays within `RECOVERED_UM`; infinite if it never does.
+
+    The answer to the equation of `load_peak_um`, D (exp(r1 t) - exp(r2 t)) / (r1 - r2) with its roots r1 and r2,
+    begun after the loop's delay.
+    """
+    speed_per_s, stiffness = model.gain * gains.kp_per_s, model.gain * gains.kp_per_s / gains.ti_s
+    root = cmath.sqrt(speed_per_s**2 - 4 * stiffness) or 1e-9  # of a double root the limit, to nine digits
+    time_s = np.arange(0.0, _LONGEST_S, _LOOK_S)
+    slow, fast = (np.exp((sign * root - speed_per_s) / 2 * time_s) for sign in (1, -1))
+    away_um = step_um_per_s * ((slow - fast) / root).real
+    away = np.flatnonzero(np.abs(away_um) > RECOVERED_UM)
+    if away.size == 0:
+        return 0.0
+    over_s = float(time_s[away[-1]]) + _LOOK_S + model.delay_s + gains.filter_s
+    return over_s if over_s < _LONGEST_S else math.inf
 
 
 def effective_delay_s(model: PlantModel, dt_s: float, filter_s: float) -> float:

@@ -13,6 +13,7 @@ from tuning.candidates import (
     lambda_tuned,
     least_variance,
     load_peak_um,
+    load_recovery_s,
     max_ki,
     simc,
     ziegler_nichols,
@@ -45,8 +46,8 @@ class Candidate:
         None for an unstable loop.
     ratio : float
         Predicted standard deviation over the least possible.
-    load_peak_um : float
-        After the demanded step of the leak, by formula.
+    load_peak_um, load_recovery_s : float
+        After the demanded step of the leak, by formula: furthest excursion, and how long until it is over.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Candidate:
     predicted: Predicted | None
     ratio: float
     load_peak_um: float
+    load_recovery_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +112,9 @@ def candidate(
     found = margins(gains, model, disturbance.rest.dt_s)
     predicted = predict(gains, model, disturbance, loop) if found.stable else None
     ratio = predicted.std_um / least_std_um(model, disturbance, loop) if predicted is not None else math.inf
-    peak_um = load_peak_um(gains, model, demands.load_step_um_per_s)
-    return Candidate(name, gains, found, predicted, ratio, peak_um)
+    step_um_per_s = demands.load_step_um_per_s
+    peak_um, over_s = load_peak_um(gains, model, step_um_per_s), load_recovery_s(gains, model, step_um_per_s)
+    return Candidate(name, gains, found, predicted, ratio, peak_um, over_s)
 
 
 def candidates(
@@ -177,7 +180,7 @@ def table(rows: tuple[Candidate, ...]) -> str:
     """The candidates as a Markdown table."""
     head = (
         "| design | K 1/s | Ti s | Td s | filter s | std um | / least | flow std um/s | Ms | GM | PM deg "
-        "| delay margin s | disk margin | load peak um |\n|---" + "|---:" * 13 + "|"
+        "| delay margin s | disk margin | load peak um | over after s |\n|---" + "|---:" * 14 + "|"
     )
     lines = [head]
     for row in rows:
@@ -186,6 +189,6 @@ def table(rows: tuple[Candidate, ...]) -> str:
         lines.append(
             f"| {row.name} | {g.kp_per_s:.3f} | {g.ti_s:.2f} | {g.td_s:.2f} | {g.filter_s:.2f} | {std} | {m.ms:.2f} "
             f"| {m.gain_margin:.1f} | {m.phase_margin_deg:.0f} | {m.delay_margin_s:.2f} | {m.disk_margin:.2f} "
-            f"| {row.load_peak_um:.2f} |"
+            f"| {row.load_peak_um:.2f} | {row.load_recovery_s:.1f} |"
         )
     return "\n".join(lines)

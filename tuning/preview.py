@@ -14,6 +14,7 @@ import numpy as np
 
 from membrane_ctrl.config import LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments.measurement import Measurement
+from tuning.candidates import RECOVERED_UM
 from tuning.disturbance_model import Disturbance
 from tuning.plant_model import PlantModel
 from tuning.records import Series
@@ -110,7 +111,8 @@ class Preview:
     std_um, bias_um : float
         Of the true centre.
     load_peak_um, recovery_s : float
-        After a step of the leak: furthest excursion, and time until the centre stays within `band_um` (weather off).
+        After a step of the leak: furthest excursion, and time until the centre stays within
+        `RECOVERED_UM` (weather off).
     """
 
     std_um: float
@@ -127,14 +129,13 @@ def preview(
     seed: int = 1,
     duration_s: float = 180.0,
     load_step_um_per_s: float = 0.6,
-    band_um: float = 0.5,
 ) -> Preview:
     """Hold on the fitted twin in its weather, and once more without weather for a step of the leak."""
     true_um = _held(loop, pump, model, ModelBench(model, disturbance, pump, seed), duration_s)
     calm = _without_weather(disturbance)
     stepped = ModelBench(model, calm, pump, seed, (_SETTLE_S, load_step_um_per_s))
     answer_um = _held(loop, pump, model, stepped, 120.0)
-    away = np.flatnonzero(np.abs(answer_um) > band_um)
+    away = np.flatnonzero(np.abs(answer_um) > RECOVERED_UM)
     return Preview(
         std_um=float(true_um.std()),
         bias_um=float(true_um.mean()),

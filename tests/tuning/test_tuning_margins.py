@@ -10,7 +10,17 @@ import pytest
 
 from benchmarks.minimum_variance import least_std_um as least_of_the_twin
 from membrane_ctrl.config import LoopConfig, TwinConfig
-from tuning.candidates import Demands, amigo, lambda_tuned, least_variance, load_peak_um, max_ki, simc
+from tuning.candidates import (
+    RECOVERED_UM,
+    Demands,
+    amigo,
+    lambda_tuned,
+    least_variance,
+    load_peak_um,
+    load_recovery_s,
+    max_ki,
+    simc,
+)
 from tuning.disturbance import Noise
 from tuning.disturbance_model import Disturbance
 from tuning.feedforward_fit import WeatherGain
@@ -85,6 +95,17 @@ def test_load_peak_against_simulation(ti_s: float) -> None:
     system = control.tf([1.0, 0.0], [1.0, 0.8, 0.8 / ti_s])
     _, y = control.step_response(0.6 * system, t)
     assert load_peak_um(gains, model, 0.6) == pytest.approx(float(np.max(y)), rel=0.01)
+    assert RECOVERED_UM == 0.5
+    last_s = float(t[np.flatnonzero(np.abs(y) > 0.5)[-1]]) if np.max(np.abs(y)) > 0.5 else 0.0
+    assert load_recovery_s(gains, model, 0.6) == pytest.approx(last_s, abs=0.05)
+
+
+def test_load_recovery_of_a_double_root_and_of_a_loop_that_never_comes_back() -> None:
+    """k K = 1 and Ti = 4: y = D t exp(-t / 2), for D = 1 within 0.5 um after 4.3 s; without gain never."""
+    model = PlantModel(1.0, 0.0, 0.0, 1.0)
+    assert load_recovery_s(Gains(1.0, 4.0), model, 1.0) == pytest.approx(4.31, abs=0.05)
+    assert load_recovery_s(Gains(1e-6, 1e6), model, 1.0) == math.inf
+    assert load_recovery_s(Gains(20.0, 0.1), model, 1.0) == 0.0
 
 
 def typical(loop: LoopConfig) -> Disturbance:
