@@ -1,0 +1,64 @@
+"""The supervisor writes the controller's memory down now and then, and a replay can begin with it."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+
+import pytest
+
+from firmware_iface.roles import BenchCommand, BenchIdentity, BenchReading
+from membrane_ctrl.clock import RunClock
+from membrane_ctrl.config import Config
+from membrane_ctrl.controller import Controller
+from membrane_ctrl.controller_memory import recall
+from membrane_ctrl.errors import Exit
+from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
+from membrane_ctrl.metrology.hencky import zernike_projection
+from membrane_ctrl.supervisor import Supervisor, Wiring
+from membrane_ctrl.telemetry import ROW_BYTES
+from membrane_ctrl.tick_record import MESSAGE_BYTES, TickAssembler
+from membrane_ctrl.twin.plant import Plant
+from membrane_ctrl.virtual_bench import VirtualBench
+
+CONFIG = Config()
+
+
+class PromptBench:
+    """A bench whose board answers at once; its plant stands still."""
+
+    def __init__(self) -> None:
+        self._bench = VirtualBench(Plant(CONFIG.twin, CONFIG.pump))
+        self._bench.open()
+
+    async def open(self) -> BenchIdentity:
+        raise AssertionError("the link was never lost")
+
+    async def read(self) -> BenchReading:
+        return self._bench.read()
+
+    async def write(self, command: BenchCommand) -> None:
+        self._bench.write(command)
+
+    async def clear_faults(self) -> None:
+        raise AssertionError("nothing is latched")
+
+    async def close(self) -> None:
+        self._bench.close()
+
+
+async def test_the_memory_is_the_one_before_its_tick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("membrane_ctrl.supervisor.MEMORY_EVERY_S", 0.1)
+    with ExitStack() as stack:
+        sizes = {"telemetry": ROW_BYTES, "events": 4096, "inputs": MESSAGE_BYTES}
+        addresses = {name: stack.enter_context(ring(400, size)) for name, size in sizes.items()}
+        writers = {name: RingWriter(address) for name, address in addresses.items()}
+        inputs = RingReader(addresses["inputs"])
+        for end in (*writers.values(), inputs):
+            stack.callback(end.close)
+        controller = Controller(CONFIG, zernike_projection())
+        supervisor = Supervisor(controller, Wiring(bench=PromptBench(), **writers), RunClock.start(), 50.0)
+        assert await supervisor.run(0.4) == Exit.DONE
+        batch = TickAssembler().take(inputs.drain())
+    assert batch.memories
+    for tick, memory in batch.memories.items():
+        assert recall(memory, Controller(CONFIG, zernike_projection()))._ticks == tick - 1
