@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -122,7 +123,7 @@ def _verified(folder: SessionFolder) -> list[str]:
     done = session.verified_of(folder)
     words = "kept" if done.kept else f"taken back: {done.reason}"
     rows = [
-        (f"{s.time_s:.0f} s", f"{s.std_um:.3f}", f"{s.before_um:.3f}", f"{s.growth:.2f}", f"{s.ms:.2f}", s.reason)
+        (f"{s.time_s:.0f} s", f"{s.std_um:.3f}", f"{s.before_um:.3f}", f"{s.growth:.2f}", _seen(s.ms), s.reason)
         for s in done.stages
     ]
     heads = ("after", "std um", "gains before um", "ratio", "sensitivity seen", "")
@@ -131,6 +132,10 @@ def _verified(folder: SessionFolder) -> list[str]:
         _table(heads, rows),
         _image(folder, "verify.png"),
     ]
+
+
+def _seen(ms: float) -> str:
+    return f"{ms:.2f}" if math.isfinite(ms) else "too short to say"
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
