@@ -111,7 +111,7 @@ class Recording:
     def _send_statics(self) -> None:
         stream = self._stream
         if not self._laid_out:
-            self._laid_out = True
+            self._laid_out = True  # also if it fails: a full disk is tried again every few seconds
             blueprint = run_blueprint(self._config)
             stream.send_blueprint(blueprint)
             blueprint.save(APPLICATION, str(self._run_dir / LAYOUT))

@@ -93,7 +93,7 @@ def test_the_hold_ends_the_experiment_of_a_session_that_has_gone(logs: Path) -> 
     link._client.ask(do="tune", experiment=spec.model_dump())
     link._client.close()  # killed: nothing is released
     watcher = HoldRig(connected_in_any_state(logs), "watcher")
-    states = [watcher._next_held().state for _ in range(400)]
+    states = [watcher._next_held().state for _ in range(330)]
     assert states[0] == State.TUNE
     assert states[-1] == State.HOLD
     watcher._link.close()
