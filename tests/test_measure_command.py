@@ -301,10 +301,10 @@ def test_error_bars(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     middle = sigma["x_mm"].size // 2
     assert sigma["sigma_geometry_um"][middle, middle] == pytest.approx(0, abs=1e-9)  # counted from the vertex
     # what the Monte Carlo of the same set says
-    assert run(["uncertainty", str(made / "0000"), "--out", str(tmp_path / "mc"), "--trials", "300"]) == 0
+    assert run(["uncertainty", str(made / "0000"), "--out", str(tmp_path / "mc"), "--trials", "100"]) == 0
     trials = json.loads((tmp_path / "mc" / "uncertainty.json").read_text())
-    assert details["geometry"] == pytest.approx(trials["sag_sigma_um"], rel=0.15)  # of 300 trials: 4 % sigma
-    assert np.nanmean(sigma["sigma_geometry_um"]) == pytest.approx(trials["rmse_um"]["mean"], rel=0.15)
+    assert details["geometry"] == pytest.approx(trials["sag_sigma_um"], rel=0.25)  # of 100 trials: 7 % sigma
+    assert np.nanmean(sigma["sigma_geometry_um"]) == pytest.approx(trials["rmse_um"]["mean"], rel=0.25)
 
 
 def test_a_geometrys_own_covariance_makes_the_error_bars(made: Path, tmp_path: Path) -> None:

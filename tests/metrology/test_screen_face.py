@@ -36,8 +36,8 @@ MAP = HeightMapConfig(
 CROOKED = ScreenPoseConfig(bow_mm=0.8, height_map=MAP)
 
 
-def _optics(screen: ScreenPoseConfig | None, shrink: int = 8) -> OpticsConfig:
-    optics = bench(noise_adu=0.0, shrink=shrink)
+def _optics(screen: ScreenPoseConfig | None) -> OpticsConfig:
+    optics = bench(noise_adu=0.0)
     return optics.model_copy(update={"geometry": optics.geometry.model_copy(update={"screen": screen})})
 
 
@@ -130,14 +130,14 @@ def test_world_points_lie_on_the_face() -> None:
 
 
 def test_the_full_result_needs_the_face_and_gets_it() -> None:
-    truth = _optics(CROOKED, shrink=4)
+    truth = _optics(CROOKED)
     stack = good_set(truth)
     errors = []
-    for optics in (truth, _optics(None, shrink=4)):
+    for optics in (truth, _optics(None)):
         checked = check(stack, optics)
         full = reconstruct_full(optics, checked, measure_pixels(optics, checked))
         errors.append(_error_um(full.surface))
-    assert errors[0] < 0.1  # um: rounding to 8 bits at a sixteenth of the pixels
+    assert errors[0] < 0.1  # um: rounding to 8 bits at a 64th of the pixels
     assert errors[1] > 20 * errors[0]
 
 
