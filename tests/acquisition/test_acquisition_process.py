@@ -20,6 +20,7 @@ from membrane_ctrl.acquisition.warm_up import small
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import CameraConfig, Config, OpticsConfig, ShapeConfig
 from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.geometry_file import origin_of
 from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
 from membrane_ctrl.metrology.patterns import fringe_sequence
 from membrane_ctrl.telemetry import FIELDS, ROW_BYTES, TelemetryRow
@@ -80,7 +81,7 @@ class Run:
             self.estimates += [pickle.loads(message) for message in self._shapes.drain()]
 
     def states(self) -> list[str]:
-        return [report["state"] for report in self.reports if report["kind"] != "alive"]
+        return [report["state"] for report in self.reports if report["kind"] == "acquisition"]
 
     def _tick(self) -> None:
         self._ticks += 1
@@ -110,6 +111,8 @@ def test_measures_the_twin_follows_a_jump_and_stops_when_told(stack: ExitStack) 
     run = Run(stack)
     run.until(lambda: len(run.estimates) >= 4)
     assert run.states()[0] == "preparing"
+    (geometry,) = [report for report in run.reports if report["kind"] == "geometry"]
+    assert (geometry["hash"], geometry["file"]) == (origin_of(CONFIG.optics).hash, None)
     assert [e.kind for e in run.estimates[:3]] == ["full", "fringes", "fringes"]
     assert [e.cycle for e in run.estimates[:3]] == [1, 2, 3]
     assert all(e.verdict == "ok" and e.displacement_um == 0.0 and e.latency_s > 0 for e in run.estimates)

@@ -117,7 +117,7 @@ class Run:
 
     def said(self, state: str, words: str) -> bool:
         """Whether a report says so."""
-        reports = (report for report in self.reports if report["kind"] != "alive")
+        reports = (report for report in self.reports if report["kind"] == "acquisition")
         return any(report["state"] == state and words in report["message"] for report in reports)
 
     def _end(self) -> None:
