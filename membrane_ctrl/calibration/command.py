@@ -19,6 +19,7 @@ from membrane_ctrl.calibration.procedure import Procedure
 from membrane_ctrl.calibration.session import Head, Session
 from membrane_ctrl.calibration.sweep import CaptureLink, Sweep
 from membrane_ctrl.capture_set import read_head
+from membrane_ctrl.config import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.ctl import Where, socket_path
 from membrane_ctrl.errors import DeviceError, Exit, InputError
 from membrane_ctrl.geometry_file import GeometryOrigin, origin_of, read_geometry
@@ -88,6 +89,8 @@ def take_sets(link: CaptureLink, session: Session | None, options: LiveOptions) 
         procedure = Procedure(link, sweep, held, progress)
         head = session.head if session is not None else _planned(link, held, options)
         missing = session.missing if session is not None else tuple(range(len(head.setpoints_um)))
+        if session is not None:
+            _same_bench(link, session)
         procedure.check(head)
         minutes = sum(procedure.times_s(head, missing)) / 60
         progress.say(_plan(head, len(missing), held, minutes))
@@ -135,6 +138,23 @@ def solve_and_adopt(session: Session, options: LiveOptions) -> int:
 def _planned(link: CaptureLink, held: Held, options: LiveOptions) -> Head:
     wanted = setpoints_um(held, reach_of(held, link.config), options.range_um, options.sets or USUAL_SETS)
     return sessions.head_of(link.name, held.setpoint_um, held.shape_on, wanted)
+
+
+def _same_bench(link: CaptureLink, session: Session) -> None:
+    """Raises InputError if the hold measures with another geometry than the sets so far were taken with."""
+    now = geometry_of_run(link.run_dir, link.config).optics
+    for folder in session.sets:
+        if not folder.exists():
+            continue
+        then = read_head(folder).optics
+        if _written_out(then) != _written_out(now):
+            raise InputError(f"{folder}: of another camera or geometry than {link.name} has; begin a new session")
+
+
+def _written_out(optics: OpticsConfig) -> tuple[GeometryConfig, CameraConfig]:
+    """What may be left out in one place and stand in another: the reference is not compared, the pixel's place is."""
+    camera = optics.camera.model_copy(update={"principal_px": optics.camera.principal})
+    return optics.geometry.model_copy(update={"reference_displacement_um": None}), camera
 
 
 def _plan(head: Head, missing: int, held: Held, minutes: float) -> str:

@@ -9,11 +9,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from live_bench import LiveBench, config
+from live_bench import CAMERA, TRUE, LiveBench, config
 
 from membrane_ctrl.calibration import command
 from membrane_ctrl.calibration.command import LiveOptions
 from membrane_ctrl.cli import run
+from membrane_ctrl.config import OpticsConfig
 from membrane_ctrl.geometry_file import read_geometry
 from membrane_ctrl.names import ShapeState
 
@@ -75,6 +76,10 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
     assert row.shape_state != ShapeState.OFF  # as it was
     assert (tmp_path / "bench.toml").read_text() == OLD
 
+    bench.config = bench.config.model_copy(update={"optics": OpticsConfig(camera=CAMERA, geometry=TRUE)})
+    assert run([*live, "--session", str(session), "--yes"]) == 2
+    assert "set-1: of another camera or geometry than run has" in capsys.readouterr().err
+    bench.config = bench.hold.config
     bench.fails = ["rejected: somebody walked by"]
     answer(monkeypatch, "y\nno\n")
     assert run([*live, "--session", str(session)]) == 0
