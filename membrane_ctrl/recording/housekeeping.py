@@ -18,7 +18,7 @@ from membrane_ctrl.recording.thrift import Thrift, thrift
 # Counting the bytes of a hundred runs takes a second of disk.
 RETENTION_INTERVAL_S = 3600.0
 # At the run's end a person waits for the prompt, and a service manager is about to kill what is left. A segment of an
-# hour takes a few seconds (docs/recording.md).
+# hour takes longer only on a very busy machine (docs/recording.md).
 _OPTIMISE_LAST_S = 20.0
 _LOOK_S = 0.05
 
