@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+import tomli_w
+
 from membrane_ctrl.config import CameraConfig, GeometryConfig, OpticsConfig, Section
 from membrane_ctrl.config_file import parse, prune, read_toml, with_height_map
 from membrane_ctrl.errors import InputError
@@ -92,6 +94,8 @@ class GeometryFile:
         If they were calibrated.
     calibration : CalibrationTable or None
         None for what was written by hand.
+    text : str
+        All that the file says, the screen's height map in it and not beside it.
     """
 
     path: Path
@@ -100,6 +104,7 @@ class GeometryFile:
     pitch: PitchTable | None
     calibration: CalibrationTable | None
     origin: GeometryOrigin
+    text: str
 
     def over(self, optics: OpticsConfig) -> OpticsConfig:
         """The bench with this geometry instead of its own. Raises InputError if it is of another camera."""
@@ -122,14 +127,15 @@ def read_geometry(path: Path) -> GeometryFile:
     """
     tables = read_toml(path)
     calibrated = tables.get("schema") == SCHEMA
-    hashed = content_hash(tables if "geometry" in tables else {"geometry": tables})
     table = tables.get("geometry", tables)
     with_height_map(table, path)
+    hashed = content_hash(tables if "geometry" in tables else {"geometry": tables})
+    text = tomli_w.dumps(tables)
     if isinstance(table, dict):
         prune(table, GeometryConfig)
     geometry = parse(table, GeometryConfig, str(path))
     if not calibrated:
-        return GeometryFile(path, geometry, None, None, None, GeometryOrigin(hashed, str(path)))
+        return GeometryFile(path, geometry, None, None, None, GeometryOrigin(hashed, str(path)), text)
     calibration = _part(tables, "calibration", CalibrationTable, path)
     if calibration is not None and calibration.hash != hashed:
         raise InputError(
@@ -138,7 +144,7 @@ def read_geometry(path: Path) -> GeometryFile:
         )
     origin = GeometryOrigin(hashed, str(path), "" if calibration is None else calibration.date_utc)
     lens, pitch = _part(tables, "camera", LensTable, path), _part(tables, "pattern", PitchTable, path)
-    return GeometryFile(path, geometry, lens, pitch, calibration, origin)
+    return GeometryFile(path, geometry, lens, pitch, calibration, origin, text)
 
 
 def origin_of(optics: OpticsConfig) -> GeometryOrigin:

@@ -25,7 +25,7 @@ class InForce:
     calibration : CalibrationTable or None
         What a drift is seen against.
     text : str
-        Of the file; empty without one.
+        What the file says; empty without one.
     note : str
         Why what the configuration states by hand is used although it names a file.
     """
@@ -72,4 +72,4 @@ def _read(path: Path | None, config: Config) -> InForce:
         note = f"{wanted} is not there yet: [optics.geometry] is used, as measured by hand" if wanted else ""
         return InForce(optics, origin_of(optics), note=note)
     file = read_geometry(path)
-    return InForce(file.over(optics), file.origin, file.calibration, path.read_text(encoding="utf-8"))
+    return InForce(file.over(optics), file.origin, file.calibration, file.text)

@@ -98,6 +98,26 @@ def test_a_run_measures_with_the_file_as_it_was_at_its_start(tmp_path: Path) -> 
     assert kept.note == ""
 
 
+def test_a_height_map_beside_the_file_is_kept_with_the_run(tmp_path: Path) -> None:
+    lab, run_dir = tmp_path / "lab", tmp_path / "run"
+    lab.mkdir()
+    run_dir.mkdir()
+    (lab / "screen.txt").write_text("0.1 0.0 0.1\n0.2 0.1 0.2\n")
+    height_map = {"s_x_mm": [-300, 0, 300], "s_y_mm": [-300, 300], "file": "screen.txt"}
+    tables = {"geometry": {"a_mm": 2672.0, "b_mm": 2871.0, "alpha_deg": 80.9, "screen": {"height_map": height_map}}}
+    covariance = {"names": ["a_mm"], "matrix": [[4.0]]}
+    (lab / "g.toml").write_text(tomli_w.dumps({**tables, "covariance": covariance}))
+    config = Config(optics=OpticsConfig(geometry_file=lab / "g.toml"))
+    begun = geometry_in_force(config)
+    begun.keep(run_dir)
+    kept = geometry_of_run(run_dir, config)
+    assert kept.optics == begun.optics
+    assert kept.origin.hash == begun.origin.hash
+    assert "covariance" in kept.text
+    (lab / "screen.txt").write_text("0.1 0.0 0.1\n0.2 0.1 0.3\n")
+    assert geometry_in_force(config).origin.hash != begun.origin.hash
+
+
 def test_without_a_file_yet_the_hand_counts_and_it_is_said(tmp_path: Path) -> None:
     config = Config(optics=OpticsConfig(geometry_file=tmp_path / "g.toml"))
     there = geometry_in_force(config)
