@@ -6,10 +6,11 @@ The gain k from natural excitation is known to 10 or 20 % only; that is enough t
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from membrane_ctrl.config import LoopConfig
 from tuning.disturbance_model import observe
+from tuning.feedforward_fit import lagged
 from tuning.gains_file import GainsFile
 from tuning.identify import identify
 from tuning.loop_model import Gains
@@ -79,7 +80,7 @@ def health(record: Record, setpoint_um: Series, loop: LoopConfig, made: GainsFil
     std_um = centre_std_um(off_um, Trial(model, weather, loop, loop), weather)
     least_um = least_std_um(model, weather, loop)
     designed = predict(Gains.of(loop), model, weather, loop).std_um / least_um
-    gain, gain_sigma = _natural_gain(record)
+    gain, gain_sigma = _natural_gain(record, loop)
     leak_um_per_s = model.gain * float(record.flow_um_per_s.mean())
     found: list[str] = []
     if std_um / least_um > _RATIO_GROWTH * designed:
@@ -94,8 +95,17 @@ def health(record: Record, setpoint_um: Series, loop: LoopConfig, made: GainsFil
     return Health(std_um, least_um, std_um / least_um, designed, gain, gain_sigma, leak_um_per_s, tuple(found))
 
 
-def _natural_gain(record: Record) -> tuple[float, float]:
-    """Gain and standard error without any experiment; NaN where the flow hardly moved."""
+def _natural_gain(record: Record, loop: LoopConfig) -> tuple[float, float]:
+    """Gain and standard error without any experiment; NaN where the flow hardly moved.
+
+    With feed-forward most of the flow answers the air's temperature, and what both do to the centre cancels: k would
+    look far too small. What the air does by itself is known from the loop's own gain, which a pump does not change;
+    the barometer's share is fitted beside k.
+    """
+    if record.has_thermometer:
+        gas_k = lagged(record.air_temperature_c, loop.gas_follows_air_s, record.dt_s)
+        by_air_um = loop.temperature_gain_um_per_k * gas_k
+        record = replace(record, displacement_um=record.displacement_um - by_air_um)
     try:
         found = identify(record)
     except ValueError:

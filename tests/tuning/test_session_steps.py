@@ -16,6 +16,7 @@ from membrane_ctrl.metrology.hencky import zernike_projection
 from tuning import journal, plain
 from tuning.disturbance import Noise
 from tuning.disturbance_model import Disturbance
+from tuning.feedforward_fit import WeatherGain
 from tuning.gains_file import GainsFile, PlantSection
 from tuning.outer_loop import STEP_UM, evaluate
 from tuning.plant_model import PlantModel
@@ -30,9 +31,11 @@ WEATHER = Disturbance(Noise(1.0, 0.01, 0.01, 12.0, 0.05, 0.1, 0.1, 0.02), None, 
 LOOP = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
 
 
-def held(loop: LoopConfig, plant: PlantModel = PLANT, duration_s: float = 600.0) -> tuple[Record, ModelBench]:
+def held(
+    loop: LoopConfig, plant: PlantModel = PLANT, duration_s: float = 600.0, weather: Disturbance = WEATHER
+) -> tuple[Record, ModelBench]:
     """A hold of the model's own bench, settled."""
-    bench = ModelBench(plant, WEATHER, PumpConfig(), 3)
+    bench = ModelBench(plant, weather, PumpConfig(), 3)
     rig = Rig(bench, loop, PumpConfig(), plant.holding_flow_um_per_s)
     rig.hold(30.0)
     return rig.hold(duration_s), bench
@@ -140,6 +143,19 @@ def test_a_loop_in_order_suggests_nothing_and_an_aged_one_says_why() -> None:
     assert fresh.gain == pytest.approx(1.0, abs=3 * fresh.gain_sigma)
     leaky = health(record, about_um, LOOP, gains_file(replace(PLANT, leak_um_per_s=0.8)))
     assert any("leak" in suggestion for suggestion in leaky.suggestions)
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.6])
+def test_the_gain_is_seen_although_the_feed_forward_cancels_the_weather(gain: float) -> None:
+    """A slow loop whose flow is nearly all feed-forward; the pump as it was, and one that has lost 40 %."""
+    rest = Noise(1.0, 1e-4, 1e-4, 12.0, 0.05, 0.1, 0.1, 0.02)
+    barometer = WeatherGain(-0.36, 0.01, 2 * 1.2**2 / 30, 0.05, 0.0)
+    weather = Disturbance(rest, barometer, WeatherGain(123.0, 1.0, 2 * 0.05**2 / 300, 0.002, 12.0))
+    loop = LoopConfig(kp_per_s=0.25, ti_s=20.0)
+    record, _ = held(loop, replace(PLANT, gain=gain), weather=weather)
+    found = health(record, np.zeros(len(record)), loop, gains_file(PLANT))
+    assert found.gain == pytest.approx(gain, abs=0.12)
+    assert any(suggestion.startswith("k is") for suggestion in found.suggestions) == (gain < 1)
 
 
 def test_a_glance_is_too_short_to_judge() -> None:
