@@ -14,11 +14,14 @@ from typing import IO
 import rerun_cli  # type: ignore[import-untyped]
 
 from membrane_ctrl.errors import DeviceError
+from membrane_ctrl.review.rrd_place import first_message_after
 from membrane_ctrl.review.rrd_reader import segments
 
 # The recorder flushes every second.
 _FOLLOW_S = 0.5
 _CHUNK_BYTES = 1 << 20
+_RECENT_BYTES = 20 << 20  # ten minutes at 50 Hz, as they are written
+_STYLE_BYTES = 1 << 20  # blueprint, colours and names come first, in a tenth of this
 
 
 def viewer_command(*arguments: str) -> list[str]:
@@ -102,7 +105,10 @@ def _page(host: str, port: int, data_port: int) -> str:
 def follow(
     folder: Path, out: IO[bytes], wanted: Callable[[], bool], sleep: Callable[[float], None] = time.sleep
 ) -> None:
-    """Copy the run's segments as they grow, one after the other, until the run has its summary or nobody looks.
+    """Copy what is new of a run as it grows, segment by segment, until it has its summary or nobody looks.
+
+    It begins some minutes back: a browser takes in a few times what comes, and would be hours behind a night. Before
+    that comes the beginning of the segment, which says how everything is to be drawn.
 
     Raises BrokenPipeError when the reader has gone.
     """
@@ -112,7 +118,8 @@ def follow(
 
 
 def _grown(folder: Path, wanted: Callable[[], bool], sleep: Callable[[float], None]) -> Iterator[bytes]:
-    number, place = 0, 0
+    number, place, style = _recent(segments(folder))
+    yield style
     while wanted():
         over = (folder / "summary.json").exists()
         files = segments(folder)
@@ -130,6 +137,20 @@ def _grown(folder: Path, wanted: Callable[[], bool], sleep: Callable[[float], No
             return
         else:
             sleep(_FOLLOW_S)
+
+
+def _recent(files: list[Path]) -> tuple[int, int, bytes]:
+    """Number of the segment to begin with, the place in it, and what has to come before that."""
+    sizes = [file.stat().st_size for file in files]
+    number = max(0, len(files) - 1)
+    if number > 0 and sizes[number] < _RECENT_BYTES:
+        number -= 1
+    if not files or sizes[number] < _RECENT_BYTES + _STYLE_BYTES:
+        return number, 0, b""
+    style_ends = first_message_after(files[number], _STYLE_BYTES)
+    place = first_message_after(files[number], sizes[number] - _RECENT_BYTES)
+    with files[number].open("rb") as file:
+        return number, place, file.read(style_ends) if place else b""
 
 
 def free_port() -> int:

@@ -19,10 +19,11 @@ from benchmarks.nights import Planted, night
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.errors import DeviceError, InputError
 from membrane_ctrl.recording.rows import column
-from membrane_ctrl.review import open_run
+from membrane_ctrl.review import open_run, viewer
 from membrane_ctrl.review.catalogue import Filter, entries, resolve, to_prune
 from membrane_ctrl.review.export import export
 from membrane_ctrl.review.review_command import ReviewOptions, make_review
+from membrane_ctrl.review.rrd_place import first_message_after
 from membrane_ctrl.review.viewer import follow
 from membrane_ctrl.review.words import moment_s, number, span
 
@@ -195,6 +196,23 @@ def test_around_finds_events_and_what_was_found(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.2, [Planted("pressure step", 400.0, 20.0)])
     for what in ("pressure", "hold", "end"):
         assert command(["review", str(folder), "--around", what, "--save", str(tmp_path / "r.rrd")]) == 0
+
+
+def test_following_a_long_run_begins_some_minutes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = segment(tmp_path, night(1, 0.2, "typical", [])[0]).read_bytes()
+    (tmp_path / "night-000.rrd").write_bytes(whole)
+    (tmp_path / "summary.json").touch()
+    monkeypatch.setattr(viewer, "_RECENT_BYTES", len(whole) // 4)
+    monkeypatch.setattr(viewer, "_STYLE_BYTES", len(whole) // 8)
+    out = io.BytesIO()
+    follow(tmp_path, out, lambda: True)
+    followed = out.getvalue()
+    assert whole.startswith(followed[: len(whole) // 8])
+    assert whole.endswith(followed[-len(whole) // 5 :])
+    assert len(followed) < len(whole) // 2
+    (tmp_path / "shorter.rrd").write_bytes(followed)
+    end = first_message_after(tmp_path / "shorter.rrd", len(followed))
+    assert followed[end : end + 8] == bytes(8)  # from message to message up to the one that ends a file
 
 
 def test_following_copies_what_grows_until_the_run_is_over(tmp_path: Path) -> None:
