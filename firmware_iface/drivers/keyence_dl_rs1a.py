@@ -1,7 +1,7 @@
 """Keyence DL-RS1A communication unit on RS-232, with the sensor amplifiers of the IL, IG and GT2 series.
 
 Manual: DL-RS1A user's manual, IL edition (96081E): settings page 7, commands pages 8-10, data numbers pages 11-12,
-error numbers page 16. A command ends in CR or CR LF, an answer in CR LF.
+error numbers page 16. A command ends in CR or CR LF, an answer in CR LF; CR alone is taken, too.
 
 `SR,ii,038` reads the internal value (R.V.) of amplifier ii: unlike the judgment value of `M0`, neither a zero shift
 at the amplifier's own keys nor a hold setting moves it, and its answer says what it answers. The protocol has no
@@ -24,7 +24,7 @@ from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, Displacemen
 MANUAL = "DL-RS1A user's manual, IL edition, pages 7-16"
 BAUDS = (2400, 4800, 9600, 19_200, 38_400)  # page 7
 _VALUE = r"[+-](?:\d\d\.\d{3}|\d{3}\.\d\d|\d{4}\.\d|E{2}\.E{3}|E{3}\.E{2}|E{4}\.E)"
-_ALL = re.compile(rf"(?:M0((?:,{_VALUE})+)|ER,M0,(\d\d))\r\n")
+_ALL = re.compile(rf"(?:M0((?:,{_VALUE})+)|ER,M0,(\d\d))\r\n?")
 _ALL_CHARS = 4 + 15 * 8
 # page 16
 ERRORS = {
@@ -36,6 +36,7 @@ ERRORS = {
     65: "no amplifier of this number",
 }
 QUALITY_AMPLIFIER_ERROR, QUALITY_OUT_OF_RANGE = 1, 2
+_NOT_READABLE = "22"
 _STEPS_UM = {3: 1.0, 2: 10.0, 1: 100.0}  # decimals of the millimetre
 
 
@@ -90,9 +91,9 @@ class KeyenceDlRs1a(LinkedDevice):
         self._step_max_um = step_max_um
         number = f"{amplifier:02d}"
         self._read_command = f"SR,{number},038"
-        self._read_answer = re.compile(rf"(?:SR,{number},038,({_VALUE})|ER,SR,(\d\d))\r\n")
+        self._read_answer = re.compile(rf"(?:SR,{number},038,({_VALUE})|ER,SR,(\d\d))\r\n?")
         self._errors_command = f"SR,{number},033"
-        self._errors_answer = re.compile(rf"(?:SR,{number},033,(\d{{5}})|ER,SR,(\d\d))\r\n")
+        self._errors_answer = re.compile(rf"(?:SR,{number},033,(\d{{5}})|ER,SR,(\d\d))\r\n?")
         # the fence has to differ from a reading also when it is refused, as when the amplifier is pulled off: `M0`
         self._link = LineLink(as_port(port, self._settings), "\r\n", timeout_s, LineFence("M0", _ALL, _ALL_CHARS))
         super().__init__(self._link)
@@ -131,8 +132,9 @@ class KeyenceDlRs1a(LinkedDevice):
         if _STEPS_UM[self._decimals] > self._step_max_um:
             raise DeviceRefusedError(f"{self._link.name}: head with steps of {_STEPS_UM[self._decimals]:g} um")
         errors = await self._link.query(self._errors_command, self._errors_answer)
-        _refuse(self._link.name, errors[2])
-        if bits := int(errors[1]):
+        if errors[2] != _NOT_READABLE:  # amplifiers that do not tell: their head error is seen in the value
+            _refuse(self._link.name, errors[2])
+        if bits := int(errors[1] or 0):
             raise DeviceRefusedError(f"{self._link.name}: amplifier in error (state {bits:016b}); see its manual")
         await self._reading()  # the witness of the first one
         detail = f"amplifier {self._amplifier} of {len(values)}, steps of {_STEPS_UM[self._decimals]:g} um"

@@ -1,7 +1,8 @@
 """Micro-Epsilon optoNCDT 1420 laser triangulation sensor on RS-422.
 
 Manual: optoNCDT 1420 instruction manual; commands in its appendix A 3 (pages 93-110), digital values and error codes
-in 7.5.2 (pages 65-67). A command ends in LF, its answer in `->`, an error is `Exxx` before that.
+in 7.5.2 (pages 65-67). A command ends in LF, its answer in `->` (line ends behind it are taken), an error is `Exxx`
+before that. It may repeat the command and write a rate as `4`, `4.0` or `4 kHz`.
 
 The sensor streams; a reading is the mean of the middle half of everything since the last one (at 4 kHz and 50 Hz: 40
 of 80 values). A hit byte, which nothing in the protocol shows, is one outlier among many and left out; and unlike the
@@ -38,6 +39,7 @@ ERROR_CODES = {
 _IN_RANGE = (643, 64_877)  # page 65: below and above are reserves, measured but not specified
 _PROMPT = b"->"
 _ERROR = re.compile(r"E(\d{3})([^\r\n]*)")
+_RATE = re.compile(r"(\d+(?:\.\d*)?)(?: ?kHz)?")
 _MIDDLE_MIN = 8  # of fewer values the median
 _BATCHES_MAX = 1024  # of a caller that stays away; old ones go first
 _SILENT_MAX = 3  # readings without a single value: the sensor restarted or lost its power
@@ -154,7 +156,7 @@ class Optoncdt1420(LinkedDevice):
         fields = dict(re.findall(r"^\s*([\w. -]+?):\s*(.*?)\s*$", text, re.MULTILINE))
         name, measuring_range = fields.get("Name", ""), fields.get("Measuring range", "")
         found = re.match(r"([\d.]+)\s*mm", measuring_range)
-        if not name.startswith("ILD1420") or found is None:
+        if "1420" not in name or found is None:
             raise DeviceRefusedError(f"{self._port.name}: {name or text[:40]!r} is no optoNCDT 1420")
         self._range_mm = float(found[1])
         if self._range_wanted_mm is not None and self._range_mm != self._range_wanted_mm:
@@ -169,7 +171,7 @@ class Optoncdt1420(LinkedDevice):
         await self._command(setting)
         text = await self._command(name)
         found = re.search(rf"^\s*{name} +(.+?)\s*$", text, re.MULTILINE)
-        if found is None or found[1].split() != setting.split()[1:]:
+        if found is None or _plain(found[1]) != _plain(setting.split()[1]):
             raise DeviceRefusedError(f"{self._port.name}: set {setting!r}, read back {text.strip()[:60]!r}")
 
     async def _command(self, command: str) -> str:
@@ -179,13 +181,13 @@ class Optoncdt1420(LinkedDevice):
         what = f"{self._port.name}: {command}"
         try:
             async with asyncio.timeout(self._timeout_s):
-                while not self._heard.endswith(_PROMPT):
+                while not self._heard.rstrip().endswith(_PROMPT):
                     await self._stirred()
         except TimeoutError:
             hint = f"{len(self._heard)} bytes but no prompt; wrong baud rate?" if self._heard else "no answer"
             raise LinkError(f"{what}: {hint} within {self._timeout_s:g} s") from None
         # bytes of a stream that is just being stopped have no text in them that could be an error: see the marks
-        text = self._heard[: -len(_PROMPT)].decode("ascii", "replace")
+        text = self._heard.rstrip()[: -len(_PROMPT)].decode("ascii", "replace")
         if error := _ERROR.search(text):
             raise DeviceRefusedError(f"{what}: E{error[1]}{error[2]}")
         return text
@@ -289,6 +291,12 @@ class Optoncdt1420(LinkedDevice):
             "lost": f"{self._parser.bytes_lost} bytes outside of values, {self._parser.untrusted} values untrusted",
             "manual": MANUAL,
         }
+
+
+def _plain(value: str) -> str:
+    """A rate without unit and needless zeros, anything else as it is."""
+    rate = _RATE.fullmatch(value)
+    return f"{float(rate[1]):g}" if rate else value
 
 
 def middle(values: NDArray[np.int64]) -> float:

@@ -60,12 +60,15 @@ class SerialExchange:
         Silence that the devices want between an answer and the next question.
     quiet_s : float
         Silence after a loss. As long as devices are usually late at most; the fence covers the rest.
+    blank : bytes
+        Of these, what comes between answers means nothing, like the LF behind a CR that already ended one.
     """
 
-    def __init__(self, port: BytePort, gap_s: float, quiet_s: float) -> None:
+    def __init__(self, port: BytePort, gap_s: float, quiet_s: float, blank: bytes = b"") -> None:
         self._port = port
         self._gap_s = gap_s
         self._quiet_s = quiet_s
+        self._blank = blank
         self._key_turns: defaultdict[int, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._turn = asyncio.Lock()  # released when the question has ended, whatever became of its caller
         self._in_flight: asyncio.Task[bytes] | None = None
@@ -209,7 +212,7 @@ class SerialExchange:
         """Bytes came (called by the port)."""
         self._last_byte_s = asyncio.get_running_loop().time()
         if self._answer is None or self._answer.done() or self._take is None:
-            self._noisy = True  # nobody asked
+            self._noisy |= bool(data.strip(self._blank))  # nobody asked
             return
         self._heard += data
         try:

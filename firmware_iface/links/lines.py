@@ -10,6 +10,7 @@ from firmware_iface.links.serial_port import BytePort
 from firmware_iface.roles import LinkError
 
 _SHOWN_CHARS = 60
+_LINE_ENDS = b"\r\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +40,7 @@ class LineLink:
     """
 
     def __init__(self, port: BytePort, end: str, timeout_s: float, fence: LineFence, quiet_s: float = 0.1) -> None:
-        self._exchange = SerialExchange(port, gap_s=0.0, quiet_s=quiet_s)
+        self._exchange = SerialExchange(port, gap_s=0.0, quiet_s=quiet_s, blank=_LINE_ENDS)
         self._end = end
         self._timeout_s = timeout_s
         self._fence = fence
@@ -80,7 +81,7 @@ class LineLink:
         command : str
             Without its end.
         answer : re.Pattern
-            Has to match everything that comes, and nothing that is still incomplete.
+            Has to match everything that comes, line ends before it aside, and nothing that is still incomplete.
         longest : int
             Characters of the longest answer; more are no answer.
 
@@ -101,6 +102,7 @@ class LineLink:
         what = f"{self.name}: {command.splitlines()[-1]}"
 
         def take(heard: bytes) -> bytes | None:
+            heard = heard.lstrip(_LINE_ENDS)
             try:
                 text = heard.decode("ascii")
             except UnicodeDecodeError:

@@ -127,7 +127,7 @@ def test_a_jump_is_believed_when_repeated() -> None:
         SerialFaults(deaf=True),
         SerialFaults(delay_s=0.3),
         SerialFaults(garbage_bytes=19),
-        SerialFaults(cut_bytes=1),
+        SerialFaults(cut_bytes=2),
         SerialFaults(cut_bytes=4),
         SerialFaults(bit_errors=20),
     ],
