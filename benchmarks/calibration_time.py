@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from benchmarks.figures import Figure, at_most
-from membrane_ctrl.calibrate_command import problem_of, read_sets
+from membrane_ctrl.calibration.sets_command import problem_of, read_sets
 from membrane_ctrl.config import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.metrology.calibrate.solve import solve
 from membrane_ctrl.twin.film_shape import typical_film

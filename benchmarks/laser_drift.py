@@ -14,8 +14,8 @@ from membrane_ctrl.config import Config, ShapeConfig, TwinConfig
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.names import State
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_camera import VirtualCamera
-from membrane_ctrl.virtual_run import run_virtual
+from membrane_ctrl.virtual.camera import VirtualCamera
+from membrane_ctrl.virtual.run import run_virtual
 
 DRIFT_UM_PER_MIN = 2.0
 MINUTES = 10

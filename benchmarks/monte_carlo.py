@@ -18,7 +18,7 @@ from membrane_ctrl.metrology.monte_carlo import TrialBench, run_trials
 from membrane_ctrl.metrology.phase import equal_shifts, phase_sigma_rad
 from membrane_ctrl.metrology.uncertainty import HeightMap, linear_covariance, trial_covariance
 from membrane_ctrl.metrology.unwrap import mm_per_rad
-from membrane_ctrl.set_figure import Figures
+from membrane_ctrl.sets.set_figure import Figures
 from membrane_ctrl.twin.film_shape import typical_film
 from membrane_ctrl.twin.simulate import simulate_run
 from membrane_ctrl.twin.simulation_spec import Motion, SimulationSpec

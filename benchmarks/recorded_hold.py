@@ -17,9 +17,9 @@ from membrane_ctrl.ipc.ring import RingWriter
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.tick_record import pack_tick
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_bench import VirtualBench
-from membrane_ctrl.virtual_run import VirtualRun, VirtualTick
-from membrane_ctrl.virtual_shape import TruthShape
+from membrane_ctrl.virtual.bench import VirtualBench
+from membrane_ctrl.virtual.run import VirtualRun, VirtualTick
+from membrane_ctrl.virtual.shape import TruthShape
 
 Rings = dict[str, RingWriter]
 

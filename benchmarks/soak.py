@@ -25,9 +25,9 @@ from membrane_ctrl.names import State
 from membrane_ctrl.twin.events import DailyTemperature, LaserDropout, PressureWeather
 from membrane_ctrl.twin.events import Event as Happening
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_bench import VirtualBench
-from membrane_ctrl.virtual_run import VirtualRun, VirtualTick
-from membrane_ctrl.virtual_shape import TruthShape
+from membrane_ctrl.virtual.bench import VirtualBench
+from membrane_ctrl.virtual.run import VirtualRun, VirtualTick
+from membrane_ctrl.virtual.shape import TruthShape
 
 DAY_S = 86_400.0
 RATE_HZ = 10.0

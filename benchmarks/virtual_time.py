@@ -12,9 +12,9 @@ from benchmarks.figures import Figure, at_least, at_most
 from membrane_ctrl.config import Config, LoopConfig, ShapeConfig
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_bench import VirtualBench
-from membrane_ctrl.virtual_run import VirtualRun, run_virtual
-from membrane_ctrl.virtual_shape import TruthShape
+from membrane_ctrl.virtual.bench import VirtualBench
+from membrane_ctrl.virtual.run import VirtualRun, run_virtual
+from membrane_ctrl.virtual.shape import TruthShape
 
 RATE_HZ = 10.0
 VIRTUAL_S = 3600.0

@@ -13,9 +13,9 @@ from rich.table import Table
 
 from membrane_ctrl.alarms.apprise_sender import require_sendable
 from membrane_ctrl.bench import open_bench
+from membrane_ctrl.calibration.geometry_in_force import geometry_in_force
 from membrane_ctrl.config import Config, DevicesConfig
 from membrane_ctrl.errors import DeviceError, Exit
-from membrane_ctrl.geometry_in_force import geometry_in_force
 from membrane_ctrl.port.tls import server_context
 from membrane_ctrl.port.unix import SOCKET_NAME
 from membrane_ctrl.port_config import AlarmsConfig, PortConfig

@@ -23,13 +23,13 @@ from firmware_iface.register_map import default_map
 from firmware_iface.roles import Bench, LinkError
 from membrane_ctrl.alarms.apprise_sender import require_sendable
 from membrane_ctrl.bench import connect, open_bench
+from membrane_ctrl.calibration.geometry_in_force import geometry_in_force
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.commands import Command
 from membrane_ctrl.config import Config
 from membrane_ctrl.controller import Controller
 from membrane_ctrl.crew import Crew, Rings, rings_for
 from membrane_ctrl.errors import DeviceError, Exit, InputError
-from membrane_ctrl.geometry_in_force import geometry_in_force
 from membrane_ctrl.ipc.published import publish
 from membrane_ctrl.ipc.ring import RingReader, RingWriter
 from membrane_ctrl.latched import LatchedFile

@@ -10,7 +10,7 @@ from membrane_ctrl.config import Config, LoopConfig, PumpConfig, ShapeConfig, Tw
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.names import State
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_run import run_virtual
+from membrane_ctrl.virtual.run import run_virtual
 
 
 @pytest.mark.parametrize("rate_hz", [5.0, 10.0, 20.0, 50.0])

@@ -18,8 +18,8 @@ from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.names import Rung, State
 from membrane_ctrl.tick import Event
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_bench import VirtualBench
-from membrane_ctrl.virtual_run import VirtualRun, VirtualTick, run_virtual
+from membrane_ctrl.virtual.bench import VirtualBench
+from membrane_ctrl.virtual.run import VirtualRun, VirtualTick, run_virtual
 
 CALM = Config(twin=TwinConfig(scenario="calm", laser_noise_um=0.3))
 Alter = Callable[[float, BenchReading], BenchReading | None]

@@ -7,8 +7,8 @@ from membrane_ctrl.config import Config, LoopConfig, ShapeConfig, TwinConfig
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.names import State
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_bench import VirtualBench
-from membrane_ctrl.virtual_run import VirtualRun
+from membrane_ctrl.virtual.bench import VirtualBench
+from membrane_ctrl.virtual.run import VirtualRun
 
 CONFIG = Config(
     loop=LoopConfig(rate_hz=10.0), twin=TwinConfig(scenario="calm"), shape=ShapeConfig(enabled=False)

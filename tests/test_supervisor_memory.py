@@ -18,7 +18,7 @@ from membrane_ctrl.supervisor import Supervisor, Wiring
 from membrane_ctrl.telemetry import ROW_BYTES
 from membrane_ctrl.tick_record import MESSAGE_BYTES, TickAssembler
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_bench import VirtualBench
+from membrane_ctrl.virtual.bench import VirtualBench
 
 CONFIG = Config()
 

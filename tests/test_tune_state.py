@@ -21,8 +21,8 @@ from membrane_ctrl.tick_record import RECORD, pack_tick, unpack_tick
 from membrane_ctrl.twin.events import AmbientChange
 from membrane_ctrl.twin.events import Event as TwinEvent
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_bench import VirtualBench
-from membrane_ctrl.virtual_run import VirtualRun
+from membrane_ctrl.virtual.bench import VirtualBench
+from membrane_ctrl.virtual.run import VirtualRun
 
 CONFIG = Config(twin=TwinConfig(scenario="quiet", start_error_um=-5.0), shape=ShapeConfig(enabled=False))
 BEGIN_S = 40.0

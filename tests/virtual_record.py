@@ -19,7 +19,7 @@ from membrane_ctrl.recording.inputs_file import InputsFile
 from membrane_ctrl.tick import TickInputs, TickOutputs
 from membrane_ctrl.tick_record import TickAssembler, pack_tick
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_run import Alter, run_virtual
+from membrane_ctrl.virtual.run import Alter, run_virtual
 
 CONFIG = Config(twin=TwinConfig(laser_noise_um=0.5))
 

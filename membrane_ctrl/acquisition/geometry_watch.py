@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from membrane_ctrl.calibration.geometry_in_force import InForce
 from membrane_ctrl.estimate import ShapeEstimate
-from membrane_ctrl.geometry_in_force import InForce
 from membrane_ctrl.metrology.calibrate.drift import DriftMonitor, RingMonitor, noise_urad
 from membrane_ctrl.metrology.covariance import pixel_sigma_adu
 from membrane_ctrl.metrology.geometry import Geometry

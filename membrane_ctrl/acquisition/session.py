@@ -20,11 +20,11 @@ from membrane_ctrl.acquisition.remote import Remote
 from membrane_ctrl.acquisition.twin_bench import TwinTruth
 from membrane_ctrl.acquisition.warm_up import TYPICAL_FILM, small, warm_up
 from membrane_ctrl.acquisition.worker import estimate_message, keep_cycling
+from membrane_ctrl.calibration.geometry_in_force import KEPT, geometry_of_run
+from membrane_ctrl.calibration.geometry_spread_file import spread_of
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config, OpticsConfig
 from membrane_ctrl.estimate import ShapeEstimate
-from membrane_ctrl.geometry_in_force import KEPT, geometry_of_run
-from membrane_ctrl.geometry_spread_file import spread_of
 from membrane_ctrl.ipc.ring import RingAddress, RingWriter
 from membrane_ctrl.metrology.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.live import LiveReconstructor

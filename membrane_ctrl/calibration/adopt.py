@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from membrane_ctrl.calibration.geometry_file import GeometryFile, GeometryOrigin, read_geometry
 from membrane_ctrl.config import OpticsConfig
 from membrane_ctrl.errors import DeviceError, InputError
-from membrane_ctrl.geometry_file import GeometryFile, GeometryOrigin, read_geometry
 from membrane_ctrl.metrology.geometry import Geometry
 from membrane_ctrl.recording.atomic import write_text_atomic
 

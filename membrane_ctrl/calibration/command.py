@@ -11,25 +11,25 @@ from pathlib import Path
 
 import numpy as np
 
-from membrane_ctrl.calibrate_command import CalibrateOptions, calibrate_command, freed, stated_sigmas
 from membrane_ctrl.calibration import session as sessions
 from membrane_ctrl.calibration.adopt import adopt, compared
+from membrane_ctrl.calibration.geometry_file import GeometryOrigin, origin_of, read_geometry
+from membrane_ctrl.calibration.geometry_in_force import geometry_of_run
 from membrane_ctrl.calibration.plan import Held, reach_of, setpoints_um
+from membrane_ctrl.calibration.prior_file import read_prior
 from membrane_ctrl.calibration.procedure import Procedure
 from membrane_ctrl.calibration.session import Head, Session
+from membrane_ctrl.calibration.sets_command import CalibrateOptions, calibrate_command, freed, stated_sigmas
 from membrane_ctrl.calibration.sweep import CaptureLink, Sweep
-from membrane_ctrl.capture_set import read_head
 from membrane_ctrl.config import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.ctl import Where, socket_path
 from membrane_ctrl.errors import DeviceError, Exit, InputError
-from membrane_ctrl.geometry_file import GeometryOrigin, origin_of, read_geometry
-from membrane_ctrl.geometry_in_force import geometry_of_run
 from membrane_ctrl.metrology.calibrate.foresee import foresee
 from membrane_ctrl.metrology.calibrate.parameters import sigmas
 from membrane_ctrl.metrology.calibrate.propagate import Propagated
 from membrane_ctrl.metrology.calibrate.verdict import GOOD_SPREAD_UM
 from membrane_ctrl.port.client import PortClient
-from membrane_ctrl.prior_file import read_prior
+from membrane_ctrl.sets.capture_set import read_head
 from membrane_ctrl.tune.live_hold import LiveHold
 from membrane_ctrl.tune.progress import Progress
 from tuning.hold_link import HoldError

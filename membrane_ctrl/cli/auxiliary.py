@@ -28,7 +28,7 @@ def calibrate_board(
     board: BoardOption = "charuco:15x9",
 ) -> int:
     """Draw the board that `calibrate-camera` looks for, for a screen of so many pixels."""
-    from membrane_ctrl.calibrate_camera_command import draw_board
+    from membrane_ctrl.calibration.camera_command import draw_board
 
     return draw_board(out, board, square_px, width_px, height_px)
 
@@ -41,8 +41,8 @@ def calibrate_camera(
     json: JsonOption = False,
 ) -> int:
     """Focal length, principal point and distortion from photographs of a board; size and pixels are the config's."""
-    from membrane_ctrl.calibrate_camera_command import CameraOptions
-    from membrane_ctrl.calibrate_camera_command import calibrate_camera as run
+    from membrane_ctrl.calibration.camera_command import CameraOptions
+    from membrane_ctrl.calibration.camera_command import calibrate_camera as run
 
     return run(CameraOptions(photographs, board, configured(config), out, json))
 
@@ -56,14 +56,14 @@ def calibrate_pose(
     json: JsonOption = False,
 ) -> int:
     """Pose of the camera from the ring's ellipse in a full set."""
-    from membrane_ctrl.calibrate_pose_command import PoseOptions
-    from membrane_ctrl.calibrate_pose_command import calibrate_pose as run
+    from membrane_ctrl.calibration.pose_command import PoseOptions
+    from membrane_ctrl.calibration.pose_command import calibrate_pose as run
 
     return run(PoseOptions(folder, geometry, tuple(prior or ()), radius_sigma_mm, out, json))
 
 
 def calibrate_display(config: ConfigArgument, json: JsonOption = False) -> int:
     """Settle time and gamma of the screen, as the camera sees it, and what they are worth."""
-    from membrane_ctrl.calibrate_display_command import calibrate_display as run
+    from membrane_ctrl.calibration.display_command import calibrate_display as run
 
     return run(configured(config), str(config), json)

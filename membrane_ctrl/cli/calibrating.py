@@ -43,7 +43,7 @@ def calibrate(
     take_over: Annotated[bool, typer.Option("--take-over", help="--live: take the command from its holder.")] = False,
 ) -> int:
     """Calibrate the optics: one geometry with its covariance, from sets at several pressures."""
-    from membrane_ctrl.calibrate_command import CalibrateOptions, calibrate_command
+    from membrane_ctrl.calibration.sets_command import CalibrateOptions, calibrate_command
     from membrane_ctrl.errors import InputError
 
     names, priors = tuple(free or ()), tuple(prior or ())

@@ -13,9 +13,9 @@ from membrane_ctrl.telemetry import TelemetryRow
 from membrane_ctrl.tick import Event
 from membrane_ctrl.twin.events import Event as TwinEvent
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_bench import VirtualBench
-from membrane_ctrl.virtual_run import VirtualRun
-from membrane_ctrl.virtual_shape import TruthShape
+from membrane_ctrl.virtual.bench import VirtualBench
+from membrane_ctrl.virtual.run import VirtualRun
+from membrane_ctrl.virtual.shape import TruthShape
 from tuning.hold_link import HoldError, News
 
 _NEWS_S = 0.5

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.acquisition.geometry_watch import LiveDrift, geometry_event
+from membrane_ctrl.calibration.geometry_file import CalibrationTable, origin_of
+from membrane_ctrl.calibration.geometry_in_force import InForce
 from membrane_ctrl.config import OpticsConfig
 from membrane_ctrl.estimate import ShapeEstimate
-from membrane_ctrl.geometry_file import CalibrationTable, origin_of
-from membrane_ctrl.geometry_in_force import InForce
 from membrane_ctrl.metrology.calibrate.drift import CYCLES, ring_um
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.metrology.surface import Surface

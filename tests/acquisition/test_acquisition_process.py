@@ -17,10 +17,10 @@ import pytest
 from membrane_ctrl.acquisition.frames import FrameReader, FrameRing
 from membrane_ctrl.acquisition.process import AcquisitionSpec, acquisition_main
 from membrane_ctrl.acquisition.warm_up import small
+from membrane_ctrl.calibration.geometry_file import origin_of
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import CameraConfig, Config, OpticsConfig, ShapeConfig
 from membrane_ctrl.estimate import ShapeEstimate
-from membrane_ctrl.geometry_file import origin_of
 from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
 from membrane_ctrl.metrology.patterns import fringe_sequence
 from membrane_ctrl.telemetry import FIELDS, ROW_BYTES, TelemetryRow

@@ -13,9 +13,9 @@ from live_bench import CAMERA, TRUE, LiveBench, config
 
 from membrane_ctrl.calibration import command
 from membrane_ctrl.calibration.command import LiveOptions
+from membrane_ctrl.calibration.geometry_file import read_geometry
 from membrane_ctrl.cli import run
 from membrane_ctrl.config import OpticsConfig
-from membrane_ctrl.geometry_file import read_geometry
 from membrane_ctrl.names import ShapeState
 
 WORDS = ["calibrate", "--live", "--no-pictures"]

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.calibration.adopt import adopt, compared
+from membrane_ctrl.calibration.geometry_file import origin_of, read_geometry
 from membrane_ctrl.config import GeometryConfig, OpticsConfig
 from membrane_ctrl.errors import DeviceError
-from membrane_ctrl.geometry_file import origin_of, read_geometry
 
 NEW = "a_mm = 2674.0\nb_mm = 2869.0\nalpha_deg = 81.2\n"
 

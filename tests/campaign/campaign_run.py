@@ -26,9 +26,9 @@ from membrane_ctrl.names import Rung, State
 from membrane_ctrl.safety import TABLE
 from membrane_ctrl.twin.events import AmbientChange, LeakChange
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_bench import VirtualBench, Wrong
-from membrane_ctrl.virtual_run import VirtualRun
-from membrane_ctrl.virtual_shape import TruthShape
+from membrane_ctrl.virtual.bench import VirtualBench, Wrong
+from membrane_ctrl.virtual.run import VirtualRun
+from membrane_ctrl.virtual.shape import TruthShape
 
 RATE_HZ = 25.0
 AFTERMATH_S = 30.0

@@ -11,8 +11,8 @@ from firmware_iface.emulators.board_state import GAUGE_PRESSURE_LIMIT_PA
 from membrane_ctrl.config import Config
 from membrane_ctrl.names import Rung, State
 from membrane_ctrl.safety import MOVING, TABLE
-from membrane_ctrl.virtual_bench import VirtualBench
-from membrane_ctrl.virtual_run import VirtualRun, VirtualTick
+from membrane_ctrl.virtual.bench import VirtualBench
+from membrane_ctrl.virtual.run import VirtualRun, VirtualTick
 
 _NAMES = {float(rule.code): rule.name for rule in TABLE}
 _MAY_PUMP = MOVING | {State.CHECK, State.FAULT}

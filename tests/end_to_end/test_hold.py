@@ -20,8 +20,8 @@ from pymodbus.client import ModbusTcpClient
 from rerun.chunk import RrdReader
 
 from firmware_iface.register_map import default_map
-from membrane_ctrl.capture_set import read_head
 from membrane_ctrl.cli import run
+from membrane_ctrl.sets.capture_set import read_head
 
 pytestmark = pytest.mark.real_time
 

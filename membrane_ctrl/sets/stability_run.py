@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from membrane_ctrl.calibration.geometry_spread_file import spread_of
 from membrane_ctrl.errors import InputError
-from membrane_ctrl.geometry_spread_file import spread_of
 from membrane_ctrl.metrology.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.monte_carlo import run_trials
 from membrane_ctrl.metrology.pairs import LAGS_S, Moment, Pair, PairFinder
 from membrane_ctrl.metrology.stability import RunningCovariance, Tally
 from membrane_ctrl.metrology.surface import PARAMETERS, parameter_to_coeffs
 from membrane_ctrl.metrology.uncertainty import HeightMap, height_matrix, trial_covariance
-from membrane_ctrl.set_figure import SetFigure
-from membrane_ctrl.stability_series import SeriesFile, read_series
+from membrane_ctrl.sets.set_figure import SetFigure
+from membrane_ctrl.sets.stability_series import SeriesFile, read_series
 
 FloatArray = NDArray[np.float64]
 
@@ -182,7 +182,7 @@ class StabilityRun:
 
     def draw(self) -> list[Path]:
         """Write the SD map and the pictures, and name these; the series must be closed. Raises OSError."""
-        from membrane_ctrl.stability_pictures import draw_pairs, draw_stability, draw_zernike
+        from membrane_ctrl.sets.stability_pictures import draw_pairs, draw_stability, draw_zernike
 
         grid = self._grid
         if grid is None:
@@ -200,7 +200,7 @@ class StabilityRun:
 
     def record(self, pictures: list[Path]) -> None:
         """Write `stability.rrd`; the series must be closed. Raises OSError."""
-        from membrane_ctrl.stability_rerun import log_stability
+        from membrane_ctrl.sets.stability_rerun import log_stability
 
         if self._grid is None:
             return

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from membrane_ctrl.capture_set import CaptureHead, anchored, read_set
+from membrane_ctrl.calibration.geometry_file import GeometryFile
 from membrane_ctrl.errors import CommandError, RejectedError
 from membrane_ctrl.estimate import Verdict
-from membrane_ctrl.geometry_file import GeometryFile
-from membrane_ctrl.measurement import read_anchor, stack_of
 from membrane_ctrl.metrology.bin_figure import BinFigure, bin_figure
 from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, check
 from membrane_ctrl.metrology.monte_carlo import TrialBench
 from membrane_ctrl.metrology.quality import judge
+from membrane_ctrl.sets.capture_set import CaptureHead, anchored, read_set
+from membrane_ctrl.sets.measurement import read_anchor, stack_of
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from membrane_ctrl.measurement import Measurement
-from membrane_ctrl.result_recording import log_pictures, result_recording
+from membrane_ctrl.sets.measurement import Measurement
+from membrane_ctrl.sets.result_recording import log_pictures, result_recording
 
 
 def log_measurement(path: Path, measurement: Measurement, pictures: Sequence[Path]) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from membrane_ctrl.calibration.geometry_file import CalibrationTable, GeometryOrigin, origin_of, read_geometry
 from membrane_ctrl.config import Config, OpticsConfig
 from membrane_ctrl.errors import InputError
-from membrane_ctrl.geometry_file import CalibrationTable, GeometryOrigin, origin_of, read_geometry
 
 KEPT = "geometry.toml"  # in the run's folder
 

@@ -22,7 +22,7 @@ from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.telemetry import TelemetryRow
 from membrane_ctrl.tick import Event, TickInputs, TickOutputs
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_bench import VirtualBench
+from membrane_ctrl.virtual.bench import VirtualBench
 
 ShapeSource = Callable[[float], ShapeEstimate | None]
 Alter = Callable[[float, BenchReading], BenchReading | None]

@@ -12,13 +12,13 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from membrane_ctrl.capture_set import read_head
+from membrane_ctrl.calibration.geometry_file import read_geometry
 from membrane_ctrl.errors import CommandError, InputError, RejectedError
-from membrane_ctrl.geometry_file import read_geometry
 from membrane_ctrl.metrology.stability import default_points_mm
-from membrane_ctrl.result_files import write_json
-from membrane_ctrl.set_figure import Figures
-from membrane_ctrl.stability_run import SERIES, StabilityRun
+from membrane_ctrl.sets.capture_set import read_head
+from membrane_ctrl.sets.result_files import write_json
+from membrane_ctrl.sets.set_figure import Figures
+from membrane_ctrl.sets.stability_run import SERIES, StabilityRun
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from firmware_iface.roles import Pattern
+from membrane_ctrl.calibration.geometry_file import GeometryFile, GeometryOrigin, origin_of
 from membrane_ctrl.config import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig, PatternConfig, Section
 from membrane_ctrl.config_file import parse, prune, read_toml, with_height_map
 from membrane_ctrl.errors import InputError
-from membrane_ctrl.geometry_file import GeometryFile, GeometryOrigin, origin_of
 from membrane_ctrl.metrology.patterns import AXES, GRAY_BITS
 
 FloatArray = NDArray[np.float64]

@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.geometry_spread_file import spread_of
-from membrane_ctrl.measurement import Measurement
+from membrane_ctrl.calibration.geometry_spread_file import spread_of
 from membrane_ctrl.metrology.covariance import parameter_covariance, pixel_sigma_adu, slope_per_screen
 from membrane_ctrl.metrology.monte_carlo import TRIAL_POINTS, TrialBench
 from membrane_ctrl.metrology.phase import phase_sigma_rad
 from membrane_ctrl.metrology.surface import PARAMETERS, sag_gradient
 from membrane_ctrl.metrology.uncertainty import HeightMap, geometry_covariance, geometry_jacobian
 from membrane_ctrl.metrology.unwrap import mm_per_rad
+from membrane_ctrl.sets.measurement import Measurement
 
 FloatArray = NDArray[np.float64]
 

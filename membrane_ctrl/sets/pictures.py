@@ -10,11 +10,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from membrane_ctrl.error_bars import ErrorBars
-from membrane_ctrl.measurement import Measurement
 from membrane_ctrl.metrology.full import FullResult
 from membrane_ctrl.metrology.outline import Outline
 from membrane_ctrl.metrology.radial import RadialProfile
+from membrane_ctrl.sets.error_bars import ErrorBars
+from membrane_ctrl.sets.measurement import Measurement
 
 FloatArray = NDArray[np.float64]
 

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from membrane_ctrl.calibration.geometry_file import read_geometry
+from membrane_ctrl.calibration.geometry_spread_file import spread_of
 from membrane_ctrl.errors import InputError
-from membrane_ctrl.geometry_file import read_geometry
-from membrane_ctrl.geometry_spread_file import spread_of
 from membrane_ctrl.metrology.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.monte_carlo import TrialBench
 from membrane_ctrl.metrology.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty import HeightMap, linear_covariance, noise_covariance, trial_covariance
-from membrane_ctrl.result_files import write_json
-from membrane_ctrl.set_figure import Figures, SetFigure
+from membrane_ctrl.sets.result_files import write_json
+from membrane_ctrl.sets.set_figure import Figures, SetFigure
 from membrane_ctrl.trial_runner import run_everywhere
 
 FloatArray = NDArray[np.float64]
@@ -122,7 +122,7 @@ def _table(
 
 
 def _write(out: Path, grid: HeightMap, result: Spread, height_um: FloatArray, table: dict[str, Any]) -> None:
-    from membrane_ctrl.stability_pictures import draw_uncertainty  # matplotlib takes a second to load
+    from membrane_ctrl.sets.stability_pictures import draw_uncertainty  # matplotlib takes a second to load
 
     rmse = grid.picture(1e3 * grid.sigma(result.covariance))
     try:

@@ -11,10 +11,10 @@ from typing import Annotated, Any
 import tomli_w
 from pydantic import Field
 
+from membrane_ctrl.calibration.geometry_file import LensTable
 from membrane_ctrl.config import GeometryConfig, OpticsConfig, Section
 from membrane_ctrl.config_file import load, parse
 from membrane_ctrl.errors import InputError
-from membrane_ctrl.geometry_file import LensTable
 from membrane_ctrl.metrology.calibrate.parameters import NAMES
 
 SCHEMA = "membrane-prior/1"

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from membrane_ctrl.capture_set import CaptureHead, CaptureSet, anchored, read_set
+from membrane_ctrl.calibration.geometry_file import GeometryFile
 from membrane_ctrl.errors import InputError
 from membrane_ctrl.estimate import Verdict
-from membrane_ctrl.geometry_file import GeometryFile
 from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, check
 from membrane_ctrl.metrology.frame_stack import FrameStack
 from membrane_ctrl.metrology.full import FullResult, measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.integrity import Flag
 from membrane_ctrl.metrology.quality import judge
 from membrane_ctrl.metrology.reconstruct import HeightFunction
+from membrane_ctrl.sets.capture_set import CaptureHead, CaptureSet, anchored, read_set
 
 
 @dataclass(frozen=True)

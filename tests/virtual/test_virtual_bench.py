@@ -9,7 +9,7 @@ import pytest
 from firmware_iface.roles import BenchCommand, LinkDownError, LinkError
 from membrane_ctrl.config import Config, TwinConfig
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_bench import VirtualBench
+from membrane_ctrl.virtual.bench import VirtualBench
 
 CONFIG = Config(twin=TwinConfig(scenario="calm"))
 

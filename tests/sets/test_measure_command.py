@@ -268,7 +268,7 @@ def test_a_pose_that_the_rim_contradicts_is_asked_about(
     assert "is the camera's pose right" in capsys.readouterr().out
 
 
-FACET = Path(__file__).parents[1].parent / "shared" / "data" / "sofast" / "measurement_facet.h5"
+FACET = Path(__file__).parents[2].parent / "shared" / "data" / "sofast" / "measurement_facet.h5"
 
 
 @pytest.mark.skipif(not FACET.is_file(), reason="no measured facet")

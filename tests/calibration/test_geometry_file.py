@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import tomli_w
 
+from membrane_ctrl.calibration.geometry_file import origin_of, read_geometry
+from membrane_ctrl.calibration.geometry_in_force import KEPT, geometry_in_force, geometry_of_run
 from membrane_ctrl.cli.options import configured
 from membrane_ctrl.config import CameraConfig, Config, GeometryConfig, OpticsConfig, PatternConfig
 from membrane_ctrl.errors import InputError
-from membrane_ctrl.geometry_file import origin_of, read_geometry
-from membrane_ctrl.geometry_in_force import KEPT, geometry_in_force, geometry_of_run
 from membrane_ctrl.metrology.calibrate.content_hash import SCHEMA, content_hash
 
 CAMERA = CameraConfig(width_px=306, height_px=256, pixel_um=27.6)

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from membrane_ctrl.calibrate_report import lines_of, report_of
+from membrane_ctrl.calibration.geometry_file import read_geometry
+from membrane_ctrl.calibration.prior_file import Prior, read_prior
+from membrane_ctrl.calibration.report import lines_of, report_of
 from membrane_ctrl.config import GeometryConfig, OpticsConfig
 from membrane_ctrl.errors import Exit, InputError
-from membrane_ctrl.geometry_file import read_geometry
 from membrane_ctrl.metrology.calibrate.artefact import Origin, tables_of
 from membrane_ctrl.metrology.calibrate.determined import condition_number
 from membrane_ctrl.metrology.calibrate.drift import noise_urad
@@ -29,8 +30,7 @@ from membrane_ctrl.metrology.calibrate.separable import Witness
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, slope_residual, solve
 from membrane_ctrl.metrology.calibrate.verdict import Finding, after, before
 from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.prior_file import Prior, read_prior
-from membrane_ctrl.set_figure import Figures
+from membrane_ctrl.sets.set_figure import Figures
 
 
 @dataclass(frozen=True)
@@ -242,7 +242,7 @@ def _noise_urad(solution: Solution, phases: SetPhases, index: int) -> float:
 
 def _draw(path: Path, solution: Solution) -> None:
     """The residuals' maps, also of a solution that is refused: there they are wanted most."""
-    from membrane_ctrl.calibrate_pictures import draw_residuals
+    from membrane_ctrl.calibration.pictures import draw_residuals
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

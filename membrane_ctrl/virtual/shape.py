@@ -12,7 +12,7 @@ import numpy as np
 from membrane_ctrl.config import Config
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.metrology.hencky import zernike_projection
-from membrane_ctrl.virtual_bench import VirtualBench
+from membrane_ctrl.virtual.bench import VirtualBench
 
 # Change of sag of a cycle of rendered full-size frames at 50 Hz in typical weather: 0.007 um (docs/control.md).
 SAG_SIGMA_UM = 0.01

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.capture_set import CaptureSet, read_set
+from membrane_ctrl.calibration.geometry_file import read_geometry
+from membrane_ctrl.calibration.prior_file import read_prior, write_prior
 from membrane_ctrl.errors import Exit, InputError, RejectedError
-from membrane_ctrl.geometry_file import read_geometry
-from membrane_ctrl.measurement import stack_of
 from membrane_ctrl.metrology.bin_figure import bin_figure
 from membrane_ctrl.metrology.calibrate.artefact import general_form
 from membrane_ctrl.metrology.calibrate.parameters import usual_sigma
@@ -23,7 +22,8 @@ from membrane_ctrl.metrology.checked import RejectedSetError, check
 from membrane_ctrl.metrology.geometry import Geometry
 from membrane_ctrl.metrology.outline import find_outline
 from membrane_ctrl.metrology.reconstruct import HeightFunction
-from membrane_ctrl.prior_file import read_prior, write_prior
+from membrane_ctrl.sets.capture_set import CaptureSet, read_set
+from membrane_ctrl.sets.measurement import stack_of
 
 FloatArray = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.errors import InputError
-from membrane_ctrl.scenario import complaints, load_scenario, play
+from membrane_ctrl.virtual.scenario import complaints, load_scenario, play
 
-FOLDER = Path(__file__).parent / "scenarios"
+FOLDER = Path(__file__).parents[1] / "scenarios"
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.toml")), ids=lambda path: path.stem)

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.error_bars import ErrorBars, error_bars
+from membrane_ctrl.calibration.geometry_file import read_geometry
 from membrane_ctrl.errors import Exit, InputError
-from membrane_ctrl.geometry_file import read_geometry
-from membrane_ctrl.measurement import Measurement, measure_set
 from membrane_ctrl.metrology.outline import Outline, find_outline
 from membrane_ctrl.metrology.radial import RadialProfile, radial_profile
-from membrane_ctrl.result_files import details_table, result_table, write_result
+from membrane_ctrl.sets.error_bars import ErrorBars, error_bars
+from membrane_ctrl.sets.measurement import Measurement, measure_set
+from membrane_ctrl.sets.result_files import details_table, result_table, write_result
 
 FloatArray = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ def measure_command(
 ) -> int:
     """Measure one set, write the result, say what came out. Returns the exit code; raises InputError."""
     if folder.suffix == ".h5":
-        from membrane_ctrl.facet_command import facet_command
+        from membrane_ctrl.sets.facet_command import facet_command
 
         return facet_command(folder, as_json)
     measurement = measure_set(folder, None if geometry is None else read_geometry(geometry))
@@ -44,11 +44,11 @@ def measure_command(
         write_result(target, measurement, details_table(measurement, profile, outline, bars), bars)
         drawn: list[Path] = []
         if pictures:
-            from membrane_ctrl.pictures import draw_all
+            from membrane_ctrl.sets.pictures import draw_all
 
             drawn = draw_all(target, measurement, light, profile, outline, bars)
         if rerun:
-            from membrane_ctrl.measurement_rerun import log_measurement
+            from membrane_ctrl.sets.measurement_rerun import log_measurement
 
             log_measurement(target / "measurement.rrd", measurement, drawn)
     except OSError as error:

@@ -11,12 +11,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from membrane_ctrl.calibration.prior_file import write_prior
 from membrane_ctrl.config import CameraConfig, Config
 from membrane_ctrl.errors import Exit, InputError, RejectedError
 from membrane_ctrl.metrology.calibrate.board import Board, on_screen
 from membrane_ctrl.metrology.calibrate.lens import Lens, View, calibrate_lens
 from membrane_ctrl.metrology.calibrate.parameters import usual_sigma
-from membrane_ctrl.prior_file import write_prior
 
 _IMAGES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 

@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from membrane_ctrl.result_recording import log_pictures, result_recording
+from membrane_ctrl.sets.result_recording import log_pictures, result_recording
 
 FloatArray = NDArray[np.float64]
 

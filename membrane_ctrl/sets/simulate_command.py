@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from membrane_ctrl.calibration.geometry_file import read_geometry
 from membrane_ctrl.config import Config, OpticsConfig
 from membrane_ctrl.errors import InputError
-from membrane_ctrl.geometry_file import read_geometry
 from membrane_ctrl.twin.film_shape import FilmShape, typical_film
 from membrane_ctrl.twin.frame_faults import FrameFault
 from membrane_ctrl.twin.illumination import Light

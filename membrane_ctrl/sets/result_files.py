@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.error_bars import ErrorBars
-from membrane_ctrl.measurement import Measurement, noise_seen_adu
 from membrane_ctrl.metrology.full import FullResult
 from membrane_ctrl.metrology.outline import Outline
 from membrane_ctrl.metrology.radial import RadialProfile
+from membrane_ctrl.sets.error_bars import ErrorBars
+from membrane_ctrl.sets.measurement import Measurement, noise_seen_adu
 
 
 def result_table(measurement: Measurement) -> dict[str, Any]:

@@ -49,9 +49,9 @@ from membrane_ctrl.telemetry import FIELDS
 from membrane_ctrl.tick import Event
 from membrane_ctrl.twin import events as happenings
 from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual_bench import VirtualBench, Wrong
-from membrane_ctrl.virtual_run import VirtualRun, VirtualTick
-from membrane_ctrl.virtual_shape import TruthShape
+from membrane_ctrl.virtual.bench import VirtualBench, Wrong
+from membrane_ctrl.virtual.run import VirtualRun, VirtualTick
+from membrane_ctrl.virtual.shape import TruthShape
 
 _SWITCHES: dict[str, Any] = {field.name: field.default for field in fields(Wrong)}
 Happening = Literal["ambient", "air_temperature", "leak", "laser_dropout", "laser_drift", "power_cycle"]
