@@ -164,6 +164,19 @@ class DevicesConfig(Section):
         return self
 
     @model_validator(mode="after")
+    def _one_owner_a_port(self) -> DevicesConfig:
+        owners: dict[str, tuple[str, str]] = {}
+        for role, section in self.roles().items():
+            link = "" if hasattr(section, "port") else section.link
+            port = section.port if hasattr(section, "port") else link.removeprefix("rtu://").partition("?")[0]
+            other, other_link = owners.setdefault(port, (role, link))
+            if other != role and not (link and link == other_link):
+                raise ValueError(
+                    f"{other} and {role} name one port, {port}; only Modbus devices of the same link share"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _camera_sees_a_screen(self) -> DevicesConfig:
         if self.camera is None and self.screen is not None:
             raise ValueError("[devices.screen] needs a [devices.camera] that looks at it")

@@ -12,6 +12,7 @@ median, the mean resolves less than a digital step (0.8 um at 50 mm range).
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import re
 
@@ -129,6 +130,8 @@ class Optoncdt1420(LinkedDevice):
         self._settle_anew()
         self._port.open(self)
         try:
+            with contextlib.suppress(DeviceRefusedError):  # refused with what was said to it half before
+                await self._command("OUTPUT NONE")
             await self._command("OUTPUT NONE")
             identity = await self._identify()
             for setting in self._settings():
@@ -184,8 +187,10 @@ class Optoncdt1420(LinkedDevice):
                 while not self._heard.rstrip().endswith(_PROMPT):
                     await self._stirred()
         except TimeoutError:
-            hint = f"{len(self._heard)} bytes but no prompt; wrong baud rate?" if self._heard else "no answer"
-            raise LinkError(f"{what}: {hint} within {self._timeout_s:g} s") from None
+            hint = f"no answer within {self._timeout_s:g} s; is it on, wired and set to {self._port.settings}?"
+            if self._heard:
+                hint = f"{len(self._heard)} bytes but no prompt within {self._timeout_s:g} s; wrong baud rate?"
+            raise LinkError(f"{what}: {hint}") from None
         # bytes of a stream that is just being stopped have no text in them that could be an error: see the marks
         text = self._heard.rstrip()[: -len(_PROMPT)].decode("ascii", "replace")
         if error := _ERROR.search(text):

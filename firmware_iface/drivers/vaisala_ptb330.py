@@ -121,7 +121,7 @@ class VaisalaPtb330(LinkedDevice):
         except LinkDownError:
             raise
         except LinkError as error:
-            raise DeviceRefusedError(f"{error}: not a PTB330") from error
+            raise DeviceRefusedError(f"{error} (or it is not a PTB330)") from error
         errors = await self._link.query("ERRS", _ERRORS, 400)
         return DeviceIdentity(f"Vaisala {about[1]}", about[3], about[2], errors[1].strip())
 

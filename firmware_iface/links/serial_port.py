@@ -35,6 +35,7 @@ _REMEDIES = {
     errno.ENODEV: "there is no such port; is the adapter plugged in?",
     errno.ENXIO: "there is no such port; is the adapter plugged in?",
     errno.ENOTTY: "this is not a serial port",
+    errno.EISDIR: "this is not a serial port",
 }
 
 
@@ -283,7 +284,7 @@ def _opened(path: str, name: str, settings: SerialSettings) -> Any:
     except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
         code = _errno(error)
         remedy = _REMEDIES.get(code, str(error))
-        if code == errno.ENOTTY:
+        if code in (errno.ENOTTY, errno.EISDIR):
             raise DeviceRefusedError(f"{name}: {remedy}") from error
         raise LinkDownError(f"{name}: {remedy}") from error
     with contextlib.suppress(ValueError, OSError):

@@ -258,6 +258,17 @@ def test_another_sensor_is_refused(emulator: dict[str, Any], settings: dict[str,
     run_virtual(test())
 
 
+def test_half_a_command_of_someone_else_is_not_in_the_way() -> None:
+    async def test() -> None:
+        bench = Bench()
+        bench.emulator.received(b"MEASR")
+        await bench.driver.open()
+        assert await bench.tick() == pytest.approx(12.0, abs=STEP_UM)
+        await bench.driver.close()
+
+    run_virtual(test())
+
+
 @pytest.mark.parametrize(
     ("faults", "message"),
     [({"silent": True}, "no answer"), ({"garbage_bytes": 40}, "wrong baud rate"), ({"delay_s": 1.0}, "no answer")],
