@@ -21,6 +21,7 @@ from benchmarks.page import page
 # those that need a quiet machine first, those that take long last
 NAMES = (
     "hold_live",
+    "ticks",
     "live_cycle",
     "sliding_window",
     "measure_full",
