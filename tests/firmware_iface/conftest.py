@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import AsyncIterator
-from pathlib import Path
 
 import pytest
 from counting_plant import CountingPlant, ManualClock
 
 from firmware_iface.emulators.pump_board import PumpBoardEmulator
-
-sys.path.insert(0, str(Path(__file__).parents[2]))  # the benchmarks are the audit of these tests too
 
 
 @pytest.fixture

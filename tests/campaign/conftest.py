@@ -1,6 +1,0 @@
-"""The benchmarks' soak serves these tests too; it lives beside the package, not in it."""
-
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
