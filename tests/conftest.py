@@ -1,4 +1,4 @@
-"""What every test must leave behind: no asyncio task, no child process."""
+"""What every test must leave behind, no asyncio task and no child process; and the same examples at every run."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ import multiprocessing
 from collections.abc import AsyncIterator, Iterator
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("seeded", derandomize=True, deadline=None)
+settings.load_profile("seeded")
 
 
 @pytest.fixture

@@ -75,8 +75,9 @@ def settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settlin
     delays, shares = delays[order], shares[order]
     floor = max(_FIT_TO, _NOISE_SIGMAS * noise)
     unsettled = np.flatnonzero(shares > floor)
-    if unsettled.size == 0:  # faster than the first frame
-        return Settling(float(delays[0]), math.nan, math.nan)
+    if unsettled.size == 0:  # faster than the first frame; what that had left goes no slower than the rest went
+        still = max(float(shares[0]), _LEFT)
+        return Settling(float(delays[0]) * math.log(_LEFT) / math.log(still), math.nan, math.nan)
     if unsettled[-1] == len(delays) - 1:
         raise ValueError(
             f"{100 * shares[-1]:.0f} % of a step is left after {delays[-1]:.2f} s: does the camera see the screen, "
@@ -85,7 +86,11 @@ def settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settlin
     seen_s = float(delays[unsettled[-1] + 1])  # the first frame after which all are good
     falling = (shares < _FIT_FROM) & (shares > floor)
     if np.count_nonzero(falling) < _LEAST_POINTS or np.ptp(delays[falling]) <= 0:
-        return Settling(seen_s + float(np.max(np.diff(delays))), math.nan, math.nan)
+        # too fast to fit: from _FIT_FROM to the floor in no more than this, and no slower afterwards
+        before = np.flatnonzero(shares[: unsettled[-1] + 1] >= _FIT_FROM)
+        fell_s = seen_s - (float(delays[before[-1]]) if before.size else 0.0)
+        rest_s = fell_s * max(0.0, math.log(floor / _LEFT)) / math.log(_FIT_FROM / floor)
+        return Settling(seen_s + rest_s, math.nan, math.nan)
     slope, offset = np.polyfit(delays[falling], np.log(shares[falling]), 1)
     if slope >= 0:
         return Settling(2 * seen_s, math.nan, math.nan)

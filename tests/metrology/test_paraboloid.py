@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from membrane_ctrl.metrology.face import Face
 from membrane_ctrl.metrology.facet import Sight, measure_on, solve_facet, turned
 from membrane_ctrl.metrology.geometry import Geometry
 from membrane_ctrl.metrology.paraboloid import Paraboloid, fit_slopes
@@ -89,6 +90,7 @@ def rig():
         screen_origin_mm=np.array([2000.0, -100.0, 10_000.0]),
         screen_s_x=np.array([1.0, 0.0, 0.0]),
         screen_s_y=np.array([0.0, 1.0, 0.0]),
+        face=Face.of(None),
     )
 
 
