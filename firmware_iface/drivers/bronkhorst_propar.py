@@ -1,8 +1,8 @@
 """Bronkhorst parameters over ProPar on a serial line, in its binary form.
 
 Source: manual 9.17.027. Binary, because its messages carry a sequence number: an answer is never taken for that of
-another question. What ProPar lacks is a checksum. So every number is asked for twice in one message, and what was
-written is read back; a flipped bit then makes two different answers.
+another question. What ProPar lacks is a checksum. So every number is asked for three times in one message, and what
+was written is read back; a flipped bit then makes answers that differ.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ from firmware_iface.roles import DeviceRefusedError, LinkError
 
 MANUAL = "Bronkhorst 9.17.027, sections 3.4 to 3.6"
 _QUIET_S = 0.1
-_ANSWER_BYTES = 40  # the longest: a text of 16 characters, or two floats, with every byte doubled
+_ANSWER_BYTES = 50  # the longest: a text of 16 characters, or three floats, with every byte doubled
+# Two copies are hit at the same bit once in a million messages on a line where a tenth of them is hit at all
+_COPIES = 3
 _REFUSALS = (3, 4, 5, 6, 13)  # status: the request itself is wrong for this instrument
 _SEQUENCES = 256
 _FORMATS = {"u8": ">B", "u16": ">H", "f32": ">f"}
@@ -65,10 +67,11 @@ class ProparParameters:
             self._exchange.connect()
 
     async def number(self, parameter: Parameter) -> float:
-        """A number that came twice. Raises LinkError."""
-        first, second = await self._asked(parameter, parameter)
-        if first != second:
-            raise LinkError(f"{self.name}: {parameter.name} came as {first.hex()} and as {second.hex()}; noise")
+        """A number that came `_COPIES` times the same. Raises LinkError."""
+        first, *others = await self._asked(*[parameter] * _COPIES)
+        if any(other != first for other in others):
+            came = ", ".join(raw.hex() for raw in (first, *others))
+            raise LinkError(f"{self.name}: {parameter.name} came as {came}; noise")
         return float(struct.unpack(_FORMATS[parameter.kind], first)[0])
 
     async def text(self, parameter: Parameter) -> str:
