@@ -19,7 +19,7 @@ def test_the_mirror_is_held_through_serial_instruments(tmp_path: Path) -> None:
     near = tmp_path / "near.toml"
     near.write_text(EXAMPLE.read_text() + "\n[twin]\nstart_error_um = -2.0\n")
     done = subprocess.run(
-        [*HOLD[:-1], str(near), "--twin", "--duration", "14s", "--logs", str(tmp_path / "logs"), "--json"],
+        [*HOLD[:-1], str(near), "--twin", "--duration", "18s", "--logs", str(tmp_path / "logs"), "--json"],
         capture_output=True,
         text=True,
         timeout=120,
