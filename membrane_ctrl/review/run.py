@@ -171,7 +171,8 @@ def open_run(path: Path | str) -> Run:
     notes: list[str] = []
     events = read_events(folder, notes)
     summary = read_summary(folder, notes)
-    for files in (column_files(folder, TICKS), rrd_reader.segments(folder)):
+    tables = (TICKS, *(level_table(window_s) for window_s in WINDOWS_S), SHAPES)
+    for files in (*(column_files(folder, table) for table in tables), rrd_reader.segments(folder)):
         notes += [f"{name}: missing; what it held is left out" for name in missing_files(files)]
     there, expected = len(rrd_reader.segments(folder)), _segments(summary)
     if there < expected:

@@ -125,11 +125,14 @@ def from_columns(columns: Mapping[str, Column]) -> Shapes:
 
 
 def joined(parts: list[Shapes]) -> Shapes:
-    """One after the other."""
+    """One after the other, each cycle once."""
     if not parts:
         return from_columns({})
     names = (*_NUMBERS, "coeffs_um", "verdict", "covariance_time_s", "covariance_um2")
-    return Shapes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+    whole = Shapes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+    # a journal may repeat what the recorder had just written when it was killed
+    until_s = np.maximum.accumulate(np.concatenate(([-np.inf], whole.time_s)))[:-1]
+    return whole.select(whole.time_s > until_s)
 
 
 def _numbers(table: pa.Table, name: str) -> Column:

@@ -104,6 +104,23 @@ def test_a_killed_run_is_whole_in_its_tables(tmp_path: Path) -> None:
     assert {"ticks-waiting.arrows", "ticks-000.arrows", "levels_60s-waiting.arrows"} <= files
 
 
+def test_a_cycle_that_the_journal_repeats_counts_once(tmp_path: Path) -> None:
+    rows, shapes = night(3, 0.05, "typical", [])
+    tables(tmp_path, rows, shapes)
+    columns = tmp_path / "columns"
+    (columns / "shapes-waiting.arrows").write_bytes((columns / "shapes-000.arrows").read_bytes())
+    found = open_run(tmp_path).shapes()
+    assert len(found) == len(shapes)
+    assert (np.diff(found.time_s) > 0).all()
+
+
+@pytest.mark.parametrize("table", ["levels_1s", "shapes"])
+def test_a_missing_file_of_any_table_is_named(tmp_path: Path, table: str) -> None:
+    folder = written(tmp_path, 0.02)
+    (folder / "columns" / f"{table}-000.arrows").rename(folder / "columns" / f"{table}-001.arrows")
+    assert any(f"{table}-000.arrows: missing" in note for note in open_run(folder).notes)
+
+
 def test_a_run_without_tables_is_read_from_rerun(tmp_path: Path) -> None:
     rows, _ = night(4, 0.02, "typical", [])
     segment(tmp_path, rows)
