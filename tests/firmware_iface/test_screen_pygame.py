@@ -15,6 +15,8 @@ from firmware_iface.display.pattern_image import ScreenRaster, checkerboard, pat
 from firmware_iface.drivers.screen_pygame import PygameScreen, ScreenSettings
 from firmware_iface.roles import DeviceRefusedError, LinkError, Pattern
 
+pytestmark = pytest.mark.real_time
+
 WIDTH_PX, HEIGHT_PX = 341, 257  # odd on purpose: a scaler or a padded line would show
 RASTER = ScreenRaster(WIDTH_PX, HEIGHT_PX, 0.25, periods=4, period_mm=14.0)
 PATTERNS = [
