@@ -120,7 +120,8 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
     """
     seconds = run.level(1.0, start_s, end_s, LEVEL_COLUMNS)
     if not seconds["time_s"].size:
-        raise InputError(f"{run.folder}: nothing to report: no telemetry in this part of the run")
+        known = "".join(f"; {note}" for note in run.notes)
+        raise InputError(f"{run.folder}: nothing to report: no telemetry in this part of the run{known}")
     span_s = (float(seconds["time_s"][0]), float(seconds["time_s"][-1]) + 1.0)
     found, shape = _found_and_shape(run, seconds, start_s, end_s)
     del seconds  # of a month a quarter of a GB, and what comes needs more

@@ -174,6 +174,8 @@ def open_run(path: Path | str) -> Run:
     tables = (TICKS, *(level_table(window_s) for window_s in WINDOWS_S), SHAPES)
     for files in (*(column_files(folder, table) for table in tables), rrd_reader.segments(folder)):
         notes += [f"{name}: missing; what it held is left out" for name in missing_files(files)]
+    if not column_files(folder, TICKS) and rrd_reader.segments(folder):
+        notes.append("the tables of ticks are missing; the Rerun segments stand in for them, without every tick")
     there, expected = len(rrd_reader.segments(folder)), _segments(summary)
     if there < expected:
         notes.append(f"{expected - there} of {expected} Rerun segments are missing; the tables stand in for them")

@@ -129,6 +129,7 @@ def test_a_run_without_tables_is_read_from_rerun(tmp_path: Path) -> None:
     assert run.ticks().num_rows == len(rows)
     assert run.level(1.0)["rows"].sum() == len(rows)
     assert len(run.shapes()) == 0
+    assert any("tables of ticks are missing" in note for note in run.notes)
 
 
 def test_a_torn_table_gives_what_is_whole(tmp_path: Path) -> None:
