@@ -70,7 +70,7 @@ class Rig:
 
     def run(self, experiment: Experiment, around: Around, centre_um: float) -> tuple[Record, Finished]:
         """The same for an experiment of one's own, inside the guard."""
-        return self._run(ExcursionGuard(experiment, around, centre_um), around.holding_flow_um_per_s)
+        return self._run(ExcursionGuard(experiment, around, centre_um, 1 / self.dt_s), around.holding_flow_um_per_s)
 
     def _run(self, guard: Experiment, holding_flow_um_per_s: float) -> tuple[Record, Finished]:
         flows: list[float] = []

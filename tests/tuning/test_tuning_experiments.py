@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from benchmarks.tuning import Case, TwinBench
 from membrane_ctrl.config import PumpConfig
-from membrane_ctrl.control.experiments.machine import Around, Finished, Patterned
+from membrane_ctrl.control.experiments.machine import Around, ExcursionGuard, Finished, Patterned
 from membrane_ctrl.control.experiments.measurement import Measurement
 from membrane_ctrl.control.experiments.patterns import doublets, multisine, steps
 from membrane_ctrl.control.experiments.pump_map import PumpMapper
@@ -20,6 +21,15 @@ from tuning.records import Record
 from tuning.rig import Rig, laser_noise_um
 
 AROUND = Around(1.24, 0.32, 5.3, 1.0)
+
+
+class SaturatingPump(TwinBench):
+    """More than a share of its full command makes no difference."""
+
+    most_fraction = 1.0
+
+    def exchange(self, pump_fraction: float, vent_fraction: float) -> Measurement:
+        return super().exchange(min(pump_fraction, self.most_fraction), vent_fraction)
 
 
 class StuckPump(TwinBench):
@@ -106,6 +116,38 @@ def test_characterising_gives_up_by_name_when_no_relay_can_be_completed() -> Non
         characterise(Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s))
 
 
+@pytest.mark.parametrize("most_fraction", [0.38, 0.6])
+def test_a_saturating_pump_is_no_weak_one(most_fraction: float) -> None:
+    """With a single gain it would be: 0.29 and 0.57 of the true one, known to 3 %."""
+    case = Case("typical")
+    bench = SaturatingPump(case, 1)
+    bench.most_fraction = most_fraction
+    rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
+    found = characterise(rig).quality
+    assert found.verdict == "refused"
+    assert any("the pump saturates" in reason and "pump map" in reason for reason in found.reasons)
+    assert held_again(rig, bench)
+
+
+@pytest.mark.parametrize(("rate_hz", "least_um"), [(50.0, 7.7), (10.0, 5.3)])
+def test_the_guard_keeps_more_in_hand_where_readings_are_few(rate_hz: float, least_um: float) -> None:
+    """White readings of 1 um: three standard deviations of position and coast are never taken for the limit."""
+    rng = np.random.default_rng(3)
+    guard = ExcursionGuard(Patterned(AROUND, lambda _: 0.0, 600.0, 0.0), AROUND, 0.0, rate_hz)
+    seen = [guard.step(Measurement(float(x), math.nan, math.nan), 1 / rate_hz) for x in rng.standard_normal(5000)]
+    assert not any(isinstance(out, Finished) and not out.completed for out in seen)
+    slow = ExcursionGuard(Patterned(AROUND, lambda _: 0.0, 600.0, 0.0), AROUND, 0.0, rate_hz)
+    out = [slow.step(Measurement(float(x), math.nan, math.nan), 1 / rate_hz) for x in np.arange(0.0, 10.0, 1e-3)]
+    stopped = next(i for i, value in enumerate(out) if isinstance(value, Finished))
+    assert stopped * 1e-3 == pytest.approx(least_um, abs=0.5)
+
+
+def test_a_limit_within_the_noise_is_refused() -> None:
+    around = Around(1.24, 0.32, 5.3, 3.0)
+    with pytest.raises(ValueError, match="noise alone takes 13"):
+        ExcursionGuard(Patterned(around, lambda _: 0.0, 60.0, 0.0), around, 0.0, 10.0)
+
+
 def test_a_mirror_that_is_too_tight_is_told_to_open_the_bleed() -> None:
     case = Case("calm", laser_noise_um=0.3, leak=0.2)
     rig = Rig(TwinBench(case, 1), case.loop(), PumpConfig(), case.holding_flow_um_per_s)
@@ -175,6 +217,14 @@ def test_pump_map_finds_start_stall_leak_and_curve() -> None:
     assert not found.too_tight
     assert max(abs(x) for x in bench.true_um) < 10.0
     assert found.applied_to(PumpConfig()).start_fraction == found.start_fraction
+
+
+def test_the_noise_kept_in_hand_is_that_of_the_tick_rate() -> None:
+    """4 um of laser noise leave something of 10 um at 50 readings a second (3 x 0.652 x 4), nothing at 25."""
+    noisy = replace(AROUND, laser_um=4.0)
+    ExcursionGuard(Relay(noisy, 0.0), noisy, 0.0, rate_hz=50.0)
+    with pytest.raises(ValueError, match=r"takes 11\.1 um of it at 25 readings/s; give a larger limit"):
+        ExcursionGuard(Relay(noisy, 0.0), noisy, 0.0, rate_hz=25.0)
 
 
 def test_pump_map_says_when_there_is_no_pump() -> None:

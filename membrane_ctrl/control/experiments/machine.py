@@ -106,17 +106,30 @@ class ExcursionGuard:
     around : Around
     centre_um : float
         Where the mirror stood before.
+    rate_hz : float
+        Readings in a second: with fewer, the figure is noisier and more is kept in hand.
+
+    Raises
+    ------
+    ValueError
+        If the noise kept in hand leaves nothing of the limit; the message says what would help.
     """
 
-    def __init__(self, experiment: Experiment, around: Around, centre_um: float) -> None:
+    def __init__(self, experiment: Experiment, around: Around, centre_um: float, rate_hz: float) -> None:
         self._experiment = experiment
         self._motion = Motion()
         self._centre_um = centre_um
-        self._bound_um = around.limit_um - 3 * self._noise_per_laser_um() * around.laser_um
+        in_hand_um = 3 * self._noise_per_laser_um(rate_hz) * around.laser_um
+        if in_hand_um >= around.limit_um:
+            raise ValueError(
+                f"limit of {around.limit_um:g} um: the laser's noise alone takes {in_hand_um:.1f} um of it at "
+                f"{rate_hz:g} readings/s; give a larger limit, or a faster or quieter laser"
+            )
+        self._bound_um = around.limit_um - in_hand_um
         self._limit_um = around.limit_um
 
     @staticmethod
-    def _noise_per_laser_um(rate_hz: float = 50.0) -> float:
+    def _noise_per_laser_um(rate_hz: float) -> float:
         """Standard deviation of position + coast x speed for readings of 1 um; sigma sqrt(dt / (2 T)) behind a
         lag."""
         gain = COAST_S / (SLOW_S - FAST_S)

@@ -32,7 +32,8 @@ class Trial:
     Raises
     ------
     ValueError
-        If the pump has no room about the holding flow; the message says what would help.
+        If the pump has no room about the holding flow, or the noise none in the limit; the message says what would
+        help.
     """
 
     def __init__(self, spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre_um: float) -> None:
@@ -45,7 +46,8 @@ class Trial:
             laser_um=spec.laser_um,
             limit_um=spec.limit_um,
         )
-        self._guard = ExcursionGuard(self._machine(around, pump, centre_um), around, centre_um)
+        machine = self._machine(around, pump, centre_um)
+        self._guard = ExcursionGuard(machine, around, centre_um, loop.rate_hz)
         self._left_s = spec.duration_s
 
     def _machine(self, around: Around, pump: PumpConfig, centre_um: float) -> Experiment:
