@@ -9,6 +9,7 @@ import numpy as np
 
 from tuning.identify import Identified, independence, prediction_errors, whiteness
 from tuning.records import Record
+from tuning.straightness import two_gains
 
 _LOST_MAX = 0.01
 _GAIN_SIGMA_MAX = 0.10  # k beyond +-20 % (2 sigma) moves Ms and the variance by more than designs differ
@@ -17,6 +18,8 @@ _DELAY_SIGMA_MAX_S = 0.1
 _UNANSWERED = 5.0  # k below this many standard errors: the pump did nothing that could be told from the weather
 _JUMP_SIGMAS = 8.0  # of 10^4 residuals none is beyond 5
 _P_MIN = 1e-4
+_BENT_SIGMAS = 5.0  # good benches show less than 1.5, saturating ones more than 9
+_BENT_SHARE = 0.2  # of k; less than that the margins bear
 _WORSE_MAX = 1.5  # innovation on new data over that of the fit
 
 
@@ -97,8 +100,20 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
         degraded.append(f"k is known to {sigma.gain / model.gain:.0%}: a longer relay would make it 3 %")
     if sigma.delay_s > _DELAY_SIGMA_MAX_S:
         refused.append(f"the delay is known to {sigma.delay_s:.2f} s only: run the doublets")
+    refused.extend(_bent(record, identified))
     if identified.independence_p < _P_MIN:
         degraded.append("the residuals know the flow (a saturating or sticking pump?): run the pump map")
     if identified.whiteness_p < _P_MIN:
         degraded.append("the residuals are coloured: something periodic moves the mirror or the reading")
     return refused, degraded
+
+
+def _bent(record: Record, identified: Identified) -> list[str]:
+    """What is wrong if one gain does not do for both halves of the pump."""
+    found = two_gains(record, identified)
+    least = max(_BENT_SIGMAS * found.difference_sigma, _BENT_SHARE * identified.model.gain)
+    if abs(found.above - found.below) < least:
+        return []
+    what = "the pump saturates" if found.above < found.below else "the pump stalls at small flows"
+    gains = f"k = {found.below:.2f} below the holding flow and {found.above:.2f} above"
+    return [f"{what} ({gains}): run the pump map and set [pump] from it"]

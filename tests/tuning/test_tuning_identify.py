@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import record
+from synthetic import record, way_um
 
 from tuning.identify import identify, independence, whiteness
 from tuning.plant_model import PlantModel
 from tuning.quality import judge, validate
+from tuning.records import Record
+from tuning.straightness import two_gains
 
 TRUTH = PlantModel(0.8, 0.09, 0.15, 1.1)
 
@@ -100,3 +102,19 @@ def test_too_little_excitation_is_refused_with_the_experiment_that_helps() -> No
     found = judge(whole, identify(whole))
     assert found.verdict == "refused"
     assert any("longer" in reason or "doublets" in reason or "pump map" in reason for reason in found.reasons)
+
+
+def test_a_pump_that_saturates_is_told_from_a_straight_one() -> None:
+    """Above 2.2 um/s nothing more comes out, although the record says 4."""
+    dt_s, rng = 0.02, np.random.default_rng(3)
+    flow = np.repeat(rng.choice([0.4, 1.2, 2.2, 4.0], 120), 30)
+    absent = np.full(flow.size, np.nan)
+    gains = {}
+    for most in (10.0, 2.2):
+        came = np.minimum(flow, most)
+        y = way_um(came, TRUTH, dt_s) + rng.standard_normal(flow.size)
+        found = Record(dt_s, flow, y, absent, absent)
+        gains[most] = two_gains(found, identify(found))
+    straight, bent = gains[10.0], gains[2.2]
+    assert abs(straight.above - straight.below) < 4 * straight.difference_sigma
+    assert bent.below - bent.above > 5 * bent.difference_sigma
