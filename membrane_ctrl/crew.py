@@ -60,24 +60,14 @@ def _frames(config: Config, stack: ExitStack) -> FrameAddress:
 
 
 class Crew:
-    """Recorder, live screen and acquisition of one run. The hold goes on without any of them, and says so.
-
-    Attributes
-    ----------
-    children : list of Child
-        Those that are not replaced when they end: the supervisor tells when they do.
-    """
+    """Recorder, live screen, acquisition and alarms of one run. The hold goes on without any of them, and says so."""
 
     def __init__(
         self, config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str, duration_s: float | None
     ) -> None:
-        from membrane_ctrl.screen.process import ScreenSpec
-
         self._clock = clock
         self._summary = run_dir / "summary.json"
-        screen_spec = ScreenSpec(clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s)
-        self._screen = Child("screen", "membrane_ctrl.screen.process:screen_main", (screen_spec,), nice=5)
-        self.children = [self._screen]
+        self._screen = Post(_screen(config, clock, rings, run_dir, duration_s))
         self._recorder = Post(_recorder(config, clock, rings, run_dir, name))
         self._acquisition = None
         if rings.shapes is not None and rings.frames is not None:
@@ -86,18 +76,17 @@ class Crew:
 
     @property
     def _posts(self) -> list[Post]:
-        return [post for post in (self._recorder, self._acquisition, self._alarms) if post is not None]
+        return [post for post in (self._recorder, self._acquisition, self._alarms, self._screen) if post is not None]
 
     def start(self, stack: ExitStack) -> None:
         """Start all; the stack ends whatever `take_down` has not."""
         for post in self._posts:
             post.start(self._clock.now())
-        self._screen.start()
         stack.callback(self._stop)
 
     def _stop(self) -> None:
-        for child in (*(post.child for post in self._posts), self._screen):
-            child.stop(_CHILD_STOPS_S)
+        for post in self._posts:
+            post.child.stop(_CHILD_STOPS_S)
 
     def reports(self) -> list[Event]:
         """What the children have said since the last call, and who was replaced; never waits."""
@@ -121,9 +110,32 @@ class Crew:
         if recorder.exit_code != 0 and not self._summary.exists():  # another writes the end down
             self._recorder.replace(self._clock.now())
             self._recorder.child.join(_RECORDER_CLOSES_S)
-        self._screen.join(_CHILD_STOPS_S)
+        self._end_screen()
         if self._alarms is not None:
             self._alarms.child.join(_ALARMS_LEAVE_S)
+
+    def _end_screen(self) -> None:
+        """The terminal is a person's again, whatever has become of who drew on it."""
+        from membrane_ctrl.screen.process import give_back_terminal
+
+        screen = self._screen.child
+        if not screen.join(_CHILD_STOPS_S):
+            screen.stop(0.0)
+        if screen.exit_code != 0:
+            give_back_terminal()
+
+
+def _screen(config: Config, clock: RunClock, rings: Rings, run_dir: Path, duration_s: float | None) -> Make:
+    from membrane_ctrl.screen.process import ScreenSpec
+
+    spec = ScreenSpec(clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s)
+
+    def make(count: int) -> tuple[Child, Connection]:
+        ours, theirs = pipe()
+        arguments = (replace(spec, since_s=clock.now()) if count else spec, theirs)
+        return Child("screen", "membrane_ctrl.screen.process:screen_main", arguments, nice=5), ours
+
+    return make
 
 
 def _recorder(config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str) -> Make:

@@ -158,7 +158,7 @@ async def _run(
 
     with _open(rings) as (telemetry, events, inputs, shapes):
         truth = twin.truth_reader() if twin else None
-        wiring = Wiring(bench, telemetry, events, inputs, shapes, truth, crew.children, crew.reports)
+        wiring = Wiring(bench, telemetry, events, inputs, shapes, truth, crew.reports)
         controller = Controller(config, zernike_projection())
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         port = port_for(RunHooks(supervisor.ask, supervisor.tell, clock.now, lambda: controller.loop_config))
@@ -219,14 +219,17 @@ def _open(rings: Rings) -> Iterator[tuple[RingWriter, RingWriter, RingWriter, Ri
 
 @contextlib.contextmanager
 def _signals(supervisor: Supervisor) -> Iterator[None]:
-    """SIGINT and SIGTERM ask for a clean stop; the safe state comes before anything else."""
+    """SIGINT, SIGTERM and a closed terminal ask for a clean stop; the safe state comes before anything else."""
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, supervisor.ask, Command("stop", signal.Signals(number).name))
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # `nohup` asks to go on without the terminal
+        numbers.append(signal.SIGHUP)
+    for number in numbers:
+        loop.add_signal_handler(number, supervisor.ask, Command("stop", number.name))
     try:
         yield
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in numbers:
             loop.remove_signal_handler(number)
 
 

@@ -1,7 +1,8 @@
-"""Child processes: started with `spawn`, out of reach of Ctrl-C, and never left behind.
+"""Child processes: started with `spawn`, out of reach of the terminal, and never left behind.
 
-Ctrl-C on a terminal reaches every process of the foreground group; only the control process may act on it, as
-the safe state comes first. So SIGINT is ignored from before the children's first instruction.
+Ctrl-C, Ctrl-\\ and a terminal that is closed reach every process of the foreground group; only the control process
+may act on them, as the safe state comes first, and the recording and the last alarm come after it. So these signals
+are ignored from before the children's first instruction; examples/membrane-ctrl.service relies on it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from collections.abc import Iterator
 from typing import Any
 
 _CONTEXT = multiprocessing.get_context("spawn")
+_OF_THE_TERMINAL = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP)
 
 
 class Child:
@@ -40,7 +42,7 @@ class Child:
 
     def start(self) -> None:
         """Start it; returns at once."""
-        with _interrupts_ignored():
+        with _terminal_ignored():
             self._process.start()
 
     @property
@@ -95,13 +97,14 @@ def _main(target: str, args: tuple[Any, ...], nice: int) -> None:
 
 
 @contextlib.contextmanager
-def _interrupts_ignored() -> Iterator[None]:
+def _terminal_ignored() -> Iterator[None]:
     """An ignored signal stays ignored across exec: the child has it from its first instruction on."""
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in _OF_THE_TERMINAL}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def pipe() -> Any:

@@ -22,7 +22,6 @@ from membrane_ctrl.controller_memory import remember
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.ipc.ring import RingReader, RingWriter
-from membrane_ctrl.processes import Child
 from membrane_ctrl.tick import Event, TickInputs, TickOutputs
 from membrane_ctrl.tick_record import pack_tick
 
@@ -43,7 +42,6 @@ class Wiring:
     inputs: RingWriter | None = None  # what the ticks were given, for a replay
     shapes: RingReader | None = None
     truth: Callable[[], tuple[float, float]] | None = None  # (displacement_um, laser_bias_um) of the twin
-    children: Sequence[Child] = ()
     reports: Callable[[], list[Event]] = list  # what the children have said since the last call
     tasks: dict[str, asyncio.Task[None]] = field(default_factory=dict)
     heard: Sequence[Callable[[TickOutputs], None]] = ()  # who wants to know what each tick decided; must not raise
@@ -74,7 +72,6 @@ class Supervisor:
         self._link_up = True
         self._link_error = ""
         self._inputs_error = ""
-        self._dead: set[str] = set()
         self._next_watch_s = 0.0
         self._next_memory_s = MEMORY_EVERY_S
         self._vent_fraction = 0.0
@@ -226,10 +223,6 @@ class Supervisor:
 
     def _watch(self) -> None:
         """The hold goes on without its children, and says so."""
-        for child in self._wiring.children:
-            if not child.alive and child.name not in self._dead:
-                self._dead.add(child.name)
-                self.tell({"kind": "child_ended", "child": child.name, "exit_code": child.exit_code})
         for report in self._wiring.reports():
             self.tell(report)
             for told in self._wiring.told:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import multiprocessing
 import os
 import pickle
@@ -11,14 +12,16 @@ import struct
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
 
 from rich.console import Console
 from rich.live import Live
 
+from membrane_ctrl.child_report import alive, reporter
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.ipc.ring import RingAddress, RingReader
@@ -29,6 +32,8 @@ from membrane_ctrl.telemetry import FIELDS, TelemetryRow
 
 _LOOK_S = 0.2  # as fast as a person reads changing figures
 _PLAIN_S = 1.0
+# A round takes some ms; a terminal that is stopped (Ctrl-S, a dead ssh) takes what is written to it for a while
+_HANGS_S = 15.0
 _ROW = struct.Struct(f"<{len(FIELDS)}d")
 
 
@@ -48,6 +53,8 @@ class ScreenSpec:
         The run's configuration.
     duration_s : float or None
         How long the run shall take.
+    since_s : float
+        What was told before this is not told again: there was another screen then.
     """
 
     clock: RunClock
@@ -57,26 +64,48 @@ class ScreenSpec:
     run_dir: Path
     config: Config
     duration_s: float | None = None
+    since_s: float = -math.inf
 
 
-def screen_main(spec: ScreenSpec) -> None:
+def screen_main(spec: ScreenSpec, status: Connection | None = None) -> None:
     """Show the run on stderr until its "end" event, SIGTERM, or the death of the parent.
 
-    Target of a `spawn`ed process. SIGINT is left to the control process; the terminal is given back in any case.
+    Target of a `spawn`ed process; over `status` it says that it is alive. SIGINT is left to the control process; the
+    terminal is given back in any case.
     """
     parent = multiprocessing.parent_process()  # who started it, even if that is gone by now
     parent_pid = os.getppid() if parent is None or parent.pid is None else parent.pid
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
+    report = reporter(status)
+    with closing(_Feed(spec)) as feed:
+
+        def rounds(show: Callable[[], object]) -> None:
+            while not feed.model.ended and os.getppid() == parent_pid:
+                show()
+                report(alive(_HANGS_S))
+                time.sleep(_LOOK_S)
+
+        try:
+            _draw(spec, feed, rounds)
+        except OSError:  # nobody reads any more: `2>&1 | head`, a terminal that was closed; another would see no more
+            rounds(feed.update)
+
+
+def _draw(spec: ScreenSpec, feed: _Feed, rounds: Callable[[Callable[[], object]], None]) -> None:
+    """Go on drawing as what stderr is can be drawn on. Raises OSError when it is closed."""
     console = Console(stderr=True)
-    with ExitStack() as stack:
-        stack.enter_context(suppress(BrokenPipeError))  # nobody reads any more: `2>&1 | head`
-        feed = stack.enter_context(closing(_Feed(spec)))
-        drawable = console.is_terminal and not console.is_dumb_terminal
-        show = stack.enter_context(_live(console, spec, feed) if drawable else _plain(spec, feed))
-        while not feed.model.ended and os.getppid() == parent_pid:
-            show()
-            time.sleep(_LOOK_S)
+    drawable = console.is_terminal and not console.is_dumb_terminal
+    with _live(console, spec, feed) if drawable else _plain(spec, feed) as show:
+        rounds(show)
+
+
+def give_back_terminal() -> None:
+    """For a screen that was killed: the first page of the terminal, and its cursor. Nothing without a terminal."""
+    with suppress(OSError):
+        if sys.stderr.isatty():
+            sys.stderr.write("\x1b[?1049l\x1b[?25h")
+            sys.stderr.flush()
 
 
 class _Feed:
@@ -126,7 +155,11 @@ def _plain(spec: ScreenSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
 
     def show() -> None:
         nonlocal due_s
-        lines = [event_line(event) for event in feed.update() if at_once(event)]
+        lines = [
+            event_line(event)
+            for event in feed.update()
+            if at_once(event) and event.get("mono_s", math.inf) >= spec.since_s
+        ]
         now_s = spec.clock.now()
         if now_s >= due_s:
             lines.append(line(feed.model.view(now_s)))

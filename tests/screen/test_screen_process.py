@@ -9,17 +9,20 @@ import pty
 import select
 import signal
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, redirect_stderr
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from screen_feed import FAULT, event, packed, rows, shape
 
+from membrane_ctrl.child_report import ALIVE
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.ipc.ring import RingWriter, ring
-from membrane_ctrl.screen.process import ScreenSpec, screen_main
+from membrane_ctrl.screen.process import ScreenSpec, give_back_terminal, screen_main
 from membrane_ctrl.telemetry import ROW_BYTES
 
 pytestmark = pytest.mark.real_time
@@ -138,9 +141,12 @@ def test_dead_parent_ends_it(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     assert list(parents) == []
 
 
-def test_reader_that_went_away_is_no_error(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reader_that_went_away_is_no_error_and_none_for_who_watches_the_screen(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Gone:
         def write(self, words: str) -> int:
+            run.tell("end", exit=0)
             raise BrokenPipeError
 
         def flush(self) -> None: ...
@@ -149,8 +155,38 @@ def test_reader_that_went_away_is_no_error(run: Run, monkeypatch: pytest.MonkeyP
             return False
 
     monkeypatch.setattr(signal, "signal", lambda number, handler: None)
+    monkeypatch.setattr(time, "sleep", lambda duration_s: None)
     run.tick()
     gone = Gone()
     monkeypatch.setattr(sys, "stderr", gone)
-    screen_main(run.spec)
-    assert sys.stderr is gone  # and no exception came out
+    ours, theirs = multiprocessing.Pipe()
+    with ours, theirs:
+        screen_main(run.spec, theirs)
+        assert sys.stderr is gone  # and no exception came out
+
+
+def test_a_screen_that_takes_the_place_of_another_does_not_tell_old_news_again(
+    run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(signal, "signal", lambda number, handler: None)
+    run.tell("fault", **FAULT)
+    time.sleep(0.002)
+    spec = replace(run.spec, since_s=run.spec.clock.now())
+    run.tell("end", exit=0)
+    ours, theirs = multiprocessing.Pipe()
+    with ours, theirs, redirect_stderr(sys.stdout):
+        screen_main(spec, theirs)
+        assert ours.recv()["kind"] == ALIVE
+    told = capsys.readouterr().out
+    assert "END 0" in told
+    assert "FAULT link lost" not in told
+
+
+def test_the_terminal_of_a_killed_screen_is_given_back(
+    terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours, theirs = terminal
+    with open(theirs, "w", closefd=False) as stderr:
+        monkeypatch.setattr(sys, "stderr", stderr)
+        give_back_terminal()
+    assert read_until(ours, b"\x1b[?25h").startswith(b"\x1b[?1049l")
