@@ -169,8 +169,6 @@ async def _run(
         supervisor.tell({"kind": "start", "devices": devices, "priority": raise_priority(), "message": board.cleared})
         exit_code = Exit.DEVICE_FAILED
         try:
-            assert config.devices is not None
-            await connect(bench, config.devices)
             if not options.standby:
                 supervisor.ask(Command("hold", "command line"))
             elif latched := "; ".join(part for part in (latcher.latched, board.latched) if part):
@@ -179,6 +177,8 @@ async def _run(
             gc.freeze()  # what lives for the whole run need not be looked at again between two ticks
             async with port.open():
                 with _signals(supervisor), latcher, systemd:
+                    assert config.devices is not None
+                    await connect(bench, config.devices)  # last: the board's watchdog runs from here on
                     exit_code = await supervisor.run(options.duration_s)
         except LinkError as error:
             supervisor.tell({"kind": "link", "message": str(error)})

@@ -1,0 +1,181 @@
+"""The unit file under a real systemd: ready, watched, protected, stopped, killed, hung, latched, given up."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Iterator
+
+import pytest
+from systemd_room import Room, missing, systemd_room
+
+pytestmark = [pytest.mark.campaign, pytest.mark.timeout(300)]
+
+RUNS = "/var/lib/membrane-ctrl/logs"
+LATCHED = f"{RUNS}/latched-fault.json"
+CTL = "cd /var/lib/membrane-ctrl && PYTHONPATH=/opt/source LD_LIBRARY_PATH=/opt/python/lib setpriv --reuid membrane "
+CTL += "--regid membrane --init-groups /opt/membrane-ctrl/.venv/bin/membrane-ctrl ctl"
+# Apprise need not be installed here: what it would be told goes into a file
+APPRISE = """
+class _Target:
+    def notify(self, title, body, notify_type):
+        with open("/run/told/told", "a") as file:
+            file.write(title + chr(10))
+        return True
+
+class Apprise:
+    @staticmethod
+    def instantiate(url):
+        return _Target()
+"""
+ALARMS = '[alarms]\nurls_file = "/etc/membrane-ctrl/urls"\nsilent_s = 3.0\n'
+RESUMES = '[resume]\nfaults = ["watchdog_tripped"]\n'
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Room]:
+    if why := missing():
+        pytest.skip(why)
+    with systemd_room(tmp_path_factory.mktemp("room")) as made:
+        made.run(f"mkdir /opt/stand-in; cat > /opt/stand-in/apprise.py <<'END'\n{APPRISE}\nEND")
+        made.run("echo mail://ann > /etc/membrane-ctrl/urls")
+        made.drop_in("PYTHONPATH=/opt/source:/opt/stand-in")
+        yield made
+
+
+def runs(room: Room) -> list[str]:
+    return room.run(f"ls -d {RUNS}/2*").splitlines()
+
+
+def told(room: Room) -> str:
+    return room.run("cat /run/told/told 2> /dev/null || true")
+
+
+def test_it_is_ready_says_how_it_is_and_can_do_no_harm(room: Room) -> None:
+    room.fresh()
+    room.start()
+    assert room.show("ActiveState", "Type", "WatchdogUSec") == {
+        "ActiveState": "active",
+        "Type": "notify",
+        "WatchdogUSec": "10s",
+    }
+    room.until(lambda: room.status_has("inflate"))
+    status = room.run(f"cat /proc/{room.main_pid}/status")
+    assert "NoNewPrivs:\t1" in status
+    assert "Seccomp:\t2" in status
+    assert "CapBnd:\t0000000000000000" in status
+    assert "CapEff:\t0000000000000000" in status
+    as_service = f"nsenter -t {room.main_pid} -m setpriv --reuid membrane --regid membrane --init-groups"
+    for place in ("/etc/membrane-ctrl", "/opt/membrane-ctrl", "/usr/local"):
+        refused = room.run(f"{as_service} touch {place}/new 2>&1 || true")
+        assert "Read-only file system" in refused
+    assert room.run(f"{as_service} ls /tmp /root 2>&1 || true").count("Permission denied") == 1
+    assert room.run(f"{as_service} touch /var/lib/membrane-ctrl/mine && echo may") == "may"
+    room.until(lambda: room.status_has("hold"), 90.0)
+
+
+def test_a_stop_is_clean_and_stays(room: Room) -> None:
+    room.fresh()
+    room.start()
+    room.until(lambda: room.status_has("inflate"))
+    room.run("systemctl stop membrane-ctrl")
+    assert room.settled("inactive")
+    assert "Deactivated successfully" in room.log()
+    assert "pump 0" in room.log()
+    assert json.loads(room.run(f"cat {runs(room)[0]}/summary.json"))["exit"] == "interrupted"
+    assert room.survivors() == []
+
+
+def test_a_killed_hold_is_recorded_reported_made_safe_and_started_again(room: Room) -> None:
+    room.fresh(ALARMS + RESUMES)
+    room.start()
+    room.until(lambda: room.status_has("inflate"))
+    room.kill(signal.SIGKILL)
+    room.until(lambda: room.show("NRestarts")["NRestarts"] == "1")
+    assert "control_gone" in told(room)
+    assert "pump 0" in room.log()
+    assert room.run(f"ls {runs(room)[0]}/summary.json")
+    room.until(lambda: room.status_has("inflate"))
+
+
+def test_a_hung_hold_is_killed_by_systemds_watchdog_and_started_again(room: Room) -> None:
+    room.fresh(ALARMS + RESUMES)
+    room.start()
+    room.until(lambda: room.status_has("inflate"))
+    room.kill(signal.SIGSTOP)
+    room.until(lambda: room.show("NRestarts")["NRestarts"] == "1", 90.0)
+    assert "Watchdog timeout" in room.log()
+    assert "silent" in told(room)
+    assert "control_gone" in told(room)
+    assert room.run(f"ls {runs(room)[0]}/summary.json")
+    room.until(lambda: room.status_has("inflate"))
+
+
+def test_after_a_kill_a_board_that_latched_needs_a_person(room: Room) -> None:
+    room.fresh()
+    room.start()
+    room.until(lambda: room.status_has("inflate"))
+    room.kill(signal.SIGKILL)
+    room.until(lambda: room.settled("failed"))
+    assert room.show("ExecMainStatus", "NRestarts") == {"ExecMainStatus": "4", "NRestarts": "1"}
+    assert "the board has latched faults" in room.log()
+
+
+def test_a_trip_stays_down_and_the_next_start_names_it(room: Room) -> None:
+    room.fresh()
+    room.start()
+    room.until(lambda: room.status_has("inflate"))
+    room.run("systemctl stop twin")
+    room.until(lambda: room.settled("failed"))
+    assert room.show("ExecMainStatus", "NRestarts") == {"ExecMainStatus": "5", "NRestarts": "0"}
+    fault = json.loads(room.run(f"cat {LATCHED}"))["name"]
+    assert fault == "link_lost"
+    room.run("systemctl start membrane-ctrl || true")
+    assert room.show("ExecMainStatus")["ExecMainStatus"] == "4"
+    assert f"a fault is latched: {fault}" in room.log()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        f": > {LATCHED}",
+        f"head -c 500 /dev/urandom > {LATCHED}",
+        f"mkdir {LATCHED}",
+        f"touch {LATCHED}; chmod 0 {LATCHED}",
+    ],
+    ids=["empty", "binary", "folder", "unreadable"],
+)
+def test_a_damaged_latched_fault_file_keeps_it_down(room: Room, damage: str) -> None:
+    room.fresh()
+    room.run(f"install -d -o membrane -g membrane {RUNS}; {damage}")
+    room.run("systemctl start membrane-ctrl || true")
+    assert room.show("ActiveState", "ExecMainStatus") == {"ActiveState": "failed", "ExecMainStatus": "4"}
+    assert "a fault is latched: unreadable" in room.log()
+
+
+def test_in_standby_it_runs_with_a_latched_fault_and_holds_only_after_a_person_acknowledged(room: Room) -> None:
+    room.fresh()
+    room.run(f"install -d -o membrane -g membrane {RUNS}; : > {LATCHED}; chown membrane {LATCHED}")
+    unit = "/run/units/membrane-ctrl.service"
+    room.run(f"sed -i '/^ExecStart=/s/$/ --standby/' {unit}; systemctl daemon-reload")
+    try:
+        room.start()
+        assert room.show("ActiveState")["ActiveState"] == "active"
+        assert "latched" in room.run(f"{CTL} hold 2>&1 || true")
+        room.run(f"{CTL} ack --why 'seen' && {CTL} hold")
+        room.until(lambda: room.status_has("inflate"))
+    finally:
+        room.run(f"cp /opt/source/examples/membrane-ctrl.service {unit}; systemctl daemon-reload")
+
+
+def test_what_dies_again_and_again_is_given_up_in_a_safe_state(room: Room) -> None:
+    room.fresh(RESUMES)
+    room.start()
+    for _ in range(5):
+        room.until(lambda: room.settled("active"))
+        room.kill(signal.SIGKILL)
+        room.until(lambda: not room.settled("active"))
+    room.until(lambda: room.settled("failed"))
+    assert "Start request repeated too quickly" in room.log()
+    assert room.log().count("pump 0") == 5
+    assert room.survivors() == []
