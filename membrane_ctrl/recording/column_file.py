@@ -2,14 +2,15 @@
 
 A Rerun segment holds a chunk an entity a second: made for looking, not for a statistic over 2.6e7 ticks. So each
 table is written a second time, as Arrow IPC streams `columns/<table>-000.arrows`, `-001`, ...: whole batches, no
-footer, so that what a killed recorder leaves is good up to its last batch. The batch it was filling is in a journal.
+footer, so that what a killed recorder leaves is good up to its last batch, each under a checksum (`sealed_stream`).
+The batch it was filling is in a journal.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from membrane_ctrl.recording.atomic import sync_data
 from membrane_ctrl.recording.column_journal import Journal
+from membrane_ctrl.recording.sealed_stream import SealedStream, whole_batches
 
 FOLDER = "columns"
 SUFFIX = ".arrows"
@@ -64,8 +66,7 @@ class ColumnFile:
         self._number = 0
         self._path = self._folder
         self._file_until_s = 0.0
-        self._sink: pa.NativeFile | None = None
-        self._writer: pa.RecordBatchWriter | None = None
+        self._stream: SealedStream | None = None
         self.lost = 0
         self._journal = Journal(self._folder / f"{table}-waiting{SUFFIX}", self._schema)
         if resumed:
@@ -110,7 +111,7 @@ class ColumnFile:
         batches, self._waiting = self._waiting, []
         batch = pa.Table.from_batches(batches).combine_chunks().to_batches()[0]
         try:
-            self._open_for(first_s).write_batch(batch)
+            self._open_for(first_s).write(batch)
             sync_data(self._path)  # before the journal goes
             self._journal.drop()
         except OSError:
@@ -130,38 +131,34 @@ class ColumnFile:
 
     def close_file(self) -> None:
         """End the file there is; the next batch begins another."""
-        writer, sink, self._writer, self._sink = self._writer, self._sink, None, None
-        if writer is not None and sink is not None:
-            writer.close()
-            sink.close()
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.close()
 
-    def _open_for(self, time_s: float) -> pa.RecordBatchWriter:
-        if self._writer is not None and time_s >= self._file_until_s:
+    @property
+    def files(self) -> int:
+        """Files of the table that are there."""
+        return sum(1 for _ in self._folder.glob(f"{self._table}-[0-9]*{SUFFIX}"))
+
+    def _open_for(self, time_s: float) -> SealedStream:
+        if self._stream is not None and time_s >= self._file_until_s:
             self.close_file()
-        if self._writer is None:
+        if self._stream is None:
             self._folder.mkdir(exist_ok=True)
             while (path := self._folder / f"{self._table}-{self._number:03d}{SUFFIX}").exists():
                 self._number += 1  # also those of a recorder that was killed
             self._path = path
-            self._sink = pa.OSFile(str(path), "wb")
+            self._stream = SealedStream(path, self._schema, "zstd")
             self._file_until_s = time_s + FILE_S
-            # one thread: compressing is not urgent, the tick beside it is
-            options = pa.ipc.IpcWriteOptions(compression="zstd", use_threads=False)
-            self._writer = pa.ipc.new_stream(self._sink, self._schema, options=options)
-        return self._writer
+        return self._stream
 
     def _last_written_s(self) -> float:
         """Time of the last row in the table's newest file that can be read; -inf without one."""
         for path in sorted(self._folder.glob(f"{self._table}-[0-9]*{SUFFIX}"), reverse=True):
             last_s = -math.inf
-            for batch in _whole_batches(path, self._schema.get_field_index(self._time_name)):
-                last_s = float(batch.column(0)[-1].as_py())
+            with contextlib.suppress(OSError, pa.ArrowException):
+                for batch in whole_batches(path, [self._time_name]):
+                    last_s = float(batch.column(0)[-1].as_py())
             if last_s > -math.inf:
                 return last_s
         return -math.inf
-
-
-def _whole_batches(path: Path, field: int) -> Iterator[pa.RecordBatch]:
-    """One column of a file, batch by batch, up to where a killed recorder has cut it."""
-    with contextlib.suppress(OSError, pa.ArrowException), pa.OSFile(str(path)) as source:
-        yield from pa.ipc.open_stream(source, options=pa.ipc.IpcReadOptions(included_fields=[field]))

@@ -14,6 +14,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from membrane_ctrl.recording.atomic import sync_data
+from membrane_ctrl.recording.sealed_stream import SealedStream, whole_batches
 
 
 class Journal:
@@ -30,17 +31,14 @@ class Journal:
     def __init__(self, path: Path, schema: pa.Schema) -> None:
         self._path = path
         self._schema = schema
-        self._file: pa.NativeFile | None = None
-        self._writer: pa.RecordBatchWriter | None = None
+        self._stream: SealedStream | None = None
         self._kept = 0  # batches in it
 
     def left_behind(self) -> list[pa.RecordBatch]:
         """Whole batches that a recorder has left; what it was writing when it was killed is not among them."""
         found: list[pa.RecordBatch] = []
-        with contextlib.suppress(OSError, pa.ArrowException), pa.OSFile(str(self._path)) as source:
-            reader = pa.ipc.open_stream(source)
-            if reader.schema.equals(self._schema):
-                found.extend(reader)
+        with contextlib.suppress(OSError, pa.ArrowException):
+            found.extend(batch for batch in whole_batches(self._path) if batch.schema.equals(self._schema))
         return found
 
     def keep(self, waiting: Sequence[pa.RecordBatch]) -> None:
@@ -54,11 +52,11 @@ class Journal:
         if self._kept == len(waiting):
             return
         try:
-            if self._writer is None:
+            if self._stream is None:
                 self._begin(waiting)
             else:
                 for batch in waiting[self._kept :]:
-                    self._writer.write_batch(batch)
+                    self._stream.write(batch)
             sync_data(self._path)
         except OSError:
             self.drop()
@@ -67,9 +65,9 @@ class Journal:
 
     def drop(self) -> None:
         """Nothing waits any more."""
-        if self._file is not None:
-            self._file.close()
-        self._file = self._writer = None
+        if self._stream is not None:
+            self._stream.abandon()
+        self._stream = None
         self._kept = 0
         with contextlib.suppress(OSError):
             self._path.unlink(missing_ok=True)
@@ -78,8 +76,7 @@ class Journal:
         """A new file takes the old one's place once all is in it: what was left behind is never without a copy."""
         self._path.parent.mkdir(exist_ok=True)
         part = self._path.with_suffix(".part")
-        self._file = pa.OSFile(str(part), "wb")
-        self._writer = pa.ipc.new_stream(self._file, self._schema)
+        self._stream = SealedStream(part, self._schema)
         for batch in waiting:
-            self._writer.write_batch(batch)
+            self._stream.write(batch)
         part.replace(self._path)

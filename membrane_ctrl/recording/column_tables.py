@@ -144,6 +144,12 @@ class ColumnTables:
         return sum(file.lost for file in self._files)
 
     @property
+    def files(self) -> dict[str, int]:
+        """Files of each table: a reader that finds fewer knows that the last ones are missing."""
+        levels = {level_table(window_s): file.files for window_s, file in self._levels.items()}
+        return {TICKS: self._ticks.files, SHAPES: self._shapes.files, **levels}
+
+    @property
     def _files(self) -> tuple[ColumnFile, ...]:
         return (self._ticks, self._shapes, *self._levels.values())
 

@@ -175,6 +175,7 @@ class Recorder:
         guarded("columns", self._columns.close)
         account = {
             "segments": self._rerun.segments,
+            "tables": self._columns.files,
             "errors": self._complaints.errors,
             "rows_lost": self._rows_lost,
             "column_rows_lost": self._columns.lost,

@@ -5,13 +5,12 @@ Slow against the tables (a chunk an entity a second), but everything is in there
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rerun.chunk import RrdReader
+from rerun.chunk import Chunk
 
 from membrane_ctrl.recording.streams import (
     LATENCY,
@@ -23,6 +22,7 @@ from membrane_ctrl.recording.streams import (
     STREAMS,
     ZERNIKE,
 )
+from membrane_ctrl.review.rrd_salvage import FAULTS, read_chunks, salvage
 
 Column = NDArray[np.float64]
 _VALUES = "Scalars:scalars"
@@ -112,17 +112,26 @@ def _scalars(path: Path, entities: set[str], notes: list[str]) -> dict[str, tupl
 
 
 def _chunks(path: Path, entities: set[str], notes: list[str]) -> Iterator[tuple[str, NDArray[np.int64], Column]]:
+    for chunk in _readable(path, entities, notes):
+        batch = chunk.to_record_batch()
+        if _VALUES not in batch.schema.names or _TIME not in batch.schema.names:
+            continue
+        cells = batch.column(_VALUES)
+        values = cells.flatten().to_numpy(zero_copy_only=False).reshape(batch.num_rows, -1)
+        yield chunk.entity_path, batch.column(_TIME).cast("int64").to_numpy(), values
+
+
+def _readable(path: Path, entities: set[str], notes: list[str]) -> list[Chunk]:
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the reader's way to say that a file has no footer
-            for chunk in RrdReader(path).stream():
-                if chunk.entity_path not in entities:
-                    continue
-                batch = chunk.to_record_batch()
-                if _VALUES not in batch.schema.names or _TIME not in batch.schema.names:
-                    continue
-                cells = batch.column(_VALUES)
-                values = cells.flatten().to_numpy(zero_copy_only=False).reshape(batch.num_rows, -1)
-                yield chunk.entity_path, batch.column(_TIME).cast("int64").to_numpy(), values
-    except (RuntimeError, ValueError, OSError) as error:
-        notes.append(f"{path.name}: damaged or cut short ({str(error).splitlines()[0][:120]})")
+        return read_chunks(path, entities)
+    except FAULTS as error:
+        why = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {path}: ")[:120]
+    try:
+        chunks, lost_bytes = salvage(path, entities)
+    except OSError as error:
+        why, chunks, lost_bytes = error.strerror or str(error), [], 0
+    what = f"{lost_bytes / 1e3:.1f} kB of it are left out" if chunks else "nothing of it can be read"
+    note = f"{path.name}: damaged or cut short, {what} ({why})"
+    if note not in notes:
+        notes.append(note)
+    return chunks

@@ -15,11 +15,12 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from membrane_ctrl.config import Config
+from membrane_ctrl.recording.column_file import SUFFIX
 from membrane_ctrl.recording.column_tables import SHAPES, TICKS, level_table
 from membrane_ctrl.recording.levels import NAMES as LEVEL_NAMES
 from membrane_ctrl.recording.levels import TICK_FIELDS, WINDOWS_S, coarser_level, first_level
 from membrane_ctrl.review import rrd_reader, shapes
-from membrane_ctrl.review.column_reader import column_files, first_s, missing_files, read_file
+from membrane_ctrl.review.column_reader import add_note, column_files, first_s, missing_files, read_file
 from membrane_ctrl.review.folder import find_folder, read_config, read_events, read_summary
 from membrane_ctrl.review.shapes import Shapes
 from membrane_ctrl.telemetry import FIELDS
@@ -28,6 +29,11 @@ Column = NDArray[np.float64]
 Block = dict[str, Column]
 # Rerun rounds the time of a tick to the nanosecond; the next one is milliseconds away
 _SAME_TICK_S = 1e-6
+# From the last tick to the end of a run, and what of a killed one is in the segments only.
+_WAY_DOWN_S = 60.0
+_FILES_MAX = 100_000  # ten years of hours
+TABLES = (TICKS, *(level_table(window_s) for window_s in WINDOWS_S), SHAPES)
+_STAND_IN = "Rerun segments stand in for ticks that the tables lack: without every tick, and without checksums"
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,14 +93,37 @@ class Run:
         for block in self._table_blocks(TICKS, "mono_s", wanted, start_s, end_s):
             last_s = float(block["mono_s"][-1])
             yield block
-        if last_s >= end_s or (self.summary is not None and last_s > -np.inf):
-            return
+        if last_s < end_s and not self._reaches_end(last_s):
+            yield from self._segment_blocks(wanted, max(start_s, last_s + _SAME_TICK_S), end_s)
+
+    def _reaches_end(self, until_s: float) -> bool:
+        """Whether a table that ends there has all that there was: a run without a summary may have more."""
+        if self.summary is None or until_s == -np.inf:
+            return False
+        duration_s = self.summary.get("duration_s")
+        return not isinstance(duration_s, (int, float)) or until_s > duration_s - _WAY_DOWN_S
+
+    def _segment_blocks(self, names: Sequence[str], start_s: float, end_s: float) -> Iterator[Block]:
+        """Telemetry of the Rerun segments."""
         paths = rrd_reader.segments(self.folder)
-        for path in paths if last_s == -np.inf else paths[-2:]:
-            block = _cut(rrd_reader.read_ticks(path, wanted, self.notes), "mono_s", start_s, end_s)
-            block = _cut(block, "mono_s", last_s + _SAME_TICK_S, np.inf)
-            if block["mono_s"].size:
-                yield block
+        first = self._segment_at(paths, start_s) if np.isfinite(start_s) else 0
+        begun_s = np.inf
+        for path in paths[first:]:
+            block = _cut(rrd_reader.read_ticks(path, names, self.notes), "mono_s", start_s, end_s)
+            if not block["mono_s"].size:
+                continue
+            begun_s = min(begun_s, float(block["mono_s"][0]))
+            if block["mono_s"][-1] - begun_s > _WAY_DOWN_S:
+                add_note(self.notes, _STAND_IN)
+            yield block
+
+    def _segment_at(self, paths: Sequence[Path], time_s: float) -> int:
+        """Number of the last segment that begins before a time."""
+        for place in reversed(range(len(paths))):
+            times_s = rrd_reader.read_ticks(paths[place], ["mono_s"], self.notes)["mono_s"]
+            if times_s.size and times_s[0] <= time_s:
+                return place
+        return 0
 
     def level(
         self,
@@ -114,7 +143,7 @@ class Run:
         table = level_table(window_s)
         blocks = list(self._table_blocks(table, "time_s", names, start_s, end_s))
         until_s = float(blocks[-1]["time_s"][-1]) + window_s if blocks else start_s
-        if self.summary is None or not blocks:
+        if not blocks or not self._reaches_end(until_s):
             if window_s in finer:
                 blocks.append(coarser_level(self.level(finer[window_s], until_s, end_s, names), window_s))
             else:
@@ -125,12 +154,27 @@ class Run:
 
     def shapes(self) -> Shapes:
         """Every measured figure of the run."""
-        tables = (read_file(path, shapes.TABLE_COLUMNS, self.notes) for path in column_files(self.folder, SHAPES))
+        files = column_files(self.folder, SHAPES)
+        tables = (self._file(path, files[-1], shapes.TABLE_COLUMNS) for path in files)
         found = [shapes.from_table(table) for table in tables if table is not None and table.num_rows]
         if not found:
             columns = [rrd_reader.read_shapes(path, self.notes) for path in rrd_reader.segments(self.folder)]
             found = [shapes.from_columns(part) for part in columns if part]
         return shapes.joined(found)
+
+    def look_through(self) -> None:
+        """Read every table and segment once, so that `notes` names whatever is damaged; a month in some seconds."""
+        for table in TABLES:
+            files = column_files(self.folder, table)
+            for path in files:
+                self._file(path, files[-1], ["mono_s" if table == TICKS else "time_s"])
+        for path in rrd_reader.segments(self.folder):
+            rrd_reader.read_ticks(path, ["mono_s"], self.notes)
+
+    def _file(self, path: Path, last: Path, names: Sequence[str]) -> pa.Table | None:
+        """Columns of a file; the last one of a run that was closed has an end."""
+        closed = self.summary is not None and not self.summary.get("rebuilt")
+        return read_file(path, names, self.notes, closed and path == last)
 
     def _table_blocks(
         self, table: str, time_name: str, names: Sequence[str], start_s: float, end_s: float
@@ -143,7 +187,7 @@ class Run:
             begins, ends = starts[place], next((s for s in starts[place + 1 :] if s is not None), None)
             if (begins is not None and begins >= end_s) or (ends is not None and ends <= start_s):
                 continue
-            read = read_file(path, names, self.notes)
+            read = self._file(path, files[-1], names)
             if read is None or time_name not in read.column_names:
                 continue
             block = {name: _array(read, name) for name in names}
@@ -171,22 +215,33 @@ def open_run(path: Path | str) -> Run:
     notes: list[str] = []
     events = read_events(folder, notes)
     summary = read_summary(folder, notes)
-    tables = (TICKS, *(level_table(window_s) for window_s in WINDOWS_S), SHAPES)
-    for files in (*(column_files(folder, table) for table in tables), rrd_reader.segments(folder)):
-        notes += [f"{name}: missing; what it held is left out" for name in missing_files(files)]
-    if not column_files(folder, TICKS) and rrd_reader.segments(folder):
-        notes.append("the tables of ticks are missing; the Rerun segments stand in for them, without every tick")
-    there, expected = len(rrd_reader.segments(folder)), _segments(summary)
-    if there < expected:
-        notes.append(f"{expected - there} of {expected} Rerun segments are missing; the tables stand in for them")
+    notes += _missing(folder, summary)
     return Run(folder, read_config(folder, notes), events, summary, origin_of(folder, events), notes)
 
 
-def _segments(summary: dict[str, Any] | None) -> int:
-    """Rerun segments that the recorder says it wrote."""
+def _missing(folder: Path, summary: dict[str, Any] | None) -> list[str]:
+    """Tables and segments that are not there: by their numbers, and by the summary's count of them."""
     account = (summary or {}).get("recorder")
-    count = account.get("segments") if isinstance(account, dict) else 0
-    return count if isinstance(count, int) else 0
+    counts = account if isinstance(account, dict) else {}
+    tables = counts.get("tables")
+    notes = []
+    for table in TABLES:
+        count = _count(tables.get(table) if isinstance(tables, dict) else 0)
+        gone = missing_files(column_files(folder, table), f"{table}-000{SUFFIX}", count)
+        notes += [f"{name}: missing; what it held is left out" for name in gone]
+    segments = rrd_reader.segments(folder)
+    ticks = bool(column_files(folder, TICKS))
+    if not ticks and segments:
+        notes.append("the tables of ticks are missing; the Rerun segments stand in for them, without every tick")
+    count = _count(counts.get("segments"))
+    gone = missing_files(segments, segments[0].name if segments else f"{folder.name[17:]}-000.rrd", count)
+    held = "its ticks are in the tables" if ticks else "what it held is left out"
+    return notes + [f"{name}: missing; {held}" for name in gone]
+
+
+def _count(value: object) -> int:
+    """Of files, as the summary says: no run has as many as a damaged one may say."""
+    return value if isinstance(value, int) and value <= _FILES_MAX else 0
 
 
 def origin_of(folder: Path, events: Sequence[dict[str, Any]]) -> datetime:
