@@ -91,7 +91,7 @@ def _read(
         what = "cut short" if damage.at_end and not content.ended else "damaged"
         add_note(notes, f"{path.name}: {what}, {size_kb:.1f} kB: {_rows_lost(batches, damage)} left out")
     if content.sealed and over and not content.ended and not content.damage:
-        lost = _rows_lost(batches, Damage(len(batches) + 1, 0, True))
+        lost = _rows_lost(batches, Damage(len(batches), 0, True))
         add_note(notes, f"{path.name}: without the mark of its end: {lost} missing, if there were any")
     return pa.Table.from_batches(batches, schema=reader.schema).select(wanted)
 
@@ -117,8 +117,8 @@ def _batches(reader: pa.RecordBatchReader) -> tuple[list[pa.RecordBatch], Except
 
 
 def _rows_lost(batches: Sequence[pa.RecordBatch], damage: Damage) -> str:
-    """The rows that a stretch has held, by the times of those around it. The file's head counts as a batch there."""
-    after = damage.batches - 1
+    """The rows that a stretch has held, by the times of those around it."""
+    after = damage.batches
     last_s = _time_s(batches[after - 1], -1) if 0 < after <= len(batches) else None
     next_s = _time_s(batches[after], 0) if after < len(batches) else None
     if last_s is not None and next_s is not None:
