@@ -24,7 +24,7 @@ from membrane_ctrl.config import Config
 from membrane_ctrl.ipc.ring import RingAddress, RingReader
 
 # Rings are emptied this often: the telemetry ring has to hold a few of these.
-_POLL_S = 0.25
+POLL_S = 0.25
 # A recorder that has not got round for so long is replaced: half of what the rings hold, so that the next one
 # still finds everything. A disk that is slower than this for one second of a run is as good as gone.
 _ROUND_S = 30.0
@@ -68,7 +68,7 @@ class RecorderSpec:
     frames: FrameAddress | None = None
     inputs: RingAddress | None = None
     resumes: int = 0
-    flush_s: float = 1.0 - _POLL_S
+    flush_s: float = 1.0 - POLL_S
 
 
 def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
@@ -87,6 +87,8 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: asked.set())
     os.environ["RUST_LOG"] = "off"  # Rerun's own log would write over the live screen; its errors come as exceptions
+    # read when Rerun is imported: its allocator gives back at once what a closed segment leaves, or 30 MB would stay
+    os.environ["MIMALLOC_PURGE_DELAY"] = "0"
     if not _record(spec, reporter(status), asked.is_set, parent_died):
         os._exit(0)  # everything is written; Rerun's exit handler would wait for a dead writer
 
@@ -126,7 +128,7 @@ def _record(
             recorder.write()
             report(alive(_ROUND_S))
         if not recorder.ended:
-            time.sleep(_POLL_S)
+            time.sleep(POLL_S)
     recorder.finish(in_haste=asked())
     if thumbnails is not None:
         thumbnails.close()
