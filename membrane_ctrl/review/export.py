@@ -47,7 +47,7 @@ def export(
     Raises
     ------
     InputError
-        If the format or a stream is not known, or h5py is missing.
+        If the format or a stream is not known, h5py is missing, or the run has nothing of what is wanted.
     DeviceError
         If the folder cannot be written.
     """
@@ -57,20 +57,32 @@ def export(
     try:
         out.mkdir(parents=True, exist_ok=True)
         if to == "hdf5":
-            return [_hdf5(run, out / "run.h5", fields, extras, start_s, end_s)]
+            return _hdf5(run, out / "run.h5", fields, extras, start_s, end_s)
         written = []
         if fields:
             blocks = (pa.table(block) for block in run.tick_blocks(fields, start_s, end_s))
             written += _tables(blocks, out / f"ticks.{to}", to)
-        if SHAPES in extras:
-            written += _tables(iter([shape_table(run, start_s, end_s)]), out / f"shapes.{to}", to)
-        if EVENTS in extras:
+            _say_if_missing(run, bool(written))
+        if SHAPES in extras and (shapes := shape_table(run, start_s, end_s)).num_rows:
+            written += _tables(iter([shapes]), out / f"shapes.{to}", to)
+        if EVENTS in extras and run.events:
             path = out / "events.jsonl"
             path.write_text("".join(json.dumps(e, ensure_ascii=False) + "\n" for e in run.events), encoding="utf-8")
             written.append(path)
     except OSError as error:
         raise DeviceError(f"{out}: cannot be written ({(error.strerror or str(error)).lower()})") from None
+    if not written:
+        raise _nothing(run)
     return written
+
+
+def _say_if_missing(run: Run, telemetry: bool) -> None:
+    if not telemetry:
+        run.notes.append("no telemetry in this part of the run: no ticks are exported")
+
+
+def _nothing(run: Run) -> InputError:
+    return InputError("; ".join((f"{run.folder}: nothing to export of what is wanted", *run.notes)))
 
 
 def shape_table(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> pa.Table:
@@ -128,7 +140,7 @@ def _tables(tables: Iterator[pa.Table], path: Path, to: str) -> list[Path]:
     return [path] if writer is not None else []
 
 
-def _hdf5(run: Run, path: Path, fields: Sequence[str], extras: set[str], start_s: float, end_s: float) -> Path:
+def _hdf5(run: Run, path: Path, fields: Sequence[str], extras: set[str], start_s: float, end_s: float) -> list[Path]:
     try:
         import h5py
     except ImportError:
@@ -147,12 +159,18 @@ def _hdf5(run: Run, path: Path, fields: Sequence[str], extras: set[str], start_s
                 data = file[place]
                 data.resize(data.shape[0] + values.size, axis=0)
                 data[-values.size :] = values
-        if SHAPES in extras:
-            shapes = run.shapes()
-            shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
+        if fields:
+            _say_if_missing(run, "ticks" in file)
+        shapes = run.shapes()
+        shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
+        if SHAPES in extras and len(shapes):
             for name in ("time_s", "coeffs_um", "hencky_um", "sag_um", "sag_sigma_um", "displacement_um"):
                 file.create_dataset(f"shapes/{name}", data=getattr(shapes, name))
-        if EVENTS in extras:
+        if EVENTS in extras and run.events:
             lines = [json.dumps(event, ensure_ascii=False) for event in run.events]
             file.create_dataset("events", data=lines, dtype=h5py.string_dtype())
-    return path
+        empty = not len(file)
+    if empty:
+        path.unlink()
+        raise _nothing(run)
+    return [path]

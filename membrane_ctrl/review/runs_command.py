@@ -36,6 +36,7 @@ def list_command(logs: Path, wanted: Filter, since: str | None, until: str | Non
 def show_command(run: Path, json: bool) -> int:
     """One run: its line of the catalogue, its states and faults, what is missing of it."""
     opened = open_run(resolve(run))
+    opened.look_through()
     entry = catalogue.entry(opened.folder)
     if json:
         print(
