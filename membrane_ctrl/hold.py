@@ -89,7 +89,8 @@ def hold_mirror(options: HoldOptions) -> int:
         latcher = partial(Latcher, latched, run_dir.name, clock.utc)
         exit_code = asyncio.run(_run(bench, config, options, clock, rings, crew, twin, port, latcher, board))
         crew.take_down()
-    _report(run_dir, options.json)
+    with contextlib.suppress(OSError):  # the terminal was closed, or nobody reads any more
+        _report(run_dir, options.json)
     return exit_code
 
 

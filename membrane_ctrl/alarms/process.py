@@ -26,6 +26,7 @@ _LOOK_S = 0.5
 # After the run's end, for the last notices; a longer one would keep a service manager from restarting
 _LAST_S = 8.0
 _SENDING_S = 300.0  # a list of mail servers, each with a minute of time-out
+_IDLE_S = 15.0  # with nothing to send; who hangs then would not tell anybody anything
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +88,7 @@ def watch(spec: AlarmsSpec, send: Send, report: Callable[[Event], None], parent_
             watcher.look(telemetry.drain(), events.drain(), clock.now())
             if watcher.ended or not lives:
                 break
+            report(alive(_IDLE_S))
             time.sleep(_LOOK_S)
         if not watcher.ended:
             watcher.orphaned(clock.now())
