@@ -75,7 +75,10 @@ class ReviewBlueprint:
         )  # fmt: skip
 
     def _log(self, name: str, *paths: str) -> rrb.TextLogView:
-        columns = rrb.TextLogColumns(timeline_columns=["run_time"], text_log_columns=["loglevel", "body"])
+        columns = rrb.TextLogColumns(
+            timeline_columns=["run_time"],
+            text_log_columns=["entitypath", "loglevel", "body"] if len(self._prefixes) > 1 else ["loglevel", "body"],
+        )
         return rrb.TextLogView(name=name, origin="/", contents=self._contents(paths), columns=columns)
 
     def _overview(self) -> rrb.Vertical:

@@ -9,17 +9,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from membrane_ctrl.errors import InputError
+from membrane_ctrl.errors import DeviceError, InputError
 from membrane_ctrl.names import State
 from membrane_ctrl.recording.screenshot import screenshot_of
 from membrane_ctrl.review import viewer
 from membrane_ctrl.review.blueprints import TABS, ReviewBlueprint
 from membrane_ctrl.review.catalogue import resolve
 from membrane_ctrl.review.found import Found
+from membrane_ctrl.review.interrupts import ends_as_by_ctrl_c
 from membrane_ctrl.review.layer import Layer
 from membrane_ctrl.review.run import Run, open_run
 from membrane_ctrl.review.words import moment_s
 
+_THIS_MACHINE = "127.0.0.1"
 # Seen about a moment asked for with --at or --around.
 _AROUND_S = 120.0
 
@@ -37,7 +39,7 @@ class ReviewOptions:
     align: str = "hold"
     live: bool = False
     web: bool = False
-    bind: str = "127.0.0.1"
+    bind: str = _THIS_MACHINE
     port: int = 0
     save: Path | None = None
     screenshot: Path | None = None
@@ -45,28 +47,72 @@ class ReviewOptions:
 
 def review_command(options: ReviewOptions) -> int:
     """Make the review and show it."""
+    _require_sense(options)
+    runs = [open_run(resolve(path)) for path in options.runs]
+    with ends_as_by_ctrl_c(), tempfile.TemporaryDirectory(prefix="membrane-review-") as folder:
+        if options.live:
+            return viewer.live(runs[0].folder, options.web, options.port)
+        for target in (options.save, options.screenshot):
+            if target is not None:
+                _require_writable(target, runs)
+        file = options.save or Path(folder) / "review.rrd"
+        try:
+            make_review(runs, options, file)
+        finally:
+            for run in runs:
+                for note in run.notes:
+                    print(f"note: {run.name}: {note}", file=sys.stderr)
+        return _show(file, options)
+
+
+def _show(file: Path, options: ReviewOptions) -> int:
+    if options.screenshot is not None:
+        try:
+            options.screenshot.write_bytes(screenshot_of([file]))
+        except RuntimeError as error:
+            raise DeviceError(f"no picture: {error}") from None
+        return 0
+    if options.save is not None:
+        print(file)
+        return 0
+    return viewer.serve([file], options.bind, options.port) if options.web else viewer.show([file])
+
+
+def _require_sense(options: ReviewOptions) -> None:
+    """No option that is unknown, or that would be passed over in silence."""
     if options.tab not in TABS:
         raise InputError(f"--tab {options.tab}: known are {', '.join(TABS)}")
     if options.align not in {"hold", "start", "utc"}:
         raise InputError(f"--align {options.align}: known are hold, start, utc")
-    runs = [open_run(resolve(path)) for path in options.runs]
-    if options.live:
-        if len(runs) != 1:
-            raise InputError("--live: one run at a time")
-        return viewer.live(runs[0].folder, options.web, options.port)
-    with tempfile.TemporaryDirectory(prefix="membrane-review-") as folder:
-        file = options.save or Path(folder) / "review.rrd"
-        make_review(runs, options, file)
-        for run in runs:
-            for note in run.notes:
-                print(f"note: {run.name}: {note}", file=sys.stderr)
-        if options.screenshot is not None:
-            options.screenshot.write_bytes(screenshot_of([file]))
-            return 0
-        if options.save is not None:
-            print(file)
-            return 0
-        return viewer.serve([file], options.bind, options.port) if options.web else viewer.show([file])
+    if options.around is not None and not options.around.strip():
+        raise InputError("--around: say which event, e.g. --around hold")
+    moments = (options.at, options.around, options.start or options.end)
+    if sum(moment is not None for moment in moments) > 1:
+        raise InputError("--at, --around, --from with --to: only one of these at a time")
+    if not options.web and (options.bind != _THIS_MACHINE or options.port):
+        raise InputError("--bind and --port: only with --web")
+    if not options.live:
+        return
+    if len(options.runs) != 1:
+        raise InputError("--live: one run at a time")
+    if any(part is not None for part in (*moments, options.save, options.screenshot)):
+        raise InputError("--live follows the run as it goes on: leave --at, --from, --save and the like away")
+    if options.bind != _THIS_MACHINE:
+        raise InputError("--live serves this machine only: leave --bind away, and bring the page over with ssh -L")
+
+
+def _require_writable(target: Path, runs: Sequence[Run]) -> None:
+    """Said before the work, not after it."""
+    if any(target.resolve().parent == run.folder.resolve() for run in runs):
+        raise InputError(f"{target}: lies among what the recorder wrote; choose another folder")
+    try:
+        new = not target.exists()
+        target.open("ab").close()
+        if new:
+            target.unlink()
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise DeviceError(f"{target}: cannot be written ({reason}); choose another place") from None
 
 
 def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> None:
@@ -83,11 +129,9 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> None
     Raises
     ------
     InputError
-        If a time or an event asked for is not in the first run, or a run has no telemetry.
+        If a time or an event asked for is not in the first run, or no run has telemetry.
     """
-    for run in runs:
-        if not run.level(60.0, names=("rows",))["time_s"].size:
-            raise InputError(f"{run.folder}: nothing to show: no telemetry can be read")
+    runs = _with_telemetry(runs)
     span_s = _span(runs[0], options)
     zeros_s = _zeros(runs, options.align)
     prefixes = ("",) if len(runs) == 1 else tuple(f"/run_{number}" for number in range(1, len(runs) + 1))
@@ -100,24 +144,43 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> None
     layer.close()
 
 
+def _with_telemetry(runs: Sequence[Run]) -> list[Run]:
+    """The runs that can be shown; of the others it is noted that they cannot."""
+    there = [run for run in runs if run.level(60.0, names=("rows",))["time_s"].size]
+    if not there:
+        raise InputError(f"{', '.join(str(run.folder) for run in runs)}: nothing to show: no telemetry can be read")
+    for run in runs:
+        if run not in there:
+            run.notes.append("not shown: no telemetry of it can be read")
+    return there
+
+
 def _span(run: Run, options: ReviewOptions) -> tuple[float, float] | None:
     """The part of the run asked for, in its seconds."""
     if options.start is not None or options.end is not None:
         start_s = 0.0 if options.start is None else moment_s(options.start, run.origin_utc)
         end_s = _end_s(run) if options.end is None else moment_s(options.end, run.origin_utc)
-        if not start_s < end_s:
+        if options.start is not None and options.end is not None and not start_s < end_s:
             raise InputError(f"--from {options.start} is not before --to {options.end}")
+        if start_s >= _end_s(run):
+            raise _not_in(run, f"--from {options.start}")
+        if end_s <= 0:
+            raise _not_in(run, f"--to {options.end}")
         return start_s, end_s
     if options.at is not None:
         at_s = moment_s(options.at, run.origin_utc)
         if not -_AROUND_S <= at_s <= _end_s(run) + _AROUND_S:
-            last = f"{run.utc(0):%Y-%m-%d %H:%M} to {run.utc(_end_s(run)):%Y-%m-%d %H:%M} UTC"
-            raise InputError(f"--at {options.at}: not in the run, which went from {last}")
+            raise _not_in(run, f"--at {options.at}")
         return at_s - _AROUND_S, at_s + _AROUND_S
     if options.around is not None:
         at_s = _around(run, options.around)
         return at_s - _AROUND_S, at_s + _AROUND_S
     return None
+
+
+def _not_in(run: Run, asked: str) -> InputError:
+    went = f"{run.utc(0):%Y-%m-%d %H:%M} to {run.utc(_end_s(run)):%Y-%m-%d %H:%M} UTC"
+    return InputError(f"{asked}: not in the run, which went from {went}")
 
 
 def _around(run: Run, what: str) -> float:
@@ -133,9 +196,8 @@ def _around(run: Run, what: str) -> float:
     for item in found:
         if wanted in item.kind:
             return item.time_s
-    named = sorted(
-        {str(e.get("name") or e.get("state") or e.get("kind")) for e in run.events} | {f.kind for f in found}
-    )
+    told = {str(e.get("name") or e.get("state") or e.get("kind")) for e in run.events}
+    named = sorted(told - {"why"} | {item.kind for item in found})
     raise InputError(f"--around {what}: no such event in {run.name}; there are {', '.join(named)}")
 
 

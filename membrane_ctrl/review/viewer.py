@@ -45,8 +45,14 @@ def serve(files: list[Path], bind: str, port: int) -> int:
         127.0.0.1 unless the network may look: then the address to listen on.
     port : int
         Of the page; 0: a free one.
+
+    Raises
+    ------
+    DeviceError
+        If it cannot listen there, or the viewer does not start.
     """
     port = port or free_port()
+    _require_listening(bind, port)
     data_port = free_port()
     host = "127.0.0.1" if bind == "127.0.0.1" else socket.gethostname()
     print(f"open {_page(host, port, data_port)}", file=sys.stderr)
@@ -68,6 +74,7 @@ def live(folder: Path, web: bool, port: int = 0) -> int:
     server = viewer_command(*kind, "--bind", "127.0.0.1", "--port", str(data_port), "-")
     proxy = f"rerun+http://127.0.0.1:{data_port}/proxy"
     if web:
+        _require_listening("127.0.0.1", port)
         print(f"open {_page('127.0.0.1', port, data_port)}", file=sys.stderr)
     else:
         _require_screen()
@@ -151,6 +158,19 @@ def _recent(files: list[Path]) -> tuple[int, int, bytes]:
     place = first_message_after(files[number], sizes[number] - _RECENT_BYTES)
     with files[number].open("rb") as file:
         return number, place, file.read(style_ends) if place else b""
+
+
+def _require_listening(bind: str, port: int) -> None:
+    """The viewer says nothing of a port that is taken."""
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in bind else socket.AF_INET) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((bind, port))
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise DeviceError(
+            f"cannot listen on {bind}, port {port} ({reason}): choose another --port or --bind"
+        ) from None
 
 
 def free_port() -> int:

@@ -4,6 +4,12 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -27,6 +33,7 @@ from membrane_ctrl.review.rrd_place import first_message_after
 from membrane_ctrl.review.viewer import follow
 from membrane_ctrl.review.words import moment_s, number, span
 
+Capsys = pytest.CaptureFixture[str]
 ORIGIN = datetime(2026, 11, 21, 18, 0, 30, tzinfo=UTC)
 
 
@@ -178,18 +185,67 @@ def test_a_window_limits_the_ticks_and_runs_lie_over_each_other(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
-    [({"at": "+9h"}, "not in the run"), ({"around": "explosion"}, "no such event"), ({"tab": "x"}, "--tab"),
-     ({"align": "x"}, "--align"), ({"start": "+20s", "end": "+10s"}, "not before")],
+    ("asked", "said"),
+    [("--at +9h", "not in the run"), ("--at 25:00", "write 03:12"), ("--around explosion", "no such event"),
+     ("--around= ", "say which event"), ("--tab x", "--tab"), ("--align x", "--align"),
+     ("--from +20s --to +10s", "not before"), ("--from +3h --to +4h", "not in the run"),
+     ("--to 2020-01-01", "not in the run"), ("--at +10s --around hold", "only one"), ("--port 9", "only with --web"),
+     ("--live", "--live follows")],
 )  # fmt: skip
-def test_what_is_not_there_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: dict[str, str], said: str
-) -> None:
-    folder = written(tmp_path, 0.02)
-    names = {"start": "--from", "end": "--to"}
-    arguments = [part for key, value in options.items() for part in (names.get(key, f"--{key}"), value)]
-    assert command(["review", str(folder), *arguments, "--save", str(tmp_path / "r.rrd")]) == 2
+def test_what_is_not_there_is_said(logs: Path, tmp_path: Path, capsys: Capsys, asked: str, said: str) -> None:
+    folder, target = logs / "20261121T180000Z-night", tmp_path / "r.rrd"
+    assert command(["review", str(folder), *asked.split(" ", maxsplit=3), "--save", str(target)]) == 2
     assert said in capsys.readouterr().err
+    assert not target.exists()
+
+
+def test_a_place_that_cannot_be_written_is_said_before_the_work(logs: Path, tmp_path: Path, capsys: Capsys) -> None:
+    folder = logs / "20261121T180000Z-night"
+    assert command(["review", str(folder), "--screenshot", str(tmp_path / "absent" / "p.png")]) == 4
+    assert "cannot be written" in capsys.readouterr().err
+    assert command(["review", str(folder), "--save", str(folder / "night-000.rrd")]) == 2
+    assert "among what the recorder wrote" in capsys.readouterr().err
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        assert command(["review", str(folder), "--web", "--port", str(taken.getsockname()[1])]) == 4
+    assert "choose another --port" in capsys.readouterr().err
+
+
+def test_nothing_to_show_is_explained_and_beside_another_run_only_noted(
+    logs: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    broken, whole, target = tmp_path / "broken", logs / "20261121T180000Z-night", tmp_path / "r.rrd"
+    broken.mkdir()
+    (broken / "events.jsonl").write_text('{"kind": "start", "mono_s": 0.0}\n{"kin')
+    assert command(["review", str(broken), "--save", str(target)]) == 2
+    said = capsys.readouterr().err
+    assert "1 line cannot be read" in said
+    assert said.splitlines()[-1].endswith("nothing to show: no telemetry can be read")
+    assert command(["review", str(broken), str(whole), "--save", str(target)]) == 0
+    assert "broken: not shown" in capsys.readouterr().err
+    assert entities(target)["/overview/error"] > 0
+
+
+def listens(port: int) -> bool:
+    """Whether somebody listens on a port of this machine."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_review_that_is_ended_leaves_nothing_behind(logs: Path, tmp_path: Path, number: signal.Signals) -> None:
+    command_line = [sys.executable, "-m", "membrane_ctrl", "review", str(logs / "20261121T180000Z-night"), "--web"]
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    with subprocess.Popen(command_line, env=environment, stderr=subprocess.PIPE, text=True) as review:
+        assert review.stderr is not None
+        page = next(line for line in review.stderr if line.startswith("open http"))
+        port = int(page.split("/")[2].split(":")[1])
+        while not listens(port):
+            time.sleep(0.02)
+        assert list(tmp_path.glob("membrane-review-*/review.rrd"))
+        review.send_signal(number)
+        assert review.wait(30) == 0
+    assert not list(tmp_path.iterdir())
+    assert not listens(port)
 
 
 def test_around_finds_events_and_what_was_found(tmp_path: Path) -> None:
