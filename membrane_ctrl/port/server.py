@@ -38,6 +38,7 @@ from membrane_ctrl.tick import Event, TickOutputs
 _SESSIONS_MOST, _SESSIONS_EACH = 16, 4
 # A tick takes a command up within its period; a loop that does not in so long has other troubles, and says so
 _ANSWER_S = 5.0
+_EXPIRED = "the certificate has expired"
 _OVER = "the run is over"
 
 
@@ -167,7 +168,7 @@ class Port:
         session = Session(wire, peer, self.status)
         self._sessions.append(session)
         loop = asyncio.get_running_loop()
-        expiry = None if lasts_s is None else loop.call_later(lasts_s, self._expire, session)
+        expiry = None if lasts_s is None else loop.call_later(lasts_s, self._turn_out, session, _EXPIRED)
         greeting = {
             "membrane_ctrl": VERSION,
             "run": self._run,
@@ -182,8 +183,7 @@ class Port:
             if expiry is not None:
                 expiry.cancel()
 
-    def _expire(self, session: Session) -> None:
-        reason = "the certificate has expired"
+    def _turn_out(self, session: Session, reason: str) -> None:
         self._refusals.record(session.peer.who, "", reason)
         session.drop(reason)
 
@@ -191,7 +191,7 @@ class Port:
         own = [session for session in self._sessions if session.peer.who == peer.who]
         crowd = own if len(own) >= _SESSIONS_EACH else self._sessions if len(self._sessions) >= _SESSIONS_MOST else []
         if crowd:
-            min(crowd, key=lambda session: session.heard_s).drop("too many connections: this was silent longest")
+            self._turn_out(min(crowd, key=lambda session: session.heard_s), "too many connections: silent longest")
 
     async def _answer(self, session: Session, request: Request) -> dict[str, Any]:
         """Do what is asked, or say why not. What the controller refuses, it records itself."""

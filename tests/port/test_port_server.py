@@ -219,6 +219,8 @@ async def test_too_many_of_one_peer_cost_that_peer(tmp_path: Path) -> None:
         client(run, EVE) as last,
     ):
         assert await first.gone(), "the one that was silent longest"
+        (refused,) = run.of_kind("refused")
+        assert refused["reason"].startswith("too many connections")
         assert (await last.ask(do="status"))["ok"]
         assert (await ann.ask(do="stop"))["ok"]
 

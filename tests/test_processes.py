@@ -1,0 +1,38 @@
+"""A child is out of reach of the terminal, and never left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+
+from membrane_ctrl.processes import Child, pipe
+
+
+def test_what_a_terminal_sends_to_all_is_not_for_the_children() -> None:
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP)}
+    ours, theirs = pipe()
+    child = Child("waits", "multiprocessing.connection:wait", ([theirs],), nice=0)
+    child.start()
+    try:
+        assert child.pid is not None
+        for number, handler in before.items():
+            os.kill(child.pid, number)
+            assert signal.getsignal(number) == handler  # nor does this process lose what it does with them
+        assert not child.join(0.2)
+        ours.send("go home")
+        assert child.join(20.0)
+        assert child.exit_code == 0
+    finally:
+        child.stop(1.0)
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGCONT])
+def test_a_child_that_does_not_obey_is_killed(number: signal.Signals) -> None:
+    child = Child("sleeps", "time:sleep", (60.0,), nice=0)
+    child.start()
+    assert child.pid is not None
+    os.kill(child.pid, number)
+    child.stop(0.1)
+    assert not child.alive
