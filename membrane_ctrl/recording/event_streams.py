@@ -41,7 +41,9 @@ def event_time_s(event: Event) -> float:
 
 def event_text(event: Event) -> str:
     """One line: the kind, then what the event says of itself."""
-    details = [f"{key} {_short(value)}" for key, value in event.items() if key not in _TIMES and value is not None]
+    details = [
+        f"{key} {_short(value)}" for key, value in event.items() if key not in _TIMES and value not in (None, "")
+    ]
     return f"{event.get('kind', '?')}: {', '.join(details)}" if details else str(event.get("kind", "?"))
 
 

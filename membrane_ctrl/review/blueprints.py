@@ -22,12 +22,17 @@ class ReviewBlueprint:
         Time range to show, on the review's timeline; None: everything.
     band_um : float
         The plots of the error are three bands high.
+    maps_um : sequence of float
+        Scale of each run's maps; NaN for one without.
     """
 
-    def __init__(self, prefixes: Sequence[str], span_s: tuple[float, float] | None, band_um: float) -> None:
+    def __init__(
+        self, prefixes: Sequence[str], span_s: tuple[float, float] | None, band_um: float, maps_um: Sequence[float]
+    ) -> None:
         self._prefixes = prefixes
         self._span_s = span_s
         self._band_um = band_um
+        self._maps_um = maps_um
 
     def made(self, tab: str = "overview") -> rrb.Blueprint:
         """The blueprint, with `tab` (one of `TABS`) in front."""
@@ -109,8 +114,8 @@ class ReviewBlueprint:
 
     def _shape(self) -> rrb.Vertical:
         maps = [
-            rrb.Spatial2DView(name=f"Height change {prefix.strip('/')}".strip(), origin=f"{prefix}/shape/map")
-            for prefix in self._prefixes
+            rrb.Spatial2DView(name=_map_name(prefix.strip("/"), most_um), origin=f"{prefix}/shape/map")
+            for prefix, most_um in zip(self._prefixes, self._maps_um, strict=True)
         ]
         return rrb.Vertical(
             rrb.Horizontal(*maps, self._plot("Low orders, change, um", "/shape/change")),
@@ -132,7 +137,7 @@ class ReviewBlueprint:
                 self._plot("Gauge pressure, Pa", "/overview/gauge"),
             ),
             rrb.Horizontal(self._log("Events", "/events"), self._log("Found by machine", "/found")),
-            row_shares=[2.5, 2.5, 2, 3],
+            row_shares=[2.2, 3, 2, 2.8],
             name="faults",
         )
 
@@ -148,3 +153,9 @@ class ReviewBlueprint:
             self._plot("Time between ticks, s", "/tick/dt"),
             name="tuning",
         )
+
+
+def _map_name(run: str, most_um: float) -> str:
+    """The viewer draws no colour scale, so the name says it."""
+    scale = f", um: blue {-most_um:.2g}, green 0, red {most_um:+.2g}" if most_um == most_um else ""
+    return f"{run} height since the hold's first cycle{scale}".strip()

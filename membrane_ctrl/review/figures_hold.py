@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from membrane_ctrl.names import State
 from membrane_ctrl.review.analysis import Analysis
 from membrane_ctrl.review.figures_svg import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, picture, svg
+from membrane_ctrl.review.gaps import broken_at_gaps
 from membrane_ctrl.review.report_json import timeline
 
 Column = NDArray[np.float64]
@@ -32,7 +33,7 @@ def hours_or_less(time_s: Column | float, span_s: float) -> tuple[Any, str]:
 
 def overview(analysis: Analysis) -> str:
     """Error with its envelope, the band, states, what was found and marked."""
-    level, band_um = analysis.level, analysis.run.config.limits.band_um
+    level, band_um = broken_at_gaps(analysis.level), analysis.run.config.limits.band_um
     span_s = analysis.ticks.end_s - analysis.ticks.start_s
     time, unit = hours_or_less(level["time_s"], span_s)
     with picture(2, 1, 4.2, sharex=True, height_ratios=[8, 1.1]) as (figure, (plot, lane)):
@@ -94,7 +95,7 @@ def _lane(lane: Any, analysis: Analysis, span_s: float) -> None:
 
 def surroundings(analysis: Analysis) -> str:
     """Air, leak and pump, lateness."""
-    level = analysis.level
+    level = broken_at_gaps(analysis.level)
     time, unit = hours_or_less(level["time_s"], analysis.ticks.end_s - analysis.ticks.start_s)
     with picture(2, 2, 4.2, sharex=True) as (figure, plots):
         pressure, temperature, flow, late = plots.ravel()
@@ -110,7 +111,7 @@ def surroundings(analysis: Analysis) -> str:
         late.plot(time, level["max_lateness_ms"], color=GREY, lw=0.8, label="greatest")
         late.plot(time, level["mean_lateness_ms"], color=BLUE, label="mean")
         late.set(title="Lateness of the tick, ms", xlabel=unit)
-        if np.nanmax(level["max_lateness_ms"], initial=1e-3) > 0:
+        if np.nanmax(level["max_lateness_ms"], initial=0.0) > 0:
             late.set_yscale("log")
         late.legend(loc="upper right", ncols=2)
         return svg(figure)

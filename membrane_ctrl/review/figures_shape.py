@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.review.figures_hold import hours_or_less
 from membrane_ctrl.review.figures_svg import BLUE, GREY, ORANGE, RED, VIOLET, picture, svg
+from membrane_ctrl.review.gaps import broken_at_gaps
 from membrane_ctrl.review.shape_review import POINTS, ShapeReview
 
 Column = NDArray[np.float64]
@@ -22,19 +23,21 @@ def stability(shape: ShapeReview) -> str:
     """Heights at A, B, C; camera against laser; the map of the standard deviation; drift of the terms."""
     span_s = float(np.ptp(shape.time_s))
     every = max(1, shape.time_s.size // _LINE_POINTS)
-    time, unit = hours_or_less(shape.time_s[::every], span_s)
+    lines = {"time_s": shape.time_s, "sag": shape.sag_um, "laser": shape.laser_um, **shape.points_um}
+    lines = broken_at_gaps({name: values[::every] for name, values in lines.items()})
+    time, unit = hours_or_less(lines["time_s"], span_s)
     with picture(2, 2, 6.2, width_ratios=[1.9, 1]) as (figure, plots):
         points, sd, loops, drift = plots.ravel()
-        for name, values in shape.points_um.items():
-            points.plot(time, values[::every], color=_POINT_COLOURS[name], lw=0.9, label=name)
+        for name in shape.points_um:
+            points.plot(time, lines[name], color=_POINT_COLOURS[name], lw=0.9, label=name)
         points.set(title="Height at A, B and C since the first cycle, µm", xlabel=unit)
         points.legend(loc="upper right", ncols=3)
         _map(figure, sd, shape.sd_um, "Standard deviation of the height, µm", "viridis", (0, None))
         for name, (x, y) in POINTS.items():
             sd.plot(x, y, "o", ms=4, mfc="none", mec="white")
             sd.annotate(name, (x, y), color="white", fontsize=8, xytext=(4, 3), textcoords="offset points")
-        loops.plot(time, shape.laser_um[::every], color=GREY, lw=0.9, label="laser (in the loop)")
-        loops.plot(time, shape.sag_um[::every], color=BLUE, lw=0.9, label="sag by the camera")
+        loops.plot(time, lines["laser"], color=GREY, lw=0.9, label="laser (in the loop)")
+        loops.plot(time, lines["sag"], color=BLUE, lw=0.9, label="sag by the camera")
         loops.set(title="In the loop and out of it: change of the centre, µm", xlabel=unit)
         loops.legend(loc="upper right", ncols=2)
         _drift(drift, shape)

@@ -20,6 +20,7 @@ from membrane_ctrl.recording.rows import changes
 from membrane_ctrl.recording.streams import BLUE, GREEN, GREY, LOW_ORDERS, ORANGE, RED, STREAMS, VIOLET, Colour
 from membrane_ctrl.review.annotations import MARK
 from membrane_ctrl.review.found import LEVEL_COLUMNS, Found, find_events
+from membrane_ctrl.review.gaps import broken_at_gaps
 from membrane_ctrl.review.run import Block, Run
 from membrane_ctrl.review.settled import held_at
 from membrane_ctrl.review.shapes import Shapes, height_basis
@@ -99,7 +100,7 @@ class Layer:
         self._stream.flush()
         self._stream.disconnect()
 
-    def add(self, run: Run, prefix: str, zero_s: float, part_s: tuple[float, float]) -> list[Found]:
+    def add(self, run: Run, prefix: str, zero_s: float, part_s: tuple[float, float]) -> float:
         """Put a run in.
 
         Parameters
@@ -114,8 +115,8 @@ class Layer:
 
         Returns
         -------
-        list of Found
-            What was found in the run by machine.
+        float
+            The scale of its maps: the greatest change of height in them, um; NaN when there are none.
         """
         self._prefix, self._shift_s = prefix, zero_s
         self._origin = np.datetime64(run.origin_utc.replace(tzinfo=None), "ns")
@@ -128,8 +129,7 @@ class Layer:
         self._ticks(run, part_s)
         self._lanes(level)
         self._events(run, found)
-        self._figure(shapes.select(held_at(level, shapes.time_s)))
-        return found
+        return self._figure(shapes.select(held_at(level, shapes.time_s)))
 
     def _overviews(self, level: Block, band_um: float) -> None:
         for overview in OVERVIEWS:
@@ -178,10 +178,10 @@ class Layer:
             self._style("/found/marks", [("found by machine", RED)], points=True)
             self._scalars("/found/marks", times, np.zeros((len(found), 1)))
 
-    def _figure(self, shapes: Shapes) -> None:
+    def _figure(self, shapes: Shapes) -> float:
         good = shapes.select((shapes.verdict != "rejected") & np.isfinite(shapes.coeffs_um).all(axis=1))
         if not len(good):
-            return
+            return float("nan")
         shown = good.select(_some(len(good), SHAPES_MOST))
         parameters = shown.parameters_um() - shown.parameters_um()[0]
         terms = list(LOW_ORDERS)
@@ -192,9 +192,9 @@ class Layer:
         self._scalars("/shape/sag_change", shown.time_s, change)
         self._style("/shape/residual", [("slope residual urad", BLUE)])
         self._scalars("/shape/residual", shown.time_s, shown.slope_residual_urad[:, np.newaxis])
-        self._maps(shown, parameters)
+        return self._maps(shown, parameters)
 
-    def _maps(self, shown: Shapes, parameters: Column) -> None:
+    def _maps(self, shown: Shapes, parameters: Column) -> float:
         """Height changes against the first cycle of the hold, on one scale, so that they may be played."""
         axis = (np.arange(_MAP_PX) + 0.5) * 2 / _MAP_PX - 1
         x, y = np.meshgrid(axis, -axis)
@@ -212,6 +212,7 @@ class Layer:
             image = rr.DepthImage(picture, colormap="turbo", depth_range=(-most, most))
             self._at(float(shown.time_s[row]))
             self._stream.log(self._prefix + "/shape/map", image)
+        return most
 
     def _style(self, path: str, lines: Iterable[tuple[str, Colour]], points: bool = False) -> None:
         names, colours = zip(*lines, strict=True)
@@ -222,7 +223,8 @@ class Layer:
 
     def _scalars(self, path: str, time_s: Column, values: Column) -> None:
         if time_s.size:
-            self._columns(path, time_s, rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64)))
+            drawn = broken_at_gaps({"time_s": time_s, "values": values})
+            self._columns(path, drawn["time_s"], rr.Scalars.columns(scalars=drawn["values"]))
 
     def _columns(self, path: str, time_s: Column, columns: Iterable[rr.ComponentColumn]) -> None:
         indexes = [

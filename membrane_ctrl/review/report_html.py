@@ -19,6 +19,7 @@ from membrane_ctrl.review.words import number, span
 
 # A month has thousands of lines; the file beside the report has all.
 _LINES_MOST = 200
+READING, TRUE = "reading (in the loop)", "true centre (twin)"
 _HIDDEN = {"time_utc", "mono_s", "kind", "exit_code", "made_utc"}
 
 
@@ -91,7 +92,7 @@ def _found(analysis: Analysis) -> str:
 
 
 def _windows(analysis: Analysis) -> str:
-    both = (("reading (in the loop)", analysis.reading), ("true centre (twin)", analysis.true))
+    both = ((READING, analysis.reading), (TRUE, analysis.true))
     rows = [
         [
             name,
@@ -108,18 +109,18 @@ def _windows(analysis: Analysis) -> str:
 
 
 def _details(analysis: Analysis) -> str:
-    series = analysis.true or analysis.reading
+    series, name = (analysis.reading, READING) if analysis.true is None else (analysis.true, TRUE)
     if series is None:
         return ""
     ticks = analysis.ticks
     return _facts(
         [
-            ("drift", _slope(series.drift, "µm/h")),
+            (f"drift, {name}", _slope(series.drift, "µm/h")),
             (
-                "single readings",
+                "single readings of the laser",
                 f"std {number(ticks.raw_reading.std)} µm, {100 * ticks.raw_in_band:.2f} % in the band",
             ),
-            ("RMS by frequency", _bands(series)),
+            (f"RMS by frequency, {name}", _bands(series)),
         ]
     )
 

@@ -137,10 +137,12 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> None
     prefixes = ("",) if len(runs) == 1 else tuple(f"/run_{number}" for number in range(1, len(runs) + 1))
     layer = Layer(file, runs[0].name if len(runs) == 1 else " and ".join(run.name for run in runs))
     shown = None if span_s is None else (span_s[0] - zeros_s[0], span_s[1] - zeros_s[0])
-    layer.blueprint(ReviewBlueprint(prefixes, shown, runs[0].config.limits.band_um).made(options.tab))
+    maps_um = []
     for run, prefix, zero_s in zip(runs, prefixes, zeros_s, strict=True):
         part_s = (-math.inf, math.inf) if shown is None else (shown[0] + zero_s, shown[1] + zero_s)
-        layer.add(run, prefix, zero_s, part_s)
+        maps_um.append(layer.add(run, prefix, zero_s, part_s))
+    blueprint = ReviewBlueprint(prefixes, shown, runs[0].config.limits.band_um, maps_um)
+    layer.blueprint(blueprint.made(options.tab))
     layer.close()
 
 
