@@ -12,7 +12,9 @@ import sys
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
+from fcntl import ioctl
 from pathlib import Path
+from termios import TIOCSCTTY
 from typing import Any
 
 import psutil
@@ -133,9 +135,14 @@ class Run:
 
 @contextlib.asynccontextmanager
 async def running(
-    folder: Path, plant: WatchedPlant, config: str = "", environment: Mapping[str, str] | None = None
+    folder: Path,
+    plant: WatchedPlant,
+    config: str = "",
+    environment: Mapping[str, str] | None = None,
+    terminal: int = asyncio.subprocess.DEVNULL,
 ) -> AsyncIterator[Run]:
-    """A board, and a hold of it that is under way; both are gone afterwards."""
+    """A board, and a hold of it that is under way, on a terminal if there is one; both are gone afterwards."""
+    on_terminal = terminal != asyncio.subprocess.DEVNULL
     board = PumpBoardEmulator(plant)
     await board.start()
     keep_up = asyncio.create_task(_catch_up(plant.bench))
@@ -143,9 +150,12 @@ async def running(
     lab.write_text(f'[devices]\nboard = "tcp://127.0.0.1:{board.port}"\nwatchdog_s = {WATCHDOG_S}\n{config}')
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "membrane_ctrl", "hold", "--config", str(lab), "--logs", str(folder / "logs")),
-        stdout=asyncio.subprocess.DEVNULL,
-        stderr=asyncio.subprocess.DEVNULL,
+        stdin=terminal,
+        stdout=terminal,
+        stderr=terminal,
         env={**os.environ, **(environment or {})},
+        start_new_session=on_terminal,
+        preexec_fn=(lambda: ioctl(0, TIOCSCTTY, 0)) if on_terminal else None,
     )
     children: list[psutil.Process] = []
     try:
