@@ -239,7 +239,7 @@ class Controller:
         rule = verdict.rule
         if rule is None:
             if ladder.rung == Rung.HOLD_FLOW:
-                ladder.clear()
+                ladder.clear(scene.now_s)
                 events.append({"kind": "cleared", "name": self.fault.name if self.fault else ""})
                 self.fault = None
             return

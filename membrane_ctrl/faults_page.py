@@ -41,7 +41,8 @@ def faults_page() -> str:
         "Generated from `membrane_ctrl/safety.py` (`make generate`). What was tried of it, and what came of it, is",
         "in the [fault matrix](fault-matrix.md); what to do is in [operations](operations.md).",
         "",
-        "A rule trips when `needed` of the last `window` ticks show its cause. Of rules that trip together the one",
+        "A rule trips when `needed` of the last `window` ticks show its cause. Ticks without the value that a rule judges",
+        "do not count, neither for it nor against it. Of rules that trip together the one",
         "that enters deepest wins; the first cause of a fault is the one that is told. Everything below `hold_flow`",
         "latches: the state is `fault` until a person acknowledges it, or until the cause has stayed away for",
         "`resume.wait_s`, the rule's name is in `resume.faults`, and the day's `resume.most_per_day` is not used up.",
@@ -53,7 +54,7 @@ def faults_page() -> str:
         "|---|---|---|",
     ]
     after = {
-        Rung.HOLD_FLOW: "`states.hold_flow_max_s`",
+        Rung.HOLD_FLOW: "`states.hold_flow_max_s`; what is used of it comes back at the same pace",
         Rung.RAMP_DOWN: "`states.ramp_down_s`",
         Rung.PUMP_OFF: "`states.pump_off_max_s`",
     }

@@ -84,7 +84,11 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """One row of the table. `limit` and `remedy` are for people; `broken` decides."""
+    """One row of the table. `limit` and `remedy` are for people; `broken` decides.
+
+    A tick in which `unseen` is true shows nothing of the cause, neither way, and is left out of the window: a sensor
+    that is only there now and then, over its limit each time, must not be forgiven for the ticks between.
+    """
 
     code: int
     name: str
@@ -97,6 +101,7 @@ class Rule:
     states: Collection[State]
     remedy: str
     broken: Callable[[Observation, LimitsConfig], bool]
+    unseen: Callable[[Observation], bool] = lambda o: False
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +132,7 @@ TABLE: tuple[Rule, ...] = (
         ALWAYS,
         "find what over-filled the mirror before it is inflated again",
         lambda o, c: o.gauge_pressure_pa > c.gauge_pressure_max_pa,
+        lambda o: math.isnan(o.gauge_pressure_pa),
     ),
     Rule(
         21,
@@ -139,6 +145,7 @@ TABLE: tuple[Rule, ...] = (
         ALWAYS,
         "check the laser against a ruler, then the setpoint and the limits",
         lambda o, c: o.displacement_um > c.displacement_max_um,
+        lambda o: math.isnan(o.displacement_um),
     ),
     Rule(
         50,
@@ -306,6 +313,7 @@ TABLE: tuple[Rule, ...] = (
         MOVING,
         "check the pressure sensor: without it over-pressure is not seen",
         lambda o, c: not math.isfinite(o.gauge_pressure_pa) and o.reading_age_s == 0,
+        lambda o: o.reading_age_s > 0,
     ),
     Rule(
         22,
@@ -318,6 +326,7 @@ TABLE: tuple[Rule, ...] = (
         HOLDING,
         "look for a leak or a laser that was moved",
         lambda o, c: o.displacement_um < c.displacement_min_um,
+        lambda o: math.isnan(o.displacement_um),
     ),
     Rule(
         23,
@@ -331,6 +340,7 @@ TABLE: tuple[Rule, ...] = (
         HOLDING,
         "look for a leak, a stuck pump or a mirror that is too tight",
         lambda o, c: abs(o.error_um) > c.following_error_max_um,
+        lambda o: math.isnan(o.error_um),
     ),
     Rule(
         25,
@@ -375,7 +385,7 @@ TABLE: tuple[Rule, ...] = (
 
 
 class SafetyTable:
-    """Judges observations by the table; remembers only the last M ticks of each rule."""
+    """Judges observations by the table; remembers only the last M ticks that showed something of each rule."""
 
     def __init__(self, limits: LimitsConfig, table: tuple[Rule, ...] = TABLE) -> None:
         self._limits = limits
@@ -395,6 +405,8 @@ class SafetyTable:
             broken = rule.broken(observation, self._limits)
             if not broken and not self._history[index]:
                 continue  # nearly always
+            if rule.unseen(observation):
+                continue
             history = ((self._history[index] << 1) | broken) & ((1 << rule.window) - 1)
             self._history[index] = history
             if history.bit_count() >= rule.needed and (tripped is None or rule.rung > tripped.rung):

@@ -120,3 +120,23 @@ def test_what_the_operator_is_told_carries_the_value() -> None:
     table = SafetyTable(LIMITS)
     table.judge(State.HOLD, BAD["over_pressure"])
     assert table.judge(State.HOLD, BAD["over_pressure"]).seen == "750.1 Pa"
+
+
+UNSEEN = {
+    "over_pressure": replace(GOOD, gauge_pressure_pa=math.nan),
+    "over_displacement": replace(GOOD, displacement_um=math.nan, displacement_valid=False),
+    "under_displacement": replace(GOOD, displacement_um=math.nan, displacement_valid=False),
+    "following_error": replace(GOOD, error_um=math.nan),
+    "pressure_missing": replace(GOOD, gauge_pressure_pa=math.nan, reading_age_s=0.02),
+}
+
+
+@pytest.mark.parametrize("name", UNSEEN)
+def test_ticks_that_show_nothing_are_left_out_of_the_window(name: str) -> None:
+    rule = next(rule for rule in TABLE if rule.name == name)
+    table = judge_alone(rule)
+    for _ in range(rule.needed - 1):
+        assert table.judge(State.HOLD, BAD[name]).rule is None
+        for _ in range(rule.window):
+            assert table.judge(State.HOLD, UNSEEN[name]).rule is None
+    assert table.judge(State.HOLD, BAD[name]).rule is rule

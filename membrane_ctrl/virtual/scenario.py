@@ -7,6 +7,7 @@ scenario = "calm"
 time_s = 25.0
 wrong = "no_light"
 for_s = 10.0             # for ever when left out
+every_s = 15.0           # again and again with this period, to the end; once when left out
 
 [[at]]                   # something happens to the mirror: an event of `twin.events`
 time_s = 40.0
@@ -70,6 +71,7 @@ class At(Section):
     time_s: Annotated[float, Field(ge=0)]
     wrong: str | None = None
     for_s: Annotated[float, Field(gt=0)] | None = None
+    every_s: Annotated[float, Field(ge=1e-3)] | None = None
     event: Happening | None = None
     over_s: Annotated[float, Field(ge=0)] = 0.0
     command: str | None = None
@@ -82,6 +84,8 @@ class At(Section):
             raise ValueError("give exactly one of wrong, event and command")
         if self.wrong is not None and self.wrong not in _SWITCHES:
             raise ValueError(f"wrong = {self.wrong!r} is unknown; known are {', '.join(_SWITCHES)}")
+        if self.every_s is not None and (self.wrong is None or self.for_s is None or self.for_s >= self.every_s):
+            raise ValueError("every_s goes with wrong and with a for_s shorter than it")
         if self.command is not None and self.command not in get_args(Kind):
             raise ValueError(f"command = {self.command!r} is unknown; known are {', '.join(get_args(Kind))}")
         return self
@@ -166,7 +170,7 @@ def play(scenario: Scenario) -> Outcome:
     shape = TruthShape(bench, config, config.twin.seed) if scenario.shapes else None
     run = VirtualRun(config, bench, zernike_projection(), shape)
     wish = Command("hold", "scenario")
-    agenda = [(0.0, wish), *_agenda(steps), (scenario.duration_s, Command("stop", "duration"))]
+    agenda = [(0.0, wish), *_agenda(steps, scenario.duration_s), (scenario.duration_s, Command("stop", "duration"))]
     agenda.sort(key=lambda entry: entry[0])
     ticks: list[VirtualTick] = []
     while run.finished is None and run.now_s < scenario.duration_s + 60.0:
@@ -208,16 +212,18 @@ def complaints(expect: Expectation, outcome: Outcome) -> Iterator[str]:
 Due = Command | Callable[[VirtualBench], None]
 
 
-def _agenda(steps: list[At]) -> Iterator[tuple[float, Due]]:
+def _agenda(steps: list[At], end_s: float) -> Iterator[tuple[float, Due]]:
     """What is to be done when; a switch goes back by itself when its time is over."""
     for at in steps:
         if at.command is not None:
             command = Command(at.command, "scenario", value=at.value, text=at.text)  # type: ignore[arg-type]  # checked
             yield at.time_s, command
         elif at.wrong is not None:
-            yield at.time_s, _switch(at.wrong, at.value)
-            if at.for_s is not None:
-                yield at.time_s + at.for_s, _switch(at.wrong, _SWITCHES[at.wrong])
+            times = 1 if at.every_s is None else max(1, math.ceil((end_s - at.time_s) / at.every_s))
+            for begin_s in (at.time_s + k * (at.every_s or 0.0) for k in range(times)):
+                yield begin_s, _switch(at.wrong, at.value)
+                if at.for_s is not None:
+                    yield begin_s + at.for_s, _switch(at.wrong, _SWITCHES[at.wrong])
         elif at.event == "power_cycle":
             yield at.time_s, VirtualBench.power_cycle
 
