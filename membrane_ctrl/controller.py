@@ -224,14 +224,18 @@ class Controller:
         scene, fault = self._scene, self.fault
         scene.may_resume = scene.resume_possible = False
         if self.state != State.FAULT or fault is None:
+            self._resume.due(False, scene.now_s)  # what was waited in an earlier fault does not count in the next
             return
         scene.resume_possible = self._resume.possible(fault, scene.ladder.rung, scene.now_s)
-        if scene.resume_possible and observation.link_up and observation.reading_age_s == 0.0:
-            own = observation.board_faults != 0  # the board latched when the controller was lost to it
-            scene.may_resume = self._resume.due(
-                not own and not fault.broken(observation, self._config.limits), scene.now_s
-            )
-            self._clear_board |= own
+        if not scene.resume_possible:
+            return
+        limits = self._config.limits
+        own = observation.board_faults != 0  # the board latched when the controller was lost to it
+        silent = not observation.link_up or observation.reading_age_s > limits.stale_s
+        gone = not (silent or own or fault.broken(observation, limits))
+        if observation.reading_age_s == 0.0 or not gone:  # an answer that is lost now and then says nothing
+            scene.may_resume = self._resume.due(gone, scene.now_s)
+        self._clear_board |= own
 
     def _apply(self, verdict: Verdict, events: list[Event]) -> None:
         """Put the verdict on the ladder; whatever goes below HOLD_FLOW latches as the run's fault."""

@@ -38,7 +38,7 @@ def test_gain_change_is_bumpless(before: PidGains, after: PidGains, mean: float,
 
 def test_integral_action_has_its_time() -> None:
     """After Ti the integral of a steady error has repeated the proportional term."""
-    pid = Pid(PidGains(0.5, 4.0, 0.0), V_MAX)
+    pid = Pid(PidGains(0.5, 4.0, 0.7), V_MAX)
     pid.place(1.0)
     for _ in range(200):
         pid.terms(1.0, 0.0)
@@ -69,3 +69,22 @@ def test_back_calculation_settles_at_the_limit() -> None:
         pid.terms(2.0, 0.0)
         pid.integrate(0.02)
     assert pid.integral_um_per_s == pytest.approx(V_MAX)
+
+
+@pytest.mark.parametrize(("error_um", "limit_um_per_s"), [(10.0, V_MAX), (-10.0, 0.0)])
+def test_back_calculation_goes_to_the_limit_with_the_integral_time(error_um: float, limit_um_per_s: float) -> None:
+    """Beyond the range dI/dt = (limit - I) / Ti, however large the error: v - u takes away K e."""
+    pid = Pid(PidGains(0.61, 6.5, 0.0), V_MAX)
+    pid.place(2.0)
+    pid.terms(error_um, 0.0)
+    pid.integrate(0.02)
+    assert pid.integral_um_per_s == pytest.approx(2.0 + (limit_um_per_s - 2.0) * 0.02 / 6.5)
+
+
+def test_what_is_placed_is_the_whole_output_until_the_next_error() -> None:
+    """An error of before, of another state, must not come back by way of a change of gains."""
+    pid = Pid(PidGains(0.5, 4.0, 0.5), V_MAX)
+    pid.terms(3.0, 1.0)
+    pid.place(1.0)
+    pid.set_gains(PidGains(1.5, 4.0, 0.0))
+    assert pid.integral_um_per_s == 1.0
