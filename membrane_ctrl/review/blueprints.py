@@ -96,7 +96,7 @@ class ReviewBlueprint:
                 self._plot("Air temperature, C", "/overview/temperature"),
             ),
             rrb.Horizontal(self._log("Found by machine", "/found"), self._log("Events", "/events")),
-            row_shares=[4, 2, 2, 2],
+            row_shares=[3.6, 2.7, 1.9, 1.8],
             name="overview",
         )
 
@@ -158,4 +158,4 @@ class ReviewBlueprint:
 def _map_name(run: str, most_um: float) -> str:
     """The viewer draws no colour scale, so the name says it."""
     scale = f", um: blue {-most_um:.2g}, green 0, red {most_um:+.2g}" if most_um == most_um else ""
-    return f"{run} height since the hold's first cycle{scale}".strip()
+    return f"{run} Height since the hold's first cycle{scale}".strip()
