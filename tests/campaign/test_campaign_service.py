@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from collections.abc import Iterator
 
@@ -13,8 +14,8 @@ pytestmark = [pytest.mark.campaign, pytest.mark.timeout(300)]
 
 RUNS = "/var/lib/membrane-ctrl/logs"
 LATCHED = f"{RUNS}/latched-fault.json"
-CTL = "cd /var/lib/membrane-ctrl && PYTHONPATH=/opt/source LD_LIBRARY_PATH=/opt/python/lib setpriv --reuid membrane "
-CTL += "--regid membrane --init-groups /opt/membrane-ctrl/.venv/bin/membrane-ctrl ctl"
+PLACES = "PYTHONPATH=/opt/source LD_LIBRARY_PATH=/opt/python/lib"
+SOCKET = f"--socket {RUNS}/control.sock"
 # Apprise need not be installed here: what it would be told goes into a file
 APPRISE = """
 class _Target:
@@ -45,6 +46,13 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Room]:
 
 def runs(room: Room) -> list[str]:
     return room.run(f"ls -d {RUNS}/2*").splitlines()
+
+
+def ctl(room: Room, who: str, words: str) -> str:
+    """What a person of the lab is told."""
+    program = "/opt/membrane-ctrl/.venv/bin/membrane-ctrl"
+    as_who = f"setpriv --reuid {who} --regid {who} --init-groups"
+    return room.run(f"cd /; {PLACES} {as_who} {program} ctl {words} {SOCKET} 2>&1 || true")
 
 
 def told(room: Room) -> str:
@@ -161,11 +169,41 @@ def test_in_standby_it_runs_with_a_latched_fault_and_holds_only_after_a_person_a
     try:
         room.start()
         assert room.show("ActiveState")["ActiveState"] == "active"
-        assert "latched" in room.run(f"{CTL} hold 2>&1 || true")
-        room.run(f"{CTL} ack --why 'seen' && {CTL} hold")
+        assert "latched" in ctl(room, "membrane", "hold")
+        assert "done" in ctl(room, "membrane", "ack --why seen")
+        assert "done" in ctl(room, "membrane", "hold")
         room.until(lambda: room.status_has("inflate"))
     finally:
         room.run(f"cp /opt/source/examples/membrane-ctrl.service {unit}; systemctl daemon-reload")
+
+
+def test_a_member_of_the_group_operates_and_a_stranger_does_not_come_near(room: Room) -> None:
+    room.fresh()
+    room.run("for who in ann eve; do adduser --quiet --disabled-password --gecos '' $who; done")
+    room.run("adduser --quiet ann membrane")
+    room.start()
+    assert "commander" in ctl(room, "ann", "status")
+    assert "gains takes the role tune" in ctl(room, "ann", "gains 'kp_per_s = 0.5'")
+    assert "permission denied" in ctl(room, "eve", "status")
+    assert "permission denied" in ctl(room, "eve", "stop")
+    assert "stop: done" in ctl(room, "ann", "stop")
+    room.until(lambda: room.settled("inactive"))
+
+
+@pytest.mark.skipif(not all(map(shutil.which, ("Xvfb", "xauth", "xhost", "xdpyinfo"))), reason="needs an X server")
+def test_the_service_reaches_a_desktops_display_once_it_may(room: Room) -> None:
+    unit = "/opt/source/examples/membrane-ctrl.service"
+    edits = "-e 's,^ExecStart=.*,ExecStart=/usr/bin/xdpyinfo -display :7,' -e '/^ExecStopPost/d' -e '/^Restart/d'"
+    room.run(f"sed {edits} -e 's/Type=notify/Type=oneshot/' {unit} > /run/units/display.service")
+    room.run("xauth -f /run/cookie add :7 . 0123456789abcdef0123456789abcdef")
+    xvfb = "/usr/bin/Xvfb :7 -noreset -nolisten local -auth /run/cookie"
+    room.run(f"printf '[Service]\\nExecStart={xvfb}\\n' > /run/units/x.service; systemctl daemon-reload")
+    room.run("systemctl start x; until [ -e /tmp/.X11-unix/X7 ]; do sleep 0.1; done")
+    try:
+        room.run("! systemctl start display")
+        room.run("XAUTHORITY=/run/cookie DISPLAY=:7 xhost +si:localuser:membrane; systemctl start display")
+    finally:
+        room.run("systemctl stop x")
 
 
 def test_what_dies_again_and_again_is_given_up_in_a_safe_state(room: Room) -> None:
