@@ -49,6 +49,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: is a folder, a TOML file is needed") from None
     except PermissionError:
         raise InputError(f"{path}: no permission to read it") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({(error.strerror or str(error)).lower()})") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not valid TOML: {error}") from None
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from membrane_ctrl.recording import plain_json
+from membrane_ctrl.recording.checked_text import dumps_checked
 
 Event = dict[str, Any]
 
@@ -54,7 +54,7 @@ class EventsFile:
     def append(self, events: Sequence[Event]) -> None:
         """Write events, and those still waiting from before. Raises OSError (full disk)."""
         for event in events:
-            line = plain_json.dumps(event).encode() + b"\n"
+            line = dumps_checked(event).encode() + b"\n"
             if line in self._written:
                 continue
             self._waiting.append(line)

@@ -12,8 +12,9 @@ from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.ipc.ring import RingReader
-from membrane_ctrl.recording import events, plain_json
+from membrane_ctrl.recording import events
 from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.recording.checked_text import dumps_checked
 from membrane_ctrl.recording.column_tables import ColumnTables
 from membrane_ctrl.recording.complaints import Complaints, Report
 from membrane_ctrl.recording.events import Event, EventsFile
@@ -184,7 +185,7 @@ class Recorder:
             # without what the former recorder knew, the statistics begin with what the ring still had
             "partial": self._began_anew and self._feeds["telemetry"].dropped > 0,
         }
-        text = plain_json.dumps(self._summary.as_dict(self._dropped(), account), indent=2) + "\n"
+        text = dumps_checked(self._summary.as_dict(self._dropped(), account), indent=2) + "\n"
         guarded("summary.json", lambda: write_text_atomic(self._run_dir / "summary.json", text))
         self._events_file.close()
         self._inputs_file.close()

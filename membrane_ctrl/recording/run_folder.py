@@ -11,6 +11,7 @@ from membrane_ctrl import config_file
 from membrane_ctrl.config import Config
 from membrane_ctrl.errors import DeviceError, InputError
 from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.recording.checked_text import with_comment
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -51,7 +52,7 @@ def create_run_folder(logs_dir: Path, name: str, started_utc: datetime, config: 
     except OSError as error:
         raise _unwritable(logs_dir, error) from None
     try:
-        write_text_atomic(run_dir / "config.toml", config_file.dump(config))
+        write_text_atomic(run_dir / "config.toml", with_comment(config_file.dump(config)))
     except OSError as error:
         shutil.rmtree(run_dir, ignore_errors=True)
         raise _unwritable(run_dir, error) from None

@@ -9,6 +9,7 @@ from typing import Any
 from membrane_ctrl.config import Config
 from membrane_ctrl.config_file import parse, read_toml
 from membrane_ctrl.errors import InputError
+from membrane_ctrl.recording.checked_text import comment_is_right, take_checksum
 from membrane_ctrl.recording.column_file import FOLDER
 from membrane_ctrl.review.annotations import ANNOTATIONS_FILE, MARK
 
@@ -45,7 +46,7 @@ def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
     """`summary.json`; None with a note if it is missing or broken."""
     path = folder / "summary.json"
     try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
+        summary: Any = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         notes.append("summary.json: missing; the run is still going, or its recorder was killed")
         return None
@@ -55,12 +56,16 @@ def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
     if not isinstance(summary, dict) or summary.get("schema") != _SUMMARY_SCHEMA:
         notes.append(f"summary.json: not of schema {_SUMMARY_SCHEMA}; its figures are not used")
         return {} if not isinstance(summary, dict) else summary
+    if not take_checksum(summary):
+        notes.append("summary.json: does not fit its checksum (damaged or edited); it is not used")
+        return None
     return summary
 
 
 def read_config(folder: Path, notes: list[str]) -> Config:
     """`config.toml`; tables that this version does not understand are at their defaults, with a note."""
     path = folder / "config.toml"
+    notes += _config_damage(path)
     try:
         tables = read_toml(path)
         return parse(tables, Config, "config.toml")
@@ -79,24 +84,43 @@ def read_config(folder: Path, notes: list[str]) -> Config:
         except InputError:
             continue
         known[name] = table
-    return parse(known, Config, "config.toml")
+    try:
+        return parse(known, Config, "config.toml")
+    except InputError:  # tables that do not go together
+        return Config()
+
+
+def _config_damage(path: Path) -> list[str]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, ValueError):  # said by who reads it
+        return []
+    if not text:
+        return ["config.toml: empty; everything is taken at its default"]
+    right = comment_is_right(text)
+    return [] if right else ["config.toml: does not fit its checksum (damaged or edited); its values are doubtful"]
 
 
 def _json_lines(path: Path, notes: list[str]) -> list[dict[str, Any]]:
-    if not path.exists():
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        notes.append(f"{path.name}: cannot be read ({error.strerror})")
         return []
     found, broken = [], 0
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in text.splitlines():
         try:
             event = json.loads(line)
         except ValueError:
             event = None
-        if isinstance(event, dict):
+        if isinstance(event, dict) and take_checksum(event):
             found.append(_mark(event))
         else:
             broken += 1
     if broken:
-        notes.append(f"{path.name}: {broken} line{'s' * (broken > 1)} cannot be read")
+        notes.append(f"{path.name}: {broken} line{'s' * (broken > 1)} cannot be read, or not trusted: left out")
     return found
 
 

@@ -31,6 +31,8 @@ Block = dict[str, Column]
 _SAME_TICK_S = 1e-6
 # From the last tick to the end of a run, and what of a killed one is in the segments only.
 _WAY_DOWN_S = 60.0
+# A batch of a level spans minutes; in shorter gaps there was nothing to record.
+_HOLE_S = 30.0
 _FILES_MAX = 100_000  # ten years of hours
 TABLES = (TICKS, *(level_table(window_s) for window_s in WINDOWS_S), SHAPES)
 _STAND_IN = "Rerun segments stand in for ticks that the tables lack: without every tick, and without checksums"
@@ -93,8 +95,12 @@ class Run:
         for block in self._table_blocks(TICKS, "mono_s", wanted, start_s, end_s):
             last_s = float(block["mono_s"][-1])
             yield block
-        if last_s < end_s and not self._reaches_end(last_s):
-            yield from self._segment_blocks(wanted, max(start_s, last_s + _SAME_TICK_S), end_s)
+        if last_s >= end_s or self._reaches_end(last_s):
+            return
+        for block in self._segment_blocks(wanted, max(start_s, last_s + _SAME_TICK_S), end_s):
+            if block["mono_s"][-1] - last_s > _WAY_DOWN_S:
+                add_note(self.notes, _STAND_IN)
+            yield block
 
     def _reaches_end(self, until_s: float) -> bool:
         """Whether a table that ends there has all that there was: a run without a summary may have more."""
@@ -107,15 +113,10 @@ class Run:
         """Telemetry of the Rerun segments."""
         paths = rrd_reader.segments(self.folder)
         first = self._segment_at(paths, start_s) if np.isfinite(start_s) else 0
-        begun_s = np.inf
         for path in paths[first:]:
             block = _cut(rrd_reader.read_ticks(path, names, self.notes), "mono_s", start_s, end_s)
-            if not block["mono_s"].size:
-                continue
-            begun_s = min(begun_s, float(block["mono_s"][0]))
-            if block["mono_s"][-1] - begun_s > _WAY_DOWN_S:
-                add_note(self.notes, _STAND_IN)
-            yield block
+            if block["mono_s"].size:
+                yield block
 
     def _segment_at(self, paths: Sequence[Path], time_s: float) -> int:
         """Number of the last segment that begins before a time."""
@@ -137,20 +138,28 @@ class Run:
         What is not in the table of the level is made from the next finer one, in the end from the ticks.
         """
         names = tuple(dict.fromkeys(("time_s", "rows", *names)))
-        finer = {coarse: fine for fine, coarse in pairwise(WINDOWS_S)}
         if window_s not in WINDOWS_S:
             raise ValueError(f"levels are {', '.join(f'{w:g}' for w in WINDOWS_S)} s, not {window_s:g}")
-        table = level_table(window_s)
-        blocks = list(self._table_blocks(table, "time_s", names, start_s, end_s))
-        until_s = float(blocks[-1]["time_s"][-1]) + window_s if blocks else start_s
-        if not blocks or not self._reaches_end(until_s):
-            if window_s in finer:
-                blocks.append(coarser_level(self.level(finer[window_s], until_s, end_s, names), window_s))
-            else:
-                blocks += [first_level(block) for block in self.tick_blocks(TICK_FIELDS, until_s, end_s)]
+        blocks = list(self._table_blocks(level_table(window_s), "time_s", names, start_s, end_s))
+        time_s = np.concatenate([block["time_s"] for block in blocks] or [np.empty(0)])
+        missing = _holes(time_s, window_s, start_s)
+        until_s = float(time_s[-1]) + window_s if time_s.size else start_s
+        if not time_s.size or not self._reaches_end(until_s):
+            missing.append((until_s, end_s))
+        for hole in missing:
+            blocks += self._made_level(window_s, *hole, names)
         if not blocks:
             return {name: np.empty(0) for name in names}
-        return {name: np.concatenate([block[name] for block in blocks]) for name in names}
+        level = {name: np.concatenate([block[name] for block in blocks]) for name in names}
+        order = np.argsort(level["time_s"], kind="stable") if missing else slice(None)
+        return {name: values[order] for name, values in level.items()}
+
+    def _made_level(self, window_s: float, start_s: float, end_s: float, names: Sequence[str]) -> list[Block]:
+        """A part of a level, from the next finer one or from the ticks."""
+        finer = {coarse: fine for fine, coarse in pairwise(WINDOWS_S)}
+        if window_s in finer:
+            return [coarser_level(self.level(finer[window_s], start_s, end_s, names), window_s)]
+        return [first_level(block) for block in self.tick_blocks(TICK_FIELDS, start_s, end_s)]
 
     def shapes(self) -> Shapes:
         """Every measured figure of the run."""
@@ -215,6 +224,8 @@ def open_run(path: Path | str) -> Run:
     notes: list[str] = []
     events = read_events(folder, notes)
     summary = read_summary(folder, notes)
+    if summary and summary.get("exit") and not any(event.get("kind") == "end" for event in events):
+        notes.append("events.jsonl: lines are missing, the last one at least: the run has ended, and no line says so")
     notes += _missing(folder, summary)
     return Run(folder, read_config(folder, notes), events, summary, origin_of(folder, events), notes)
 
@@ -256,6 +267,17 @@ def origin_of(folder: Path, events: Sequence[dict[str, Any]]) -> datetime:
         return datetime.strptime(folder.name[:16], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
     except ValueError:
         return datetime.fromtimestamp(folder.stat().st_mtime, UTC)
+
+
+def _holes(time_s: Column, window_s: float, start_s: float) -> list[tuple[float, float]]:
+    """Parts that a level's windows leave out, in front of them and between them: batches that were damaged."""
+    if not time_s.size:
+        return []
+    least_s = window_s + _HOLE_S
+    ends = np.flatnonzero(np.diff(time_s) > least_s)
+    holes = [(float(time_s[row]) + window_s, float(time_s[row + 1])) for row in ends]
+    begins = [(start_s, float(time_s[0]))] if time_s[0] - max(start_s, 0.0) > least_s else []
+    return begins + holes
 
 
 def _with_time(names: Sequence[str]) -> tuple[str, ...]:

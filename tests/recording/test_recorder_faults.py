@@ -19,6 +19,7 @@ from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config, RecordingConfig
 from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
 from membrane_ctrl.recording import recorder as recorder_module
+from membrane_ctrl.recording.checked_text import dumps_checked
 from membrane_ctrl.recording.recorder import Recorder
 from membrane_ctrl.recording.rerun_output import RETRY_S
 from membrane_ctrl.recording.sink import Recording, RecordingError
@@ -204,7 +205,8 @@ def test_events_that_cannot_be_written_are_reported_and_come_later(
     monkeypatch.setattr(recorder_module.events.os, "open", real_open)
     bench.second(1)
     bench.recorder.finish()
-    assert (bench.run_dir / "events.jsonl").read_text() == '{"kind": "fault", "mono_s": 0.5}\n'
+    text = (bench.run_dir / "events.jsonl").read_text()
+    assert text == dumps_checked({"kind": "fault", "mono_s": 0.5}) + "\n"
 
 
 def test_a_disk_that_runs_low_is_reported_once(tmp_path: Path) -> None:

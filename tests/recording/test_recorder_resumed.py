@@ -17,6 +17,7 @@ from synthetic_run import STARTED_UTC, rows_of, shape_of
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config, RecordingConfig
 from membrane_ctrl.ipc.ring import RingAddress, RingReader, RingWriter, ring
+from membrane_ctrl.recording.checked_text import dumps_checked
 from membrane_ctrl.recording.events import EventsFile
 from membrane_ctrl.recording.optimizer import Optimizer
 from membrane_ctrl.recording.read_back import read_rows
@@ -146,11 +147,12 @@ def test_without_what_the_first_knew_the_statistics_begin_with_what_the_ring_has
 
 def test_half_a_line_of_the_event_log_is_written_again_whole(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
-    path.write_bytes(b'{"kind": "a"}\n{"kind": "b"}\n{"ki')
+    lines = [dumps_checked({"kind": kind}).encode() + b"\n" for kind in "abc"]
+    path.write_bytes(lines[0] + lines[1] + lines[2][:5])
     file = EventsFile(path, resumed=True)
     file.append([{"kind": "b"}, {"kind": "c"}])
     file.close()
-    assert path.read_bytes() == b'{"kind": "a"}\n{"kind": "b"}\n{"kind": "c"}\n'
+    assert path.read_bytes() == b"".join(lines)
 
 
 def test_a_fault_does_not_wait_for_its_second(tmp_path: Path, stack: ExitStack) -> None:
