@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import time
+from functools import partial
 from pathlib import Path
 
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import RecordingConfig
 from membrane_ctrl.recording.complaints import Complaints
 from membrane_ctrl.recording.optimizer import Optimizer
-from membrane_ctrl.recording.retention import deletable_runs, delete_run, expired, size_bytes
+from membrane_ctrl.recording.retention import OldRun, deletable_runs, delete_remains, delete_run, expired, size_bytes
 from membrane_ctrl.recording.run_folder import free_mb
 from membrane_ctrl.recording.sink import LAYOUT
 from membrane_ctrl.recording.thrift import Thrift, thrift
@@ -80,10 +81,15 @@ class Housekeeping:
             return
         # the run's own axis: a wall clock that is set wrong meanwhile deletes nothing
         now_utc = self._clock.utc(self._clock.now())
+        delete_remains(self._run_dir.parent)
         runs = deletable_runs(self._run_dir.parent, self._run_dir, now_utc)
         for run, why in expired(runs, size_bytes(self._run_dir), config.keep_gb, config.keep_days, now_utc):
-            delete_run(run)
-            self._complaints.report({"kind": "run_deleted", "run": run.folder.name, "message": why})
+            # one by one: a folder that cannot go must not keep the others
+            self._complaints.guarded(f"retention: {run.folder.name}", partial(self._delete, run, why))
+
+    def _delete(self, run: OldRun, why: str) -> None:
+        delete_run(run)
+        self._complaints.report({"kind": "run_deleted", "run": run.folder.name, "message": why})
 
     def close(self) -> None:
         """End what is under way."""

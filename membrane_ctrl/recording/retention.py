@@ -10,6 +10,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 _RUN = re.compile(r"(\d{8}T\d{6}Z)-.+")
+_DOOMED = ".deleted-"
 _KEEP = ".keep"
 # A clock that is wrong by years must not take every run with it.
 _NEVER_TOO_OLD = 3
@@ -38,7 +39,10 @@ def deletable_runs(logs_dir: Path, present: Path, now_utc: datetime) -> list[Old
             continue
         if (folder / _KEEP).exists() or _may_run(folder, now_utc):
             continue
-        started = datetime.strptime(match[1], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+        try:
+            started = datetime.strptime(match[1], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+        except ValueError:  # digits, but no time
+            continue
         found.append(OldRun(folder, started, size_bytes(folder)))
     return found
 
@@ -57,7 +61,10 @@ def size_bytes(folder: Path) -> int:
 def _may_run(folder: Path, now_utc: datetime) -> bool:
     if (folder / "summary.json").exists():
         return False
-    newest_s = max(path.lstat().st_mtime for path in folder.iterdir())
+    try:
+        newest_s = max(path.lstat().st_mtime for path in folder.iterdir())
+    except OSError:  # something goes away while we look: somebody is at work there
+        return True
     return now_utc - datetime.fromtimestamp(newest_s, UTC) < _ABANDONED_AFTER
 
 
@@ -92,6 +99,12 @@ def expired(
 
 def delete_run(run: OldRun) -> None:
     """Delete a run; renamed first, so that what a crash leaves of it is no run. Raises OSError."""
-    doomed = run.folder.with_name(f".deleted-{run.folder.name}")
+    doomed = run.folder.with_name(f"{_DOOMED}{run.folder.name}")
     run.folder.rename(doomed)
     shutil.rmtree(doomed)
+
+
+def delete_remains(logs_dir: Path) -> None:
+    """Delete what a crash in `delete_run` has left; what does not go now goes another time."""
+    for doomed in logs_dir.glob(f"{_DOOMED}*"):
+        shutil.rmtree(doomed, ignore_errors=True)

@@ -118,3 +118,31 @@ def test_the_recorder_deletes_old_runs_at_its_start_and_each_hour_and_says_which
     assert reports[2]["run"] == "20260901T110000Z-brought"
     assert present.exists()
     keeping.close()
+
+
+def test_one_run_that_cannot_go_keeps_no_other_and_remains_of_a_crash_go_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    present = make_run(tmp_path, "20261121T120000Z-now", summary=False)
+    for day in range(1, 6):
+        make_run(tmp_path, f"202610{day:02d}T110000Z-old")
+    make_run(tmp_path, "20261399T999999Z-no-time")
+    make_run(tmp_path, ".deleted-20260901T110000Z-half")
+    rename = Path.rename
+
+    def guarded(path: Path, target: Path) -> Path:
+        if path.name.startswith("20261001"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", guarded)
+    reports: list[dict[str, object]] = []
+    config = RecordingConfig(keep_days=30.0, min_free_mb=1.0)
+    keeping = Housekeeping(present, HandClock(0.0, NOW), config, Complaints(reports.append))
+    keeping.look(0.0, [])
+    keeping.close()
+    assert [report["kind"] for report in reports] == ["recorder_error", "run_deleted"]
+    assert "Permission denied" in str(reports[0]["message"])
+    assert reports[1]["run"] == "20261002T110000Z-old"
+    assert not list(tmp_path.glob(".deleted-*"))
+    assert (tmp_path / "20261399T999999Z-no-time").exists()
