@@ -18,6 +18,7 @@ from membrane_ctrl.errors import Exit, InputError
 from membrane_ctrl.recording import events as event_lines
 from membrane_ctrl.recording import plain_json
 from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.recording.checked_text import take_checksum
 from membrane_ctrl.recording.column_tables import TICKS
 from membrane_ctrl.recording.inputs_file import InputsReader
 from membrane_ctrl.recording.optimizer import optimize_command, quiet_environment
@@ -26,10 +27,10 @@ from membrane_ctrl.recording.rows import COLUMN, Rows, column
 from membrane_ctrl.recording.sink import is_whole
 from membrane_ctrl.recording.summary import Summary
 from membrane_ctrl.review.column_reader import column_files
+from membrane_ctrl.review.rrd_reader import REPAIRED
 from membrane_ctrl.review.run import open_run
 from membrane_ctrl.telemetry import FIELDS
 
-FOLDER = "repaired"
 # A recorder writes each second: what has changed since is a run that is still going on.
 _STILL_RUNNING_S = 5.0
 _SEGMENT_TIMEOUT_S = 3600.0
@@ -59,8 +60,8 @@ def repair_command(run_dir: Path, in_place: bool, as_json: bool) -> int:
     else:
         for finding in findings:
             print(f"{finding.file:28} {finding.state}{': ' if finding.action else ''}{finding.action}")
-    if not in_place and (run_dir / FOLDER).exists():
-        print(f"repaired files: {run_dir / FOLDER}; --in-place puts them in the originals' place", file=sys.stderr)
+    if not in_place and (run_dir / REPAIRED).exists():
+        print(f"repaired files: {run_dir / REPAIRED}; --in-place puts them in the originals' place", file=sys.stderr)
     return int(Exit.DONE)
 
 
@@ -108,7 +109,7 @@ def _now_s(folder: Path) -> float:
 def _target(path: Path, in_place: bool) -> Path:
     if in_place:
         return path
-    folder = path.parent / FOLDER
+    folder = path.parent / REPAIRED
     folder.mkdir(exist_ok=True)
     return folder / path.name
 
@@ -160,9 +161,10 @@ def _split_events(data: bytes) -> tuple[bytes, bytes]:
 
 def _is_event(line: bytes) -> bool:
     try:
-        return isinstance(json.loads(line), dict)
+        table = json.loads(line)
     except ValueError:
         return False
+    return isinstance(table, dict) and take_checksum(table)
 
 
 def _look_at_inputs(run_dir: Path) -> list[Finding]:
@@ -207,7 +209,9 @@ def rebuild_summary(run_dir: Path) -> dict[str, Any]:
             summary.add_shape(estimate)
     good, _ = _split_events(path.read_bytes()) if path.exists() else (b"", b"")
     for line in good.splitlines():
-        summary.add_event(event_lines.parse(line))
+        event = event_lines.parse(line)
+        take_checksum(event)
+        summary.add_event(event)
     table = summary.as_dict({}, {"segments": len(_segments(run_dir))})
     table["ticks"] = max(table["ticks"], ticks)
     return {**table, "exit": table["exit"] or "crashed", "rebuilt": True}
@@ -215,7 +219,7 @@ def rebuild_summary(run_dir: Path) -> dict[str, Any]:
 
 def _segments(run_dir: Path) -> Sequence[Path]:
     """Each segment once: the repaired one where there is one."""
-    repaired = run_dir / FOLDER
+    repaired = run_dir / REPAIRED
     paths = sorted(run_dir.glob("*.rrd"))
     return [repaired / path.name if (repaired / path.name).exists() else path for path in paths]
 

@@ -22,9 +22,11 @@ from membrane_ctrl.recording.streams import (
     STREAMS,
     ZERNIKE,
 )
+from membrane_ctrl.review.column_reader import add_note
 from membrane_ctrl.review.rrd_salvage import FAULTS, read_chunks, salvage
 
 Column = NDArray[np.float64]
+REPAIRED = "repaired"  # below the run: what `repair` made of damaged files
 _VALUES = "Scalars:scalars"
 _TIME = "run_time"
 
@@ -127,11 +129,16 @@ def _readable(path: Path, entities: set[str], notes: list[str]) -> list[Chunk]:
     except FAULTS as error:
         why = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {path}: ")[:120]
     try:
+        chunks = read_chunks(path.parent / REPAIRED / path.name, entities)
+    except FAULTS:
+        pass
+    else:
+        add_note(notes, f"{path.name}: damaged or cut short, read from its copy in {REPAIRED}/ ({why})")
+        return chunks
+    try:
         chunks, lost_bytes = salvage(path, entities)
     except OSError as error:
         why, chunks, lost_bytes = error.strerror or str(error), [], 0
     what = f"{lost_bytes / 1e3:.1f} kB of it are left out" if chunks else "nothing of it can be read"
-    note = f"{path.name}: damaged or cut short, {what} ({why})"
-    if note not in notes:
-        notes.append(note)
+    add_note(notes, f"{path.name}: damaged or cut short, {what} ({why})")
     return chunks

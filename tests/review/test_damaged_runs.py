@@ -217,6 +217,17 @@ def test_a_torn_segment_gives_its_whole_messages(tmp_path: Path, share: float) -
     assert _content(tmp_path) == before
 
 
+def test_a_repaired_copy_is_read_instead(tmp_path: Path) -> None:
+    rows, _ = night(4, 0.02, "typical", [])
+    path = segment(tmp_path, rows)
+    (tmp_path / "repaired").mkdir()
+    shutil.copy(path, tmp_path / "repaired")
+    path.write_bytes(path.read_bytes()[:100_000])
+    run = open_run(tmp_path)
+    assert run.ticks(["error_um"]).num_rows == len(rows)
+    assert any("read from its copy in repaired/" in note for note in run.notes)
+
+
 def test_an_event_and_a_figure_that_were_changed_are_not_believed(sound: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(sound, tmp_path / sound.name)
     for name, old, new in (("events.jsonl", '"settle"', '"sottle"'), ("summary.json", '"done"', '"dune"')):
