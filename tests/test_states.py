@@ -59,7 +59,7 @@ def test_the_ramp_down_is_a_straight_line() -> None:
 
 def test_a_pause_that_nobody_ends_ends_itself() -> None:
     outcome = played({"time_s": 20.0, "command": "pause"}, states={"pause_max_s": 15.0})
-    paused = [tick.row.mono_s for tick in outcome.ticks if 20.5 < tick.row.mono_s and tick.row.p_um_per_s == 0.0]
+    paused = [tick.row.mono_s for tick in outcome.ticks if tick.row.mono_s > 20.5 and tick.row.p_um_per_s == 0.0]
     assert 34.5 < max(second for second in paused if second < 50.0) < 35.5
 
 
@@ -79,7 +79,7 @@ def test_venting_without_a_gauge_goes_on() -> None:
 
 
 def test_a_stop_is_the_last_word() -> None:
-    """Until the pump is seen off the mirror is on its way down; a `lower` then must not make a standby of the stop."""
+    """Until the pump is seen off the mirror is on its way down; a `lower` then makes no standby of the stop."""
     outcome = played(
         {"time_s": 19.0, "wrong": "readback_fraction", "value": 0.5, "for_s": 2.5},
         {"time_s": 20.0, "command": "stop"},
