@@ -74,16 +74,14 @@ class ReviewBlueprint:
         return self._plot("Error: least, mean, greatest; red: found by machine, um", *paths, span=span)
 
     def _lanes(self) -> rrb.StateTimelineView:
-        paths = ("/state/controller", "/state/shape_loop", "/state/rung", "/state/fault")
+        several = len(self._prefixes) > 1  # there is room for two lanes of each
+        paths = ("/state/controller", "/state/fault", *(() if several else ("/state/shape_loop", "/state/rung")))
         return rrb.StateTimelineView(
             name="States", origin="/", contents=self._contents(paths), time_view=self._axis()
         )  # fmt: skip
 
     def _log(self, name: str, *paths: str) -> rrb.TextLogView:
-        columns = rrb.TextLogColumns(
-            timeline_columns=["run_time"],
-            text_log_columns=["entitypath", "loglevel", "body"] if len(self._prefixes) > 1 else ["loglevel", "body"],
-        )
+        columns = rrb.TextLogColumns(timeline_columns=["run_time"], text_log_columns=["loglevel", "body"])
         return rrb.TextLogView(name=name, origin="/", contents=self._contents(paths), columns=columns)
 
     def _overview(self) -> rrb.Vertical:
@@ -95,7 +93,7 @@ class ReviewBlueprint:
                 self._plot("Air pressure, Pa", "/overview/ambient"),
                 self._plot("Air temperature, C", "/overview/temperature"),
             ),
-            rrb.Horizontal(self._log("Found by machine", "/found"), self._log("Events", "/events")),
+            rrb.Horizontal(self._log("Found by machine, UTC", "/found"), self._log("Events, UTC", "/events")),
             row_shares=[3.6, 2.7, 1.9, 1.8],
             name="overview",
         )
@@ -136,7 +134,7 @@ class ReviewBlueprint:
                 self._plot("Ticks missed so far", "/overview/missed"),
                 self._plot("Gauge pressure, Pa", "/overview/gauge"),
             ),
-            rrb.Horizontal(self._log("Events", "/events"), self._log("Found by machine", "/found")),
+            rrb.Horizontal(self._log("Events, UTC", "/events"), self._log("Found by machine, UTC", "/found")),
             row_shares=[2.2, 3, 2, 2.8],
             name="faults",
         )

@@ -35,6 +35,7 @@ LEVEL_ROWS_MOST = 50_000
 SHAPES_MOST = 20_000
 MAPS_MOST = 40
 _MAP_PX = 96
+_RUN_COLOURS: tuple[Colour, ...] = (BLUE, ORANGE, GREEN, VIOLET, RED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +88,8 @@ class Layer:
         self._stream = rr.RecordingStream(APPLICATION, recording_id=name)
         self._stream.save(path)
         self._stream.send_recording_name(name)
-        self._prefix = ""
+        self._prefix = self._label = ""
+        self._number = -1
         self._shift_s = 0.0
         self._origin = np.datetime64(0, "ns")
 
@@ -119,6 +121,8 @@ class Layer:
             The scale of its maps: the greatest change of height in them, um; NaN when there are none.
         """
         self._prefix, self._shift_s = prefix, zero_s
+        self._label = f"{prefix.strip('/')} " if prefix else ""
+        self._number += 1
         self._origin = np.datetime64(run.origin_utc.replace(tzinfo=None), "ns")
         level_s = _level_for(run)
         level = run.level(level_s)
@@ -170,13 +174,20 @@ class Layer:
             levels = ["ERROR" if event.get("kind") == "fault" else "INFO" for event in told]
             texts = [f"mark: {e.get('text')}" if e.get("kind") == MARK else event_text(e) for e in told]
             times = np.array([event_time_s(event) for event in told])
-            self._columns("/events", times, rr.TextLog.columns(text=texts, level=levels))
+            self._log(run, "/events", times, texts, levels)
         if found:
             texts = [f"{f.kind}: {f.size:.3g} {f.unit} (confidence {f.confidence:.3f})" for f in found]
             times = np.array([f.time_s for f in found])
-            self._columns("/found", times, rr.TextLog.columns(text=texts, level=["WARN"] * len(found)))
+            self._log(run, "/found", times, texts, ["WARN"] * len(found))
             self._style("/found/marks", [("found by machine", RED)], points=True)
             self._scalars("/found/marks", times, np.zeros((len(found), 1)))
+
+    def _log(self, run: Run, path: str, time_s: Column, texts: list[str], levels: list[str]) -> None:
+        """Lines that begin with the time of the day, which is what people ask for."""
+        lines = [
+            f"{self._label}{run.utc(at_s):%H:%M:%S} {text}" for at_s, text in zip(time_s.tolist(), texts, strict=True)
+        ]
+        self._columns(path, time_s, rr.TextLog.columns(text=lines, level=levels))
 
     def _figure(self, shapes: Shapes) -> float:
         good = shapes.select((shapes.verdict != "rejected") & np.isfinite(shapes.coeffs_um).all(axis=1))
@@ -216,9 +227,10 @@ class Layer:
 
     def _style(self, path: str, lines: Iterable[tuple[str, Colour]], points: bool = False) -> None:
         names, colours = zip(*lines, strict=True)
-        label = f"{self._prefix.strip('/')} " if self._prefix else ""
         style = rr.SeriesPoints if points else rr.SeriesLines
-        archetype = style(names=[label + name for name in names], colors=list(colours))
+        if self._prefix:
+            colours = tuple(_of_run(colour, self._number) for colour in colours)
+        archetype = style(names=[self._label + name for name in names], colors=list(colours))
         self._stream.log(self._prefix + path, archetype, static=True)
 
     def _scalars(self, path: str, time_s: Column, values: Column) -> None:
@@ -236,6 +248,12 @@ class Layer:
     def _at(self, time_s: float) -> None:
         self._stream.set_time("run_time", duration=_nanoseconds(np.array([time_s - self._shift_s]))[0])
         self._stream.set_time("utc", timestamp=self._origin + _nanoseconds(np.array([time_s]))[0])
+
+
+def _of_run(colour: Colour, number: int) -> Colour:
+    """Runs that lie over each other differ by colour; what is grey in one alone is the dark shade."""
+    red, green, blue = _RUN_COLOURS[number % len(_RUN_COLOURS)]
+    return (red // 2, green // 2, blue // 2) if colour == GREY else (red, green, blue)
 
 
 def _nanoseconds(time_s: Column) -> NDArray[np.timedelta64]:

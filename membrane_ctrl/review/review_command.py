@@ -141,6 +141,8 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> None
     for run, prefix, zero_s in zip(runs, prefixes, zeros_s, strict=True):
         part_s = (-math.inf, math.inf) if shown is None else (shown[0] + zero_s, shown[1] + zero_s)
         maps_um.append(layer.add(run, prefix, zero_s, part_s))
+        if prefix:
+            print(f"{prefix.strip('/')} is {run.name}", file=sys.stderr)
     blueprint = ReviewBlueprint(prefixes, shown, runs[0].config.limits.band_um, maps_um)
     layer.blueprint(blueprint.made(options.tab))
     layer.close()

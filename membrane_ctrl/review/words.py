@@ -26,7 +26,7 @@ def number(value: float | None, digits: int = 3) -> str:
     """A number to so many digits; a dash for none."""
     if value is None or not math.isfinite(value):
         return "–"
-    return f"{value:.{digits}g}" if abs(value) < 1e5 else f"{value:.0f}"
+    return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"
 
 
 def moment_s(text: str, origin_utc: datetime) -> float:

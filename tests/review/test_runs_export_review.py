@@ -165,6 +165,13 @@ def entities(path: Path) -> dict[str, int]:
     return rows
 
 
+def colours(path: Path, entity: str) -> list[int]:
+    """Of the lines of a plot."""
+    batches = (chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == entity)
+    columns = (batch.column("SeriesLines:colors") for batch in batches if "SeriesLines:colors" in batch.schema.names)
+    return next(column.to_pylist()[0] for column in columns)
+
+
 def test_the_viewer_is_given_levels_ticks_figure_and_what_was_found(tmp_path: Path) -> None:
     run = open_run(written(tmp_path, 0.2, [Planted("pressure step", 400.0, 20.0)]))
     make_review([run], ReviewOptions([run.folder]), tmp_path / "r.rrd")
@@ -182,6 +189,7 @@ def test_a_window_limits_the_ticks_and_runs_lie_over_each_other(tmp_path: Path) 
     rows = entities(tmp_path / "r.rrd")
     assert 100 <= rows["/run_1/loop/error"] <= 102
     assert 100 <= rows["/run_2/loop/error"] <= 102
+    assert len({tuple(colours(tmp_path / "r.rrd", f"/run_{number}/loop/error")) for number in (1, 2)}) == 2
 
 
 @pytest.mark.parametrize(
