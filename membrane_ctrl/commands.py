@@ -109,4 +109,6 @@ def refusal(command: Command, state: State, config: Config) -> str:
         return f"gains on trial for {command.value:g} s: 1 .. {TRIAL_MAX_S:g} s are possible"
     if command.kind == "gains" and command.loop is not None and command.loop.rate_hz != config.loop.rate_hz:
         return "the tick rate cannot be changed while it ticks"
+    if command.kind == "capture" and not config.shape.enabled:
+        return "no camera measures in this run: [shape] enabled = false"
     return ""

@@ -1,0 +1,18 @@
+"""What a command is refused for, before anything is done."""
+
+from __future__ import annotations
+
+import pytest
+
+from membrane_ctrl.commands import TABLE, Command, refusal
+from membrane_ctrl.config import Config, ShapeConfig
+from membrane_ctrl.names import State
+
+WITHOUT_SHAPE = Config(shape=ShapeConfig(enabled=False))
+
+
+@pytest.mark.parametrize("state", sorted(TABLE["capture"].states))
+def test_no_picture_is_promised_where_nothing_measures(state: State) -> None:
+    capture = Command("capture", "tester")
+    assert "no camera measures" in refusal(capture, state, WITHOUT_SHAPE)
+    assert refusal(capture, state, Config()) == ""
