@@ -98,7 +98,7 @@ def _require_sense(options: ReviewOptions) -> None:
     if any(part is not None for part in (*moments, options.save, options.screenshot)):
         raise InputError("--live follows the run as it goes on: leave --at, --from, --save and the like away")
     if options.bind != _THIS_MACHINE:
-        raise InputError("--live serves this machine only: leave --bind away, and bring the page over with ssh -L")
+        raise InputError("--live serves this machine only: leave --bind away and use the ssh line it prints")
 
 
 def _require_writable(target: Path, runs: Sequence[Run]) -> None:

@@ -54,11 +54,7 @@ def serve(files: list[Path], bind: str, port: int) -> int:
     port = port or free_port()
     _require_listening(bind, port)
     data_port = free_port()
-    host = "127.0.0.1" if bind == "127.0.0.1" else socket.gethostname()
-    print(f"open {_page(host, port, data_port)}", file=sys.stderr)
-    if bind == "127.0.0.1":
-        tunnel = f"ssh -L {port}:127.0.0.1:{port} -L {data_port}:127.0.0.1:{data_port} {socket.gethostname()}"
-        print(f"from another machine first: {tunnel}", file=sys.stderr)
+    _say_where(bind, port, data_port)
     options = ["--serve-web", "--bind", bind, "--port", str(data_port), "--web-viewer-port", str(port)]
     return _run(viewer_command(*options, *(str(path) for path in files)))
 
@@ -75,7 +71,7 @@ def live(folder: Path, web: bool, port: int = 0) -> int:
     proxy = f"rerun+http://127.0.0.1:{data_port}/proxy"
     if web:
         _require_listening("127.0.0.1", port)
-        print(f"open {_page('127.0.0.1', port, data_port)}", file=sys.stderr)
+        _say_where("127.0.0.1", port, data_port)
     else:
         _require_screen()
     try:
@@ -105,8 +101,14 @@ def _require_screen() -> None:
         raise DeviceError("no screen here: use --web and open the address in a browser, or --screenshot FILE")
 
 
-def _page(host: str, port: int, data_port: int) -> str:
-    return f"http://{host}:{port}/?url=rerun%2Bhttp%3A%2F%2F{host}%3A{data_port}%2Fproxy"
+def _say_where(bind: str, port: int, data_port: int) -> None:
+    """The page's address, and how another machine gets to it."""
+    host = "127.0.0.1" if bind == "127.0.0.1" else socket.gethostname()
+    page = f"http://{host}:{port}/?url=rerun%2Bhttp%3A%2F%2F{host}%3A{data_port}%2Fproxy"
+    print(f"open {page}", file=sys.stderr)
+    if bind == "127.0.0.1":
+        tunnel = f"ssh -L {port}:127.0.0.1:{port} -L {data_port}:127.0.0.1:{data_port} {socket.gethostname()}"
+        print(f"from another machine first: {tunnel}", file=sys.stderr)
 
 
 def follow(
