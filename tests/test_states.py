@@ -79,12 +79,23 @@ def test_venting_without_a_gauge_goes_on() -> None:
 
 
 def test_a_stop_is_the_last_word() -> None:
-    """Until the pump is seen off the mirror is on its way down; a `lower` then makes no standby of the stop."""
+    """A `lower` in the same tick makes no standby of the stop."""
     outcome = played(
         {"time_s": 19.0, "wrong": "readback_fraction", "value": 0.5, "for_s": 2.5},
         {"time_s": 20.0, "command": "stop"},
-        {"time_s": 20.5, "command": "lower"},
+        {"time_s": 20.0, "command": "lower"},
     )
     assert outcome.ticks[-1].outputs.finished is not None
     assert outcome.ticks[-1].row.mono_s < 24.0
     assert not changes(outcome, "standby")
+
+
+def test_a_board_that_has_latched_a_fault_is_not_held_with() -> None:
+    """Its own limit is 800 Pa; here ours is higher, and the check has to see the board's bit."""
+    outcome = played(
+        {"time_s": 0.5, "wrong": "gauge_offset_pa", "value": 300.0, "for_s": 1.0},
+        duration_s=20.0,
+        limits={"gauge_pressure_max_pa": 2000.0},
+    )
+    assert not changes(outcome, "inflate")
+    assert [event["name"] for event in outcome.of("fault")] == ["overdue"]
