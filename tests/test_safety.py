@@ -140,3 +140,12 @@ def test_ticks_that_show_nothing_are_left_out_of_the_window(name: str) -> None:
         for _ in range(rule.window):
             assert table.judge(State.HOLD, UNSEEN[name]).rule is None
     assert table.judge(State.HOLD, BAD[name]).rule is rule
+
+
+def test_a_visit_to_another_state_forgets_what_was_seen_before() -> None:
+    table = SafetyTable(LIMITS)
+    rule = next(rule for rule in TABLE if rule.name == "following_error")
+    for _ in range(rule.needed - 1):
+        table.judge(State.HOLD, BAD[rule.name])
+    table.judge(State.STANDBY, GOOD)
+    assert table.judge(State.HOLD, BAD[rule.name]).rule is None
