@@ -6,10 +6,12 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 
 from membrane_ctrl.recording.column_file import FOLDER, SUFFIX
 from membrane_ctrl.recording.sealed_stream import Damage, Unsealed, unseal
+from membrane_ctrl.review.possible_times import possible_times
 
 # The column that says when: of ticks, and of the other tables.
 _TIMES = ("mono_s", "time_s")
@@ -93,7 +95,19 @@ def _read(
     if content.sealed and over and not content.ended and not content.damage:
         lost = _rows_lost(batches, Damage(len(batches), 0, True))
         add_note(notes, f"{path.name}: without the mark of its end: {lost} missing, if there were any")
-    return pa.Table.from_batches(batches, schema=reader.schema).select(wanted)
+    table = pa.Table.from_batches(batches, schema=reader.schema).select(wanted)
+    return table if content.sealed else _possible(path, table, notes)
+
+
+def _possible(path: Path, table: pa.Table, notes: list[str]) -> pa.Table:
+    """Rows whose time can be: without a checksum it may be any number."""
+    name = next((name for name in _TIMES if name in table.schema.names), None)
+    if name is None:
+        return table
+    mask = possible_times(table.column(name).to_numpy())
+    if not mask.all():
+        add_note(notes, f"{path.name}: {np.count_nonzero(~mask)} rows with impossible times are left out")
+    return table.filter(pa.array(mask))
 
 
 def first_s(path: Path, time_name: str) -> float | None:

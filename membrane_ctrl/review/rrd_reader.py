@@ -23,6 +23,7 @@ from membrane_ctrl.recording.streams import (
     ZERNIKE,
 )
 from membrane_ctrl.review.column_reader import add_note
+from membrane_ctrl.review.possible_times import possible_times
 from membrane_ctrl.review.rrd_salvage import FAULTS, read_chunks, salvage
 
 Column = NDArray[np.float64]
@@ -108,6 +109,10 @@ def _scalars(path: Path, entities: set[str], notes: list[str]) -> dict[str, tupl
     for entity, chunks in parts.items():
         times = np.concatenate([chunk[0] for chunk in chunks])
         values = np.concatenate([chunk[1] for chunk in chunks])
+        possible = possible_times(_seconds(times))
+        if not possible.all():
+            add_note(notes, f"{path.name}: rows with impossible times are left out")
+            times, values = times[possible], values[possible]
         order = np.argsort(times, kind="stable")
         joined[entity] = (times[order], values[order])
     return joined
