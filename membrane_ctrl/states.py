@@ -25,6 +25,7 @@ from membrane_ctrl.observer import Observer
 
 # a pump that someone left running has run down by then: lag 0.15 s, transport 0.1 s (docs/physics.md, inner loop)
 _PUMP_STANDS_S = 0.5
+_VENTED_S = 900.0  # twice what the twin's valve takes from 600 Pa; the pump is off, so it is only said
 
 Way = Literal["stop", "lower", "vent"]
 
@@ -229,6 +230,8 @@ def lower(scene: Scene) -> State:
         reading = scene.observer.reading
         pressure_pa = reading.gauge_pressure_pa if reading else math.nan
         scene.why = f"venting: {pressure_pa:.0f} Pa left"
+        if scene.state_age_s > _VENTED_S:
+            scene.why += f" after {scene.state_age_s / 60:.0f} min: see whether the vent opens and the gauge reads"
         if not pressure_pa < scene.config.states.vented_pressure_pa:
             return State.LOWER
     else:
