@@ -20,7 +20,9 @@ Level = dict[str, Column]
 LEVEL_COLUMNS = (
     "state", "mean_ambient_pressure_pa", "mean_flow_um_per_s", "mean_feedforward_um_per_s", "min_displacement_um",
     "mean_displacement_um", "max_displacement_um", "max_displacement_quality", "max_lateness_ms", "mean_error_um",
+    "mean_air_temperature_c",
 )  # fmt: skip
+_WEATHER = {"mean_ambient_pressure_pa": "barometer lost", "mean_air_temperature_c": "thermometer lost"}
 # A door is 20 Pa, weather within two seconds a few Pa (gusty: 1.8 Pa, 1 sigma).
 DOOR_LEAST_PA = 6.0
 DOOR_LEAST_SIGMAS = 5.5
@@ -54,7 +56,8 @@ class Found:
     Attributes
     ----------
     kind : str
-        "pressure step", "leak step", "laser glitch", "laser lost", "lateness burst", "noise change" or "shape jump".
+        "pressure step", "leak step", "laser glitch", "laser lost", "barometer lost", "thermometer lost",
+        "lateness burst", "noise change" or "shape jump".
     start_s, end_s : float
         Time range of the run that shows it.
     time_s : float
@@ -89,7 +92,8 @@ def find_events(level: Level, shapes: Shapes) -> list[Found]:
     if level["time_s"].size:
         even = _even(level)
         finders: Iterable[Callable[[Level], list[Found]]] = (
-            pressure_steps, leak_steps, laser_glitches, laser_losses, lateness_bursts, noise_changes,
+            pressure_steps, leak_steps, laser_glitches, laser_losses, weather_losses, lateness_bursts,
+            noise_changes,
         )  # fmt: skip
         for finder in finders:
             found += finder(even)
@@ -144,18 +148,22 @@ def laser_losses(level: Level) -> list[Found]:
     """The laser said that its reading is no good, or gave none."""
     bad = (level["max_displacement_quality"] > 0) | ~np.isfinite(level["mean_displacement_um"])
     bad &= (level["state"] == State.HOLD) & (level["rows"] > 0)
-    return [
-        Found(
-            "laser lost",
-            float(level["time_s"][a]),
-            level["time_s"][a] - 5,
-            level["time_s"][b] + 6,
-            b - a + 1.0,
-            "s",
-            1.0,
-        )
-        for a, b in _runs(bad, 1)
-    ]
+    return _losses("laser lost", bad, level, 1)
+
+
+def weather_losses(level: Level) -> list[Found]:
+    """A barometer or thermometer that has given values gives none: what is fed forward then misses the weather."""
+    found: list[Found] = []
+    for name, kind in _WEATHER.items():
+        there = np.isfinite(level[name])
+        found += _losses(kind, ~there & (np.cumsum(there) > 0) & (level["rows"] > 0), level, 5)
+    return found
+
+
+def _losses(kind: str, lost: NDArray[np.bool_], level: Level, join: int) -> list[Found]:
+    time_s = level["time_s"]
+    return [Found(kind, float(time_s[a]), time_s[a] - 5, time_s[b] + 6, b - a + 1.0, "s", 1.0)
+            for a, b in _runs(lost, join)]  # fmt: skip
 
 
 def lateness_bursts(level: Level) -> list[Found]:

@@ -9,7 +9,7 @@ from benchmarks.events_found import matched
 from benchmarks.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night
 from membrane_ctrl.recording.levels import TICK_FIELDS, Columns, first_level
 from membrane_ctrl.recording.rows import COLUMN, Rows, column
-from membrane_ctrl.review.found import Found, find_events, noise_changes
+from membrane_ctrl.review.found import Found, find_events, noise_changes, weather_losses
 from membrane_ctrl.review.shapes import from_estimates
 from membrane_ctrl.review.steps import confidence, steps
 
@@ -57,6 +57,19 @@ def test_a_change_of_noise_is_found() -> None:
     found = noise_changes(level_of(rows))
     assert [round(item.size, 1) for item in found] == [pytest.approx(2.5, rel=0.2)]
     assert abs(found[0].time_s - 3600) < 300
+
+
+@pytest.mark.parametrize(
+    ("field", "kind"), [("ambient_pressure_pa", "barometer lost"), ("air_temperature_c", "thermometer lost")]
+)
+def test_lost_weather_is_found_once_it_was_there(field: str, kind: str) -> None:
+    rows, _ = night(4, 0.2, "quiet", [])
+    time_s = column(rows, "mono_s")
+    rows[(time_s < 20.0) | ((time_s >= 300.0) & (time_s < 360.0)) | (time_s == 100.0), COLUMN[field]] = np.nan
+    (found,) = weather_losses(level_of(rows))
+    assert (found.kind, found.time_s, found.size) == (kind, 300.0, 60.0)
+    rows[:, COLUMN[field]] = np.nan  # a bench without one
+    assert weather_losses(level_of(rows)) == []
 
 
 def test_a_step_and_a_gap() -> None:
