@@ -52,7 +52,10 @@ def parts(days: float, seed: int = 1) -> Iterator[tuple[Rows, list[ShapeEstimate
 def timed(*arguments: str) -> dict[str, float]:
     """Wall time and peak memory of a command in a process of its own."""
     done = subprocess.run([sys.executable, "-c", _CHILD, *arguments], capture_output=True, text=True, check=True)
-    return dict(json.loads(done.stdout.splitlines()[-1]))
+    found = dict(json.loads(done.stdout.splitlines()[-1]))
+    if found.pop("code"):
+        raise RuntimeError(f"{' '.join(arguments)}: {done.stderr.strip()}")
+    return found
 
 
 def run(days: float = MONTH_DAYS) -> list[Figure]:
@@ -68,6 +71,7 @@ def run(days: float = MONTH_DAYS) -> list[Figure]:
         brief = timed("report", str(short), "--out", f"{folder}/a")
         whole = timed("report", str(month), "--out", f"{folder}/b")
         opened = timed("review", str(month), "--save", f"{folder}/review.rrd")
+        shown = timed("runs", "show", str(month))
         return [
             Figure("ticks", days * 86400 * RATE_HZ, ""),
             Figure("tables on the disk", size_gb, "GB"),
@@ -77,6 +81,7 @@ def run(days: float = MONTH_DAYS) -> list[Figure]:
             at_most("report of half an hour", brief["took_s"], "s", 5.0),
             at_most("what the viewer opens, made in", opened["took_s"], "s", 10.0),
             Figure("its memory", opened["peak_gb"], "GB"),
+            Figure("its tables looked through by `runs show`", shown["took_s"], "s"),
         ]
 
 

@@ -15,6 +15,7 @@ from typing import BinaryIO
 HEAD_BYTES = 12
 _MAGIC = b"RRF2"
 _MESSAGE = struct.Struct("<QQ")
+_FOOTER_BYTES = 32  # behind the last message: where its table of contents is
 END = 0  # the last message of a file that was closed; a table of contents follows
 STORE = 1  # which recording, or which blueprint, the messages behind it are of
 _KINDS = range(8)  # four are in use; a larger number is no kind but a place that was missed
@@ -61,6 +62,17 @@ def whole_messages(path: Path) -> list[Message]:
                 break
             found.append(message)
     return found
+
+
+def is_closed(path: Path) -> bool:
+    """Whether messages follow one another to the end of a closed file; what is in them is not looked at.
+
+    Raises
+    ------
+    OSError
+    """
+    found = whole_messages(path)
+    return bool(found) and found[-1].kind == END and path.stat().st_size == found[-1].end + _FOOTER_BYTES
 
 
 def _heads(file: BinaryIO) -> Iterator[Message]:

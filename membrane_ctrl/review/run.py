@@ -22,6 +22,7 @@ from membrane_ctrl.recording.levels import TICK_FIELDS, WINDOWS_S, coarser_level
 from membrane_ctrl.review import rrd_reader, shapes
 from membrane_ctrl.review.column_reader import add_note, column_files, first_s, missing_files, read_file
 from membrane_ctrl.review.folder import find_folder, read_config, read_events, read_summary
+from membrane_ctrl.review.rrd_place import is_closed
 from membrane_ctrl.review.shapes import Shapes
 from membrane_ctrl.telemetry import FIELDS
 
@@ -172,13 +173,17 @@ class Run:
         return shapes.joined(found)
 
     def look_through(self) -> None:
-        """Read every table and segment once, so that `notes` names whatever is damaged; a month in some seconds."""
+        """See that every table and segment is whole, so that `notes` names what is damaged.
+
+        A segment whose messages follow one another is not decoded: that would take minutes for a month.
+        """
         for table in TABLES:
             files = column_files(self.folder, table)
             for path in files:
                 self._file(path, files[-1], ["mono_s" if table == TICKS else "time_s"])
         for path in rrd_reader.segments(self.folder):
-            rrd_reader.read_ticks(path, ["mono_s"], self.notes)
+            if not _is_closed(path):
+                rrd_reader.read_ticks(path, ["mono_s"], self.notes)
 
     def _file(self, path: Path, last: Path, names: Sequence[str]) -> pa.Table | None:
         """Columns of a file; the last one of a run that was closed has an end."""
@@ -228,6 +233,13 @@ def open_run(path: Path | str) -> Run:
         notes.append("events.jsonl: lines are missing, the last one at least: the run has ended, and no line says so")
     notes += _missing(folder, summary)
     return Run(folder, read_config(folder, notes), events, summary, origin_of(folder, events), notes)
+
+
+def _is_closed(path: Path) -> bool:
+    try:
+        return is_closed(path)
+    except OSError:
+        return False
 
 
 def _missing(folder: Path, summary: dict[str, Any] | None) -> list[str]:
