@@ -1,8 +1,9 @@
 """Child processes: started with `spawn`, out of reach of the terminal, and never left behind.
 
-Ctrl-C, Ctrl-\\ and a terminal that is closed reach every process of the foreground group; only the control process
-may act on them, as the safe state comes first, and the recording and the last alarm come after it. So these signals
-are ignored from before the children's first instruction; examples/membrane-ctrl.service relies on it.
+Ctrl-C, Ctrl-\\ and a terminal that is closed reach every process of the foreground group, and so does the SIGTERM
+of `timeout` or of a machine that shuts down; only the control process may act on them, as the safe state comes first,
+and the recording and the last alarm come after it. So these signals are ignored from before the children's first
+instruction, and a child is asked to end by another one; examples/membrane-ctrl.service relies on it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from collections.abc import Iterator
 from typing import Any
 
 _CONTEXT = multiprocessing.get_context("spawn")
-_OF_THE_TERMINAL = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP)
+_OF_THE_GROUP = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
+# Until a child has a handler for it, it simply ends.
+STOP = signal.SIGUSR1
 
 
 class Child:
@@ -42,7 +45,7 @@ class Child:
 
     def start(self) -> None:
         """Start it; returns at once."""
-        with _terminal_ignored():
+        with _group_ignored():
             self._process.start()
 
     @property
@@ -70,10 +73,11 @@ class Child:
         self._process.kill()
 
     def stop(self, timeout_s: float) -> None:
-        """SIGTERM, and SIGKILL if that does not end it in time."""
+        """`STOP`, and SIGKILL if that does not end it in time."""
         if self._process.pid is None:
             return
-        self._process.terminate()
+        if self.alive:
+            os.kill(self._process.pid, STOP)
         if not self.join(timeout_s):
             self._process.kill()
             self._process.join()
@@ -97,9 +101,9 @@ def _main(target: str, args: tuple[Any, ...], nice: int) -> None:
 
 
 @contextlib.contextmanager
-def _terminal_ignored() -> Iterator[None]:
+def _group_ignored() -> Iterator[None]:
     """An ignored signal stays ignored across exec: the child has it from its first instruction on."""
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in _OF_THE_TERMINAL}
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in _OF_THE_GROUP}
     try:
         yield
     finally:

@@ -1,4 +1,4 @@
-"""A child is out of reach of the terminal, and never left behind."""
+"""A child is out of reach of what its group is sent, and never left behind."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ import pytest
 from membrane_ctrl.processes import Child, pipe
 
 
-def test_what_a_terminal_sends_to_all_is_not_for_the_children() -> None:
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP)}
+def test_what_is_sent_to_the_whole_group_is_not_for_the_children() -> None:
+    before = {
+        number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
+    }
     ours, theirs = pipe()
     child = Child("waits", "multiprocessing.connection:wait", ([theirs],), nice=0)
     child.start()

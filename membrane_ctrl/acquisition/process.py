@@ -58,7 +58,7 @@ class AcquisitionSpec:
 def acquisition_main(spec: AcquisitionSpec, control: Connection) -> None:
     """Measure the shape until told to stop: target of a `spawn`ed process.
 
-    Ends on "stop" over `control`, on SIGTERM, and when the parent has died. SIGINT is left to the control process.
+    Ends on "stop" over `control`, on `processes.STOP`, and when the parent has died.
     Reports go back over `control` as dicts {"kind": "acquisition", "state": ..., "message": ...}.
 
     Raises

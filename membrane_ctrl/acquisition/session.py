@@ -29,6 +29,7 @@ from membrane_ctrl.ipc.ring import RingAddress, RingWriter
 from membrane_ctrl.metrology.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.live import LiveReconstructor
 from membrane_ctrl.metrology.patterns import fringe_sequence, full_sequence
+from membrane_ctrl.processes import STOP
 from membrane_ctrl.twin.camera import FilmPosition, TwinOptics
 
 _TRUTH_LOOK_S = 0.1
@@ -52,8 +53,8 @@ class WaitingClock:
 def run(spec: AcquisitionSpec, remote: Remote) -> None:
     """Prepare, then measure until told to stop.
 
-    Until the first cycle SIGTERM simply ends the process, as nothing is held that would need care and a kernel
-    that is being compiled cannot be asked; from then on it ends the cycle at its next exposure.
+    Until the first cycle `processes.STOP` simply ends the process, as nothing is held that would need care and a
+    kernel that is being compiled cannot be asked; from then on it ends the cycle at its next exposure.
 
     Raises
     ------
@@ -71,12 +72,12 @@ def run(spec: AcquisitionSpec, remote: Remote) -> None:
         if spec.truth is None:
             bench = configured_bench(config, clock)
             _warm_up(config, plan, TYPICAL_FILM, clock)
-            signal.signal(signal.SIGTERM, lambda number, frame: remote.end())
+            signal.signal(STOP, lambda number, frame: remote.end())
             stack.callback(bench.close)
             _open(bench, config, clock, remote)
         else:
             bench = _twin_bench(spec.truth, config, plan, clock, remote, stack)
-            signal.signal(signal.SIGTERM, lambda number, frame: remote.end())
+            signal.signal(STOP, lambda number, frame: remote.end())
             stack.callback(bench.close)
         if remote.stop:
             return

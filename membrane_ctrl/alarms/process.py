@@ -20,6 +20,7 @@ from membrane_ctrl.child_report import alive, reporter
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.ipc.ring import RingAddress, RingReader
 from membrane_ctrl.port_config import AlarmsConfig
+from membrane_ctrl.processes import STOP
 from membrane_ctrl.tick import Event
 
 _LOOK_S = 0.5
@@ -58,7 +59,7 @@ def alarms_main(spec: AlarmsSpec, status: Any) -> None:
     Target of a `spawn`ed process; `status` is its end of a pipe, for events about what it has sent.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _leave)
+    signal.signal(STOP, _leave)
     parent = multiprocessing.parent_process()  # who started it, even if that is gone by now
     parent_pid = os.getppid() if parent is None else parent.pid
     watch(spec, apprise_sender(spec.config, spec.run), reporter(status), lambda: os.getppid() == parent_pid)

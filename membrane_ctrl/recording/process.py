@@ -22,6 +22,7 @@ from membrane_ctrl.child_report import alive, reporter
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.ipc.ring import RingAddress, RingReader
+from membrane_ctrl.processes import STOP
 
 # Rings are emptied this often: the telemetry ring has to hold a few of these.
 POLL_S = 0.25
@@ -72,7 +73,7 @@ class RecorderSpec:
 
 
 def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
-    """Record until the "end" event, until SIGTERM, or until the parent has died; then close and summarise.
+    """Record until the "end" event, until `processes.STOP`, or until the parent has died; then close and summarise.
 
     Parameters
     ----------
@@ -85,7 +86,7 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
     asked = Flag()
     # ctrl-C reaches the whole terminal group: the supervisor decides when the run is over, with the "end" event
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: asked.set())
+    signal.signal(STOP, lambda *_: asked.set())
     os.environ["RUST_LOG"] = "off"  # Rerun's own log would write over the live screen; its errors come as exceptions
     # read when Rerun is imported: its allocator gives back at once what a closed segment leaves, or 30 MB would stay
     os.environ["MIMALLOC_PURGE_DELAY"] = "0"

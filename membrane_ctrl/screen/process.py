@@ -25,6 +25,7 @@ from membrane_ctrl.child_report import alive, reporter
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.ipc.ring import RingAddress, RingReader
+from membrane_ctrl.processes import STOP
 from membrane_ctrl.screen.model import Event, ScreenModel
 from membrane_ctrl.screen.plain import at_once, event_line, line
 from membrane_ctrl.screen.view import screen
@@ -68,7 +69,7 @@ class ScreenSpec:
 
 
 def screen_main(spec: ScreenSpec, status: Connection | None = None) -> None:
-    """Show the run on stderr until its "end" event, SIGTERM, or the death of the parent.
+    """Show the run on stderr until its "end" event, `processes.STOP`, or the death of the parent.
 
     Target of a `spawn`ed process; over `status` it says that it is alive. SIGINT is left to the control process; the
     terminal is given back in any case.
@@ -76,7 +77,7 @@ def screen_main(spec: ScreenSpec, status: Connection | None = None) -> None:
     parent = multiprocessing.parent_process()  # who started it, even if that is gone by now
     parent_pid = os.getppid() if parent is None or parent.pid is None else parent.pid
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _leave)
+    signal.signal(STOP, _leave)
     report = reporter(status)
     with closing(_Feed(spec)) as feed:
 

@@ -18,6 +18,7 @@ from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import DevicesConfig, PumpConfig, TwinConfig
 from membrane_ctrl.ipc.ring import RingAddress, RingWriter
 from membrane_ctrl.priority import raise_priority
+from membrane_ctrl.processes import STOP
 from membrane_ctrl.twin.events import Event
 from membrane_ctrl.twin.lab import Lab
 from membrane_ctrl.twin.plant import STEP_S, Plant
@@ -74,7 +75,7 @@ class BenchReport:
 
 
 def serve(spec: BenchSpec, ready: Connection) -> None:
-    """Serve the bench in a spawned process until SIGTERM, or until `linger_s` after the parent's end.
+    """Serve the bench in a spawned process until `processes.STOP`, or until `linger_s` after the parent's end.
 
     SIGINT is ignored: Ctrl-C goes to the whole terminal, and the bench must outlive the controller's safe stop.
 
@@ -93,7 +94,7 @@ def serve(spec: BenchSpec, ready: Connection) -> None:
 
 async def _serve(spec: BenchSpec, ready: Connection) -> None:
     stop = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
+    asyncio.get_running_loop().add_signal_handler(STOP, stop.set)
     with _truth_writer(spec.truth) as writer:
         try:
             bench = LiveBench(spec, writer)

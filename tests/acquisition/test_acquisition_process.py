@@ -23,6 +23,7 @@ from membrane_ctrl.config import CameraConfig, Config, OpticsConfig, ShapeConfig
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
 from membrane_ctrl.metrology.patterns import fringe_sequence
+from membrane_ctrl.processes import STOP
 from membrane_ctrl.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.twin.truth import TRUTH_BYTES, Truth
 
@@ -150,7 +151,7 @@ def test_pause_resume_full_and_sigterm(stack: ExitStack) -> None:
     assert [e.kind for e in run.estimates[taken : taken + 2]] == ["full", "fringes"]
     assert run.process.pid is not None
     os.kill(run.process.pid, signal.SIGINT)  # not for this process
-    os.kill(run.process.pid, signal.SIGTERM)
+    os.kill(run.process.pid, STOP)
     run.until(lambda: not run.process.is_alive())
     assert run.process.exitcode == 0
 

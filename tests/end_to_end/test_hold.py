@@ -144,14 +144,21 @@ def test_a_short_hold_with_the_camera_loop_leaves_everything_it_should(tmp_path:
     assert rows_in(tmp_path) > 800
 
 
-def test_sigint_stops_cleanly_with_130(tmp_path: Path, running: subprocess.Popen[str]) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_the_whole_group_stops_cleanly_with_130(
+    tmp_path: Path, running: subprocess.Popen[str], number: signal.Signals
+) -> None:
+    """Ctrl-C and `timeout` reach the children first; the bench and the recorder have to outlive it."""
     wait_for(lambda: reached(tmp_path, "inflate"))
-    running.send_signal(signal.SIGINT)
+    for process in psutil.Process(running.pid).children(recursive=True):
+        process.send_signal(number)
+    running.send_signal(number)
     _, stderr = running.communicate(timeout=PATIENCE_S)
     assert running.returncode == 130
     summary = json.loads((run_dir(tmp_path) / "summary.json").read_text())
     assert summary["exit"] == "interrupted"
     assert [e["state"] for e in events(tmp_path) if e["kind"] == "state"][-1] == "lower"
+    assert not [e for e in events(tmp_path) if e["kind"] in {"fault", "child_ended"}]
     assert "Traceback" not in stderr
 
 

@@ -28,6 +28,7 @@ from membrane_ctrl.child_report import reporter
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.ipc.ring import RingWriter, ring
+from membrane_ctrl.processes import STOP
 from membrane_ctrl.recording.process import RecorderSpec, parent_died, recorder_main
 from membrane_ctrl.recording.rows import COLUMN, unpack
 from membrane_ctrl.recording.run_folder import create_run_folder
@@ -186,13 +187,13 @@ def test_without_an_end_event_the_run_still_gets_one(feed: Feed, asked: bool, or
     assert has_footer(feed.spec.run_dir / "test-000.rrd")
 
 
-def test_sigint_is_ignored_and_sigterm_finishes(feed: Feed) -> None:
+def test_sigint_is_ignored_and_a_stop_finishes(feed: Feed) -> None:
     with recorder(feed.spec) as (process, _):
         wait_for((feed.spec.run_dir / "test-000.rrd").exists)
         os.kill(process.pid, signal.SIGINT)
         for row in rows_of(1.0):
             feed.telemetry.put(row.pack())
-        os.kill(process.pid, signal.SIGTERM)
+        os.kill(process.pid, STOP)
         process.join(DEADLINE_S)
         assert process.exitcode == 0
     found = summary_of(feed.spec.run_dir)
@@ -208,6 +209,7 @@ from synthetic_run import rows_of
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.ipc.ring import Ring, RingWriter
+from membrane_ctrl.processes import STOP
 from membrane_ctrl.recording.process import RecorderSpec, recorder_main
 from membrane_ctrl.telemetry import ROW_BYTES
 

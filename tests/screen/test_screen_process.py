@@ -22,6 +22,7 @@ from membrane_ctrl.child_report import ALIVE
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.ipc.ring import RingWriter, ring
+from membrane_ctrl.processes import STOP
 from membrane_ctrl.screen.process import ScreenSpec, give_back_terminal, screen_main
 from membrane_ctrl.telemetry import ROW_BYTES
 
@@ -102,8 +103,8 @@ def test_terminal_shows_the_run_and_is_given_back_at_the_end(run: Run, terminal:
     assert b"\x1b[?25h" in finish(process, ours)  # the cursor too
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_terminal_is_given_back_on_sigterm_and_sigint_is_not_for_us(
+@pytest.mark.parametrize("number", [STOP, signal.SIGINT])
+def test_terminal_is_given_back_on_a_stop_and_sigint_is_not_for_us(
     run: Run, terminal: tuple[int, int], number: signal.Signals
 ) -> None:
     ours, theirs = terminal

@@ -20,6 +20,7 @@ from firmware_iface.register_map import default_map
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import PumpConfig, TwinConfig
 from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
+from membrane_ctrl.processes import STOP
 from membrane_ctrl.twin.bench import BenchReport, BenchSpec, LiveBench, serve
 from membrane_ctrl.twin.events import AmbientChange
 from membrane_ctrl.twin.truth import TRUTH_BYTES, Truth
@@ -109,7 +110,8 @@ def test_serves_the_plant_in_real_time_and_publishes_the_truth() -> None:
         ended_s, last = clock.now(), client.read("sensors")
         truths = [Truth.unpack(message) for message in reader.drain()]
         reader.close()
-        process.terminate()
+        assert process.pid is not None
+        os.kill(process.pid, STOP)
         process.join(5.0)
         assert process.exitcode == 0
     device_s = device_time_s(last) - device_time_s(first)
