@@ -98,3 +98,46 @@ def test_a_rejected_shape_is_no_witness() -> None:
         bad = estimate(tick * 0.1, SAG_UM + 500.0, "rejected") if tick % 20 == 10 else None
         good = estimate(tick * 0.1, SAG_UM) if tick % 20 == 0 else None
         assert judge.step(0.1, 0.0, 600.0, bad or good) == Liar.NOBODY
+
+
+def shown(judge: Plausibility, time_s: float, laser_um: float, camera_um: float, gauge_um: float) -> Liar:
+    """One tick of a second without noise."""
+    gauge_pa = PRESSURE_PA * (1 + 3 * gauge_um / SAG_UM)
+    return judge.step(1.0, laser_um, gauge_pa, estimate(time_s, SAG_UM + camera_um))
+
+
+def settled(laser_um: float, camera_um: float, gauge_um: float) -> tuple[Plausibility, float]:
+    """Who has seen peace for a minute and then this for a minute."""
+    judge, time_s = Plausibility(10.0), 0.0
+    for _ in range(60):
+        time_s += 1.0
+        shown(judge, time_s, 0.0, 0.0, 0.0)
+    for _ in range(60):
+        time_s += 1.0
+        shown(judge, time_s, laser_um, camera_um, gauge_um)
+    return judge, time_s
+
+
+def test_who_is_found_stays_accused_whatever_the_gauge_says_then() -> None:
+    judge, time_s = settled(30.0, 0.0, 0.0)
+    assert judge.liar == Liar.LASER
+    for second in range(1, 121):  # the gauge goes over to the laser's story
+        assert shown(judge, time_s + second, 30.0, 0.0, 30.0) == Liar.LASER
+
+
+def test_who_is_found_is_believed_again_only_below_half_the_limit() -> None:
+    judge, time_s = settled(30.0, 0.0, 0.0)
+    for second in range(1, 121):
+        said = shown(judge, time_s + second, 7.0, 0.0, 0.0)
+    assert said == Liar.LASER  # 7 um apart: less than the limit, more than half of it
+    for second in range(121, 241):
+        said = shown(judge, time_s + second, 4.0, 0.0, 0.0)
+    assert said == Liar.NOBODY
+
+
+def test_two_that_part_with_the_gauge_between_them_leave_it_unsure() -> None:
+    judge, time_s = settled(20.0, 0.0, 10.0)
+    assert judge.liar == Liar.UNSURE
+    for second in range(1, 121):  # it is not settled: a gauge that speaks later is heard
+        said = shown(judge, time_s + second, 20.0, 0.0, 0.0)
+    assert said == Liar.LASER
