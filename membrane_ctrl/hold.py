@@ -38,6 +38,7 @@ from membrane_ctrl.port.listeners import listeners_for
 from membrane_ctrl.port.server import Port, RunHooks
 from membrane_ctrl.priority import raise_priority
 from membrane_ctrl.recording.run_folder import create_run_folder
+from membrane_ctrl.review.interrupts import ends_as_by_ctrl_c
 from membrane_ctrl.simulated import TwinProcess
 from membrane_ctrl.supervisor import Supervisor, Wiring
 from membrane_ctrl.systemd import SystemdNotify
@@ -70,7 +71,7 @@ def hold_mirror(options: HoldOptions) -> int:
     require_sendable(options.config.alarms)
     geometry = geometry_in_force(options.config)
     clock = RunClock.start()
-    with ExitStack() as stack:
+    with ends_as_by_ctrl_c(), ExitStack() as stack:  # SIGTERM before and after the ticks cleans up as well
         twin = TwinProcess.started(options.config, clock, stack, options.lab) if options.twin else None
         config = twin.config if twin else options.config
         assert config.devices is not None
@@ -225,6 +226,7 @@ def _signals(supervisor: Supervisor) -> Iterator[None]:
     numbers = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # `nohup` asks to go on without the terminal
         numbers.append(signal.SIGHUP)
+    before = {number: signal.getsignal(number) for number in numbers}
     for number in numbers:
         loop.add_signal_handler(number, supervisor.ask, Command("stop", number.name))
     try:
@@ -232,6 +234,7 @@ def _signals(supervisor: Supervisor) -> Iterator[None]:
     finally:
         for number in numbers:
             loop.remove_signal_handler(number)
+            signal.signal(number, before[number])  # asyncio leaves the default: an end without clean-up
 
 
 def _report(run_dir: Path, as_json: bool) -> None:
