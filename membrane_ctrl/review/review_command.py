@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from membrane_ctrl.errors import DeviceError, InputError
+from membrane_ctrl.interrupts import ends_as_by_ctrl_c
 from membrane_ctrl.names import State
 from membrane_ctrl.recording.screenshot import screenshot_of
 from membrane_ctrl.review import viewer
 from membrane_ctrl.review.blueprints import TABS, ReviewBlueprint
 from membrane_ctrl.review.catalogue import resolve
 from membrane_ctrl.review.found import Found
-from membrane_ctrl.review.interrupts import ends_as_by_ctrl_c
 from membrane_ctrl.review.layer import Layer
 from membrane_ctrl.review.run import Run, open_run
 from membrane_ctrl.review.words import moment_s
