@@ -30,6 +30,7 @@ from membrane_ctrl.config import Config
 from membrane_ctrl.controller import Controller
 from membrane_ctrl.crew import Crew, Rings, rings_for
 from membrane_ctrl.errors import DeviceError, Exit, InputError
+from membrane_ctrl.interrupts import ends_as_by_ctrl_c
 from membrane_ctrl.ipc.published import publish
 from membrane_ctrl.ipc.ring import RingReader, RingWriter
 from membrane_ctrl.latched import LatchedFile
@@ -38,7 +39,6 @@ from membrane_ctrl.port.listeners import listeners_for
 from membrane_ctrl.port.server import Port, RunHooks
 from membrane_ctrl.priority import raise_priority
 from membrane_ctrl.recording.run_folder import create_run_folder
-from membrane_ctrl.review.interrupts import ends_as_by_ctrl_c
 from membrane_ctrl.simulated import TwinProcess
 from membrane_ctrl.supervisor import Supervisor, Wiring
 from membrane_ctrl.systemd import SystemdNotify
