@@ -80,9 +80,9 @@ class Crew:
 
     def start(self, stack: ExitStack) -> None:
         """Start all; the stack ends whatever `take_down` has not."""
+        stack.callback(self._stop)
         for post in self._posts:
             post.start(self._clock.now())
-        stack.callback(self._stop)
 
     def _stop(self) -> None:
         for post in self._posts:

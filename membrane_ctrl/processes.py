@@ -2,7 +2,7 @@
 
 Ctrl-C, Ctrl-\\ and a terminal that is closed reach every process of the foreground group, and so does the SIGTERM
 of `timeout` or of a machine that shuts down; only the control process may act on them, as the safe state comes first,
-and the recording and the last alarm come after it. So these signals are ignored from before the children's first
+and the recording and the last alarm come after it. So these signals are blocked from before the children's first
 instruction, and a child is asked to end by another one; examples/membrane-ctrl.service relies on it.
 """
 
@@ -15,6 +15,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
+from multiprocessing import resource_tracker
 from typing import Any
 
 _CONTEXT = multiprocessing.get_context("spawn")
@@ -45,8 +46,13 @@ class Child:
 
     def start(self) -> None:
         """Start it; returns at once."""
-        with _group_ignored():
-            self._process.start()
+        resource_tracker.ensure_running()  # it unblocks signals when it starts
+        try:
+            with _group_blocked():
+                self._process.start()
+        except BaseException:  # the signal that came meanwhile: who asked for the child does not know of it yet
+            self.stop(1.0)
+            raise
 
     @property
     def pid(self) -> int | None:
@@ -101,14 +107,13 @@ def _main(target: str, args: tuple[Any, ...], nice: int) -> None:
 
 
 @contextlib.contextmanager
-def _group_ignored() -> Iterator[None]:
-    """An ignored signal stays ignored across exec: the child has it from its first instruction on."""
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in _OF_THE_GROUP}
+def _group_blocked() -> Iterator[None]:
+    """The child inherits the mask, from its first instruction on; this process gets what came meanwhile."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_THE_GROUP)
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def pipe() -> Any:

@@ -28,7 +28,7 @@ def serve_twin(config: Config, speed: float) -> int:
         print(
             f"the twin listens on tcp://127.0.0.1:{report.port}, Modbus unit 1; stop it with Ctrl-C", file=sys.stderr
         )
-        signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)  # after the child's start: it would inherit the mask
+        signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
         stopped = signal.sigwait(_STOPS)
     finally:
         child.stop(2.0)

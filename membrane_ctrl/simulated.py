@@ -46,8 +46,8 @@ class TwinProcess:
         )
         ours, theirs = pipe()
         child = Child("twin", "membrane_ctrl.twin.bench:serve", (spec, theirs), nice=0)
-        child.start()
         stack.callback(child.stop, 2.0)
+        child.start()
         report = ours.recv() if ours.poll(_READY_S) else BenchReport(error="the twin did not start")
         if report.error:
             raise DeviceError(report.error)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from multiprocessing.context import SpawnProcess
 
 import pytest
 
@@ -37,4 +38,28 @@ def test_a_child_that_does_not_obey_is_killed(number: signal.Signals) -> None:
     assert child.pid is not None
     os.kill(child.pid, number)
     child.stop(0.1)
+    assert not child.alive
+
+
+def test_a_signal_that_comes_while_a_child_is_started_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    class ToldError(Exception):
+        """By the handler."""
+
+    def tell(number: int, frame: object) -> None:
+        raise ToldError
+
+    child = Child("sleeps", "time:sleep", (60.0,), nice=0)
+    start = SpawnProcess.start
+
+    def start_while_signalled(self: SpawnProcess) -> None:
+        start(self)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(SpawnProcess, "start", start_while_signalled)
+    before = signal.signal(signal.SIGTERM, tell)
+    try:
+        with pytest.raises(ToldError):
+            child.start()
+    finally:
+        signal.signal(signal.SIGTERM, before)
     assert not child.alive

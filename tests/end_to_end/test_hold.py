@@ -311,3 +311,15 @@ def test_no_shared_memory_is_left_behind(tmp_path: Path) -> None:
     assert done.returncode == 0
     assert "leaked" not in done.stderr
     assert not shared_memory() - before
+
+
+def test_sigterm_while_the_processes_start_cleans_up(running: subprocess.Popen[str]) -> None:
+    """The twin is there before the recorder and the others: none of them may be left, nor the signal lost."""
+    wait_for(lambda: len(psutil.Process(running.pid).children()) > 1)
+    children = psutil.Process(running.pid).children()
+    running.send_signal(signal.SIGTERM)
+    _, stderr = running.communicate(timeout=PATIENCE_S)
+    assert running.returncode == 130
+    assert "Traceback" not in stderr
+    assert "leaked" not in stderr
+    assert psutil.wait_procs(children, 5.0)[1] == []
