@@ -24,6 +24,8 @@ def test_only_what_is_listed_and_not_vented_is_possible() -> None:
 
 def test_the_cause_must_stay_away_for_the_whole_wait() -> None:
     rule = ResumeRule(CONFIG)
+    assert not rule.due(True, 1000.0)  # nobody has seen the cause go: the wait begins now
+    assert not rule.due(False, 1001.0)
     assert [rule.due(True, now_s) for now_s in (0.0, 9.0)] == [False, False]
     assert not rule.due(False, 9.5)
     assert [rule.due(True, now_s) for now_s in (10.0, 19.9, 20.0)] == [False, False, True]
