@@ -63,6 +63,18 @@ def test_a_cause_that_comes_back_during_the_wait_is_waited_for_from_its_end(wron
     assert 50.0 <= resumed[0] < 52.0
 
 
+@pytest.mark.parametrize(
+    ("wrong", "fault"), [("no_light", "displacement_missing"), ("gauge_lost", "pressure_missing")]
+)
+def test_a_cause_that_stays_is_waited_out(wrong: str, fault: str) -> None:
+    """The link is there all the time, the sensor comes back at 100 s: nothing may resume before 110 s."""
+    outcome = play(scenario(At(time_s=20.0, wrong=wrong, for_s=80.0), duration_s=115.0, faults=(fault,)))
+    assert [event["name"] for event in outcome.of("fault")] == [fault]
+    resumed = [event["mono_s"] for event in outcome.of("state") if event["from"] == "fault"]
+    assert len(resumed) == 1
+    assert 110.0 <= resumed[0] < 112.0
+
+
 def test_a_wait_does_not_count_in_the_next_fault() -> None:
     """Acknowledged after 8 s of the wait; the next fault waits its own 10 s."""
     steps = (
