@@ -14,7 +14,7 @@ from membrane_ctrl.review.allan import Allan, allan_deviation
 from membrane_ctrl.review.anomalies import Anomaly, anomalies
 from membrane_ctrl.review.drift import Slope, slope
 from membrane_ctrl.review.found import LEVEL_COLUMNS, Found, find_events
-from membrane_ctrl.review.hold_pass import KEPT_AWAY, READING, TRUE, HoldPass, hold_pass
+from membrane_ctrl.review.hold_pass import ERROR, KEPT_AWAY, READING, TRUE, HoldPass, hold_pass
 from membrane_ctrl.review.psd import Spectrum, power_spectrum
 from membrane_ctrl.review.run import Block, Run
 from membrane_ctrl.review.settled import held_at
@@ -152,11 +152,11 @@ def _found_and_shape(
 
 def _series(run: Run, ticks: HoldPass, which: int) -> Series | None:
     rate_hz, band_um = run.config.loop.rate_hz, run.config.limits.band_um
-    second, counts, sums = ticks.seconds
+    second, counts, sums = ticks.seconds[which]
     moments = ticks.raw_reading if which == READING else ticks.raw_true
     if not moments.count:
         return None
-    means = {w: window_means(second, counts, sums[which], w, rate_hz) for w in WINDOWS_S}
+    means = {w: window_means(second, counts, sums[ERROR], w, rate_hz) for w in WINDOWS_S}
     grid = ticks.reading_um if which == READING else ticks.true_um
     grid = fill_short_gaps(grid[_first(grid) : grid.size - _first(grid[::-1])], round(FILLED_S * rate_hz))
     longest = max(1, min(grid.size // 4, round(_ALLAN_LONGEST_S * rate_hz)))
@@ -188,8 +188,8 @@ def _first(grid: NDArray[np.float32]) -> int:
 
 
 def _benefit(run: Run, ticks: HoldPass, true: bool) -> Benefit | None:
-    second, counts, sums = ticks.seconds
-    error = sums[TRUE if true else READING]
+    second, counts, sums = ticks.seconds[TRUE if true else READING]
+    error = sums[ERROR]
     _, held = window_means(second, counts, error, 1, run.config.loop.rate_hz)
     _, without = window_means(second, counts, error + sums[KEPT_AWAY], 1, run.config.loop.rate_hz)
     return Benefit(float(held.std()), float(without.std())) if held.size else None

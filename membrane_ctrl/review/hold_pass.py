@@ -25,13 +25,18 @@ NAMES = (
     *SETTLED_FIELDS, "displacement_um", "truth_displacement_um", "feedforward_um_per_s", "flow_wanted_um_per_s",
     "flow_um_per_s", "pump_fraction", "lateness_ms", "missed_ticks",
 )  # fmt: skip
-# Series of the sums over seconds.
-READING, TRUE, KEPT_AWAY = range(3)
+# Which error: a tick without a reading has a true centre all the same, so each has sums of its own,
+READING, TRUE = range(2)
+# and these are their rows.
+ERROR, KEPT_AWAY = range(2)
 # The histogram reaches this many bands to each side, in bins of a fiftieth of a band.
 _HISTOGRAM_BANDS = 5
 _HISTOGRAM_BINS = 500
 # Flow wanted and flow given differ by less than this when nothing limits: single precision at full flow.
 _SATURATED_UM_PER_S = 1e-3
+
+
+SecondsOf = tuple[NDArray[np.int64], Column, Column]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +58,9 @@ class HoldPass:
     Attributes
     ----------
     ticks, settled : int
+        Of `settled` only those with a reading.
+    unread_s : float
+        Settled time without a reading.
     missed_ticks : int
     start_s, end_s : float
     hold_s : float
@@ -62,7 +70,8 @@ class HoldPass:
     reading_um, true_um : (n,) float32
         Setpoint minus laser reading and target minus true centre on a grid of ticks, NaN where not settled.
     seconds : tuple
-        `SecondSums.result` of reading error, true error and what the feed-forward kept away.
+        `SecondSums.result` of the ticks with a reading (`READING`) and of those with a true centre (`TRUE`): rows of
+        sums are the error (`ERROR`) and what the feed-forward kept away (`KEPT_AWAY`).
     raw_reading, raw_true : Moments
     raw_in_band : float
         Share of settled readings within the band.
@@ -74,6 +83,7 @@ class HoldPass:
 
     ticks: int
     settled: int
+    unread_s: float
     missed_ticks: int
     start_s: float
     end_s: float
@@ -81,7 +91,7 @@ class HoldPass:
     grid_s: float
     reading_um: Single
     true_um: Single
-    seconds: tuple[NDArray[np.int64], Column, Column]
+    seconds: tuple[SecondsOf, SecondsOf]
     raw_reading: Moments
     raw_true: Moments
     raw_in_band: float
@@ -118,14 +128,14 @@ class _Collector:
         size = max(0, math.ceil((span_s[1] - span_s[0]) / self._period_s) + 2)
         self._reading = np.full(size, np.nan, dtype=np.float32)
         self._true = np.full(size, np.nan, dtype=np.float32)
-        self._seconds = SecondSums(3)
+        self._seconds = SecondSums(2), SecondSums(2)
         self._raw_reading, self._raw_true = Moments(), Moments()
         reach_um = _HISTOGRAM_BANDS * self._band_um
         self._edges_um = np.linspace(-reach_um, reach_um, _HISTOGRAM_BINS + 1)
         self._histogram = np.zeros(_HISTOGRAM_BINS, dtype=np.int64)
         self._lateness = LogHistogram()
         self._pump = _PumpSums()
-        self._ticks = self._counted = self._inside = self._hold = 0
+        self._ticks = self._counted = self._unread = self._inside = self._hold = 0
         self._missed = 0.0
         self._span = (math.nan, math.nan)
 
@@ -147,12 +157,14 @@ class _Collector:
         inside = (place >= 0) & (place < self._reading.size)
         self._reading[place[inside]] = reading[inside]
         self._true[place[inside]] = true[inside]
-        there = np.isfinite(reading)
-        self._seconds.add(held["mono_s"][there], np.stack((reading, true, kept_away))[:, there])
+        for sums, error in zip(self._seconds, (reading, true), strict=True):
+            known = np.isfinite(error)
+            sums.add(held["mono_s"][known], np.stack((error, kept_away))[:, known])
         self._raw_reading.add(reading)
         self._raw_true.add(true)
-        reading = reading[there]
+        reading = reading[np.isfinite(reading)]
         self._counted += reading.size
+        self._unread += true.size - reading.size
         self._inside += int((np.abs(reading) <= self._band_um).sum())
         scale = _HISTOGRAM_BINS / (self._edges_um[-1] - self._edges_um[0])
         bins = np.clip((reading - self._edges_um[0]) * scale, 0, _HISTOGRAM_BINS - 1).astype(np.int64)
@@ -162,6 +174,7 @@ class _Collector:
         return HoldPass(
             ticks=self._ticks,
             settled=self._counted,
+            unread_s=self._unread * self._period_s,
             missed_ticks=int(self._missed),
             start_s=self._span[0],
             end_s=self._span[1],
@@ -169,7 +182,7 @@ class _Collector:
             grid_s=self._grid_s,
             reading_um=self._reading,
             true_um=self._true,
-            seconds=self._seconds.result(),
+            seconds=(self._seconds[READING].result(), self._seconds[TRUE].result()),
             raw_reading=self._raw_reading,
             raw_true=self._raw_true,
             raw_in_band=self._inside / self._counted if self._counted else math.nan,

@@ -118,7 +118,8 @@ def _details(analysis: Analysis) -> str:
             (f"drift, {name}", _slope(series.drift, "µm/h")),
             (
                 "single readings of the laser",
-                f"std {number(ticks.raw_reading.std)} µm, {100 * ticks.raw_in_band:.2f} % in the band",
+                f"std {number(ticks.raw_reading.std)} µm, {100 * ticks.raw_in_band:.2f} % in the band; "
+                f"{number(ticks.unread_s)} s held without one",
             ),
             (f"RMS by frequency, {name}", _bands(series)),
         ]

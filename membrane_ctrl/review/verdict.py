@@ -11,6 +11,8 @@ Word = Literal["good", "look", "bad"]
 
 # Anomalies that end the claim that the mirror was held.
 _GRAVE = {"fault", "band left", "never settled"}
+# Single readings that fail to come are any laser's.
+_UNREAD_LEAST_S = 1.0
 
 
 def verdict(analysis: Analysis) -> tuple[Word, str]:
@@ -25,8 +27,9 @@ def verdict(analysis: Analysis) -> tuple[Word, str]:
     seconds = series.windows[0]
     who = "true centre" if analysis.true else "laser reading"
     share = 100 * seconds.in_band
+    unread = f" ({span(ticks.unread_s)} of it without a reading)" if ticks.unread_s >= _UNREAD_LEAST_S else ""
     return word, (
-        f"Held for {span(ticks.hold_s)} of {whole}; {share:.6g} % of its seconds within "
+        f"Held for {span(ticks.hold_s)} of {whole}{unread}; {share:.6g} % of its seconds within "
         f"±{run.config.limits.band_um:g} µm ({who}: std {seconds.std_um:.3f} µm, mean {seconds.mean_um:+.3f} µm)"
         f"{_what(names)}."
     )
