@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from membrane_ctrl.errors import InputError
 from membrane_ctrl.names import State
@@ -24,14 +25,14 @@ from membrane_ctrl.review.windows import WindowStatistics, describe, window_mean
 Column = NDArray[np.float64]
 
 WINDOWS_S = (1, 4, 60)
-# Decades of frequency whose RMS is given; the last ends at half the tick rate.
-BANDS_HZ = (1e-4, 1e-3, 1e-2, 0.1, 1.0)
 # A level with about this many rows makes a picture.
 _PICTURE_ROWS = 9000
 # The slope is fitted to minutes, of a short run to seconds.
 _SLOPE_MINUTES_FROM_S = 3600.0
 # A missed tick or a glitch is bridged by a straight line, or no segment of a spectrum would be whole.
 FILLED_S = 0.5
+# Of the seconds, whose spectrum is used below 0.1 Hz at most: what a laser without light for a moment leaves.
+_FILLED_SECONDS = 5
 # A day has slower and larger motions than any hold; longer means say no more than the slope.
 _ALLAN_LONGEST_S = 1e5
 
@@ -48,6 +49,9 @@ class Series:
         Times and means of the 1 s windows.
     allan : Allan
     spectrum : Spectrum
+        Of the ticks.
+    slow : Spectrum
+        Of the 1 s means, in segments of half the hold: for what is slower than the segments of `spectrum`.
     drift : Slope
         um per hour.
     """
@@ -56,6 +60,7 @@ class Series:
     seconds_um: Column
     allan: Allan
     spectrum: Spectrum
+    slow: Spectrum
     drift: Slope
 
 
@@ -167,8 +172,28 @@ def _series(run: Run, ticks: HoldPass, which: int) -> Series | None:
         seconds_um=np.stack(means[1]),
         allan=allan_deviation(grid, 1 / rate_hz, lengths),
         spectrum=power_spectrum(grid, rate_hz),
+        slow=slow_spectrum(*means[1]),
         drift=slope(*means[60 if minutes else 1]),
     )
+
+
+def slow_spectrum(time_s: Column, means: Column) -> Spectrum:
+    """Spectrum of 1 s means in segments half as long as the longest stretch without a gap: three of a whole hold.
+
+    Parameters
+    ----------
+    time_s, means : (n,) arrays
+        Middles of the seconds, and means; gaps up to 5 s are bridged.
+    """
+    if not time_s.size:
+        return power_spectrum(np.empty(0), 1.0)
+    place = np.floor(time_s - time_s[0] + 0.5).astype(np.int64)
+    grid = np.full(int(place[-1]) + 1, np.nan, dtype=np.float32)
+    grid[place] = means
+    grid = fill_short_gaps(grid, _FILLED_SECONDS)
+    gaps = np.flatnonzero(~np.isfinite(np.concatenate(([np.nan], grid, [np.nan]))))
+    longest = int(np.diff(gaps).max()) - 1
+    return power_spectrum(grid, 1.0, fft.prev_fast_len(max(8, longest // 2), real=True))
 
 
 def fill_short_gaps(values: NDArray[np.float32], most: int) -> NDArray[np.float32]:

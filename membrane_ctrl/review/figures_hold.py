@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.names import State
 from membrane_ctrl.review.analysis import Analysis
+from membrane_ctrl.review.bands import density
 from membrane_ctrl.review.figures_svg import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, picture, svg
 from membrane_ctrl.review.gaps import broken_at_gaps
 from membrane_ctrl.review.report_json import timeline
@@ -140,9 +141,9 @@ def distributions(analysis: Analysis) -> str:
                 continue
             if series.allan.tau_s.size:
                 allan.loglog(series.allan.tau_s, series.allan.deviation, "o-", ms=3, color=colour, label=name)
-            density = np.sqrt(series.spectrum.density[1:])
-            if np.isfinite(density).any():
-                spectrum.loglog(series.spectrum.frequency_hz[1:], density, color=colour, lw=0.8, label=name)
+            frequency_hz, power = density(series.spectrum, series.slow)
+            if np.isfinite(power).any():
+                spectrum.loglog(frequency_hz, np.sqrt(power), color=colour, lw=0.8, label=name)
         allan.set(title="Overlapping Allan deviation", xlabel="τ, s", ylabel="µm")
         spectrum.set(title="Amplitude spectral density", xlabel="Hz", ylabel="µm/√Hz")
         for plot in (allan, spectrum):

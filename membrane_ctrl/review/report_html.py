@@ -9,9 +9,10 @@ from typing import Any
 from membrane_ctrl import __version__
 from membrane_ctrl.review import figures_hold, figures_shape
 from membrane_ctrl.review.analysis import Analysis, Series
+from membrane_ctrl.review.bands import bands, unseen_s
 from membrane_ctrl.review.compare import Difference
 from membrane_ctrl.review.drift import Slope
-from membrane_ctrl.review.report_json import bands, timeline
+from membrane_ctrl.review.report_json import timeline
 from membrane_ctrl.review.shape_review import ShapeReview
 from membrane_ctrl.review.style import STYLE
 from membrane_ctrl.review.verdict import verdict
@@ -127,9 +128,11 @@ def _details(analysis: Analysis) -> str:
 
 
 def _bands(series: Series) -> str:
-    there = [band for band in bands(series) if band["rms_um"] == band["rms_um"]]
-    said = [f"{number(b['low_hz'])}–{number(b['high_hz'])} Hz: {number(b['rms_um'])} µm" for b in there]
-    return "; ".join(said) or "too short to say"
+    there = [band for band in bands(series.spectrum, series.slow) if band.rms_um == band.rms_um]
+    if not there:
+        return "too short to say"
+    said = [f"{number(b.from_hz)}–{number(b.high_hz)} Hz: {number(b.rms_um)} µm" for b in there]
+    return f"{'; '.join(said)}; not seen: what is slower than {span(unseen_s(there))}"
 
 
 def _pump(analysis: Analysis) -> str:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
-from itertools import pairwise
 from typing import Any
 
 from membrane_ctrl.names import State
-from membrane_ctrl.review.analysis import BANDS_HZ, Analysis, Series
+from membrane_ctrl.review.analysis import Analysis, Series
+from membrane_ctrl.review.bands import bands
 from membrane_ctrl.review.drift import Slope
 from membrane_ctrl.review.shape_review import ShapeReview
 from membrane_ctrl.review.verdict import verdict
@@ -91,18 +91,10 @@ def _series(series: Series | None) -> dict[str, Any] | None:
             "deviation_um": list(series.allan.deviation),
             "windows": [int(n) for n in series.allan.windows],
         },
-        "bands_rms_um": bands(series),
+        "bands_rms_um": [asdict(band) for band in bands(series.spectrum, series.slow)],
         "spectrum_segments": series.spectrum.segments,
+        "slow_spectrum_segments": series.slow.segments,
     }
-
-
-def bands(series: Series) -> list[dict[str, float]]:
-    """RMS in each of `BANDS_HZ`."""
-    edges = [*BANDS_HZ, float(series.spectrum.frequency_hz[-1])]
-    return [
-        {"low_hz": low, "high_hz": high, "rms_um": series.spectrum.band_rms(low, high)}
-        for low, high in pairwise(edges)
-    ]
 
 
 def _slope(slope: Slope) -> dict[str, float | bool]:

@@ -7,8 +7,10 @@ import pytest
 from scipy import signal
 
 from membrane_ctrl.review.allan import allan_deviation
+from membrane_ctrl.review.analysis import slow_spectrum
+from membrane_ctrl.review.bands import bands, unseen_s
 from membrane_ctrl.review.drift import slope
-from membrane_ctrl.review.psd import power_spectrum
+from membrane_ctrl.review.psd import Spectrum, power_spectrum
 
 allantools = pytest.importorskip("allantools", reason="the reference for the Allan deviation is not installed")
 RATE_HZ = 10.0
@@ -62,6 +64,43 @@ def test_band_rms_of_a_sine_and_a_gap() -> None:
     assert spectrum.band_rms(0.4, 0.6) == pytest.approx(np.sqrt(2), rel=0.01)
     assert spectrum.band_rms(1.0, 5.0) < 0.01
     assert power_spectrum(values[:100], RATE_HZ, 1024).segments == 0
+
+
+def spectra(values: np.ndarray, rate_hz: int) -> tuple[Spectrum, Spectrum]:
+    """Of ticks and of their 1 s means."""
+    means = values.reshape(-1, rate_hz).mean(axis=1)
+    kept = np.isfinite(means)
+    return power_spectrum(values, rate_hz), slow_spectrum(np.arange(means.size)[kept] + 0.5, means[kept])
+
+
+@pytest.mark.parametrize(("hours", "period_s"), [(8.0, 1800.0), (8.0, 600.0), (8.0, 60.0), (0.5, 200.0)])
+def test_the_bands_of_a_long_hold_add_up_and_slow_motion_is_in_its_own(hours: float, period_s: float) -> None:
+    time_s = np.arange(round(hours * 3600 * 50)) / 50
+    values = np.sin(2 * np.pi * time_s / period_s) + 0.1 * np.random.default_rng(6).normal(size=time_s.size)
+    found = bands(*spectra(values, 50))
+    powers = {band.low_hz: band.rms_um**2 for band in found if np.isfinite(band.rms_um)}
+    assert np.sqrt(sum(powers.values())) == pytest.approx(values.std(), rel=0.01)
+    own = next(band for band in found if band.low_hz < 1 / period_s <= band.high_hz)
+    assert own.rms_um == pytest.approx(np.sqrt(0.5), rel=0.01)
+    assert sum(power for low_hz, power in powers.items() if low_hz != own.low_hz) == pytest.approx(0.01, rel=0.05)
+    assert unseen_s(found) == pytest.approx(hours * 1800, rel=0.02)
+
+
+def test_a_lost_light_leaves_the_slow_bands() -> None:
+    time_s = np.arange(36_000 * 10) / 10
+    values = np.sin(2 * np.pi * time_s / 1800)
+    values[100_000:100_030] = np.nan  # bridged
+    values[250_000:260_000] = np.nan  # not bridged
+    fast, slow = spectra(values, 10)
+    assert slow.segments >= 2
+    assert next(band for band in bands(fast, slow) if band.low_hz == 1e-4).rms_um == pytest.approx(0.707, rel=0.03)
+
+
+def test_too_short_for_a_band_is_said() -> None:
+    assert all(np.isnan(band.rms_um) for band in bands(*spectra(np.full(100, np.nan), 10)))
+    found = bands(*spectra(np.random.default_rng(7).normal(size=600), 10))
+    assert [np.isnan(band.from_hz) for band in found] == [True, True, True, False, False, False]
+    assert found[3].from_hz > found[3].low_hz
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.8])
