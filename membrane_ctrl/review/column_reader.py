@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from membrane_ctrl.recording.column_file import FOLDER, SUFFIX
 from membrane_ctrl.recording.sealed_stream import Damage, Unsealed, unseal
@@ -112,12 +113,19 @@ def _possible(path: Path, table: pa.Table, notes: list[str]) -> pa.Table:
 
 def first_s(path: Path, time_name: str) -> float | None:
     """Time of the first row; None if the file's beginning does not give it."""
+    times_s = first_column(path, time_name)
+    return float(times_s[0]) if times_s.size else None
+
+
+def first_column(path: Path, name: str) -> NDArray[np.float64]:
+    """A column of the first batch; empty if the file's beginning does not give it."""
     try:
         with path.open("rb") as file:
             content = unseal(file.read(_LOOK_BYTES))
-        return float(pa.ipc.open_stream(content.data).read_next_batch().column(time_name)[0].as_py())
+        batch = pa.ipc.open_stream(content.data).read_next_batch()
+        return np.asarray(batch.column(name).to_numpy(zero_copy_only=False), dtype=np.float64)
     except (pa.ArrowException, OSError, KeyError, StopIteration):
-        return None
+        return np.empty(0)
 
 
 def _batches(reader: pa.RecordBatchReader) -> tuple[list[pa.RecordBatch], Exception | None]:

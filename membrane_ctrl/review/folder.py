@@ -12,6 +12,7 @@ from membrane_ctrl.errors import InputError
 from membrane_ctrl.recording.checked_text import comment_is_right, take_checksum
 from membrane_ctrl.recording.column_file import FOLDER
 from membrane_ctrl.review.annotations import ANNOTATIONS_FILE, MARK
+from membrane_ctrl.review.understood import understood
 
 _SUMMARY_SCHEMA = "membrane-summary/1"
 
@@ -63,31 +64,20 @@ def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
 
 
 def read_config(folder: Path, notes: list[str]) -> Config:
-    """`config.toml`; tables that this version does not understand are at their defaults, with a note."""
+    """`config.toml`; keys that this version does not understand are at their defaults, with a note."""
     path = folder / "config.toml"
     notes += _config_damage(path)
     try:
         tables = read_toml(path)
+    except InputError as error:
+        notes.append(f"{error}; everything is taken at its default")
+        return Config()
+    try:
         return parse(tables, Config, "config.toml")
     except InputError as error:
-        notes.append(f"{error}; what it does not say is taken at its default")
-        if not path.exists():
-            return Config()
-    try:
-        tables = read_toml(path)
-    except InputError:
-        return Config()
-    known: dict[str, Any] = {}
-    for name, table in tables.items():
-        try:
-            parse({name: table}, Config, "config.toml")
-        except InputError:
-            continue
-        known[name] = table
-    try:
-        return parse(known, Config, "config.toml")
-    except InputError:  # tables that do not go together
-        return Config()
+        config, left_out = understood(tables)
+        notes.append(f"{error}; left out, or taken at its default: {', '.join(left_out)}")
+        return config
 
 
 def _config_damage(path: Path) -> list[str]:

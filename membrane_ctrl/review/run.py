@@ -22,6 +22,7 @@ from membrane_ctrl.recording.levels import TICK_FIELDS, WINDOWS_S, coarser_level
 from membrane_ctrl.review import rrd_reader, shapes
 from membrane_ctrl.review.column_reader import add_note, column_files, first_s, missing_files, read_file
 from membrane_ctrl.review.folder import find_folder, read_config, read_events, read_summary
+from membrane_ctrl.review.recorded_rate import at_recorded_rate
 from membrane_ctrl.review.rrd_place import is_closed
 from membrane_ctrl.review.shapes import Shapes
 from membrane_ctrl.telemetry import FIELDS
@@ -232,7 +233,8 @@ def open_run(path: Path | str) -> Run:
     if summary and summary.get("exit") and not any(event.get("kind") == "end" for event in events):
         notes.append("events.jsonl: lines are missing, the last one at least: the run has ended, and no line says so")
     notes += _missing(folder, summary)
-    return Run(folder, read_config(folder, notes), events, summary, origin_of(folder, events), notes)
+    config = at_recorded_rate(read_config(folder, notes), folder, notes)
+    return Run(folder, config, events, summary, origin_of(folder, events), notes)
 
 
 def _is_closed(path: Path) -> bool:
