@@ -30,12 +30,15 @@ class OldRun:
 def deletable_runs(logs_dir: Path, present: Path, now_utc: datetime) -> list[OldRun]:
     """Runs in `logs_dir`, oldest first, but for the present one, those that may still run, and those with a `.keep`.
 
-    Only folders that look like a run are looked at: a name that begins with a time, and `config.toml`.
+    Only folders that look like a run are looked at: a name that begins with a time, and `config.toml`. A link is none:
+    what it leads to lies elsewhere.
     """
     found = []
     for folder in sorted(logs_dir.iterdir()):
         match = _RUN.fullmatch(folder.name)
-        if not match or not (folder / "config.toml").is_file() or folder.resolve() == present.resolve():
+        if not match or folder.is_symlink() or not (folder / "config.toml").is_file():
+            continue
+        if folder.resolve() == present.resolve():
             continue
         if (folder / _KEEP).exists() or _may_run(folder, now_utc):
             continue

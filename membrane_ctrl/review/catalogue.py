@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from membrane_ctrl.errors import DeviceError, InputError
+from membrane_ctrl.errors import InputError
 from membrane_ctrl.recording.retention import OldRun, deletable_runs, delete_run, expired
 from membrane_ctrl.review.folder import is_run, read_config, read_events, read_summary
 from membrane_ctrl.review.run import origin_of
@@ -156,13 +156,15 @@ def to_prune(
     return expired(runs, 0, keep_gb, keep_days, now_utc)
 
 
-def prune(runs: Sequence[OldRun]) -> None:
-    """Delete the folders of runs. Raises DeviceError at the first that cannot be."""
+def prune(runs: Sequence[OldRun]) -> dict[Path, str]:
+    """Delete the folders of runs; one that cannot be deleted keeps no other. Returns those that stay, and why."""
+    stay: dict[Path, str] = {}
     for run in runs:
         try:
             delete_run(run)
         except OSError as error:
-            raise DeviceError(f"{run.folder}: cannot be deleted ({error.strerror or error})") from None
+            stay[run.folder] = error.strerror or str(error)
+    return stay
 
 
 def as_dict(run: Entry) -> dict[str, Any]:

@@ -29,7 +29,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def review(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="One run, or several laid over each other.")],
+    runs: Annotated[list[str], typer.Argument(metavar="RUN...", help="One run, or several laid over each other.")],
     at: Annotated[str | None, typer.Option(help="Open on this moment: 03:12 (UTC) or +90m from the start.")] = None,
     around: Annotated[str | None, typer.Option(help="Open on the first event called so, e.g. a fault.")] = None,
     start: FromOption = None,
@@ -47,14 +47,16 @@ def review(
 
     `review mark RUN TEXT --at 03:12` marks a moment: it stands on the timeline and in the report.
     """
-    if runs[0] == Path("mark"):
+    if runs[0] == "mark":  # what follows is text, too, and a path would lose its double slashes
         from membrane_ctrl.review.runs_command import mark_command
 
-        return mark_command([str(run) for run in runs[1:]], at)
+        return mark_command(runs[1:], at)
     from membrane_ctrl.review.review_command import ReviewOptions, review_command
 
     return review_command(
-        ReviewOptions(runs, at, around, start, end, tab, align, live, web, bind, port, save, screenshot)
+        ReviewOptions(
+            [Path(run) for run in runs], at, around, start, end, tab, align, live, web, bind, port, save, screenshot
+        )
     )
 
 

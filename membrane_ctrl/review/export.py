@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import pyarrow.parquet
 from membrane_ctrl.errors import DeviceError, InputError
 from membrane_ctrl.recording.streams import STREAMS
 from membrane_ctrl.review.run import Run
+from membrane_ctrl.review.targets import refuse_originals
 from membrane_ctrl.telemetry import FIELDS
 
 FORMATS = ("parquet", "csv", "hdf5")
@@ -47,33 +49,47 @@ def export(
     Raises
     ------
     InputError
-        If the format or a stream is not known, h5py is missing, or the run has nothing of what is wanted.
+        If the format or a stream is not known, h5py is missing, the run has nothing of what is wanted, or the folder
+        is one of a run.
     DeviceError
         If the folder cannot be written.
     """
     if to not in FORMATS:
         raise InputError(f"--to {to}: known are {', '.join(FORMATS)}")
     fields, extras = _selected(streams)
+    refuse_originals(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        if to == "hdf5":
-            return _hdf5(run, out / "run.h5", fields, extras, start_s, end_s)
-        written = []
-        if fields:
-            blocks = (pa.table(block) for block in run.tick_blocks(fields, start_s, end_s))
-            written += _tables(blocks, out / f"ticks.{to}", to)
-            _say_if_missing(run, bool(written))
-        if SHAPES in extras and (shapes := shape_table(run, start_s, end_s)).num_rows:
-            written += _tables(iter([shapes]), out / f"shapes.{to}", to)
-        if EVENTS in extras and run.events:
-            path = out / "events.jsonl"
-            path.write_text("".join(json.dumps(e, ensure_ascii=False) + "\n" for e in run.events), encoding="utf-8")
-            written.append(path)
+        # beside what is there already, so that an export that fails leaves that alone
+        with tempfile.TemporaryDirectory(prefix=".export-", dir=out) as folder:
+            files = (_hdf5 if to == "hdf5" else _files)(run, to, Path(folder), fields, extras, start_s, end_s)
+            return [path.replace(out / path.name) for path in files]
     except OSError as error:
         raise DeviceError(f"{out}: cannot be written ({(error.strerror or str(error)).lower()})") from None
+
+
+def _files(
+    run: Run, to: str, out: Path, fields: Sequence[str], extras: set[str], start_s: float, end_s: float
+) -> list[Path]:
+    written = []
+    if fields:
+        blocks = (pa.table(block) for block in run.tick_blocks(fields, start_s, end_s))
+        written += _tables(blocks, out / f"ticks.{to}", to)
+        _say_if_missing(run, bool(written))
+    if SHAPES in extras and (shapes := shape_table(run, start_s, end_s)).num_rows:
+        written += _tables(iter([shapes]), out / f"shapes.{to}", to)
+    if EVENTS in extras and (lines := _event_lines(run, start_s, end_s)):
+        path = out / "events.jsonl"
+        path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+        written.append(path)
     if not written:
         raise _nothing(run)
     return written
+
+
+def _event_lines(run: Run, start_s: float, end_s: float) -> list[str]:
+    part = (event for event in run.events if start_s <= float(event.get("mono_s") or 0.0) < end_s)
+    return [json.dumps(event, ensure_ascii=False) for event in part]
 
 
 def _say_if_missing(run: Run, telemetry: bool) -> None:
@@ -140,11 +156,14 @@ def _tables(tables: Iterator[pa.Table], path: Path, to: str) -> list[Path]:
     return [path] if writer is not None else []
 
 
-def _hdf5(run: Run, path: Path, fields: Sequence[str], extras: set[str], start_s: float, end_s: float) -> list[Path]:
+def _hdf5(
+    run: Run, to: str, out: Path, fields: Sequence[str], extras: set[str], start_s: float, end_s: float
+) -> list[Path]:
+    path = out / "run.h5"
     try:
         import h5py
     except ImportError:
-        raise InputError("--to hdf5 needs h5py: pip install 'membrane-ctrl[sofast]'") from None
+        raise InputError(f"--to {to} needs h5py: pip install 'membrane-ctrl[sofast]'") from None
     with h5py.File(path, "w") as file:
         file.attrs["run"] = run.name
         file.attrs["started_utc"] = run.origin_utc.isoformat()
@@ -166,11 +185,9 @@ def _hdf5(run: Run, path: Path, fields: Sequence[str], extras: set[str], start_s
         if SHAPES in extras and len(shapes):
             for name in ("time_s", "coeffs_um", "hencky_um", "sag_um", "sag_sigma_um", "displacement_um"):
                 file.create_dataset(f"shapes/{name}", data=getattr(shapes, name))
-        if EVENTS in extras and run.events:
-            lines = [json.dumps(event, ensure_ascii=False) for event in run.events]
+        if EVENTS in extras and (lines := _event_lines(run, start_s, end_s)):
             file.create_dataset("events", data=lines, dtype=h5py.string_dtype())
         empty = not len(file)
     if empty:
-        path.unlink()
         raise _nothing(run)
     return [path]

@@ -12,13 +12,14 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from membrane_ctrl.errors import InputError
+from membrane_ctrl.errors import Exit, InputError
 from membrane_ctrl.recording import plain_json
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.annotations import add_mark
 from membrane_ctrl.review.catalogue import Entry, Filter, entries, resolve
 from membrane_ctrl.review.export import export
 from membrane_ctrl.review.run import Run, open_run
+from membrane_ctrl.review.span import end_s, not_in
 from membrane_ctrl.review.words import moment_s, number, span
 
 
@@ -56,25 +57,36 @@ def show_command(run: Path, json: bool) -> int:
 def prune_command(logs: Path, keep_days: float | None, keep_gb: float | None, delete: bool, json: bool) -> int:
     """What the retention rule gives up; deleted only with `delete`."""
     gone = catalogue.to_prune(logs, catalogue.now_utc(), keep_days, keep_gb)
-    if delete:
-        catalogue.prune([run for run, _ in gone])
+    stay = catalogue.prune([run for run, _ in gone]) if delete else {}
+    gone = [(run, why) for run, why in gone if run.folder not in stay]
     if json:
         table = [{"name": run.folder.name, "size_bytes": run.size_bytes, "why": why} for run, why in gone]
         print(plain_json.dumps({"deleted": delete, "runs": table}, indent=1))
-        return 0
+        return _said_what_stays(stay)
     for run, why in gone:
         print(f"{'deleted' if delete else 'would delete'} {run.folder.name}, {run.size_bytes / 1e6:.0f} MB: {why}")
     freed_mb = sum(run.size_bytes for run, _ in gone) / 1e6
     print(f"{len(gone)} runs, {freed_mb:.0f} MB" + ("" if delete or not gone else "; --delete does it"))
-    return 0
+    return _said_what_stays(stay)
+
+
+def _said_what_stays(stay: dict[Path, str]) -> int:
+    for folder, why in stay.items():
+        print(f"{folder}: cannot be deleted ({why.lower()}); look at its permissions", file=sys.stderr)
+    return Exit.DEVICE_FAILED if stay else 0
 
 
 def mark_command(words: Sequence[str], at: str | None) -> int:
     """Add a mark to a run's timeline: the run and what to say, where."""
     if len(words) != 2 or at is None:
         raise InputError("review mark: write `review mark RUN TEXT --at 03:12` (TEXT in quotes)")
+    if not words[1].strip():
+        raise InputError("review mark: say something: `review mark RUN TEXT --at 03:12`")
     opened = open_run(resolve(Path(words[0])))
-    mark = add_mark(opened.folder, opened.origin_utc, moment_s(at, opened.origin_utc), words[1])
+    at_s = moment_s(at, opened.origin_utc)
+    if not 0 <= at_s <= end_s(opened):
+        raise not_in(opened, f"--at {at}")
+    mark = add_mark(opened.folder, opened.origin_utc, at_s, words[1])
     print(f"marked {mark['time_utc']} in {opened.name}")
     return 0
 
