@@ -137,7 +137,7 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
     true = _series(run, ticks, TRUE)
     benefit = _benefit(run, ticks, true is not None)
     leak = _leak(level)
-    odd = anomalies(run, ticks, reading, true, leak[0], found, shape)
+    odd = anomalies(run, (start_s, end_s), ticks, reading, true, leak[0], found, shape)
     return Analysis(
         run, (start_s, end_s), ticks, level, level_s, reading, true, benefit, leak, found, shape, odd
     )  # fmt: skip

@@ -42,6 +42,7 @@ class _Series(Protocol):
 
 def anomalies(
     run: Run,
+    part_s: tuple[float, float],
     ticks: HoldPass,
     reading: _Series | None,
     true: _Series | None,
@@ -49,9 +50,9 @@ def anomalies(
     found: Sequence[Found],
     shape: ShapeReview | None,
 ) -> tuple[Anomaly, ...]:
-    """All of a run, the gravest first."""
+    """All of a part of a run, the gravest first."""
     odd = [Anomaly("incomplete recording", note) for note in run.notes]
-    faults = [event for event in run.events if event.get("kind") == "fault"]
+    faults = [event for event in run.events_between(*part_s) if event.get("kind") == "fault"]
     names = Counter(str(event.get("name", "?")) for event in faults)
     odd += [Anomaly("fault", f"{name}, {count} time{'s' * (count > 1)}") for name, count in names.most_common()]
     if reading is None:

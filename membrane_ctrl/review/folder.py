@@ -40,7 +40,7 @@ def read_events(folder: Path, notes: list[str]) -> tuple[dict[str, Any], ...]:
     if not (folder / "events.jsonl").exists():
         notes.append("events.jsonl: missing; states are taken from the telemetry")
     later = _json_lines(folder / ANNOTATIONS_FILE, notes)
-    return tuple(sorted(events + later, key=_moment))
+    return tuple(sorted(events + later, key=event_s))
 
 
 def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
@@ -121,6 +121,7 @@ def _mark(event: dict[str, Any]) -> dict[str, Any]:
     return event
 
 
-def _moment(event: dict[str, Any]) -> float:
+def event_s(event: dict[str, Any]) -> float:
+    """Second of the run of an event; 0 of one that does not say."""
     moment = event.get("mono_s")
     return float(moment) if isinstance(moment, (int, float)) else 0.0

@@ -62,6 +62,7 @@ class HoldPass:
     unread_s : float
         Settled time without a reading.
     missed_ticks : int
+        Within the part.
     start_s, end_s : float
     hold_s : float
         Time in `hold`.
@@ -112,14 +113,14 @@ def hold_pass(run: Run, span_s: tuple[float, float], part_s: tuple[float, float]
     part_s : tuple
         Part of the run wanted.
     """
-    collected = _Collector(run, span_s)
+    collected = _Collector(run, span_s, math.isfinite(part_s[0]))
     for block in run.tick_blocks(NAMES, *part_s):
         collected.add(block)
     return collected.result()
 
 
 class _Collector:
-    def __init__(self, run: Run, span_s: tuple[float, float]) -> None:
+    def __init__(self, run: Run, span_s: tuple[float, float], from_within: bool) -> None:
         loop, self._band_um = run.config.loop, run.config.limits.band_um
         self._period_s = 1 / loop.rate_hz
         self._settled = Settled()
@@ -136,6 +137,8 @@ class _Collector:
         self._lateness = LogHistogram()
         self._pump = _PumpSums()
         self._ticks = self._counted = self._unread = self._inside = self._hold = 0
+        # the running count at the beginning: of a part its first tick's, which says what was before
+        self._missed_before = math.nan if from_within else 0.0
         self._missed = 0.0
         self._span = (math.nan, math.nan)
 
@@ -147,7 +150,9 @@ class _Collector:
         self._span = (self._span[0] if self._ticks > time_s.size else float(time_s[0]), float(time_s[-1]))
         self._hold += int((block["state"] == State.HOLD).sum())
         missed = block["missed_ticks"][np.isfinite(block["missed_ticks"])]
-        self._missed = max(self._missed, float(missed.max())) if missed.size else self._missed
+        if missed.size:
+            self._missed_before = float(missed[0]) if math.isnan(self._missed_before) else self._missed_before
+            self._missed = max(self._missed, float(missed.max()) - self._missed_before)
         self._lateness.add(block["lateness_ms"])
         held = {name: np.asarray(block[name][mask], dtype=np.float64) for name in NAMES}
         self._pump.add(held)

@@ -34,12 +34,13 @@ def report_command(
     opened = open_run(resolve(run))
     span = _part(opened, start, end)
     analysis = analyse(opened, *span)
-    other = None if compare_with is None else analyse(open_run(resolve(compare_with)))
+    other = None if compare_with is None else _other(open_run(resolve(compare_with)), start, end)
     differences = [] if other is None else compare(analysis, other)
     table = report_table(analysis)
     if other is not None:
         table["compared_with"] = {
             "run": other.run.name,
+            "whole_run": not any(map(math.isfinite, other.part_s)),
             "report": report_table(other),
             "differences": [asdict(difference) | {"said": difference.said} for difference in differences],
         }
@@ -49,7 +50,7 @@ def report_command(
     if json:
         print(text)
     else:
-        _say(analysis, folder, time.monotonic() - began_s)
+        _say(analysis, other, folder, time.monotonic() - began_s)
     return 0
 
 
@@ -59,6 +60,12 @@ def _part(run: Run, start: str | None, end: str | None) -> tuple[float, float]:
     if not start_s < end_s:
         raise InputError(f"--from {start} is not before --to {end}")
     return start_s, end_s
+
+
+def _other(run: Run, start: str | None, end: str | None) -> Analysis:
+    """The run compared with: the same part, if it is one from the start; a time of the day is another in each run."""
+    from_start = all(text is None or text.strip().startswith("+") for text in (start, end))
+    return analyse(run, *_part(run, start, end)) if from_start else analyse(run)
 
 
 def _write(folder: Path, files: dict[str, str]) -> None:
@@ -71,10 +78,14 @@ def _write(folder: Path, files: dict[str, str]) -> None:
         raise DeviceError(f"{folder}: cannot be written ({reason}); choose another folder with --out") from None
 
 
-def _say(analysis: Analysis, folder: Path, took_s: float) -> None:
+def _say(analysis: Analysis, other: Analysis | None, folder: Path, took_s: float) -> None:
     for note in analysis.run.notes:
         print(f"note: {note}", file=sys.stderr)
     print(verdict(analysis)[1])
     for event in analysis.found[:20]:
         print(f"  {analysis.run.utc(event.time_s):%Y-%m-%d %H:%M:%S}  {event.kind}, {event.size:.3g} {event.unit}")
+    if other is not None:
+        whole = not any(map(math.isfinite, other.part_s))
+        part = "" if not any(map(math.isfinite, analysis.part_s)) else ", the whole of it" if whole else ", same part"
+        print(f"against {other.run.name}{part}: {verdict(other)[1]}")
     print(f"{folder / 'report.html'} ({took_s:.1f} s)")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -189,8 +190,14 @@ def _compared(analysis: Analysis, other: Analysis, differences: Sequence[Differe
         for d in differences
     ]
     _, sentence = verdict(other)
+    if _is_part(analysis) and not _is_part(other):
+        sentence = f"A part of this run against the whole of the other. {sentence}"
     table = _table(["", "this run", "other run", "", "difference", "p"], rows)
     return f"<p>{_text(sentence)}</p>{table}"
+
+
+def _is_part(analysis: Analysis) -> bool:
+    return any(math.isfinite(moment_s) for moment_s in analysis.part_s)
 
 
 def _timeline(analysis: Analysis) -> str:

@@ -21,7 +21,7 @@ from membrane_ctrl.recording.levels import NAMES as LEVEL_NAMES
 from membrane_ctrl.recording.levels import TICK_FIELDS, WINDOWS_S, coarser_level, first_level
 from membrane_ctrl.review import rrd_reader, shapes
 from membrane_ctrl.review.column_reader import add_note, column_files, first_s, missing_files, read_file
-from membrane_ctrl.review.folder import find_folder, read_config, read_events, read_summary
+from membrane_ctrl.review.folder import event_s, find_folder, read_config, read_events, read_summary
 from membrane_ctrl.review.recorded_rate import at_recorded_rate
 from membrane_ctrl.review.rrd_place import is_closed
 from membrane_ctrl.review.shapes import Shapes
@@ -74,6 +74,10 @@ class Run:
     def utc(self, mono_s: float) -> datetime:
         """UTC of a second of the run."""
         return self.origin_utc + timedelta(seconds=mono_s)
+
+    def events_between(self, start_s: float, end_s: float) -> tuple[dict[str, Any], ...]:
+        """Events of a part of the run."""
+        return tuple(event for event in self.events if start_s <= event_s(event) < end_s)
 
     def ticks(self, names: Sequence[str] | None = None, start_s: float = -np.inf, end_s: float = np.inf) -> pa.Table:
         """Telemetry as an Arrow table (`.to_pandas()` where pandas is installed).
