@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.names import State
 from membrane_ctrl.recording.levels import coarser_level
+from membrane_ctrl.review.door_steps import door_steps, looked_at
 from membrane_ctrl.review.shapes import Shapes
 from membrane_ctrl.review.steps import confidence, differences, local_sigma, steps
 
@@ -18,9 +19,9 @@ Level = dict[str, Column]
 
 # Columns of the 1 s level that are looked at.
 LEVEL_COLUMNS = (
-    "state", "mean_ambient_pressure_pa", "mean_flow_um_per_s", "mean_feedforward_um_per_s", "min_displacement_um",
-    "mean_displacement_um", "max_displacement_um", "max_displacement_quality", "max_lateness_ms", "mean_error_um",
-    "mean_air_temperature_c",
+    "state", "min_ambient_pressure_pa", "mean_ambient_pressure_pa", "mean_flow_um_per_s",
+    "mean_feedforward_um_per_s", "min_displacement_um", "mean_displacement_um", "max_displacement_um",
+    "max_displacement_quality", "max_lateness_ms", "mean_error_um", "mean_air_temperature_c",
 )  # fmt: skip
 _WEATHER = {"mean_ambient_pressure_pa": "barometer lost", "mean_air_temperature_c": "thermometer lost"}
 # A door is 20 Pa, weather within two seconds a few Pa (gusty: 1.8 Pa, 1 sigma).
@@ -102,10 +103,11 @@ def find_events(level: Level, shapes: Shapes) -> list[Found]:
 
 
 def pressure_steps(level: Level) -> list[Found]:
-    """Doors: the air pressure steps within a second or two."""
+    """Doors: the air pressure steps within some seconds."""
     values = level["mean_ambient_pressure_pa"]
-    found = steps(values, half=1, skip=1, least=DOOR_LEAST_PA, least_sigmas=DOOR_LEAST_SIGMAS)
-    return [_event("pressure step", level, s.row, 1, s.size, "Pa", confidence(s.sigmas, values.size)) for s in found]
+    found = door_steps(values, level["min_ambient_pressure_pa"], DOOR_LEAST_PA, DOOR_LEAST_SIGMAS)
+    places = looked_at(values.size)
+    return [_event("pressure step", level, s.row, 1, s.size, "Pa", confidence(s.sigmas, places)) for s in found]
 
 
 def leak_steps(level: Level) -> list[Found]:

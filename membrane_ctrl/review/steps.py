@@ -12,8 +12,6 @@ Column = NDArray[np.float64]
 
 # The noise is judged over stretches of this many values: weather changes over a night.
 _STRETCH = 3600
-# sigma of a normal distribution over its median absolute value
-_SIGMA_OVER_MAD = 1.4826
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,15 +76,24 @@ def differences(values: Column, half: int, skip: int) -> Column:
     return result
 
 
-def local_sigma(values: Column) -> Column:
-    """(n,) robust standard deviation of stretches of the series, constant within each, about 0."""
+def local_sigma(values: Column, share: float = 0.5) -> Column:
+    """(n,) robust standard deviation of stretches of the series, constant within each, about 0.
+
+    Parameters
+    ----------
+    values : (n,) array
+    share : float
+        Of the values that are nothing but noise: what this share of them keeps below is judged by a normal
+        distribution. Half of them (the median) is the most robust, and blind to values that mostly repeat.
+    """
     result = np.full(values.size, np.nan)
+    sigmas = float(special.ndtri(0.5 * (1 + share)))
     for first in range(0, values.size, _STRETCH):
         # the last stretch is a full one, too
         start = max(0, min(first, values.size - _STRETCH))
         part = values[start : first + _STRETCH]
         part = np.abs(part[np.isfinite(part)])
-        result[first : first + _STRETCH] = _SIGMA_OVER_MAD * np.median(part) if part.size else np.nan
+        result[first : first + _STRETCH] = np.quantile(part, share) / sigmas if part.size else np.nan
     return result
 
 
