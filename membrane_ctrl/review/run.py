@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
@@ -24,6 +24,7 @@ from membrane_ctrl.review.column_reader import add_note, column_files, first_s, 
 from membrane_ctrl.review.folder import event_s, find_folder, read_config, read_events, read_summary
 from membrane_ctrl.review.recorded_rate import at_recorded_rate
 from membrane_ctrl.review.rrd_place import is_closed
+from membrane_ctrl.review.segment_blocks import cut, segment_blocks
 from membrane_ctrl.review.shapes import Shapes
 from membrane_ctrl.telemetry import FIELDS
 
@@ -38,6 +39,14 @@ _HOLE_S = 30.0
 _FILES_MAX = 100_000  # ten years of hours
 TABLES = (TICKS, *(level_table(window_s) for window_s in WINDOWS_S), SHAPES)
 _STAND_IN = "Rerun segments stand in for ticks that the tables lack: without every tick, and without checksums"
+
+
+@dataclass(frozen=True, slots=True)
+class _Reach:
+    """How far a table goes: last row given of a part, and last row known of, which may lie behind it; -inf: none."""
+
+    given_s: float
+    known_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,13 +106,13 @@ class Run:
     def tick_blocks(self, names: Sequence[str], start_s: float = -np.inf, end_s: float = np.inf) -> Iterator[Block]:
         """Telemetry in blocks of some hours, so that a month needs no more memory than a night."""
         wanted = _with_time(names)
-        last_s = -np.inf
-        for block in self._table_blocks(TICKS, "mono_s", wanted, start_s, end_s):
-            last_s = float(block["mono_s"][-1])
-            yield block
-        if last_s >= end_s or self._reaches_end(last_s):
+        table = yield from self._table_blocks(TICKS, "mono_s", wanted, start_s, end_s)
+        # a part that lies in a hole of the table; one behind its end is none
+        hole = table.given_s == -np.inf and start_s < table.known_s
+        if not hole and (table.known_s >= end_s or self._reaches_end(table.known_s)):
             return
-        for block in self._segment_blocks(wanted, max(start_s, last_s + _SAME_TICK_S), end_s):
+        last_s = -np.inf if hole else table.known_s
+        for block in segment_blocks(self.folder, wanted, max(start_s, last_s + _SAME_TICK_S), end_s, self.notes):
             if block["mono_s"][-1] - last_s > _WAY_DOWN_S:
                 add_note(self.notes, _STAND_IN)
             yield block
@@ -114,23 +123,6 @@ class Run:
             return False
         duration_s = self.summary.get("duration_s")
         return not isinstance(duration_s, (int, float)) or until_s > duration_s - _WAY_DOWN_S
-
-    def _segment_blocks(self, names: Sequence[str], start_s: float, end_s: float) -> Iterator[Block]:
-        """Telemetry of the Rerun segments."""
-        paths = rrd_reader.segments(self.folder)
-        first = self._segment_at(paths, start_s) if np.isfinite(start_s) else 0
-        for path in paths[first:]:
-            block = _cut(rrd_reader.read_ticks(path, names, self.notes), "mono_s", start_s, end_s)
-            if block["mono_s"].size:
-                yield block
-
-    def _segment_at(self, paths: Sequence[Path], time_s: float) -> int:
-        """Number of the last segment that begins before a time."""
-        for place in reversed(range(len(paths))):
-            times_s = rrd_reader.read_ticks(paths[place], ["mono_s"], self.notes)["mono_s"]
-            if times_s.size and times_s[0] <= time_s:
-                return place
-        return 0
 
     def level(
         self,
@@ -146,14 +138,15 @@ class Run:
         names = tuple(dict.fromkeys(("time_s", "rows", *names)))
         if window_s not in WINDOWS_S:
             raise ValueError(f"levels are {', '.join(f'{w:g}' for w in WINDOWS_S)} s, not {window_s:g}")
-        blocks = list(self._table_blocks(level_table(window_s), "time_s", names, start_s, end_s))
+        blocks, table = _listed(self._table_blocks(level_table(window_s), "time_s", names, start_s, end_s))
         time_s = np.concatenate([block["time_s"] for block in blocks] or [np.empty(0)])
         missing = _holes(time_s, window_s, start_s)
         until_s = float(time_s[-1]) + window_s if time_s.size else start_s
-        if not time_s.size or not self._reaches_end(until_s):
+        within = table.known_s >= end_s  # the table goes on behind the part
+        if not time_s.size or (end_s - until_s > _HOLE_S if within else not self._reaches_end(until_s)):
             missing.append((until_s, end_s))
-        for hole in missing:
-            blocks += self._made_level(window_s, *hole, names)
+        for begins_s, ends_s in missing:
+            blocks += self._made_level(window_s, begins_s, ends_s, names) if begins_s < ends_s else []
         if not blocks:
             return {name: np.empty(0) for name in names}
         level = {name: np.concatenate([block[name] for block in blocks]) for name in names}
@@ -197,24 +190,38 @@ class Run:
 
     def _table_blocks(
         self, table: str, time_name: str, names: Sequence[str], start_s: float, end_s: float
-    ) -> Iterator[Block]:
+    ) -> Generator[Block, None, _Reach]:
+        """Blocks of a table's part; returns how far the table goes."""
         files = column_files(self.folder, table)
         limited = np.isfinite(start_s) or np.isfinite(end_s)
         starts = [first_s(path, time_name) if limited else None for path in files]
-        last_s = -np.inf
+        last_s = known_s = -np.inf
         for place, path in enumerate(files):
             begins, ends = starts[place], next((s for s in starts[place + 1 :] if s is not None), None)
+            known_s = max(known_s, -np.inf if begins is None else begins)
             if (begins is not None and begins >= end_s) or (ends is not None and ends <= start_s):
                 continue
             read = self._file(path, files[-1], names)
             if read is None or time_name not in read.column_names:
                 continue
             block = {name: _array(read, name) for name in names}
+            known_s = max(known_s, block[time_name][-1] if block[time_name].size else -np.inf)
             # a journal may repeat what the recorder had just written when it was killed
-            block = _cut(block, time_name, max(start_s, np.nextafter(last_s, np.inf)), end_s)
+            block = cut(block, time_name, max(start_s, np.nextafter(last_s, np.inf)), end_s)
             if block[time_name].size:
                 last_s = float(block[time_name][-1])
                 yield block
+        return _Reach(last_s, float(known_s))
+
+
+def _listed(blocks: Generator[Block, None, _Reach]) -> tuple[list[Block], _Reach]:
+    """All blocks, and what their generator returns."""
+    found: list[Block] = []
+    while True:
+        try:
+            found.append(next(blocks))
+        except StopIteration as end:
+            return found, end.value
 
 
 def open_run(path: Path | str) -> Run:
@@ -309,11 +316,3 @@ def _array(table: pa.Table, name: str) -> Column:
     if name not in table.column_names:
         return np.full(table.num_rows, np.nan)
     return np.asarray(table.column(name).to_numpy())
-
-
-def _cut(block: Block, time_name: str, start_s: float, end_s: float) -> Block:
-    time_s = block[time_name]
-    first, last = np.searchsorted(time_s, [start_s, end_s])
-    if first == 0 and last == time_s.size:
-        return block
-    return {name: values[first:last] for name, values in block.items()}
