@@ -214,6 +214,8 @@ def _first(grid: NDArray[np.float32]) -> int:
 
 def _benefit(run: Run, ticks: HoldPass, true: bool) -> Benefit | None:
     second, counts, sums = ticks.seconds[TRUE if true else READING]
+    if not np.isfinite(sums[KEPT_AWAY]).any():
+        return None
     error = sums[ERROR]
     _, held = window_means(second, counts, error, 1, run.config.loop.rate_hz)
     _, without = window_means(second, counts, error + sums[KEPT_AWAY], 1, run.config.loop.rate_hz)

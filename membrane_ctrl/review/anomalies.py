@@ -13,12 +13,17 @@ from membrane_ctrl.review.hold_pass import HoldPass
 from membrane_ctrl.review.run import Run
 from membrane_ctrl.review.shape_review import ShapeReview
 from membrane_ctrl.review.windows import WindowStatistics
+from membrane_ctrl.review.words import span
 
 # 95 % in band is what noise alone leaves of single ticks; of seconds a hold keeps all.
 _IN_BAND_LEAST = 0.999
 _BIAS_MOST_UM = 0.1
 _LATE_P99_MOST_MS = 5.0
 _REJECTED_MOST = 0.02
+_THIN = (
+    "without every tick: means are those of the 1 s level; single readings, their histogram, spectrum, Allan "
+    "deviation and pump are those of the ticks that are there, and what the feed-forward was worth is not known"
+)
 # Below this a one-sided pump loses the band (PHYSICS: a mirror that is too tight).
 _LEAK_LEAST_UM_PER_S = 0.4
 # A one-sided pump is at 0 now and then in typical weather (2 % on the twin).
@@ -68,6 +73,8 @@ def anomalies(
             odd.append(Anomaly("drift", _of(series.drift, "um/h")))
     if ticks.missed_ticks:
         odd.append(Anomaly("missed ticks", f"{ticks.missed_ticks} of {ticks.ticks + ticks.missed_ticks}"))
+    if ticks.thin_s:
+        odd.append(Anomaly("thinned ticks", f"{span(ticks.thin_s)} held {_THIN}"))
     if ticks.lateness_ms.quantile(0.99) > _LATE_P99_MOST_MS:
         odd.append(Anomaly("late ticks", f"p99 is {ticks.lateness_ms.quantile(0.99):.1f} ms"))
     if leak_um_per_s < _LEAK_LEAST_UM_PER_S:

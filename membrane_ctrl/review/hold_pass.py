@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,11 @@ from membrane_ctrl.names import State
 from membrane_ctrl.recording.levels import true_error_um
 from membrane_ctrl.recording.statistics import LogHistogram, Moments
 from membrane_ctrl.review.feedforward import WithoutFeedforward
+from membrane_ctrl.review.held_time import HeldTime
 from membrane_ctrl.review.run import Run
 from membrane_ctrl.review.settled import FIELDS as SETTLED_FIELDS
 from membrane_ctrl.review.settled import Settled
+from membrane_ctrl.review.thin_seconds import LevelMeans, SecondsOf, ThinSeconds, filled, level_means
 from membrane_ctrl.review.windows import SecondSums
 
 Column = NDArray[np.float64]
@@ -32,11 +34,10 @@ ERROR, KEPT_AWAY = range(2)
 # The histogram reaches this many bands to each side, in bins of a fiftieth of a band.
 _HISTOGRAM_BANDS = 5
 _HISTOGRAM_BINS = 500
+# A second here and there has lost ticks, beside a damaged batch or by a slow machine: it is left out, the rest kept.
+_THIN_FROM = 0.05
 # Flow wanted and flow given differ by less than this when nothing limits: single precision at full flow.
 _SATURATED_UM_PER_S = 1e-3
-
-
-SecondsOf = tuple[NDArray[np.int64], Column, Column]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,8 @@ class HoldPass:
     start_s, end_s : float
     hold_s : float
         Time in `hold`.
+    thin_s : float
+        Settled seconds whose ticks are not all there: their means are those of the level.
     grid_s : float
         Time of the first place of the grids.
     reading_um, true_um : (n,) float32
@@ -89,6 +92,7 @@ class HoldPass:
     start_s: float
     end_s: float
     hold_s: float
+    thin_s: float
     grid_s: float
     reading_um: Single
     true_um: Single
@@ -116,7 +120,21 @@ def hold_pass(run: Run, span_s: tuple[float, float], part_s: tuple[float, float]
     collected = _Collector(run, span_s, math.isfinite(part_s[0]))
     for block in run.tick_blocks(NAMES, *part_s):
         collected.add(block)
-    return collected.result()
+    ticks = collected.result()
+    thin, setpoint_um = collected.thin.result()
+    within = (thin >= part_s[0]) & (thin + 1 <= part_s[1])
+    if np.count_nonzero(within) <= _THIN_FROM * ticks.seconds[READING][0].size:
+        return ticks
+    return _with_level(ticks, level_means(run, thin[within], setpoint_um[within]))
+
+
+def _with_level(ticks: HoldPass, means: LevelMeans) -> HoldPass:
+    """The means of seconds whose ticks are not all there, from the level."""
+    reading, true = ticks.seconds
+    if means.second.size <= _THIN_FROM * reading[0].size:
+        return ticks
+    seconds = filled(reading, means, means.reading_um), filled(true, means, means.true_um)
+    return replace(ticks, seconds=seconds, thin_s=float(means.second.size))
 
 
 class _Collector:
@@ -136,7 +154,9 @@ class _Collector:
         self._histogram = np.zeros(_HISTOGRAM_BINS, dtype=np.int64)
         self._lateness = LogHistogram()
         self._pump = _PumpSums()
-        self._ticks = self._counted = self._unread = self._inside = self._hold = 0
+        self._ticks = self._counted = self._unread = self._inside = 0
+        self._hold = HeldTime(run.config.recording.quiet_hz)
+        self.thin = ThinSeconds(loop.rate_hz)
         # the running count at the beginning: of a part its first tick's, which says what was before
         self._missed_before = math.nan if from_within else 0.0
         self._missed = 0.0
@@ -148,7 +168,8 @@ class _Collector:
         kept_away = self._without.kept_away_um(block["feedforward_um_per_s"])[mask]
         self._ticks += time_s.size
         self._span = (self._span[0] if self._ticks > time_s.size else float(time_s[0]), float(time_s[-1]))
-        self._hold += int((block["state"] == State.HOLD).sum())
+        self._hold.add(time_s, block["state"] == State.HOLD)
+        self.thin.add(time_s, block["setpoint_um"], mask)
         missed = block["missed_ticks"][np.isfinite(block["missed_ticks"])]
         if missed.size:
             self._missed_before = float(missed[0]) if math.isnan(self._missed_before) else self._missed_before
@@ -183,7 +204,8 @@ class _Collector:
             missed_ticks=int(self._missed),
             start_s=self._span[0],
             end_s=self._span[1],
-            hold_s=self._hold * self._period_s,
+            hold_s=self._hold.result_s(self._period_s),
+            thin_s=0.0,
             grid_s=self._grid_s,
             reading_um=self._reading,
             true_um=self._true,

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.nights import night, write_run
-from membrane_ctrl.recording.rows import COLUMN, column
+from membrane_ctrl.names import State
+from membrane_ctrl.recording.rows import COLUMN, Rows, column
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.analysis import analyse
+from membrane_ctrl.review.held_time import HeldTime
 from membrane_ctrl.review.report_json import report_table
 from membrane_ctrl.review.verdict import verdict
 
@@ -35,3 +38,53 @@ def test_the_true_centre_counts_where_the_laser_is_blind(tmp_path: Path) -> None
     assert analysis.benefit.with_um == pytest.approx(seconds.std_um, rel=1e-9)
     assert report_table(analysis)["held_without_reading_s"] == pytest.approx(60, abs=0.2)
     assert "(1 min of it without a reading)" in verdict(analysis)[1]
+
+
+def _with_ticks(folder: Path, rows: Rows, kept: np.ndarray) -> Path:
+    """A run whose levels are of all rows, and its ticks some of them."""
+    write_run(folder, iter([(rows, [])]))
+    write_run(folder / "thin", iter([(rows[kept], [])]))
+    shutil.copy(folder / "thin" / "columns" / "ticks-000.arrows", folder / "columns")
+    return folder
+
+
+def test_seconds_without_every_tick_are_those_of_the_level(tmp_path: Path) -> None:
+    rows, _ = night(1, HOURS, "typical", [])
+    rows[:300, COLUMN["state"]] = State.SETTLE
+    rows[1000:1050, COLUMN["displacement_um"]] += 1.0  # something happened: ten seconds with every tick
+    tick = column(rows, "tick")
+    some = (tick % 5 == 0) | ((tick >= 950) & (tick < 1050))
+    every = analyse(open_run(_with_ticks(tmp_path / "every", rows, tick >= 0)))
+    thinned = analyse(open_run(_with_ticks(tmp_path / "some", rows, some)))
+    assert every.ticks.thin_s == 0
+    assert thinned.ticks.hold_s == pytest.approx(every.ticks.hold_s, abs=0.5)
+    assert thinned.ticks.thin_s == pytest.approx(HOURS * 3600 - 30 - 5 - 10, abs=2)
+    assert every.reading is not None
+    assert thinned.reading is not None
+    for ours, theirs in zip(thinned.reading.windows, every.reading.windows, strict=True):
+        assert ours.count == theirs.count
+        assert ours.std_um == pytest.approx(theirs.std_um, rel=1e-3)
+        assert ours.mean_um == pytest.approx(theirs.mean_um, abs=1e-4)
+    assert [odd.name for odd in thinned.anomalies if odd not in every.anomalies] == ["thinned ticks"]
+    assert every.benefit is not None
+    assert thinned.benefit is None
+
+
+def test_a_part_between_seconds_and_a_lost_tick_are_not_thin(tmp_path: Path) -> None:
+    rows, _ = night(1, HOURS, "typical", [])
+    run = open_run(_with_ticks(tmp_path / "run", rows, ~np.isin(column(rows, "tick"), [1203, 1204, 1205])))
+    analysis = analyse(run, 60.5, 140.3)
+    assert (analysis.ticks.thin_s, analysis.benefit is None) == (0, False)
+    assert analysis.ticks.hold_s == pytest.approx(79.8, abs=0.1)
+
+
+def test_time_held_is_that_between_ticks() -> None:
+    time_s = np.array([0.0, 0.1, 0.6, 1.1, 1.2, 3.0, 63.0, 63.1])
+    held = np.array([False, True, True, True, False, True, True, True])
+    for cut in (1, 3, 5, 7):
+        time = HeldTime(quiet_hz=2.0)
+        time.add(time_s[:cut], held[:cut])
+        time.add(time_s[:0], held[:0])
+        time.add(time_s[cut:], held[cut:])
+        # the minute without a tick is not known
+        assert time.result_s(0.1) == pytest.approx(0.5 + 0.5 + 0.1 + 0.1 + 0.1)

@@ -65,7 +65,8 @@ def test_what_the_tables_have_is_not_read_from_segments(tmp_path: Path, reads: l
 def test_only_segments_about_the_part_are_read(
     tmp_path: Path, reads: list[int], start_s: float, end_s: float
 ) -> None:
-    folder, notes = _with_segments(tmp_path / "run"), []
+    folder = _with_segments(tmp_path / "run")
+    notes: list[str] = []
     blocks = list(segment_blocks(folder, ["mono_s"], start_s, end_s, notes))
     time_s = np.concatenate([block["mono_s"] for block in blocks])
     every = np.concatenate([SEGMENT_S * n + np.arange(SEGMENT_S) for n in range(60) if n not in {10, 31}])
