@@ -7,12 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from membrane_ctrl.names import State
 from membrane_ctrl.recording.levels import coarser_level
-from membrane_ctrl.review.door_steps import door_steps, looked_at
+from membrane_ctrl.review.door_steps import door_steps, looked_at, update_s
+from membrane_ctrl.review.laser_jumps import glitches
 from membrane_ctrl.review.shapes import Shapes
-from membrane_ctrl.review.steps import confidence, differences, local_sigma, steps
+from membrane_ctrl.review.steps import confidence, differences, steps
 
 Column = NDArray[np.float64]
 Level = dict[str, Column]
@@ -32,9 +34,9 @@ LEAK_LEAST_SHARE = 0.2
 LEAK_LEAST_UM_PER_S = 0.03
 LEAK_LEAST_SIGMAS = 6.0
 LEAK_HALF_MIN = 5
-# A laser's noise is 1 um; the film makes no spike of a single tick.
-GLITCH_LEAST_UM = 4.0
-GLITCH_LEAST_SIGMAS = 8.0
+# The loop brings the mirror back after a door, and after a time without a reading.
+DOOR_MOVES_S = 5
+LOST_MOVES_S = 3
 LATE_LEAST_MS = 5.0
 LATE_LEAST_RATIO = 8.0
 LATE_BURST_S = 10.0
@@ -128,22 +130,23 @@ def leak_steps(level: Level) -> list[Found]:
 
 
 def laser_glitches(level: Level) -> list[Found]:
-    """A reading far from its second's mean, while the mirror before and after is where it was."""
-    mean = level["mean_displacement_um"]
-    above, below = level["max_displacement_um"] - mean, mean - level["min_displacement_um"]
-    excursion = np.fmax(above, below)
-    usual = float(np.nanmedian(excursion)) if np.isfinite(excursion).any() else 0.0
-    sigma = local_sigma(excursion - usual)
-    moved = np.nan_to_num(np.abs(differences(mean, 1, 1)))
-    enough = np.fmax(GLITCH_LEAST_UM, GLITCH_LEAST_SIGMAS * sigma)
-    rows = np.flatnonzero((excursion - usual > enough) & (moved < 0.3 * excursion) & (level["state"] == State.HOLD))
-    rows = rows[np.concatenate(([True], np.diff(rows) > 2))] if rows.size else rows
-    size = np.where(above >= below, above, -below)
-    scores = (excursion - usual) / np.maximum(sigma, 1e-9)
+    """Readings that jump and jump back, while neither the air pressure nor a loss of the laser explains it."""
+    lost = level["max_displacement_quality"] > 0
+    barometer = level["mean_ambient_pressure_pa"]
+    stepped = np.zeros(lost.size, dtype=bool)
+    stepped[[round(step.time_s - level["time_s"][0]) for step in pressure_steps(level)]] = True
+    # a slow barometer tells of a door when it comes to it
+    stepped = _widened(stepped, DOOR_MOVES_S + (update_s(barometer) if update_s(barometer) > 1 else 0))
+    usable = (level["state"] == State.HOLD) & ~stepped & ~_widened(lost, LOST_MOVES_S)
+    calm = ~_widened(~np.isfinite(barometer), DOOR_MOVES_S)
+    low_um, mean_um, high_um = (level[f"{kind}_displacement_um"] for kind in ("min", "mean", "max"))
+    found = glitches(low_um, mean_um, high_um, usable, calm)
+    time_s = level["time_s"]
     return [
-        _event("laser glitch", level, int(row), 1, float(size[row]), "um", confidence(float(scores[row]), mean.size))
-        for row in rows
-    ]
+        Found("laser glitch", float(time_s[g.first]), float(time_s[g.first]) - 30, float(time_s[g.last]) + 30,
+              g.size_um, "um", confidence(g.sigmas, time_s.size))
+        for g in found
+    ]  # fmt: skip
 
 
 def laser_losses(level: Level) -> list[Found]:
@@ -228,6 +231,11 @@ def _event(kind: str, table: Level, row: int, half_s: float, size: float, unit: 
     """An event with a range about it of some times what it was found in."""
     time_s = float(table["time_s"][row])
     return Found(kind, time_s, time_s - 30 * half_s**0.5, time_s + 30 * half_s**0.5, size, unit, sure)
+
+
+def _widened(flags: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:
+    """True rows and so many on each side of them."""
+    return np.asarray(ndimage.maximum_filter1d(flags, 2 * rows + 1, mode="constant", cval=0), dtype=bool)
 
 
 def _runs(flags: NDArray[np.bool_], join: int) -> list[tuple[int, int]]:

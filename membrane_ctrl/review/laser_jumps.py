@@ -1,0 +1,120 @@
+"""Laser readings that jump and jump back: spikes within a second, and glitches that last up to a minute."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from membrane_ctrl.review.steps import Column, differences, local_sigma
+
+# A laser's noise is 1 um; the film makes no spike of a single tick.
+GLITCH_LEAST_UM = 4.0
+GLITCH_LEAST_SIGMAS = 8.0
+# What lasts longer the loop has followed and the camera contradicted.
+GLITCH_LONGEST_S = 60
+# Longer than spikes, shorter than what weather and loop do.
+_BASE_S = 7
+# A glitch within a second leaves the mirror where it was.
+_MOVED_MOST = 0.3
+# Both edges are of one size, but for what the loop does within two seconds.
+_EDGES_ALIKE = 0.6
+_EDGE_S = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Glitch:
+    """A reading that was not the mirror's: first and last row, um, and sigmas above the noise."""
+
+    first: int
+    last: int
+    size_um: float
+    sigmas: float
+
+
+def glitches(
+    low_um: Column, mean_um: Column, high_um: Column, usable: NDArray[np.bool_], calm: NDArray[np.bool_]
+) -> list[Glitch]:
+    """Spikes and longer glitches, one for each that happened.
+
+    Parameters
+    ----------
+    low_um, mean_um, high_um : (n,) arrays
+        Least, mean and greatest reading of each second.
+    usable : (n,) array
+        Seconds in which the mirror is held, and neither a step of the air pressure moved it nor the laser was lost.
+    calm : (n,) array
+        Those in which a barometer says so: without one, a door that is closed again looks like a long glitch.
+    """
+    if not np.isfinite(mean_um).any():
+        return []
+    size_um = _farthest(low_um, mean_um, high_um)
+    long = [_sized(glitch, size_um) for glitch in _pairs(_edges(mean_um, usable & calm))]
+    apart = usable.copy()
+    for glitch in long:
+        apart[max(0, glitch.first - _EDGE_S) : glitch.last + _EDGE_S + 1] = False
+    return sorted(long + _spikes(size_um, mean_um, apart), key=lambda glitch: glitch.first)
+
+
+def _farthest(low_um: Column, mean_um: Column, high_um: Column) -> Column:
+    """(n,) the reading of each second that is farthest from where the seconds around it are, against that."""
+    rows = np.arange(mean_um.size)
+    there = np.isfinite(mean_um)
+    base = ndimage.median_filter(np.interp(rows, rows[there], mean_um[there]), _BASE_S, mode="nearest")
+    above, below = high_um - base, base - low_um
+    return np.where(above >= below, above, -below)
+
+
+def _sized(glitch: Glitch, size_um: Column) -> Glitch:
+    """Of a short one the size is that of its readings: the mean of a second tells of a part of it."""
+    if glitch.last - glitch.first > _BASE_S // 2:
+        return glitch
+    part = size_um[glitch.first - 1 : glitch.last + 2]
+    return replace(glitch, size_um=float(part[np.nanargmax(np.abs(part))]))
+
+
+def _spikes(size_um: Column, mean_um: Column, usable: NDArray[np.bool_]) -> list[Glitch]:
+    """A reading far from where the seconds around it are, while the mirror before and after is where it was."""
+    far = np.abs(size_um)
+    usual = float(np.nanmedian(far))
+    sigma = local_sigma(far - usual)
+    moved = np.nan_to_num(np.abs(differences(mean_um, 1, 1)))
+    enough = np.fmax(GLITCH_LEAST_UM, GLITCH_LEAST_SIGMAS * sigma)
+    found = np.flatnonzero((far - usual > enough) & (moved < _MOVED_MOST * far) & usable)
+    found = found[np.concatenate(([True], np.diff(found) > 2))] if found.size else found
+    score = (far - usual) / np.maximum(sigma, 1e-9)
+    return [Glitch(int(row), int(row), float(size_um[row]), float(score[row])) for row in found]
+
+
+def _edges(mean_um: Column, usable: NDArray[np.bool_]) -> list[Glitch]:
+    """Steps of the reading within two seconds, each a glitch without an end; `first` is the second of the step."""
+    change = np.full(mean_um.size, np.nan)
+    change[1:-1] = mean_um[_EDGE_S:] - mean_um[:-_EDGE_S]
+    sigma = local_sigma(change)
+    size = np.nan_to_num(np.abs(change))
+    rows = np.flatnonzero((size >= np.fmax(GLITCH_LEAST_UM, GLITCH_LEAST_SIGMAS * sigma)) & usable)
+    if not rows.size:
+        return []
+    other = (np.diff(rows) > 1) | (np.diff(np.sign(change[rows])) != 0)
+    best = [int(part[np.argmax(size[part])]) for part in np.split(rows, np.flatnonzero(other) + 1)]
+    return [Glitch(row, row, float(change[row]), float(size[row] / max(sigma[row], 1e-9))) for row in best]
+
+
+def _pairs(edges: list[Glitch]) -> list[Glitch]:
+    """Edges with their edges back; others are no glitches."""
+    found: list[Glitch] = []
+    for place, edge in enumerate(edges):
+        if found and edge.first <= found[-1].last:
+            continue
+        later = edges[place + 1 : place + 1 + GLITCH_LONGEST_S]
+        near = (other for other in later if other.first <= edge.first + GLITCH_LONGEST_S)
+        back = next((other for other in near if _alike(edge.size_um, -other.size_um)), None)
+        if back is not None:
+            found.append(Glitch(edge.first, back.first, edge.size_um, edge.sigmas))
+    return found
+
+
+def _alike(size_um: float, other_um: float) -> bool:
+    return size_um * other_um > 0 and _EDGES_ALIKE <= abs(size_um / other_um) <= 1 / _EDGES_ALIKE
