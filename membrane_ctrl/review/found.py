@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,7 @@ Level = dict[str, Column]
 
 # Columns of the 1 s level that are looked at.
 LEVEL_COLUMNS = (
-    "state", "min_ambient_pressure_pa", "mean_ambient_pressure_pa", "mean_flow_um_per_s",
+    "state", "fault", "min_ambient_pressure_pa", "mean_ambient_pressure_pa", "mean_flow_um_per_s",
     "mean_feedforward_um_per_s", "min_displacement_um", "mean_displacement_um", "max_displacement_um",
     "max_displacement_quality", "max_lateness_ms", "mean_error_um", "mean_air_temperature_c",
 )  # fmt: skip
@@ -48,6 +49,12 @@ SPREAD_HALF_MIN = 10
 JUMP_LEAST_UM = 0.3
 JUMP_LEAST_SIGMAS = 8.0
 JUMP_HALF_CYCLES = 5
+# Of a fault or an event: what the loop needs to be back in the band after it (a leak of 1.2 um/s and 40 um: 32 s).
+BACK_S = 30
+# An event timed to a second may be found some after its effect begins.
+TIMED_S = 5.0
+# These are timed to minutes; what they explain is within their range.
+_TIMED_TO_MINUTES = ("leak step", "noise change")
 # Robust sigma of a greatest-of-a-second is taken about its median.
 _SIGMA_OVER_MAD = 1.4826
 
@@ -60,7 +67,7 @@ class Found:
     ----------
     kind : str
         "pressure step", "leak step", "laser glitch", "laser lost", "barometer lost", "thermometer lost",
-        "lateness burst", "noise change" or "shape jump".
+        "lateness burst", "noise change", "shape jump" or "band left".
     start_s, end_s : float
         Time range of the run that shows it.
     time_s : float
@@ -81,7 +88,7 @@ class Found:
     confidence: float
 
 
-def find_events(level: Level, shapes: Shapes) -> list[Found]:
+def find_events(level: Level, shapes: Shapes, band_um: float = math.inf) -> list[Found]:
     """All events of a run in the order of time.
 
     Parameters
@@ -90,6 +97,8 @@ def find_events(level: Level, shapes: Shapes) -> list[Found]:
         The 1 s level (`Run.level(1.0)`).
     shapes : Shapes
         May be empty.
+    band_um : float
+        The run's `limits.band_um`; without it no "band left" is looked for.
     """
     found: list[Found] = []
     if level["time_s"].size:
@@ -100,6 +109,7 @@ def find_events(level: Level, shapes: Shapes) -> list[Found]:
         )  # fmt: skip
         for finder in finders:
             found += finder(even)
+        found += band_left(even, band_um, found)
     found += shape_jumps(shapes)
     return sorted(found, key=lambda event: event.time_s)
 
@@ -204,6 +214,23 @@ def noise_changes(level: Level) -> list[Found]:
         _event("noise change", time_s, s.row, 60, float(np.exp(s.size)), "times", confidence(s.sigmas, size))
         for s in found
     ]
+
+
+def band_left(level: Level, band_um: float, known: Sequence[Found]) -> list[Found]:
+    """The 1 s mean of the error leaves the band, and neither a fault nor an event known explains it."""
+    time_s, error_um = level["time_s"], level["mean_error_um"]
+    out = (np.abs(error_um) > band_um) & (level["state"] == State.HOLD)
+    out &= ~_widened(level["fault"] > 0, BACK_S)
+    for event in known:
+        from_s = event.start_s if event.kind in _TIMED_TO_MINUTES else event.time_s - TIMED_S
+        first, end = np.searchsorted(time_s, [from_s, event.end_s + BACK_S])
+        out[first:end] = False
+    found = []
+    for a, b in _runs(out, BACK_S):
+        worst = a + int(np.nanargmax(np.abs(error_um[a : b + 1])))
+        found.append(Found("band left", float(time_s[a]), float(time_s[a]) - 30, float(time_s[b]) + 30,
+                           float(error_um[worst]), "um", 1.0))  # fmt: skip
+    return found
 
 
 def shape_jumps(shapes: Shapes) -> list[Found]:

@@ -1,0 +1,62 @@
+"""The band left with and without something that explains it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.nights import DOOR, Planted, night
+from membrane_ctrl.recording.levels import TICK_FIELDS, first_level
+from membrane_ctrl.recording.rows import COLUMN, Rows, column
+from membrane_ctrl.review.found import Found, find_events
+from membrane_ctrl.review.shapes import from_estimates
+
+BAND_UM = 2.0
+AT_S = 1500.0
+
+
+def found_in(rows: Rows, band_um: float = BAND_UM) -> list[Found]:
+    return find_events(first_level({name: column(rows, name) for name in TICK_FIELDS}), from_estimates([]), band_um)
+
+
+def bumped(events: list[Planted], size_um: float, scenario: str = "typical") -> Rows:
+    """The error goes and comes back within some 15 s, too slowly for a glitch."""
+    rows, _ = night(31, 1.0, scenario, events)
+    bump = size_um * np.exp(-0.5 * ((column(rows, "mono_s") - AT_S - 10) / 4) ** 2)
+    rows[:, COLUMN["error_um"]] -= bump
+    rows[:, COLUMN["displacement_um"]] += bump
+    return rows
+
+
+@pytest.mark.parametrize("size_um", [5.0, -5.0])
+def test_an_excursion_without_a_cause_is_named(size_um: float) -> None:
+    (found,) = found_in(bumped([], size_um))
+    assert (found.kind, found.unit) == ("band left", "um")
+    assert found.time_s == pytest.approx(AT_S + 5, abs=3.0)
+    assert found.size == pytest.approx(-size_um, abs=1.2)
+
+
+def test_the_band_is_the_runs() -> None:
+    rows = bumped([], 5.0)
+    assert found_in(rows, 7.0) == []
+    assert found_in(rows, float("inf")) == []
+
+
+def test_a_door_and_a_fault_explain_it() -> None:
+    assert [f.kind for f in found_in(bumped([Planted(DOOR, AT_S + 2, 12.0)], 5.0))] == [DOOR]
+    rows = bumped([], 5.0)
+    time_s = column(rows, "mono_s")
+    rows[(time_s >= AT_S) & (time_s < AT_S + 3), COLUMN["fault"]] = 10
+    assert found_in(rows) == []
+
+
+def test_one_that_is_not_held_is_none() -> None:
+    rows = bumped([], 5.0)
+    rows[column(rows, "mono_s") < AT_S + 60, COLUMN["state"]] = 3
+    assert "band left" not in {f.kind for f in found_in(rows)}
+
+
+@pytest.mark.parametrize("scenario", ["quiet", "typical", "gusty"])
+def test_weather_leaves_the_mirror_in_its_band(scenario: str) -> None:
+    rows, _ = night(32, 4.0, scenario, [])
+    assert found_in(rows) == []
