@@ -54,11 +54,14 @@ def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:
         return _at_rest(viewer)
 
 
-def screenshot_of(files: Sequence[Path]) -> bytes:
-    """PNG of recordings as they open, at their end. Raises RuntimeError as `screenshot`."""
+def screenshot_of(files: Sequence[Path], at_s: float | None = None) -> bytes:
+    """PNG of recordings as they open, at a second of `run_time` or their end. Raises RuntimeError as `screenshot`."""
     with _viewer() as viewer:
         viewer.open([str(path.resolve()) for path in files])
-        viewer.set_time("run_time", play_state="following")
+        if at_s is None:
+            viewer.set_time("run_time", play_state="following")
+        else:
+            viewer.set_time("run_time", duration=at_s, play_state="paused")
         return _at_rest(viewer)
 
 

@@ -113,7 +113,8 @@ class Layer:
         zero_s : float
             Second of the run that the timeline calls 0.
         part_s : tuple
-            What is shown tick by tick, if it is not too much.
+            What is looked at: shown tick by tick, if that is not too much, and all that logs and maps hold, since a
+            cursor that stands at the end of the recording would show those of the end.
 
         Returns
         -------
@@ -132,8 +133,8 @@ class Layer:
         self._overviews(level, run.config.limits.band_um)
         self._ticks(run, part_s)
         self._lanes(level)
-        self._events(run, found)
-        return self._figure(shapes.select(held_at(level, shapes.time_s)))
+        self._events(run, found, part_s)
+        return self._figure(shapes.select(held_at(level, shapes.time_s)), part_s)
 
     def _overviews(self, level: Block, band_um: float) -> None:
         for overview in OVERVIEWS:
@@ -168,17 +169,19 @@ class Layer:
                 states = [lane.word(code) for _, code in found]
                 self._columns(lane.path, times, rr.StateChange.columns(state=states))
 
-    def _events(self, run: Run, found: Sequence[Found]) -> None:
-        told = [event for event in run.events if event.get("kind") not in {"why"}]
+    def _events(self, run: Run, found: Sequence[Found], part_s: tuple[float, float]) -> None:
+        told = [e for e in run.events if e.get("kind") != "why" and part_s[0] <= event_time_s(e) <= part_s[1]]
         if told:
             levels = ["ERROR" if event.get("kind") == "fault" else "INFO" for event in told]
             texts = [f"mark: {e.get('text')}" if e.get("kind") == MARK else event_text(e) for e in told]
             times = np.array([event_time_s(event) for event in told])
             self._log(run, "/events", times, texts, levels)
+        seen = [f for f in found if part_s[0] <= f.time_s <= part_s[1]]
+        if seen:
+            texts = [f"{f.kind}: {f.size:.3g} {f.unit} (confidence {f.confidence:.3f})" for f in seen]
+            self._log(run, "/found", np.array([f.time_s for f in seen]), texts, ["WARN"] * len(seen))
         if found:
-            texts = [f"{f.kind}: {f.size:.3g} {f.unit} (confidence {f.confidence:.3f})" for f in found]
             times = np.array([f.time_s for f in found])
-            self._log(run, "/found", times, texts, ["WARN"] * len(found))
             self._style("/found/marks", [("found by machine", RED)], points=True)
             self._scalars("/found/marks", times, np.zeros((len(found), 1)))
 
@@ -189,7 +192,7 @@ class Layer:
         ]
         self._columns(path, time_s, rr.TextLog.columns(text=lines, level=levels))
 
-    def _figure(self, shapes: Shapes) -> float:
+    def _figure(self, shapes: Shapes, part_s: tuple[float, float]) -> float:
         good = shapes.select((shapes.verdict != "rejected") & np.isfinite(shapes.coeffs_um).all(axis=1))
         if not len(good):
             return float("nan")
@@ -203,14 +206,16 @@ class Layer:
         self._scalars("/shape/sag_change", shown.time_s, change)
         self._style("/shape/residual", [("slope residual urad", BLUE)])
         self._scalars("/shape/residual", shown.time_s, shown.slope_residual_urad[:, np.newaxis])
-        return self._maps(shown, parameters)
+        seen = (shown.time_s >= part_s[0]) & (shown.time_s <= part_s[1])
+        seen |= ~seen.any()  # nothing measured there: all, rather than no map
+        return self._maps(shown.time_s[seen], parameters[seen])
 
-    def _maps(self, shown: Shapes, parameters: Column) -> float:
+    def _maps(self, time_s: Column, parameters: Column) -> float:
         """Height changes against the first cycle of the hold, on one scale, so that they may be played."""
         axis = (np.arange(_MAP_PX) + 0.5) * 2 / _MAP_PX - 1
         x, y = np.meshgrid(axis, -axis)
         inside = np.hypot(x, y) <= 1.0
-        wanted = np.flatnonzero(_some(len(shown), MAPS_MOST))
+        wanted = np.flatnonzero(_some(time_s.size, MAPS_MOST))
         heights = parameters[wanted] @ height_basis(x[inside], y[inside])
         most = max(0.5, float(np.abs(heights).max()))
         context = rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (1, "", (24, 24, 24, 255))])
@@ -221,7 +226,7 @@ class Layer:
             picture = np.zeros((_MAP_PX, _MAP_PX), dtype=np.float32)
             picture[inside] = height
             image = rr.DepthImage(picture, colormap="turbo", depth_range=(-most, most))
-            self._at(float(shown.time_s[row]))
+            self._at(float(time_s[row]))
             self._stream.log(self._prefix + "/shape/map", image)
         return most
 

@@ -57,25 +57,25 @@ def review_command(options: ReviewOptions) -> int:
                 _require_writable(target, runs)
         file = options.save or Path(folder) / "review.rrd"
         try:
-            make_review(runs, options, file)
+            cursor_s = make_review(runs, options, file)
         finally:
             for run in runs:
                 for note in run.notes:
                     print(f"note: {run.name}: {note}", file=sys.stderr)
-        return _show(file, options)
+        return _show(file, options, cursor_s)
 
 
-def _show(file: Path, options: ReviewOptions) -> int:
+def _show(file: Path, options: ReviewOptions, cursor_s: float | None) -> int:
     if options.screenshot is not None:
         try:
-            options.screenshot.write_bytes(screenshot_of([file]))
+            options.screenshot.write_bytes(screenshot_of([file], cursor_s))
         except RuntimeError as error:
             raise DeviceError(f"no picture: {error}") from None
         return 0
     if options.save is not None:
         print(file)
         return 0
-    return viewer.serve([file], options.bind, options.port) if options.web else viewer.show([file])
+    return viewer.serve([file], options.bind, options.port) if options.web else viewer.show([file], cursor_s)
 
 
 def _require_sense(options: ReviewOptions) -> None:
@@ -115,7 +115,7 @@ def _require_writable(target: Path, runs: Sequence[Run]) -> None:
         raise DeviceError(f"{target}: cannot be written ({reason}); choose another place") from None
 
 
-def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> None:
+def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> float | None:
     """Write the recording that the viewer opens.
 
     Parameters
@@ -125,6 +125,11 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> None
     options : ReviewOptions
     file : Path
         To write.
+
+    Returns
+    -------
+    float or None
+        Second of the timeline that was asked for: the moment, or where the part begins.
 
     Raises
     ------
@@ -146,6 +151,9 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> None
     blueprint = ReviewBlueprint(prefixes, shown, runs[0].config.limits.band_um, maps_um)
     layer.blueprint(blueprint.made(options.tab))
     layer.close()
+    if shown is None:
+        return None
+    return shown[0] if options.start or options.end else (shown[0] + shown[1]) / 2
 
 
 def _with_telemetry(runs: Sequence[Run]) -> list[Run]:

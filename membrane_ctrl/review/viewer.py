@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO
 
 import rerun_cli  # type: ignore[import-untyped]
+from rerun.experimental import ViewerClient
 
 from membrane_ctrl.errors import DeviceError
 from membrane_ctrl.review.rrd_place import first_message_after
@@ -19,6 +20,9 @@ from membrane_ctrl.review.rrd_reader import segments
 
 # The recorder flushes every second.
 _FOLLOW_S = 0.5
+# A window opens in a few seconds, by a software driver in ten.
+_CURSOR_S = 30.0
+_CURSOR_AGAIN_S = 0.2
 _CHUNK_BYTES = 1 << 20
 _RECENT_BYTES = 20 << 20  # ten minutes at 50 Hz, as they are written
 _STYLE_BYTES = 1 << 20  # blueprint, colours and names come first, in a tenth of this
@@ -29,11 +33,29 @@ def viewer_command(*arguments: str) -> list[str]:
     return [str(Path(rerun_cli.__file__).parent / "rerun"), *arguments]
 
 
-def show(files: list[Path]) -> int:
-    """Open files on this machine's screen; returns when the window is closed."""
+def show(files: list[Path], at_s: float | None = None) -> int:
+    """Open files on this machine's screen, at a second of `run_time`; returns when the window is closed."""
     _require_screen()
-    paths = [str(path) for path in files]
-    return _run(viewer_command("--bind", "127.0.0.1", "--port", str(free_port()), *paths))
+    port = free_port()
+    command = viewer_command("--bind", "127.0.0.1", "--port", str(port), *(str(path) for path in files))
+    return _run(command, lambda process: None if at_s is None else put_cursor(process, port, at_s))
+
+
+def put_cursor(process: subprocess.Popen[bytes], port: int, at_s: float, most_s: float = _CURSOR_S) -> None:
+    """Put the time cursor of a viewer there as soon as it has opened its files; a blueprint cannot say it.
+
+    A viewer that does not answer in time is left as it opened: the plots show the part asked for all the same.
+    """
+    until_s = time.monotonic() + most_s
+    while time.monotonic() < until_s and process.poll() is None:
+        try:
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client.set_time("run_time", duration=at_s, play_state="paused")
+            if any(opened.current_time == round(1e9 * at_s) for opened in client.get_state().recordings):
+                return
+        except (RuntimeError, ConnectionError):
+            pass
+        time.sleep(_CURSOR_AGAIN_S)
 
 
 def serve(files: list[Path], bind: str, port: int) -> int:
@@ -182,10 +204,11 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _run(command: list[str]) -> int:
+def _run(command: list[str], started: Callable[[subprocess.Popen[bytes]], None] = lambda _: None) -> int:
     try:
         with subprocess.Popen(command, env=_environment()) as viewer:
             try:
+                started(viewer)
                 return 0 if viewer.wait() == 0 else 4
             except KeyboardInterrupt:
                 viewer.terminate()
