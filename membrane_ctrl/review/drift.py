@@ -10,6 +10,12 @@ from scipy import stats
 
 Column = NDArray[np.float64]
 
+# Rounds of g and of the variance that the line took up: the coverage of short records is right after three, and
+# more leave the shortest no degree of freedom, whose interval then says nothing.
+_BIAS_ROUNDS = 3
+# Of the variance; with more the correlation would be made of the correction.
+_TAKEN_MOST = 0.5
+
 
 @dataclass(frozen=True, slots=True)
 class Slope:
@@ -41,8 +47,10 @@ def slope(time_s: Column, values: Column) -> Slope:
 
     The variance of the ordinary slope is multiplied by the integrated autocorrelation time of the residuals,
     g = 1 + 2 sum r_k, summed while the sums of neighbouring pairs stay positive and fall (Geyer 1992, initial
-    monotone sequence); Student's t has the degrees of freedom that are left, n / g - 2. A line that took up part of
-    a slow wander makes g too small in short series: r_k is raised by 1 / n for each of the two parameters.
+    monotone sequence); Student's t has the degrees of freedom that are left, n / g - 2. A line takes up part of a
+    slow wander and makes g too small in short series: each of its two parameters takes g / n of the variance out of
+    every r_k, which is put back, with g from the round before. An interval of 95 % then covers 94 to 97 % of
+    long records, and 90 % of those of six correlation times.
 
     Parameters
     ----------
@@ -72,8 +80,15 @@ def _correlation_time(residual: Column) -> float:
     covariance = np.fft.irfft(power)[:size]
     if covariance[0] <= 0:
         return 1.0
-    correlation = covariance / covariance[0] + 2.0 / size
-    correlation[0] = 1.0
+    seen, factor = covariance / covariance[0], 1.0
+    for _ in range(_BIAS_ROUNDS):
+        taken = min(2 * factor / size, _TAKEN_MOST)
+        factor = _positive_sum(seen * (1 - taken) + taken)
+    return factor
+
+
+def _positive_sum(correlation: Column) -> float:
+    size = correlation.size
     pairs = correlation[: size // 2 * 2].reshape(-1, 2).sum(axis=1)
     ends = np.flatnonzero(pairs <= 0)
     pairs = np.minimum.accumulate(pairs[: ends[0]] if ends.size else pairs)

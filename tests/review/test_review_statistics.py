@@ -116,6 +116,21 @@ def test_the_interval_of_the_slope_covers_the_truth_as_often_as_it_says(memory: 
     assert 180 <= covered <= 199
 
 
+@pytest.mark.parametrize(("count", "step_s", "tau_s"), [(60, 60.0, 300.0), (600, 1.0, 30.0), (600, 1.0, 100.0)])
+def test_the_interval_of_a_short_record_knows_that_the_line_took_up_its_wander(
+    count: int, step_s: float, tau_s: float
+) -> None:
+    rng, memory = np.random.default_rng(0), np.exp(-step_s / tau_s)
+    time_s = step_s * np.arange(count)
+    covered = 0
+    for _ in range(200):
+        noise = rng.normal(size=count) * np.sqrt(1 - memory**2)
+        noise[0] = rng.normal()
+        found = slope(time_s, np.asarray(signal.lfilter([1.0], [1.0, -memory], noise)))
+        covered += found.low <= 0.0 <= found.high
+    assert 0.89 <= covered / 200 <= 0.98
+
+
 def test_a_slope_is_seen_and_too_few_values_say_nothing() -> None:
     time_s = 60.0 * np.arange(100)
     values = 0.5 * time_s / 3600 + 0.01 * np.random.default_rng(5).normal(size=100)
