@@ -17,8 +17,8 @@ from membrane_ctrl.review.held_time import HeldTime
 from membrane_ctrl.review.run import Run
 from membrane_ctrl.review.settled import FIELDS as SETTLED_FIELDS
 from membrane_ctrl.review.settled import Settled
-from membrane_ctrl.review.thin_seconds import LevelMeans, SecondsOf, ThinSeconds, filled, level_means
-from membrane_ctrl.review.windows import SecondSums
+from membrane_ctrl.review.thin_seconds import LevelMeans, ThinSeconds, filled, level_means
+from membrane_ctrl.review.windows import SecondsOf, SecondSums
 
 Column = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -75,7 +75,7 @@ class HoldPass:
         Setpoint minus laser reading and target minus true centre on a grid of ticks, NaN where not settled.
     seconds : tuple
         `SecondSums.result` of the ticks with a reading (`READING`) and of those with a true centre (`TRUE`): rows of
-        sums are the error (`ERROR`) and what the feed-forward kept away (`KEPT_AWAY`).
+        sums are the error (`ERROR`) and what the feed-forward kept away (`KEPT_AWAY`: of the true centre, if known).
     raw_reading, raw_true : Moments
     raw_in_band : float
         Share of settled readings within the band.
@@ -197,6 +197,9 @@ class _Collector:
         self._histogram += np.bincount(bins, minlength=_HISTOGRAM_BINS)
 
     def result(self) -> HoldPass:
+        reading, true = (sums.result() for sums in self._seconds)
+        if true[0].size:  # what was kept away is asked of one of the two only: of a month 20 MB
+            reading = reading[0], reading[1], reading[2][:KEPT_AWAY].copy()
         return HoldPass(
             ticks=self._ticks,
             settled=self._counted,
@@ -209,7 +212,7 @@ class _Collector:
             grid_s=self._grid_s,
             reading_um=self._reading,
             true_um=self._true,
-            seconds=(self._seconds[READING].result(), self._seconds[TRUE].result()),
+            seconds=(reading, true),
             raw_reading=self._raw_reading,
             raw_true=self._raw_true,
             raw_in_band=self._inside / self._counted if self._counted else math.nan,

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.names import State
 from membrane_ctrl.review.run import Block, Run
-from membrane_ctrl.review.windows import LEAST_SHARE
+from membrane_ctrl.review.windows import LEAST_SHARE, Seconds, SecondsOf
 
 Column = NDArray[np.float64]
-SecondsOf = tuple[NDArray[np.int64], Column, Column]
 
 LEVEL_COLUMNS = ("state", "mean_displacement_um", "mean_true_error_um")
 
@@ -28,13 +27,13 @@ class ThinSeconds:
 
     def __init__(self, rate_hz: float) -> None:
         self._least = LEAST_SHARE * rate_hz
-        self._parts: list[tuple[NDArray[np.int64], Column]] = []
+        self._parts: list[tuple[Seconds, Column]] = []
 
     def add(self, time_s: Column, setpoint_um: Column, settled: NDArray[np.bool_]) -> None:
         """Take in (n,) times, setpoints and whether each tick is settled."""
         if not time_s.size:
             return
-        second = np.floor(time_s + 1e-9).astype(np.int64)
+        second = np.floor(time_s + 1e-9).astype(np.int32)
         starts = _starts(second)
         rows = np.stack((np.ones(time_s.size), settled.astype(np.float64), setpoint_um))
         sums = np.add.reduceat(rows, starts, axis=1)
@@ -42,10 +41,10 @@ class ThinSeconds:
         thin = (sums[0] < self._least) & (sums[1] > 0)
         self._parts.append((second[starts][thin], sums[:, thin]))
 
-    def result(self) -> tuple[NDArray[np.int64], Column]:
+    def result(self) -> tuple[Seconds, Column]:
         """(k,) seconds whose few ticks are all settled, (k,) their mean setpoint in um."""
         if not self._parts:
-            return np.empty(0, dtype=np.int64), np.empty(0)
+            return np.empty(0, dtype=np.int32), np.empty(0)
         second = np.concatenate([part[0] for part in self._parts])
         if not second.size:
             return second, np.empty(0)
@@ -59,16 +58,16 @@ class ThinSeconds:
 class LevelMeans:
     """Means of (k,) thin seconds by the level: with the ticks they had, errors in um, NaN where there is none."""
 
-    second: NDArray[np.int64]
+    second: Seconds
     ticks: Column
     reading_um: Column
     true_um: Column
 
 
-def level_means(run: Run, second: NDArray[np.int64], setpoint_um: Column) -> LevelMeans:
+def level_means(run: Run, second: Seconds, setpoint_um: Column) -> LevelMeans:
     """What the 1 s level knows of thin seconds, as far as its own are whole."""
     level: Block = run.level(1.0, float(second[0]), float(second[-1]) + 1.0, LEVEL_COLUMNS)
-    _, place, row = np.intersect1d(second, np.rint(level["time_s"]).astype(np.int64), return_indices=True)
+    _, place, row = np.intersect1d(second, np.rint(level["time_s"]).astype(np.int32), return_indices=True)
     whole = (level["rows"][row] >= LEAST_SHARE * run.config.loop.rate_hz) & (level["state"][row] == State.HOLD)
     place, row = place[whole], row[whole]
     reading_um = setpoint_um[place] - level["mean_displacement_um"][row]
@@ -83,12 +82,12 @@ def filled(seconds: SecondsOf, means: LevelMeans, error_um: Column) -> SecondsOf
     there = np.isfinite(error_um)
     second, counts, sums = seconds
     kept = ~np.isin(second, means.second[there])
-    ticks = means.ticks[there]
+    ticks = means.ticks[there].astype(np.float32)
     joined = np.concatenate((second[kept], means.second[there]))
     order = np.argsort(joined, kind="stable")
     errors_um = np.concatenate((sums[0][kept], error_um[there] * ticks))[order]
     return joined[order], np.concatenate((counts[kept], ticks))[order], np.stack((errors_um, errors_um * np.nan))
 
 
-def _starts(second: NDArray[np.int64]) -> NDArray[np.intp]:
+def _starts(second: Seconds) -> NDArray[np.intp]:
     return np.flatnonzero(np.concatenate(([True], second[1:] != second[:-1])))

@@ -8,6 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Column = NDArray[np.float64]
+# Of a month there are millions: single precision, which counts ticks exactly.
+Seconds = NDArray[np.int32]
+Counts = NDArray[np.float32]
+SecondsOf = tuple[Seconds, Counts, Column]
 
 # A window with fewer of its ticks than this says nothing of its length.
 LEAST_SHARE = 0.9
@@ -47,22 +51,22 @@ class SecondSums:
     """
 
     def __init__(self, series: int) -> None:
-        self._parts: list[tuple[NDArray[np.int64], Column, Column]] = []
+        self._parts: list[SecondsOf] = []
         self._series = series
 
     def add(self, time_s: Column, values: Column) -> None:
         """Take in (n,) times and (series, n) values, all finite or NaN together."""
         if not time_s.size:
             return
-        second = np.floor(time_s + 1e-9).astype(np.int64)
+        second = np.floor(time_s + 1e-9).astype(np.int32)
         starts = np.flatnonzero(np.concatenate(([True], second[1:] != second[:-1])))
-        counts = np.diff(np.append(starts, time_s.size)).astype(np.float64)
+        counts = np.diff(np.append(starts, time_s.size)).astype(np.float32)
         self._parts.append((second[starts], counts, np.add.reduceat(values, starts, axis=1)))
 
-    def result(self) -> tuple[NDArray[np.int64], Column, Column]:
+    def result(self) -> SecondsOf:
         """(k,) seconds that have ticks, (k,) their ticks, (series, k) sums."""
         if not self._parts:
-            return np.empty(0, dtype=np.int64), np.empty(0), np.empty((self._series, 0))
+            return np.empty(0, dtype=np.int32), np.empty(0, dtype=np.float32), np.empty((self._series, 0))
         second = np.concatenate([part[0] for part in self._parts])
         counts = np.concatenate([part[1] for part in self._parts])
         sums = np.concatenate([part[2] for part in self._parts], axis=1)
@@ -72,7 +76,7 @@ class SecondSums:
 
 
 def window_means(
-    second: NDArray[np.int64], counts: Column, sums: Column, window_s: int, rate_hz: float
+    second: Seconds, counts: Counts, sums: Column, window_s: int, rate_hz: float
 ) -> tuple[Column, Column]:
     """Middles (k,) in s and means of the windows that have at least `LEAST_SHARE` of their ticks.
 
