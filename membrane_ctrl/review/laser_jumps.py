@@ -19,8 +19,8 @@ GLITCH_LONGEST_S = 60
 _BASE_S = 7
 # A glitch within a second leaves the mirror where it was.
 _MOVED_MOST = 0.3
-# Both edges are of one size, but for what the loop does within two seconds.
-_EDGES_ALIKE = 0.6
+# Both edges are of one size, but for what the loop does within two seconds: up to 4 um/s.
+_EDGES_ALIKE = 0.5
 _EDGE_S = 2
 
 
@@ -99,7 +99,13 @@ def _edges(mean_um: Column, usable: NDArray[np.bool_]) -> list[Glitch]:
         return []
     other = (np.diff(rows) > 1) | (np.diff(np.sign(change[rows])) != 0)
     best = [int(part[np.argmax(size[part])]) for part in np.split(rows, np.flatnonzero(other) + 1)]
-    return [Glitch(row, row, float(change[row]), float(size[row] / max(sigma[row], 1e-9))) for row in best]
+    found = []
+    for row in best:
+        score = float(size[row] / max(sigma[row], 1e-9))
+        # of the two seconds the one that changed more
+        at = row + int(abs(mean_um[row + 1] - mean_um[row]) > abs(mean_um[row] - mean_um[row - 1]))
+        found.append(Glitch(at, at, float(change[row]), score))
+    return found
 
 
 def _pairs(edges: list[Glitch]) -> list[Glitch]:
@@ -108,12 +114,21 @@ def _pairs(edges: list[Glitch]) -> list[Glitch]:
     for place, edge in enumerate(edges):
         if found and edge.first <= found[-1].last:
             continue
-        later = edges[place + 1 : place + 1 + GLITCH_LONGEST_S]
-        near = (other for other in later if other.first <= edge.first + GLITCH_LONGEST_S)
-        back = next((other for other in near if _alike(edge.size_um, -other.size_um)), None)
+        back = _back(edge, edges[place + 1 : place + 1 + GLITCH_LONGEST_S])
         if back is not None:
             found.append(Glitch(edge.first, back.first, edge.size_um, edge.sigmas))
     return found
+
+
+def _back(edge: Glitch, later: list[Glitch]) -> Glitch | None:
+    """The greatest edge back before the next one like this: a loop that follows at full speed makes lesser ones."""
+    best = None
+    for other in later:
+        if other.first > edge.first + GLITCH_LONGEST_S or _alike(edge.size_um, other.size_um):
+            break
+        if _alike(edge.size_um, -other.size_um) and (best is None or abs(other.size_um) > abs(best.size_um)):
+            best = other
+    return best
 
 
 def _alike(size_um: float, other_um: float) -> bool:

@@ -34,7 +34,7 @@ def test_a_glitch_is_found_once_however_long(size_um: float, lasts_s: float) -> 
     rows, _ = night(21, HOURS, "typical", [])
     wrong_for(rows, size_um, lasts_s)
     (found,) = glitches_in(rows)
-    assert found.time_s == pytest.approx(AT_S, abs=2.0)
+    assert found.time_s == pytest.approx(AT_S, abs=1.5)
     assert found.size == pytest.approx(size_um, rel=0.35)
     assert found.end_s > AT_S + lasts_s
 
@@ -52,6 +52,25 @@ def test_a_door_is_no_glitch(open_s: float, period_s: float) -> None:
     if open_s > 1.0:  # within a second nobody can know
         rows[:, pressure] = np.nan
         assert glitches_in(rows) == []
+
+
+def test_a_loop_that_follows_at_full_speed_does_not_end_a_glitch() -> None:
+    rows, _ = night(25, HOURS, "typical", [])
+    time_s = column(rows, "mono_s")
+    there = (time_s >= AT_S) & (time_s < AT_S + 8)
+    after = 12.0 * (time_s >= AT_S + 8) - 1.2 * np.clip(time_s - AT_S - 8, 0, 10)
+    rows[:, READING] += there * np.minimum(0.0, -12.0 + 4.0 * (time_s - AT_S)) + after
+    (found,) = glitches_in(rows)
+    assert (found.time_s, found.size) == (pytest.approx(AT_S, abs=1.0), pytest.approx(-12.0, rel=0.4))
+    assert found.end_s > AT_S + 8 + 25
+
+
+def test_two_glitches_are_two() -> None:
+    rows, _ = night(26, HOURS, "typical", [])
+    time_s = column(rows, "mono_s")
+    for at_s in (AT_S, AT_S + 15):
+        rows[(time_s >= at_s) & (time_s < at_s + 4), READING] += 10.0
+    assert [round(g.time_s - AT_S) for g in glitches_in(rows)] == [pytest.approx(0, abs=1), pytest.approx(15, abs=1)]
 
 
 def test_a_reading_that_stays_away_is_no_glitch() -> None:
