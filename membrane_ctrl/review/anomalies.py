@@ -75,6 +75,8 @@ def anomalies(
         odd.append(Anomaly("missed ticks", f"{ticks.missed_ticks} of {ticks.ticks + ticks.missed_ticks}"))
     if ticks.thin_s:
         odd.append(Anomaly("thinned ticks", f"{span(ticks.thin_s)} held {_THIN}"))
+    if ticks.uncovered_s:
+        odd.append(Anomaly("thinned ticks", f"{span(ticks.uncovered_s)} held are in no figure: few ticks, no level"))
     if ticks.lateness_ms.quantile(0.99) > _LATE_P99_MOST_MS:
         odd.append(Anomaly("late ticks", f"p99 is {ticks.lateness_ms.quantile(0.99):.1f} ms"))
     if leak_um_per_s < _LEAK_LEAST_UM_PER_S:

@@ -69,6 +69,8 @@ class HoldPass:
         Time in `hold`.
     thin_s : float
         Settled seconds whose ticks are not all there: their means are those of the level.
+    uncovered_s : float
+        Those whose means the level has not either: no statistics cover them.
     grid_s : float
         Time of the first place of the grids.
     reading_um, true_um : (n,) float32
@@ -93,6 +95,7 @@ class HoldPass:
     end_s: float
     hold_s: float
     thin_s: float
+    uncovered_s: float
     grid_s: float
     reading_um: Single
     true_um: Single
@@ -125,7 +128,8 @@ def hold_pass(run: Run, span_s: tuple[float, float], part_s: tuple[float, float]
     within = (thin >= part_s[0]) & (thin + 1 <= part_s[1])
     if np.count_nonzero(within) <= _THIN_FROM * ticks.seconds[READING][0].size:
         return ticks
-    return _with_level(ticks, level_means(run, thin[within], setpoint_um[within]))
+    means = level_means(run, thin[within], setpoint_um[within])
+    return replace(_with_level(ticks, means), uncovered_s=float(np.count_nonzero(within) - means.second.size))
 
 
 def _with_level(ticks: HoldPass, means: LevelMeans) -> HoldPass:
@@ -209,6 +213,7 @@ class _Collector:
             end_s=self._span[1],
             hold_s=self._hold.result_s(self._period_s),
             thin_s=0.0,
+            uncovered_s=0.0,
             grid_s=self._grid_s,
             reading_um=self._reading,
             true_um=self._true,
