@@ -66,10 +66,18 @@ class Series:
 
 @dataclass(frozen=True, slots=True)
 class Benefit:
-    """Feed-forward: std of the 1 s means as held, and as they would have been without it (um)."""
+    """Feed-forward: std of the 1 s means as held, and as they would have been without it (um).
+
+    Attributes
+    ----------
+    with_um, without_um : float
+    without_seconds_um : (2, n) array
+        Times and 1 s means without it.
+    """
 
     with_um: float
     without_um: float
+    without_seconds_um: Column
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,8 +226,8 @@ def _benefit(run: Run, ticks: HoldPass, true: bool) -> Benefit | None:
         return None
     error = sums[ERROR]
     _, held = window_means(second, counts, error, 1, run.config.loop.rate_hz)
-    _, without = window_means(second, counts, error + sums[KEPT_AWAY], 1, run.config.loop.rate_hz)
-    return Benefit(float(held.std()), float(without.std())) if held.size else None
+    without = np.stack(window_means(second, counts, error + sums[KEPT_AWAY], 1, run.config.loop.rate_hz))
+    return Benefit(float(held.std()), float(without[1].std()), without) if held.size else None
 
 
 def _leak(level: Block) -> tuple[float, float, float]:

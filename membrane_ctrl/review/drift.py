@@ -65,7 +65,7 @@ def slope(time_s: Column, values: Column) -> Slope:
     spread = float((hours**2).sum())
     rate = float((hours * values).sum()) / spread
     residual = values - values.mean() - rate * hours
-    factor = _correlation_time(residual)
+    factor = correlation_time(residual)
     effective = values.size / factor
     freedom = max(effective - 2, 1.0)
     sigma = np.sqrt(float((residual**2).sum()) / (values.size - 2) * effective / freedom * factor / spread)
@@ -73,7 +73,7 @@ def slope(time_s: Column, values: Column) -> Slope:
     return Slope(rate, rate - reach, rate + reach, effective)
 
 
-def _correlation_time(residual: Column) -> float:
+def correlation_time(residual: Column) -> float:
     """1 + 2 sum of the autocorrelation, in samples; at least 1."""
     size = residual.size
     power = np.abs(np.fft.rfft(residual, 2 * size)) ** 2

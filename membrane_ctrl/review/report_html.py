@@ -186,13 +186,14 @@ def _compared(analysis: Analysis, other: Analysis, differences: Sequence[Differe
             d.unit,
             d.said,
             f"{d.p_value:.2g}" if d.p_value == d.p_value else "–",
+            _text(d.note),
         ]
         for d in differences
     ]
     _, sentence = verdict(other)
     if _is_part(analysis) and not _is_part(other):
         sentence = f"A part of this run against the whole of the other. {sentence}"
-    table = _table(["", "this run", "other run", "", "difference", "p"], rows)
+    table = _table(["", "this run", "other run", "", "difference", "p", ""], rows)
     return f"<p>{_text(sentence)}</p>{table}"
 
 

@@ -1,0 +1,86 @@
+"""The tests behind a comparison: what is alike seldom differs, what differs is seen, rows say what they know."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from review_runs import written
+from scipy import signal
+
+from membrane_ctrl.review import open_run
+from membrane_ctrl.review.analysis import Analysis, analyse
+from membrane_ctrl.review.block_tests import mean_p, spread_p, windowed
+from membrane_ctrl.review.compare import compare
+
+HOURS = 0.5
+
+
+def series(rng: np.random.Generator, hours: float, std: float = 1.0, memory: float = 0.9) -> np.ndarray:
+    """(2, n): seconds and a wander of that standard deviation."""
+    size = round(hours * 3600)
+    noise = signal.lfilter([1.0], [1.0, -memory], rng.normal(size=size + 500))[500:]
+    return np.stack((np.arange(size) + 0.5, std * math.sqrt(1 - memory**2) * noise))
+
+
+def long_windows(values: np.ndarray, window_s: float) -> np.ndarray:
+    return np.stack(windowed(values[0], values[1], window_s))
+
+
+@pytest.mark.parametrize("window_s", [1.0, 4.0, 60.0])
+def test_spreads_of_alike_series_of_different_length_seldom_differ(window_s: float) -> None:
+    rng = np.random.default_rng(1)
+    seen = [
+        spread_p(*(long_windows(series(rng, hours), window_s) for hours in (0.5, 3.0)), window_s) for _ in range(150)
+    ]
+    assert np.mean(np.array(seen) < 0.01) < 0.05
+    assert 0.35 < np.mean(seen) < 0.65
+
+
+@pytest.mark.parametrize("window_s", [4.0, 60.0])
+def test_a_spread_half_as_large_again_is_seen(window_s: float) -> None:
+    rng = np.random.default_rng(2)
+    parts = [long_windows(series(rng, 4.0, std), window_s) for std in (1.0, 1.5)]
+    assert spread_p(*parts, window_s) < 0.01
+
+
+def test_what_all_blocks_of_a_run_share_is_no_difference() -> None:
+    rng = np.random.default_rng(3)
+    without, with_it = [], []
+    for _ in range(100):
+        a, b = (series(rng, 1.0, 0.1) + np.array([[0.0], [0.1 * rng.normal()]]) for _ in range(2))
+        without.append(mean_p(a, b))
+        with_it.append(mean_p(a, b, offset=0.1 * math.sqrt(2)))
+    assert np.mean(np.array(without) < 0.01) > 0.4
+    assert np.mean(np.array(with_it) < 0.01) < 0.05
+
+
+def test_blocks_that_remember_each_other_count_for_fewer() -> None:
+    rng = np.random.default_rng(4)
+    pairs = [[series(rng, 4.0, memory=0.999) for _ in range(2)] for _ in range(60)]
+    alone, known = (np.array([mean_p(a, b, correlated=flag) for a, b in pairs]) for flag in (False, True))
+    assert np.mean(known < 0.01) < 0.1
+    assert np.mean(known < 0.01) <= np.mean(alone < 0.01)
+
+
+@pytest.fixture(scope="module")
+def analyses(tmp_path_factory: pytest.TempPathFactory) -> list[Analysis]:
+    logs: Path = tmp_path_factory.mktemp("compare")
+    return [analyse(open_run(written(logs, HOURS, seed=seed, name=f"2026112{seed}T180000Z-n"))) for seed in (1, 2)]
+
+
+def test_every_row_is_tested_or_says_why_not(analyses: list[Analysis]) -> None:
+    rows = {row.name: row for row in compare(*analyses)}
+    assert all(math.isfinite(row.p_value) or row.note.startswith("no test") for row in rows.values())
+    assert {name for name, row in rows.items() if not math.isfinite(row.p_value)} <= {"pump strokes", "lateness p99"}
+    assert "stretches" in rows["leak"].note
+    assert not any(row.said in {"larger", "smaller"} for row in rows.values())
+
+
+def test_too_short_is_said(tmp_path: Path, analyses: list[Analysis]) -> None:
+    short = analyse(open_run(written(tmp_path, 0.05, seed=3)))
+    rows = {row.name: row for row in compare(analyses[0], short)}
+    assert rows["reading, std of 60 s"].note == "no test: too short for blocks"
+    assert rows["reading, std of 60 s"].said == ""
