@@ -260,7 +260,9 @@ def packed(place: int) -> list[bytes]:
     return pack_tick(place + 1, replace(inputs, estimate=None), outputs, outputs.row.pack())
 
 
-def test_a_full_disk_costs_its_frames_and_the_file_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_that_met_a_full_disk_is_written_with_the_next_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from membrane_ctrl.recording import inputs_file
 
     file, assembler = InputsFile(tmp_path, "x"), TickAssembler()
@@ -280,10 +282,37 @@ def test_a_full_disk_costs_its_frames_and_the_file_goes_on(tmp_path: Path, monke
         patch.setattr(inputs_file.os, "write", half)
         with pytest.raises(OSError, match="No space"):
             file.append(batches[1], [])
+    assert file.lost_ticks == 50
     file.append(batches[2], [])
     file.close()
-    found = [item.tick for item in recorded_ticks(InputsReader(tmp_path)) if isinstance(item, RecordedTick)]
-    assert found == [*range(1, 51), *range(101, 151)]
+    reader = InputsReader(tmp_path)
+    found = [item.tick for item in recorded_ticks(reader) if isinstance(item, RecordedTick)]
+    assert found == list(range(1, 151))
+    assert (reader.damage, file.lost_ticks) == ([], 0)
+
+
+def test_frames_that_waited_too_long_are_given_up_and_their_ticks_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from membrane_ctrl.recording import inputs_file
+
+    monkeypatch.setattr(inputs_file, "WAITING_MAX", 2)
+    file, assembler = InputsFile(tmp_path, "x"), TickAssembler()
+
+    def full(descriptor: int, data: bytes) -> int:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(inputs_file.os, "write", full)
+        for first in (0, 10, 20):
+            with pytest.raises(OSError, match="No space"):
+                file.append(assembler.take([m for n in range(first, first + 10) for m in packed(n)]), [])
+    file.append(assembler.take(packed(30)), [])
+    file.close()
+    reader = InputsReader(tmp_path)
+    found = [item.tick for item in recorded_ticks(reader) if isinstance(item, RecordedTick)]
+    assert found == list(range(21, 32))  # of four frames two may wait
+    assert (reader.damage, file.lost_ticks) == ([], 20)
 
 
 def test_a_difference_is_shown_with_what_was_recorded(

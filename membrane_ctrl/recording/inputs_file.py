@@ -7,11 +7,14 @@ records come first, in columns (`column_codec`), then the rare parts.
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import math
 import os
 import struct
 import zlib
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,10 +32,12 @@ _COUNT = struct.Struct("<I")
 _PART = struct.Struct("<cqI")  # kind, tick, bytes that follow
 _TAIL, _SHAPE, _MEMORY = b"C", b"S", b"M"
 _LOOK_BYTES = 1 << 20  # holds a first frame, whatever is in it
+# While the disk is full frames wait here, one a second: ten minutes, in which a person who was told makes room; 2 MB.
+WAITING_MAX = 600
 
 
 class InputsFile:
-    """Appends frames. What a full disk did not take is given up: half a frame is no frame.
+    """Appends frames; what a full disk does not take waits, and the next call goes on where this one stopped.
 
     Parameters
     ----------
@@ -51,19 +56,23 @@ class InputsFile:
         head = {"schema": SCHEMA, "program": f"membrane-ctrl {version}", "fields": [list(f) for f in RECORD.descr]}
         self._head = json.dumps(head).encode() + b"\n"
         self._descriptor: int | None = None
+        self._waiting: deque[tuple[int, bytes]] = deque()  # ticks in it, frame
+        self._given_up_ticks = 0
+
+    @property
+    def lost_ticks(self) -> int:
+        """Ticks that no file has: given up, or still waiting for the disk."""
+        return self._given_up_ticks + sum(ticks for ticks, _ in self._waiting)
 
     def append(self, batch: TickBatch, shapes: list[ShapeEstimate], now_s: float = 0.0) -> None:
-        """Write one frame. Raises OSError (full disk): its ticks are then lost to a replay."""
-        if not (len(batch.records) or shapes):
-            return
-        descriptor = self._descriptor_at(now_s)
-        parts = [(_TAIL, tick, tail) for tick, tail in batch.tails.items()]
-        parts += [(_MEMORY, tick, memory) for tick, memory in batch.memories.items()]
-        parts += [(_SHAPE, 0, pack_estimate(shape)) for shape in shapes]
-        body = _COUNT.pack(len(batch.records)) + encode_columns(batch.records)
-        body += b"".join(_PART.pack(kind, tick, len(data)) + data for kind, tick, data in parts)
-        packed = zlib.compress(body, 6)
-        _write_all(descriptor, _HEAD.pack(_MAGIC, len(packed), zlib.crc32(packed)) + packed)
+        """Write one frame, and those still waiting from before. Raises OSError (full disk): it waits."""
+        if len(batch.records) or shapes:
+            self._waiting.append((len(batch.records), _packed(batch, shapes)))
+        while len(self._waiting) > WAITING_MAX:
+            self._given_up_ticks += self._waiting.popleft()[0]
+        while self._waiting:
+            self._write(self._descriptor_at(now_s), self._waiting[0][1])
+            self._waiting.popleft()
 
     def _descriptor_at(self, now_s: float) -> int:
         if now_s >= self._segment_until_s:
@@ -73,8 +82,23 @@ class InputsFile:
             path = self._run_dir / f"inputs-{number:03d}.bin"
             self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
             self._segment_until_s = now_s + self._segment_s
-            _write_all(self._descriptor, self._head)
+        if not os.lseek(self._descriptor, 0, os.SEEK_CUR):
+            self._write(self._descriptor, self._head)
         return self._descriptor
+
+    @staticmethod
+    def _write(descriptor: int, data: bytes) -> None:
+        """All of it or nothing. Raises OSError."""
+        before = os.lseek(descriptor, 0, os.SEEK_CUR)
+        try:
+            written = os.write(descriptor, data)
+            if written < len(data) and os.write(descriptor, data[written:]) < len(data) - written:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError:
+            with contextlib.suppress(OSError):  # half a frame is damage to a reader, and what is there is room
+                os.ftruncate(descriptor, before)
+            os.lseek(descriptor, before, os.SEEK_SET)
+            raise
 
     def sync(self) -> None:
         """Wait until the disk has it. Raises OSError."""
@@ -88,10 +112,14 @@ class InputsFile:
             self._descriptor = None
 
 
-def _write_all(descriptor: int, data: bytes) -> None:
-    written = os.write(descriptor, data)
-    if written < len(data):  # the rest raises what stopped it
-        os.write(descriptor, data[written:])
+def _packed(batch: TickBatch, shapes: list[ShapeEstimate]) -> bytes:
+    parts = [(_TAIL, tick, tail) for tick, tail in batch.tails.items()]
+    parts += [(_MEMORY, tick, memory) for tick, memory in batch.memories.items()]
+    parts += [(_SHAPE, 0, pack_estimate(shape)) for shape in shapes]
+    body = _COUNT.pack(len(batch.records)) + encode_columns(batch.records)
+    body += b"".join(_PART.pack(kind, tick, len(data)) + data for kind, tick, data in parts)
+    packed = zlib.compress(body, 6)
+    return _HEAD.pack(_MAGIC, len(packed), zlib.crc32(packed)) + packed
 
 
 @dataclass(frozen=True, slots=True)

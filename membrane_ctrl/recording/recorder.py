@@ -90,6 +90,7 @@ class Recorder:
         self._summary = before.summary
         self._columns = ColumnTables(run_dir, before.windows if resumes else None)
         self._inputs_file = InputsFile(run_dir, __version__, config.recording.segment_s)
+        self._input_ticks_lost = before.input_ticks_lost
         self._assembler = TickAssembler()
         self._resumes = resumes
         self._began_anew = resumes > 0 and handed_on is None
@@ -161,6 +162,7 @@ class Recorder:
             self._complaints.errors,
             self._rows_lost,
             self._events_lost + self._events_file.lost,
+            self._input_ticks_lost + self._inputs_file.lost_ticks,
         )
         save_state(self._run_dir, state)
 
@@ -181,6 +183,7 @@ class Recorder:
             "rows_lost": self._rows_lost,
             "column_rows_lost": self._columns.lost,
             "events_lost": self._events_lost + self._events_file.lost,
+            "input_ticks_lost": self._input_ticks_lost + self._inputs_file.lost_ticks,
             "restarts": self._resumes,
             # without what the former recorder knew, the statistics begin with what the ring still had
             "partial": self._began_anew and self._feeds["telemetry"].dropped > 0,

@@ -33,7 +33,7 @@ class RecorderState:
         The controller's state in the last row.
     windows : OpenWindows
         Of the overview tables.
-    errors, rows_lost, events_lost : int
+    errors, rows_lost, events_lost, input_ticks_lost : int
         The recorder's own account.
     """
 
@@ -46,6 +46,7 @@ class RecorderState:
     errors: int = 0
     rows_lost: int = 0
     events_lost: int = 0
+    input_ticks_lost: int = 0
 
 
 def save_state(run_dir: Path, state: RecorderState) -> None:

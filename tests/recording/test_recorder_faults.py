@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rrd_reading import scalars
 from synthetic_run import STARTED_UTC, rows_of, shape_of
@@ -20,10 +21,12 @@ from membrane_ctrl.config import Config, RecordingConfig
 from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
 from membrane_ctrl.recording import recorder as recorder_module
 from membrane_ctrl.recording.checked_text import dumps_checked
+from membrane_ctrl.recording.inputs_file import InputsFile, InputsReader
 from membrane_ctrl.recording.recorder import Recorder
 from membrane_ctrl.recording.rerun_output import RETRY_S
 from membrane_ctrl.recording.sink import Recording, RecordingError
 from membrane_ctrl.telemetry import ROW_BYTES
+from membrane_ctrl.tick_record import MESSAGE_BYTES, RECORD, TICK
 
 
 class HandClock(RunClock):
@@ -87,6 +90,7 @@ def make_bench(run_dir: Path, config: Config) -> Iterator[Bench]:
     clock = HandClock(0.0, STARTED_UTC)
     with ExitStack() as stack:
         sizes = {"telemetry": (2000, ROW_BYTES), "events": (64, 4000), "shapes": (8, 30_000)}
+        sizes["inputs"] = (2000, MESSAGE_BYTES)
         addresses = {name: stack.enter_context(ring(*size)) for name, size in sizes.items()}
         readers = {name: RingReader(address) for name, address in addresses.items()}
         writers = {name: RingWriter(address) for name, address in addresses.items()}
@@ -207,6 +211,36 @@ def test_events_that_cannot_be_written_are_reported_and_come_later(
     bench.recorder.finish()
     text = (bench.run_dir / "events.jsonl").read_text()
     assert text == dumps_checked({"kind": "fault", "mono_s": 0.5}) + "\n"
+
+
+@pytest.mark.parametrize("room_again", [True, False])
+def test_inputs_that_met_a_full_disk_come_later_or_are_counted(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, room_again: bool
+) -> None:
+    def full(*_: Any) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def ticks_of(second: int) -> None:
+        for tick in range(50 * second + 1, 50 * second + 51):
+            record = np.zeros(1, dtype=RECORD)
+            record["tick"] = tick
+            bench.writers["inputs"].put(TICK + record.tobytes())
+        bench.second(second)
+
+    ticks_of(0)
+    with monkeypatch.context() as patch:
+        patch.setattr(InputsFile, "_write", full)
+        ticks_of(1)
+        ticks_of(2)
+        if not room_again:
+            bench.recorder.finish()
+    if room_again:
+        ticks_of(3)
+        bench.recorder.finish()
+    found = [int(tick) for frame in InputsReader(bench.run_dir) for tick in frame.records["tick"]]
+    assert found == list(range(1, 201 if room_again else 51))
+    account = json.loads((bench.run_dir / "summary.json").read_text())["recorder"]
+    assert account["input_ticks_lost"] == (0 if room_again else 100)
 
 
 def test_a_disk_that_runs_low_is_reported_once(tmp_path: Path) -> None:
