@@ -2,13 +2,13 @@
 
 An alarm is told when its condition has stood for its time; told again, to more people, when nobody acknowledges it;
 brought to mind now and then; and told off when the condition has stayed away. A condition that goes and comes within
-that time is the same alarm, told once.
+that time is the same alarm, told once. Several conditions under one name are one alarm: a full disk hits all files.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from membrane_ctrl.alarms.signs import Severity, Sign
@@ -40,8 +40,9 @@ class Notice:
 
 @dataclass(slots=True)
 class _Alarm:
-    sign: Sign
+    sign: Sign  # what people are told
     since_s: float  # of the condition
+    standing: dict[str, Sign] = field(default_factory=dict)  # by what it is about, the oldest first
     gone_s: float = math.inf  # since when it has stayed away
     told_s: float = math.inf
     reminded_s: float = math.inf
@@ -51,6 +52,15 @@ class _Alarm:
     @property
     def told(self) -> bool:
         return math.isfinite(self.told_s)
+
+    def end(self, about: str) -> None:
+        """One of its conditions has gone, or all: a reminder names one that still stands."""
+        if about:
+            self.standing.pop(about, None)
+        else:
+            self.standing.clear()
+        if self.standing and self.sign.about not in self.standing:
+            self.sign = next(iter(self.standing.values()))
 
 
 class AlarmBook:
@@ -76,16 +86,20 @@ class AlarmBook:
         alarm = self._alarms.get(sign.name)
         if alarm is None:
             if sign.bad:
-                self._alarms[sign.name] = _Alarm(sign, now_s)
+                self._alarms[sign.name] = _Alarm(sign, now_s, standing={sign.about: sign})
             return
         if not sign.bad:
+            alarm.end(sign.about)
+            if alarm.standing:
+                return
             if alarm.told:
                 alarm.gone_s = min(alarm.gone_s, now_s)
             else:  # gone before anyone was told
                 del self._alarms[sign.name]
             return
         alarm.gone_s = math.inf
-        if not alarm.told:
+        alarm.standing[sign.about] = sign
+        if not alarm.told or alarm.sign.about not in alarm.standing:
             alarm.sign = sign
 
     def acknowledge(self) -> None:

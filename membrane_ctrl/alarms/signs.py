@@ -30,6 +30,9 @@ class Sign:
         Of an alarm that has come.
     for_s : float
         How long the condition must stand before anyone is told.
+    about : str
+        Which of several conditions under one name: the alarm stands until the last of them has gone. "" with `bad`
+        False: all have gone.
     """
 
     name: str
@@ -37,6 +40,7 @@ class Sign:
     severity: Severity = "warning"
     text: str = ""
     for_s: float = 0.0
+    about: str = ""
 
 
 def signs_of(event: Event) -> list[Sign]:
@@ -67,11 +71,14 @@ def signs_of(event: Event) -> list[Sign]:
             )
             return [Sign(f"{event.get('child')}_ended", True, "warning", text)]
         case "child_restarted":
-            return [Sign(f"{event.get('child')}_ended", False)]
+            ended = Sign(f"{event.get('child')}_ended", False)
+            # another recorder knows nothing of the former's trouble, and says anew what still stands
+            return [ended, Sign("recorder", False)] if event.get("child") == "recorder" else [ended]
         case "recorder_error" | "disk_low":
-            return [Sign("recorder", True, "warning", str(event.get("message", event)))]
+            text = str(event.get("message", event))
+            return [Sign("recorder", True, "warning", text, about=str(event.get("what", "")))]
         case "recorder_recovered":
-            return [Sign("recorder", False)]
+            return [Sign("recorder", False, about=str(event.get("what", "")))]
         case "port_failed":
             return [Sign("port", True, "warning", f"the control port failed: {event.get('message')}", _GLITCH_S)]
         case "port_open":

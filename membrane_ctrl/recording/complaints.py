@@ -48,13 +48,13 @@ class Complaints:
             self.recovered(what)
 
     def complain(self, what: str, message: str, kind: str = "recorder_error") -> None:
-        """Report trouble once for as long as it is the same."""
+        """Report trouble once for as long as it is the same; the report says in `what` whose end to wait for."""
         if self._trouble.get(what) != message:
             self._trouble[what] = message
             self.errors += kind == "recorder_error"
-            self.report({"kind": kind, "message": message})
+            self.report({"kind": kind, "what": what, "message": message})
 
     def recovered(self, what: str) -> None:
         """Say that it works again, if it did not."""
         if self._trouble.pop(what, None) is not None:
-            self.report({"kind": "recorder_recovered", "message": f"{what} works again"})
+            self.report({"kind": "recorder_recovered", "what": what, "message": f"{what} works again"})

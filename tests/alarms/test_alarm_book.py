@@ -7,8 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from membrane_ctrl.alarms.book import AlarmBook, Notice
-from membrane_ctrl.alarms.signs import Sign
+from membrane_ctrl.alarms.signs import Sign, signs_of
 from membrane_ctrl.port_config import AlarmsConfig
+from membrane_ctrl.recording.complaints import Complaints
+from membrane_ctrl.tick import Event
 
 CONFIG = AlarmsConfig(escalate_after_s=900, remind_every_s=3600, clear_after_s=30)
 BAD, GOOD = Sign("leak", True, "warning", "it leaks", for_s=10.0), Sign("leak", False)
@@ -109,3 +111,56 @@ def test_alarms_stand_beside_each_other(name: str) -> None:
     book.take(Sign(name, True, "critical", "!"), 20.0)
     (notice,) = book.step(20.0)
     assert (notice.name, notice.severity) == (name, "critical")
+
+
+class Disk:
+    """The recorder's complaints as the alarms hear of them, at a time set by hand."""
+
+    def __init__(self) -> None:
+        self.book = AlarmBook(CONFIG)
+        self.complaints = Complaints(self.hear)
+        self.now_s = 0.0
+
+    def hear(self, event: Event) -> None:
+        for sign in signs_of(event):
+            self.book.take(sign, self.now_s)
+
+    def step(self, now_s: float) -> list[tuple[str, str]]:
+        self.now_s = now_s
+        return [(notice.kind, notice.text) for notice in self.book.step(now_s)]
+
+
+def test_trouble_with_the_disk_is_over_with_the_last_of_it_and_not_with_the_first() -> None:
+    disk = Disk()
+    disk.complaints.complain("disk", "less than 500 MB free", kind="disk_low")
+    assert disk.step(0.0) == [("raised", "less than 500 MB free")]
+    disk.step(5.0)
+    disk.complaints.complain("state file", "state file: x")
+    disk.step(6.0)
+    disk.complaints.recovered("state file")
+    assert disk.step(37.0) == []
+    assert disk.book.standing("recorder")
+    assert disk.step(910.0) == [("escalated", "less than 500 MB free")]
+    disk.complaints.recovered("disk")
+    assert disk.step(940.0) == [("cleared", "less than 500 MB free")]
+
+
+def test_a_reminder_names_what_still_stands() -> None:
+    disk = Disk()
+    disk.complaints.complain("disk", "less than 500 MB free", kind="disk_low")
+    disk.complaints.complain("state file", "state file: x")
+    disk.step(0.0)
+    disk.complaints.recovered("disk")
+    assert disk.step(900.0) == [("escalated", "state file: x")]
+
+
+def test_another_recorder_begins_without_the_formers_trouble_and_tells_its_own() -> None:
+    disk = Disk()
+    disk.complaints.complain("state file", "state file: x")
+    disk.step(0.0)
+    disk.hear({"kind": "child_restarted", "child": "recorder"})
+    disk.step(1.0)
+    assert not disk.book.standing("recorder")
+    Complaints(disk.hear).complain("disk", "less than 500 MB free", kind="disk_low")
+    assert disk.step(40.0) == [], "the same alarm, not told off and told again"
+    assert disk.step(900.0) == [("escalated", "less than 500 MB free")]

@@ -29,7 +29,11 @@ LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=
         ({"kind": "child_ended", "child": "recorder", "exit_code": -9}, [("recorder_ended", True, "warning")]),
         ({"kind": "child_silent", "child": "recorder"}, [("recorder_ended", True, "warning")]),
         ({"kind": "child_given_up", "child": "recorder"}, [("recorder_ended", True, "warning")]),
-        ({"kind": "child_restarted", "child": "recorder"}, [("recorder_ended", False, "warning")]),
+        (
+            {"kind": "child_restarted", "child": "recorder"},
+            [("recorder_ended", False, "warning"), ("recorder", False, "warning")],
+        ),
+        ({"kind": "child_restarted", "child": "screen"}, [("screen_ended", False, "warning")]),
         ({"kind": "recorder_error", "message": "disk full"}, [("recorder", True, "warning")]),
         ({"kind": "recorder_recovered"}, [("recorder", False, "warning")]),
         ({"kind": "port_failed", "message": "x"}, [("port", True, "warning")]),
