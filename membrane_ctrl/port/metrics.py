@@ -21,7 +21,7 @@ _REQUEST_S = 2.0
 _COUNTERS = {"tick": "ticks_total", "missed_ticks": "missed_ticks_total"}
 
 
-def metrics_text(row: TelemetryRow | None, clients: int, refused: int) -> str:
+def metrics_text(row: TelemetryRow | None, clients: int, refused: int, recording_ok: bool = True) -> str:
     """Prometheus' text format, version 0.0.4.
 
     Parameters
@@ -30,6 +30,8 @@ def metrics_text(row: TelemetryRow | None, clients: int, refused: int) -> str:
         The newest tick; None before the first.
     clients, refused : int
         Of the control port.
+    recording_ok : bool
+        No trouble with recorder or disk stands.
     """
     lines: list[str] = []
 
@@ -39,6 +41,7 @@ def metrics_text(row: TelemetryRow | None, clients: int, refused: int) -> str:
 
     add("port_clients", "gauge", ("", clients))
     add("port_refused_total", "counter", ("", refused))
+    add("recording_ok", "gauge", ("", recording_ok))
     if row is not None:
         add("in_state", "gauge", *((f'{{state="{s.name.lower()}"}}', float(row.state == s)) for s in State))
         for field, value in asdict(row).items():

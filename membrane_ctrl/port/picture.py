@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from membrane_ctrl.names import Rung, ShapeState, State
+from membrane_ctrl.recorder_trouble import RecorderTrouble
 from membrane_ctrl.telemetry import TelemetryRow
 from membrane_ctrl.tick import Event, TickOutputs
 
@@ -18,10 +19,13 @@ class Picture:
     ----------
     row : TelemetryRow or None
         Of the newest tick.
+    recorder : RecorderTrouble
+        What keeps the run from being recorded.
     """
 
     def __init__(self) -> None:
         self.row: TelemetryRow | None = None
+        self.recorder = RecorderTrouble()
         self._since_s = 0.0
         self._why = self._shape_reason = ""
         self._fault: Event | None = None
@@ -45,6 +49,7 @@ class Picture:
 
     def note(self, event: Event) -> None:
         """Remember what stands until it is over: what a person should look at, and which geometry is used."""
+        self.recorder.take(event)
         match event["kind"]:
             case "maintenance":
                 self._maintenance[event["name"]] = event["message"]
@@ -69,5 +74,6 @@ class Picture:
             "shape_reason": self._shape_reason,
             "geometry": {key: value for key, value in self._geometry.items() if key != "kind"} or None,
             "maintenance": self._maintenance,
+            "recording": dict(self.recorder.standing),
             "row": {key: value if math.isfinite(value) else None for key, value in asdict(row).items()},
         }

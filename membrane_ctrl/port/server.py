@@ -146,7 +146,8 @@ class Port:
 
     def metrics(self) -> str:
         """The same for Prometheus."""
-        return metrics_text(self._picture.row, len(self._sessions), self._refusals.count)
+        recording_ok = not self._picture.recorder.standing
+        return metrics_text(self._picture.row, len(self._sessions), self._refusals.count, recording_ok)
 
     async def _welcome_unix(self, connection: socket.socket) -> None:
         assert self._listeners.unix is not None

@@ -11,6 +11,7 @@ from membrane_ctrl.config import Config
 from membrane_ctrl.control.leak import JUDGE_S, TOO_TIGHT_UM_PER_S
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.names import ShapeState, State
+from membrane_ctrl.recorder_trouble import RecorderTrouble
 from membrane_ctrl.screen.trend import Trend
 from membrane_ctrl.screen.why import why
 from membrane_ctrl.screen.words import duration
@@ -67,6 +68,8 @@ class View:
         The newest of them, with its time.
     too_tight : bool
         The leak is too small for the band.
+    recording : str
+        What keeps the run from being recorded; empty if nothing does.
     """
 
     row: TelemetryRow | None
@@ -86,6 +89,7 @@ class View:
     faults: int
     last_fault: str
     too_tight: bool
+    recording: str
     shape: ShapeView
 
 
@@ -117,6 +121,7 @@ class ScreenModel:
         self._rejected = 0
         self._acquisition = ""
         self._shape_told = ""
+        self._recorder = RecorderTrouble()
         self.ended = False
 
     def take_row(self, row: TelemetryRow) -> None:
@@ -132,6 +137,7 @@ class ScreenModel:
     def take_event(self, event: Event) -> None:
         """One event, a line of `events.jsonl`."""
         words = text(event)
+        self._recorder.take(event)
         match event.get("kind"):
             case "state" | "why":
                 self._told = words
@@ -183,6 +189,7 @@ class ScreenModel:
             faults=self._faults,
             last_fault=self._last_fault,
             too_tight=self._too_tight(now_s),
+            recording=self._recorder.words,
             shape=self._shape(now_s),
         )
 

@@ -9,6 +9,7 @@ from membrane_ctrl.screen.words import duration, number, percent
 
 _AT_ONCE = frozenset(
     {"fault", "cleared", "state", "link", "child_ended", "child_silent", "child_restarted", "child_given_up", "end"}
+    | {"recorder_error", "disk_low", "recorder_recovered"}  # a disk that takes nothing does not take the event either
 )
 
 
@@ -28,6 +29,8 @@ def line(view: View) -> str:
         f"late {number(row.lateness_ms, 1)} ms",
         view.why,
     ]
+    if view.recording:
+        parts.append(f"RECORDING {view.recording}")
     if math.isfinite(view.left_s):
         parts.append(f"{duration(view.left_s)} left")
     return "  ".join(parts)
@@ -43,7 +46,7 @@ def event_line(event: Event) -> str:
     """An event in one line."""
     mono_s = event.get("mono_s", math.nan)
     what = " ".join(str(event[key]) for key in ("state", "child", "exit") if key in event)
-    words = " ".join(word for word in (what, text(event)) if word)
+    words = " ".join(f"{what} {text(event)}".split())  # one line, whatever an error said
     remedy = f"; {event['remedy']}" if event.get("remedy") else ""
     return f"{number(mono_s, 1):>9} s  {str(event.get('kind', '?')).upper()} {words}{remedy}".rstrip()
 

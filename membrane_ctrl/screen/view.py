@@ -78,6 +78,8 @@ def _figures(view: View, config: Config) -> Table:
     table.add_row("", "")
     table.add_row("lateness", _lateness(view, row))
     table.add_row("faults", _faults(view))
+    if view.recording:  # one line: of a full disk every file complains, and the faults must stay in sight
+        table.add_row("recorder", Text(view.recording, style="bold yellow", no_wrap=True, overflow="ellipsis"))
     return table
 
 

@@ -33,6 +33,11 @@ def test_before_the_first_tick_there_are_the_ports_own() -> None:
     assert "error_um" not in metrics_text(None, 0, 0)
 
 
+def test_trouble_with_the_recording_is_a_gauge() -> None:
+    assert "membrane_recording_ok 1.0" in metrics_text(None, 0, 0).splitlines()
+    assert "membrane_recording_ok 0.0" in metrics_text(None, 0, 0, recording_ok=False).splitlines()
+
+
 async def fetch(port: int, request: bytes) -> bytes:
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     writer.write(request)

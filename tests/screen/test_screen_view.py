@@ -69,6 +69,7 @@ def everything_wrong() -> ScreenModel:
         event(75.0, "shape", state="suspended", reason="no fresh estimate for 15 s: the last trim is held")
     )
     model.take_shape(shape(70.0, verdict="rejected", reason="tracking lost: the film moved by 5 mrad"))
+    model.take_event(event(75.0, "recorder_error", what="recording", message="events.jsonl: No space left " * 20))
     row = replace(HOLDING, state=State.FAULT, shape_state=ShapeState.SUSPENDED, rung=Rung.VENT, fault=30.0)
     model.take_row(replace(row, mono_s=75.0, tick=3e6, missed_ticks=12.0, vent_fraction=1.0, leak_um_per_s=0.1))
     return model
@@ -87,6 +88,16 @@ def test_fault_and_its_remedy_are_seen() -> None:
     assert "pump is off and the vent is open: link lost" in page
     assert "link lost: the link to the pump board is down (link down); check cable, power and address" in page
     assert "12 of 3000012 ticks missed" in page
+
+
+def test_trouble_with_the_recording_is_seen_until_it_is_over() -> None:
+    model = held()
+    model.take_event(event(75.0, "disk_low", what="disk", message="less than 500 MB free; delete old runs"))
+    assert any("recorder less than 500 MB free; delete old runs" in row for row in drawn(model))
+    assert line(model.view(75.0)).count("RECORDING less than 500 MB free; delete old runs") == 1
+    model.take_event(event(76.0, "recorder_recovered", what="disk", message="disk works again"))
+    assert not any("recorder" in row for row in drawn(model))
+    assert "RECORDING" not in line(model.view(75.0))
 
 
 def test_silence_is_the_headline() -> None:
@@ -117,10 +128,12 @@ def test_plain_events() -> None:
     )
     assert event_line(event(1.0, "state", state="hold", why="settled")) == "      1.0 s  STATE hold settled"
     assert event_line({"kind": "end", "exit": 5}) == "        – s  END 5"
+    assert event_line(event(1.0, "recorder_error", message="a\n  b")) == "      1.0 s  RECORDER_ERROR a b"
 
 
 def test_what_cannot_wait_a_second() -> None:
     kinds = ("fault", "cleared", "state", "link", "child_ended", "end")
+    kinds += ("recorder_error", "disk_low", "recorder_recovered")
     assert all(at_once({"kind": kind}) for kind in kinds)
     assert not any(at_once({"kind": kind}) for kind in ("why", "shape", "command", "start"))
     assert at_once({"kind": "acquisition", "state": "retrying"})
