@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shutil
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +25,7 @@ from membrane_ctrl.acquisition.frames import FrameHead, FrameReader, Pixels
 from membrane_ctrl.config import OpticsConfig, RecordingConfig
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.ipc.ring import RingAddress, RingReader
+from membrane_ctrl.recording.thrift import PICTURES_FROM
 from membrane_ctrl.telemetry import FIELDS
 
 _ROW = struct.Struct(f"<{len(FIELDS)}d")
@@ -39,6 +40,21 @@ class _Set:
     kind: str
     heads: tuple[FrameHead, ...]
     pixels: tuple[Pixels, ...]
+
+    @property
+    def size_bytes(self) -> int:
+        """What it takes on disk at most: noise does not shrink."""
+        return sum(pixels.nbytes for pixels in self.pixels)
+
+
+@dataclass(frozen=True, slots=True)
+class _Write:
+    """A set on its way to the disk."""
+
+    cycle: int
+    folder: Path
+    size_bytes: int
+    done: Future[None]
 
 
 class RawFrames:
@@ -58,6 +74,9 @@ class RawFrames:
         The ring of frames.
     telemetry : RingAddress
         Where a fault is seen.
+    tell : callable
+        Takes an event of kind "raw_frames" when sets begin to be left out for want of disk: once for each reason,
+        until one is kept again.
 
     Attributes
     ----------
@@ -73,13 +92,16 @@ class RawFrames:
         recording: RecordingConfig,
         frames: FrameAddress,
         telemetry: RingAddress,
+        tell: Callable[[dict[str, Any]], None] = lambda event: None,
     ) -> None:
         self._folder, self._optics, self._plan, self._recording = folder, optics, plan, recording
         self._patterns = {pattern.name: pattern for pattern in plan.full}
         self._frames = FrameReader(frames)
         self._telemetry = RingReader(telemetry)
         self._writer = ThreadPoolExecutor(1, "raw frames")
-        self._writing: list[Future[None]] = []
+        self._writing: list[_Write] = []
+        self._tell = tell
+        self._told = ""
         self._in_fault = False
         self._kept: dict[int, Path] = {}
         self._reference: Path | None = None
@@ -88,6 +110,7 @@ class RawFrames:
 
     def after(self, estimate: ShapeEstimate) -> None:
         """Look at a cycle that is done: is it one to keep?"""
+        self._collect()
         self.look_for_fault()
         if not (self._recording.raw_every_cycles or self._recording.raw_before_fault_cycles):
             return
@@ -104,7 +127,8 @@ class RawFrames:
     def capture(self, estimate: ShapeEstimate) -> Path:
         """Have a cycle's frames written and wait for it; returns the set's folder. Raises OSError."""
         kept = self._keep(estimate.cycle)
-        wait(self._writing)
+        wait(write.done for write in self._writing)
+        self._collect()
         if kept is None or not (kept / "capture.toml").exists():
             raise OSError("the set could not be written whole: is the disk full, or slower than the cycles?")
         if kept == self._reference:
@@ -125,6 +149,7 @@ class RawFrames:
         """Look once more, write what waits, detach."""
         self.look_for_fault()
         self._writer.shutdown()
+        self._collect()
         self._frames.close()
         self._telemetry.close()
 
@@ -132,18 +157,53 @@ class RawFrames:
         """Copy a cycle's frames and have them written; None if that cannot be."""
         if cycle in self._kept:
             return self._kept[cycle]
-        self._writing = [write for write in self._writing if not write.done()]
+        self._collect()
         found = self._copy(cycle)
-        if found is None or len(self._writing) >= _WAITING_SETS or not self._room():
-            self.left_out += 1
+        against = self._against(found) if found is not None else ""
+        if found is None or against:
+            self._leave_out(against)
             return None
         path = self._kept[cycle] = self._unused(cycle)
         reference = None
         if found.kind == "fringes" and self._reference is not None:
             self._reference_needed, reference = True, f"../{self._reference.name}"
         table = _description(found, self._optics, self._patterns, reference)
-        self._writing.append(self._writer.submit(_write, path, table, found))
+        done = self._writer.submit(_write, path, table, found)
+        self._writing.append(_Write(cycle, path, found.size_bytes, done))
         return path
+
+    def _against(self, found: _Set) -> str:
+        """Why a set cannot go to the disk now; empty if it can."""
+        if len(self._writing) >= _WAITING_SETS:
+            return "the disk is slower than the cycles"
+        try:
+            free_bytes = shutil.disk_usage(self._folder.parent).free
+        except OSError as error:
+            return str(error)
+        # what is on its way may not be there yet: after all of it the disk has to be left as for thumbnails
+        left_mb = (free_bytes - found.size_bytes - sum(write.size_bytes for write in self._writing)) / 1e6
+        least_mb = PICTURES_FROM * self._recording.min_free_mb
+        return "" if left_mb > least_mb else f"they would leave less than {least_mb:g} MB free"
+
+    def _leave_out(self, why: str) -> None:
+        self.left_out += 1
+        if why and why != self._told:
+            self._told = why
+            self._tell({"kind": "raw_frames", "left_out": self.left_out, "message": f"frames are left out: {why}"})
+
+    def _collect(self) -> None:
+        """Look at what has been written; a set that was not is none, and nothing may refer to it."""
+        done = [write for write in self._writing if write.done.done()]
+        self._writing = [write for write in self._writing if write not in done]
+        for write in done:
+            error = write.done.exception()
+            if error is None:
+                self._told = ""
+                continue
+            self._kept.pop(write.cycle, None)
+            if self._reference == write.folder:
+                self._reference = None
+            self._leave_out(str(error))
 
     def _unused(self, cycle: int) -> Path:
         """A name for the set; an acquisition that was replaced counts its cycles from 1 again."""
@@ -162,19 +222,23 @@ class RawFrames:
                 return _Set(kind, tuple(heads), tuple(pixels for pixels in copies if pixels is not None))
         return None  # a cycle that was stopped, or is partly written over
 
-    def _room(self) -> bool:
-        free_mb = shutil.disk_usage(self._folder.parent).free / 1e6
-        return free_mb > self._recording.min_free_mb
-
 
 def _write(folder: Path, table: dict[str, Any], content: _Set) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    for head, pixels in zip(content.heads, content.pixels, strict=True):
-        if not cv2.imwrite(str(folder / f"{head.pattern}.png"), pixels, _FASTEST):
-            raise OSError(f"{folder / head.pattern}.png: cannot be written")
-    (folder / "capture.toml").write_text(
-        tomli_w.dumps(table), encoding="utf-8"
-    )  # last: a set is whole when it is there
+    """Write a set, or leave nothing of it. Raises OSError, cv2.error."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if "reference" in table and not (folder / table["reference"] / "capture.toml").exists():
+            raise OSError(f"{folder.name}: the full cycle that it refers to is not there")
+        for head, pixels in zip(content.heads, content.pixels, strict=True):
+            _, png = cv2.imencode(".png", pixels, _FASTEST)
+            (folder / f"{head.pattern}.png").write_bytes(
+                png.tobytes()
+            )  # unlike OpenCV it says why a full disk refuses
+        # last: a set is whole when it is there
+        (folder / "capture.toml").write_text(tomli_w.dumps(table), encoding="utf-8")
+    except Exception:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 def _description(

@@ -14,7 +14,7 @@ class Thrift(IntEnum):
 
 
 # In units of `recording.min_free_mb`: below it a person has been told, and what is left is for the essential.
-_PICTURES_FROM, _RERUN_FROM = 2.0, 0.2
+PICTURES_FROM, _RERUN_FROM = 2.0, 0.2
 # More must be free again than what a level began at, or it would come and go with every file.
 _HYSTERESIS = 1.1
 
@@ -38,4 +38,4 @@ def thrift(free_mb: float, min_free_mb: float, before: Thrift) -> Thrift:
 def _level(free_mb: float, min_free_mb: float) -> Thrift:
     if free_mb < _RERUN_FROM * min_free_mb:
         return Thrift.ESSENTIAL
-    return Thrift.NO_PICTURES if free_mb < _PICTURES_FROM * min_free_mb else Thrift.ALL
+    return Thrift.NO_PICTURES if free_mb < PICTURES_FROM * min_free_mb else Thrift.ALL

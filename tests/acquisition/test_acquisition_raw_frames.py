@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 import pytest
 from acquisition_fakes import FRINGES, FULL, PLAN, estimate
 
+from membrane_ctrl.acquisition import raw_frames
 from membrane_ctrl.acquisition.frames import FrameRing, FrameWriter
 from membrane_ctrl.acquisition.raw_frames import RawFrames
 from membrane_ctrl.config import CameraConfig, OpticsConfig, RecordingConfig
@@ -32,7 +34,9 @@ class Keeping:
         self._frames = stack.enter_context(closing(FrameWriter(frames.address)))
         self._telemetry = stack.enter_context(closing(RingWriter(telemetry)))
         settings = RecordingConfig(min_free_mb=recording.pop("min_free_mb", 1), **recording)  # type: ignore[arg-type]
-        self.raw = RawFrames(folder / "raw", OPTICS, PLAN, settings, frames.address, telemetry)
+        self.told: list[dict[str, Any]] = []
+        raw = folder / "raw"
+        self.raw = RawFrames(raw, OPTICS, PLAN, settings, frames.address, telemetry, self.told.append)
         self.folder = folder / "raw"
         self.cycle = 0
 
@@ -146,3 +150,40 @@ def test_switched_off_and_without_room_nothing_is_written(stack: ExitStack, tmp_
     full.take("full")
     assert full.kept() == []
     assert full.raw.left_out == 1
+
+
+@pytest.mark.parametrize(("left_bytes", "kept"), [(-1, []), (1, ["cycle-000001"])])
+def test_a_set_has_to_leave_the_disk_to_the_telemetry(
+    stack: ExitStack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_bytes: int, kept: list[str]
+) -> None:
+    free = 2 * 100_000_000 + len(FULL) * 16 * 8 + left_bytes
+    monkeypatch.setattr(raw_frames.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+    keeping = Keeping(stack, tmp_path, min_free_mb=100)
+    keeping.take("full")
+    assert keeping.kept() == kept
+    assert bool(keeping.told) == (not kept)
+
+
+def test_what_the_disk_did_not_take_whole_goes_and_is_told_once(
+    stack: ExitStack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real_write = Path.write_bytes
+
+    def full_at_the_third(path: Path, data: bytes) -> int:
+        if path.stem == FULL[2].name:
+            raise OSError(28, "No space left on device")
+        return real_write(path, data)
+
+    keeping = Keeping(stack, tmp_path, raw_before_fault_cycles=1)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", full_at_the_third)
+        for cycle in (1, 2):
+            keeping.take("full")
+            with pytest.raises(OSError, match="could not be written"):
+                keeping.capture(cycle)
+    assert list(keeping.folder.iterdir()) == []
+    assert [(told["kind"], "No space left" in told["message"]) for told in keeping.told] == [("raw_frames", True)]
+    keeping.take()
+    keeping.fault(3)
+    assert keeping.kept() == ["cycle-000003"]
+    assert "reference" not in (keeping.folder / "cycle-000003" / "capture.toml").read_text()  # it is not there
