@@ -3,14 +3,15 @@
 A tick is a pure function of its inputs and of the ticks before it, so the same code gives the same outputs to the
 last bit; what differs is a change of the code. A replay begins with the run, or in the middle of it with a recorded
 memory of the controller (`controller_memory`). Each tick's outputs are compared by their checksum. Where ticks are
-missing in the record, what follows starts from a controller that missed them, too: from there on only decisions
-(states, faults) are compared.
+missing in the record, what follows starts from a controller that missed them, too: up to the next recorded memory
+only decisions (states, faults) are compared.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.config import Config
 from membrane_ctrl.controller import Controller
-from membrane_ctrl.controller_memory import recall
+from membrane_ctrl.controller_memory import UnknownMemoryError, recall
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.estimate import ShapeEstimate
 from membrane_ctrl.recording.inputs_file import Frame
@@ -123,30 +124,33 @@ def replay(
     """
     controller = Controller(config, sag_sensitivity)
     found = Replay()
+    same_past = True
     for item in record:
         if isinstance(item, Gap):
             if item.time_s <= to_s:
                 found.gaps.append(item)
+            same_past = False
             continue
         if item.inputs.now_s > to_s or found.finished is not None:
             break
         if not found.ticks:
             found.begin_s = item.inputs.now_s
             if item.tick > 1 and item.memory:
-                controller = recall(item.memory, controller)
+                controller, same_past = recall(item.memory, controller), True
+        elif item.memory and not same_past:
+            with suppress(UnknownMemoryError):  # then decisions only, as before
+                controller, same_past = recall(item.memory, Controller(config, sag_sensitivity)), True
         outputs = controller.tick(item.inputs)
         found.ticks += 1
         found.last_s = item.inputs.now_s
         found.finished = outputs.finished
         found.decisions += decisions_of(outputs.events, item.inputs.now_s)
-        if item.inputs.now_s >= from_s:
+        if item.inputs.now_s >= from_s and same_past:
             _compare(item, outputs, found)
     return found
 
 
 def _compare(item: RecordedTick, outputs: TickOutputs, found: Replay) -> None:
-    if found.gaps:
-        return
     found.compared += 1
     if output_crc(outputs, outputs.row.pack()) != item.output_crc:
         found.different += 1

@@ -34,6 +34,10 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
     started_s = time.perf_counter()
     begin, found = _replayed(run, from_s, to_s)
     took_s = time.perf_counter() - started_s
+    if not found.ticks:
+        part = "" if math.isinf(to_s) else f" up to {to_s:g} s"
+        why = "; ".join((*run.inputs.damage, *(gap.reason for gap in found.gaps[:1])))
+        raise InputError(f"{folder}: no tick to replay{part}{why and ': '}{why}")
     if found.last_s < from_s:
         raise InputError(f"{folder}: --from {from_s:g}s: the record ends at {found.last_s:.1f} s")
     report = _report(run, found, to_s)
@@ -44,6 +48,11 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
     rate = found.ticks / took_s if took_s else math.inf
     print(f"{found.ticks} ticks in {took_s:.1f} s ({rate:.0f} a second)", file=sys.stderr)
     if to_test is not None:
+        if found.gaps:
+            raise InputError(
+                f"--to-test: ticks are missing at {found.gaps[0].time_s:.1f} s, so that what the controller should "
+                "have decided is not known; choose a part without a gap with --from and --to"
+            )
         target = write_incident(run, found, to_test, begin, to_s)
         print(f"written: {target}; say in its incident.toml what happened", file=sys.stderr)
     return int(Exit.DONE if report["verdict"] == "identical" else Exit.REJECTED)
@@ -119,7 +128,7 @@ def _lines(report: dict[str, Any]) -> list[str]:
     for gap in report["gaps"]:
         lines.append(
             f"gap        {gap['ticks']} ticks after tick {gap['after_tick']} at {gap['time_s']:.2f} s: {gap['why']}; "
-            "from there on decisions only"
+            "decisions only up to the next recorded memory"
         )
     lines += [f"damage     {sentence}" for sentence in report["damage"]]
     return lines

@@ -143,3 +143,39 @@ def test_an_incident_begins_in_the_middle(record: Path, tmp_path: Path, monkeypa
 
 def _refuse(*_: object) -> None:
     raise UnknownMemoryError("another layout")
+
+
+@pytest.mark.parametrize("layout", ["today's", "another"])
+def test_behind_a_gap_the_next_memory_is_taken_up_and_compared_from_there(
+    tmp_path: Path, layout: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    memory = MEMORY if layout == "today's" else as_memory(CONFIG)
+    write_record(tmp_path, TICKS, range(510, 521), memories={MIDDLE: memory})
+    assert run(["replay", str(tmp_path), "--json"]) == Exit.REJECTED
+    report = json.loads(capsys.readouterr().out)
+    assert (report["verdict"], report["different"]) == ("gaps", 0)
+    assert report["compared"] == 509 + (len(TICKS) - MIDDLE + 1 if layout == "today's" else 0)
+
+
+def test_no_incident_is_made_across_a_gap(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tests" / "incidents").mkdir(parents=True)
+    write_record(tmp_path, TICKS, range(510, 521), memories={MIDDLE: MEMORY})
+    assert run(["replay", str(tmp_path), "--to-test", "torn"]) == Exit.BAD_INPUT
+    assert "ticks are missing at 10.2 s" in capsys.readouterr().err
+    assert run(["replay", str(tmp_path), "--from", "13.5s", "--to-test", "whole"]) == Exit.DONE
+    assert [path.name for path in (tmp_path / "tests" / "incidents").iterdir()] == ["whole"]
+
+
+@pytest.mark.parametrize("left", [b"", b"noise" * 100])
+def test_inputs_of_which_nothing_can_be_read_are_said_to_be_so(
+    record: Path, left: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (record / "inputs-000.bin").write_bytes(left)
+    assert run(["replay", str(record)]) == Exit.BAD_INPUT
+    said = capsys.readouterr().err
+    assert "no tick to replay" in said
+    assert "inputs-000.bin" in said
+    assert said.count("\n") == 1
