@@ -55,6 +55,7 @@ from membrane_ctrl.virtual.run import VirtualRun, VirtualTick
 from membrane_ctrl.virtual.shape import TruthShape
 
 _SWITCHES: dict[str, Any] = {field.name: field.default for field in fields(Wrong)}
+_FRACTIONS = ("pump_share", "pump_stuck_fraction", "vent_stuck_fraction")  # beyond them the plant has no answer
 Happening = Literal["ambient", "air_temperature", "leak", "laser_dropout", "laser_drift", "power_cycle"]
 _MAKE: dict[str, Callable[[At], happenings.Event]] = {
     "ambient": lambda at: happenings.AmbientChange(at.time_s, at.value, at.over_s),
@@ -84,6 +85,8 @@ class At(Section):
             raise ValueError("give exactly one of wrong, event and command")
         if self.wrong is not None and self.wrong not in _SWITCHES:
             raise ValueError(f"wrong = {self.wrong!r} is unknown; known are {', '.join(_SWITCHES)}")
+        if self.wrong in _FRACTIONS and not 0 <= self.value <= 1:
+            raise ValueError(f"wrong = {self.wrong!r} with value = {self.value:g}: a fraction, 0 to 1")
         if self.every_s is not None and (self.wrong is None or self.for_s is None or self.for_s >= self.every_s):
             raise ValueError("every_s goes with wrong and with a for_s shorter than it")
         if self.command is not None and self.command not in get_args(Kind):

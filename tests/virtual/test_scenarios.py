@@ -27,6 +27,7 @@ GOOD = 'title = "x"\nduration_s = 20.0\n[config.loop]\nrate_hz = 10.0\n'
     ("text", "words"),
     [
         ('[[at]]\ntime_s = 1.0\nwrong = "gremlins"\n[expect]\n', ["at.0", "gremlins", "no_light"]),
+        ('[[at]]\ntime_s = 1.0\nwrong = "pump_share"\nvalue = 1.5\n[expect]\n', ["at.0", "pump_share", "0 to 1"]),
         ('[[at]]\ntime_s = 1.0\nwrong = "silent"\ncommand = "stop"\n[expect]\n', ["at.0", "exactly one"]),
         ('[[at]]\ntime_s = 1.0\ncommand = "explode"\n[expect]\n', ["at.0", "explode", "lower"]),
         ('[[expect.bounds]]\nfield = "height"\nlow = 1.0\n', ["expect.bounds.0", "height"]),
