@@ -88,7 +88,7 @@ def ctl(
         typer.Argument(
             metavar="ACTION",
             help="status, watch, setpoint UM, hold, pause, resume, manual FLOW, gains FILE, keep, shape on|off, "
-            'mark "text", ack, lower, vent, stop, release, quiet.',
+            'mark "text", ack, lower, vent, stop, release, quiet, latch "text", capture.',
         ),
     ],
     argument: Annotated[str | None, typer.Argument(metavar="[VALUE]")] = None,

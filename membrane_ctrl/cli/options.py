@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
 from membrane_ctrl.config import Config
 from membrane_ctrl.config_file import load
+from membrane_ctrl.section import Section
+
+S = TypeVar("S", bound=Section)
 
 ConfigArgument = Annotated[Path, typer.Argument(help="Configuration, one TOML file.", metavar="CONFIG")]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="Configuration, one TOML file.")]
@@ -26,12 +29,24 @@ TrialsOption = Annotated[int, typer.Option(min=2, help="Monte Carlo trials.")]
 def configured(path: Path | None) -> Config:
     """Return the configuration of a file, or the defaults without one; raises `InputError`.
 
-    Its geometry file is looked for beside it, wherever the command is called.
+    The files that it names are looked for beside it, wherever the command is called.
     """
     if path is None:
         return Config()
     config = load(path, Config)
-    if config.optics.geometry_file is None:
-        return config
-    beside = path.resolve().parent / config.optics.geometry_file.expanduser()
-    return config.model_copy(update={"optics": config.optics.model_copy(update={"geometry_file": beside})})
+    optics, port, alarms = config.optics, config.port, config.alarms
+    folder = path.resolve().parent
+    if optics.geometry_file is not None:
+        optics = _beside(optics, folder, "geometry_file")
+    if port.tls is not None:
+        tls = _beside(port.tls, folder, "certificate_file", "key_file", "client_ca_file")
+        port = port.model_copy(update={"tls": tls})
+    alarms = _beside(alarms, folder, "urls_file", "escalation_urls_file")
+    return config.model_copy(update={"optics": optics, "port": port, "alarms": alarms})
+
+
+def _beside(section: S, folder: Path, *names: str) -> S:
+    """The section with its file names as paths from a folder; what is not set stays so."""
+    given = {name: getattr(section, name) for name in names}
+    made = {name: type(file)(folder / Path(file).expanduser()) for name, file in given.items() if file is not None}
+    return section.model_copy(update=made)

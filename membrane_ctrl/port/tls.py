@@ -41,9 +41,14 @@ class TlsListener:
         self.socket = listen_tcp(config.host, config.port, "port.tls")
 
     def peer(self, certificate: dict[str, Any]) -> Peer:
-        """Who the certificate (as of `getpeercert`) names, and as what."""
+        """Who the certificate (as of `getpeercert`) names, and as what; who has no name may only read.
+
+        All the nameless would be one commander, and the record could not say who it was.
+        """
         subject = {key: value for part in certificate.get("subject", ()) for key, value in part}
-        name = "".join(c for c in subject.get("commonName", "nameless") if c.isprintable())
+        name = "".join(c for c in subject.get("commonName", "") if c.isprintable()).strip()
+        if not name:
+            return Peer("tls:nameless", "read")
         who = f"tls:{name}".encode()[:WHO_BYTES].decode(errors="ignore")
         return Peer(who, _ROLES.get(subject.get("organizationalUnitName", ""), "read"))
 

@@ -9,7 +9,6 @@ import tomli_w
 
 from membrane_ctrl.calibration.geometry_file import origin_of, read_geometry
 from membrane_ctrl.calibration.geometry_in_force import KEPT, geometry_in_force, geometry_of_run
-from membrane_ctrl.cli.options import configured
 from membrane_ctrl.config import CameraConfig, Config, GeometryConfig, OpticsConfig, PatternConfig
 from membrane_ctrl.errors import InputError
 from membrane_ctrl.metrology.calibrate.content_hash import SCHEMA, content_hash
@@ -133,8 +132,3 @@ def test_a_file_that_cannot_be_used_is_no_missing_one(tmp_path: Path) -> None:
     (tmp_path / "g.toml").write_text("[geometry]\na_mm = 3\n")
     with pytest.raises(InputError, match=r"g\.toml: a_mm"):
         geometry_in_force(Config(optics=OpticsConfig(geometry_file=tmp_path / "g.toml")))
-
-
-def test_the_file_is_looked_for_beside_the_configuration(tmp_path: Path) -> None:
-    (tmp_path / "lab.toml").write_text('[optics]\ngeometry_file = "g.toml"\n')
-    assert configured(tmp_path / "lab.toml").optics.geometry_file == tmp_path / "g.toml"

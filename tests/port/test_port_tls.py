@@ -16,6 +16,7 @@ from port_run import PortRun, port_run
 
 from membrane_ctrl.errors import DeviceError, InputError
 from membrane_ctrl.port.client import PortClient
+from membrane_ctrl.port.people import Peer
 from membrane_ctrl.port.tls import TlsListener, client_context
 from membrane_ctrl.port_config import PortConfig, TlsConfig
 
@@ -156,6 +157,16 @@ def test_how_long_a_certificate_lasts(config: PortConfig) -> None:
     listener = TlsListener(config.tls)
     in_an_hour = time.strftime("%b %d %H:%M:%S %Y GMT", time.gmtime(time.time() + 3600))
     assert listener.lasts_s({"notAfter": in_an_hour}) == pytest.approx(3600, abs=60)
+    listener.close()
+
+
+def test_who_has_no_name_only_reads(config: PortConfig) -> None:
+    assert config.tls is not None
+    listener = TlsListener(config.tls)
+    unit = (("organizationalUnitName", "tune"),)
+    assert listener.peer({"subject": (unit,)}) == Peer("tls:nameless", "read")
+    assert listener.peer({"subject": (unit, (("commonName", " "),))}) == Peer("tls:nameless", "read")
+    assert listener.peer({"subject": (unit, (("commonName", "bea"),))}) == Peer("tls:bea", "tune")
     listener.close()
 
 
