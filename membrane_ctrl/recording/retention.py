@@ -30,8 +30,8 @@ class OldRun:
 def deletable_runs(logs_dir: Path, present: Path, now_utc: datetime) -> list[OldRun]:
     """Runs in `logs_dir`, oldest first, but for the present one, those that may still run, and those with a `.keep`.
 
-    Only folders that look like a run are looked at: a name that begins with a time, and `config.toml`. A link is none:
-    what it leads to lies elsewhere.
+    Only folders that look like a run are looked at: a name that begins with a time, and `config.toml`. A link is
+    none: what it leads to lies elsewhere.
     """
     found = []
     for folder in sorted(logs_dir.iterdir()):

@@ -63,7 +63,12 @@ def review(
 def report(
     run: RunArgument,
     out: Annotated[Path | None, typer.Option(help="Folder for report.html and report.json; RUN/report.")] = None,
-    compare: Annotated[Path | None, typer.Option("--compare", help="Another run to set it against.")] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(
+            "--compare", help="Another run to set it against: of a part by +.. the same part, else the whole."
+        ),
+    ] = None,
     start: FromOption = None,
     end: ToOption = None,
     json: JsonOption = False,
