@@ -13,7 +13,8 @@ import socket
 from types import TracebackType
 
 from membrane_ctrl.names import State
-from membrane_ctrl.tick import TickOutputs
+from membrane_ctrl.recorder_trouble import RecorderTrouble
+from membrane_ctrl.tick import Event, TickOutputs
 
 _EVERY_S = 0.5  # far below any sensible WatchdogSec=, and nothing to a tick
 
@@ -31,6 +32,7 @@ class SystemdNotify:
         self._address = (address or os.environ.get("NOTIFY_SOCKET", "")).replace("@", "\0", 1)
         self._next_s = -math.inf
         self._state = -1.0
+        self._recorder = RecorderTrouble()
 
     def __enter__(self) -> SystemdNotify:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
@@ -42,6 +44,10 @@ class SystemdNotify:
         self._send("STOPPING=1")
         self._socket.close()
 
+    def told(self, event: Event) -> None:
+        """Take in what a child process reports; the next status line has it."""
+        self._recorder.take(event)
+
     def heard(self, outputs: TickOutputs) -> None:
         """A tick has ended."""
         row = outputs.row
@@ -51,9 +57,10 @@ class SystemdNotify:
         self._next_s, self._state = row.mono_s + _EVERY_S, row.state
         error = f", error {row.error_um:+.2f} um" if math.isfinite(row.error_um) else ""
         fault = f", fault {row.fault:g}" if row.fault else ""
-        self._send(f"{ready}WATCHDOG=1\nSTATUS={State(int(row.state)).name.lower()}{error}{fault}")
+        trouble = f", recording: {self._recorder.words}" if self._recorder.standing else ""
+        self._send(f"{ready}WATCHDOG=1\nSTATUS={State(int(row.state)).name.lower()}{error}{fault}{trouble}")
 
     def _send(self, message: str) -> None:
         if self._address:
             with contextlib.suppress(OSError):
-                self._socket.sendto(message.encode(), self._address)
+                self._socket.sendto(message.encode(errors="replace"), self._address)  # a path may be no text

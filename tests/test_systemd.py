@@ -62,6 +62,17 @@ def test_ready_once_then_the_watchdog_twice_a_second_and_at_each_change(systemd:
     ]
 
 
+def test_trouble_with_the_recording_is_in_the_status_until_it_is_over(systemd: socket.socket) -> None:
+    with SystemdNotify() as notify:
+        notify.told({"kind": "disk_low", "what": "disk", "message": "/srv/\udcff: less than 500 MB\nfree"})
+        notify.heard(outputs(0.0, State.HOLD, fault=20))
+        notify.told({"kind": "recorder_recovered", "what": "disk", "message": "disk works again"})
+        notify.heard(outputs(1.0, State.HOLD))
+    messages = said(systemd)
+    assert messages[0][1:] == ["WATCHDOG=1", "STATUS=hold, fault 20, recording: /srv/?: less than 500 MB free"]
+    assert messages[1] == ["WATCHDOG=1", "STATUS=hold"]
+
+
 def test_without_systemd_or_with_one_that_is_gone_nothing_happens(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
