@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.figures import Figure, at_least, at_most
 from benchmarks.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night, planted
+from membrane_ctrl.config import Config
 from membrane_ctrl.recording.levels import TICK_FIELDS, first_level
 from membrane_ctrl.recording.rows import column
 from membrane_ctrl.review.found import Found, find_events
@@ -25,7 +26,7 @@ def search(seed: int, scenario: str, hours: float = HOURS) -> tuple[list[Planted
     rows, estimates = night(seed, hours, scenario, events)
     level = first_level({name: column(rows, name) for name in TICK_FIELDS})
     shapes: Shapes = from_estimates(estimates)
-    return events, find_events(level, shapes)
+    return events, find_events(level, shapes, Config().limits.band_um)
 
 
 def matched(events: list[Planted], found: list[Found]) -> tuple[list[Planted], list[Found]]:

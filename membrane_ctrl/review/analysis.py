@@ -160,7 +160,7 @@ def _found_and_shape(
     mirror = run.config.optics.mirror
     held = held_at(seconds, shapes.time_s)
     shape = review_shapes(shapes, held, mirror.analysis_radius_mm / mirror.radius_mm)
-    return tuple(find_events(seconds, shapes)), shape
+    return tuple(find_events(seconds, shapes, run.config.limits.band_um)), shape
 
 
 def _series(run: Run, ticks: HoldPass, which: int) -> Series | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -67,7 +66,7 @@ class Found:
     ----------
     kind : str
         "pressure step", "leak step", "laser glitch", "laser lost", "barometer lost", "thermometer lost",
-        "lateness burst", "noise change", "shape jump" or "band left".
+        "lateness burst", "noise change", "shape jump" or "excursion".
     start_s, end_s : float
         Time range of the run that shows it.
     time_s : float
@@ -88,7 +87,7 @@ class Found:
     confidence: float
 
 
-def find_events(level: Level, shapes: Shapes, band_um: float = math.inf) -> list[Found]:
+def find_events(level: Level, shapes: Shapes, band_um: float) -> list[Found]:
     """All events of a run in the order of time.
 
     Parameters
@@ -98,7 +97,7 @@ def find_events(level: Level, shapes: Shapes, band_um: float = math.inf) -> list
     shapes : Shapes
         May be empty.
     band_um : float
-        The run's `limits.band_um`; without it no "band left" is looked for.
+        The run's `limits.band_um`: what leaves it for no other reason is an excursion.
     """
     found: list[Found] = []
     if level["time_s"].size:
@@ -109,7 +108,7 @@ def find_events(level: Level, shapes: Shapes, band_um: float = math.inf) -> list
         )  # fmt: skip
         for finder in finders:
             found += finder(even)
-        found += band_left(even, band_um, found)
+        found += excursions(even, band_um, found)
     found += shape_jumps(shapes)
     return sorted(found, key=lambda event: event.time_s)
 
@@ -216,7 +215,7 @@ def noise_changes(level: Level) -> list[Found]:
     ]
 
 
-def band_left(level: Level, band_um: float, known: Sequence[Found]) -> list[Found]:
+def excursions(level: Level, band_um: float, known: Sequence[Found]) -> list[Found]:
     """The 1 s mean of the error leaves the band, and neither a fault nor an event known explains it."""
     time_s, error_um = level["time_s"], level["mean_error_um"]
     out = (np.abs(error_um) > band_um) & (level["state"] == State.HOLD)
@@ -228,7 +227,7 @@ def band_left(level: Level, band_um: float, known: Sequence[Found]) -> list[Foun
     found = []
     for a, b in _runs(out, BACK_S):
         worst = a + int(np.nanargmax(np.abs(error_um[a : b + 1])))
-        found.append(Found("band left", float(time_s[a]), float(time_s[a]) - 30, float(time_s[b]) + 30,
+        found.append(Found("excursion", float(time_s[a]), float(time_s[a]) - 30, float(time_s[b]) + 30,
                            float(error_um[worst]), "um", 1.0))  # fmt: skip
     return found
 

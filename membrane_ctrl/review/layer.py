@@ -129,7 +129,7 @@ class Layer:
         level = run.level(level_s)
         seconds = level if level_s == 1.0 else run.level(1.0, names=LEVEL_COLUMNS)
         shapes = run.shapes()
-        found = find_events(seconds, shapes)
+        found = find_events(seconds, shapes, run.config.limits.band_um)
         self._overviews(level, run.config.limits.band_um)
         self._ticks(run, part_s)
         self._lanes(level)

@@ -77,7 +77,8 @@ def _anomalies(analysis: Analysis) -> str:
 def _found(analysis: Analysis) -> str:
     if not analysis.found:
         return (
-            "<p>Nothing: no door, leak step, laser glitch, lateness burst, change of noise or jump of the figure.</p>"
+            "<p>Nothing: no door, leak step, laser glitch, lateness burst, change of noise, excursion or jump "
+            "of the figure.</p>"
         )
     rows = [
         [

@@ -204,7 +204,7 @@ def _around(run: Run, what: str) -> float:
             return float(event.get("mono_s") or 0.0)
     from membrane_ctrl.review.found import LEVEL_COLUMNS, find_events
 
-    found: list[Found] = find_events(run.level(1.0, names=LEVEL_COLUMNS), run.shapes())
+    found: list[Found] = find_events(run.level(1.0, names=LEVEL_COLUMNS), run.shapes(), run.config.limits.band_um)
     for item in found:
         if wanted in item.kind:
             return item.time_s

@@ -22,7 +22,7 @@ def level_of(rows: Rows) -> Columns:
 
 def found_in(events: list[Planted], seed: int = 1, scenario: str = "typical") -> list[Found]:
     rows, shapes = night(seed, HOURS, scenario, events)
-    return find_events(level_of(rows), from_estimates(shapes))
+    return find_events(level_of(rows), from_estimates(shapes), 2.0)
 
 
 @pytest.mark.parametrize("scenario", ["quiet", "typical", "gusty"])

@@ -31,7 +31,7 @@ def bumped(events: list[Planted], size_um: float, scenario: str = "typical") -> 
 @pytest.mark.parametrize("size_um", [5.0, -5.0])
 def test_an_excursion_without_a_cause_is_named(size_um: float) -> None:
     (found,) = found_in(bumped([], size_um))
-    assert (found.kind, found.unit) == ("band left", "um")
+    assert (found.kind, found.unit) == ("excursion", "um")
     assert found.time_s == pytest.approx(AT_S + 5, abs=3.0)
     assert found.size == pytest.approx(-size_um, abs=1.2)
 
@@ -53,7 +53,7 @@ def test_a_door_and_a_fault_explain_it() -> None:
 def test_one_that_is_not_held_is_none() -> None:
     rows = bumped([], 5.0)
     rows[column(rows, "mono_s") < AT_S + 60, COLUMN["state"]] = 3
-    assert "band left" not in {f.kind for f in found_in(rows)}
+    assert "excursion" not in {f.kind for f in found_in(rows)}
 
 
 @pytest.mark.parametrize("scenario", ["quiet", "typical", "gusty"])
