@@ -119,6 +119,7 @@ def status_lines(status: dict[str, Any]) -> list[str]:
         lines.append(f"  {'shape loop':15}{status['shape']} {status['shape_reason']}".rstrip())
         lines.append(f"  {'geometry':15}{_geometry(status.get('geometry'))}")
     lines += [f"  {'maintenance':15}{message}" for message in status.get("maintenance", {}).values()]
+    lines += [f"  {'recording':15}{message}" for message in status.get("recording", {}).values()]
     lines.append(f"  {'commander':15}{status.get('commander') or 'nobody'}")
     return lines
 

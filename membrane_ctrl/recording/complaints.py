@@ -58,3 +58,8 @@ class Complaints:
         """Say that it works again, if it did not."""
         if self._trouble.pop(what, None) is not None:
             self.report({"kind": "recorder_recovered", "what": what, "message": f"{what} works again"})
+
+    def forget(self, prefix: str, but: set[str]) -> None:
+        """Say that trouble is over whose cause is there no longer: what begins with `prefix` and is not in `but`."""
+        for what in [what for what in self._trouble if what.startswith(prefix) and what not in but]:
+            self.recovered(what)

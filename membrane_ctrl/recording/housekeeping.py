@@ -22,6 +22,7 @@ RETENTION_INTERVAL_S = 3600.0
 # hour takes longer only on a very busy machine (docs/recording.md).
 _OPTIMISE_LAST_S = 20.0
 _LOOK_S = 0.05
+_RUN = "retention: "  # and the run that cannot be deleted
 
 
 class Housekeeping:
@@ -83,9 +84,11 @@ class Housekeeping:
         now_utc = self._clock.utc(self._clock.now())
         delete_remains(self._run_dir.parent)
         runs = deletable_runs(self._run_dir.parent, self._run_dir, now_utc)
-        for run, why in expired(runs, size_bytes(self._run_dir), config.keep_gb, config.keep_days, now_utc):
-            # one by one: a folder that cannot go must not keep the others
-            self._complaints.guarded(f"retention: {run.folder.name}", partial(self._delete, run, why))
+        gone = expired(runs, size_bytes(self._run_dir), config.keep_gb, config.keep_days, now_utc)
+        # a folder that a person has moved away by hand is no trouble any more
+        self._complaints.forget(_RUN, but={_RUN + run.folder.name for run, _ in gone})
+        for run, why in gone:  # one by one: a folder that cannot go must not keep the others
+            self._complaints.guarded(_RUN + run.folder.name, partial(self._delete, run, why))
 
     def _delete(self, run: OldRun, why: str) -> None:
         delete_run(run)

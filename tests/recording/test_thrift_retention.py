@@ -140,8 +140,14 @@ def test_one_run_that_cannot_go_keeps_no_other_and_remains_of_a_crash_go_too(
     config = RecordingConfig(keep_days=30.0, min_free_mb=1.0)
     keeping = Housekeeping(present, HandClock(0.0, NOW), config, Complaints(reports.append))
     keeping.look(0.0, [])
-    keeping.close()
     assert [report["kind"] for report in reports] == ["recorder_error", "run_deleted"]
+    keeping.look(RETENTION_INTERVAL_S, [])
+    assert len(reports) == 2, "told once"
+    monkeypatch.undo()
+    (tmp_path / "20261001T110000Z-old").rename(tmp_path / "by-hand")
+    keeping.look(2 * RETENTION_INTERVAL_S, [])
+    assert (reports[2]["kind"], reports[2]["what"]) == ("recorder_recovered", "retention: 20261001T110000Z-old")
+    keeping.close()
     assert "Permission denied" in str(reports[0]["message"])
     assert reports[1]["run"] == "20261002T110000Z-old"
     assert not list(tmp_path.glob(".deleted-*"))
