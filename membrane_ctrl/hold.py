@@ -243,13 +243,21 @@ def _report(run_dir: Path, as_json: bool) -> None:
     if as_json:
         print(summary_path.read_text(encoding="utf-8") if summary_path.exists() else "{}")
         return
+    if not run_dir.exists():
+        print(f"{run_dir}: removed or moved during the run; nothing of the run is there", file=sys.stderr)
+        return
     if summary_path.exists():
-        for line in _headline(json.loads(summary_path.read_text(encoding="utf-8"))):
+        summary = json.loads(summary_path.read_text(encoding="utf-8"))
+        for line in _headline(summary):
             print(line, file=sys.stderr)
+        anew_s = summary["recorder"].get("folder_anew_s")
+        if anew_s is not None:
+            print(f"the run folder was removed or moved; this one begins at {anew_s:.1f} s", file=sys.stderr)
     else:
         print("the recorder left no summary.json; what it had recorded is still readable", file=sys.stderr)
     print(f"run folder: {run_dir}", file=sys.stderr)
-    print(f"open it:    rerun {run_dir}/*.rrd", file=sys.stderr)
+    if any(run_dir.glob("*.rrd")):
+        print(f"open it:    rerun {run_dir}/*.rrd", file=sys.stderr)
 
 
 def _headline(summary: dict[str, object]) -> Iterator[str]:

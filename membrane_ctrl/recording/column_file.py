@@ -135,6 +135,12 @@ class ColumnFile:
         if stream is not None:
             stream.close()
 
+    def leave_folder(self) -> None:
+        """The folder was taken away: what waits goes to the one in its place, what is written is not there."""
+        with contextlib.suppress(OSError):
+            self.close_file()
+        self._journal.drop()
+
     @property
     def files(self) -> int:
         """Files of the table that are there."""

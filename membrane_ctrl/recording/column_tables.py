@@ -138,6 +138,11 @@ class ColumnTables:
         for file in self._files:
             file.close()
 
+    def leave_folder(self) -> None:
+        """The run's folder was taken away, and another is in its place: go on there."""
+        for file in self._files:
+            file.leave_folder()
+
     @property
     def lost(self) -> int:
         """Rows of all tables given up."""

@@ -79,6 +79,12 @@ class EventsFile:
             os.fsync(self._descriptor)
             self._sync = False
 
+    def begin_anew(self, recent: Sequence[Event]) -> None:
+        """The file was taken away: begin another, with those that had gone into it unseen. Raises OSError."""
+        gone = self._descriptor is not None  # not opened yet: nothing of it was taken
+        self.close()
+        self.append(recent if gone else [])
+
     def close(self) -> None:
         """Close the file."""
         if self._descriptor is not None:

@@ -19,6 +19,7 @@ from membrane_ctrl.recording.column_tables import ColumnTables
 from membrane_ctrl.recording.complaints import Complaints, Report
 from membrane_ctrl.recording.events import Event, EventsFile
 from membrane_ctrl.recording.feed import Feed
+from membrane_ctrl.recording.folder_watch import FolderWatch
 from membrane_ctrl.recording.housekeeping import Housekeeping
 from membrane_ctrl.recording.inputs_file import InputsFile
 from membrane_ctrl.recording.rerun_output import FrameSource, RerunOutput
@@ -76,6 +77,9 @@ class Recorder:
         handed_on = load_state(run_dir) if resumes else None
         before = handed_on or RecorderState(Summary(config))
         self._run_dir = run_dir
+        self._config = config
+        self._folder = FolderWatch(run_dir)
+        self._folder_anew_s = before.folder_anew_s
         self._clock = clock
         self._feeds = {
             name: Feed(ring, before.positions.get(name, 0), before.dropped.get(name, 0))
@@ -129,6 +133,7 @@ class Recorder:
     def write(self) -> None:
         """Bring what came since the last call to the disk, and see that it got there."""
         now_s = self._clock.now()
+        self._complaints.guarded("new run folder", lambda: self._see_folder(now_s))
         rows = unpack(self._messages)
         shapes, new_events = self._shapes, self._events
         self._messages, self._shapes, self._events = [], [], []
@@ -143,6 +148,20 @@ class Recorder:
         if not self._rerun.send(now_s, rows, new_events, shapes, self._housekeeping.thrift):
             self._rows_lost += len(rows)
         guarded("state file", self._hand_on)
+
+    def _see_folder(self, now_s: float) -> None:
+        """Go on in a new folder if the run's was taken away: writing to a deleted file goes without an error."""
+        if not self._folder.gone():
+            return
+        self._folder.begin_anew(self._config)
+        self._folder_anew_s = now_s
+        # never taken back: what is missing stays missing
+        what = f"{self._run_dir} was removed or moved, and is begun anew at {now_s:.1f} s"
+        self._complaints.complain("run folder", f"{what}; what was recorded before is not in it")
+        self._inputs_file.close()
+        self._columns.leave_folder()
+        self._rerun.leave_folder()
+        self._events_file.begin_anew(self._events)
 
     def _write_inputs(self, now_s: float, shapes: list[ShapeEstimate]) -> None:
         batch = self._assembler.take(self._input_messages)
@@ -163,6 +182,7 @@ class Recorder:
             self._rows_lost,
             self._events_lost + self._events_file.lost,
             self._input_ticks_lost + self._inputs_file.lost_ticks,
+            self._folder_anew_s,
         )
         save_state(self._run_dir, state)
 
@@ -185,6 +205,7 @@ class Recorder:
             "events_lost": self._events_lost + self._events_file.lost,
             "input_ticks_lost": self._input_ticks_lost + self._inputs_file.lost_ticks,
             "restarts": self._resumes,
+            "folder_anew_s": self._folder_anew_s,  # None: it is the one that was begun
             # without what the former recorder knew, the statistics begin with what the ring still had
             "partial": self._began_anew and self._feeds["telemetry"].dropped > 0,
         }
@@ -192,6 +213,7 @@ class Recorder:
         guarded("summary.json", lambda: write_text_atomic(self._run_dir / "summary.json", text))
         self._events_file.close()
         self._inputs_file.close()
+        self._folder.close()
         remove_state(self._run_dir)
         # last, as nobody needs it: whoever is in a hurry may kill this process now
         closed, self._rerun.closed = self._rerun.closed, []

@@ -137,6 +137,13 @@ class RerunOutput:
             self._alive = False
             self._complaints.guarded("recording", self._recording.pause)
 
+    def leave_folder(self) -> None:
+        """The run's folder was taken away, and another is in its place: go on there, at once."""
+        self._alive = False
+        self._retry_s = 0.0
+        self.closed.clear()
+        self._recording.lay_out_again()
+
     def _watch_hold(self, rows: Rows) -> None:
         """Changes of the figure are against the first of the hold: before it they only show the way there."""
         if not len(rows):

@@ -13,6 +13,7 @@ from membrane_ctrl.errors import DeviceError, InputError
 from membrane_ctrl.recording.atomic import write_text_atomic
 from membrane_ctrl.recording.checked_text import with_comment
 
+CONFIG = "config.toml"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
@@ -52,11 +53,16 @@ def create_run_folder(logs_dir: Path, name: str, started_utc: datetime, config: 
     except OSError as error:
         raise _unwritable(logs_dir, error) from None
     try:
-        write_text_atomic(run_dir / "config.toml", with_comment(config_file.dump(config)))
+        write_config(run_dir, config)
     except OSError as error:
         shutil.rmtree(run_dir, ignore_errors=True)
         raise _unwritable(run_dir, error) from None
     return run_dir
+
+
+def write_config(run_dir: Path, config: Config) -> None:
+    """Write `config.toml`, every default written out. Raises OSError."""
+    write_text_atomic(run_dir / CONFIG, with_comment(config_file.dump(config)))
 
 
 def free_mb(folder: Path) -> float:

@@ -152,6 +152,10 @@ class Recording:
         self._stream.set_time(UTC, timestamp=self._origin + nanoseconds)
         self._stream.log(path, archetype)
 
+    def lay_out_again(self) -> None:
+        """The next segment is the first one that will be found: it gets the blueprint."""
+        self._laid_out = False
+
     def flush(self) -> None:
         """Bring everything sent to the file. Raises RecordingError if the writer has died since the last call."""
         try:

@@ -35,6 +35,8 @@ class RecorderState:
         Of the overview tables.
     errors, rows_lost, events_lost, input_ticks_lost : int
         The recorder's own account.
+    folder_anew_s : float or None
+        When the folder was last begun anew, because somebody had taken it away.
     """
 
     summary: Summary
@@ -47,6 +49,7 @@ class RecorderState:
     rows_lost: int = 0
     events_lost: int = 0
     input_ticks_lost: int = 0
+    folder_anew_s: float | None = None
 
 
 def save_state(run_dir: Path, state: RecorderState) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import pickle
+import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ import pytest
 from rrd_reading import scalars
 from synthetic_run import STARTED_UTC, rows_of, shape_of
 
+from membrane_ctrl import config_file
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config, RecordingConfig
 from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
@@ -24,6 +26,8 @@ from membrane_ctrl.recording.checked_text import dumps_checked
 from membrane_ctrl.recording.inputs_file import InputsFile, InputsReader
 from membrane_ctrl.recording.recorder import Recorder
 from membrane_ctrl.recording.rerun_output import RETRY_S
+from membrane_ctrl.recording.run_folder import write_config
+from membrane_ctrl.recording.sealed_stream import whole_batches
 from membrane_ctrl.recording.sink import Recording, RecordingError
 from membrane_ctrl.telemetry import ROW_BYTES
 from membrane_ctrl.tick_record import MESSAGE_BYTES, RECORD, TICK
@@ -169,6 +173,54 @@ def test_a_segment_deleted_under_the_recorder_is_reported_and_another_begun(benc
     bench.recorder.finish()
     assert bench.kinds() == ["recorder_error", "recorder_recovered", "recorder_done"]
     assert times_s(bench) == [2]
+
+
+def emptied(folder: Path) -> None:
+    """As an `rm -r` leaves it that met a file just written."""
+    shutil.rmtree(folder / "columns")
+    for path in folder.glob("*.*"):
+        path.unlink()
+
+
+def replaced(folder: Path) -> None:
+    """As by the acquisition, which makes the folder of its frames."""
+    shutil.rmtree(folder)
+    (folder / "raw").mkdir(parents=True)
+
+
+TAKEN_AWAY = {
+    "removed": shutil.rmtree,
+    "moved": lambda folder: folder.rename(folder.with_name("elsewhere")),
+    "emptied": emptied,
+    "replaced": replaced,
+}
+
+
+@pytest.mark.parametrize("how", TAKEN_AWAY)
+def test_a_run_folder_taken_away_is_begun_anew_and_said(tmp_path: Path, how: str) -> None:
+    run_dir = tmp_path / "run"
+    config = Config()
+    run_dir.mkdir()
+    write_config(run_dir, config)
+    for bench in make_bench(run_dir, config):
+        bench.writers["events"].put(b'{"kind": "start", "mono_s": 0.0}')
+        bench.second(0)
+        TAKEN_AWAY[how](run_dir)
+        bench.writers["events"].put(b'{"kind": "mark", "mono_s": 0.9}')
+        for number in (1, 2):
+            bench.second(number)
+        bench.recorder.finish()
+        said = [report["message"] for report in bench.reports if report["kind"] == "recorder_error"]
+        what = f"{run_dir} was removed or moved, and is begun anew at 1.0 s"
+        assert said == [f"{what}; what was recorded before is not in it"]
+        assert "recorder_recovered" not in bench.kinds()
+        assert times_s(bench) == [1, 2]
+    assert config_file.load(run_dir / "config.toml", Config) == config
+    assert json.loads((run_dir / "events.jsonl").read_text())["kind"] == "mark"
+    found = json.loads((run_dir / "summary.json").read_text())
+    assert (found["ticks"], found["recorder"]["folder_anew_s"]) == (150, 1.0)
+    rows = sum(batch.num_rows for batch in whole_batches(run_dir / "columns" / "ticks-000.arrows"))
+    assert rows == 150  # those of the first second still waited for a batch
 
 
 def test_segments_are_changed_in_time_without_losing_a_row(bench: Bench) -> None:
