@@ -166,7 +166,7 @@ async def _run(
         port = port_for(RunHooks(supervisor.ask, supervisor.tell, clock.now, lambda: controller.loop_config))
         latcher, systemd = latcher_for(supervisor.tell), SystemdNotify()
         wiring.heard = (port.heard, latcher.heard, systemd.heard, partial(_capture, crew, supervisor.tell))
-        wiring.told = (port.told,)
+        wiring.told = (port.told, systemd.told)
         devices = config.devices.name if config.devices else ""
         supervisor.tell({"kind": "start", "devices": devices, "priority": raise_priority(), "message": board.cleared})
         exit_code = Exit.DEVICE_FAILED

@@ -88,7 +88,7 @@ def run(spec: AcquisitionSpec, remote: Remote) -> None:
         frames = stack.enter_context(closing(FrameWriter(spec.frames)))
         stack.callback(bench.close)  # before the ring of frames: an exposure under way holds the pixels of a slot
         laser = stack.enter_context(closing(LaserHistory(spec.telemetry)))
-        raw = _raw_frames(spec, geometry.optics, plan, stack)
+        raw = _raw_frames(spec, geometry.optics, plan, stack, remote)
         cycle = ShapeCycle(
             bench.camera, bench.screen, reconstructor, plan, frames, clock, laser, stopping=remote.interrupts
         )
@@ -153,9 +153,12 @@ def _spread(run_dir: Path | None, optics: OpticsConfig) -> GeometrySpread | None
     return spread if spread.names else None
 
 
-def _raw_frames(spec: AcquisitionSpec, optics: OpticsConfig, plan: CyclePlan, stack: ExitStack) -> RawFrames | None:
+def _raw_frames(
+    spec: AcquisitionSpec, optics: OpticsConfig, plan: CyclePlan, stack: ExitStack, remote: Remote
+) -> RawFrames | None:
     """What keeps frames, if there is a place for them."""
     if spec.run_dir is None:
         return None
-    raw = RawFrames(spec.run_dir / "raw", optics, plan, spec.config.recording, spec.frames, spec.telemetry)
+    folder, recording = spec.run_dir / "raw", spec.config.recording
+    raw = RawFrames(folder, optics, plan, recording, spec.frames, spec.telemetry, remote.tell)
     return stack.enter_context(closing(raw))
