@@ -98,6 +98,7 @@ async def test_the_terminal_of_a_screen_that_hangs_at_the_end_is_usable(tmp_path
         assert terminal.usable
 
 
+@pytest.mark.usefixtures("signals_are_heeded")
 async def test_a_closed_terminal_is_a_clean_stop(tmp_path: Path) -> None:
     async with on_terminal(tmp_path) as (run, terminal):
         terminal.close()

@@ -239,6 +239,7 @@ def listens(port: int) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
+@pytest.mark.usefixtures("signals_are_heeded")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_review_that_is_ended_leaves_nothing_behind(logs: Path, tmp_path: Path, number: signal.Signals) -> None:
     command_line = [sys.executable, "-m", "membrane_ctrl", "review", str(logs / "20261121T180000Z-night"), "--web"]
