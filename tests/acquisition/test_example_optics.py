@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from firmware_iface.emulators.gige_camera import GigeCameraEmulator
 from firmware_iface.roles import LinkError
 from membrane_ctrl.config import Config
 from membrane_ctrl.config_file import dump, load
+from membrane_ctrl.device_config import DevicesConfig
 from membrane_ctrl.twin.lab import Lab
 
 pytestmark = pytest.mark.real_time
@@ -92,25 +93,34 @@ async def check(config: Config, path: Path) -> tuple[int, dict[str, Any], str]:
     return process.returncode, probes["camera"], err.decode()
 
 
-async def test_the_example_passes_check_with_camera_and_screen(camera: GigeCameraEmulator, tmp_path: Path) -> None:
+@pytest.fixture
+async def devices(camera: GigeCameraEmulator) -> AsyncIterator[DevicesConfig]:
+    """What the example names, emulated."""
     assert EXAMPLE.devices is not None
     lab = Lab(StillPlant(), EXAMPLE.devices)
-    devices = await lab.start()
-    assert devices.camera is not None
-    table = devices.camera.model_copy(update={"camera": "127.0.0.1", "packet_bytes": 8000})
-    config = EXAMPLE.model_copy(update={"devices": devices.model_copy(update={"camera": table})})
-    try:
-        code, probe, errors = await check(config, tmp_path / "moved.toml")
-        assert (code, probe["problem"]) == (0, ""), errors
-        assert "gamma 2.2" in probe["notes"]
-        assert "settles in" in probe["notes"]
+    made = await lab.start()
+    assert made.camera is not None
+    table = made.camera.model_copy(update={"camera": "127.0.0.1", "packet_bytes": 8000})
+    yield made.model_copy(update={"camera": table})
+    await lab.stop()
 
-        bright = table.model_copy(update={"exposure_ms": 200.0})
-        quick = devices.screen.model_copy(update={"settle_ms": 50.0, "linearise": False})  # type: ignore[union-attr]
-        changed = devices.model_copy(update={"camera": bright, "screen": quick})
-        code, probe, errors = await check(config.model_copy(update={"devices": changed}), tmp_path / "bright.toml")
-        assert code == 4
-        assert "saturated" in probe["problem"]
-        assert "lower exposure_ms" in probe["problem"]
-    finally:
-        await lab.stop()
+
+async def test_the_example_passes_check_with_camera_and_screen(devices: DevicesConfig, tmp_path: Path) -> None:
+    config = EXAMPLE.model_copy(update={"devices": devices})
+    code, probe, errors = await check(config, tmp_path / "moved.toml")
+    assert (code, probe["problem"]) == (0, ""), errors
+    assert "gamma 2.2" in probe["notes"]
+    assert "settles in" in probe["notes"]
+
+
+@pytest.mark.campaign  # what a test of the display says is in test_acquisition_display_test.py
+async def test_too_bright_a_picture_is_told(devices: DevicesConfig, tmp_path: Path) -> None:
+    assert devices.camera is not None
+    assert devices.screen is not None
+    bright = devices.camera.model_copy(update={"exposure_ms": 200.0})
+    quick = devices.screen.model_copy(update={"settle_ms": 50.0, "linearise": False})
+    changed = devices.model_copy(update={"camera": bright, "screen": quick})
+    code, probe, _ = await check(EXAMPLE.model_copy(update={"devices": changed}), tmp_path / "bright.toml")
+    assert code == 4
+    assert "saturated" in probe["problem"]
+    assert "lower exposure_ms" in probe["problem"]

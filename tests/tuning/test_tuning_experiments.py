@@ -116,7 +116,7 @@ def test_characterising_gives_up_by_name_when_no_relay_can_be_completed() -> Non
         characterise(Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s))
 
 
-@pytest.mark.parametrize("most_fraction", [0.38, 0.6])
+@pytest.mark.parametrize("most_fraction", [pytest.param(0.38, marks=pytest.mark.campaign), 0.6])
 def test_a_saturating_pump_is_no_weak_one(most_fraction: float) -> None:
     """With a single gain it would be: 0.29 and 0.57 of the true one, known to 3 %."""
     case = Case("typical")
