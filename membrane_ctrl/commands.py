@@ -21,6 +21,8 @@ Kind = Literal[
 ]  # fmt: skip
 Role = Literal["read", "operate", "tune"]
 
+# Who asks for what `hold` begins with
+AT_START = "command line"
 # Gains on trial are watched by whoever asked for them; longer than this nobody watches.
 TRIAL_MAX_S = 7200.0
 

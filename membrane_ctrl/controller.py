@@ -36,6 +36,8 @@ _DT_RANGE = (0.2, 5.0)
 
 # a reason that comes and goes faster (a pump that touches its limit) tells nobody anything
 _WHY_STANDS_S = 1.0
+# who asked for one of these is named in the line that says why
+_MOVES = frozenset({"hold", "stop", "pause", "manual", "tune", "ack", "lower", "vent"})
 _NO_DIGITS = str.maketrans("", "", "0123456789")
 # for the record of a tick without an answer; its whole numbers, which have no NaN, are not used
 _NO_READING = BenchReading(
@@ -175,7 +177,7 @@ class Controller:
             case "shape_on" | "shape_off":
                 self._shape.switch(command.kind == "shape_on", scene.now_s)
             case "latch":
-                scene.latched = command.text or f"locked by {command.who}"
+                scene.latched = scene.latched or command.text or f"locked by {command.who}"
             case "ack":
                 scene.latched = ""
                 scene.acknowledged = self.state == State.FAULT
@@ -185,7 +187,7 @@ class Controller:
                 scene.stop_exit = Exit.DONE if command.who == "duration" else Exit.INTERRUPTED
             case "lower" | "vent":
                 self._go_down(command.kind)
-        if command.kind not in ("mark", "capture"):
+        if command.kind in _MOVES:
             scene.asked_by = command.who
 
     def _prepare(self, command: Command) -> str:
@@ -200,7 +202,7 @@ class Controller:
             scene.trial = Trial(spec, scene.loop_config, self._config.pump, centre_um)
         except ValueError as error:
             return str(error)
-        scene.hold_wanted = scene.paused = False
+        scene.hold_wanted = False
         return ""
 
     def _set_gains(self, loop: LoopConfig) -> None:
@@ -302,6 +304,7 @@ class Controller:
             self.fault, self._tick_error = None, ""
             scene.ladder.leave()
             scene.acknowledged = False
+        scene.manual_wanted = scene.paused = False  # asked of the hold that was, not of the next one
         self.state = state
         self._state_since_s = math.nan
         scene.good_since_s = scene.last_good_s = math.nan

@@ -89,6 +89,8 @@ def request_for(options: CtlOptions) -> dict[str, Any]:
         if not argument:
             raise InputError('ctl mark: what? ctl mark "door opened"')
         request["text"] = argument
+    elif action == "latch":
+        request["text"] = argument or ""
     elif action == "gains":
         request["loop"] = _gains(argument)
         if options.trial:

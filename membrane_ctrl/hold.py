@@ -25,7 +25,7 @@ from membrane_ctrl.alarms.apprise_sender import require_sendable
 from membrane_ctrl.bench import connect, open_bench
 from membrane_ctrl.calibration.geometry_in_force import geometry_in_force
 from membrane_ctrl.clock import RunClock
-from membrane_ctrl.commands import Command
+from membrane_ctrl.commands import AT_START, Command
 from membrane_ctrl.config import Config
 from membrane_ctrl.controller import Controller
 from membrane_ctrl.crew import Crew, Rings, rings_for
@@ -105,7 +105,11 @@ def _latched(config: Config, logs_dir: Path, options: HoldOptions) -> LatchedFil
     file = LatchedFile(logs_dir)
     fault = file.read()
     if fault is not None and options.clear_faults:
-        file.clear()
+        try:
+            file.clear()
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            raise DeviceError(f"{file.path}: cannot be cleared ({reason}); remove it by hand") from None
     elif fault is not None and not options.standby:
         raise DeviceError(f"a fault is latched: {fault}; {fault.remedy}, then start with --clear-faults")
     return file
@@ -172,9 +176,9 @@ async def _run(
         exit_code = Exit.DEVICE_FAILED
         try:
             if not options.standby:
-                supervisor.ask(Command("hold", "command line"))
+                supervisor.ask(Command("hold", AT_START))
             elif latched := "; ".join(part for part in (latcher.latched, board.latched) if part):
-                supervisor.ask(Command("latch", "command line", text=latched))
+                supervisor.ask(Command("latch", AT_START, text=latched))
             gc.collect()
             gc.freeze()  # what lives for the whole run need not be looked at again between two ticks
             async with port.open():

@@ -16,6 +16,7 @@ NAME = "latched-fault.json"
 SCHEMA = "membrane-latched-fault/1"
 # More than a fault takes; the least that a disk gives.
 _RESERVE_BYTES = 4096
+_MOST_BYTES = 65536  # a longer file is none of ours, and is not read to its end
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +33,7 @@ class LatchedFault:
     def __str__(self) -> str:
         """For one line."""
         seen = f" ({self.seen})" if self.seen else ""
-        return f"{self.name}: {self.cause}{seen}, {self.time_utc}, run {self.run}"
+        return " ".join(f"{self.name}: {self.cause}{seen}, {self.time_utc}, run {self.run}".split())
 
 
 class LatchedFile:
@@ -51,17 +52,14 @@ class LatchedFile:
     def read(self) -> LatchedFault | None:
         """The latched fault, None if there is none. Never raises: what cannot be read is latched."""
         try:
-            text = self.path.read_text(encoding="utf-8")
-        except FileNotFoundError:
-            return None
-        except (OSError, UnicodeDecodeError) as error:
-            return self._unreadable(str(error))
-        try:
-            table = json.loads(text)
+            content = self._content()
+            if content is None:
+                return None
+            table = json.loads(content)
             if table.pop("schema") != SCHEMA or not all(isinstance(value, str) for value in table.values()):
                 raise ValueError("another schema")
             return LatchedFault(**table)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             return self._unreadable(f"{type(error).__name__}: {error}")
 
     def write(self, fault: LatchedFault) -> None:
@@ -73,6 +71,11 @@ class LatchedFile:
         self._reserve.replace(self.path)
         with contextlib.suppress(OSError):
             self.reserve()
+
+    def add(self, fault: LatchedFault) -> None:
+        """Latch, unless something is latched already: the first cause is the one that is told. Raises OSError."""
+        if self.read() is None:
+            self.write(fault)
 
     def reserve(self) -> None:
         """Take the room for a fault while there is some: one on a full disk is latched as well. Raises OSError."""
@@ -97,6 +100,20 @@ class LatchedFile:
     def clear(self) -> None:
         """A person has looked at it, or the resume rule let it go. Raises OSError."""
         self.path.unlink(missing_ok=True)
+
+    def _content(self) -> bytes | None:
+        """What is there; None if nothing is, not even a link whose aim is gone. Raises OSError or ValueError."""
+        try:
+            self.path.lstat()
+        except FileNotFoundError:
+            return None
+        if not self.path.is_file():  # of a pipe the first byte would be waited for
+            raise ValueError("no file")
+        with self.path.open("rb") as file:
+            content = file.read(_MOST_BYTES + 1)
+        if len(content) > _MOST_BYTES:
+            raise ValueError(f"longer than {_MOST_BYTES} bytes")
+        return content
 
     def _unreadable(self, why: str) -> LatchedFault:
         return LatchedFault(

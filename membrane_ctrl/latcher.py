@@ -10,6 +10,7 @@ from datetime import datetime
 from functools import partial
 from types import TracebackType
 
+from membrane_ctrl.commands import AT_START
 from membrane_ctrl.latched import LatchedFault, LatchedFile
 from membrane_ctrl.tick import Event, TickOutputs
 
@@ -61,7 +62,7 @@ class Latcher:
         self._report()
 
     def heard(self, outputs: TickOutputs) -> None:
-        """A tick has ended: latch when it went into `fault`, clear when it left it or was acknowledged."""
+        """A tick has ended: latch a fault or a person's lock, clear what was left or acknowledged."""
         self._report()
         for event in outputs.events:
             match event:
@@ -69,18 +70,32 @@ class Latcher:
                     self._fault = event
                 case {"kind": "state", "state": "fault"}:
                     self._latch(outputs.row.mono_s)
+                case {"kind": "command", "command": "latch", "who": who} if (
+                    "refused" not in event and who != AT_START  # what is latched at the start is where it belongs
+                ):
+                    self._lock(who, event.get("text", ""), outputs.row.mono_s)
                 case {"kind": "state", "from": "fault"} | {"kind": "command", "command": "ack"} if (
                     "refused" not in event and self._file is not None
                 ):
                     self._disk.submit(self._try, self._file.clear)
 
     def _latch(self, now_s: float) -> None:
-        if self._file is None:
-            return
         words = {key: str(self._fault.get(key, "")) for key in ("name", "cause", "seen", "remedy")}
-        fault = LatchedFault(**words, time_utc=self._utc(now_s).isoformat(timespec="seconds"), run=self._run)
-        self._last = partial(self._file.write, fault)
-        self._disk.submit(self._try, self._last)
+        if self._file is not None:
+            self._write(partial(self._file.write, self._dated(words, now_s)))
+
+    def _lock(self, who: str, text: str, now_s: float) -> None:
+        remedy = "see with whoever locked it that the mirror may move"
+        words = {"name": "locked", "cause": text or "by hand", "seen": f"by {who}", "remedy": remedy}
+        if self._file is not None:
+            self._write(partial(self._file.add, self._dated(words, now_s)))
+
+    def _dated(self, words: dict[str, str], now_s: float) -> LatchedFault:
+        return LatchedFault(**words, time_utc=self._utc(now_s).isoformat(timespec="seconds"), run=self._run)
+
+    def _write(self, act: Callable[[], None]) -> None:
+        self._last = act
+        self._disk.submit(self._try, act)
 
     def _settle(self, file: LatchedFile) -> None:
         """The run is over: what the disk did not take is tried once more, and the disk is waited for."""

@@ -178,7 +178,6 @@ def manual(scene: Scene) -> State:
     if scene.way_down is not None:
         return _go_down(scene)
     if scene.hold_wanted:
-        scene.manual_wanted = False
         scene.why = f"{scene.asked_by} asked to hold the mirror again"
         _keep_flowing(scene)
         return State.INFLATE

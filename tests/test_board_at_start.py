@@ -80,3 +80,9 @@ def test_clear_faults_clears_the_file_in_standby_as_well(tmp_path: Path, standby
     file = _latched(Config(), tmp_path, options(standby, clear_faults=True))
     assert file is not None
     assert LatchedFile(tmp_path).read() is None
+
+
+def test_a_latched_fault_that_cannot_be_cleared_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / NAME).mkdir()
+    with pytest.raises(DeviceError, match=r"cannot be cleared.*by hand"):
+        _latched(Config(), tmp_path, options(clear_faults=True))

@@ -99,6 +99,19 @@ def test_the_pump_is_handed_over_to_a_person_and_back_without_a_gap() -> None:
     assert min(row.pump_fraction for row in rows[990:]) > 0.2
 
 
+def test_the_line_that_says_why_names_who_asked_for_that_and_nobody_else() -> None:
+    run = VirtualRun(CALM, VirtualBench(Plant(CALM.twin, CALM.pump), 0.5), zernike_projection())
+    asked = {1: Command("hold", "ann"), 1000: Command("pause", "ann"), 1001: Command("shape_off", "bob")}
+    said = [
+        event["why"]
+        for number in range(1, 1200)
+        if (tick := run.tick((asked[number],) if number in asked else ())) is not None
+        for event in tick.events
+        if event["kind"] == "why"
+    ]
+    assert said[-1].startswith("paused by ann")
+
+
 def test_a_repeated_sample_or_two_are_no_fault() -> None:
     held: list[BenchReading] = []
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
 from firmware_iface.roles import BenchCommand
+from membrane_ctrl.commands import AT_START
 from membrane_ctrl.latched import NAME, LatchedFault, LatchedFile
 from membrane_ctrl.latcher import Latcher
 from membrane_ctrl.telemetry import FIELDS, TelemetryRow
@@ -39,7 +42,8 @@ def test_it_comes_back_as_it_was_and_goes_when_cleared(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content",
     [b"", b"{", b"\xff\xfe", b"[]", b'"x"', b"null", b'{"schema": "other"}', b"\0" * 300,
-     b'{"schema": "membrane-latched-fault/1"}', b'{"schema": "membrane-latched-fault/1", "name": 3}'],
+     b'{"schema": "membrane-latched-fault/1"}', b'{"schema": "membrane-latched-fault/1", "name": 3}',
+     b"[" * 30_000, b" " * 70_000 + b"{}"],
 )  # fmt: skip
 def test_a_corrupt_file_counts_as_latched(tmp_path: Path, content: bytes) -> None:
     (tmp_path / NAME).write_bytes(content)
@@ -63,6 +67,20 @@ def test_a_folder_or_no_permission_in_its_place_counts_as_latched(tmp_path: Path
     assert LatchedFile(tmp_path).read() is not None
 
 
+def test_a_link_to_nowhere_or_a_pipe_in_its_place_counts_as_latched(tmp_path: Path) -> None:
+    (tmp_path / NAME).symlink_to(tmp_path / "not mounted")
+    assert LatchedFile(tmp_path).read() is not None
+    LatchedFile(tmp_path).clear()
+    os.mkfifo(tmp_path / NAME)
+    assert LatchedFile(tmp_path).read() is not None
+
+
+def test_a_fault_of_many_lines_is_told_in_one(tmp_path: Path) -> None:
+    file = LatchedFile(tmp_path)
+    file.write(replace(FAULT, seen="ValueError: first\nsecond"))
+    assert str(file.read()).count("first second") == 1
+
+
 def make(folder: Path, told: list[Event]) -> Latcher:
     return Latcher(LatchedFile(folder), "run-7", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), told.append)
 
@@ -82,6 +100,25 @@ def test_a_trip_is_latched_and_an_acknowledgement_clears_it(tmp_path: Path) -> N
         latcher.heard(outputs({"kind": "command", "command": "ack"}))
     assert LatchedFile(tmp_path).read() is None
     assert not told
+
+
+LOCK: Event = {"kind": "command", "command": "latch", "who": "unix:ann", "why": "", "text": "hands inside"}
+
+
+def test_a_lock_outlives_its_run_and_does_not_hide_a_fault(tmp_path: Path) -> None:
+    with make(tmp_path, []) as latcher:
+        latcher.heard(outputs(LOCK | {"refused": "not now"}))
+        latcher.heard(outputs(LOCK | {"who": AT_START}))
+    assert LatchedFile(tmp_path).read() is None
+    with make(tmp_path, []) as latcher:
+        latcher.heard(outputs(LOCK))
+    assert "hands inside (by unix:ann)" in str(LatchedFile(tmp_path).read())
+    with make(tmp_path, []) as latcher:
+        latcher.heard(outputs({"kind": "command", "command": "ack"}, *TRIP))
+        latcher.heard(outputs(LOCK))
+    found = LatchedFile(tmp_path).read()
+    assert found is not None
+    assert found.name == "late"
 
 
 def test_a_resumed_fault_is_no_longer_latched(tmp_path: Path) -> None:

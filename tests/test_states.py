@@ -63,6 +63,26 @@ def test_a_pause_that_nobody_ends_ends_itself() -> None:
     assert 34.5 < max(second for second in paused if second < 50.0) < 35.5
 
 
+@pytest.mark.parametrize(
+    ("at", "config"),
+    [
+        ([{"time_s": 25.0, "command": "lower"}, {"time_s": 30.0, "command": "hold"}], {}),
+        (
+            [{"time_s": 25.0, "wrong": "unreachable", "for_s": 1.0}],
+            {"resume": {"faults": ["link_lost"], "wait_s": 2.0}},
+        ),
+    ],
+)
+@pytest.mark.parametrize("wish", [{"command": "manual", "value": 3.0}, {"command": "pause"}])
+def test_what_was_asked_of_a_hold_is_not_asked_of_the_next(
+    wish: dict[str, Any], at: list[dict[str, Any]], config: dict[str, Any]
+) -> None:
+    outcome = played({"time_s": 20.0, **wish}, *at, **config)
+    assert changes(outcome, "hold")[-1] > 30.0
+    assert all(manual_s < 25.0 for manual_s in changes(outcome, "manual"))
+    assert "paused" not in [event["why"] for event in outcome.of("why")][-1]
+
+
 def test_what_is_called_hold_has_been_inside_the_band_for_settle_s() -> None:
     outcome = played(states={"settle_s": 6.0}, duration_s=40.0)
     settle_s, hold_s = changes(outcome, "settle")[0], changes(outcome, "hold")[0]

@@ -31,7 +31,7 @@ ACTIONS: tuple[str, ...] = (*KINDS, *get_args(Errand))
 
 
 _NEEDED = {"value": ("setpoint", "manual"), "text": ("mark",), "loop": ("gains",), "experiment": ("tune",)}
-_OPTIONAL = {"value": ("gains",)}
+_OPTIONAL = {"value": ("gains",), "text": ("latch",)}
 
 
 class RequestError(ValueError):
@@ -68,7 +68,7 @@ class Request(Section):
     value : float or None
         `setpoint`: um. `manual`: um/s. `gains`: s on trial, until they are kept or go back.
     text : str
-        `mark`: what to write.
+        `mark`: what to write. `latch`: why nobody may hold the mirror.
     loop : dict or None
         `gains`: the keys of `[loop]` that change.
     experiment : dict or None
@@ -120,7 +120,7 @@ def _number_in(line: bytes) -> int:
         number = json.loads(line)["number"]
     except (ValueError, TypeError, LookupError, RecursionError):
         return 0
-    return number if isinstance(number, int) and 0 <= number < 2**53 else 0
+    return number if type(number) is int and 0 <= number < 2**53 else 0
 
 
 def _short(reason: str, most: int = 300) -> str:

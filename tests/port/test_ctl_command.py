@@ -31,6 +31,11 @@ def test_every_action_is_a_request_that_the_port_reads(action: str) -> None:
     assert parse(json.dumps(request).encode()).why == "test"
 
 
+def test_a_lock_may_say_why() -> None:
+    request = request_for(options("latch", "hands inside"))
+    assert parse(json.dumps(request).encode()).text == "hands inside"
+
+
 @pytest.mark.parametrize(
     ("action", "argument", "says"),
     [
