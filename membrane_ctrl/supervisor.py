@@ -30,6 +30,8 @@ _CHILD_WATCH_S = 0.5
 # A replay has to run through half of this on the way to its part, in some seconds; a memory takes 0.6 ms of a
 # tick and 7 kB
 MEMORY_EVERY_S = 600.0
+# of a text in an event that is longer than a slot of the ring; a fault has four that are not constant
+_TEXT_CUT = 200
 
 
 @dataclass(slots=True)
@@ -86,7 +88,7 @@ class Supervisor:
         """Put an event on record, now."""
         now_s = self._clock.now()
         stamped = {"time_utc": self._clock.utc(now_s).isoformat(), "mono_s": round(now_s, 6), **event}
-        self._wiring.events.put(json.dumps(stamped, allow_nan=False, default=str).encode())
+        self._wiring.events.put(_line(stamped, self._wiring.events.slot_bytes))
 
     async def run(self, duration_s: float | None) -> Exit:
         """Tick until a tick says that the run is over; the pump is off by then, or cannot be reached."""
@@ -227,3 +229,12 @@ class Supervisor:
             self.tell(report)
             for told in self._wiring.told:
                 told(report)
+
+
+def _line(event: Event, most_bytes: int) -> bytes:
+    """An event for the ring: the texts of one that is too long are cut, as no message is worth the hold."""
+    line = json.dumps(event, allow_nan=False, default=str).encode()
+    if len(line) <= most_bytes:
+        return line
+    cut = {key: value[:_TEXT_CUT] if isinstance(value, str) else value for key, value in event.items()}
+    return json.dumps(cut, allow_nan=False, default=str).encode()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import ExitStack
 
 import pytest
@@ -62,3 +63,16 @@ async def test_the_memory_is_the_one_before_its_tick(monkeypatch: pytest.MonkeyP
     assert batch.memories
     for tick, memory in batch.memories.items():
         assert recall(memory, Controller(CONFIG, zernike_projection()))._ticks == tick - 1
+
+
+def test_an_event_that_is_too_long_for_its_slot_is_cut() -> None:
+    with ExitStack() as stack:
+        address = stack.enter_context(ring(4, 4096))
+        writer, reader = RingWriter(address), RingReader(address)
+        for end in (writer, reader):
+            stack.callback(end.close)
+        wiring = Wiring(bench=PromptBench(), telemetry=writer, events=writer)
+        supervisor = Supervisor(Controller(CONFIG, zernike_projection()), wiring, RunClock.start(), 50.0)
+        supervisor.tell({"kind": "fault", "name": "tick_error", "seen": "\N{SNOWMAN}" * 10_000})
+        (told,) = reader.drain()
+    assert json.loads(told)["name"] == "tick_error"

@@ -60,6 +60,11 @@ class RingWriter:
         self._stride = _stride(address.slot_bytes)
         self._next = _U64.unpack_from(self._buffer, 0)[0]
 
+    @property
+    def slot_bytes(self) -> int:
+        """Longest message."""
+        return self._address.slot_bytes
+
     def put(self, message: bytes) -> None:
         """Write one message over the oldest. Raises ValueError if it is longer than a slot."""
         length = len(message)
