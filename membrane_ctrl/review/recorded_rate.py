@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from membrane_ctrl.config import Config
 from membrane_ctrl.recording.column_tables import TICKS, level_table
 from membrane_ctrl.review.column_reader import column_files, first_column
 
-# Ticks jitter, and a minute of them has its late ones; rates in use are farther apart.
+# Rates in use are farther apart.
 _DIFFERS = 0.05
 # Nobody sets 9.998 Hz; that is a clock's jitter.
 _WHOLE = 0.005
@@ -30,13 +31,24 @@ def at_recorded_rate(config: Config, folder: Path, notes: list[str]) -> Config:
 
 def recorded_rate_hz(folder: Path) -> float | None:
     """Ticks a second by the tables; None where they do not say."""
-    for table, name in ((TICKS, "dt_s"), (level_table(1.0), "rows")):
-        for path in column_files(folder, table):
-            values = first_column(path, name)
-            values = values[np.isfinite(values) & (values > 0)]
-            if values.size:
-                typical = float(np.median(values))
-                rate_hz = 1 / typical if name == "dt_s" else typical
-                whole_hz = float(round(rate_hz))
-                return whole_hz if abs(rate_hz - whole_hz) <= _WHOLE * rate_hz else rate_hz
+    for path in column_files(folder, TICKS):
+        spacing_s = _spacing_s(path)
+        spacing_s = spacing_s[spacing_s > 0]
+        if spacing_s.size:
+            return _whole(1 / float(np.median(spacing_s)))
+    for path in column_files(folder, level_table(1.0)):
+        rows = first_column(path, "rows")
+        if rows.size:
+            return _whole(float(np.median(rows)))
     return None
+
+
+def _spacing_s(path: Path) -> NDArray[np.float64]:
+    """From when one of a file's first ticks was due to when the next was: `dt_s` is that and the jitter of both."""
+    dt_s, late_ms = (first_column(path, name) for name in ("dt_s", "lateness_ms"))
+    return dt_s[1:] - 1e-3 * np.diff(np.nan_to_num(late_ms)) if late_ms.size == dt_s.size else dt_s
+
+
+def _whole(rate_hz: float) -> float:
+    whole_hz = float(round(rate_hz))
+    return whole_hz if abs(rate_hz - whole_hz) <= _WHOLE * rate_hz else rate_hz

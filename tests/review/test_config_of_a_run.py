@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from review_runs import written
+from review_runs import tables, written
 
+from benchmarks.nights import night
+from membrane_ctrl.recording.rows import COLUMN
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.analysis import analyse
 from membrane_ctrl.review.recorded_rate import recorded_rate_hz
@@ -71,3 +73,15 @@ def test_without_ticks_the_seconds_know_the_rate(tmp_path: Path) -> None:
         path.unlink()
     assert recorded_rate_hz(folder) == 10.0
     assert recorded_rate_hz(tmp_path) is None
+
+
+def test_late_ticks_are_no_other_rate(tmp_path: Path) -> None:
+    """Where a sleep ends up to a fifth of a period late, most ticks are farther apart than the period."""
+    rows, _ = night(1, 0.01, "quiet", [])
+    late_ms = np.arange(len(rows)) * 0.7 % 2.0 * 10
+    rows[:, COLUMN["mono_s"]] = 0.1 * np.arange(len(rows)) + 1e-3 * late_ms
+    rows[:, COLUMN["lateness_ms"]] = late_ms
+    rows[1:, COLUMN["dt_s"]] = np.diff(rows[:, COLUMN["mono_s"]])
+    assert np.median(rows[:, COLUMN["dt_s"]]) > 0.105
+    tables(tmp_path, rows, [])
+    assert recorded_rate_hz(tmp_path) == 10.0
