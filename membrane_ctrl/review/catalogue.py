@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.errors import InputError
-from membrane_ctrl.recording.retention import OldRun, deletable_runs, delete_run, expired
+from membrane_ctrl.recording.retention import OldRun, deletable_runs, delete_run, expired, size_bytes
 from membrane_ctrl.review.folder import is_run, read_config, read_events, read_summary
 from membrane_ctrl.review.run import origin_of
 
@@ -97,7 +97,7 @@ def entries(logs_dir: Path, wanted: Filter | None = None) -> list[Entry]:
     """The runs of a folder, oldest first. Raises InputError if there is no such folder."""
     if not logs_dir.is_dir():
         raise InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
-    found = [entry(folder) for folder in sorted(logs_dir.iterdir()) if is_run(folder)]
+    found = [entry(folder) for folder in _folders(logs_dir)]
     return [item for item in found if wanted is None or wanted.takes(item)]
 
 
@@ -119,7 +119,7 @@ def entry(folder: Path) -> Entry:
         kp_per_s=loop.kp_per_s,
         ti_s=loop.ti_s,
         configuration=_hash(folder / "config.toml"),
-        size_mb=sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6,
+        size_mb=size_bytes(folder) / 1e6,
         marks=sum(event.get("kind") == "mark" for event in events),
         kept=(folder / KEPT_FILE).exists(),
     )
@@ -135,13 +135,19 @@ def resolve(run: Path, logs_dir: Path = Path("logs")) -> Path:
     """
     if run.exists() or not logs_dir.is_dir():
         return run
-    folders = [folder for folder in sorted(logs_dir.iterdir()) if is_run(folder)]
+    folders = _folders(logs_dir)
     if str(run) == "last" and folders:
         return folders[-1]
-    near = [folder for folder in folders if folder.name == run.name or str(run) in folder.name]
+    near = [folder for folder in folders if folder.name == str(run)]
+    near = near or [folder for folder in folders if str(run) in folder.name]
     if len(near) > 1:
         raise InputError(f"{run}: more than one run is called so: {', '.join(folder.name for folder in near[:4])}")
     return near[0] if near else run
+
+
+def _folders(logs_dir: Path) -> list[Path]:
+    """The folders of runs, by their names; hidden ones are what is left of runs that were deleted."""
+    return [folder for folder in sorted(logs_dir.iterdir()) if not folder.name.startswith(".") and is_run(folder)]
 
 
 def to_prune(

@@ -110,10 +110,16 @@ def list_runs(
 ) -> int:
     """List the runs there are, oldest first."""
     from membrane_ctrl.durations import parse_duration_s
+    from membrane_ctrl.errors import InputError
     from membrane_ctrl.review.catalogue import Filter
     from membrane_ctrl.review.runs_command import list_command
 
     if context.invoked_subcommand is not None:
+        sources = {name: context.get_parameter_source(name) for name in context.params}
+        given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+        if given:  # `--logs` in front of `prune` would leave it with another folder than was meant
+            told = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+            raise InputError(f"{told} in front of `{context.invoked_subcommand}` is for the list: write it behind")
         return 0
     least_s = None if longer is None else parse_duration_s(longer)
     wanted = Filter(
@@ -133,8 +139,10 @@ def show_run(run: RunArgument, json: JsonOption = False) -> int:
 @runs_app.command("prune")
 def prune_runs(
     logs: LogsOption = Path("logs"),
-    keep_days: Annotated[float | None, typer.Option(min=0, help="Give up runs older than this.")] = None,
-    keep_gb: Annotated[float | None, typer.Option(min=0, help="Then the oldest, until all are at most this.")] = None,
+    keep_days: Annotated[float | None, typer.Option(min=0, max=1e5, help="Give up runs older than this.")] = None,
+    keep_gb: Annotated[
+        float | None, typer.Option(min=0, max=1e6, help="Then the oldest, until all are at most this.")
+    ] = None,
     delete: Annotated[bool, typer.Option("--delete", help="Do it; otherwise it is only said.")] = False,
     json: JsonOption = False,
 ) -> int:

@@ -40,6 +40,8 @@ def moment_s(text: str, origin_utc: datetime) -> float:
         If it is none of these.
     """
     text = text.strip()
+    if re.fullmatch(r"\+ *0+[dhms]?", text):  # the start: no duration, but a moment
+        return 0.0
     if text.startswith("+"):
         return parse_duration_s(text[1:])
     clock = re.fullmatch(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:\.\d+)?))?", text)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -63,6 +64,14 @@ def test_a_run_is_found_by_part_of_its_name(logs: Path) -> None:
     assert resolve(Path("last"), logs).name == "20261123T180000Z-night"
     with pytest.raises(InputError, match="more than one"):
         resolve(Path("night"), logs)
+    second = logs / "20261122T180000Z-night-2"  # a second run in the same second
+    leftover = logs / ".deleted-20261123T180000Z-night"
+    for copy in (second, leftover):
+        shutil.copytree(logs / "20261122T180000Z-night", copy)
+    assert resolve(Path("20261122T180000Z-night"), logs).name == "20261122T180000Z-night"
+    assert [entry.name[:8] for entry in entries(logs)] == ["20261121", "20261122", "20261122", "20261123"]
+    for copy in (second, leftover):
+        shutil.rmtree(copy)
 
 
 def test_runs_commands(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -72,6 +81,10 @@ def test_runs_commands(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "state  hold" in capsys.readouterr().out
     assert command(["runs", "--logs", str(logs / "absent")]) == 2
     assert command(["runs", "prune", "--logs", str(logs)]) == 2
+    assert command(["runs", "prune", "--logs", str(logs), "--keep-days", "1e12"]) == 2
+    capsys.readouterr()
+    assert command(["runs", "--logs", str(logs), "prune", "--keep-gb", "0"]) == 2
+    assert "--logs in front of `prune`" in capsys.readouterr().err
 
 
 def test_prune_spares_what_is_kept_and_says_before_it_does(tmp_path: Path) -> None:
@@ -133,8 +146,8 @@ def test_a_mark_made_later_is_an_event_and_touches_nothing_else(tmp_path: Path) 
 
 @pytest.mark.parametrize(
     ("text", "seconds"),
-    [("18:01", 30.0), ("18:00:45", 15.0), ("03:12", 33_090.0), ("+1h5m", 3900.0), ("2026-11-21T18:01:30", 60.0),
-     ("2026-11-21T19:01:30+01:00", 60.0)],
+    [("18:01", 30.0), ("18:00:45", 15.0), ("03:12", 33_090.0), ("+1h5m", 3900.0), ("+0s", 0.0),
+     ("2026-11-21T18:01:30", 60.0), ("2026-11-21T19:01:30+01:00", 60.0)],
 )  # fmt: skip
 def test_moments(text: str, seconds: float) -> None:
     assert moment_s(text, ORIGIN) == seconds
