@@ -13,6 +13,7 @@ import numpy as np
 from membrane_ctrl.config import Config
 from membrane_ctrl.config_file import load
 from membrane_ctrl.errors import InputError
+from membrane_ctrl.recording.checked_text import comment_is_right
 from membrane_ctrl.recording.inputs_file import InputsReader
 from membrane_ctrl.replay import Decision, decisions_of
 from membrane_ctrl.telemetry import TelemetryRow
@@ -30,6 +31,7 @@ class RecordedRun:
     inputs: InputsReader
     decisions: list[Decision]
     told_until_s: float  # the event log ends here, if a crash cut it
+    config_damage: str = ""  # not the configuration that the run had
 
     def row_at(self, time_s: float) -> TelemetryRow | None:
         """The row that was recorded then; None if the recording does not have it."""
@@ -54,7 +56,10 @@ def open_run(folder: Path) -> RecordedRun:
     events = _events(folder / "events.jsonl")
     cut = not any(event.get("kind") == "end" for event in events)
     told_until_s = max((float(event.get("mono_s") or 0.0) for event in events), default=0.0) if cut else math.inf
-    return RecordedRun(folder, load(folder / "config.toml", Config), inputs, decisions_of(events), told_until_s)
+    config = load(folder / "config.toml", Config)
+    right = comment_is_right((folder / "config.toml").read_text(encoding="utf-8"))
+    damage = "" if right else "config.toml: does not fit its checksum (damaged or edited)"
+    return RecordedRun(folder, config, inputs, decisions_of(events), told_until_s, damage)
 
 
 def _events(path: Path) -> list[dict[str, Any]]:

@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.config import Config
-from membrane_ctrl.config_file import load
 from membrane_ctrl.errors import Exit, InputError
 from membrane_ctrl.recording import events as event_lines
 from membrane_ctrl.recording import plain_json
@@ -27,6 +25,7 @@ from membrane_ctrl.recording.rows import COLUMN, Rows, column
 from membrane_ctrl.recording.sink import is_whole
 from membrane_ctrl.recording.summary import Summary
 from membrane_ctrl.review.column_reader import column_files
+from membrane_ctrl.review.folder import read_config
 from membrane_ctrl.review.rrd_reader import REPAIRED
 from membrane_ctrl.review.run import open_run
 from membrane_ctrl.telemetry import FIELDS
@@ -83,6 +82,7 @@ def repair(run_dir: Path, in_place: bool = False) -> list[Finding]:
     findings = [_repair_segment(path, in_place) for path in segments]
     findings += _repair_events(run_dir, in_place)
     findings += _look_at_inputs(run_dir)
+    findings += _look_at_config(run_dir)
     return [*findings, _repair_summary(run_dir, in_place)]
 
 
@@ -177,6 +177,13 @@ def _look_at_inputs(run_dir: Path) -> list[Finding]:
     return [Finding(name, "whole", f"{ticks} ticks")] if reader.paths else []
 
 
+def _look_at_config(run_dir: Path) -> list[Finding]:
+    """Nothing to mend: a summary that is rebuilt takes what cannot be read of it at its default."""
+    notes: list[str] = []
+    read_config(run_dir, notes)
+    return [Finding("config.toml", "damaged", "; ".join(notes))] if notes else []
+
+
 def _repair_summary(run_dir: Path, in_place: bool) -> Finding:
     path = run_dir / "summary.json"
     there = path.exists()
@@ -194,7 +201,7 @@ def rebuild_summary(run_dir: Path) -> dict[str, Any]:
 
     Of a run without tables the ticks that Rerun does not have (in quiet times) are not in the statistics.
     """
-    summary = Summary(load(run_dir / "config.toml", Config))
+    summary = Summary(read_config(run_dir, []))
     path = run_dir / "events.jsonl"
     last_s = -np.inf
     for rows in _all_rows(run_dir):

@@ -96,7 +96,7 @@ def _report(run: RecordedRun, found: Replay, to_s: float) -> dict[str, Any]:
         "gaps": [
             {"after_tick": g.after_tick, "time_s": g.time_s, "ticks": g.ticks, "why": g.reason} for g in found.gaps
         ],
-        "damage": run.inputs.damage,
+        "damage": [*filter(None, (run.config_damage,)), *run.inputs.damage],
     }
 
 

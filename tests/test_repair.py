@@ -171,6 +171,22 @@ def test_a_run_with_nothing_but_its_configuration_is_no_error(folder: Path) -> N
     assert json.loads((folder / "summary.json").read_text())["ticks"] == 0
 
 
+@pytest.mark.parametrize("config", [b"\0" * 500, b"\xff", b"[loop]\nrate = 3\n"])
+def test_a_damaged_configuration_is_named_and_keeps_nothing_from_being_mended(folder: Path, config: bytes) -> None:
+    (folder / "config.toml").write_bytes(config)
+    findings = {finding.file: finding for finding in repair(folder)}
+    assert "config.toml" in findings["config.toml"].action
+    assert findings["summary.json"].state == "missing"
+    assert json.loads((folder / "summary.json").read_text())["rebuilt"]
+
+
+def test_what_cannot_be_read_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "events.jsonl").unlink()
+    (folder / "events.jsonl").mkdir()
+    assert run(["repair", str(folder)]) == Exit.BAD_INPUT
+    assert capsys.readouterr().err.endswith("events.jsonl: is a directory\n")
+
+
 def test_a_run_that_is_still_recorded_is_left_alone(folder: Path) -> None:
     (folder / ".recorder-state").write_bytes(b"")
     with pytest.raises(InputError, match="still being recorded"):

@@ -13,6 +13,7 @@ import pytest
 from synthetic_shape import shape_at
 from virtual_record import CONFIG, kept_ticks, laser_lost, write_record
 
+from membrane_ctrl import config_file
 from membrane_ctrl import replay as replay_module
 from membrane_ctrl.cli import run
 from membrane_ctrl.clock import RunClock
@@ -22,6 +23,7 @@ from membrane_ctrl.controller import Controller
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.incident import check_incident, read_incident
 from membrane_ctrl.metrology.hencky import zernike_projection
+from membrane_ctrl.recording.checked_text import with_comment
 from membrane_ctrl.recording.inputs_file import InputsFile, InputsReader
 from membrane_ctrl.recording.rows import unpack
 from membrane_ctrl.recording.sink import Recording
@@ -112,6 +114,13 @@ def test_a_changed_gain_shows_as_another_pump_but_the_same_states(record: Path) 
     assert [d.what for d in found.decisions if d.what.startswith("state")] == [
         "state check", "state inflate", "state settle", "state hold", "state lower",
     ]  # fmt: skip
+
+
+def test_another_configuration_than_the_run_had_is_named(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = with_comment(config_file.dump(CONFIG)).replace("kp_per_s = 0.61", "kp_per_s = 0.5")
+    (record / "config.toml").write_text(text)
+    assert run(["replay", str(record)]) == Exit.REJECTED
+    assert "config.toml: does not fit its checksum" in capsys.readouterr().out
 
 
 def test_only_what_is_asked_for_is_compared(

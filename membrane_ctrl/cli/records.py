@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import Annotated
 
 import typer
 
 from membrane_ctrl.cli.options import JsonOption, RunArgument
 from membrane_ctrl.durations import parse_duration_s
+from membrane_ctrl.errors import InputError
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -32,7 +35,8 @@ def replay(
 
     from_s = 0.0 if start is None else parse_duration_s(start)
     to_s = math.inf if end is None else parse_duration_s(end)
-    return replay_command(run_dir, from_s, to_s, to_test, json)
+    with _files_of_the_run():
+        return replay_command(run_dir, from_s, to_s, to_test, json)
 
 
 def repair(
@@ -45,4 +49,14 @@ def repair(
     """Mend what a crash left of a run: torn segments, a torn event log, a missing summary."""
     from membrane_ctrl.repair import repair_command
 
-    return repair_command(run_dir, in_place, json)
+    with _files_of_the_run():
+        return repair_command(run_dir, in_place, json)
+
+
+@contextlib.contextmanager
+def _files_of_the_run() -> Iterator[None]:
+    """A file that cannot be read or written is named in one line."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{error.filename or 'files'}: {(error.strerror or str(error)).lower()}") from None
