@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from membrane_ctrl.review.drift import Slope
+from membrane_ctrl.review.folder import event_s
 from membrane_ctrl.review.found import Found
 from membrane_ctrl.review.hold_pass import HoldPass
 from membrane_ctrl.review.run import Run
@@ -71,6 +73,9 @@ def anomalies(
             odd.append(Anomaly("bias", f"{seconds.mean_um:+.3f} um on average"))
         if series.drift.significant:
             odd.append(Anomaly("drift", _of(series.drift, "um/h")))
+    if pauses := _pauses_s(run, part_s, ticks.end_s):
+        asked = f"{len(pauses)} time{'s' * (len(pauses) > 1)}, {span(sum(pauses))} in all"
+        odd.append(Anomaly("paused", f"{asked}: the pump gave its mean flow, and nothing held the mirror"))
     if ticks.missed_ticks:
         odd.append(Anomaly("missed ticks", f"{ticks.missed_ticks} of {ticks.ticks + ticks.missed_ticks}"))
     if ticks.thin_s:
@@ -91,6 +96,21 @@ def anomalies(
     counts = Counter(event.kind for event in found)
     odd += [Anomaly(kind, f"{count} found") for kind, count in counts.most_common()]
     return tuple(odd)
+
+
+def _pauses_s(run: Run, part_s: tuple[float, float], end_s: float) -> list[float]:
+    """Lengths of the pauses asked for within a part: to `resume`, another state, the longest allowed, or the end."""
+    lengths_s: list[float] = []
+    since_s = math.nan
+    for event in (*run.events, {"kind": "end", "mono_s": end_s}):
+        command = event.get("command") if not event.get("refused") else None
+        if command == "pause" and math.isnan(since_s):
+            since_s = event_s(event)
+        elif not math.isnan(since_s) and (command == "resume" or event.get("kind") in {"state", "end"}):
+            over_s = min(event_s(event), since_s + run.config.states.pause_max_s, part_s[1])
+            lengths_s.append(over_s - max(since_s, part_s[0]))
+            since_s = math.nan
+    return [length_s for length_s in lengths_s if length_s > 0]
 
 
 def _of(drift: Slope, unit: str) -> str:

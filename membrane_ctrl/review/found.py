@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.names import State
 from membrane_ctrl.recording.levels import coarser_level
 from membrane_ctrl.review.door_steps import door_steps, looked_at, update_s
 from membrane_ctrl.review.laser_jumps import glitches
+from membrane_ctrl.review.settled import held_at
 from membrane_ctrl.review.shapes import Shapes
 from membrane_ctrl.review.steps import confidence, differences, steps
 
@@ -48,7 +50,9 @@ SPREAD_HALF_MIN = 10
 JUMP_LEAST_UM = 0.3
 JUMP_LEAST_SIGMAS = 8.0
 JUMP_HALF_CYCLES = 5
-# Of a fault or an event: what the loop needs to be back in the band after it (a leak of 1.2 um/s and 40 um: 32 s).
+# From cycle to cycle; a setpoint's ramp is faster, and frames of a mirror that moves do not fit each other.
+JUMP_STILL_UM = 2.0
+# Of a fault, a pause or an event: what the loop needs to be back in the band after it (40 um at 1.2 um/s: 32 s).
 BACK_S = 30
 # An event timed to a second may be found some after its effect begins.
 TIMED_S = 5.0
@@ -109,7 +113,7 @@ def find_events(level: Level, shapes: Shapes, band_um: float) -> list[Found]:
         for finder in finders:
             found += finder(even)
         found += excursions(even, band_um, found)
-    found += shape_jumps(shapes)
+    found += shape_jumps(shapes.select(held_at(level, shapes.time_s)))
     return sorted(found, key=lambda event: event.time_s)
 
 
@@ -216,10 +220,11 @@ def noise_changes(level: Level) -> list[Found]:
 
 
 def excursions(level: Level, band_um: float, known: Sequence[Found]) -> list[Found]:
-    """The 1 s mean of the error leaves the band, and neither a fault nor an event known explains it."""
+    """The 1 s mean of the error leaves the band, and no fault, pause or event known explains it."""
     time_s, error_um = level["time_s"], level["mean_error_um"]
     out = (np.abs(error_um) > band_um) & (level["state"] == State.HOLD)
-    out &= ~_widened(level["fault"] > 0, BACK_S)
+    paused = np.diff(error_um, prepend=np.nan) == 0  # a loop that waits repeats its error
+    out &= ~_widened((level["fault"] > 0) | paused, BACK_S)
     for event in known:
         from_s = event.start_s if event.kind in _TIMED_TO_MINUTES else event.time_s - TIMED_S
         first, end = np.searchsorted(time_s, [from_s, event.end_s + BACK_S])
@@ -233,11 +238,13 @@ def excursions(level: Level, band_um: float, known: Sequence[Found]) -> list[Fou
 
 
 def shape_jumps(shapes: Shapes) -> list[Found]:
-    """The figure beside its sag (terms 5 to 11) steps between cycles."""
+    """The figure beside its sag (terms 5 to 11, without what a deeper bowl has of them) steps between cycles."""
     good = shapes.select(shapes.verdict != "rejected")
+    moved_um = np.abs(np.diff(good.displacement_um, prepend=np.nan, append=np.nan))
+    good = good.select(~(np.fmax(moved_um[:-1], moved_um[1:]) > JUMP_STILL_UM))
     if len(good) < 4 * JUMP_HALF_CYCLES:
         return []
-    terms = good.coeffs_um[:, 4:11]
+    terms = (good.coeffs_um - np.outer(good.sag_um, zernike_projection()))[:, 4:11]
     change = np.stack([differences(term, JUMP_HALF_CYCLES, 0) for term in terms.T])
     size = np.sqrt((change**2).sum(axis=0))
     scale = np.nanmedian(size)

@@ -25,7 +25,7 @@ Single = NDArray[np.float32]
 
 NAMES = (
     *SETTLED_FIELDS, "displacement_um", "truth_displacement_um", "feedforward_um_per_s", "flow_wanted_um_per_s",
-    "flow_um_per_s", "pump_fraction", "lateness_ms", "missed_ticks",
+    "pump_fraction", "lateness_ms", "missed_ticks",
 )  # fmt: skip
 # Which error: a tick without a reading has a true centre all the same, so each has sums of its own,
 READING, TRUE = range(2)
@@ -36,7 +36,7 @@ _HISTOGRAM_BANDS = 5
 _HISTOGRAM_BINS = 500
 # A second here and there has lost ticks, beside a damaged batch or by a slow machine: it is left out, the rest kept.
 _THIN_FROM = 0.05
-# Flow wanted and flow given differ by less than this when nothing limits: single precision at full flow.
+# A flow wanted beyond what the pump can give by less than this is single precision.
 _SATURATED_UM_PER_S = 1e-3
 
 
@@ -49,7 +49,7 @@ class PumpActivity:
     travel_per_hour: float  # sum of the changes of its command: what wears it
     starts_per_hour: float
     running_share: float
-    saturated_share: float  # of ticks whose flow a limit cut
+    saturated_share: float  # of ticks that wanted less than no flow, or more than the full one
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +157,7 @@ class _Collector:
         self._edges_um = np.linspace(-reach_um, reach_um, _HISTOGRAM_BINS + 1)
         self._histogram = np.zeros(_HISTOGRAM_BINS, dtype=np.int64)
         self._lateness = LogHistogram()
-        self._pump = _PumpSums()
+        self._pump = _PumpSums(loop.flow_max_um_per_s)
         self._ticks = self._counted = self._unread = self._inside = 0
         self._hold = HeldTime(run.config.recording.quiet_hz)
         self.thin = ThinSeconds(loop.rate_hz)
@@ -231,7 +231,8 @@ class _Collector:
 class _PumpSums:
     """Sums behind `PumpActivity`."""
 
-    def __init__(self) -> None:
+    def __init__(self, flow_max_um_per_s: float) -> None:
+        self._most_um_per_s = flow_max_um_per_s + _SATURATED_UM_PER_S
         self._fraction = Moments()
         self._travel = 0.0
         self._starts = self._running = self._saturated = 0
@@ -243,8 +244,8 @@ class _PumpSums:
         self._travel += float(np.abs(np.diff(pump)).sum())
         self._starts += int((running[1:] & ~running[:-1]).sum())
         self._running += int(running.sum())
-        cut = np.abs(held["flow_wanted_um_per_s"] - held["flow_um_per_s"])
-        self._saturated += int((cut > _SATURATED_UM_PER_S).sum())
+        wanted = held["flow_wanted_um_per_s"]
+        self._saturated += int(((wanted < -_SATURATED_UM_PER_S) | (wanted > self._most_um_per_s)).sum())
 
     def result(self, period_s: float) -> PumpActivity:
         count = self._fraction.count

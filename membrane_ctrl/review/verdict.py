@@ -26,11 +26,12 @@ def verdict(analysis: Analysis) -> tuple[Word, str]:
         return "bad", f"Not held: no second of {whole} counts as settled{_what(names)}."
     seconds = series.windows[0]
     who = "true centre" if analysis.true else "laser reading"
+    std = f"std {seconds.std_um:.3f} µm, " if seconds.count > 1 else ""
     share = 100 * seconds.in_band
     unread = f" ({span(ticks.unread_s)} of it without a reading)" if ticks.unread_s >= _UNREAD_LEAST_S else ""
     return word, (
         f"Held for {span(ticks.hold_s)} of {whole}{unread}; {share:.6g} % of its seconds within "
-        f"±{run.config.limits.band_um:g} µm ({who}: std {seconds.std_um:.3f} µm, mean {seconds.mean_um:+.3f} µm)"
+        f"±{run.config.limits.band_um:g} µm ({who}: {std}mean {seconds.mean_um:+.3f} µm)"
         f"{_what(names)}."
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ LEAST_SHARE = 0.9
 
 @dataclass(frozen=True, slots=True)
 class WindowStatistics:
-    """Statistics of means over windows of one length; NaN without windows.
+    """Statistics of means over windows of one length; NaN without windows, and one alone has no `std_um`.
 
     Attributes
     ----------
@@ -101,14 +102,13 @@ def window_means(
 def describe(means_um: Column, window_s: float, band_um: float) -> WindowStatistics:
     """What is said of windows' means."""
     if not means_um.size:
-        nan = float("nan")
-        return WindowStatistics(window_s, 0, nan, nan, nan, nan, nan)
+        return WindowStatistics(window_s, 0, math.nan, math.nan, math.nan, math.nan, math.nan)
     size_um = np.abs(means_um)
     return WindowStatistics(
         window_s,
         int(means_um.size),
         float(means_um.mean()),
-        float(means_um.std()),
+        float(means_um.std()) if means_um.size > 1 else math.nan,
         float(size_um.max()),
         float(np.quantile(size_um, 0.997)),
         float((size_um <= band_um).mean()),

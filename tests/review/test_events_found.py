@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from benchmarks.events_found import matched
 from benchmarks.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night
+from membrane_ctrl.metrology.hencky import zernike_projection
+from membrane_ctrl.names import State
 from membrane_ctrl.recording.levels import TICK_FIELDS, Columns, first_level
 from membrane_ctrl.recording.rows import COLUMN, Rows, column
 from membrane_ctrl.review.found import Found, find_events, noise_changes, weather_losses
@@ -87,3 +91,24 @@ def test_confidence_falls_with_the_places_looked_at() -> None:
     assert confidence(6.0, 1000) > 0.99999
     assert confidence(3.0, 1) == pytest.approx(0.9973, abs=1e-4)
     assert confidence(3.0, 10_000) == 0.0
+
+
+def test_a_mirror_that_is_moved_makes_no_jump_of_its_figure() -> None:
+    """A deeper bowl has more of Z11, and frames of a bowl that moves have some of Z6; inflating is no event."""
+    rows, shapes = night(1, 0.5, "quiet", [])
+    time_s = column(rows, "mono_s")
+    moved_um = np.interp(time_s, [300, 317, 1000, 1017], [0, 60, 60, 0])
+    rows[:, COLUMN["state"]] = np.where(time_s < 200, State.INFLATE, State.HOLD)
+    estimates = []
+    for estimate in shapes:
+        at_um = float(np.interp(estimate.time_s, time_s, moved_um))
+        speed = float(np.interp(estimate.time_s, time_s, np.gradient(moved_um, time_s)))
+        coeffs_um = estimate.coeffs_um + zernike_projection() * at_um
+        coeffs_um[5] += 2.0 * (estimate.time_s < 150) + 0.3 * speed
+        displacement_um = estimate.displacement_um + at_um
+        sag_um = estimate.sag_um + at_um
+        estimates.append(
+            replace(estimate, coeffs_um=coeffs_um, sag_um=sag_um, displacement_um=displacement_um)
+        )  # fmt: skip
+    found = find_events(level_of(rows), from_estimates(estimates), 2.0)
+    assert [event for event in found if event.kind == JUMP] == []

@@ -50,6 +50,14 @@ def test_a_door_and_a_fault_explain_it() -> None:
     assert found_in(rows) == []
 
 
+def test_a_pause_explains_it() -> None:
+    rows = bumped([], 5.0)
+    time_s = column(rows, "mono_s")
+    paused = (time_s >= AT_S - 30) & (time_s < AT_S)
+    rows[paused, COLUMN["error_um"]] = -0.3712  # a loop that waits repeats its error
+    assert found_in(rows) == []
+
+
 def test_one_that_is_not_held_is_none() -> None:
     rows = bumped([], 5.0)
     rows[column(rows, "mono_s") < AT_S + 60, COLUMN["state"]] = 3

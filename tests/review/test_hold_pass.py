@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.nights import night, write_run
+from benchmarks.nights import CONFIG, night, write_run
 from membrane_ctrl.names import State
 from membrane_ctrl.recording.rows import COLUMN, Rows, column
 from membrane_ctrl.review import open_run
@@ -93,3 +93,13 @@ def test_time_held_is_that_between_ticks() -> None:
         time.add(time_s[cut:], held[cut:])
         # the minute without a tick is not known
         assert time.result_s(0.1) == pytest.approx(0.5 + 0.5 + 0.1 + 0.1 + 0.1)
+
+
+def test_a_flow_that_only_lags_is_not_at_a_limit(tmp_path: Path) -> None:
+    rows, _ = night(1, HOURS, "quiet", [])
+    rows[:, COLUMN["flow_wanted_um_per_s"]] = 1.0
+    rows[:, COLUMN["flow_um_per_s"]] = 0.9  # the limit of its rate
+    rows[::4, COLUMN["flow_wanted_um_per_s"]] = -0.1
+    rows[1::4, COLUMN["flow_wanted_um_per_s"]] = CONFIG.loop.flow_max_um_per_s + 0.1
+    write_run(tmp_path / "run", iter([(rows, [])]))
+    assert analyse(open_run(tmp_path / "run")).ticks.pump.saturated_share == pytest.approx(0.5, abs=1e-3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -179,6 +180,29 @@ def test_a_run_that_never_held(tmp_path: Path) -> None:
     analysis = analyse(open_run(tmp_path / "run"))
     assert report_table(analysis)["verdict"] == "bad"
     assert "Not held" in render(analysis)
+
+
+def test_pauses_are_named(quiet_run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / quiet_run.name
+    shutil.copytree(quiet_run, folder)
+    asked = [(100.0, "pause", None), (160.0, "resume", None), (200.0, "pause", "no"), (1000.0, "pause", None)]
+    lines = [{"kind": "command", "mono_s": at_s, "command": what, "refused": why} for at_s, what, why in asked]
+    with (folder / "events.jsonl").open("a") as file:
+        file.write("".join(json.dumps(line) + "\n" for line in lines))
+
+    def paused(start_s: float) -> list[str]:
+        return [odd.seen for odd in analyse(open_run(folder), start_s).anomalies if odd.name == "paused"]
+
+    # a pause that nobody ended was over after `states.pause_max_s`
+    assert paused(-np.inf)[0].startswith("2 times, 11 min in all")
+    assert paused(1300.0)[0].startswith("1 time, 5 min in all")
+
+
+def test_one_window_has_no_spread(quiet_run: Path) -> None:
+    analysis = analyse(open_run(quiet_run), 59.5, 125.0)
+    assert analysis.reading is not None
+    minutes = analysis.reading.windows[2]
+    assert (minutes.count, np.isnan(minutes.std_um), np.isfinite(minutes.max_um)) == (1, True, True)
 
 
 def test_nothing_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
