@@ -65,8 +65,8 @@ class HoldPass:
     missed_ticks : int
         Within the part.
     start_s, end_s : float
-    hold_s : float
-        Time in `hold`.
+    hold_s, settled_s : float
+        Time in `hold`, and that of it which was settled.
     thin_s : float
         Settled seconds whose ticks are not all there: their means are those of the level.
     uncovered_s : float
@@ -94,6 +94,7 @@ class HoldPass:
     start_s: float
     end_s: float
     hold_s: float
+    settled_s: float
     thin_s: float
     uncovered_s: float
     grid_s: float
@@ -159,7 +160,7 @@ class _Collector:
         self._lateness = LogHistogram()
         self._pump = _PumpSums(loop.flow_max_um_per_s)
         self._ticks = self._counted = self._unread = self._inside = 0
-        self._hold = HeldTime(run.config.recording.quiet_hz)
+        self._hold, self._calm = (HeldTime(run.config.recording.quiet_hz) for _ in range(2))
         self.thin = ThinSeconds(loop.rate_hz)
         # the running count at the beginning: of a part its first tick's, which says what was before
         self._missed_before = math.nan if from_within else 0.0
@@ -173,6 +174,7 @@ class _Collector:
         self._ticks += time_s.size
         self._span = (self._span[0] if self._ticks > time_s.size else float(time_s[0]), float(time_s[-1]))
         self._hold.add(time_s, block["state"] == State.HOLD)
+        self._calm.add(time_s, mask)
         self.thin.add(time_s, block["setpoint_um"], mask)
         missed = block["missed_ticks"][np.isfinite(block["missed_ticks"])]
         if missed.size:
@@ -212,6 +214,7 @@ class _Collector:
             start_s=self._span[0],
             end_s=self._span[1],
             hold_s=self._hold.result_s(self._period_s),
+            settled_s=self._calm.result_s(self._period_s),
             thin_s=0.0,
             uncovered_s=0.0,
             grid_s=self._grid_s,

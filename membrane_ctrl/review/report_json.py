@@ -34,6 +34,7 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
         "part_s": {"start": ticks.start_s, "end": ticks.end_s},
         "duration_s": ticks.end_s - ticks.start_s,
         "hold_s": ticks.hold_s,
+        "settled_s": ticks.settled_s,
         "held_without_every_tick_s": ticks.thin_s,
         "held_without_reading_s": ticks.unread_s,
         "ticks": ticks.ticks,

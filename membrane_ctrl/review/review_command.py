@@ -16,6 +16,7 @@ from membrane_ctrl.recording.screenshot import screenshot_of
 from membrane_ctrl.review import viewer
 from membrane_ctrl.review.blueprints import TABS, ReviewBlueprint
 from membrane_ctrl.review.catalogue import resolve
+from membrane_ctrl.review.folder import event_s
 from membrane_ctrl.review.found import Found
 from membrane_ctrl.review.layer import Layer
 from membrane_ctrl.review.run import Run, open_run
@@ -196,19 +197,20 @@ def _not_in(run: Run, asked: str) -> InputError:
 
 
 def _around(run: Run, what: str) -> float:
-    """Time of the first event whose kind, name, state or text is or contains `what`; found ones count, too."""
+    """Time of the first event whose kind, name, state, text or command contains `what`; found ones count, too."""
     wanted = what.lower()
-    for event in run.events:
-        words = [str(event.get(key, "")).lower() for key in ("kind", "name", "state", "text")]
-        if any(wanted in word for word in words):
-            return float(event.get("mono_s") or 0.0)
+    # `hold` is the state, not the command that led to it
+    for keys in (("kind", "name", "state", "text"), ("command",)):
+        for event in run.events:
+            if any(wanted in str(event.get(key, "")).lower() for key in keys):
+                return event_s(event)
     from membrane_ctrl.review.found import LEVEL_COLUMNS, find_events
 
     found: list[Found] = find_events(run.level(1.0, names=LEVEL_COLUMNS), run.shapes(), run.config.limits.band_um)
     for item in found:
         if wanted in item.kind:
             return item.time_s
-    told = {str(e.get("name") or e.get("state") or e.get("kind")) for e in run.events}
+    told = {str(e.get("name") or e.get("state") or e.get("command") or e.get("kind")) for e in run.events}
     named = sorted(told - {"why"} | {item.kind for item in found})
     raise InputError(f"--around {what}: no such event in {run.name}; there are {', '.join(named)}")
 

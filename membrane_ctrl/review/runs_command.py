@@ -18,9 +18,10 @@ from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.annotations import add_mark
 from membrane_ctrl.review.catalogue import Entry, Filter, entries, resolve
 from membrane_ctrl.review.export import export
+from membrane_ctrl.review.folder import event_s
 from membrane_ctrl.review.run import Run, open_run
 from membrane_ctrl.review.span import end_s, not_in
-from membrane_ctrl.review.words import moment_s, number, span
+from membrane_ctrl.review.words import moment_s, number, one_line, span
 
 
 def list_command(logs: Path, wanted: Filter, since: str | None, until: str | None, json: bool) -> int:
@@ -47,8 +48,8 @@ def show_command(run: Path, json: bool) -> int:
     _console().print(_table([entry]))
     for event in opened.events:
         if event.get("kind") in {"state", "fault", "mark", "end"}:
-            said = event.get("state") or event.get("name") or event.get("text") or event.get("exit") or ""
-            print(f"  {opened.utc(float(event.get('mono_s') or 0)):%H:%M:%S}  {event['kind']:6} {said}")
+            said = str(event.get("state") or event.get("name") or event.get("text") or event.get("exit") or "")
+            print(f"  {opened.utc(event_s(event)):%H:%M:%S}  {event['kind']:6} {one_line(said)}")
     for note in opened.notes:
         print(f"  note: {note}")
     return 0

@@ -13,6 +13,8 @@ Word = Literal["good", "look", "bad"]
 _GRAVE = {"fault", "band left", "never settled"}
 # Single readings that fail to come are any laser's.
 _UNREAD_LEAST_S = 1.0
+# Every hold begins with some seconds that do not count; more is a setpoint on its way.
+_MOVING_LEAST_S = 60.0
 
 
 def verdict(analysis: Analysis) -> tuple[Word, str]:
@@ -28,9 +30,14 @@ def verdict(analysis: Analysis) -> tuple[Word, str]:
     who = "true centre" if analysis.true else "laser reading"
     std = f"std {seconds.std_um:.3f} µm, " if seconds.count > 1 else ""
     share = 100 * seconds.in_band
-    unread = f" ({span(ticks.unread_s)} of it without a reading)" if ticks.unread_s >= _UNREAD_LEAST_S else ""
+    parts = []
+    if ticks.unread_s >= _UNREAD_LEAST_S:
+        parts.append(f"{span(ticks.unread_s)} of it without a reading")
+    if ticks.hold_s - ticks.settled_s >= _MOVING_LEAST_S:
+        parts.append(f"{span(ticks.hold_s - ticks.settled_s)} of it not yet settled")
+    but = f" ({', '.join(parts)})" if parts else ""
     return word, (
-        f"Held for {span(ticks.hold_s)} of {whole}{unread}; {share:.6g} % of its seconds within "
+        f"Held for {span(ticks.hold_s)} of {whole}{but}; {share:.6g} % of its seconds within "
         f"±{run.config.limits.band_um:g} µm ({who}: {std}mean {seconds.mean_um:+.3f} µm)"
         f"{_what(names)}."
     )

@@ -29,6 +29,11 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"
 
 
+def one_line(text: str) -> str:
+    """What people wrote, for a terminal: a space for line ends and whatever else cannot be printed."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
 def moment_s(text: str, origin_utc: datetime) -> float:
     """Seconds of the run for a moment as written: `03:12[:30]` (UTC), ISO 8601, or `+90s`, `+1h5m` from its start.
 

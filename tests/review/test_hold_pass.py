@@ -83,6 +83,19 @@ def test_a_part_between_seconds_and_a_lost_tick_are_not_thin(tmp_path: Path) -> 
     assert analysis.ticks.hold_s == pytest.approx(79.8, abs=0.1)
 
 
+def test_a_setpoint_on_its_way_is_told_from_what_counts(tmp_path: Path) -> None:
+    rows, _ = night(1, HOURS, "quiet", [])
+    time_s = column(rows, "mono_s")
+    rows[:, COLUMN["setpoint_um"]] = np.interp(time_s, [100, 190], [-90.0, 0.0])
+    rows[:, COLUMN["target_um"]] = np.where(time_s < 100, -90.0, 0.0)
+    write_run(tmp_path / "run", iter([(rows, [])]))
+    analysis = analyse(open_run(tmp_path / "run"))
+    assert analysis.ticks.hold_s == pytest.approx(360, abs=0.5)
+    assert analysis.ticks.settled_s == pytest.approx(360 - 90 - 5 - 5, abs=0.5)
+    assert report_table(analysis)["settled_s"] == analysis.ticks.settled_s
+    assert "(1 min 40 s of it not yet settled)" in verdict(analysis)[1]
+
+
 def test_time_held_is_that_between_ticks() -> None:
     time_s = np.array([0.0, 0.1, 0.6, 1.1, 1.2, 3.0, 63.0, 63.1])
     held = np.array([False, True, True, True, False, True, True, True])

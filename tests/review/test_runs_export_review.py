@@ -32,7 +32,7 @@ from membrane_ctrl.review.export import export
 from membrane_ctrl.review.review_command import ReviewOptions, make_review
 from membrane_ctrl.review.rrd_place import first_message_after
 from membrane_ctrl.review.viewer import follow
-from membrane_ctrl.review.words import moment_s, number, span
+from membrane_ctrl.review.words import moment_s, number, one_line, span
 
 Capsys = pytest.CaptureFixture[str]
 ORIGIN = datetime(2026, 11, 21, 18, 0, 30, tzinfo=UTC)
@@ -160,6 +160,7 @@ def test_moments_that_are_none(text: str) -> None:
 
 
 def test_words() -> None:
+    assert one_line("a door\n\x1b[31mµ") == "a door  [31mµ"
     assert [span(s) for s in (41, 65, 3600, 28_740, 2_606_400)] == [
         "41 s",
         "1 min 5 s",
@@ -272,8 +273,13 @@ def test_a_review_that_is_ended_leaves_nothing_behind(logs: Path, tmp_path: Path
 
 def test_around_finds_events_and_what_was_found(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.2, [Planted("pressure step", 400.0, 20.0)])
-    for what in ("pressure", "hold", "end"):
-        assert command(["review", str(folder), "--around", what, "--save", str(tmp_path / "r.rrd")]) == 0
+    with (folder / "events.jsonl").open("a") as file:
+        for at_s, what in ((500.0, "hold"), (300.0, "pause")):
+            file.write(json.dumps({"mono_s": at_s, "kind": "command", "command": what}) + "\n")
+    run = open_run(folder)
+    for what, at_s in (("pressure", 400.0), ("hold", 0.0), ("end", 720.0), ("pause", 300.0)):
+        options = ReviewOptions([folder], around=what)
+        assert make_review([run], options, tmp_path / "r.rrd") == pytest.approx(at_s, abs=2.0)
 
 
 def test_following_a_long_run_begins_some_minutes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
