@@ -162,7 +162,7 @@ def _split_events(data: bytes) -> tuple[bytes, bytes]:
 def _is_event(line: bytes) -> bool:
     try:
         table = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         return False
     return isinstance(table, dict) and take_checksum(table)
 

@@ -40,7 +40,7 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
         raise InputError(f"{folder}: no tick to replay{part}{why and ': '}{why}")
     if found.last_s < from_s:
         raise InputError(f"{folder}: --from {from_s:g}s: the record ends at {found.last_s:.1f} s")
-    report = _report(run, found, to_s)
+    report = _report(run, found, begin, to_s)
     if as_json:
         print(json.dumps(report))
     else:
@@ -72,7 +72,7 @@ def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, Replay
     return 1, replay(run.config, recorded_ticks(run.inputs), zernike_projection(), from_s, to_s)
 
 
-def _report(run: RecordedRun, found: Replay, to_s: float) -> dict[str, Any]:
+def _report(run: RecordedRun, found: Replay, begin: int, to_s: float) -> dict[str, Any]:
     # where the log or the inputs end early, nothing is said of what came then
     end_s = min(to_s, run.told_until_s, found.last_s)
     today = [decision for decision in found.decisions if decision.time_s <= end_s]
@@ -87,6 +87,7 @@ def _report(run: RecordedRun, found: Replay, to_s: float) -> dict[str, Any]:
         "verdict": _verdict(found, bool(decisions), bool(run.inputs.damage)),
         "recorded_by": run.inputs.program,
         "begin_s": found.begin_s,
+        "from_memory": begin > 1,
         "ticks": found.ticks,
         "compared": found.compared,
         "different": found.different,
@@ -111,7 +112,7 @@ def _lines(report: dict[str, Any]) -> list[str]:
     """What a person wants to read."""
     lines = [f"verdict    {report['verdict']}: {report['compared']} of {report['ticks']} ticks compared bit by bit"]
     lines.append(f"recorded   by {report['recorded_by'] or 'an unknown program'}")
-    if report["begin_s"] > 1.0:
+    if report["from_memory"]:
         lines.append(f"begins     at {report['begin_s']:.2f} s, with the controller's recorded memory")
     first = report["first_different"]
     if first is not None:

@@ -98,6 +98,7 @@ def test_a_replay_begins_with_the_last_memory_before(
     assert report["verdict"] == "identical"
     assert report["ticks"] == len(TICKS) - first + 1
     assert report["begin_s"] == TICKS[first - 1][0].now_s
+    assert report["from_memory"] == (first > 1)
 
 
 @pytest.mark.parametrize(

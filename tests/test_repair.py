@@ -119,7 +119,9 @@ def test_a_segment_with_a_bad_block_gives_back_what_is_readable(folder: Path) ->
     assert len(read_rows(folder / "repaired" / "night-001.rrd")) >= 100
 
 
-@pytest.mark.parametrize("tail", [b'{"mono_s": 3, "kind": "sta', b"\x00" * 512, b'{"a": 1}', "\u00e4".encode()[:1]])
+@pytest.mark.parametrize(
+    "tail", [b'{"mono_s": 3, "kind": "sta', b"\x00" * 512, b'{"a": 1}', b"[" * 30_000, "\u00e4".encode()[:1]]
+)
 def test_a_torn_tail_of_the_event_log_is_cut_and_kept(folder: Path, tail: bytes) -> None:
     path = folder / "events.jsonl"
     good = path.read_bytes()

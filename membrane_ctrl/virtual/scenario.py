@@ -87,6 +87,10 @@ class At(Section):
             raise ValueError(f"wrong = {self.wrong!r} is unknown; known are {', '.join(_SWITCHES)}")
         if self.wrong in _FRACTIONS and not 0 <= self.value <= 1:
             raise ValueError(f"wrong = {self.wrong!r} with value = {self.value:g}: a fraction, 0 to 1")
+        if self.for_s is not None and self.wrong is None:
+            raise ValueError("for_s goes with wrong; an event has over_s")
+        if self.over_s and self.event is None:
+            raise ValueError("over_s goes with event; what is wrong has for_s")
         if self.every_s is not None and (self.wrong is None or self.for_s is None or self.for_s >= self.every_s):
             raise ValueError("every_s goes with wrong and with a for_s shorter than it")
         if self.command is not None and self.command not in get_args(Kind):
@@ -134,6 +138,15 @@ class Scenario(Section):
     config: Config = Config()
     at: tuple[At, ...] = ()
     expect: Expectation
+
+    @model_validator(mode="after")
+    def _before_the_end(self) -> Scenario:
+        for number, at in enumerate(self.at):
+            if at.time_s >= self.duration_s:
+                raise ValueError(
+                    f"at.{number}: time_s = {at.time_s:g} is not before duration_s = {self.duration_s:g}"
+                )
+        return self
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +207,7 @@ def play(scenario: Scenario) -> Outcome:
 
 def complaints(expect: Expectation, outcome: Outcome) -> Iterator[str]:
     """What did not come as expected, a line each."""
-    finished = outcome.ticks[-1].outputs.finished
+    finished = outcome.ticks[-1].outputs.finished if outcome.ticks else None
     exit_name = "none" if finished is None else finished.name.lower()
     found: list[tuple[str, Any, Any]] = [
         ("exit", expect.exit, exit_name),

@@ -30,6 +30,9 @@ GOOD = 'title = "x"\nduration_s = 20.0\n[config.loop]\nrate_hz = 10.0\n'
         ('[[at]]\ntime_s = 1.0\nwrong = "pump_share"\nvalue = 1.5\n[expect]\n', ["at.0", "pump_share", "0 to 1"]),
         ('[[at]]\ntime_s = 1.0\nwrong = "silent"\ncommand = "stop"\n[expect]\n', ["at.0", "exactly one"]),
         ('[[at]]\ntime_s = 1.0\ncommand = "explode"\n[expect]\n', ["at.0", "explode", "lower"]),
+        ('[[at]]\ntime_s = 1.0\nevent = "laser_dropout"\nfor_s = 9.0\n[expect]\n', ["at.0", "for_s", "over_s"]),
+        ('[[at]]\ntime_s = 1.0\nwrong = "silent"\nover_s = 9.0\n[expect]\n', ["at.0", "over_s", "for_s"]),
+        ('[[at]]\ntime_s = 20.0\nwrong = "silent"\n[expect]\n', ["at.0", "20", "duration_s"]),
         ('[[expect.bounds]]\nfield = "height"\nlow = 1.0\n', ["expect.bounds.0", "height"]),
         ('[[expect.bounds]]\nfield = "trim_um"\n', ["expect.bounds.0", "low, high"]),
         ('[expect]\nexit = "well"\n', ["expect.exit", "safety_trip"]),
@@ -56,3 +59,10 @@ def test_what_does_not_come_is_complained_of(tmp_path: Path) -> None:
     scenario = load_scenario(path)
     found = "\n".join(complaints(scenario.expect, play(scenario)))
     assert all(word in found for word in ("exit", "states", "faults", "party", "bored", "truth_displacement_um"))
+
+
+def test_a_process_that_never_runs_is_complained_of(tmp_path: Path) -> None:
+    path = tmp_path / "stalled.toml"
+    path.write_text(GOOD + '[[at]]\ntime_s = 0.0\nwrong = "stalled"\n[expect]\nexit = "done"\n')
+    scenario = load_scenario(path)
+    assert list(complaints(scenario.expect, play(scenario))) == ["exit: none, not done"]
