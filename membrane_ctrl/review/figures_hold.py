@@ -13,6 +13,7 @@ from membrane_ctrl.review.bands import density
 from membrane_ctrl.review.figures_svg import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, picture, svg
 from membrane_ctrl.review.gaps import broken_at_gaps
 from membrane_ctrl.review.report_json import timeline
+from membrane_ctrl.review.words import one_line
 
 Column = NDArray[np.float64]
 
@@ -20,6 +21,8 @@ _STATE_COLOURS = {
     State.STANDBY: "#c9ccd1", State.CHECK: "#9ecae1", State.INFLATE: "#56b4e9", State.SETTLE: ORANGE,
     State.HOLD: GREEN, State.MANUAL: VIOLET, State.TUNE: "#f0e442", State.LOWER: ORANGE, State.FAULT: RED,
 }  # fmt: skip
+# Of a mark's text: more would not fit beside its line, and the timeline has all of it.
+_LETTERS_MOST = 40
 _FOUND_COLOURS = {"pressure step": VIOLET, "leak step": ORANGE, "noise change": ORANGE, "shape jump": BLUE}
 
 
@@ -72,8 +75,12 @@ def _found(plot: Any, analysis: Analysis, span_s: float) -> None:
             at, _ = hours_or_less(float(noted.get("mono_s") or 0.0), span_s)
             colour = RED if noted["kind"] == "fault" else "black"
             plot.axvline(at, color=colour, lw=1)
-            text = str(noted.get("text") or noted.get("name") or "fault")
-            plot.annotate(text, (at, 0.8 * top), rotation=90, fontsize=7, color=colour, ha="right", va="top")
+            text = one_line(str(noted.get("text") or noted.get("name") or "fault"))
+            if len(text) > _LETTERS_MOST:
+                text = f"{text[: _LETTERS_MOST - 1]}…"
+            plot.annotate(
+                text, (at, 0.8 * top), rotation=90, fontsize=7, color=colour, ha="right", va="top", parse_math=False
+            )
 
 
 def _lane(lane: Any, analysis: Analysis, span_s: float) -> None:

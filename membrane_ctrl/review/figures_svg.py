@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -52,7 +53,9 @@ def picture(rows: int = 1, columns: int = 1, height_in: float = 3.0, **subplots:
 
 def svg(figure: Figure) -> str:
     """The figure as an `<svg>` element that scales with the page."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(_STYLE), warnings.catch_warnings():
+        # letters are text in the page, drawn with the reader's fonts
+        warnings.filterwarnings("ignore", r"Glyph \d+ .* missing from font")
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     text = buffer.getvalue()

@@ -20,6 +20,7 @@ svg{width:100%;height:auto;display:block}
 table{border-collapse:collapse;width:100%;font-size:13.5px;font-variant-numeric:tabular-nums}
 th{text-align:left;color:#667;font-weight:600;border-bottom:1px solid #d5dae2;padding:4px 10px 4px 0}
 td{border-bottom:1px solid #eef0f4;padding:4px 10px 4px 0;vertical-align:top}
+td:first-child{white-space:nowrap}
 code{font-size:12px;background:#f3f5f8;padding:1px 5px;border-radius:3px}
 dl{display:grid;grid-template-columns:max-content 1fr;gap:4px 18px;margin:10px 0;font-size:14px}
 dt{color:#667}

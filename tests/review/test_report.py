@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import shutil
 from html.parser import HTMLParser
@@ -180,6 +181,16 @@ def test_a_run_that_never_held(tmp_path: Path) -> None:
     analysis = analyse(open_run(tmp_path / "run"))
     assert report_table(analysis)["verdict"] == "bad"
     assert "Not held" in render(analysis)
+
+
+@pytest.mark.parametrize("text", ["$\\frac{$ <b>", "日本 $", "two\nlines", "long " * 100])
+def test_a_mark_may_say_anything(quiet_run: Path, tmp_path: Path, text: str) -> None:
+    folder = tmp_path / quiet_run.name
+    shutil.copytree(quiet_run, folder)
+    assert command(["review", "mark", str(folder), text, "--at", "+100s"]) == 0
+    page = render(analyse(open_run(folder)))
+    assert html.escape(text) in page
+    assert "<b>" not in page.split("<svg")[1]
 
 
 def test_pauses_are_named(quiet_run: Path, tmp_path: Path) -> None:
