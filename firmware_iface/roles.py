@@ -20,6 +20,10 @@ class LinkDownError(LinkError):
     """The connection is gone (not merely one late or bad answer)."""
 
 
+class LinkWaitsError(LinkDownError):
+    """It is not yet time for the next attempt to connect; why the last one failed has been said."""
+
+
 class DeviceRefusedError(LinkError):
     """The device is reachable but not usable: wrong kind, unknown map version, refused write."""
 

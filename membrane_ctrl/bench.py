@@ -6,7 +6,7 @@ import asyncio
 
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.role_bench import RoleBench
-from firmware_iface.roles import Bench, BenchIdentity, DeviceRefusedError, LinkError
+from firmware_iface.roles import Bench, BenchIdentity, DeviceRefusedError, LinkError, LinkWaitsError
 from membrane_ctrl.config import DevicesConfig
 from membrane_ctrl.errors import DeviceError, InputError
 from membrane_ctrl.role_devices import role_devices
@@ -37,12 +37,13 @@ async def connect(bench: Bench, devices: DevicesConfig) -> BenchIdentity:
     where = devices.board or "devices"  # a composed bench names the role itself
     loop = asyncio.get_running_loop()
     give_up_s = loop.time() + _PATIENCE_S
+    failure = ""
     while True:
         try:
             return await bench.open()
-        except DeviceRefusedError as error:
-            raise DeviceError(f"{where}: {error}") from None
         except LinkError as error:
-            if loop.time() > give_up_s:
-                raise DeviceError(f"{where}: {error}") from None
+            if not (isinstance(error, LinkWaitsError) and failure):
+                failure = str(error).removeprefix(f"{where}: ")
+            if isinstance(error, DeviceRefusedError) or loop.time() > give_up_s:
+                raise DeviceError(f"{where}: {failure}") from None
         await asyncio.sleep(_PAUSE_S)

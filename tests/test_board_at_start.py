@@ -10,7 +10,7 @@ import pytest_asyncio
 
 from firmware_iface.emulators.pump_board import BoardSample, PumpBoardEmulator
 from firmware_iface.register_map import default_map
-from membrane_ctrl.bench import open_bench
+from membrane_ctrl.bench import connect, open_bench
 from membrane_ctrl.config import Config, DevicesConfig, ResumeConfig
 from membrane_ctrl.errors import DeviceError
 from membrane_ctrl.hold import BoardAtStart, HoldOptions, _identify, _latched
@@ -86,3 +86,15 @@ def test_a_latched_fault_that_cannot_be_cleared_is_refused_in_one_line(tmp_path:
     (tmp_path / NAME).mkdir()
     with pytest.raises(DeviceError, match=r"cannot be cleared.*by hand"):
         _latched(Config(), tmp_path, options(clear_faults=True))
+
+
+async def test_a_board_that_is_not_there_is_told_by_why_it_could_not_be_reached(
+    monkeypatch: pytest.MonkeyPatch, unused_tcp_port: int
+) -> None:
+    monkeypatch.setattr("membrane_ctrl.bench._PATIENCE_S", 0.05)
+    monkeypatch.setattr("membrane_ctrl.bench._PAUSE_S", 0.0)
+    devices = DevicesConfig(board=f"tcp://127.0.0.1:{unused_tcp_port}")
+    with pytest.raises(DeviceError) as caught:
+        await connect(open_bench(devices), devices)
+    reason = "no connection; is the device on, and is this its address?"
+    assert str(caught.value) == f"tcp://127.0.0.1:{unused_tcp_port}: {reason}"

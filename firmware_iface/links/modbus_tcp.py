@@ -24,7 +24,7 @@ from firmware_iface.links.modbus_rules import (
     WRITE_SINGLE,
     exception_error,
 )
-from firmware_iface.roles import LinkDownError, LinkError
+from firmware_iface.roles import LinkDownError, LinkError, LinkWaitsError
 
 # the library reports in its log what is raised here as well; without a handler it would write into the live screen
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
@@ -95,7 +95,7 @@ class GuardedModbusTcp:
             No connection, or not yet time for the next attempt.
         """
         if (wait_s := self.retry_in_s) > 0:
-            raise LinkDownError(f"{self.name}: next attempt to connect in {wait_s:.1f} s")
+            raise LinkWaitsError(f"{self.name}: next attempt to connect in {wait_s:.1f} s")
         await self.close()
         self._back_off.attempted(self._clock())
 

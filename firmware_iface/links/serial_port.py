@@ -21,7 +21,7 @@ import serial
 
 from firmware_iface.links.backoff import BackOff
 from firmware_iface.links.usb_ports import check_port_name, port_path
-from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError, LinkWaitsError
 
 _READ_BYTES = 65_536
 # a port that is not there costs one look-up: no reason to back off, and a replug is to be found at once
@@ -185,7 +185,7 @@ class SerialPort:
             Several adapters have this USB identity.
         """
         if (wait_s := self.retry_in_s) > 0:
-            raise LinkDownError(f"{self._port}: next attempt to open in {wait_s:.1f} s")
+            raise LinkWaitsError(f"{self._port}: next attempt to open in {wait_s:.1f} s")
         self.close()
         path = self._locate()
         self._back_off.attempted(self._clock())
