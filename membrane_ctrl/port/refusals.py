@@ -33,7 +33,7 @@ class Refusals:
         self._unsaid = 0
         self.count = 0
 
-    def record(self, who: str, command: str, reason: str) -> None:
+    def record(self, who: str, command: str, reason: str, why: str = "") -> None:
         """Count a refusal, and record it if the bucket allows."""
         self.count += 1
         now_s = self._now()
@@ -43,7 +43,7 @@ class Refusals:
             self._unsaid += 1
             return
         self._left -= 1.0
-        event: Event = {"kind": "refused", "who": who, "command": command, "reason": reason}
+        event: Event = {"kind": "refused", "who": who, "command": command, "why": why, "reason": reason}
         if self._unsaid:
             event["and_unrecorded"] = self._unsaid
         self._tell(event)

@@ -205,7 +205,7 @@ class Port:
         except InputError as error:
             refusal, command = str(error), None
         if command is None:
-            self._refusals.record(peer.who, request.do, refusal)
+            self._refusals.record(peer.who, request.do, refusal, request.why)
             return {"ok": False, "refused": refusal}
         refusal = await self._obeyed(command)
         if refusal:

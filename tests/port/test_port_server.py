@@ -69,12 +69,12 @@ async def test_a_loop_that_does_not_tick_is_said(tmp_path: Path, monkeypatch: py
 async def test_a_role_that_is_too_low_is_refused_and_recorded(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run:
         async with client(run, EVE) as eve:
-            assert "takes the role operate" in (await eve.ask(do="stop"))["refused"]
+            assert "takes the role operate" in (await eve.ask(do="stop", why="curious"))["refused"]
         async with client(run, ANN) as ann:
             assert "takes the role tune" in (await ann.ask(do="gains", loop={"kp_per_s": 0.5}))["refused"]
-        assert [(e["who"], e["command"]) for e in run.of_kind("refused")] == [
-            ("unix:eve", "stop"),
-            ("unix:ann", "gains"),
+        assert [(e["who"], e["command"], e["why"]) for e in run.of_kind("refused")] == [
+            ("unix:eve", "stop", "curious"),
+            ("unix:ann", "gains", ""),
         ]
         assert run.asked == []
 
