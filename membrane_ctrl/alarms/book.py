@@ -2,7 +2,8 @@
 
 An alarm is told when its condition has stood for its time; told again, to more people, when nobody acknowledges it;
 brought to mind now and then; and told off when the condition has stayed away. A condition that goes and comes within
-that time is the same alarm, told once. Several conditions under one name are one alarm: a full disk hits all files.
+that time is the same alarm, told once; a latched fault is always another one. Several conditions under one name are
+one alarm: a full disk hits all files.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ class AlarmBook:
     def take(self, sign: Sign, now_s: float) -> None:
         """Note what a sign says."""
         alarm = self._alarms.get(sign.name)
-        if alarm is None:
+        if alarm is None or (sign.bad and sign.anew and math.isfinite(alarm.gone_s)):
             if sign.bad:
                 self._alarms[sign.name] = _Alarm(sign, now_s, standing={sign.about: sign})
             return

@@ -33,6 +33,8 @@ class Sign:
     about : str
         Which of several conditions under one name: the alarm stands until the last of them has gone. "" with `bad`
         False: all have gone.
+    anew : bool
+        What comes after the last one has gone is another one, however soon.
     """
 
     name: str
@@ -41,6 +43,7 @@ class Sign:
     text: str = ""
     for_s: float = 0.0
     about: str = ""
+    anew: bool = False
 
 
 def signs_of(event: Event) -> list[Sign]:
@@ -49,7 +52,7 @@ def signs_of(event: Event) -> list[Sign]:
         case "fault":
             text = f"{event.get('cause')} ({event.get('seen')}; {event.get('limit')}); {event.get('remedy')}"
             if event.get("latching"):
-                return [Sign("fault", True, "critical", f"{event.get('name')}: {text}")]
+                return [Sign("fault", True, "critical", f"{event.get('name')}: {text}", anew=True)]
             return [Sign("glitch", True, "warning", f"{event.get('name')}: {text}", _GLITCH_S)]
         case "cleared":
             return [Sign("glitch", False)]

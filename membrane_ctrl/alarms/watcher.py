@@ -41,6 +41,7 @@ class Watcher:
         self._book = AlarmBook(config)
         self._outbox = outbox
         self._last_row_s = now_s + _STARTS_S
+        self._fault: Event = {}
         self.ended = False
 
     def look(self, rows: Sequence[bytes], events: Sequence[bytes], now_s: float) -> None:
@@ -59,9 +60,13 @@ class Watcher:
         self._send(now_s)
 
     def _take_event(self, event: Event, now_s: float) -> None:
+        kind = event.get("kind")
+        if kind == "fault":
+            self._fault = event
+        elif kind == "state" and event.get("state") == "fault" and not self._fault.get("latching"):
+            event = self._fault | {"latching": True}  # held on the mean flow for too long, it has latched
         for sign in signs_of(event):
             self._book.take(sign, now_s)
-        kind = event.get("kind")
         if kind == "alarms_acknowledged" or (kind == "command" and event.get("command") == "ack"):
             self._book.acknowledge()  # whoever asks for `ack` has seen it, whether it is obeyed or not
         self.ended |= kind == "end"

@@ -54,6 +54,33 @@ def told(post: Post) -> list[tuple[str, str]]:
     return [(notice.name, notice.kind) for notice in post.through]
 
 
+def test_a_fault_that_was_held_for_too_long_is_told_as_latched() -> None:
+    post = Post()
+    watcher = Watcher(CONFIG, Outbox(post), 0.0)
+    watcher.look([ROW.pack()], [message(kind="fault", name="displacement_missing", latching=False)], 1.0)
+    watcher.look([ROW.pack()], [message(kind="state", state="fault", **{"from": "hold"})], 31.0)
+    assert [(notice.name, notice.severity) for notice in post.through] == [
+        ("glitch", "warning"),
+        ("fault", "critical"),
+    ]
+    assert post.through[1].text.startswith("displacement_missing")
+
+
+def test_the_next_fault_is_told_however_soon_it_comes_after_an_acknowledgement() -> None:
+    post = Post()
+    watcher = Watcher(CONFIG, Outbox(post), 0.0)
+    watcher.look([ROW.pack()], [message(kind="fault", name="late", latching=True)], 1.0)
+    acknowledged = [
+        message(kind="command", command="ack"),
+        message(kind="state", state="standby", **{"from": "fault"}),
+    ]
+    watcher.look([ROW.pack()], acknowledged, 2.0)
+    watcher.look([ROW.pack()], [message(kind="fault", name="over_pressure", latching=True)], 10.0)
+    watcher.look([ROW.pack()], [], 10.0 + CONFIG.escalate_after_s)
+    assert told(post) == [("fault", "raised"), ("fault", "raised"), ("fault", "escalated")]
+    assert post.through[-1].text.startswith("over_pressure")
+
+
 def test_a_fault_is_told_at_once_and_its_end_too() -> None:
     post = Post()
     watcher = Watcher(CONFIG, Outbox(post), 0.0)
