@@ -12,12 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.errors import InputError
+from membrane_ctrl.recording.column_tables import level_table
 from membrane_ctrl.recording.retention import OldRun, deletable_runs, delete_run, expired, size_bytes
+from membrane_ctrl.review.column_reader import column_files, read_file
 from membrane_ctrl.review.folder import is_run, read_config, read_events, read_summary
 from membrane_ctrl.review.run import origin_of
 
 # A file of this name in a run's folder keeps it from being pruned.
 KEPT_FILE = ".keep"
+_LEVEL_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +32,7 @@ class Entry:
     folder : Path
     started_utc : datetime
     duration_s : float
-        NaN while it goes on, or if its recorder was killed.
+        Of a run that goes on, or whose recorder was killed, as far as its tables go; NaN without any.
     std_um : float
         Of the true centre on the twin, else of the reading.
     in_band : float
@@ -102,16 +105,16 @@ def entries(logs_dir: Path, wanted: Filter | None = None) -> list[Entry]:
 
 
 def entry(folder: Path) -> Entry:
-    """One run's line, from its small files only."""
+    """One run's line, from its small files only, and of one without a summary from the end of its seconds."""
     notes: list[str] = []
     events = read_events(folder, notes)
     summary: dict[str, Any] = read_summary(folder, notes) or {}
     loop = read_config(folder, notes).loop
-    std = _number(summary.get("true_std_um"))
+    std, duration_s = _number(summary.get("true_std_um")), _number(summary.get("duration_s"))
     return Entry(
         folder=folder,
         started_utc=origin_of(folder, events),
-        duration_s=_number(summary.get("duration_s")),
+        duration_s=duration_s if math.isfinite(duration_s) else _recorded_s(folder),
         std_um=std if math.isfinite(std) else _number(summary.get("reading_std_um")),
         in_band=_number(summary.get("in_band_1s_fraction")),
         faults=sum(event.get("kind") == "fault" for event in events),
@@ -178,6 +181,15 @@ def as_dict(run: Entry) -> dict[str, Any]:
     names = [name for name in Entry.__dataclass_fields__ if name not in {"folder", "started_utc"}]
     table = {name: getattr(run, name) for name in names}
     return {"name": run.name, "folder": str(run.folder), "started_utc": run.started_utc.isoformat(), **table}
+
+
+def _recorded_s(folder: Path) -> float:
+    """How far the seconds of a run go, by the last file that has some."""
+    for path in reversed(column_files(folder, level_table(_LEVEL_S))):
+        table = read_file(path, ["time_s"], [])
+        if table is not None and table.num_rows:
+            return float(table.column("time_s")[-1].as_py()) + _LEVEL_S
+    return math.nan
 
 
 def _number(value: object) -> float:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.names import State
 from membrane_ctrl.review.run import Block, Run
-from membrane_ctrl.review.windows import LEAST_SHARE, Seconds, SecondsOf
+from membrane_ctrl.review.windows import Seconds, SecondsOf, least_ticks
 
 Column = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ class ThinSeconds:
     """
 
     def __init__(self, rate_hz: float) -> None:
-        self._least = LEAST_SHARE * rate_hz
+        self._least = least_ticks(1.0, rate_hz)
         self._parts: list[tuple[Seconds, Column]] = []
 
     def add(self, time_s: Column, setpoint_um: Column, settled: NDArray[np.bool_]) -> None:
@@ -68,7 +68,7 @@ def level_means(run: Run, second: Seconds, setpoint_um: Column) -> LevelMeans:
     """What the 1 s level knows of thin seconds, as far as its own are whole."""
     level: Block = run.level(1.0, float(second[0]), float(second[-1]) + 1.0, LEVEL_COLUMNS)
     _, place, row = np.intersect1d(second, np.rint(level["time_s"]).astype(np.int32), return_indices=True)
-    whole = (level["rows"][row] >= LEAST_SHARE * run.config.loop.rate_hz) & (level["state"][row] == State.HOLD)
+    whole = (level["rows"][row] >= least_ticks(1.0, run.config.loop.rate_hz)) & (level["state"][row] == State.HOLD)
     place, row = place[whole], row[whole]
     reading_um = setpoint_um[place] - level["mean_displacement_um"][row]
     return LevelMeans(second[place], level["rows"][row], reading_um, level["mean_true_error_um"][row])

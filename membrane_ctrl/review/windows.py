@@ -15,7 +15,7 @@ Counts = NDArray[np.float32]
 SecondsOf = tuple[Seconds, Counts, Column]
 
 # A window with fewer of its ticks than this says nothing of its length.
-LEAST_SHARE = 0.9
+_LEAST_SHARE = 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +76,16 @@ class SecondSums:
         return second[starts], np.add.reduceat(counts, starts), np.add.reduceat(sums, starts, axis=1)
 
 
+def least_ticks(window_s: float, rate_hz: float) -> float:
+    """Ticks that a window must have: nine tenths, or all but one, which may have come just behind its end."""
+    ticks = window_s * rate_hz
+    return min(_LEAST_SHARE * ticks, ticks - 1)
+
+
 def window_means(
     second: Seconds, counts: Counts, sums: Column, window_s: int, rate_hz: float
 ) -> tuple[Column, Column]:
-    """Middles (k,) in s and means of the windows that have at least `LEAST_SHARE` of their ticks.
+    """Middles (k,) in s and means of the windows that have at least `least_ticks`.
 
     Parameters
     ----------
@@ -95,7 +101,7 @@ def window_means(
     number = second // window_s
     starts = np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
     ticks, total = np.add.reduceat(counts, starts), np.add.reduceat(sums, starts)
-    whole = (ticks >= LEAST_SHARE * window_s * rate_hz) & np.isfinite(total)
+    whole = (ticks >= least_ticks(window_s, rate_hz)) & np.isfinite(total)
     return np.asarray((number[starts][whole] + 0.5) * window_s, dtype=np.float64), total[whole] / ticks[whole]
 
 

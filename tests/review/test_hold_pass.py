@@ -96,6 +96,18 @@ def test_a_setpoint_on_its_way_is_told_from_what_counts(tmp_path: Path) -> None:
     assert "(1 min 40 s of it not yet settled)" in verdict(analysis)[1]
 
 
+def test_a_tick_that_comes_just_behind_its_second_thins_none(tmp_path: Path) -> None:
+    rows, _ = night(1, HOURS, "quiet", [])
+    late_ms = np.random.default_rng(1).uniform(0.0, 1.0, len(rows))
+    rows[:, COLUMN["mono_s"]] = 0.2 * (1 + np.arange(len(rows))) + 1e-3 * late_ms - 5e-4  # 5 Hz
+    rows[:, COLUMN["lateness_ms"]], rows[:, COLUMN["dt_s"]] = late_ms, 0.2
+    write_run(tmp_path / "run", iter([(rows, [])]))
+    analysis = analyse(open_run(tmp_path / "run"))
+    assert analysis.reading is not None
+    assert analysis.reading.windows[0].count == pytest.approx(2 * HOURS * 3600 - 5, abs=1)
+    assert (analysis.ticks.thin_s, analysis.ticks.uncovered_s) == (0.0, 0.0)
+
+
 def test_time_held_is_that_between_ticks() -> None:
     time_s = np.array([0.0, 0.1, 0.6, 1.1, 1.2, 3.0, 63.0, 63.1])
     held = np.array([False, True, True, True, False, True, True, True])

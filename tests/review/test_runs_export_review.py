@@ -59,6 +59,15 @@ def test_the_catalogue_lists_and_filters(logs: Path) -> None:
     assert [e.name[:8] for e in entries(logs, Filter(text="1122"))] == ["20261122"]
 
 
+def test_a_run_without_an_end_is_as_long_as_what_it_has(tmp_path: Path) -> None:
+    folder = written(tmp_path, 0.1)
+    (folder / "summary.json").unlink()
+    assert [entry.exit for entry in entries(tmp_path, Filter(least_s=359.0))] == ["open"]
+    assert entries(tmp_path, Filter(least_s=370.0)) == []
+    shutil.rmtree(folder / "columns")
+    assert np.isnan(entries(tmp_path)[0].duration_s)
+
+
 def test_a_run_is_found_by_part_of_its_name(logs: Path) -> None:
     assert resolve(Path("1122"), logs).name == "20261122T180000Z-night"
     assert resolve(Path("last"), logs).name == "20261123T180000Z-night"
