@@ -15,9 +15,15 @@ import math
 from membrane_ctrl.config import LoopConfig
 from membrane_ctrl.control.filters import LagRate
 
+# From one tick to the next no weather and no door does this (a slammed one: 100 Pa); a sensor that fails does, as one
+# that says 85 or -127 C
+_STEP_MAX_PA, _STEP_MAX_K = 500.0, 2.0
+
 
 class FeedForward:
     """Feed-forward from barometer and air thermometer; either may be switched off, or come and go (NaN), at any time.
+
+    A value that jumps further than the weather can is a sensor's own, and moves nothing.
 
     Parameters
     ----------
@@ -25,8 +31,8 @@ class FeedForward:
     """
 
     def __init__(self, loop: LoopConfig) -> None:
-        self._pressure = LagRate(loop.feedforward_filter_s)
-        self._temperature = LagRate(loop.gas_follows_air_s)
+        self._pressure = LagRate(loop.feedforward_filter_s, _STEP_MAX_PA)
+        self._temperature = LagRate(loop.gas_follows_air_s, _STEP_MAX_K)
         self.set_gains(loop)
 
     def set_gains(self, loop: LoopConfig) -> None:

@@ -41,17 +41,20 @@ class LagRate:
     The mean rate over a step is what the lag moved, divided by the step, so that the rate integrates to exactly
     the lag's own movement. While the signal is absent (NaN) the last value stands and the rate dies away; when it
     is back, the lag is placed where the rate goes on from its present value, whatever the signal did meanwhile:
-    neither is a bump.
+    neither is a bump. A step that the signal cannot have made is taken for an absence.
 
     Parameters
     ----------
     time_constant_s : float
         0: the bare difference quotient.
+    step_max : float
+        The largest that the signal can make from one value to the next.
     """
 
-    def __init__(self, time_constant_s: float) -> None:
+    def __init__(self, time_constant_s: float, step_max: float = math.inf) -> None:
         self.time_constant_s = time_constant_s
         self.rate_per_s = 0.0
+        self._step_max = step_max
         self._input = math.nan
         self._lag = math.nan
         self._absent = True
@@ -60,7 +63,7 @@ class LagRate:
         """Mean rate per second over the step; `given` may be NaN."""
         share = smoothing(dt_s, self.time_constant_s)
         if math.isfinite(given):
-            if self._absent:
+            if self._absent or abs(given - self._input) > self._step_max:
                 self._lag = given - self.rate_per_s * dt_s / share
             self._input = given
         self._absent = not math.isfinite(given)

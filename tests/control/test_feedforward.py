@@ -56,6 +56,16 @@ def test_sensor_that_comes_and_goes_is_no_bump(lost: str) -> None:
     assert jumps.max() < steady
 
 
+@pytest.mark.parametrize("air_said_c", [85.0, -127.0, 1e308])
+@pytest.mark.parametrize("pressure_said_pa", [0.0, 110_000.0, 1e308])
+@pytest.mark.parametrize("until", [201, 400])
+def test_a_sensor_that_fails_to_a_value_moves_nothing(air_said_c: float, pressure_said_pa: float, until: int) -> None:
+    """For one tick or for long, there and back again."""
+    pressure_pa, air_c = np.full(600, 101_325.0), np.full(600, 20.0)
+    pressure_pa[200:until], air_c[200:until] = pressure_said_pa, air_said_c
+    assert not answered(LoopConfig(), pressure_pa, air_c).any()
+
+
 def test_switching_at_run_time_is_no_bump() -> None:
     feedforward, ramp = FeedForward(LoopConfig()), iter(range(10_000))
     flows = []
