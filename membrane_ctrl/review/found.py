@@ -52,8 +52,10 @@ JUMP_LEAST_SIGMAS = 8.0
 JUMP_HALF_CYCLES = 5
 # From cycle to cycle; a setpoint's ramp is faster, and frames of a mirror that moves do not fit each other.
 JUMP_STILL_UM = 2.0
-# Of a fault, a pause or an event: what the loop needs to be back in the band after it (40 um at 1.2 um/s: 32 s).
+# After what explains it: what the loop needs to be back in the band (a leak of 1.2 um/s and 40 um: 32 s).
 BACK_S = 30
+# Means of so many seconds tell a setpoint on its way from noise.
+RAMP_HALF_S = 5
 # An event timed to a second may be found some after its effect begins.
 TIMED_S = 5.0
 # These are timed to minutes; what they explain is within their range.
@@ -220,11 +222,13 @@ def noise_changes(level: Level) -> list[Found]:
 
 
 def excursions(level: Level, band_um: float, known: Sequence[Found]) -> list[Found]:
-    """The 1 s mean of the error leaves the band, and no fault, pause or event known explains it."""
+    """The 1 s mean of the error leaves the band, and no fault, pause, ramp or event known explains it."""
     time_s, error_um = level["time_s"], level["mean_error_um"]
     out = (np.abs(error_um) > band_um) & (level["state"] == State.HOLD)
     paused = np.diff(error_um, prepend=np.nan) == 0  # a loop that waits repeats its error
-    out &= ~_widened((level["fault"] > 0) | paused, BACK_S)
+    setpoint_um = error_um + level["mean_displacement_um"]
+    ramped = np.abs(differences(setpoint_um, RAMP_HALF_S, 1)) > band_um
+    out &= ~_widened((level["fault"] > 0) | paused | ramped, BACK_S)
     for event in known:
         from_s = event.start_s if event.kind in _TIMED_TO_MINUTES else event.time_s - TIMED_S
         first, end = np.searchsorted(time_s, [from_s, event.end_s + BACK_S])

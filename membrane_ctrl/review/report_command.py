@@ -20,6 +20,9 @@ from membrane_ctrl.review.run import Run, open_run
 from membrane_ctrl.review.verdict import verdict
 from membrane_ctrl.review.words import moment_s
 
+# A terminal shows no more at once; the page has all of them.
+_LINES_MOST = 20
+
 
 def report_command(
     run: Path,
@@ -82,8 +85,10 @@ def _say(analysis: Analysis, other: Analysis | None, folder: Path, took_s: float
     for note in analysis.run.notes:
         print(f"note: {note}", file=sys.stderr)
     print(verdict(analysis)[1])
-    for event in analysis.found[:20]:
+    for event in analysis.found[:_LINES_MOST]:
         print(f"  {analysis.run.utc(event.time_s):%Y-%m-%d %H:%M:%S}  {event.kind}, {event.size:.3g} {event.unit}")
+    if len(analysis.found) > _LINES_MOST:
+        print(f"  and {len(analysis.found) - _LINES_MOST} more in the report")
     if other is not None:
         whole = not any(map(math.isfinite, other.part_s))
         part = "" if not any(map(math.isfinite, analysis.part_s)) else ", the whole of it" if whole else ", same part"

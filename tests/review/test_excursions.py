@@ -58,6 +58,16 @@ def test_a_pause_explains_it() -> None:
     assert found_in(rows) == []
 
 
+@pytest.mark.parametrize("to_um", [20.0, -20.0, 3.0])
+def test_a_setpoint_on_its_way_explains_it(to_um: float) -> None:
+    rows = bumped([], 5.0)
+    over_s = abs(to_um) / 3.5
+    moved_um = np.interp(column(rows, "mono_s"), [AT_S, AT_S + over_s], [0.0, to_um])
+    for name in ("setpoint_um", "displacement_um", "filtered_um"):
+        rows[:, COLUMN[name]] += moved_um
+    assert found_in(rows) == []
+
+
 def test_one_that_is_not_held_is_none() -> None:
     rows = bumped([], 5.0)
     rows[column(rows, "mono_s") < AT_S + 60, COLUMN["state"]] = 3
