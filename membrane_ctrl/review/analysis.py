@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from membrane_ctrl.errors import InputError
-from membrane_ctrl.names import State
+from membrane_ctrl.names import ShapeState, State
 from membrane_ctrl.review.allan import Allan, allan_deviation
 from membrane_ctrl.review.anomalies import Anomaly, anomalies
 from membrane_ctrl.review.drift import Slope, slope
@@ -145,7 +145,7 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
     true = _series(run, ticks, TRUE)
     benefit = _benefit(run, ticks, true is not None)
     leak = _leak(level)
-    odd = anomalies(run, (start_s, end_s), ticks, reading, true, leak[0], found, shape)
+    odd = anomalies(run, (start_s, end_s), ticks, reading, true, leak[0], _tracking(level), found, shape)
     return Analysis(
         run, (start_s, end_s), ticks, level, level_s, reading, true, benefit, leak, found, shape, odd
     )  # fmt: skip
@@ -236,6 +236,13 @@ def _leak(level: Block) -> tuple[float, float, float]:
     if not leak.size:
         return (math.nan, math.nan, math.nan)
     return float(np.median(leak)), float(leak.min()), float(leak.max())
+
+
+def _tracking(level: Block) -> float:
+    """Share of the time held in which the shape loop moved the setpoint."""
+    state = level["shape_state"][level["state"] == State.HOLD]
+    state = state[np.isfinite(state)]
+    return float((state == ShapeState.TRACKING).mean()) if state.size else math.nan
 
 
 def _level_for(span_s: float) -> float:

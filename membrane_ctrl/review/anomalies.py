@@ -26,6 +26,9 @@ _THIN = (
     "without every tick: means are those of the 1 s level; single readings, their histogram, spectrum, Allan "
     "deviation and pump are those of the ticks that are there, and what the feed-forward was worth is not known"
 )
+# Every hold waits some seconds for its first cycles.
+_TRACKING_LEAST = 0.8
+_UNTRACKED_MOST_S = 60.0
 # Below this a one-sided pump loses the band (PHYSICS: a mirror that is too tight).
 _LEAK_LEAST_UM_PER_S = 0.4
 # A one-sided pump is at 0 now and then in typical weather (2 % on the twin).
@@ -54,6 +57,7 @@ def anomalies(
     reading: _Series | None,
     true: _Series | None,
     leak_um_per_s: float,
+    tracking_share: float,
     found: Sequence[Found],
     shape: ShapeReview | None,
 ) -> tuple[Anomaly, ...]:
@@ -88,6 +92,10 @@ def anomalies(
         odd.append(Anomaly("too tight", f"a leak of {leak_um_per_s:.2f} um/s leaves the pump no way to lower"))
     if ticks.pump.saturated_share > _SATURATED_MOST:
         odd.append(Anomaly("saturation", f"{100 * ticks.pump.saturated_share:.1f} % of ticks at a limit of the flow"))
+    untracked_s = (1 - tracking_share) * ticks.hold_s
+    if run.config.shape.enabled and tracking_share < _TRACKING_LEAST and untracked_s > _UNTRACKED_MOST_S:
+        seen = f"tracked {100 * tracking_share:.0f} % of the time held; else the centre follows the laser's mount"
+        odd.append(Anomaly("shape loop", seen))
     if shape is not None:
         if shape.rejected > _REJECTED_MOST * shape.cycles:
             odd.append(Anomaly("rejected cycles", f"{shape.rejected} of {shape.cycles}"))

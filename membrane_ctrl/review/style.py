@@ -6,7 +6,8 @@ STYLE = """
 body{margin:0;background:#f3f5f8;color:#20242b;font:15px/1.5 system-ui,"Segoe UI","DejaVu Sans",sans-serif}
 main{max-width:1080px;margin:0 auto;padding:28px 32px;background:#fff;min-height:100vh}
 header{display:flex;align-items:baseline;justify-content:space-between;gap:16px;flex-wrap:wrap}
-h1{font-size:21px;margin:0;overflow-wrap:anywhere}
+h1,h2,code{overflow-wrap:anywhere}
+h1{font-size:21px;margin:0}
 h2{font-size:16px;margin:28px 0 8px;border-bottom:1px solid #e3e7ed;padding-bottom:4px}
 .when{margin:0;color:#667}
 .verdict{font-size:17px;padding:12px 16px;border-left:5px solid;border-radius:4px;margin:16px 0}

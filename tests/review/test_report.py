@@ -16,7 +16,7 @@ from benchmarks.nights import Planted, night, write_run
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.config import Config
 from membrane_ctrl.errors import InputError
-from membrane_ctrl.names import State
+from membrane_ctrl.names import ShapeState, State
 from membrane_ctrl.recording import plain_json
 from membrane_ctrl.recording.rows import COLUMN, column
 from membrane_ctrl.recording.summary import SETTLED_AFTER_S, Summary
@@ -207,6 +207,15 @@ def test_pauses_are_named(quiet_run: Path, tmp_path: Path) -> None:
     # a pause that nobody ended was over after `states.pause_max_s`
     assert paused(-np.inf)[0].startswith("2 times, 11 min in all")
     assert paused(1300.0)[0].startswith("1 time, 5 min in all")
+
+
+@pytest.mark.parametrize(("state", "share"), [(ShapeState.WAITING, "0 %"), (ShapeState.TRACKING, None)])
+def test_a_shape_loop_that_does_not_track_is_named(tmp_path: Path, state: ShapeState, share: str | None) -> None:
+    rows, _ = night(1, 0.1, "quiet", [])
+    rows[:, COLUMN["shape_state"]] = state
+    write_run(tmp_path / "run", iter([(rows, [])]))
+    seen = [odd.seen for odd in analyse(open_run(tmp_path / "run")).anomalies if odd.name == "shape loop"]
+    assert [text.split(" of ")[0] for text in seen] == ([] if share is None else [f"tracked {share}"])
 
 
 def test_one_window_has_no_spread(quiet_run: Path) -> None:
