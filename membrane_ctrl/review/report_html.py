@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import math
+import shlex
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -80,14 +81,14 @@ def _found(analysis: Analysis) -> str:
             "<p>Nothing: no door, leak step, laser glitch, lateness burst, change of noise, excursion or jump "
             "of the figure.</p>"
         )
+    name = _text(shlex.quote(analysis.run.name))
     rows = [
         [
             f"{analysis.run.utc(event.time_s):%Y-%m-%d %H:%M:%S}",
             event.kind,
             f"{number(event.size)} {_text(event.unit)}",
             f"{event.confidence:.3f}",
-            f"<code>membrane-ctrl review {_text(analysis.run.name)} --from +{max(event.start_s, 1):.0f}s "
-            f"--to +{event.end_s:.0f}s</code>",
+            f"<code>membrane-ctrl review {name} --from +{max(event.start_s, 1):.0f}s --to +{event.end_s:.0f}s</code>",
         ]
         for event in analysis.found[:_LINES_MOST]
     ]

@@ -49,7 +49,7 @@ def moment_s(text: str, origin_utc: datetime) -> float:
         return 0.0
     if text.startswith("+"):
         return parse_duration_s(text[1:])
-    clock = re.fullmatch(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:\.\d+)?))?", text)
+    clock = re.fullmatch(r"(\d{1,2}):(\d{2})(?::([0-5]\d(?:\.\d+)?))?", text)
     try:
         if clock:
             day = origin_utc.replace(hour=int(clock[1]), minute=int(clock[2]), second=0, microsecond=0)

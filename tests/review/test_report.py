@@ -133,7 +133,7 @@ class Tags(HTMLParser):
 
 
 def test_the_page_carries_everything_itself(tmp_path: Path) -> None:
-    folder = written(tmp_path, HOURS, [Planted("pressure step", 900.5, 20.0)])
+    folder = written(tmp_path, HOURS, [Planted("pressure step", 900.5, 20.0)], name="a night")
     with (folder / "events.jsonl").open("a") as file:
         file.write(json.dumps({"mono_s": 60.0, "kind": "command", "command": "mark", "text": "<b>knock</b>"}) + "\n")
     tags = Tags()
@@ -142,6 +142,7 @@ def test_the_page_carries_everything_itself(tmp_path: Path) -> None:
     assert tags.count["svg"] >= 5
     assert tags.loaded == []
     assert "pressure step" in page
+    assert html.escape("membrane-ctrl review 'a night' --from +") in page
     assert "&lt;b&gt;knock&lt;/b&gt;" in page
 
 

@@ -162,7 +162,7 @@ def test_moments(text: str, seconds: float) -> None:
     assert moment_s(text, ORIGIN) == seconds
 
 
-@pytest.mark.parametrize("text", ["3 o'clock", "25:00", "+", "12:61"])
+@pytest.mark.parametrize("text", ["3 o'clock", "25:00", "+", "12:61", "12:01:75"])
 def test_moments_that_are_none(text: str) -> None:
     with pytest.raises(InputError):
         moment_s(text, ORIGIN)
