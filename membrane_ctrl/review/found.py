@@ -115,7 +115,7 @@ def find_events(level: Level, shapes: Shapes, band_um: float) -> list[Found]:
         for finder in finders:
             found += finder(even)
         found += excursions(even, band_um, found)
-    found += shape_jumps(shapes.select(held_at(level, shapes.time_s)))
+    found += shape_jumps(shapes, held_at(level, shapes.time_s))
     return sorted(found, key=lambda event: event.time_s)
 
 
@@ -241,14 +241,15 @@ def excursions(level: Level, band_um: float, known: Sequence[Found]) -> list[Fou
     return found
 
 
-def shape_jumps(shapes: Shapes) -> list[Found]:
+def shape_jumps(shapes: Shapes, held: NDArray[np.bool_]) -> list[Found]:
     """The figure beside its sag (terms 5 to 11, without what a deeper bowl has of them) steps between cycles."""
-    good = shapes.select(shapes.verdict != "rejected")
-    moved_um = np.abs(np.diff(good.displacement_um, prepend=np.nan, append=np.nan))
-    good = good.select(~(np.fmax(moved_um[:-1], moved_um[1:]) > JUMP_STILL_UM))
-    if len(good) < 4 * JUMP_HALF_CYCLES:
+    moved_um = np.abs(np.diff(shapes.displacement_um, prepend=np.nan, append=np.nan))
+    still = ~(np.fmax(moved_um[:-1], moved_um[1:]) > JUMP_STILL_UM)
+    good = held & still & (shapes.verdict != "rejected")
+    if np.count_nonzero(good) < 4 * JUMP_HALF_CYCLES:
         return []
-    terms = (good.coeffs_um - np.outer(good.sag_um, zernike_projection()))[:, 4:11]
+    # of a month all 36 terms are 190 MB
+    terms = shapes.coeffs_um[good, 4:11] - np.outer(shapes.sag_um[good], zernike_projection()[4:11])
     change = np.stack([differences(term, JUMP_HALF_CYCLES, 0) for term in terms.T])
     size = np.sqrt((change**2).sum(axis=0))
     scale = np.nanmedian(size)
@@ -257,7 +258,7 @@ def shape_jumps(shapes: Shapes) -> list[Found]:
     rows = np.flatnonzero((np.nan_to_num(size) >= JUMP_LEAST_UM) & (score >= JUMP_LEAST_SIGMAS))
     groups = np.split(rows, np.flatnonzero(np.diff(rows) > 2 * JUMP_HALF_CYCLES) + 1) if rows.size else []
     best = [int(group[np.argmax(size[group])]) for group in groups]
-    time_s = {"time_s": good.time_s}
+    time_s = {"time_s": shapes.time_s[good]}
     return [
         _event("shape jump", time_s, row, 60, float(size[row]), "um", confidence(float(score[row]), size.size))
         for row in best
