@@ -88,7 +88,7 @@ def quiet_screen(spec: ScreenSpec) -> None:
 
 def mute_alarms(spec: AlarmsSpec) -> None:
     """The alarms with nobody to tell."""
-    watch(spec, lambda notice: True, lambda event: None, lambda: True)
+    watch(spec, [lambda notice: True], lambda event: None, lambda: True)
 
 
 def run() -> list[Figure]:

@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import logging
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +42,10 @@ def require_sendable(config: AlarmsConfig) -> None:
         raise DeviceError(_MISSING)
 
 
-def apprise_sender(config: AlarmsConfig, run: str) -> Send:
-    """A sender for the configuration's URLs.
+def apprise_senders(config: AlarmsConfig, run: str) -> list[Send]:
+    """Senders for the configuration's URLs: of `urls_file`, and of `escalation_urls_file` if there is one.
+
+    Two, as they fail apart: what has reached the people at the bench has not reached those behind them.
 
     Parameters
     ----------
@@ -60,16 +63,14 @@ def apprise_sender(config: AlarmsConfig, run: str) -> Send:
     """
     apprise = _apprise()
     assert config.urls_file is not None
-    first = _plugins(apprise, Path(config.urls_file))
-    more = _plugins(apprise, Path(config.escalation_urls_file)) if config.escalation_urls_file else []
+    files = [name for name in (config.urls_file, config.escalation_urls_file) if name is not None]
+    return [partial(_send, _plugins(apprise, Path(name)), run) for name in files]
 
-    def send(notice: Notice) -> bool:
-        kind = _TYPES[notice.kind] or {"warning": "warning", "critical": "failure"}[notice.severity]
-        title = f"membrane-ctrl {notice.severity} {notice.kind}: {notice.name}"
-        targets = [*first, *more] if notice.escalated else first
-        return _notify(targets, title, f"{notice.text}\nrun: {run}", kind)
 
-    return send
+def _send(targets: Sequence[Any], run: str, notice: Notice) -> bool:
+    kind = _TYPES[notice.kind] or {"warning": "warning", "critical": "failure"}[notice.severity]
+    title = f"membrane-ctrl {notice.severity} {notice.kind}: {notice.name}"
+    return _notify(targets, title, f"{notice.text}\nrun: {run}", kind)
 
 
 def _notify(targets: Sequence[Any], title: str, body: str, kind: str) -> bool:

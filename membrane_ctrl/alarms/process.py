@@ -6,13 +6,13 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
-from membrane_ctrl.alarms.apprise_sender import apprise_sender
+from membrane_ctrl.alarms.apprise_sender import apprise_senders
 from membrane_ctrl.alarms.book import Notice
 from membrane_ctrl.alarms.outbox import Outbox, Send
 from membrane_ctrl.alarms.watcher import Watcher
@@ -27,6 +27,7 @@ _LOOK_S = 0.5
 # After the run's end, for the last notices; a longer one would keep a service manager from restarting
 _LAST_S = 8.0
 _SENDING_S = 300.0  # a list of mail servers, each with a minute of time-out
+_TO = ("urls_file", "escalation_urls_file")  # of the configuration, in the order of the senders
 _IDLE_S = 15.0  # with nothing to send; who hangs then would not tell anybody anything
 
 
@@ -62,26 +63,28 @@ def alarms_main(spec: AlarmsSpec, status: Any) -> None:
     signal.signal(STOP, _leave)
     parent = multiprocessing.parent_process()  # who started it, even if that is gone by now
     parent_pid = os.getppid() if parent is None else parent.pid
-    watch(spec, apprise_sender(spec.config, spec.run), reporter(status), lambda: os.getppid() == parent_pid)
+    watch(spec, apprise_senders(spec.config, spec.run), reporter(status), lambda: os.getppid() == parent_pid)
 
 
-def watch(spec: AlarmsSpec, send: Send, report: Callable[[Event], None], parent_lives: Callable[[], bool]) -> None:
+def watch(
+    spec: AlarmsSpec, senders: Sequence[Send], report: Callable[[Event], None], parent_lives: Callable[[], bool]
+) -> None:
     """The process's loop.
 
     Parameters
     ----------
     spec : AlarmsSpec
         The run.
-    send : callable
-        Tells people; see `Outbox`.
+    senders : sequence of callable
+        Tell people, see `Outbox`: all, and those of the escalation.
     report : callable
         Tells the run's record what was sent, and the control process that this one is alive; never waits.
     parent_lives : callable
         Whether the control process is still there.
     """
     clock = spec.clock
-    outbox = Outbox(_reporting(send, report))
-    watcher = Watcher(spec.config, outbox, clock.now())
+    outboxes = [Outbox(_reporting(send, to, report)) for send, to in zip(senders, _TO, strict=False)]
+    watcher = Watcher(spec.config, outboxes, clock.now())
     with closing(RingReader(spec.telemetry)) as telemetry, closing(RingReader(spec.events)) as events:
         while True:
             lives = parent_lives()  # before the rings: who ends puts the last word in first
@@ -94,16 +97,17 @@ def watch(spec: AlarmsSpec, send: Send, report: Callable[[Event], None], parent_
         if not watcher.ended:
             watcher.orphaned(clock.now())
     give_up_s = clock.now() + _LAST_S
-    while not outbox.empty and clock.now() < give_up_s:
+    while not all(outbox.empty for outbox in outboxes) and clock.now() < give_up_s:
         time.sleep(_LOOK_S)
-        outbox.step(clock.now())
+        for outbox in outboxes:
+            outbox.step(clock.now())
 
 
-def _reporting(send: Send, report: Callable[[Event], None]) -> Send:
+def _reporting(send: Send, to: str, report: Callable[[Event], None]) -> Send:
     def sending(notice: Notice) -> bool:
         through = send(notice)
         event = {"kind": "alarm", "alarm": notice.name, "what": notice.kind, "severity": notice.severity}
-        report({**event, "text": notice.text, "sent": through, "escalated": notice.escalated})
+        report({**event, "text": notice.text, "to": to, "sent": through, "escalated": notice.escalated})
         return through
 
     return sending

@@ -25,8 +25,8 @@ class Watcher:
     ----------
     config : AlarmsConfig
         Rules and times.
-    outbox : Outbox
-        Gets the notices.
+    outboxes : sequence of Outbox
+        The first gets every notice; the second, if there is one, those that are escalated.
     now_s : float
         When it begins to look.
 
@@ -36,10 +36,10 @@ class Watcher:
         The run has said its last word.
     """
 
-    def __init__(self, config: AlarmsConfig, outbox: Outbox, now_s: float) -> None:
+    def __init__(self, config: AlarmsConfig, outboxes: Sequence[Outbox], now_s: float) -> None:
         self._config = config
         self._book = AlarmBook(config)
-        self._outbox = outbox
+        self._outboxes = outboxes
         self._last_row_s = now_s + _STARTS_S
         self._fault: Event = {}
         self.ended = False
@@ -88,5 +88,7 @@ class Watcher:
 
     def _send(self, now_s: float) -> None:
         for notice in self._book.step(now_s):
-            self._outbox.post(notice)
-        self._outbox.step(now_s)
+            for outbox in self._outboxes[: 2 if notice.escalated else 1]:
+                outbox.post(notice)
+        for outbox in self._outboxes:
+            outbox.step(now_s)

@@ -12,7 +12,7 @@ from types import ModuleType
 
 import pytest
 
-from membrane_ctrl.alarms.apprise_sender import apprise_sender, read_urls, require_sendable
+from membrane_ctrl.alarms.apprise_sender import apprise_senders, read_urls, require_sendable
 from membrane_ctrl.alarms.book import Notice
 from membrane_ctrl.alarms.outbox import Outbox
 from membrane_ctrl.alarms.process import AlarmsSpec, watch
@@ -56,7 +56,7 @@ def told(post: Post) -> list[tuple[str, str]]:
 
 def test_a_fault_that_was_held_for_too_long_is_told_as_latched() -> None:
     post = Post()
-    watcher = Watcher(CONFIG, Outbox(post), 0.0)
+    watcher = Watcher(CONFIG, [Outbox(post)], 0.0)
     watcher.look([ROW.pack()], [message(kind="fault", name="displacement_missing", latching=False)], 1.0)
     watcher.look([ROW.pack()], [message(kind="state", state="fault", **{"from": "hold"})], 31.0)
     assert [(notice.name, notice.severity) for notice in post.through] == [
@@ -68,7 +68,7 @@ def test_a_fault_that_was_held_for_too_long_is_told_as_latched() -> None:
 
 def test_the_next_fault_is_told_however_soon_it_comes_after_an_acknowledgement() -> None:
     post = Post()
-    watcher = Watcher(CONFIG, Outbox(post), 0.0)
+    watcher = Watcher(CONFIG, [Outbox(post)], 0.0)
     watcher.look([ROW.pack()], [message(kind="fault", name="late", latching=True)], 1.0)
     acknowledged = [
         message(kind="command", command="ack"),
@@ -83,7 +83,7 @@ def test_the_next_fault_is_told_however_soon_it_comes_after_an_acknowledgement()
 
 def test_a_fault_is_told_at_once_and_its_end_too() -> None:
     post = Post()
-    watcher = Watcher(CONFIG, Outbox(post), 0.0)
+    watcher = Watcher(CONFIG, [Outbox(post)], 0.0)
     watcher.look([ROW.pack()], [message(kind="fault", name="late", latching=True)], 1.0)
     watcher.look([ROW.pack()], [message(kind="state", state="standby", **{"from": "fault"})], 2.0)
     watcher.look([ROW.pack()], [], 33.0)
@@ -92,7 +92,7 @@ def test_a_fault_is_told_at_once_and_its_end_too() -> None:
 
 def test_a_value_out_of_its_limits() -> None:
     post = Post()
-    watcher = Watcher(CONFIG, Outbox(post), 0.0)
+    watcher = Watcher(CONFIG, [Outbox(post)], 0.0)
     bad, good = replace(ROW, error_um=-20.0).pack(), ROW.pack()
     for now_s in range(30):
         watcher.look([bad], [], float(now_s))
@@ -106,7 +106,7 @@ def test_a_value_out_of_its_limits() -> None:
 
 def test_a_loop_that_falls_silent_is_told_and_a_slow_start_is_not() -> None:
     post = Post()
-    watcher = Watcher(CONFIG, Outbox(post), 0.0)
+    watcher = Watcher(CONFIG, [Outbox(post)], 0.0)
     watcher.look([], [], 30.0)
     watcher.look([ROW.pack()], [], 31.0)
     watcher.look([], [], 35.9)
@@ -115,10 +115,26 @@ def test_a_loop_that_falls_silent_is_told_and_a_slow_start_is_not() -> None:
     assert told(post) == [("silent", "raised")]
 
 
+def test_an_escalation_is_tried_until_it_is_through_and_keeps_nobody_else_waiting() -> None:
+    post, behind = Post(), Post()
+    behind.down = True
+    watcher = Watcher(CONFIG, [Outbox(post), Outbox(behind)], 0.0)
+    watcher.look([ROW.pack()], [message(kind="fault", latching=True)], 0.0)
+    late_s = CONFIG.escalate_after_s
+    watcher.look([ROW.pack()], [], late_s)
+    watcher.look([ROW.pack()], [message(kind="link", message="lost")], late_s + 1.0)
+    watcher.look([ROW.pack()], [], late_s + 7.0)
+    assert told(post) == [("fault", "raised"), ("fault", "escalated"), ("link", "raised")]
+    assert told(behind) == []
+    behind.down = False
+    watcher.look([ROW.pack()], [], late_s + 11.0)
+    assert told(behind) == [("fault", "escalated")]
+
+
 @pytest.mark.parametrize("event", [{"kind": "alarms_acknowledged"}, {"kind": "command", "command": "ack"}])
 def test_an_acknowledgement_keeps_the_others_asleep(event: Event) -> None:
     post = Post()
-    watcher = Watcher(CONFIG, Outbox(post), 0.0)
+    watcher = Watcher(CONFIG, [Outbox(post)], 0.0)
     watcher.look([ROW.pack()], [message(kind="fault", latching=True)], 0.0)
     watcher.look([ROW.pack()], [message(**event)], 1.0)
     watcher.look([ROW.pack()], [], 10_000.0)
@@ -152,7 +168,7 @@ def test_the_process_ends_with_the_run_and_says_why_it_ended() -> None:
     with ring(16, ROW_BYTES) as telemetry, ring(16, 4096) as events:
         writer = RingWriter(events)
         writer.put(message(kind="end", exit="safety_trip"))
-        watch(spec(telemetry, events), post, reports.append, lambda: True)
+        watch(spec(telemetry, events), [post], reports.append, lambda: True)
         writer.close()
     assert told(post) == [("run_ended", "raised")]
     assert [(r["kind"], r["alarm"], r["sent"]) for r in reports if r["kind"] != "alive"] == [
@@ -166,7 +182,7 @@ def test_a_control_process_that_vanishes_is_told() -> None:
     theirs, ours = Pipe()
     theirs.close()
     with ring(16, ROW_BYTES) as telemetry, ring(16, 4096) as events:
-        watch(spec(telemetry, events), post, reporter(ours), lambda: False)
+        watch(spec(telemetry, events), [post], reporter(ours), lambda: False)
     assert told(post) == [("control_gone", "raised")]
 
 
@@ -209,11 +225,11 @@ def urls(folder: Path, *lines: str, name: str = "urls.txt") -> str:
 def test_who_is_told(tmp_path: Path, apprise: list[tuple[str, str, str, str]]) -> None:
     first = urls(tmp_path, "# people", "", "mail://ann", "broken://x")
     more = urls(tmp_path, "chat://all", name="more.txt")
-    send = apprise_sender(AlarmsConfig(urls_file=first, escalation_urls_file=more), "the-run")
+    send, escalate = apprise_senders(AlarmsConfig(urls_file=first, escalation_urls_file=more), "the-run")
     assert send(TEST), "one of two is enough"
     assert apprise == [("mail://ann", "membrane-ctrl warning raised: test", "text\nrun: the-run", "warning")]
-    assert send(replace(TEST, kind="escalated", escalated=True))
-    assert [sent[0] for sent in apprise[1:]] == ["mail://ann", "chat://all"]
+    assert escalate(replace(TEST, kind="escalated", escalated=True))
+    assert [sent[0] for sent in apprise[1:]] == ["chat://all"]
     assert apprise[-1][3] == "failure"
 
 
@@ -224,7 +240,7 @@ def test_files_of_urls_that_are_none(tmp_path: Path, apprise: list[tuple[str, st
         read_urls(Path(urls(tmp_path, "# nothing")))
     secret = urls(tmp_path, "mail://ok", "password-and-no-scheme")
     with pytest.raises(InputError, match="URL 2 is none") as refused:
-        apprise_sender(AlarmsConfig(urls_file=secret), "run")
+        apprise_senders(AlarmsConfig(urls_file=secret), "run")
     assert "password" not in str(refused.value)
 
 
@@ -245,6 +261,11 @@ def test_alarm_test(
     assert "this is a test" in apprise[0][2]
     assert run(["alarm", "test", "--config", str(config), "--escalated"]) == 2
     assert "escalation_urls_file: missing" in capsys.readouterr().err
+    config.write_text(
+        config.read_text() + f'escalation_urls_file = "{urls(tmp_path, "refusing://x", name="more.txt")}"\n'
+    )
+    assert run(["alarm", "test", "--config", str(config), "--escalated"]) == 4
+    assert "more.txt: no service took the notice" in capsys.readouterr().err
     urls(tmp_path, "refusing://ann")
     assert run(["alarm", "test", "--config", str(config)]) == 4
     assert run(["alarm", "test"]) == 2
