@@ -13,6 +13,7 @@ from membrane_ctrl.telemetry import FIELDS
 # the mean of the readings around it. 0.2 s to each side is 20 readings at 50 Hz (0.22 um), symmetric in time so
 # that a steady motion cancels; in its 0.4 s the held centre moves less than the noise that is left.
 HALF_WINDOW_S = 0.2
+HALF_WINDOW_TICKS = 2.0  # below 10 Hz that would be fewer readings than make a mean
 LEAST_READINGS = 3
 _KEPT_S = 60.0  # longer than any full cycle takes
 
@@ -29,20 +30,28 @@ class LaserHistory:
     ----------
     telemetry : RingAddress
         Rows of `membrane_ctrl.telemetry.TelemetryRow`.
+    rate_hz : float
+        How many of them come in a second.
+
+    Attributes
+    ----------
+    half_window_s : float
+        A frame gets the readings from so long before it to so long after.
     """
 
-    def __init__(self, telemetry: RingAddress) -> None:
+    def __init__(self, telemetry: RingAddress, rate_hz: float) -> None:
         self._reader = RingReader(telemetry)
+        self.half_window_s = max(HALF_WINDOW_S, HALF_WINDOW_TICKS / rate_hz)
         self._readings: deque[tuple[float, float]] = deque()  # (mono_s, displacement_um)
         self._counter = math.nan
 
     def at(self, time_s: float) -> float:
-        """Mean reading (um) within `HALF_WINDOW_S` of a moment on the run's clock.
+        """Mean reading (um) within `half_window_s` of a moment on the run's clock.
 
         NaN if there are fewer than `LEAST_READINGS` good ones: missing, flagged and repeated samples are none.
         """
         self._update()
-        near = [reading for mono_s, reading in self._readings if abs(mono_s - time_s) <= HALF_WINDOW_S]
+        near = [reading for mono_s, reading in self._readings if abs(mono_s - time_s) <= self.half_window_s]
         return math.fsum(near) / len(near) if len(near) >= LEAST_READINGS else math.nan
 
     def close(self) -> None:

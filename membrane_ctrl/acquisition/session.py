@@ -87,7 +87,7 @@ def run(spec: AcquisitionSpec, remote: Remote) -> None:
         shapes = stack.enter_context(closing(RingWriter(spec.shapes)))
         frames = stack.enter_context(closing(FrameWriter(spec.frames)))
         stack.callback(bench.close)  # before the ring of frames: an exposure under way holds the pixels of a slot
-        laser = stack.enter_context(closing(LaserHistory(spec.telemetry)))
+        laser = stack.enter_context(closing(LaserHistory(spec.telemetry, config.loop.rate_hz)))
         raw = _raw_frames(spec, geometry.optics, plan, stack, remote)
         cycle = ShapeCycle(
             bench.camera, bench.screen, reconstructor, plan, frames, clock, laser, stopping=remote.interrupts

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from membrane_ctrl.acquisition.laser import HALF_WINDOW_S, LaserHistory
@@ -40,7 +42,7 @@ def telemetry(address: RingAddress) -> Iterator[RingWriter]:
 
 @pytest.fixture
 def laser(address: RingAddress) -> Iterator[LaserHistory]:
-    history = LaserHistory(address)
+    history = LaserHistory(address, 50.0)
     yield history
     history.close()
 
@@ -50,6 +52,15 @@ def test_mean_of_the_readings_around_a_moment(telemetry: RingWriter, laser: Lase
         telemetry.put(row(k * 0.02, k * 0.02 * 3.0, k))  # 3 um/s
     assert laser.at(1.01) == pytest.approx(3.03)  # a steady motion cancels in a symmetric window
     assert laser.at(0.51) == pytest.approx(1.53)  # and older moments are still known
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 10.0])
+def test_a_slow_loop_has_readings_enough(telemetry: RingWriter, address: RingAddress, rate_hz: float) -> None:
+    with closing(LaserHistory(address, rate_hz)) as laser:
+        for k in range(20):
+            telemetry.put(row(k / rate_hz, 1.0, k))
+        moments_s = (10.0 + np.linspace(0.0, 1.0, 7)) / rate_hz
+        assert [laser.at(moment_s) for moment_s in moments_s] == [1.0] * 7
 
 
 def test_nothing_known_before_the_first_row(laser: LaserHistory) -> None:
