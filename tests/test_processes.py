@@ -53,7 +53,7 @@ def test_a_signal_that_comes_while_a_child_is_started_is_not_lost(monkeypatch: p
 
     def start_while_signalled(self: SpawnProcess) -> None:
         start(self)
-        os.kill(os.getpid(), signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)  # to this thread: another one would take it, now or somewhat later
 
     monkeypatch.setattr(SpawnProcess, "start", start_while_signalled)
     before = signal.signal(signal.SIGTERM, tell)
