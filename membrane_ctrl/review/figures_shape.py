@@ -51,6 +51,8 @@ def _drift(plot: Any, shape: ShapeReview) -> None:
     colours = [RED if term.significant else GREY for term in shape.drift_um_per_hour]
     if np.isfinite(rate).any():
         plot.bar(noll, rate, yerr=reach, color=colours, error_kw={"lw": 0.7, "ecolor": "#555"})
+        # one term that wandered, and whose interval says nothing, would hide all the others
+        plot.set_yscale("symlog", linthresh=4 * max(float(np.nanmedian(reach)), 1e-6), linscale=2)
     plot.set(title="Drift of the terms, µm/h (95 %)", xlabel="Noll index")
 
 
