@@ -30,8 +30,8 @@ _CHILD_WATCH_S = 0.5
 # A replay has to run through half of this on the way to its part, in some seconds; a memory takes 0.6 ms of a
 # tick and 7 kB
 MEMORY_EVERY_S = 600.0
-# of a text in an event that is longer than a slot of the ring; a fault has four that are not constant
-_TEXT_CUT = 200
+# of a text in an event that is longer than a slot of the ring; a letter takes up to 12 bytes in JSON
+_TEXT_CUTS = (200, 20)
 
 
 @dataclass(slots=True)
@@ -234,7 +234,9 @@ class Supervisor:
 def _line(event: Event, most_bytes: int) -> bytes:
     """An event for the ring: the texts of one that is too long are cut, as no message is worth the hold."""
     line = json.dumps(event, allow_nan=False, default=str).encode()
-    if len(line) <= most_bytes:
-        return line
-    cut = {key: value[:_TEXT_CUT] if isinstance(value, str) else value for key, value in event.items()}
-    return json.dumps(cut, allow_nan=False, default=str).encode()
+    for most in _TEXT_CUTS:
+        if len(line) <= most_bytes:
+            break
+        cut = {key: value[:most] if isinstance(value, str) else value for key, value in event.items()}
+        line = json.dumps(cut, allow_nan=False, default=str).encode()
+    return line

@@ -73,6 +73,7 @@ def test_an_event_that_is_too_long_for_its_slot_is_cut() -> None:
             stack.callback(end.close)
         wiring = Wiring(bench=PromptBench(), telemetry=writer, events=writer)
         supervisor = Supervisor(Controller(CONFIG, zernike_projection()), wiring, RunClock.start(), 50.0)
-        supervisor.tell({"kind": "fault", "name": "tick_error", "seen": "\N{SNOWMAN}" * 10_000})
+        texts = dict.fromkeys(("cause", "seen", "limit", "remedy"), "\N{LOUDLY CRYING FACE}" * 10_000)
+        supervisor.tell({"kind": "fault", "name": "tick_error", **texts})
         (told,) = reader.drain()
     assert json.loads(told)["name"] == "tick_error"
