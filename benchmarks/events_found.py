@@ -11,7 +11,8 @@ from benchmarks.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, nig
 from membrane_ctrl.config import Config
 from membrane_ctrl.recording.levels import TICK_FIELDS, first_level
 from membrane_ctrl.recording.rows import column
-from membrane_ctrl.review.found import Found, find_events
+from membrane_ctrl.review.found import find_events
+from membrane_ctrl.review.found_event import Found
 from membrane_ctrl.review.shapes import Shapes, from_estimates
 
 HOURS = 8.0

@@ -14,7 +14,8 @@ from membrane_ctrl.names import ShapeState, State
 from membrane_ctrl.review.allan import Allan, allan_deviation
 from membrane_ctrl.review.anomalies import Anomaly, anomalies
 from membrane_ctrl.review.drift import Slope, slope
-from membrane_ctrl.review.found import LEVEL_COLUMNS, Found, find_events
+from membrane_ctrl.review.found import LEVEL_COLUMNS, find_events
+from membrane_ctrl.review.found_event import Found
 from membrane_ctrl.review.hold_pass import ERROR, KEPT_AWAY, READING, TRUE, HoldPass, hold_pass
 from membrane_ctrl.review.psd import Spectrum, power_spectrum
 from membrane_ctrl.review.run import Block, Run

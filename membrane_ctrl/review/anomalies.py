@@ -10,7 +10,7 @@ from typing import Protocol
 
 from membrane_ctrl.review.drift import Slope
 from membrane_ctrl.review.folder import event_s
-from membrane_ctrl.review.found import Found
+from membrane_ctrl.review.found_event import Found
 from membrane_ctrl.review.hold_pass import HoldPass
 from membrane_ctrl.review.run import Run
 from membrane_ctrl.review.shape_review import ShapeReview

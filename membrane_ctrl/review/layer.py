@@ -19,7 +19,8 @@ from membrane_ctrl.recording.lanes import TELEMETRY_LANES
 from membrane_ctrl.recording.rows import changes
 from membrane_ctrl.recording.streams import BLUE, GREEN, GREY, LOW_ORDERS, ORANGE, RED, STREAMS, VIOLET, Colour
 from membrane_ctrl.review.annotations import MARK
-from membrane_ctrl.review.found import LEVEL_COLUMNS, Found, find_events
+from membrane_ctrl.review.found import LEVEL_COLUMNS, find_events
+from membrane_ctrl.review.found_event import Found
 from membrane_ctrl.review.gaps import broken_at_gaps
 from membrane_ctrl.review.run import Block, Run
 from membrane_ctrl.review.settled import held_at

@@ -17,7 +17,7 @@ from membrane_ctrl.review import viewer
 from membrane_ctrl.review.blueprints import TABS, ReviewBlueprint
 from membrane_ctrl.review.catalogue import resolve
 from membrane_ctrl.review.folder import event_s
-from membrane_ctrl.review.found import Found
+from membrane_ctrl.review.found_event import Found
 from membrane_ctrl.review.layer import Layer
 from membrane_ctrl.review.run import Run, open_run
 from membrane_ctrl.review.words import moment_s

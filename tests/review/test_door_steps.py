@@ -9,7 +9,8 @@ from benchmarks.nights import DOOR, Planted, night
 from membrane_ctrl.recording.levels import TICK_FIELDS, first_level
 from membrane_ctrl.recording.rows import COLUMN, Rows, column
 from membrane_ctrl.review.door_steps import quantum, update_s
-from membrane_ctrl.review.found import Found, pressure_steps
+from membrane_ctrl.review.found import pressure_steps
+from membrane_ctrl.review.found_event import Found
 
 HOURS = 2.0
 AMBIENT = COLUMN["ambient_pressure_pa"]

@@ -13,7 +13,8 @@ from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.names import State
 from membrane_ctrl.recording.levels import TICK_FIELDS, Columns, first_level
 from membrane_ctrl.recording.rows import COLUMN, Rows, column
-from membrane_ctrl.review.found import Found, find_events, noise_changes, weather_losses
+from membrane_ctrl.review.found import find_events, noise_changes, weather_losses
+from membrane_ctrl.review.found_event import Found
 from membrane_ctrl.review.shapes import from_estimates
 from membrane_ctrl.review.steps import confidence, steps
 

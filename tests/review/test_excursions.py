@@ -8,7 +8,8 @@ import pytest
 from benchmarks.nights import DOOR, Planted, night
 from membrane_ctrl.recording.levels import TICK_FIELDS, first_level
 from membrane_ctrl.recording.rows import COLUMN, Rows, column
-from membrane_ctrl.review.found import Found, find_events
+from membrane_ctrl.review.found import find_events
+from membrane_ctrl.review.found_event import Found
 from membrane_ctrl.review.shapes import from_estimates
 
 BAND_UM = 2.0

@@ -8,7 +8,8 @@ import pytest
 from benchmarks.nights import DOOR, GLITCH, Planted, night
 from membrane_ctrl.recording.levels import TICK_FIELDS, first_level
 from membrane_ctrl.recording.rows import COLUMN, Rows, column
-from membrane_ctrl.review.found import Found, laser_glitches
+from membrane_ctrl.review.found import laser_glitches
+from membrane_ctrl.review.found_event import Found
 
 HOURS = 2.0
 AT_S = 3000.3
