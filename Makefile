@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: hold test lint types unit bench campaign generate clean
+.PHONY: hold test lint types unit bench campaign fuzz mutants generate clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml requirements.lock
@@ -32,8 +32,16 @@ unit: $(STAMP)
 bench: $(STAMP)  ## measured figures, each against a reference of the same run
 	$(BIN)/python -m benchmarks
 
-campaign: $(STAMP)
+campaign: $(STAMP)  ## everything that may go wrong, in virtual time and with real processes; docs/fault-matrix.md, sensor-faults.md
 	$(BIN)/pytest -m campaign
+	rm -f build/sensor-faults.jsonl
+	$(BIN)/python tests/campaign/sensor_faults_page.py
+
+mutants: $(STAMP)  ## wrong code on purpose: what the fast tests notice, and what the campaign alone; under an hour
+	$(BIN)/python tests/mutants/mutants.py
+
+fuzz: $(STAMP)  ## mutated run folders and capture sets through every command that reads them (an hour)
+	$(BIN)/python tests/fuzz/fuzz_folders.py
 
 generate: $(STAMP)  ## the files made from firmware_iface/registers.toml and the safety table
 	$(BIN)/python -m firmware_iface.generate

@@ -13,7 +13,6 @@ it was seen to grow. The control process in virtual time is in `soak`.
 from __future__ import annotations
 
 import os
-import pickle
 import struct
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -33,6 +32,7 @@ from benchmarks.recorded_hold import Part, parts_of
 from membrane_ctrl.alarms.process import AlarmsSpec, watch
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config, LoopConfig, RecordingConfig, ShapeConfig
+from membrane_ctrl.estimate import pack_estimate, unpack_estimate
 from membrane_ctrl.ipc.ring import RingAddress, RingWriter, ring
 from membrane_ctrl.processes import Child, pipe
 from membrane_ctrl.recording import process
@@ -186,8 +186,8 @@ def _later(part: Part, by_s: float) -> Part:
 
 
 def _shape_later(message: bytes, by_s: float) -> bytes:
-    estimate = pickle.loads(message)
-    return pickle.dumps(replace(estimate, time_s=estimate.time_s + by_s))
+    estimate = unpack_estimate(message)
+    return pack_estimate(replace(estimate, time_s=estimate.time_s + by_s))
 
 
 def _tick_later(message: bytes, ticks: int, by_s: float) -> bytes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -12,7 +11,7 @@ import numpy as np
 from membrane_ctrl.acquisition.worker import estimate_message
 from membrane_ctrl.commands import Command
 from membrane_ctrl.config import Config
-from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.estimate import ShapeEstimate, unpack_estimate
 from membrane_ctrl.ipc.ring import RingWriter
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.tick_record import pack_tick
@@ -56,14 +55,12 @@ class RealisticShapes:
             return None
         noisy = estimate.coeffs_um + 1e-3 * self._rng.normal(size=36)
         scaled = self._covariance_um2 * (1 + 1e-3 * self._rng.normal())
-        return pickle_trip(replace(estimate, coeffs_um=noisy, covariance_um2=scaled))
+        return ring_trip(replace(estimate, coeffs_um=noisy, covariance_um2=scaled))
 
 
-def pickle_trip(estimate: ShapeEstimate) -> ShapeEstimate:
+def ring_trip(estimate: ShapeEstimate) -> ShapeEstimate:
     """As the control process gets it from the ring."""
-    found = pickle.loads(estimate_message(estimate))
-    assert isinstance(found, ShapeEstimate)
-    return found
+    return unpack_estimate(estimate_message(estimate))
 
 
 def parts_of(config: Config, duration_s: float, part_s: float) -> Iterator[Part]:

@@ -6,20 +6,29 @@ for moments: do not run it on a mirror that must not move.
 
 from __future__ import annotations
 
-import asyncio
+import contextlib
 import math
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from functools import partial
 
+from firmware_iface.board_under_test import (
+    PERIOD_S,
+    PUMP_FRACTION,
+    REST_S,
+    BoardUnderTest,
+    ConformanceError,
+    other_key,
+    require,
+)
 from firmware_iface.links.modbus_links import ModbusLinks
-from firmware_iface.links.modbus_rules import ModbusLink
-from firmware_iface.register_map import Block, Register, RegisterMap, default_map
-from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from firmware_iface.register_map import Register, known_maps
+from firmware_iface.roles import DeviceBusyError, DeviceRefusedError, LinkDownError, LinkError
 
-PUMP_FRACTION = 0.05  # below what starts a diaphragm pump
-PERIOD_S = 0.3  # watchdog period during the test
 _GRACE_S = 0.1  # the board's own loop and one wake-up after the period
 _NEAR = 0.002  # of a fraction: counts of a board that rounds its output
+
+_Check = tuple[str, str, Callable[[], Awaitable[None]]]  # its name, the section of docs/firmware.md, the check
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,55 +40,48 @@ class Finding:
     problem: str
 
 
-class ConformanceError(Exception):
-    """The board did not do what it must; the message says what it did."""
-
-
-def _require(right: bool, problem: str) -> None:
-    if not right:
-        raise ConformanceError(problem)
-
-
-class Conformance:
-    """The checks, in the order they are made.
-
-    Parameters
-    ----------
-    link : ModbusLink
-        The board, connected.
-    sleep : callable
-        Waits; the board's clock is what counts.
-    """
-
-    def __init__(self, link: ModbusLink, sleep: Callable[[float], Awaitable[None]] = asyncio.sleep) -> None:
-        self._link = link
-        self._sleep = sleep
-        self._registers: RegisterMap = default_map()
-        self._command = self._registers.block("command")
-        self._heartbeat = 0
+class Conformance(BoardUnderTest):
+    """The checks, in the order they are made."""
 
     async def run(self) -> list[Finding]:
-        """Make all checks; the first one decides whether the others mean anything. Raises LinkDownError."""
-        findings: list[Finding] = []
+        """Make all checks; the first one decides whether the others mean anything.
+
+        Raises
+        ------
+        LinkDownError
+            The board went away.
+        DeviceBusyError
+            Another program holds it.
+        """
+        findings = [await self._made("identity", "Registers", self._identity)]
+        if findings[0].problem:
+            return findings
+        with contextlib.suppress(DeviceRefusedError):  # what cannot be armed is said by the check that asks for it
+            await self._arm(REST_S)
+        await self._rest()
         for check, section, test in self._checks():
-            problem = ""
-            try:
-                await test()
-            except ConformanceError as error:
-                problem = str(error)
-            except LinkDownError:
-                raise
-            except LinkError as error:
-                problem = f"no valid answer: {error}"
-            findings.append(Finding(check, section, problem))
-            if problem and check == "identity":
-                break
+            findings.append(await self._made(check, section, partial(self._armed, test)))
             await self._rest()
         return findings
 
-    def _checks(self) -> list[tuple[str, str, Callable[[], Awaitable[None]]]]:
-        return [
-            ("identity", "Registers", self._identity),
+    async def _armed(self, test: Callable[[], Awaitable[None]]) -> None:
+        await self._arm(REST_S)
+        await test()
+
+    async def _made(self, check: str, section: str, test: Callable[[], Awaitable[None]]) -> Finding:
+        problem = ""
+        try:
+            await test()
+        except ConformanceError as error:
+            problem = str(error)
+        except LinkDownError:
+            raise
+        except LinkError as error:
+            problem = f"no valid answer: {error}"
+        return Finding(check, section, problem)
+
+    def _checks(self) -> list[_Check]:
+        checks: list[_Check] = [
             ("every block is read whole", "Registers", self._blocks),
             ("samples advance", "Timing", self._advance),
             ("a command is carried out and read back", "Commands", self._obeys),
@@ -94,44 +96,29 @@ class Conformance:
             ("a latched fault keeps the pump off", "States", self._latched),
             ("clearing sets the pump to 0", "States", self._cleared),
         ]
-
-    async def _read(self, block: Block) -> dict[str, float]:
-        return block.decode(await self._link.read_holding(block.address, block.count))
-
-    async def _sensors(self) -> dict[str, float]:
-        return await self._read(self._registers.block("sensors"))
-
-    async def _write(self, pump: float, vent: float = 0.0, *, fresh: bool = True) -> None:
-        self._heartbeat = (self._heartbeat + fresh) % 2**16
-        values = {"pump_command_fraction": pump, "vent_command_fraction": vent, "heartbeat": self._heartbeat}
-        await self._link.write_registers(self._command.address, self._command.encode(values))
-
-    async def _arm(self, period_s: float = PERIOD_S, arm: float = 1.0) -> None:
-        block = self._registers.block("settings")
-        values = {"watchdog_period_s": period_s, "watchdog_arm": arm}
-        await self._link.write_registers(block.address, block.encode(values))
-
-    async def _clear(self) -> None:
-        await self._link.write_registers(self._registers.block("reset").address, [0xFFFF])
-
-    async def _rest(self) -> None:
-        """Pump off, faults cleared, watchdog off: how every check begins and ends."""
-        for step in (self._clear, lambda: self._write(0.0), lambda: self._arm(arm=0.0)):
-            try:
-                await step()
-            except LinkDownError:
-                raise
-            except LinkError:
-                continue  # what the board cannot do is said by the check that asks for it
+        if not self._claims:
+            return checks
+        return [
+            *checks,
+            ("the claim and the period are shown, the key is not", "Claim", self._shown),
+            ("another claim is refused", "Claim", self._second),
+            ("nobody else commands, clears or disarms", "Claim", self._strangers),
+            ("the same claim may be made again", "Claim", self._again),
+            ("the claim lapses with the watchdog", "Claim", self._lapses),
+            ("without a claim nothing is commanded", "Claim", self._unclaimed),
+            ("anybody may stop the pump", "Stop", self._stopped),
+        ]
 
     async def _identity(self) -> None:
         found = await self._read(self._registers.block("identity"))
         kind, version = int(found["device_kind"]), int(found["map_version"])
-        wanted = self._registers
-        _require(kind == wanted.device_kind, f"device kind is {kind}, wanted {wanted.device_kind}")
-        _require(version == wanted.map_version, f"map version is {version}, this test knows {wanted.map_version}")
-        _require(found["gauge_pressure_limit_pa"] > 0, "gauge_pressure_limit_pa is not above 0")
-        _require(0 < found["pump_limit_fraction"] <= 1, "pump_limit_fraction is not within 0..1")
+        wanted = self._registers.device_kind
+        require(kind == wanted, f"device kind is {kind}, wanted {wanted}")
+        known = " and ".join(str(known) for known in known_maps())
+        require(version in known_maps(), f"map version is {version}, this test knows {known}")
+        self._registers = known_maps()[version]
+        require(found["gauge_pressure_limit_pa"] > 0, "gauge_pressure_limit_pa is not above 0")
+        require(0 < found["pump_limit_fraction"] <= 1, "pump_limit_fraction is not within 0..1")
         self._heartbeat = int((await self._sensors())["heartbeat_echo"])
 
     async def _blocks(self) -> None:
@@ -142,9 +129,9 @@ class Conformance:
         before = await self._sensors()
         await self._sleep(0.1)
         after = await self._sensors()
-        _require(after["sample_counter"] != before["sample_counter"], "sample_counter stands still for 0.1 s")
+        require(after["sample_counter"] != before["sample_counter"], "sample_counter stands still for 0.1 s")
         passed_s = _time_s(after) - _time_s(before)
-        _require(0.02 < passed_s < 1.0, f"device time went {passed_s:.3f} s in 0.1 s")
+        require(0.02 < passed_s < 1.0, f"device time went {passed_s:.3f} s in 0.1 s")
 
     async def _obeys(self) -> None:
         for pump, vent in ((PUMP_FRACTION, 0.0), (0.0, 0.5), (0.0, 0.0)):
@@ -153,31 +140,30 @@ class Conformance:
             found = await self._sensors()
             for name, wanted in (("pump", pump), ("vent", vent)):
                 value = found[f"{name}_readback_fraction"]
-                _require(abs(value - wanted) < _NEAR, f"{name} commanded {wanted:g}, read back {value:g}")
-        _require(int(found["heartbeat_echo"]) == self._heartbeat, "heartbeat_echo is not the last heartbeat")
+                require(abs(value - wanted) < _NEAR, f"{name} commanded {wanted:g}, read back {value:g}")
+        require(int(found["heartbeat_echo"]) == self._heartbeat, "heartbeat_echo is not the last heartbeat")
 
     async def _limits(self) -> None:
-        for register in self._registers:
-            for raw in _outside(register):
-                what = f"{register.name} = {raw / register.counts_per_unit:g}"
-                await self._refused([raw], register.address, what, "limits")
-
-    async def _refused(self, words: list[int], address: int, what: str, why: str) -> None:
-        try:
-            await self._link.write_registers(address, words)
-        except DeviceRefusedError:
-            return
-        raise ConformanceError(f"accepts {what}, which is outside its {why}")
+        """Each value outside its limits, in a block that is right otherwise."""
+        right = self._command(0.0, 0.0) | {"claim_id": self._id, "claim_key": self._key, "clear_key": self._key}
+        right |= {"watchdog_period_s": REST_S, "watchdog_arm": 1.0, "clear_faults": 0.0, "stop": 1.0}
+        for block in self._registers.blocks:
+            for register in block.registers:
+                for raw in _outside(register):
+                    words = block.encode(right)
+                    at = register.address - block.address
+                    words[at : at + register.words] = [raw] * register.words  # of two words only 0 is outside
+                    what = f"{register.name} = {raw / register.counts_per_unit:g}"
+                    await self._refused(words, block.address, what, "limits")
 
     async def _atomic(self) -> None:
         await self._write(0.0, 0.25)
-        words = self._command.encode(
-            {"pump_command_fraction": 0.0, "vent_command_fraction": 1.0, "heartbeat": self._heartbeat}
-        )
+        block = self._registers.block("command")
+        words = block.encode(self._command(0.0, 1.0))
         words[0] = 0xFFFF  # a pump command of 1.31
-        await self._refused(words, self._command.address, "a command block with one value of 1.31", "limits")
-        found = await self._read(self._command)
-        _require(
+        await self._refused(words, block.address, "a command block with one value of 1.31", "limits")
+        found = await self._read(block)
+        require(
             abs(found["vent_command_fraction"] - 0.25) < _NEAR,
             f"a refused block set the vent to {found['vent_command_fraction']:g}",
         )
@@ -196,16 +182,15 @@ class Conformance:
         for period_s in (PERIOD_S, 1.5):
             await self._arm(period_s)
             found = await self._read(self._registers.block("settings"))
-            _require(found["watchdog_arm"] == 1, "watchdog_arm written 1, read back 0")
+            require(found["watchdog_arm"] == 1, "watchdog_arm written 1, read back 0")
             value_s = found["watchdog_period_s"]
-            _require(abs(value_s - period_s) < 1e-3, f"watchdog_period_s written {period_s:g}, read back {value_s:g}")
-        _require((await self._sensors())["watchdog_armed"] == 1, "watchdog_armed stays 0 after arming")
+            require(abs(value_s - period_s) < 1e-3, f"watchdog_period_s written {period_s:g}, read back {value_s:g}")
+        require((await self._sensors())["watchdog_armed"] == 1, "watchdog_armed stays 0 after arming")
 
     async def _disarm(self) -> None:
-        await self._arm(10.0)
         await self._write(PUMP_FRACTION)
         try:
-            await self._arm(10.0, 0.0)
+            await self._arm(REST_S, 0.0)
         except DeviceRefusedError:
             return
         raise ConformanceError("lets the watchdog be disarmed while the pump is commanded")
@@ -215,17 +200,9 @@ class Conformance:
         await self._write(PUMP_FRACTION)
         await self._sleep(PERIOD_S / 2)
         found = await self._sensors()
-        _require(found["pump_readback_fraction"] > 0, "stops the pump before the watchdog period is over")
+        require(found["pump_readback_fraction"] > 0, "stops the pump before the watchdog period is over")
         await self._sleep(PERIOD_S / 2 + _GRACE_S)
         await self._tripped("a host silent for longer than the watchdog period")
-
-    async def _tripped(self, after: str) -> None:
-        found = await self._sensors()
-        value = found["pump_readback_fraction"]
-        _require(value == 0, f"holds the pump at {value:g} after {after}")
-        mask = self._registers.fault_mask("watchdog")
-        _require(found["watchdog_tripped"] == 1, f"does not report watchdog_tripped after {after}")
-        _require(bool(int(found["latched_faults"]) & mask), f"does not latch the watchdog fault after {after}")
 
     async def _stuck(self) -> None:
         await self._arm()
@@ -241,7 +218,11 @@ class Conformance:
         pump = self._registers.register("pump_command_fraction")
         for _ in range(4):
             await self._sleep((PERIOD_S + _GRACE_S) / 4)
-            await self._link.write_registers(pump.address, [round(PUMP_FRACTION * pump.counts_per_unit)])
+            try:
+                await self._link.write_registers(pump.address, [round(PUMP_FRACTION * pump.counts_per_unit)])
+            except DeviceRefusedError:
+                continue  # as a board with claims has to
+            require(not self._claims, "accepts a part of the command block, which carries no claim")
         await self._tripped("writes of the pump command alone")
 
     async def _latched(self) -> None:
@@ -251,7 +232,7 @@ class Conformance:
         await self._write(PUMP_FRACTION)
         await self._sleep(_GRACE_S)
         value = (await self._sensors())["pump_readback_fraction"]
-        _require(value == 0, f"runs the pump at {value:g} while a fault is latched")
+        require(value == 0, f"runs the pump at {value:g} while a fault is latched")
 
     async def _cleared(self) -> None:
         await self._arm()
@@ -260,9 +241,77 @@ class Conformance:
         await self._write(PUMP_FRACTION)
         await self._clear()
         found = await self._sensors()
-        _require(found["latched_faults"] == 0, f"faults stay {found['latched_faults']:g} after they were cleared")
+        require(found["latched_faults"] == 0, f"faults stay {found['latched_faults']:g} after they were cleared")
         value = found["pump_readback_fraction"]
-        _require(value == 0, f"starts the pump at {value:g} when faults are cleared")
+        require(value == 0, f"starts the pump at {value:g} when faults are cleared")
+
+    async def _shown(self) -> None:
+        await self._arm(1.5)
+        found = await self._sensors()
+        claim, period_s = int(found["claim_in_force"]), found["period_in_force_s"]
+        require(claim == self._id, f"claimed as {self._id:#x}, claim_in_force reads {claim:#x}")
+        require(abs(period_s - 1.5) < 1e-3, f"watchdog period set to 1.5 s, period_in_force_s reads {period_s:g}")
+        for name, key in (("settings", "claim_key"), ("command", "command_key"), ("reset", "clear_key")):
+            require((await self._read(self._registers.block(name)))[key] == 0, f"{key} can be read")
+
+    async def _second(self) -> None:
+        await self._write(PUMP_FRACTION)
+        await self._busy(self._claim(other_key(self._key)), "a second claim while the watchdog is fed")
+        found = await self._sensors()
+        require(found["period_in_force_s"] == REST_S, "a refused claim changed the watchdog period")
+        require(int(found["claim_in_force"]) == self._id, "a refused claim changed the claim")
+
+    async def _strangers(self) -> None:
+        await self._put("stop", {"stop": 1.0})
+        for key in (self._key ^ 1 or 2, self._key ^ (1 << 31) or 2):  # the low word, and the high word
+            self._heartbeat = (self._heartbeat + 1) % 2**16
+            other = "with another key than the claim's"
+            await self._busy(self._put("command", self._command(PUMP_FRACTION, 1.0, key)), f"a command {other}")
+            await self._busy(self._clear(key), f"clear_faults {other}")
+            await self._busy(self._claim(key, arm=0.0), f"disarming {other}")
+        found = await self._sensors()
+        require(int(found["latched_faults"]) != 0, "a refused clear_faults cleared")
+        require(found["vent_readback_fraction"] < _NEAR, "a refused command moved the vent")
+        require(found["watchdog_armed"] == 1, "a refused write disarmed the watchdog")
+
+    async def _again(self) -> None:
+        await self._arm()
+        await self._write(PUMP_FRACTION)
+        for _ in range(4):
+            await self._sleep((PERIOD_S + _GRACE_S) / 4)
+            await self._arm()
+        await self._tripped("claims that are made again, which do not feed")
+
+    async def _lapses(self) -> None:
+        await self._arm()
+        await self._write(PUMP_FRACTION)
+        await self._sleep(PERIOD_S + _GRACE_S)
+        theirs = other_key(self._key)
+        await self._claim(theirs, PERIOD_S)
+        await self._busy(self._put("command", self._command(PUMP_FRACTION, 0.0)), "a command of a claim that lapsed")
+        await self._sleep(PERIOD_S + _GRACE_S)
+        await self._arm(REST_S)
+
+    async def _unclaimed(self) -> None:
+        await self._arm(REST_S, 0.0)
+        require((await self._sensors())["claim_in_force"] == 0, "keeps the claim when it is disarmed")
+        self._heartbeat = (self._heartbeat + 1) % 2**16
+        for name, values in (
+            ("command", self._command(PUMP_FRACTION, 0.0)),
+            ("reset", {"clear_faults": 0xFFFF, "clear_key": self._key}),
+        ):
+            block = self._registers.block(name)
+            await self._refused(block.encode(values), block.address, f"a write to {name} without a claim", "rights")
+
+    async def _stopped(self) -> None:
+        await self._write(PUMP_FRACTION, 0.25)
+        await self._put("stop", {"stop": 1.0})
+        await self._write(PUMP_FRACTION, 0.25)
+        found = await self._sensors()
+        value, mask = found["pump_readback_fraction"], self._registers.fault_mask("stopped")
+        require(value == 0, f"runs the pump at {value:g} after stop")
+        require(abs(found["vent_readback_fraction"] - 0.25) < _NEAR, "moves the vent at stop")
+        require(bool(int(found["latched_faults"]) & mask), "does not latch the fault `stopped`")
 
 
 def _time_s(values: dict[str, float]) -> float:
@@ -270,18 +319,25 @@ def _time_s(values: dict[str, float]) -> float:
 
 
 def _outside(register: Register) -> list[int]:
-    """Raw 16-bit values just outside a register's limits, where the type has such."""
-    if register.access != "rw" or register.words != 1 or math.isinf(register.maximum):
+    """Words just outside a register's limits, where the type has such; of a claim only 0 is."""
+    if register.access != "rw" or math.isinf(register.maximum):
         return []
+    if register.words != 1:
+        return [0]
     low, high = (round(limit * register.counts_per_unit) for limit in (register.minimum, register.maximum))
     return [raw for raw in (low - 1, high + 1, 0xFFFF) if 0 <= raw <= 0xFFFF and not low <= raw <= high]
 
 
 async def examine(url: str, unit_id: int = 1, timeout_s: float = 0.5) -> list[Finding]:
-    """All findings about the board at a Modbus URL. Raises LinkError if it is not there, ValueError for the URL."""
+    """All findings about the board at a Modbus URL.
+
+    Raises LinkError if it is not there or another program holds it, ValueError for the URL.
+    """
     link = ModbusLinks().link(url, unit_id, timeout_s)
     await link.connect()
     try:
         return await Conformance(link).run()
+    except DeviceBusyError as error:
+        raise DeviceBusyError(f"{error}: another program holds the board; stop that one first") from None
     finally:
         await link.close()

@@ -26,17 +26,20 @@ def markdown(registers: RegisterMap) -> str:
         f"Made from {_SOURCE}; do not edit.",
         "",
         f"Map version {registers.map_version}, device kind {registers.device_kind} (0x{registers.device_kind:04X}).",
+        "`since` is the first map version that has a register; a board of an earlier version has the map without it.",
         "",
         "Modbus holding registers, function codes 3 (read), 6 and 16 (write) and 23 (write, then read); addresses",
         "count from 0; 32-bit values have the big word first. value = raw / counts per unit.",
         f"An `i32` of {I32_NO_VALUE} means that there is no value. A write outside the limits is answered with",
         "exception 3 and changes nothing; one to a read-only or unknown address, or to half a value, with 2.",
+        "From map version 2 on, a part of a block is refused with 2, and a write without the claim in force with 6",
+        "while somebody holds the board, with 3 while nobody does ([firmware](firmware.md#claim)).",
     ]
     for block in registers.blocks:
         lines += ["", *_markdown_block(block)]
     lines += ["", "## Faults", "", "Bits of `latched_faults` and `clear_faults`.", ""]
-    lines += ["| bit | name | meaning |", "|---|---|---|"]
-    lines += [f"| {fault.bit} | `{fault.name}` | {fault.meaning} |" for fault in registers.faults]
+    lines += ["| bit | name | since | meaning |", "|---|---|---|---|"]
+    lines += [f"| {fault.bit} | `{fault.name}` | {fault.since} | {fault.meaning} |" for fault in registers.faults]
     return "\n".join(lines) + "\n"
 
 
@@ -47,8 +50,8 @@ def _markdown_block(block: Block) -> list[str]:
         "",
         block.meaning,
         "",
-        "| address | name | type | unit | counts per unit | limits | access | meaning |",
-        "|---|---|---|---|---|---|---|---|",
+        "| address | name | type | unit | counts per unit | limits | access | since | meaning |",
+        "|---|---|---|---|---|---|---|---|---|",
         *(_markdown_row(register) for register in block.registers),
     ]
 
@@ -57,7 +60,7 @@ def _markdown_row(register: Register) -> str:
     limits = f"{register.minimum:g} .. {register.maximum:g}" if register.access == "rw" else ""
     return (
         f"| {register.address} | `{register.name}` | {register.type} | {register.unit} | "
-        f"{register.counts_per_unit} | {limits} | {register.access} | {register.meaning} |"
+        f"{register.counts_per_unit} | {limits} | {register.access} | {register.since} | {register.meaning} |"
     )
 
 

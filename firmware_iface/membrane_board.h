@@ -3,7 +3,7 @@
 #ifndef MEMBRANE_BOARD_H
 #define MEMBRANE_BOARD_H
 
-#define MEMBRANE_MAP_VERSION 1u
+#define MEMBRANE_MAP_VERSION 2u
 #define MEMBRANE_DEVICE_KIND 0x4D42u
 #define MEMBRANE_I32_NO_VALUE (-2147483647 - 1) /* there is no value */
 
@@ -19,7 +19,7 @@
 
 /* sensors (ro): One consistent sample and the state of the board: read it whole, once a tick. */
 #define MEMBRANE_BLOCK_SENSORS_ADDRESS 16u
-#define MEMBRANE_BLOCK_SENSORS_WORDS 22u
+#define MEMBRANE_BLOCK_SENSORS_WORDS 25u
 #define MEMBRANE_SAMPLE_COUNTER_ADDRESS 16u /* u32: counts samples, wraps; standing still means a frozen board */
 #define MEMBRANE_DEVICE_TIME_S_ADDRESS 18u /* u32: whole seconds since power-up at the sample */
 #define MEMBRANE_DEVICE_TIME_FRACTION_S_ADDRESS 20u /* u16: fraction of a second to add to device_time_s */
@@ -43,10 +43,13 @@
 #define MEMBRANE_WATCHDOG_ARMED_ADDRESS 35u /* u16: 1 armed; 0 after power-up */
 #define MEMBRANE_WATCHDOG_TRIPPED_ADDRESS 36u /* u16: 1 from a trip until the fault is cleared */
 #define MEMBRANE_LATCHED_FAULTS_ADDRESS 37u /* u16: fault bits; the pump stays off while one is set */
+#define MEMBRANE_PERIOD_IN_FORCE_S_ADDRESS 38u /* u16: watchdog period now */
+#define MEMBRANE_PERIOD_IN_FORCE_S_COUNTS_PER_UNIT 1000
+#define MEMBRANE_CLAIM_IN_FORCE_ADDRESS 39u /* u32: claim_id of whoever holds or last held the board; 0: nobody */
 
-/* settings (rw): Lost at power-down: written and read back by whoever opens the board. */
+/* settings (rw): Lost at power-down. From map version 2 on, arming claims the board; written whole or not at all. */
 #define MEMBRANE_BLOCK_SETTINGS_ADDRESS 48u
-#define MEMBRANE_BLOCK_SETTINGS_WORDS 2u
+#define MEMBRANE_BLOCK_SETTINGS_WORDS 6u
 #define MEMBRANE_WATCHDOG_PERIOD_S_ADDRESS 48u /* u16: longest time between two feeding writes */
 #define MEMBRANE_WATCHDOG_PERIOD_S_COUNTS_PER_UNIT 1000
 #define MEMBRANE_WATCHDOG_PERIOD_S_MIN_RAW 50
@@ -54,10 +57,16 @@
 #define MEMBRANE_WATCHDOG_ARM_ADDRESS 49u /* u16: 1 arms (arming again does not feed); 0 disarms, refused while the pump command is above 0 */
 #define MEMBRANE_WATCHDOG_ARM_MIN_RAW 0
 #define MEMBRANE_WATCHDOG_ARM_MAX_RAW 1
+#define MEMBRANE_CLAIM_ID_ADDRESS 50u /* u32: random name of the claim; everybody may read it */
+#define MEMBRANE_CLAIM_ID_MIN_RAW 1
+#define MEMBRANE_CLAIM_ID_MAX_RAW 4294967295
+#define MEMBRANE_CLAIM_KEY_ADDRESS 52u /* u32: random secret of the claim; reads as 0 */
+#define MEMBRANE_CLAIM_KEY_MIN_RAW 1
+#define MEMBRANE_CLAIM_KEY_MAX_RAW 4294967295
 
-/* command (rw): Written whole at the end of every completed tick, which is what feeds the watchdog. A write of a part of it commands, but does not feed. */
+/* command (rw): Written whole at the end of every completed tick, which is what feeds the watchdog. A write of a part of it is refused (map version 1: it commands, but does not feed). */
 #define MEMBRANE_BLOCK_COMMAND_ADDRESS 56u
-#define MEMBRANE_BLOCK_COMMAND_WORDS 3u
+#define MEMBRANE_BLOCK_COMMAND_WORDS 5u
 #define MEMBRANE_PUMP_COMMAND_FRACTION_ADDRESS 56u /* u16: pump drive; set to 0 by the board at a fault and when faults are cleared */
 #define MEMBRANE_PUMP_COMMAND_FRACTION_COUNTS_PER_UNIT 50000
 #define MEMBRANE_PUMP_COMMAND_FRACTION_MIN_RAW 0
@@ -69,16 +78,30 @@
 #define MEMBRANE_HEARTBEAT_ADDRESS 58u /* u16: a value other than the last one feeds the watchdog */
 #define MEMBRANE_HEARTBEAT_MIN_RAW 0
 #define MEMBRANE_HEARTBEAT_MAX_RAW 65535
+#define MEMBRANE_COMMAND_KEY_ADDRESS 59u /* u32: claim_key of the claim in force; reads as 0 */
+#define MEMBRANE_COMMAND_KEY_MIN_RAW 1
+#define MEMBRANE_COMMAND_KEY_MAX_RAW 4294967295
 
 /* reset (rw): Clearing is a person's decision; no driver does it by itself. */
 #define MEMBRANE_BLOCK_RESET_ADDRESS 64u
-#define MEMBRANE_BLOCK_RESET_WORDS 1u
+#define MEMBRANE_BLOCK_RESET_WORDS 3u
 #define MEMBRANE_CLEAR_FAULTS_ADDRESS 64u /* u16: fault bits to clear; also sets the pump command to 0; reads as 0 */
 #define MEMBRANE_CLEAR_FAULTS_MIN_RAW 0
 #define MEMBRANE_CLEAR_FAULTS_MAX_RAW 65535
+#define MEMBRANE_CLEAR_KEY_ADDRESS 65u /* u32: claim_key of the claim in force; reads as 0 */
+#define MEMBRANE_CLEAR_KEY_MIN_RAW 1
+#define MEMBRANE_CLEAR_KEY_MAX_RAW 4294967295
+
+/* stop (rw): Anybody may stop the pump; it needs no claim. */
+#define MEMBRANE_BLOCK_STOP_ADDRESS 72u
+#define MEMBRANE_BLOCK_STOP_WORDS 1u
+#define MEMBRANE_STOP_ADDRESS 72u /* u16: 1 latches the fault `stopped`; reads as 0 */
+#define MEMBRANE_STOP_MIN_RAW 1
+#define MEMBRANE_STOP_MAX_RAW 1
 
 /* bits of latched_faults and clear_faults */
 #define MEMBRANE_FAULT_WATCHDOG 0x0001u /* no write of the whole command block with a new heartbeat within the period: pump off, vent as it was */
 #define MEMBRANE_FAULT_OVER_PRESSURE 0x0002u /* gauge pressure above gauge_pressure_limit_pa: pump off, vent open */
+#define MEMBRANE_FAULT_STOPPED 0x0004u /* somebody wrote `stop`: pump off, vent as it was */
 
 #endif

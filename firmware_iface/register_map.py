@@ -23,7 +23,7 @@ I32_NO_VALUE = -(2**31)
 _SUFFIXES = {"s": "_s", "um": "_um", "Pa": "_pa", "degC": "_c", "fraction": "_fraction", "1": ""}
 _ADDRESSES = 2**16
 _READ_MAX_WORDS = 125  # Modbus application protocol 1.1b3, function code 3
-_REGISTER_KEYS = {"name", "address", "type", "unit", "counts_per_unit", "min", "max", "meaning"}
+_REGISTER_KEYS = {"name", "address", "type", "unit", "counts_per_unit", "min", "max", "meaning", "since"}
 
 
 class RegisterMapError(ValueError):
@@ -52,6 +52,8 @@ class Register:
         "ro" or "rw".
     meaning : str
         One line for people.
+    since : int
+        The first map version that has it.
     """
 
     name: str
@@ -63,6 +65,7 @@ class Register:
     maximum: float
     access: str
     meaning: str
+    since: int = 1
 
     @property
     def words(self) -> int:
@@ -132,6 +135,7 @@ class Fault:
     bit: int
     name: str
     meaning: str
+    since: int = 1
 
     @property
     def mask(self) -> int:
@@ -164,6 +168,17 @@ class RegisterMap:
         """The bit of the fault of that name, as a number. Raises KeyError."""
         return {fault.name: fault.mask for fault in self.faults}[name]
 
+    def of_version(self, version: int) -> RegisterMap:
+        """The map as boards of an earlier version have it. Raises RegisterMapError for one that is not known."""
+        if not 1 <= version <= self.map_version:
+            raise RegisterMapError(f"map version {version} is none of 1..{self.map_version}")
+        had = {
+            block: [register for register in block.registers if register.since <= version] for block in self.blocks
+        }
+        blocks = [make_block(block.name, block.access, block.meaning, found) for block, found in had.items() if found]
+        faults = tuple(fault for fault in self.faults if fault.since <= version)
+        return RegisterMap(version, self.device_kind, tuple(blocks), faults)
+
 
 def make_block(name: str, access: str, meaning: str, registers: Sequence[Register]) -> Block:
     """A block from registers that follow each other."""
@@ -175,6 +190,13 @@ def make_block(name: str, access: str, meaning: str, registers: Sequence[Registe
 def default_map() -> RegisterMap:
     """The map that comes with this package."""
     return load(DEFAULT_PATH)
+
+
+@cache
+def known_maps() -> dict[int, RegisterMap]:
+    """The maps by version: that of this package, and the earlier ones whose boards still run."""
+    newest = default_map()
+    return {version: newest.of_version(version) for version in range(1, newest.map_version + 1)}
 
 
 def load(path: Path) -> RegisterMap:
@@ -198,7 +220,9 @@ def parse(table: Mapping[str, Any]) -> RegisterMap:
         raise RegisterMapError(f'schema is {table.get("schema")!r}, wanted "{SCHEMA}"')
     try:
         blocks = tuple(_parse_block(entry) for entry in table["block"])
-        faults = tuple(Fault(entry["bit"], entry["name"], entry["meaning"]) for entry in table["fault"])
+        faults = tuple(
+            Fault(entry["bit"], entry["name"], entry["meaning"], entry.get("since", 1)) for entry in table["fault"]
+        )
         found = RegisterMap(table["map_version"], table["device_kind"], blocks, faults)
     except KeyError as error:
         raise RegisterMapError(f"{error.args[0]} is missing") from error
@@ -220,6 +244,8 @@ def _parse_block(entry: Mapping[str, Any]) -> Block:
         _check_sequence(before, after)
         if after.address > before.address + before.words:
             raise RegisterMapError(f"block {name}: gap between {before.name} and {after.name}")
+        if after.since < before.since:  # the earlier map would have a gap
+            raise RegisterMapError(f"block {name}: {after.name} is older than {before.name} before it")
     return block
 
 
@@ -240,6 +266,7 @@ def _parse_register(entry: Mapping[str, Any], access: str) -> Register:
         maximum=entry.get("max", -math.inf),
         access=access,
         meaning=entry["meaning"],
+        since=entry.get("since", 1),
     )
     _check_register(register)
     return register
@@ -269,6 +296,9 @@ def _check_register(register: Register) -> None:
 
 def _check_order(found: RegisterMap) -> None:
     registers = list(found)
+    for register in registers:
+        if not 1 <= register.since <= found.map_version:
+            raise RegisterMapError(f"{register.name}: since must be a map version, 1..{found.map_version}")
     for before, after in pairwise(registers):
         _check_sequence(before, after)
     names = [register.name for register in registers]

@@ -8,7 +8,7 @@ again in the background, so that a cable put back is a good reading within its b
 Watchdog: only the pump board has one of its own. An instrument keeps the last setpoint it was given, so this bench
 watches itself: no `write` within `watchdog_s` and it sets the pump to 0 and says so. That covers a controller that
 hangs in a tick, not one that is killed: then the last flow stays until the gas is shut off by hand or by a relief
-valve. docs/decisions/106 and `check` say so.
+valve. docs/decisions/35-single-instruments.md and `check` say so.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import math
 import time
 from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 from firmware_iface.roles import (
     Barometer,
@@ -37,6 +38,7 @@ from firmware_iface.roles import (
     Vent,
 )
 
+T = TypeVar("T")
 WATCHDOG_BIT = 0  # in latched_faults, as on the pump board
 NO_ANSWER = 0xFFFF  # displacement_quality when the sensor itself does not answer; no instrument's code
 _RETRY_S = 0.1  # between two attempts to open a lost sensor; its link has the longer back-off
@@ -85,7 +87,8 @@ class RoleBench:
         self._devices = devices
         self._watchdog_s = watchdog_s
         self._clock = clock
-        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._tasks: dict[str, asyncio.Task[None]] = {}  # which open a lost sensor again, by its role
+        self._watchdog: asyncio.Task[None] | None = None
         self._last_sample = DisplacementSample(math.nan, NO_ANSWER, 0, 0.0)
         self._fed_s = math.inf
         self._commanded = 0.0
@@ -93,25 +96,38 @@ class RoleBench:
         self.identities: dict[str, DeviceIdentity] = {}
 
     async def open(self) -> BenchIdentity:
-        """Open every device, sensors first, and start the watchdog.
+        """Open every device, sensors first, and start the watchdog; what it has latched stays.
 
         Raises
         ------
         LinkError
             The first device that is not there or not as the configuration says, with its role.
         """
-        await self._stop_tasks()
+        await self._stop_reopening()  # the watchdog of an opening before stays: the pump may still run
+        if self._commanded > 0:  # it was lost while it ran: it must not wait for a sensor that is gone as well
+            with contextlib.suppress(Exception):
+                await self._devices.pump.open()
+                await self._devices.pump.set_pump(0.0)
+                self._commanded = 0.0
         for role, device in self._devices.by_role().items():
             try:
-                self.identities[role] = await device.open()
+                self.identities[role] = await _answer(role, device.open())
             except LinkError as error:
                 await self.close()
                 raise type(error)(f"{role}: {error}") from error
-        self._fed_s, self._commanded, self._tripped = self._clock(), 0.0, False
-        self._tasks["watchdog"] = asyncio.create_task(self._watch(), name="software watchdog")
+        await self._stop_watchdog()
+        self._fed_s, self._commanded = self._clock(), 0.0
+        self._watchdog = asyncio.create_task(self._watch(), name="software watchdog")
         kinds = ", ".join(f"{role} {identity.kind}" for role, identity in self.identities.items())
         firmware = ", ".join(dict.fromkeys(i.firmware for i in self.identities.values() if i.firmware))
-        return BenchIdentity(f"composed of {kinds}", 0, firmware, self._watchdog_s)
+        return BenchIdentity(
+            f"composed of {kinds}",
+            0,
+            firmware,
+            self._watchdog_s,
+            displacement_range_um=self.identities["displacement"].shows,
+            gauge_range_pa=self.identities["gauge_pressure"].shows,
+        )
 
     async def read(self) -> BenchReading:
         """All sensors at once; what a sensor cannot say is NaN.
@@ -119,8 +135,9 @@ class RoleBench:
         Raises
         ------
         LinkError
-            Pump or vent gave no valid answer; LinkDownError when its link is gone.
+            Pump or vent gave no valid answer; LinkDownError when its link is gone, or the watchdog has ended.
         """
+        await self._require_watchdog()
         sensors = asyncio.ensure_future(self._sensors())  # never raises
         try:
             pump, vent = await self._actuators()
@@ -154,23 +171,30 @@ class RoleBench:
         for name, fraction in (("pump", command.pump_fraction), ("vent", command.vent_fraction)):
             if not 0.0 <= fraction <= 1.0:
                 raise ValueError(f"{name}_fraction = {fraction} is not within 0..1")
+        await self._require_watchdog()
         pump = 0.0 if self._tripped else command.pump_fraction
         self._commanded = max(self._commanded, pump)  # it may have the new one before it has answered
-        actions = [self._devices.pump.set_pump(pump)]
+        actions = [_answer("pump", self._devices.pump.set_pump(pump))]
         if self._devices.vent is not None:
-            actions.append(self._devices.vent.set_vent(command.vent_fraction))
+            actions.append(_answer("vent", self._devices.vent.set_vent(command.vent_fraction)))
         _raise_first(await asyncio.gather(*actions, return_exceptions=True))
         self._commanded = pump
         self._fed_s = self._clock()
 
-    async def clear_faults(self) -> None:
-        """Forget a trip of the watchdog; only ever because a person said so."""
-        self._tripped = False
-        self._fed_s = self._clock()
+    async def clear_faults(self, mask: int) -> None:
+        """Forget a trip of the watchdog, if the mask has its bit."""
+        if mask & 1 << WATCHDOG_BIT:
+            self._tripped = False
+            self._fed_s = self._clock()
+
+    def dead_guards(self) -> tuple[str, ...]:
+        """The software watchdog, if its task has ended while the bench is open."""
+        return () if self._watchdog is None or not self._watchdog.done() else ("software watchdog",)
 
     async def close(self) -> None:
         """Close every device, the pump first. Never raises."""
-        await self._stop_tasks()
+        await self._stop_reopening()
+        await self._stop_watchdog()
         for device in reversed(self._devices.by_role().values()):
             await device.close()
 
@@ -187,8 +211,9 @@ class RoleBench:
         """Read-back of pump and vent; NaN for a vent that the bench does not have."""
         vent = self._devices.vent
         if vent is None:
-            return await self._devices.pump.pump_fraction(), math.nan
-        found = await asyncio.gather(self._devices.pump.pump_fraction(), vent.vent_fraction(), return_exceptions=True)
+            return await _answer("pump", self._devices.pump.pump_fraction()), math.nan
+        asked = (_answer("pump", self._devices.pump.pump_fraction()), _answer("vent", vent.vent_fraction()))
+        found = await asyncio.gather(*asked, return_exceptions=True)
         _raise_first(found)
         pump_fraction, vent_fraction = (value for value in found if isinstance(value, float))
         return pump_fraction, vent_fraction
@@ -199,7 +224,7 @@ class RoleBench:
         self._last_sample = replace(last, displacement_um=math.nan, quality=NO_ANSWER)
         if "displacement" not in self._tasks:
             try:
-                self._last_sample = await self._devices.displacement.displacement()
+                self._last_sample = await _answer("displacement", self._devices.displacement.displacement())
             except LinkError as error:
                 self._failed("displacement", error)
         return self._last_sample
@@ -208,7 +233,7 @@ class RoleBench:
         if read is None or role in self._tasks:
             return math.nan
         try:
-            return await read()
+            return await _answer(role, read())
         except LinkError as error:
             self._failed(role, error)
             return math.nan
@@ -222,26 +247,64 @@ class RoleBench:
         device = self._devices.by_role()[role]
         while True:
             with contextlib.suppress(LinkError):
-                if await device.open() == self.identities[role]:
+                if await _answer(role, device.open()) == self.identities[role]:
                     break
             await asyncio.sleep(_RETRY_S)
         del self._tasks[role]
 
     async def _watch(self) -> None:
-        """The software watchdog."""
+        """The software watchdog: whatever a driver raises, it tries again a quarter of a period later."""
         while True:
             await asyncio.sleep(self._watchdog_s / 4)
             if self._commanded > 0 and self._clock() - self._fed_s > self._watchdog_s:
                 self._tripped = True
-                with contextlib.suppress(LinkError):  # tried again a quarter of a period later
+                with contextlib.suppress(Exception):
                     await self._devices.pump.set_pump(0.0)
                     self._commanded = 0.0
 
-    async def _stop_tasks(self) -> None:
+    async def _require_watchdog(self) -> None:
+        """Nothing is read or commanded without the watchdog.
+
+        A watchdog that has ended leaves a pump that nobody stops: it gets its 0 here, and the bench counts as lost
+        until it is opened again, which starts another watchdog.
+        """
+        if self._watchdog is not None and not self._watchdog.done():
+            return
+        error = "was not started" if self._watchdog is None else _ending(self._watchdog)
+        self._tripped = True
+        with contextlib.suppress(Exception):
+            await self._devices.pump.set_pump(0.0)
+        raise LinkDownError(f"the software watchdog {error}; the pump was set to 0, open the devices again")
+
+    async def _stop_watchdog(self) -> None:
+        task, self._watchdog = self._watchdog, None
+        await _stopped([] if task is None else [task])
+
+    async def _stop_reopening(self) -> None:
         tasks, self._tasks = list(self._tasks.values()), {}
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await _stopped(tasks)
+
+
+async def _stopped(tasks: list[asyncio.Task[None]]) -> None:
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _ending(task: asyncio.Task[None]) -> str:
+    """How a task has ended that was to run for ever."""
+    error = None if task.cancelled() else task.exception()
+    return "was cancelled" if error is None else f"ended with {type(error).__name__}: {error}"
+
+
+async def _answer(role: str, asked: Awaitable[T]) -> T:
+    """A device's answer; what it raises that no driver should is a fault of that device, not the end of the run."""
+    try:
+        return await asked
+    except LinkError:
+        raise
+    except Exception as error:
+        raise LinkError(f"{role}: {type(error).__name__}: {error}") from error
 
 
 def _raise_first(results: Iterable[object]) -> None:

@@ -5,11 +5,15 @@ A driver converts to these units at its edge; nothing behind it knows registers,
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+# The mask of `Bench.clear_faults` that clears whatever is latched
+ALL_FAULTS = 0xFFFF
 
 
 class LinkError(Exception):
@@ -28,12 +32,28 @@ class DeviceRefusedError(LinkError):
     """The device is reachable but not usable: wrong kind, unknown map version, refused write."""
 
 
+class DeviceBusyError(LinkError):
+    """Another program holds the device, or the device is busy; it may be free later.
+
+    `lapses_in_s`: after this time the other's claim has ended if nobody feeds its watchdog; 0 if nothing is known.
+    """
+
+    def __init__(self, message: str, lapses_in_s: float = 0.0) -> None:
+        super().__init__(message)
+        self.lapses_in_s = lapses_in_s
+
+
+# bits of `BenchReading.foreign`
+FOREIGN_CLAIM, FOREIGN_PERIOD = 1, 2
+
+
 @dataclass(frozen=True, slots=True)
 class BenchReading:
     """One consistent sample of all sensors.
 
     `sample_counter` and `device_time_s` advance with every sample of the device, so that a frozen value is seen.
     A quantity the bench does not have is NaN. `displacement_quality` is 0 when good (else the laser's error code).
+    `foreign` says what of the claim and the watchdog is no longer as this program set it (FOREIGN_ bits).
     """
 
     displacement_um: float
@@ -48,6 +68,7 @@ class BenchReading:
     device_time_s: float
     watchdog_tripped: bool
     latched_faults: int
+    foreign: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,12 +81,24 @@ class BenchCommand:
 
 @dataclass(frozen=True, slots=True)
 class BenchIdentity:
-    """Who answered, and how its watchdog is set (read back)."""
+    """Who answered, how its watchdog is set (read back), and the limits that it has (infinite: none known).
+
+    Attributes
+    ----------
+    gauge_pressure_limit_pa, pump_limit_fraction : float
+        What the board keeps by itself.
+    displacement_range_um, gauge_range_pa : tuple of float
+        What the sensors can show.
+    """
 
     kind: str
     map_version: int
     firmware: str
     watchdog_s: float
+    gauge_pressure_limit_pa: float = math.inf
+    pump_limit_fraction: float = 1.0
+    displacement_range_um: tuple[float, float] = (-math.inf, math.inf)
+    gauge_range_pa: tuple[float, float] = (-math.inf, math.inf)
 
 
 class Bench(Protocol):
@@ -83,8 +116,15 @@ class Bench(Protocol):
         """Write pump and vent, and feed the watchdog. Raises LinkError."""
         ...
 
-    async def clear_faults(self) -> None:
-        """Clear what the devices have latched: only ever because a person said so. Raises LinkError."""
+    async def clear_faults(self, mask: int) -> None:
+        """Clear those bits of what the devices have latched, and no others. Raises LinkError.
+
+        Everything (`ALL_FAULTS`) only ever because a person said so.
+        """
+        ...
+
+    def dead_guards(self) -> tuple[str, ...]:
+        """Names of what ought to watch this bench and no longer runs; asked in every tick."""
         ...
 
     async def close(self) -> None:
@@ -94,12 +134,16 @@ class Bench(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class DeviceIdentity:
-    """Who answered: kind ("optoNCDT 1420"), serial number and firmware as the device says them."""
+    """Who answered: kind ("optoNCDT 1420"), serial number and firmware as the device says them.
+
+    `shows` is the range of a sensor in its role's unit, infinite where the driver does not know it.
+    """
 
     kind: str
     serial: str
     firmware: str
     detail: str = ""
+    shows: tuple[float, float] = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,6 +61,11 @@ class ActuatorTest:
         self._elapsed_s = 0.0
 
     @property
+    def duration_s(self) -> float:
+        """Of all parts together."""
+        return sum(part.wait_s + part.measure_s for part in self._parts)
+
+    @property
     def part(self) -> Part | None:
         """The part that is running; None when all are done."""
         left_s = self._elapsed_s

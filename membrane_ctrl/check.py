@@ -3,37 +3,61 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import math
 from dataclasses import asdict
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from membrane_ctrl.alarms.apprise_sender import require_sendable
-from membrane_ctrl.bench import open_bench
+from membrane_ctrl.bench import pump_board
 from membrane_ctrl.calibration.geometry_in_force import geometry_in_force
 from membrane_ctrl.config import Config, DevicesConfig
-from membrane_ctrl.errors import DeviceError, Exit
+from membrane_ctrl.cross_check import cross_check, require_sound
+from membrane_ctrl.device_lock import device_names, locked
+from membrane_ctrl.errors import DeviceError, Exit, FindingsError
 from membrane_ctrl.port.tls import server_context
 from membrane_ctrl.port.unix import SOCKET_NAME
 from membrane_ctrl.port_config import AlarmsConfig, PortConfig
 from membrane_ctrl.probe import Probe, probe_board, probe_roles
 from membrane_ctrl.probe_optics import probe_optics
 from membrane_ctrl.role_devices import role_devices
+from membrane_ctrl.terminal import table_console
 
 
 def check_config(config: Config, source: str, as_json: bool) -> int:
-    """Probe and report. Raises DeviceError (one line, after the report) if a device does not answer as it should."""
-    probes = asyncio.run(_probes(config.devices)) if config.devices is not None else []
-    probes += probe_optics(config)
+    """Judge the configuration, probe the devices, and report.
+
+    Raises
+    ------
+    InputError
+        A line for each setting that is refused.
+    DeviceError
+        A device does not answer as it should; after the report.
+    """
+    findings = dict.fromkeys(require_sound(config, source))  # before a device is touched
+    probes = _probed(config)
+    for probe in probes:
+        findings |= dict.fromkeys(cross_check(config, probe.facts))
     would = _what_would_happen(config)
     if as_json:
-        listed = [{key: _plain(value) for key, value in asdict(probe).items()} for probe in probes]
-        print(json.dumps({"schema": "membrane-check/1", "source": source, "devices": listed, "would": would}))
+        listed = [{key: _plain(value) for key, value in asdict(probe).items() if key != "facts"} for probe in probes]
+        found = [asdict(finding) for finding in findings]
+        report = {
+            "schema": "membrane-check/1",
+            "source": source,
+            "devices": listed,
+            "findings": found,
+            "would": would,
+        }
+        print(json.dumps(report))
     else:
-        _show(source, probes, would)
+        _show(source, probes, would, [finding.line(source) for finding in findings if finding.severity == "warning"])
+    refused = [finding.line(source) for finding in findings if finding.severity == "error"]
+    if refused:
+        raise FindingsError(refused)
     wrong = [probe for probe in probes if probe.problem]
     if wrong:
         raise DeviceError(
@@ -47,14 +71,27 @@ def _plain(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def _probed(config: Config) -> list[Probe]:
+    """What the devices say; those that another program uses are left alone, and so is the screen it may show on."""
+    devices = config.devices
+    if devices is None:
+        return probe_optics(config)
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(locked(device_names(devices)))
+        except DeviceError as error:
+            return [Probe("board" if devices.board else "devices", devices.name, problem=str(error))]
+        return asyncio.run(_probes(devices)) + probe_optics(config)
+
+
 async def _probes(devices: DevicesConfig) -> list[Probe]:
     if devices.board is not None:
-        return [await probe_board(open_bench(devices), devices.board)]
+        return [await probe_board(pump_board(devices, devices.board), devices.board)]
     return await probe_roles(role_devices(devices))
 
 
-def _show(source: str, probes: list[Probe], would: dict[str, str]) -> None:
-    console = Console()
+def _show(source: str, probes: list[Probe], would: dict[str, str], warnings: list[str]) -> None:
+    console = table_console()
     if probes:
         table = Table("role", "device", "identity", "reading", "p50 / p99 ms")
         for probe in probes:
@@ -66,7 +103,9 @@ def _show(source: str, probes: list[Probe], would: dict[str, str]) -> None:
         for word, line in (("wrong", probe.problem), ("note", probe.notes)):
             if line:
                 console.print(escape(f"{probe.role}: {word}: {line}"), soft_wrap=True)
-    table = Table(title=f"{source}: valid", title_justify="left", show_header=False)
+    for warning in warnings:
+        console.print(escape(warning), soft_wrap=True)
+    table = Table(title=f"{source}", title_justify="left", show_header=False)
     for name, line in would.items():
         table.add_row(name, escape(line))
     console.print(table)

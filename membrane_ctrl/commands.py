@@ -6,7 +6,7 @@ One table for the control port, the command line and the controller. A refusal i
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -26,6 +26,11 @@ AT_START = "command line"
 # Gains on trial are watched by whoever asked for them; longer than this nobody watches.
 TRIAL_MAX_S = 7200.0
 
+# Of the commands of one tick these come first, in this order: the safest wins, whoever was first
+DOWN: tuple[Kind, ...] = ("latch", "vent", "stop", "lower")
+# and in the same tick none of these is obeyed: what lifts the mirror, or lets it be lifted, is asked for again
+_OVERRULED: frozenset[str] = frozenset({"hold", "manual", "tune", "resume", "ack"})
+
 ANY = frozenset(State)
 RUNNING = MOVING | {State.STANDBY, State.CHECK}
 
@@ -37,11 +42,12 @@ class Command:
     Attributes
     ----------
     kind : str
+        One of `TABLE`, or "resumed": a resume within the last day, by an earlier run. Only a run's start tells it.
     who, why : str
         Recorded with it.
     value : float
         `setpoint`: um. `manual`: flow in um/s of the centre. `gains`: seconds until they go back to what they were,
-        unless `keep` comes before; NaN: for good.
+        unless `keep` comes before; NaN: for good. `resumed`: how many seconds ago.
     text : str
         `mark`: what to write on the timeline. `latch`: the fault.
     loop : LoopConfig or None
@@ -52,7 +58,7 @@ class Command:
         Given by the asker, returned with the answer.
     """
 
-    kind: Kind
+    kind: Kind | Literal["resumed"]
     who: str
     why: str = ""
     value: float = math.nan
@@ -84,15 +90,30 @@ TABLE: dict[Kind, Rule] = {
     "shape_off": Rule("operate", ANY),
     "mark": Rule("operate", ANY),
     "ack": Rule("operate", {State.STANDBY, State.FAULT}),
-    "latch": Rule("operate", {State.STANDBY}),  # a fault of an earlier run, or a person's lock: no hold before `ack`
+    "latch": Rule("operate", ANY),  # a fault of an earlier run, or a person's lock: no hold before `ack`
     "lower": Rule("operate", RUNNING),
     "vent": Rule("operate", ANY),
     "capture": Rule("operate", {State.HOLD}),  # a full set, written by the acquisition
 }
 
 
+def in_order(commands: Iterable[Command]) -> list[Command]:
+    """The commands of a tick, the safest first; the others as they came."""
+    return sorted(commands, key=lambda command: DOWN.index(command.kind) if command.kind in DOWN else len(DOWN))
+
+
+def overruled(command: Command, obeyed: Collection[str]) -> str:
+    """What of this tick's obeyed commands keeps this one from being obeyed, as a refusal; empty if nothing does."""
+    winner = next((kind for kind in DOWN if kind in obeyed), "")
+    if command.kind not in _OVERRULED or not winner:
+        return ""
+    return f"{winner} came at the same time and wins; ask again"
+
+
 def refusal(command: Command, state: State, config: Config) -> str:
     """Why a command cannot be obeyed now; empty if it can."""
+    if command.kind == "resumed":
+        return "" if command.who == AT_START else "only the start of a run tells of resumes"
     rule = TABLE[command.kind]
     if state not in rule.states:
         where = ", ".join(sorted(s.name.lower() for s in rule.states))

@@ -73,6 +73,17 @@ class LimitsConfig(Section):
     stuck_s: Annotated[float, Field(gt=0, le=600)] = 5.0
     lateness_max_ms: Annotated[float, Field(gt=0, le=10000)] = 100.0
     step_max_um: Annotated[float, Field(gt=0, le=10000)] = 50.0  # a jump between two ticks that no film makes
+    # noise of 0.5 Pa on steps of 0.001 Pa never repeats so long, nor does a slow gauge that answers once a second; a
+    # gauge that filters its noise below its own resolution repeats itself on a held mirror, and needs more
+    gauge_stuck_s: Annotated[float, Field(gt=0, le=1e5)] = 20.0
+    # a slammed door (100 Pa) moves the film by 36 um, 2 Pa; a storm of 250 Pa by 5 Pa
+    gauge_step_max_pa: Annotated[float, Field(gt=0, le=5000)] = 30.0
+    # 20 um are 1 Pa: 30 sigma of a gauge's ten-second mean, 5 times what a mount at 2 um/min has in two minutes
+    laser_gauge_apart_max_um: Annotated[float, Field(gt=0, le=10000)] = 20.0
+    # over hours: a gauge's zero drifts by 1 Pa/K (20 um/K), a fresh film's creep is 31 um (control/film_witness.py)
+    laser_gauge_drift_max_um: Annotated[float, Field(gt=0, le=10000)] = 100.0
+    # a leak that doubles is a leak; a film that takes more than this, seen by no camera, may be running away
+    leak_growth_max: Annotated[float, Field(gt=1, le=1000)] = 2.2
     following_error_max_um: Annotated[float, Field(gt=0, le=10000)] = 60.0
     band_um: Positive = 2.0
 
@@ -91,8 +102,10 @@ class StatesConfig(Section):
     hold_flow_max_s: Annotated[float, Field(gt=0, le=600)] = 12.0
     ramp_down_s: Annotated[float, Field(gt=0, le=600)] = 10.0
     pump_off_max_s: Annotated[float, Field(gt=0, le=1e6)] = 3600.0
-    lower_timeout_s: Annotated[float, Field(gt=0, le=600)] = 3.0
+    lower_timeout_s: Annotated[float, Field(gt=0, le=600)] = 3.0  # a pump commanded off is seen to stand by then
     pause_max_s: Annotated[float, Field(gt=0, le=1e5)] = 600.0
+    manual_max_s: Annotated[float, Field(gt=0, le=1e5)] = 600.0  # since the last `manual`; then it is held again
+    manual_range_um: Annotated[float, Field(gt=0, le=1e4)] = 50.0  # and so it is further from the setpoint
     vented_pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 100.0  # `vent` is done below this
     latch_twin_faults: bool = False  # a trip of the simulated mirror keeps the next run down, as a real one does
     stay_after_trip: bool = False  # wait in `fault` for `ctl ack` instead of ending the run
@@ -194,6 +207,8 @@ class MirrorConfig(Section):
 
     radius_mm: Annotated[float, Field(ge=10, le=50_000)] = 500.0
     analysis_radius_mm: Annotated[float, Field(ge=10, le=50_000)] = 475.0
+    sag_mm: Annotated[float, Field(ge=0.1, le=10_000)] = 37.1  # depth of the bowl at displacement 0
+    pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 600.0  # and the gauge's reading there; 0: not known
 
     @model_validator(mode="after")
     def _inside(self) -> MirrorConfig:

@@ -13,11 +13,17 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from membrane_ctrl.errors import InputError
+from membrane_ctrl.recording.atomic import read_text
 
 Model = TypeVar("Model", bound=BaseModel)
+# A configuration with every default is 10 kB, a height map of 100 x 100 nodes 80 kB.
+_BYTES_MAX = 1_000_000
+# The parser takes time and memory by the square of the parts of a dotted key. No key of ours has more than four.
+_PARTS_MAX = 50
+_QUOTED_PART = re.compile(r"""["']\s*\.""")
 
 
-def load(path: Path, model: type[Model]) -> Model:
+def load(path: Path, model: type[Model], follow: bool = True) -> Model:
     """Read and validate a TOML file.
 
     Parameters
@@ -26,23 +32,28 @@ def load(path: Path, model: type[Model]) -> Model:
         The file.
     model : type
         What it must hold (`config.Config` for a run).
+    follow : bool
+        The file is the user's own; False for one in a folder that may come from anywhere (`recording.atomic`).
 
     Raises
     ------
     InputError
         One line that names the file, the field and what would be right.
     """
-    tables = read_toml(path)
+    tables = read_toml(path, follow)
     optics = tables.get("optics")
     if isinstance(optics, dict):
-        with_height_map(optics.get("geometry"), path)
+        with_height_map(optics.get("geometry"), path, follow)
     return parse(tables, model, str(path))
 
 
-def read_toml(path: Path) -> dict[str, Any]:
+def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
     """The tables of a TOML file. Raises InputError naming the file (and the line, if it is not TOML)."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        text = read_text(path, _BYTES_MAX, follow=follow)
+        if any(map(_too_many_parts, text.splitlines())):
+            raise InputError(f"{path}: not valid TOML: a key of more than {_PARTS_MAX} parts")
+        return tomllib.loads(text)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except IsADirectoryError:
@@ -50,12 +61,27 @@ def read_toml(path: Path) -> dict[str, Any]:
     except PermissionError:
         raise InputError(f"{path}: no permission to read it") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({(error.strerror or str(error)).lower()})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({_small(error.strerror or str(error))})") from None
+    except RecursionError:
+        raise InputError(f"{path}: not valid TOML: nested too deep") from None
+    except ValueError as error:  # of TOML, of UTF-8, of a number with thousands of digits
         raise InputError(f"{path}: not valid TOML: {error}") from None
 
 
-def with_height_map(geometry: Any, where: Path) -> None:
+def _small(text: str) -> str:
+    """The text within a sentence."""
+    return text[:1].lower() + text[1:]
+
+
+def _too_many_parts(line: str) -> bool:
+    """Whether a line may hold such a key: too many dots between commas, which stand in a key only if it is quoted."""
+    if line.count(".") <= _PARTS_MAX or line.lstrip().startswith("#"):
+        return False
+    dots = max(piece.count(".") for piece in line.split(","))
+    return dots > _PARTS_MAX or len(_QUOTED_PART.findall(line)) > _PARTS_MAX
+
+
+def with_height_map(geometry: Any, where: Path, follow: bool = True) -> None:
     """Put the numbers of `screen.height_map.file` in its place, in the tables of a geometry that came from `where`.
 
     Raises
@@ -71,8 +97,10 @@ def with_height_map(geometry: Any, where: Path) -> None:
     if "heights_mm" in table:
         raise InputError(f"{field}: give either the file or heights_mm")
     path = where.parent / str(table.pop("file"))
+    if not follow and path.parent != where.parent:
+        raise InputError(f"{field}: {path}: not beside {where.name}")
     try:
-        lines = path.read_text(encoding="utf-8").replace(",", " ").splitlines()
+        lines = read_text(path, follow=follow).replace(",", " ").splitlines()
         rows = [[float(word) for word in line.split("#")[0].split()] for line in lines]
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)

@@ -6,13 +6,14 @@ import asyncio
 import json
 from dataclasses import asdict
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from firmware_iface.conformance import examine
 from firmware_iface.roles import LinkError
+from membrane_ctrl.device_lock import locked, modbus_names
 from membrane_ctrl.errors import DeviceError, Exit, InputError
+from membrane_ctrl.terminal import table_console
 
 
 def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
@@ -23,10 +24,11 @@ def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
     InputError
         The URL is none.
     DeviceError
-        The board is not there, or went away.
+        The board is not there, went away, or is another program's.
     """
     try:
-        findings = asyncio.run(examine(url, unit_id))
+        with locked(modbus_names(url, unit_id)):
+            findings = asyncio.run(examine(url, unit_id))
     except ValueError as error:
         raise InputError(str(error)) from None
     except LinkError as error:
@@ -39,6 +41,6 @@ def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
         table = Table("check", "result", "docs/firmware.md")
         for finding in findings:
             table.add_row(finding.check, escape(finding.problem) or "passed", finding.section)
-        Console().print(table)
-        Console().print("conforms" if passed else "does not conform: do not let it run a pump")
+        table_console().print(table)
+        table_console().print("conforms" if passed else "does not conform: do not let it run a pump")
     return Exit.DONE if passed else Exit.REJECTED

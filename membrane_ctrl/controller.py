@@ -7,12 +7,13 @@ handler runs, and what it wants is overruled wherever the ladder says so. Every 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.roles import BenchCommand, BenchReading
-from membrane_ctrl.commands import Command, refusal
+from firmware_iface.roles import ALL_FAULTS, BenchCommand, BenchReading
+from membrane_ctrl.commands import Command, in_order, overruled, refusal
 from membrane_ctrl.config import Config, LoopConfig
 from membrane_ctrl.control.experiments.machine import Finished
 from membrane_ctrl.control.experiments.trial import Trial
@@ -25,10 +26,11 @@ from membrane_ctrl.names import Rung, State
 from membrane_ctrl.observer import Observer
 from membrane_ctrl.resume import ResumeRule
 from membrane_ctrl.safety import MOVING, Observation, Rule, SafetyTable, Verdict
-from membrane_ctrl.states import HANDLERS, Scene, Way
+from membrane_ctrl.standstill import Standstill
+from membrane_ctrl.states import HANDLERS, Scene
 from membrane_ctrl.telemetry import TelemetryRow
 from membrane_ctrl.tick import Event, TickInputs, TickOutputs
-from membrane_ctrl.witnesses import Witnesses
+from membrane_ctrl.witnesses import Held, Witnesses
 
 # dt outside this range of the nominal one is no time step a loop was designed for; what is beyond is a missed
 # tick, which safety sees by its lateness
@@ -73,12 +75,13 @@ class Controller:
         self._shape = ShapeLoop(config.shape, sag_sensitivity)
         observer = Observer(config.limits)
         loop = InnerLoop(config.loop, config.pump)
-        self._scene = Scene(config, config.loop, loop, observer, Ladder(config.states), config.loop.setpoint_um)
-        self._resume = ResumeRule(config.resume)
+        ladder, standstill = Ladder(config.states), Standstill(config.loop, config.states)
+        self._scene = Scene(config, config.loop, loop, observer, ladder, standstill, config.loop.setpoint_um)
+        self._resume = ResumeRule(config.resume, config.limits)
         self._gains = GainsTrial(config.loop)
         self._witnesses = Witnesses(config)
         self._answers: list[tuple[int, str]] = []
-        self._clear_board = False
+        self._clear_mask = 0
         self._tick_error = ""
         self._ticks = 0
         self._state_since_s = math.nan
@@ -101,9 +104,33 @@ class Controller:
         last = scene.output or NO_OUTPUT
         error_um = last.error_um if self.state in MOVING else math.nan
         left_um = scene.setpoint_um + scene.trim_um - last.setpoint_um
-        events += self._witnesses.ask(inputs, self.state, scene.dt_s, scene.setpoint_um, left_um, last.leak_um_per_s)
+        scene.observer.look(inputs)
+        held = Held(
+            laser_um=scene.observer.displacement_um,
+            gauge_pressure_pa=scene.observer.gauge_pressure_pa,
+            setpoint_um=scene.setpoint_um,
+            trim_um=scene.trim_um,
+            ramp_left_um=left_um,
+            leak_um_per_s=last.leak_um_per_s,
+            flow_um_per_s=last.flow_um_per_s,
+            bleed_fraction=scene.loop_config.bleed_fraction,
+        )
+        witnesses = self._witnesses
+        events += witnesses.ask(inputs, self.state, scene.dt_s, held)
+        stand = scene.standstill
+        stand.look(inputs.now_s, inputs.reading, scene.observer.commanded, inputs.link_up)
         observation = scene.observer.observe(
-            inputs, error_um, self._tick_error, scene.overdue, scene.unfit, self._witnesses.laser_lies
+            inputs,
+            error_um,
+            self._tick_error,
+            scene.overdue,
+            scene.unfit,
+            witnesses.laser_lies,
+            runs_on=stand.runs_on,
+            inflow=stand.inflow,
+            locked=scene.latched,
+            laser_gauge_apart=witnesses.laser_gauge_apart,
+            gas_excess=witnesses.gas_excess,
         )
         verdict = self._safety.judge(self.state, observation)
         self._apply(verdict, events)
@@ -122,7 +149,7 @@ class Controller:
             events=tuple(events),
             finished=scene.finished,
             answers=tuple(self._answers),
-            clear_board=self._clear_board,
+            clear_mask=self._clear_mask,
         )
 
     def _begin(self, inputs: TickInputs, events: list[Event]) -> None:
@@ -136,16 +163,17 @@ class Controller:
         if math.isnan(self._state_since_s):  # the state's first tick
             self._state_since_s = inputs.now_s
         scene.state_age_s = inputs.now_s - self._state_since_s
-        self._answers, self._clear_board = [], False
-        for command in inputs.commands:
-            self._obey(command, events)
+        self._answers, self._clear_mask = [], 0
+        obeyed: set[str] = set()
+        for command in in_order(inputs.commands):
+            if self._obey(command, obeyed, events):
+                obeyed.add(command.kind)
         if self._gains.overdue(scene.now_s):
             self._revert_gains("nobody has kept them in time", events)
 
-    def _obey(self, command: Command, events: list[Event]) -> None:
+    def _obey(self, command: Command, obeyed: Collection[str], events: list[Event]) -> bool:
         """Do what a command asks, or say why not; either is recorded with who asked and why."""
-        scene = self._scene
-        refused = refusal(command, self.state, self._config) or self._prepare(command)
+        refused = refusal(command, self.state, self._config) or overruled(command, obeyed) or self._prepare(command)
         self._answers.append((command.number, refused))
         event: Event = {"kind": "command", "command": command.kind, "who": command.who, "why": command.why}
         if math.isfinite(command.value):
@@ -157,13 +185,18 @@ class Controller:
         if command.experiment is not None:
             event["experiment"] = command.experiment.model_dump()
         events.append({**event, "refused": refused} if refused else event)
-        if refused:
-            return
+        if not refused:
+            self._do(command)
+        return not refused
+
+    def _do(self, command: Command) -> None:
+        scene = self._scene
         match command.kind:
             case "hold":
                 scene.hold_wanted = True
             case "manual":
                 scene.manual_wanted, scene.manual_um_per_s = True, command.value
+                scene.manual_since_s = scene.now_s
             case "pause" | "resume":
                 scene.paused = command.kind == "pause"
             case "setpoint":
@@ -178,15 +211,21 @@ class Controller:
                 self._shape.switch(command.kind == "shape_on", scene.now_s)
             case "latch":
                 scene.latched = scene.latched or command.text or f"locked by {command.who}"
+                scene.hold_wanted = scene.acknowledged = False
+            case "resumed":
+                self._resume.resumed(scene.now_s - command.value)
             case "ack":
                 scene.latched = ""
                 scene.acknowledged = self.state == State.FAULT
-                self._clear_board = True
+                self._clear_mask = ALL_FAULTS
             case "stop":
                 scene.way_down = "stop"
                 scene.stop_exit = Exit.DONE if command.who == "duration" else Exit.INTERRUPTED
+            case "vent" if self.state == State.FAULT:
+                scene.ladder.enter(Rung.VENT, scene.now_s)
             case "lower" | "vent":
-                self._go_down(command.kind)
+                scene.way_down = scene.way_down or "lower"
+                scene.venting |= command.kind == "vent"
         if command.kind in _MOVES:
             scene.asked_by = command.who
 
@@ -195,6 +234,8 @@ class Controller:
         scene, spec = self._scene, command.experiment
         if command.kind == "hold" and scene.latched:
             return f"a fault is latched: {scene.latched}; acknowledge it first"
+        if command.kind in ("manual", "tune") and scene.ladder.rung != Rung.NONE:
+            return "the safety table holds the mean flow"
         if command.kind != "tune" or spec is None:
             return ""
         centre_um = scene.setpoint_um + scene.trim_um
@@ -213,31 +254,16 @@ class Controller:
         self._set_gains(self._gains.revert())
         events.append({"kind": "gains_reverted", "why": why})
 
-    def _go_down(self, way: Way) -> None:
-        """A way down further down than the one under way; `stop` stays the last word."""
-        scene = self._scene
-        if self.state == State.FAULT and way == "vent":
-            scene.ladder.enter(Rung.VENT, scene.now_s)
-        elif scene.way_down != "stop":
-            scene.way_down = way
-
     def _consider_resuming(self, observation: Observation) -> None:
         """A latched fault on the list may go, once its cause has stayed away (`resume`)."""
-        scene, fault = self._scene, self.fault
-        scene.may_resume = scene.resume_possible = False
-        if self.state != State.FAULT or fault is None:
-            self._resume.due(False, scene.now_s)  # what was waited in an earlier fault does not count in the next
+        scene, resume = self._scene, self._resume
+        if self.state != State.FAULT or self.fault is None:
+            resume.forget()
+            scene.may_resume = scene.resume_possible = False
             return
-        scene.resume_possible = self._resume.possible(fault, scene.ladder.rung, scene.now_s)
-        if not scene.resume_possible:
-            return
-        limits = self._config.limits
-        own = observation.board_faults != 0  # the board latched when the controller was lost to it
-        silent = not observation.link_up or observation.reading_age_s > limits.stale_s
-        gone = not (silent or own or fault.broken(observation, limits))
-        if observation.reading_age_s == 0.0 or not gone:  # an answer that is lost now and then says nothing
-            scene.may_resume = self._resume.due(gone, scene.now_s)
-        self._clear_board |= own
+        scene.may_resume = resume.due(self.fault, scene.ladder, observation, scene.now_s)
+        scene.resume_possible = resume.possible
+        self._clear_mask |= resume.clear_mask
 
     def _apply(self, verdict: Verdict, events: list[Event]) -> None:
         """Put the verdict on the ladder; whatever goes below HOLD_FLOW latches as the run's fault."""
@@ -268,8 +294,9 @@ class Controller:
             self._witnesses.camera_lies,
         )
         scene.trim_um = shape.trim_um if self.state in MOVING else 0.0
-        if (shape.state, shape.reason) != self._shape_was:
-            self._shape_was = (shape.state, shape.reason)
+        words = shape.reason.translate(_NO_DIGITS)  # numbers that change are no news
+        if (shape.state, words) != self._shape_was:
+            self._shape_was = (shape.state, words)
             events.append({"kind": "shape", "state": shape.state.name.lower(), "reason": shape.reason})
         return shape
 
@@ -281,13 +308,16 @@ class Controller:
             wanted = HANDLERS[self.state](scene)
         except Exception as error:
             self._tick_error = f"{type(error).__name__}: {error}"
-            scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, 0.0
+            # a mirror that is being vented is not shut up by an error
+            vents = scene.venting or scene.ladder.rung == Rung.VENT
+            scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, float(vents)
             if self.state == State.FAULT:  # nothing is left that could judge it
                 scene.finished = Exit.SAFETY_TRIP
             return
-        if not (math.isfinite(scene.pump_fraction) and 0.0 <= scene.pump_fraction <= 1.0):
-            self._tick_error = f"pump command {scene.pump_fraction} from state {self.state.name.lower()}"
-            scene.pump_fraction = 0.0
+        for name, fraction in (("pump", scene.pump_fraction), ("vent", scene.vent_fraction)):
+            if not 0.0 <= fraction <= 1.0:
+                self._tick_error = f"{name} command {fraction} from state {self.state.name.lower()}"
+                scene.pump_fraction, scene.vent_fraction = 0.0, 0.0
         if wanted != self.state:
             self._go(wanted, scene.why, events)
 
@@ -301,9 +331,14 @@ class Controller:
         if state == State.FAULT and self._gains.on_trial:
             self._revert_gains("a fault came while they were on trial", events)
         if self.state == State.FAULT:  # it was acknowledged, or may resume
+            if not scene.acknowledged and self.fault is not None:
+                self._resume.resumed(scene.now_s)
+                events.append({"kind": "resumed", "name": self.fault.name})
             self.fault, self._tick_error = None, ""
             scene.ladder.leave()
             scene.acknowledged = False
+        if state == State.STANDBY:
+            scene.venting = False
         scene.manual_wanted = scene.paused = False  # asked of the hold that was, not of the next one
         self.state = state
         self._state_since_s = math.nan

@@ -6,7 +6,6 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -14,6 +13,7 @@ from firmware_iface.links import aravis
 from firmware_iface.links.usb_ports import serial_ports
 from firmware_iface.roles import LinkError
 from membrane_ctrl.errors import Exit
+from membrane_ctrl.terminal import table_console
 
 _DRM = Path("/sys/class/drm")
 
@@ -48,7 +48,7 @@ def list_devices(as_json: bool) -> int:
     table = Table("kind", "name", "to paste")
     for device in found:
         table.add_row(device.kind, escape(device.name), escape(device.paste))
-    console = Console()
+    console = table_console()
     console.print(table if found else "nothing found: no serial port, camera or display")
     for note in missing:
         console.print(escape(note))

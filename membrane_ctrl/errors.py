@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
 
 
@@ -21,9 +22,26 @@ class CommandError(Exception):
 
     exit = Exit.BAD_INPUT
 
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """What is printed: one line, whatever line ends are in what it quotes."""
+        return (str(self),)
+
 
 class InputError(CommandError):
     """Bad usage, configuration or input."""
+
+
+class FindingsError(InputError):
+    """Several things that are wrong with the input, a line each."""
+
+    def __init__(self, lines: Sequence[str]) -> None:
+        super().__init__("\n".join(lines))
+        self._lines = tuple(lines)
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        return self._lines
 
 
 class RejectedError(CommandError):

@@ -1,14 +1,23 @@
-"""The small result of a measurement cycle: what crosses from acquisition to control and recorder."""
+"""The small result of a measurement cycle, and the bytes in which it crosses to control, recorder and session.
+
+The ring of shapes and a run's inputs file hold the same bytes: one line of JSON with the numbers and words, then the
+coefficients, then the covariance (of a symmetric one the upper half). A reader checks every length, type and range
+first, because a run folder may come from anywhere.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+import json
+import math
+from dataclasses import dataclass, fields
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+Kind = Literal["full", "fringes"]
 Verdict = Literal["ok", "degraded", "rejected"]
+TERMS = 36
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +61,7 @@ class ShapeEstimate:
     """
 
     time_s: float
-    kind: Literal["full", "fringes"]
+    kind: Kind
     coeffs_um: NDArray[np.float64]
     hencky_um: float
     covariance_um2: NDArray[np.float64]
@@ -68,3 +77,76 @@ class ShapeEstimate:
     latency_s: float = float("nan")
     cycle: int = 0
     geometry_sag_sigma_um: float = float("nan")
+
+
+_WORDS = {"kind": get_args(Kind), "verdict": get_args(Verdict)}
+_ARRAYS = ("coeffs_um", "covariance_um2")
+_NUMBERS = tuple(
+    field.name for field in fields(ShapeEstimate) if field.name not in {*_WORDS, *_ARRAYS, "reason", "cycle"}
+)
+_KEYS = {*_NUMBERS, *_WORDS, "reason", "cycle", "terms", "symmetric", "single"}
+_UPPER = np.triu_indices(TERMS)
+_LINE_BYTES_MAX = 8192  # the numbers take 0.5 kB; the rest is room for a reason
+_COEFFS_BYTES = 8 * TERMS
+_LARGEST = 1e300  # no infinity, and no whole number that a float cannot hold
+
+
+def pack_estimate(estimate: ShapeEstimate) -> bytes:
+    """A shape estimate as bytes, exact to the last bit."""
+    covariance = np.asarray(estimate.covariance_um2, dtype="<f8")
+    symmetric = np.array_equal(covariance, covariance.T)
+    values = covariance[_UPPER] if symmetric else covariance.ravel()
+    single = np.array_equal(values, values.astype("<f4"), equal_nan=True)  # as the acquisition sends them
+    head = {field.name: getattr(estimate, field.name) for field in fields(ShapeEstimate) if field.name not in _ARRAYS}
+    line = json.dumps({**head, "terms": TERMS, "symmetric": symmetric, "single": single}, default=float)
+    coeffs = np.asarray(estimate.coeffs_um, dtype="<f8")
+    return b"\n".join((line.encode(), coeffs.tobytes() + values.astype("<f4" if single else "<f8").tobytes()))
+
+
+def unpack_estimate(data: bytes) -> ShapeEstimate:
+    """The estimate of `pack_estimate`. Raises ValueError if these are not its bytes."""
+    line, _, arrays = data.partition(b"\n")
+    if len(line) > _LINE_BYTES_MAX:
+        raise ValueError(f"shape estimate: {len(line)} bytes where at most {_LINE_BYTES_MAX} are expected")
+    try:
+        head = json.loads(line)
+    except RecursionError:
+        raise ValueError("shape estimate: not one flat JSON object") from None
+    symmetric, single = _checked(head)
+    count = _UPPER[0].size if symmetric else TERMS**2
+    if len(arrays) != _COEFFS_BYTES + count * (4 if single else 8):
+        raise ValueError(f"shape estimate: {len(arrays)} bytes of arrays do not fit its first line")
+    coeffs_um = np.frombuffer(arrays, dtype="<f8", count=TERMS)
+    values = np.frombuffer(arrays, dtype="<f4" if single else "<f8", offset=_COEFFS_BYTES)
+    if np.isinf(coeffs_um).any() or np.isinf(values).any():
+        raise ValueError("shape estimate: infinite coefficient or covariance")
+    covariance = np.empty((TERMS, TERMS))
+    if symmetric:
+        rows, columns = _UPPER
+        covariance[rows, columns] = covariance[columns, rows] = values
+    else:
+        covariance[:] = values.reshape(TERMS, TERMS)
+    return ShapeEstimate(**head, coeffs_um=coeffs_um.copy(), covariance_um2=covariance)
+
+
+def _checked(head: Any) -> tuple[bool, bool]:
+    """Whether the covariance is symmetric and in singles; leaves the estimate's own fields. Raises ValueError."""
+    if not isinstance(head, dict) or not set(head) <= _KEYS:
+        raise ValueError("shape estimate: its first line names other fields")
+    layout = (head.pop("terms", None), head.pop("symmetric", None), head.pop("single", None))
+    if layout[0] != TERMS or not all(isinstance(flag, bool) for flag in layout[1:]):
+        raise ValueError(f"shape estimate: not of {TERMS} terms")
+    for name in _NUMBERS:
+        value = head.get(name, math.nan)  # what an older version did not know is NaN
+        if type(value) not in (float, int) or abs(value) > _LARGEST:
+            raise ValueError(f"shape estimate: {name} is no number")
+        head[name] = float(value)
+    if math.isnan(head["time_s"]):
+        raise ValueError("shape estimate: it has no time")
+    for name, words in _WORDS.items():
+        if head.get(name) not in words:
+            raise ValueError(f"shape estimate: {name} is none of {', '.join(words)}")
+    cycle = head.setdefault("cycle", 0)
+    if type(cycle) is not int or not 0 <= cycle < 2**63 or not isinstance(head.setdefault("reason", ""), str):
+        raise ValueError("shape estimate: cycle or reason is of a wrong kind")
+    return layout[1], layout[2]

@@ -1,7 +1,7 @@
 """Gains on trial: they go back to the last good ones unless somebody says in time that they may stay.
 
 The one who tries them may lose its connection or be killed; the loop must then not be left with gains that nobody
-has verified (docs/decisions/94-gains-on-trial.md).
+has verified (docs/decisions/78-gains-on-trial.md).
 """
 
 from __future__ import annotations

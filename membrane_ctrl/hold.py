@@ -16,11 +16,12 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from firmware_iface.register_map import default_map
-from firmware_iface.roles import Bench, LinkError
+from firmware_iface.drivers.pump_board import NO_CLAIM
+from firmware_iface.roles import ALL_FAULTS, Bench, LinkError
 from membrane_ctrl.alarms.apprise_sender import require_sendable
 from membrane_ctrl.bench import connect, open_bench
 from membrane_ctrl.calibration.geometry_in_force import geometry_in_force
@@ -29,16 +30,19 @@ from membrane_ctrl.commands import AT_START, Command
 from membrane_ctrl.config import Config
 from membrane_ctrl.controller import Controller
 from membrane_ctrl.crew import Crew, Rings, rings_for
+from membrane_ctrl.cross_check import require_sound
+from membrane_ctrl.device_lock import device_names, locked
 from membrane_ctrl.errors import DeviceError, Exit, InputError
 from membrane_ctrl.interrupts import ends_as_by_ctrl_c
 from membrane_ctrl.ipc.published import publish
 from membrane_ctrl.ipc.ring import RingReader, RingWriter
-from membrane_ctrl.latched import LatchedFile
+from membrane_ctrl.latched import LatchedFile, ResumeLog
 from membrane_ctrl.latcher import Latcher
 from membrane_ctrl.port.listeners import listeners_for
 from membrane_ctrl.port.server import Port, RunHooks
 from membrane_ctrl.priority import raise_priority
 from membrane_ctrl.recording.run_folder import create_run_folder
+from membrane_ctrl.resume import VENTED_FRACTION, WATCHDOG_MASK
 from membrane_ctrl.simulated import TwinProcess
 from membrane_ctrl.supervisor import Supervisor, Wiring
 from membrane_ctrl.systemd import SystemdNotify
@@ -68,6 +72,8 @@ def hold_mirror(options: HoldOptions) -> int:
     """
     if options.config.devices is None and not options.twin:
         raise InputError(f"{options.source}: devices: missing; name the pump board in [devices], or use --twin")
+    for warning in require_sound(options.config, options.source):
+        print(warning.line(options.source), file=sys.stderr)
     require_sendable(options.config.alarms)
     geometry = geometry_in_force(options.config)
     clock = RunClock.start()
@@ -77,8 +83,10 @@ def hold_mirror(options: HoldOptions) -> int:
         assert config.devices is not None
         logs_dir = options.logs_dir or Path(config.recording.logs_dir)
         listeners = listeners_for(config.port, logs_dir, stack)  # a second hold ends here, no device touched
+        stack.enter_context(locked(device_names(config.devices)))  # and here one with other folders
         latched = _latched(config, logs_dir, options)
-        board = asyncio.run(_identify(open_bench(config.devices), config, options))
+        resumes = None if latched is None else ResumeLog(logs_dir)
+        board = asyncio.run(_identify(open_bench(config.devices), config, options, resumes))
         run_dir = create_run_folder(logs_dir, options.name, clock.origin_utc, config)
         geometry.keep(run_dir)
         rings = rings_for(config, twin.truth if twin else None, stack)
@@ -87,7 +95,7 @@ def hold_mirror(options: HoldOptions) -> int:
         crew.start(stack)
         bench = open_bench(config.devices)  # a link belongs to the event loop that opened it
         port = partial(Port, config.port, listeners, run_dir.name)
-        latcher = partial(Latcher, latched, run_dir.name, clock.utc)
+        latcher = partial(Latcher, latched, resumes, run_dir.name, clock.utc)
         exit_code = asyncio.run(_run(bench, config, options, clock, rings, crew, twin, port, latcher, board))
         crew.take_down()
     with contextlib.suppress(OSError):  # the terminal was closed, or nobody reads any more
@@ -123,21 +131,26 @@ class BoardAtStart:
     cleared: str = ""  # as the resume rule allows
 
 
-async def _identify(bench: Bench, config: Config, options: HoldOptions) -> BoardAtStart:
-    """Who is there, and is it fit to run, before a run folder exists. Raises DeviceError."""
+async def _identify(
+    bench: Bench, config: Config, options: HoldOptions, resumes: ResumeLog | None = None
+) -> BoardAtStart:
+    """Who is there, and is it fit to run, before a run folder exists. Raises DeviceError or InputError."""
     devices = config.devices
     assert devices is not None
     try:
-        await connect(bench, devices)
+        identity = await connect(bench, devices)
+        require_sound(config, options.source, identity)
         if options.clear_faults:
-            await bench.clear_faults()
-        faults = (await bench.read()).latched_faults
+            await bench.clear_faults(ALL_FAULTS)
+        reading = await bench.read()
+        faults = reading.latched_faults
         if not faults:
             return BoardAtStart()
         what = f"{devices.name}: the board has latched faults {faults:#x} (docs/registers.md)"
-        # the controller before this one was killed: no more than that, if nothing else is latched
-        if faults == default_map().fault_mask("watchdog") and "watchdog_tripped" in config.resume.faults:
-            await bench.clear_faults()
+        # the controller before this one was killed: no more than that, if nothing else is latched and none vented
+        vented = reading.vent_fraction > VENTED_FRACTION
+        if faults == WATCHDOG_MASK and not vented and _may_resume("watchdog_tripped", config, resumes):
+            await bench.clear_faults(WATCHDOG_MASK)
             return BoardAtStart(cleared="its watchdog had stopped the pump; cleared, as resume.faults allows")
     except LinkError as error:
         raise DeviceError(f"{devices.name}: {error}") from None
@@ -146,6 +159,22 @@ async def _identify(bench: Bench, config: Config, options: HoldOptions) -> Board
     if not options.standby:
         raise DeviceError(f"{what}; find out why, then start with --clear-faults")
     return BoardAtStart(latched=what)
+
+
+def _may_resume(name: str, config: Config, resumes: ResumeLog | None) -> bool:
+    """The resume rule at a start; what it allows is counted, or it is not allowed."""
+    if name not in config.resume.faults:
+        return False
+    if resumes is None:
+        return True  # the twin, of which nothing is kept
+    now = datetime.now(UTC)
+    if len(resumes.ages_s(now)) >= config.resume.most_per_day:
+        return False
+    try:
+        resumes.add(now)
+    except OSError:
+        return False
+    return True
 
 
 async def _run(
@@ -169,8 +198,13 @@ async def _run(
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         port = port_for(RunHooks(supervisor.ask, supervisor.tell, clock.now, lambda: controller.loop_config))
         latcher, systemd = latcher_for(supervisor.tell), SystemdNotify()
-        wiring.heard = (port.heard, latcher.heard, systemd.heard, partial(_capture, crew, supervisor.tell))
-        wiring.told = (port.told, systemd.told)
+        wiring.heard = {
+            "control port": port.heard,
+            "latched-fault file": latcher.heard,
+            "systemd": systemd.heard,
+            "capture": partial(_capture, crew, supervisor.tell),
+        }
+        wiring.told = {"control port": port.told, "systemd": systemd.told}
         devices = config.devices.name if config.devices else ""
         supervisor.tell({"kind": "start", "devices": devices, "priority": raise_priority(), "message": board.cleared})
         exit_code = Exit.DEVICE_FAILED
@@ -179,12 +213,16 @@ async def _run(
                 supervisor.ask(Command("hold", AT_START))
             elif latched := "; ".join(part for part in (latcher.latched, board.latched) if part):
                 supervisor.ask(Command("latch", AT_START, text=latched))
+            for age_s in latcher.resumes_s:
+                supervisor.ask(Command("resumed", AT_START, value=age_s))
             gc.collect()
             gc.freeze()  # what lives for the whole run need not be looked at again between two ticks
             async with port.open():
                 with _signals(supervisor), latcher, systemd:
                     assert config.devices is not None
-                    await connect(bench, config.devices)  # last: the board's watchdog runs from here on
+                    # last: the board's watchdog runs from here on
+                    if (await connect(bench, config.devices)).map_version == 1:
+                        supervisor.tell({"kind": "no_claim", "message": NO_CLAIM})
                     exit_code = await supervisor.run(options.duration_s)
         except LinkError as error:
             supervisor.tell({"kind": "link", "message": str(error)})

@@ -10,12 +10,18 @@ import contextlib
 import json
 import os
 from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
 from pathlib import Path
 
 NAME = "latched-fault.json"
 SCHEMA = "membrane-latched-fault/1"
+RESUMES_NAME = "resumes.json"
+_DAY_S = 86_400.0
+_RESUMES_MOST = 1000  # of a day, as `resume.most_per_day` takes at most
 # More than a fault takes; the least that a disk gives.
 _RESERVE_BYTES = 4096
+# The room that an earlier run reserved is kept. A link in its place is not followed, for a pipe is not waited.
+_IN_PLACE = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _MOST_BYTES = 65536  # a longer file is none of ours, and is not read to its end
 
 
@@ -52,7 +58,7 @@ class LatchedFile:
     def read(self) -> LatchedFault | None:
         """The latched fault, None if there is none. Never raises: what cannot be read is latched."""
         try:
-            content = self._content()
+            content = _content(self.path)
             if content is None:
                 return None
             table = json.loads(content)
@@ -65,9 +71,7 @@ class LatchedFile:
     def write(self, fault: LatchedFault) -> None:
         """Latch, in place of an older fault. Raises OSError."""
         text = json.dumps({"schema": SCHEMA, **asdict(fault)}, indent=1) + "\n"
-        with self._reserve.open("r+b" if self._reserve.exists() else "wb") as file:
-            file.write(text.encode())
-            file.truncate()
+        self._fill(text.encode())
         self._reserve.replace(self.path)
         with contextlib.suppress(OSError):
             self.reserve()
@@ -79,7 +83,18 @@ class LatchedFile:
 
     def reserve(self) -> None:
         """Take the room for a fault while there is some: one on a full disk is latched as well. Raises OSError."""
-        self._reserve.write_bytes(bytes(_RESERVE_BYTES))
+        self._fill(bytes(_RESERVE_BYTES))
+
+    def _fill(self, content: bytes) -> None:
+        """Write to the reserve, in the room that it has. What stands in its place and is no file goes."""
+        try:
+            number = os.open(self._reserve, _IN_PLACE, 0o644)
+        except OSError:
+            self._reserve.unlink()
+            number = os.open(self._reserve, _IN_PLACE, 0o644)
+        with os.fdopen(number, "r+b") as file:
+            file.write(content)
+            file.truncate()
 
     def release(self) -> None:
         """Give that room back."""
@@ -101,21 +116,53 @@ class LatchedFile:
         """A person has looked at it, or the resume rule let it go. Raises OSError."""
         self.path.unlink(missing_ok=True)
 
-    def _content(self) -> bytes | None:
-        """What is there; None if nothing is, not even a link whose aim is gone. Raises OSError or ValueError."""
-        try:
-            self.path.lstat()
-        except FileNotFoundError:
-            return None
-        if not self.path.is_file():  # of a pipe the first byte would be waited for
-            raise ValueError("no file")
-        with self.path.open("rb") as file:
-            content = file.read(_MOST_BYTES + 1)
-        if len(content) > _MOST_BYTES:
-            raise ValueError(f"longer than {_MOST_BYTES} bytes")
-        return content
-
     def _unreadable(self, why: str) -> LatchedFault:
         return LatchedFault(
             "unreadable", f"{self.path} cannot be read", why, "look at the last run", "unknown time", "unknown"
         )
+
+
+class ResumeLog:
+    """When faults have cleared by themselves, so that a restart does not begin the day's number anew.
+
+    Parameters
+    ----------
+    logs_dir : Path
+        Where run folders go.
+    """
+
+    def __init__(self, logs_dir: Path) -> None:
+        self.path = logs_dir / RESUMES_NAME
+
+    def ages_s(self, now: datetime) -> tuple[float, ...]:
+        """How long ago those of the last day were, oldest first. Never raises: what cannot be read counts as full."""
+        try:
+            content = _content(self.path)
+            stamps = [] if content is None else json.loads(content)
+            ages_s = [(now - datetime.fromisoformat(stamp)).total_seconds() for stamp in stamps]
+        except (OSError, ValueError, TypeError, RecursionError):
+            return (0.0,) * _RESUMES_MOST
+        # one from the future (the clock was set back) counts as just now
+        return tuple(sorted((max(0.0, age_s) for age_s in ages_s if age_s < _DAY_S), reverse=True))
+
+    def add(self, when: datetime) -> None:
+        """Count one; those older than a day are left out. Raises OSError."""
+        kept = [when - timedelta(seconds=age_s) for age_s in self.ages_s(when)][-_RESUMES_MOST:]
+        scratch = self.path.with_name(f".{self.path.name}.new")
+        scratch.write_text(json.dumps([stamp.isoformat() for stamp in (*kept, when)]) + "\n", encoding="utf-8")
+        scratch.replace(self.path)
+
+
+def _content(path: Path) -> bytes | None:
+    """What is there; None if nothing is, not even a link whose aim is gone. Raises OSError or ValueError."""
+    try:
+        path.lstat()
+    except FileNotFoundError:
+        return None
+    if not path.is_file():  # of a pipe the first byte would be waited for
+        raise ValueError("no file")
+    with path.open("rb") as file:
+        content = file.read(_MOST_BYTES + 1)
+    if len(content) > _MOST_BYTES:
+        raise ValueError(f"longer than {_MOST_BYTES} bytes")
+    return content

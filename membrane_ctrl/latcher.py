@@ -6,12 +6,12 @@ import contextlib
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from datetime import datetime
+from datetime import UTC, datetime
 from functools import partial
 from types import TracebackType
 
 from membrane_ctrl.commands import AT_START
-from membrane_ctrl.latched import LatchedFault, LatchedFile
+from membrane_ctrl.latched import LatchedFault, LatchedFile, ResumeLog
 from membrane_ctrl.tick import Event, TickOutputs
 
 
@@ -22,6 +22,8 @@ class Latcher:
     ----------
     file : LatchedFile or None
         None: nothing is latched beyond the run (the twin's default).
+    resumes : ResumeLog or None
+        Where resumes are counted beyond the run.
     run : str
         Name of the run folder.
     utc : callable
@@ -31,9 +33,14 @@ class Latcher:
     """
 
     def __init__(
-        self, file: LatchedFile | None, run: str, utc: Callable[[float], datetime], tell: Callable[[Event], None]
+        self,
+        file: LatchedFile | None,
+        resumes: ResumeLog | None,
+        run: str,
+        utc: Callable[[float], datetime],
+        tell: Callable[[Event], None],
     ) -> None:
-        self._file, self._run, self._utc, self._tell = file, run, utc, tell
+        self._file, self._resumes, self._run, self._utc, self._tell = file, resumes, run, utc, tell
         # one thread, so that a fault and its acknowledgement stay in order; it exists only once there is a fault
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="latched-fault")
         self._news: deque[Event] = deque()  # from the disk's thread
@@ -46,6 +53,11 @@ class Latcher:
         """What is latched now, in one line; empty for nothing."""
         fault = None if self._file is None else self._file.read()
         return "" if fault is None else str(fault)
+
+    @property
+    def resumes_s(self) -> tuple[float, ...]:
+        """How long ago the resumes of the last day were, oldest first."""
+        return () if self._resumes is None else self._resumes.ages_s(datetime.now(UTC))
 
     def __enter__(self) -> Latcher:
         if self._file is not None:
@@ -74,6 +86,8 @@ class Latcher:
                     "refused" not in event and who != AT_START  # what is latched at the start is where it belongs
                 ):
                     self._lock(who, event.get("text", ""), outputs.row.mono_s)
+                case {"kind": "resumed"} if self._resumes is not None:
+                    self._disk.submit(self._try, partial(self._resumes.add, self._utc(outputs.row.mono_s)))
                 case {"kind": "state", "from": "fault"} | {"kind": "command", "command": "ack"} if (
                     "refused" not in event and self._file is not None
                 ):
@@ -108,7 +122,7 @@ class Latcher:
     def _try(self, act: Callable[[], None]) -> None:
         try:
             act()
-        except OSError as error:
+        except Exception as error:  # nobody looks at what a thread raises
             if not self._failing:
                 self._news.append({"kind": "latch_failed", "message": str(error)})
             self._failing = True

@@ -6,13 +6,14 @@ import asyncio
 import math
 import time
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from firmware_iface.drivers.pump_board import NO_CLAIM, PumpBoard
 from firmware_iface.role_bench import RoleDevices
-from firmware_iface.roles import Bench, BenchReading, Device, DisplacementSample, LinkError
+from firmware_iface.roles import BenchIdentity, BenchReading, Device, DisplacementSample, LinkError
 
 _READS = 100
 _LONGEST_S = 2.0  # a slow device gets fewer reads
@@ -39,6 +40,8 @@ class Probe:
         What is wrong and what to do; empty when nothing is.
     notes : str
         What to know although nothing is wrong.
+    facts : BenchIdentity or None
+        The limits of what answered.
     """
 
     role: str
@@ -49,19 +52,22 @@ class Probe:
     latency_p99_ms: float = math.nan
     problem: str = ""
     notes: str = ""
+    facts: BenchIdentity | None = None
 
 
-async def probe_board(bench: Bench, name: str) -> Probe:
-    """Open the board, read it, close it."""
+async def probe_board(board: PumpBoard, name: str) -> Probe:
+    """Look at the board, whoever holds it: nothing is written, so its claim and its watchdog stay as they are."""
     try:
-        identity = await bench.open()
-        reading, p50_ms, p99_ms = await _timed(bench.read)
+        identity = await board.identify()
+        reading, p50_ms, p99_ms = await _timed(board.read)
     except LinkError as error:
         return Probe("board", name, problem=str(error))
     finally:
-        await bench.close()
-    who = f"{identity.kind} {identity.firmware}, map {identity.map_version}, watchdog {identity.watchdog_s:g} s"
-    return Probe("board", name, who, _board_reading(reading), p50_ms, p99_ms, _board_problem(reading))
+        await board.close()
+    who = f"{identity.kind} {identity.firmware}, map {identity.map_version}"
+    said, problem = _board_reading(reading), _board_problem(reading)
+    notes = NO_CLAIM if identity.map_version == 1 else ""
+    return Probe("board", name, who, said, p50_ms, p99_ms, problem, notes, identity)
 
 
 def _board_reading(reading: BenchReading) -> str:
@@ -115,7 +121,12 @@ async def _probe(role: str, device: Device, read: Callable[[], Awaitable[Any]], 
         value = value.displacement_um
     if not problem and not math.isfinite(value):
         problem = "it answers, but has no value"
-    return Probe(role, name, identity, f"{value:.6g} {unit}", p50_ms, p99_ms, problem, notes)
+    facts = BenchIdentity(found.kind, 0, found.firmware, math.nan)
+    if role == "displacement":
+        facts = replace(facts, displacement_range_um=found.shows)
+    elif role == "gauge_pressure":
+        facts = replace(facts, gauge_range_pa=found.shows)
+    return Probe(role, name, identity, f"{value:.6g} {unit}", p50_ms, p99_ms, problem, notes, facts)
 
 
 async def _timed(read: Callable[[], Awaitable[Any]]) -> tuple[Any, float, float]:

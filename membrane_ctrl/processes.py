@@ -18,6 +18,8 @@ from collections.abc import Iterator
 from multiprocessing import resource_tracker
 from typing import Any
 
+from membrane_ctrl.terminal import only_text
+
 _CONTEXT = multiprocessing.get_context("spawn")
 _OF_THE_GROUP = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
 # Until a child has a handler for it, it simply ends.
@@ -98,7 +100,8 @@ def _main(target: str, args: tuple[Any, ...], nice: int) -> None:
     module, function = target.split(":")
     code = 0
     try:
-        getattr(importlib.import_module(module), function)(*args)
+        with only_text():
+            getattr(importlib.import_module(module), function)(*args)
     except SystemExit as leaving:
         code = leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
     sys.stdout.flush()

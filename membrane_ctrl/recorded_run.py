@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from membrane_ctrl.config import Config
 from membrane_ctrl.config_file import load
 from membrane_ctrl.errors import InputError
+from membrane_ctrl.recording.atomic import read_text
 from membrane_ctrl.recording.checked_text import comment_is_right
 from membrane_ctrl.recording.inputs_file import InputsReader
 from membrane_ctrl.replay import Decision, decisions_of
+from membrane_ctrl.review.folder import event_s, read_events
 from membrane_ctrl.telemetry import TelemetryRow
 
 # A row is found in the recording by its time, which Rerun keeps in whole nanoseconds.
@@ -36,9 +36,13 @@ class RecordedRun:
     def row_at(self, time_s: float) -> TelemetryRow | None:
         """The row that was recorded then; None if the recording does not have it."""
         from membrane_ctrl.recording.read_back import read_rows
+        from membrane_ctrl.review.rrd_salvage import FAULTS
 
         for path in sorted(self.folder.glob("*.rrd")):
-            rows = read_rows(path)
+            try:
+                rows = read_rows(path)
+            except FAULTS:
+                continue
             near = np.flatnonzero(np.abs(rows[:, 0] - time_s) < _SAME_TIME_S)
             if near.size:
                 values = rows[near[0]].tolist()
@@ -53,23 +57,10 @@ def open_run(folder: Path) -> RecordedRun:
     inputs = InputsReader(folder)
     if not inputs.paths:
         raise InputError(f"{folder}: no inputs-*.bin: this run was recorded without what a replay needs")
-    events = _events(folder / "events.jsonl")
+    events = read_events(folder, [])
     cut = not any(event.get("kind") == "end" for event in events)
-    told_until_s = max((float(event.get("mono_s") or 0.0) for event in events), default=0.0) if cut else math.inf
-    config = load(folder / "config.toml", Config)
-    right = comment_is_right((folder / "config.toml").read_text(encoding="utf-8"))
+    told_until_s = max((event_s(event) for event in events), default=0.0) if cut else math.inf
+    config = load(folder / "config.toml", Config, follow=False)
+    right = comment_is_right(read_text(folder / "config.toml"))
     damage = "" if right else "config.toml: does not fit its checksum (damaged or edited)"
     return RecordedRun(folder, config, inputs, decisions_of(events), told_until_s, damage)
-
-
-def _events(path: Path) -> list[dict[str, Any]]:
-    """Recorded events; a line that a crash tore is passed over."""
-    events = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []:
-        try:
-            event = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(event, dict):
-            events.append(event)
-    return events

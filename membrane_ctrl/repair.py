@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -13,19 +14,29 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.errors import Exit, InputError
-from membrane_ctrl.recording import events as event_lines
 from membrane_ctrl.recording import plain_json
-from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.recording.atomic import (
+    SMALL_BYTES,
+    fresh_file,
+    make_folder,
+    move,
+    read_bytes,
+    remove,
+    scratch_folder,
+    write_bytes_atomic,
+    write_text_atomic,
+)
 from membrane_ctrl.recording.checked_text import take_checksum
 from membrane_ctrl.recording.column_tables import TICKS
 from membrane_ctrl.recording.inputs_file import InputsReader
 from membrane_ctrl.recording.optimizer import optimize_command, quiet_environment
 from membrane_ctrl.recording.read_back import read_rows
 from membrane_ctrl.recording.rows import COLUMN, Rows, column
+from membrane_ctrl.recording.segment_bounds import require_bounded
 from membrane_ctrl.recording.sink import is_whole
 from membrane_ctrl.recording.summary import Summary
 from membrane_ctrl.review.column_reader import column_files
-from membrane_ctrl.review.folder import read_config
+from membrane_ctrl.review.folder import EVENTS_BYTES_MAX, event_of, read_config
 from membrane_ctrl.review.rrd_reader import REPAIRED
 from membrane_ctrl.review.run import open_run
 from membrane_ctrl.telemetry import FIELDS
@@ -98,9 +109,9 @@ def _now_s(folder: Path) -> float:
     """The file system's own time: that of another machine's disk need not be ours."""
     probe = folder / ".probe"
     try:
-        probe.touch()
-        now_s = probe.stat().st_mtime
-        probe.unlink()
+        with fresh_file(probe) as file:
+            now_s = os.fstat(file.fileno()).st_mtime
+        remove(probe)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror}); copy the run first") from None
     return now_s
@@ -109,29 +120,31 @@ def _now_s(folder: Path) -> float:
 def _target(path: Path, in_place: bool) -> Path:
     if in_place:
         return path
-    folder = path.parent / REPAIRED
-    folder.mkdir(exist_ok=True)
-    return folder / path.name
+    return make_folder(path.parent / REPAIRED) / path.name
 
 
 def _repair_segment(path: Path, in_place: bool) -> Finding:
+    try:
+        require_bounded(path)
+    except OSError as error:
+        return Finding(path.name, "torn", f"nothing could be recovered ({error.strerror})")
     if is_whole(path):
         return Finding(path.name, "whole", "")
-    part = path.with_name(f".{path.name}.part")
-    done = subprocess.run(
-        optimize_command(path, part, "--continue-on-error"),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        env=quiet_environment(),
-        timeout=_SEGMENT_TIMEOUT_S,
-        check=False,
-    )
-    if not part.exists() or not is_whole(part):
-        part.unlink(missing_ok=True)
-        why = done.stderr.decode(errors="replace").strip().splitlines()
-        return Finding(path.name, "torn", f"nothing could be recovered ({why[-1] if why else 'no data in it'})")
-    target = _target(path, in_place)
-    part.replace(target)
+    with scratch_folder(path.parent, ".repair-") as folder:
+        part = folder / path.name
+        done = subprocess.run(
+            optimize_command(path, part, "--continue-on-error"),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            env=quiet_environment(),
+            timeout=_SEGMENT_TIMEOUT_S,
+            check=False,
+        )
+        if not part.exists() or not is_whole(part):
+            why = done.stderr.decode(errors="replace").strip().splitlines()
+            return Finding(path.name, "torn", f"nothing could be recovered ({why[-1] if why else 'no data in it'})")
+        target = _target(path, in_place)
+        move(part, target)
     return Finding(path.name, "torn", f"recovered to {target.relative_to(path.parent)}")
 
 
@@ -139,13 +152,13 @@ def _repair_events(run_dir: Path, in_place: bool) -> list[Finding]:
     path = run_dir / "events.jsonl"
     if not path.exists():
         return [Finding(path.name, "missing", "the run had no event, or it was lost")]
-    data = path.read_bytes()
+    data = read_bytes(path, EVENTS_BYTES_MAX)
     good, torn = _split_events(data)
     if not torn:
         return [Finding(path.name, "whole", "")]
     target = _target(path, in_place)
-    target.with_name(f"{path.name}.torn").write_bytes(torn)
-    write_text_atomic(target, good.decode())
+    write_bytes_atomic(target.with_name(f"{path.name}.torn"), torn)
+    write_bytes_atomic(target, good)
     where = target.relative_to(run_dir)
     return [Finding(path.name, "torn", f"{len(torn)} bytes cut to {where}.torn, the rest in {where}")]
 
@@ -155,14 +168,15 @@ def _split_events(data: bytes) -> tuple[bytes, bytes]:
     good: list[bytes] = []
     torn: list[bytes] = []
     for line in data.splitlines(keepends=True):
-        (good if line.endswith(b"\n") and _is_event(line) else torn).append(line)
+        whole = line.endswith(b"\n") and event_of(line.decode(errors="replace")) is not None
+        (good if whole else torn).append(line)
     return b"".join(good), b"".join(torn)
 
 
-def _is_event(line: bytes) -> bool:
+def _is_whole_object(data: bytes) -> bool:
     try:
-        table = json.loads(line)
-    except (ValueError, RecursionError):
+        table = plain_json.loads(data.decode())
+    except ValueError:
         return False
     return isinstance(table, dict) and take_checksum(table)
 
@@ -186,8 +200,8 @@ def _look_at_config(run_dir: Path) -> list[Finding]:
 
 def _repair_summary(run_dir: Path, in_place: bool) -> Finding:
     path = run_dir / "summary.json"
-    there = path.exists()
-    if there and _is_event(path.read_bytes()):
+    there = path.is_symlink() or path.exists()
+    if there and _is_whole_object(read_bytes(path, SMALL_BYTES)):
         return Finding(path.name, "whole", "")
     table = rebuild_summary(run_dir)
     target = _target(path, in_place or not there)
@@ -214,11 +228,9 @@ def rebuild_summary(run_dir: Path) -> dict[str, Any]:
         ticks += len(frame.records)
         for estimate in frame.estimates.values():
             summary.add_shape(estimate)
-    good, _ = _split_events(path.read_bytes()) if path.exists() else (b"", b"")
+    good, _ = _split_events(read_bytes(path, EVENTS_BYTES_MAX)) if path.exists() else (b"", b"")
     for line in good.splitlines():
-        event = event_lines.parse(line)
-        take_checksum(event)
-        summary.add_event(event)
+        summary.add_event(event_of(line.decode()) or {})
     table = summary.as_dict({}, {"segments": len(_segments(run_dir))})
     table["ticks"] = max(table["ticks"], ticks)
     return {**table, "exit": table["exit"] or "crashed", "rebuilt": True}

@@ -120,11 +120,11 @@ def replay(
     Raises
     ------
     UnknownMemoryError
-        The record begins with a memory that today's code cannot take up.
+        The record begins with a memory that today's code cannot take up, or a tick raises after one was taken up.
     """
     controller = Controller(config, sag_sensitivity)
     found = Replay()
-    same_past = True
+    same_past, remembered = True, False
     for item in record:
         if isinstance(item, Gap):
             if item.time_s <= to_s:
@@ -136,11 +136,12 @@ def replay(
         if not found.ticks:
             found.begin_s = item.inputs.now_s
             if item.tick > 1 and item.memory:
-                controller, same_past = recall(item.memory, controller), True
+                controller, remembered = recall(item.memory, controller), True
         elif item.memory and not same_past:
             with suppress(UnknownMemoryError):  # then decisions only, as before
                 controller, same_past = recall(item.memory, Controller(config, sag_sensitivity)), True
-        outputs = controller.tick(item.inputs)
+                remembered = True
+        outputs = _ticked(controller, item, remembered)
         found.ticks += 1
         found.last_s = item.inputs.now_s
         found.finished = outputs.finished
@@ -148,6 +149,17 @@ def replay(
         if item.inputs.now_s >= from_s and same_past:
             _compare(item, outputs, found)
     return found
+
+
+def _ticked(controller: Controller, item: RecordedTick, remembered: bool) -> TickOutputs:
+    """A tick, which never raises by itself: if it does after a memory was taken up, the memory was forged."""
+    try:
+        return controller.tick(item.inputs)
+    except Exception as error:
+        if not remembered:
+            raise
+        what = f"{type(error).__name__} at {item.inputs.now_s:.2f} s: {error}"
+        raise UnknownMemoryError(f"the recorded memory cannot be used: {what}") from None
 
 
 def _compare(item: RecordedTick, outputs: TickOutputs, found: Replay) -> None:
@@ -160,7 +172,10 @@ def _compare(item: RecordedTick, outputs: TickOutputs, found: Replay) -> None:
 def decisions_of(events: Iterable[Event], time_s: float | None = None) -> list[Decision]:
     """The decisions among events; their time is `time_s`, or that of the event itself."""
     return [
-        Decision(event["mono_s"] if time_s is None else time_s, f"{event['kind']} {event[_DECISIONS[event['kind']]]}")
+        Decision(
+            float(event.get("mono_s") or 0.0) if time_s is None else time_s,
+            f"{event['kind']} {event[_DECISIONS[event['kind']]]}",
+        )
         for event in events
         if event.get("kind") in _DECISIONS and _DECISIONS[event["kind"]] in event
     ]
@@ -178,7 +193,7 @@ def tick_to_begin_with(frames: Iterable[Frame], from_s: float) -> int:
     return begin
 
 
-def recorded_ticks(frames: Iterable[Frame], begin: int = 1) -> Iterator[RecordedTick | Gap]:
+def recorded_ticks(frames: Iterable[Frame], begin: int = 1, memories: bool = True) -> Iterator[RecordedTick | Gap]:
     """The ticks of a record in order from the tick `begin` on, and a `Gap` wherever some are missing."""
     estimates: dict[float, ShapeEstimate] = {}
     last, last_s = begin - 1, 0.0
@@ -188,12 +203,13 @@ def recorded_ticks(frames: Iterable[Frame], begin: int = 1) -> Iterator[Recorded
             tick = int(record["tick"])
             try:
                 inputs = unpack_tick(record, frame.tails.get(tick, b""), estimates)
-            except LookupError as error:
-                yield Gap(tick - 1, last_s, 1, str(error.args[0]))
+            except (LookupError, ValueError, TypeError) as error:
+                yield Gap(tick - 1, last_s, 1, str(error.args[0] if error.args else error))
             else:
                 if tick > last + 1:
                     yield Gap(last, last_s, tick - last - 1, "not recorded")
-                yield RecordedTick(tick, inputs, int(record["output_crc"]), frame.memories.get(tick, b""))
+                memory = frame.memories.get(tick, b"") if memories else b""
+                yield RecordedTick(tick, inputs, int(record["output_crc"]), memory)
             last, last_s = tick, float(record["now_s"])
         while len(estimates) > _SHAPES_KEPT:
             del estimates[next(iter(estimates))]

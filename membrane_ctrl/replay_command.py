@@ -69,7 +69,13 @@ def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, Replay
             print(f"from the run's start: {error}", file=sys.stderr)
         finally:
             run.inputs.program = inputs.program
-    return 1, replay(run.config, recorded_ticks(run.inputs), zernike_projection(), from_s, to_s)
+    try:
+        return 1, replay(run.config, recorded_ticks(run.inputs), zernike_projection(), from_s, to_s)
+    except UnknownMemoryError as error:  # one behind a gap
+        print(f"without recorded memories: {error}", file=sys.stderr)
+        run.inputs.damage.clear()  # it is told again
+        ticks = recorded_ticks(run.inputs, memories=False)
+        return 1, replay(run.config, ticks, zernike_projection(), from_s, to_s)
 
 
 def _report(run: RecordedRun, found: Replay, begin: int, to_s: float) -> dict[str, Any]:

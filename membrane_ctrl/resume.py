@@ -1,44 +1,87 @@
-"""May a latched fault clear by itself? Only listed ones, only when their cause has stayed away, only so often."""
+"""May a latched fault clear by itself? Only listed ones, only when their cause has stayed away, only so often.
+
+Never what has vented, never what the board has latched beyond its watchdog's own trip, never a board that another
+program has taken, and nothing that a person has latched: one sign of these at any moment of the fault decides,
+whatever its first cause was.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 
-from membrane_ctrl.config import ResumeConfig
+from firmware_iface.register_map import default_map
+from membrane_ctrl.config import LimitsConfig, ResumeConfig
+from membrane_ctrl.ladder import Ladder
 from membrane_ctrl.names import Rung
-from membrane_ctrl.safety import Rule
+from membrane_ctrl.safety import Observation, Rule
 
-_DAY_S = 86_400.0
+DAY_S = 86_400.0
+WATCHDOG_MASK = default_map().fault_mask("watchdog")
+# A bleed, the actuator test and a controller's way down leave the vent at most this far open; a board that vents by
+# itself opens it fully
+VENTED_FRACTION = 0.5
 
 
 class ResumeRule:
     """Counts the resumes of the last day and how long the present cause has been away."""
 
-    def __init__(self, config: ResumeConfig) -> None:
-        self._config = config
+    def __init__(self, config: ResumeConfig, limits: LimitsConfig) -> None:
+        self._config, self._limits = config, limits
         self._resumed_s: deque[float] = deque()
         self._clear_since_s = math.nan
+        self._never = False
+        self.possible = False
+        self.clear_mask = 0
 
-    def possible(self, fault: Rule, rung: Rung, now_s: float) -> bool:
-        """The fault is on the list, the mirror was not vented, and the day's number is not used up."""
-        while self._resumed_s and now_s - self._resumed_s[0] > _DAY_S:
+    def resumed(self, at_s: float) -> None:
+        """Count a resume; one before this run has a negative time."""
+        self._resumed_s.append(at_s)
+
+    def forget(self) -> None:
+        """There is no fault: what was seen in an earlier one does not count in the next."""
+        self._clear_since_s, self._never, self.possible, self.clear_mask = math.nan, False, False, 0
+
+    def due(self, fault: Rule, ladder: Ladder, observation: Observation, now_s: float) -> bool:
+        """Look at a tick of a fault; True once the cause has stayed away for long enough.
+
+        Afterwards `possible` says whether the fault may still clear by itself, and `clear_mask` which of the board's
+        latches have to be cleared for it: the watchdog's own, or none.
+        """
+        self._never |= _decides(ladder, observation)
+        listed = fault.may_resume and fault.name in self._config.faults
+        self.possible = listed and not self._never and self._left(now_s)
+        self.clear_mask = observation.board_faults if self.possible else 0
+        if not self.possible:
+            self._clear_since_s = math.nan
+            return False
+        silent = not observation.link_up or observation.reading_age_s > self._limits.stale_s
+        gone = not (silent or self.clear_mask or fault.broken(observation, self._limits))
+        if gone and observation.reading_age_s > 0.0:
+            return False  # an answer that is lost now and then says nothing
+        return self._waited(gone, now_s)
+
+    def _left(self, now_s: float) -> bool:
+        """The day's number is not used up."""
+        while self._resumed_s and now_s - self._resumed_s[0] > DAY_S:
             self._resumed_s.popleft()
-        return (
-            fault.name in self._config.faults
-            and rung < Rung.VENT
-            and len(self._resumed_s) < self._config.most_per_day
-        )
+        return len(self._resumed_s) < self._config.most_per_day
 
-    def due(self, cause_gone: bool, now_s: float) -> bool:
-        """The cause has stayed away for long enough; True counts as a resume."""
-        if not cause_gone:
+    def _waited(self, gone: bool, now_s: float) -> bool:
+        if not gone:
             self._clear_since_s = math.nan
             return False
         if math.isnan(self._clear_since_s):
             self._clear_since_s = now_s
-        if now_s - self._clear_since_s < self._config.wait_s:
-            return False
-        self._clear_since_s = math.nan
-        self._resumed_s.append(now_s)
-        return True
+        return now_s - self._clear_since_s >= self._config.wait_s
+
+
+def _decides(ladder: Ladder, observation: Observation) -> bool:
+    """Something that only a person may clear."""
+    return (
+        ladder.rung == Rung.VENT
+        or bool(observation.board_faults & ~WATCHDOG_MASK)
+        or observation.vent_fraction > VENTED_FRACTION
+        or bool(observation.locked)
+        or bool(observation.foreign)
+    )

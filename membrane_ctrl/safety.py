@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
+from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD
 from membrane_ctrl.config import LimitsConfig
 from membrane_ctrl.names import Rung, State
 
@@ -49,6 +50,8 @@ class Observation:
         Largest of |command - read-back| that both of the last two commands agree on.
     watchdog_tripped : bool
     board_faults : int
+    foreign : int
+        What of the board's claim and watchdog is not as this run set it (`roles.FOREIGN_...`).
     lateness_ms : float
     dead_tasks : tuple of str
         Supervised tasks of the control process that ended.
@@ -58,8 +61,24 @@ class Observation:
         What the present state has waited for too long, if it has.
     unfit : str
         What the actuator test found, if anything.
+    runs_on : str
+        What the read-back says of a pump that was commanded off and ought to stand.
+    inflow : str
+        How the mirror rises although the pump is commanded off.
+    locked : str
+        Why a person has latched the mirror.
+    vent_fraction : float
+        The vent's read-back; NaN without one.
     laser_lies : str
         What the three witnesses of the sag have seen, if it is the laser that does not fit.
+    gauge_same_s : float
+        Since the readings of a taut film's gauge have been equal to the last bit.
+    gauge_jumps : int
+        Readings in a row that no film makes.
+    laser_gauge_apart : str
+        What laser and gauge have seen, if both cannot be true.
+    gas_excess : str
+        How much more gas the film takes than it used to, if no camera sees that it stands still.
     """
 
     link_up: bool
@@ -80,6 +99,15 @@ class Observation:
     unfit: str = ""
     same_s: float = 0.0
     laser_lies: str = ""
+    runs_on: str = ""
+    inflow: str = ""
+    locked: str = ""
+    vent_fraction: float = math.nan
+    foreign: int = 0
+    gauge_same_s: float = 0.0
+    gauge_jumps: int = 0
+    laser_gauge_apart: str = ""
+    gas_excess: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,15 +121,34 @@ class Rule:
     code: int
     name: str
     cause: str
-    needed: int
-    window: int
     limit: str
     rung: Rung
-    latching: bool
-    states: Collection[State]
     remedy: str
     broken: Callable[[Observation, LimitsConfig], bool]
+    seen_in: tuple[int, int] = (1, 1)  # ticks that must show the cause, of so many
+    states: Collection[State] = MOVING
+    resumable: bool = True  # `resume.faults` may name it
     unseen: Callable[[Observation], bool] = lambda o: False
+
+    @property
+    def needed(self) -> int:
+        """Ticks of the window that must show the cause."""
+        return self.seen_in[0]
+
+    @property
+    def window(self) -> int:
+        """Ticks that are looked back at."""
+        return self.seen_in[1]
+
+    @property
+    def latching(self) -> bool:
+        """Whether the fault stays until somebody acknowledges it."""
+        return self.rung > Rung.HOLD_FLOW
+
+    @property
+    def may_resume(self) -> bool:
+        """Whether it may ever clear by itself: never what has vented."""
+        return self.resumable and self.rung < Rung.VENT
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,270 +163,305 @@ class Verdict:
 # fill, and two ticks are 40 ms, in which the pump moves the film by 0.2 um.
 _TWICE = (2, 3)
 # The pump needs its lag (0.15 s) and the dead time of a tick or two to follow a command.
-_FOLLOWED = (50, 50)
+# What the loop's own noise moves the command by hides a constant difference in some ticks.
+_FOLLOWED = (40, 50)
 # The loop holds its mean flow over any tick without a reading; one repeated sample of a busy device is no fault yet.
 _A_FEW = (3, 3)
 
 TABLE: tuple[Rule, ...] = (
     Rule(
-        20,
-        "over_pressure",
-        "gauge pressure above its limit",
-        *_TWICE,
-        "limits.gauge_pressure_max_pa",
-        Rung.VENT,
-        True,
-        ALWAYS,
-        "find what over-filled the mirror before it is inflated again",
-        lambda o, c: o.gauge_pressure_pa > c.gauge_pressure_max_pa,
-        lambda o: math.isnan(o.gauge_pressure_pa),
+        code=20,
+        name="over_pressure",
+        cause="gauge pressure above its limit",
+        seen_in=_TWICE,
+        limit="limits.gauge_pressure_max_pa",
+        rung=Rung.VENT,
+        states=ALWAYS,
+        remedy="find what over-filled the mirror before it is inflated again",
+        broken=lambda o, c: o.gauge_pressure_pa > c.gauge_pressure_max_pa,
+        unseen=lambda o: math.isnan(o.gauge_pressure_pa),
     ),
     Rule(
-        21,
-        "over_displacement",
-        "the bowl is deeper than its limit",
-        *_TWICE,
-        "limits.displacement_max_um",
-        Rung.VENT,
-        True,
-        ALWAYS,
-        "check the laser against a ruler, then the setpoint and the limits",
-        lambda o, c: o.displacement_um > c.displacement_max_um,
-        lambda o: math.isnan(o.displacement_um),
+        code=21,
+        name="over_displacement",
+        cause="the bowl is deeper than its limit",
+        seen_in=_TWICE,
+        limit="limits.displacement_max_um",
+        rung=Rung.VENT,
+        states=ALWAYS,
+        remedy="check the laser against a ruler, then the setpoint and the limits",
+        broken=lambda o, c: o.displacement_um > c.displacement_max_um,
+        unseen=lambda o: math.isnan(o.displacement_um),
     ),
     Rule(
-        50,
-        "tick_error",
-        "the control code raised an error",
-        1,
-        1,
-        "none may happen",
-        Rung.PUMP_OFF,
-        True,
-        NOT_YET_FAULT,
-        "report it with the run folder",
-        lambda o, c: bool(o.tick_error),
+        code=35,
+        name="pump_runs_on",
+        cause="the pump does not stop when it is commanded off",
+        limit="states.lower_timeout_s",
+        rung=Rung.VENT,
+        states=ALWAYS,
+        remedy="cut the pump's power or shut its gas; then check its drive and wiring",
+        broken=lambda o, c: bool(o.runs_on),
     ),
     Rule(
-        41,
-        "dead_task",
-        "a task of the control process ended",
-        1,
-        1,
-        "none may end",
-        Rung.PUMP_OFF,
-        True,
-        NOT_YET_FAULT,
-        "report it with the run folder",
-        lambda o, c: bool(o.dead_tasks),
+        code=36,
+        name="gas_comes_in",
+        cause="the mirror rises although the pump is commanded off",
+        limit="30 um in 20 s beyond what the weather explains",
+        rung=Rung.VENT,
+        states=ALWAYS - MOVING,
+        remedy="cut the pump's power or shut its gas: its read-back may be wrong, or gas comes another way",
+        broken=lambda o, c: bool(o.inflow),
     ),
     Rule(
-        30,
-        "link_lost",
-        "the link to the pump board is down",
-        1,
-        1,
-        "must be up",
-        Rung.PUMP_OFF,
-        True,
-        CONNECTED,
-        "check cable, power and address; the board's watchdog has stopped the pump",
-        lambda o, c: not o.link_up,
+        code=51,
+        name="locked",
+        cause="a person has latched the mirror",
+        limit="ctl ack",
+        rung=Rung.PUMP_OFF,
+        states=CONNECTED | {State.FAULT},
+        remedy="see with whoever latched it that the mirror may move",
+        broken=lambda o, c: bool(o.locked),
+        resumable=False,
     ),
     Rule(
-        31,
-        "device_silent",
-        "the device link is up, but no answer came in time",
-        1,
-        1,
-        "limits.stale_s",
-        Rung.PUMP_OFF,
-        True,
-        CONNECTED,
-        "check the board; its watchdog has stopped the pump",
-        lambda o, c: o.reading_age_s > c.stale_s,
+        code=50,
+        name="tick_error",
+        cause="the control code raised an error",
+        limit="none may happen",
+        rung=Rung.PUMP_OFF,
+        states=NOT_YET_FAULT,
+        remedy="report it with the run folder",
+        broken=lambda o, c: bool(o.tick_error),
     ),
     Rule(
-        32,
-        "watchdog_tripped",
-        "the board's watchdog stopped the pump",
-        1,
-        1,
-        "must not trip",
-        Rung.PUMP_OFF,
-        True,
-        MOVING,
-        "look at the lateness in the recording; the machine may be overloaded",
-        lambda o, c: o.watchdog_tripped,
+        code=41,
+        name="dead_task",
+        cause="a task of the control process ended",
+        limit="none may end",
+        rung=Rung.PUMP_OFF,
+        states=NOT_YET_FAULT,
+        remedy="report it with the run folder",
+        broken=lambda o, c: bool(o.dead_tasks),
     ),
     Rule(
-        33,
-        "board_fault",
-        "the board has latched a fault of its own",
-        1,
-        1,
-        "must be 0",
-        Rung.PUMP_OFF,
-        True,
-        MOVING,
-        "read the board's fault bits (docs/registers.md)",
-        lambda o, c: o.board_faults != 0,
+        code=30,
+        name="link_lost",
+        cause="the link to the pump board is down",
+        limit="must be up",
+        rung=Rung.PUMP_OFF,
+        states=CONNECTED,
+        remedy="check cable, power and address; the board's watchdog has stopped the pump",
+        broken=lambda o, c: not o.link_up,
     ),
     Rule(
-        34,
-        "pump_mismatch",
-        "the pump's read-back does not follow its command",
-        *_FOLLOWED,
-        "0.05 of full scale",
-        Rung.PUMP_OFF,
-        True,
-        MOVING,
-        "check the pump's drive and its limits on the board",
-        lambda o, c: o.pump_mismatch > 0.05,
+        code=31,
+        name="device_silent",
+        cause="the device link is up, but no answer came in time",
+        limit="limits.stale_s",
+        rung=Rung.PUMP_OFF,
+        states=CONNECTED,
+        remedy="check the board; its watchdog has stopped the pump",
+        broken=lambda o, c: o.reading_age_s > c.stale_s,
     ),
     Rule(
-        12,
-        "displacement_frozen",
-        "the device answers, but its samples do not advance",
-        1,
-        1,
-        "limits.stale_s",
-        Rung.HOLD_FLOW,
-        False,
-        MOVING,
-        "restart the sensor",
-        lambda o, c: o.advance_age_s > c.stale_s,
+        code=37,
+        name="board_taken",
+        cause="the board's claim or watchdog is no longer as this run set it",
+        limit="as set by this run",
+        rung=Rung.PUMP_OFF,
+        states=NOT_YET_FAULT,
+        remedy="find the other program that controls the board, and stop one of the two",
+        broken=lambda o, c: o.foreign != 0,
+        resumable=False,
     ),
     Rule(
-        14,
-        "laser_implausible",
-        "camera and gauge agree that the laser does not show where the mirror is",
-        1,
-        1,
-        "shape.disagreement_max_um",
-        Rung.HOLD_FLOW,
-        False,
-        HOLDING,
-        "look for a knocked laser mount; then take a new reference with `ctl shape off` and `ctl shape on`",
-        lambda o, c: bool(o.laser_lies),
+        code=32,
+        name="watchdog_tripped",
+        cause="the board's watchdog stopped the pump",
+        limit="must not trip",
+        rung=Rung.PUMP_OFF,
+        states=CONNECTED,
+        remedy="look at the lateness in the recording; the machine may be overloaded",
+        broken=lambda o, c: o.watchdog_tripped,
     ),
     Rule(
-        15,
-        "displacement_stuck",
-        "the laser repeats one value to the last bit",
-        1,
-        1,
-        "limits.stuck_s",
-        Rung.HOLD_FLOW,
-        False,
-        MOVING,
-        "restart the sensor; with coarse steps and a calm mirror raise limits.stuck_s",
-        lambda o, c: o.displacement_valid and o.same_s > c.stuck_s,
+        code=33,
+        name="board_fault",
+        cause="the board has latched a fault of its own",
+        limit="must be 0",
+        rung=Rung.PUMP_OFF,
+        states=CONNECTED,
+        remedy="read the board's fault bits (docs/registers.md)",
+        broken=lambda o, c: o.board_faults != 0,
+        resumable=False,
     ),
     Rule(
-        13,
-        "displacement_jump",
-        "the laser reading jumped further than a film can",
-        5,
-        10,
-        "limits.step_max_um",
-        Rung.HOLD_FLOW,
-        False,
-        MOVING,
-        "look for something in the beam or a bumped laser",
-        lambda o, c: o.jumps > 0,
+        code=34,
+        name="pump_mismatch",
+        cause="the pump's read-back does not follow its command",
+        seen_in=_FOLLOWED,
+        limit="0.05 of full scale",
+        rung=Rung.PUMP_OFF,
+        remedy="check the pump's drive and its limits on the board",
+        broken=lambda o, c: o.pump_mismatch > 0.05,
+        resumable=False,
     ),
     Rule(
-        10,
-        "displacement_missing",
-        "no valid laser reading",
-        *_A_FEW,
-        "3 ticks in a row",
-        Rung.HOLD_FLOW,
-        False,
-        MOVING,
-        "check the laser's aim and its error code",
-        lambda o, c: not o.displacement_valid,
+        code=12,
+        name="displacement_frozen",
+        cause="the device answers, but its samples do not advance",
+        limit="limits.stale_s",
+        rung=Rung.HOLD_FLOW,
+        remedy="restart the sensor",
+        broken=lambda o, c: o.advance_age_s > c.stale_s,
     ),
     Rule(
-        24,
-        "pressure_missing",
-        "no gauge pressure",
-        10,
-        10,
-        "every tick",
-        Rung.RAMP_DOWN,
-        True,
-        MOVING,
-        "check the pressure sensor: without it over-pressure is not seen",
-        lambda o, c: not math.isfinite(o.gauge_pressure_pa) and o.reading_age_s == 0,
-        lambda o: o.reading_age_s > 0,
+        code=14,
+        name="laser_implausible",
+        cause="camera and gauge agree that the laser does not show where the mirror is",
+        limit="shape.disagreement_max_um",
+        rung=Rung.HOLD_FLOW,
+        states=HOLDING,
+        remedy="look for a knocked laser mount; then take a new reference with `ctl shape off` and `ctl shape on`",
+        broken=lambda o, c: bool(o.laser_lies),
     ),
     Rule(
-        22,
-        "under_displacement",
-        "the bowl is shallower than its limit",
-        *_TWICE,
-        "limits.displacement_min_um",
-        Rung.RAMP_DOWN,
-        True,
-        HOLDING,
-        "look for a leak or a laser that was moved",
-        lambda o, c: o.displacement_um < c.displacement_min_um,
-        lambda o: math.isnan(o.displacement_um),
+        code=18,
+        name="laser_gauge_apart",
+        cause="laser and gauge do not show the same film",
+        limit="limits.laser_gauge_apart_max_um, limits.laser_gauge_drift_max_um",
+        rung=Rung.RAMP_DOWN,
+        states=CONNECTED,
+        resumable=False,
+        remedy="see which of them is wrong: laser mount, gauge hose, units; for another film set [optics.mirror] "
+        "sag_mm and pressure_pa",
+        broken=lambda o, c: bool(o.laser_gauge_apart),
     ),
     Rule(
-        23,
-        "following_error",
-        "the mirror does not follow its setpoint",
-        100,
-        100,
-        "limits.following_error_max_um",
-        Rung.RAMP_DOWN,
-        True,
-        HOLDING,
-        "look for a leak, a stuck pump or a mirror that is too tight",
-        lambda o, c: abs(o.error_um) > c.following_error_max_um,
-        lambda o: math.isnan(o.error_um),
+        code=16,
+        name="gauge_stuck",
+        cause="the gauge repeats one value to the last bit",
+        limit="limits.gauge_stuck_s",
+        rung=Rung.RAMP_DOWN,
+        remedy="restart the gauge; if it filters its noise below its own resolution raise limits.gauge_stuck_s",
+        broken=lambda o, c: o.gauge_same_s > c.gauge_stuck_s,
+        unseen=lambda o: math.isnan(o.gauge_pressure_pa),
     ),
     Rule(
-        25,
-        "overdue",
-        "a state took too long",
-        1,
-        1,
-        "[states] time-outs",
-        Rung.RAMP_DOWN,
-        True,
-        CONNECTED,
-        "see what it waited for; a fill from flat needs states.inflate_timeout_s of hours",
-        lambda o, c: bool(o.overdue),
+        code=19,
+        name="gas_excess",
+        cause="the film takes far more gas than it used to, and no camera sees it stand still",
+        limit="limits.leak_growth_max",
+        rung=Rung.RAMP_DOWN,
+        states=HOLDING,
+        resumable=False,
+        remedy="look for an opening seam, then for a laser that creeps: compare it with a ruler",
+        broken=lambda o, c: bool(o.gas_excess),
     ),
     Rule(
-        26,
-        "actuator_test",
-        "the film does not answer to pump or vent",
-        1,
-        1,
-        "actuator_test.py",
-        Rung.PUMP_OFF,
-        True,
-        {State.CHECK},
-        "check hoses, valve and pump, and where the laser points",
-        lambda o, c: bool(o.unfit),
+        code=17,
+        name="gauge_jump",
+        cause="the gauge reading jumped further than a film can",
+        seen_in=(5, 10),
+        limit="limits.gauge_step_max_pa",
+        rung=Rung.HOLD_FLOW,
+        remedy="look at the gauge's hose and plug",
+        broken=lambda o, c: o.gauge_jumps > 0,
     ),
     Rule(
-        40,
-        "late",
-        "ticks start too late to be a control loop",
-        5,
-        10,
-        "limits.lateness_max_ms",
-        Rung.RAMP_DOWN,
-        True,
-        MOVING,
-        "take other work off this machine",
-        lambda o, c: o.lateness_ms > c.lateness_max_ms,
+        code=15,
+        name="displacement_stuck",
+        cause="the laser repeats one value to the last bit",
+        limit="limits.stuck_s",
+        rung=Rung.HOLD_FLOW,
+        remedy="restart the sensor; with coarse steps and a calm mirror raise limits.stuck_s",
+        broken=lambda o, c: o.displacement_valid and o.same_s > c.stuck_s,
+    ),
+    Rule(
+        code=13,
+        name="displacement_jump",
+        cause="the laser reading jumped further than a film can",
+        seen_in=(5, 10),
+        limit="limits.step_max_um",
+        rung=Rung.HOLD_FLOW,
+        remedy="look for something in the beam or a bumped laser",
+        broken=lambda o, c: o.jumps > 0,
+    ),
+    Rule(
+        code=10,
+        name="displacement_missing",
+        cause="no valid laser reading",
+        seen_in=_A_FEW,
+        limit="3 ticks in a row",
+        rung=Rung.HOLD_FLOW,
+        remedy="check the laser's aim and its error code",
+        broken=lambda o, c: not o.displacement_valid,
+    ),
+    Rule(
+        code=24,
+        name="pressure_missing",
+        cause="no gauge pressure",
+        seen_in=(10, 10),
+        limit="every tick",
+        rung=Rung.RAMP_DOWN,
+        remedy="check the pressure sensor: without it over-pressure is not seen",
+        broken=lambda o, c: not math.isfinite(o.gauge_pressure_pa) and o.reading_age_s == 0,
+        unseen=lambda o: o.reading_age_s > 0,
+    ),
+    Rule(
+        code=22,
+        name="under_displacement",
+        cause="the bowl is shallower than its limit",
+        seen_in=_TWICE,
+        limit="limits.displacement_min_um",
+        rung=Rung.RAMP_DOWN,
+        states=HOLDING,
+        remedy="look for a leak or a laser that was moved",
+        broken=lambda o, c: o.displacement_um < c.displacement_min_um,
+        unseen=lambda o: math.isnan(o.displacement_um),
+    ),
+    Rule(
+        code=23,
+        name="following_error",
+        cause="the mirror does not follow its setpoint",
+        seen_in=(100, 100),
+        limit="limits.following_error_max_um",
+        rung=Rung.RAMP_DOWN,
+        states=HOLDING,
+        remedy="look for a leak, a stuck pump or a mirror that is too tight",
+        broken=lambda o, c: abs(o.error_um) > c.following_error_max_um,
+        unseen=lambda o: math.isnan(o.error_um),
+    ),
+    Rule(
+        code=25,
+        name="overdue",
+        cause="a state took too long",
+        limit="[states] time-outs",
+        rung=Rung.RAMP_DOWN,
+        states=CONNECTED,
+        remedy="see what it waited for; a fill from flat needs states.inflate_timeout_s of hours",
+        broken=lambda o, c: bool(o.overdue),
+    ),
+    Rule(
+        code=26,
+        name="actuator_test",
+        cause="the film does not answer to pump or vent",
+        limit="actuator_test.py",
+        rung=Rung.PUMP_OFF,
+        states={State.CHECK},
+        remedy="check hoses, valve and pump, and where the laser points",
+        broken=lambda o, c: bool(o.unfit),
+    ),
+    Rule(
+        code=40,
+        name="late",
+        cause="ticks start too late to be a control loop",
+        seen_in=(5, 10),
+        limit="limits.lateness_max_ms",
+        rung=Rung.RAMP_DOWN,
+        remedy="take other work off this machine",
+        broken=lambda o, c: o.lateness_ms > c.lateness_max_ms,
     ),
 )
 
@@ -414,6 +496,9 @@ class SafetyTable:
         return Verdict(tripped, _seen(tripped, observation) if tripped else "")
 
 
+_FOREIGN = {FOREIGN_CLAIM: "another claim is in force", FOREIGN_PERIOD: "another watchdog period is in force"}
+
+
 def _seen(rule: Rule, observation: Observation) -> str:
     """The observed value behind a trip, for the one line the operator reads."""
     match rule.name:
@@ -427,6 +512,14 @@ def _seen(rule: Rule, observation: Observation) -> str:
             return f"{observation.reading_age_s:.2f} s"
         case "laser_implausible":
             return observation.laser_lies
+        case "laser_gauge_apart":
+            return observation.laser_gauge_apart
+        case "gas_excess":
+            return observation.gas_excess
+        case "gauge_stuck":
+            return f"{observation.gauge_pressure_pa:.1f} Pa for {observation.gauge_same_s:.0f} s"
+        case "gauge_jump":
+            return f"{observation.gauge_pressure_pa:.1f} Pa"
         case "displacement_stuck":
             return f"{observation.same_s:.1f} s"
         case "displacement_frozen":
@@ -435,6 +528,14 @@ def _seen(rule: Rule, observation: Observation) -> str:
             return f"{observation.lateness_ms:.0f} ms"
         case "board_fault":
             return f"bits {observation.board_faults:#x}"
+        case "pump_runs_on":
+            return observation.runs_on
+        case "gas_comes_in":
+            return observation.inflow
+        case "locked":
+            return observation.locked
+        case "board_taken":
+            return " and ".join(words for bit, words in _FOREIGN.items() if observation.foreign & bit)
         case "dead_task":
             return ", ".join(observation.dead_tasks)
         case "tick_error":

@@ -22,12 +22,14 @@ from membrane_ctrl.errors import Exit
 from membrane_ctrl.ladder import Ladder
 from membrane_ctrl.names import Rung, State
 from membrane_ctrl.observer import Observer
+from membrane_ctrl.standstill import Standstill
 
 # a pump that someone left running has run down by then: lag 0.15 s, transport 0.1 s (docs/physics.md, inner loop)
 _PUMP_STANDS_S = 0.5
-_VENTED_S = 900.0  # twice what the twin's valve takes from 600 Pa; the pump is off, so it is only said
-
-Way = Literal["stop", "lower", "vent"]
+_VENTED_S = 900.0  # twice what the twin's valve takes from 600 Pa; longer means a shut vent or a wrong gauge
+# A `stop` of a pump that does not obey: the vent has been open and the pump commanded off for so long, and whoever
+# waits is told that it runs on. Shorter than the 30 s that the service manager gives a stop.
+_STOP_GIVES_UP_S = 10.0
 
 
 @dataclass(slots=True)
@@ -39,6 +41,7 @@ class Scene:
     loop: InnerLoop
     observer: Observer
     ladder: Ladder
+    standstill: Standstill
     setpoint_um: float
     # this tick
     now_s: float = 0.0
@@ -49,9 +52,12 @@ class Scene:
     hold_wanted: bool = False
     manual_wanted: bool = False
     manual_um_per_s: float = 0.0
+    manual_since_s: float = math.nan  # the last `manual` command
+    mean_flow_um_per_s: float = 0.0  # the pump's when a person took it
     paused: bool = False
     trial: Trial | None = None  # an experiment, until its end has been told
-    way_down: Way | None = None
+    way_down: Literal["stop", "lower"] | None = None
+    venting: bool = False  # on the way down, and after a `stop` as well
     asked_by: str = ""
     stop_exit: Exit = Exit.DONE
     acknowledged: bool = False
@@ -165,7 +171,7 @@ def hold(scene: Scene) -> State:
         scene.pump_fraction = scene.output.pump_fraction
         scene.vent_fraction = scene.loop_config.bleed_fraction
         scene.why = f"paused by {scene.asked_by}: the pump gives its mean flow"
-        if scene.stay_good(True) > scene.config.states.pause_max_s:
+        if scene.stay_good(True) > scene.config.states.pause_max_s or _strayed(scene):
             scene.paused = False
         return State.HOLD
     scene.good_since_s = math.nan
@@ -180,6 +186,12 @@ def manual(scene: Scene) -> State:
     if scene.hold_wanted:
         scene.why = f"{scene.asked_by} asked to hold the mirror again"
         _keep_flowing(scene)
+        return State.INFLATE
+    if over := _manual_over(scene):
+        scene.output = scene.loop.follow(_given(scene, scene.setpoint_um), scene.mean_flow_um_per_s, scene.dt_s)
+        scene.pump_fraction = scene.output.pump_fraction
+        scene.vent_fraction = scene.loop_config.bleed_fraction
+        scene.why = f"manual is over: {over}"
         return State.INFLATE
     output = scene.output = scene.loop.follow(_given(scene, scene.setpoint_um), scene.manual_um_per_s, scene.dt_s)
     scene.pump_fraction = output.pump_fraction
@@ -220,12 +232,21 @@ def tune(scene: Scene) -> State:
 
 
 def lower(scene: Scene) -> State:
-    """The way down: pump off, seen to be off; the leak lets the mirror down by itself, or the vent does."""
-    way = scene.way_down or "lower"
+    """The way down: pump off, and seen to be off; the leak lets the mirror down by itself, or the vent does.
+
+    What ends it is read-back and pressure, never a time-out: a pump that runs on is a fault (`pump_runs_on`).
+    """
     scene.hold_wanted = False
-    timed_out = scene.state_age_s > scene.config.states.lower_timeout_s
-    if way == "vent":
-        scene.vent_fraction = 1.0
+    scene.vent_fraction = float(scene.venting)
+    stand = scene.standstill
+    scene.why = f"{_way(scene)} asked for by {scene.asked_by}: pump off"
+    if scene.way_down == "stop":
+        if stand.silent_s > scene.config.states.lower_timeout_s:
+            scene.finished = Exit.DEVICE_FAILED  # nobody can see whether the pump stands
+        elif stand.at_rest:
+            scene.finished = scene.stop_exit
+        return State.LOWER
+    if scene.venting:
         reading = scene.observer.reading
         pressure_pa = reading.gauge_pressure_pa if reading else math.nan
         scene.why = f"venting: {pressure_pa:.0f} Pa left"
@@ -233,12 +254,7 @@ def lower(scene: Scene) -> State:
             scene.why += f" after {scene.state_age_s / 60:.0f} min: see whether the vent opens and the gauge reads"
         if not pressure_pa < scene.config.states.vented_pressure_pa:
             return State.LOWER
-    else:
-        scene.why = f"{way} asked for by {scene.asked_by}: pump off"
-        if not (_pump_seen_off(scene) or timed_out):
-            return State.LOWER
-    if way == "stop":
-        scene.finished = scene.stop_exit if scene.observer.reading is not None else Exit.DEVICE_FAILED
+    if not stand.seen_off:
         return State.LOWER
     scene.way_down = None
     return State.STANDBY
@@ -249,26 +265,39 @@ def fault(scene: Scene) -> State:
     rung = scene.ladder.step(scene.now_s)
     scene.why = f"fault: {rung.name.lower().replace('_', ' ')}"
     scene.hold_wanted = False
+    scene.vent_fraction = float(scene.venting or rung == Rung.VENT)
     if rung == Rung.RAMP_DOWN:
         if scene.state_age_s == 0:
             scene.ramp_from_fraction = scene.last_pump_fraction
         left = max(0.0, 1.0 - scene.ladder.age_s(scene.now_s) / scene.config.states.ramp_down_s)
         scene.pump_fraction = left * scene.ramp_from_fraction
         return State.FAULT
-    scene.vent_fraction = 1.0 if rung == Rung.VENT else 0.0
-    off = _pump_seen_off(scene) or scene.ladder.age_s(scene.now_s) > scene.config.states.lower_timeout_s
-    if scene.acknowledged and off:
+    stops = scene.way_down == "stop"
+    stand = scene.standstill
+    silent = stand.silent_s > scene.config.states.lower_timeout_s
+    if scene.acknowledged and (stand.seen_off or silent):
         scene.why = f"fault acknowledged by {scene.asked_by}"
         return State.STANDBY
-    if scene.may_resume and off:
+    if scene.may_resume and stand.seen_off and not stops:
         scene.hold_wanted = True
         scene.why = "the cause has gone and may resume by itself"
         return State.STANDBY
-    if off and scene.way_down == "stop":
-        scene.finished = Exit.SAFETY_TRIP
-    if off and not scene.config.states.stay_after_trip and not scene.resume_possible:
+    may_end = stops or not (scene.config.states.stay_after_trip or scene.resume_possible)
+    if may_end and (stand.at_rest or silent or _nothing_left_to_do(scene, rung)):
         scene.finished = Exit.SAFETY_TRIP
     return State.FAULT
+
+
+def _nothing_left_to_do(scene: Scene, rung: Rung) -> bool:
+    """A pump that does not obey: the vent is open, and the mirror is empty or has been given the time to get so.
+
+    Until then the run goes on, for its last command is then not the only one that tells the pump to stop.
+    """
+    if rung != Rung.VENT:
+        return False
+    reading, vented_s = scene.observer.reading, scene.ladder.age_s(scene.now_s)
+    empty = reading is not None and reading.gauge_pressure_pa < scene.config.states.vented_pressure_pa
+    return vented_s > (_STOP_GIVES_UP_S if empty or scene.way_down == "stop" else _VENTED_S)
 
 
 HANDLERS: dict[State, Callable[[Scene], State]] = {
@@ -285,8 +314,30 @@ HANDLERS: dict[State, Callable[[Scene], State]] = {
 
 
 def _go_down(scene: Scene) -> State:
-    scene.why = f"{scene.way_down} asked for by {scene.asked_by}"
+    scene.why = f"{_way(scene)} asked for by {scene.asked_by}"
     return State.LOWER
+
+
+def _way(scene: Scene) -> str:
+    return "vent" if scene.venting and scene.way_down == "lower" else str(scene.way_down)
+
+
+def _strayed(scene: Scene) -> bool:
+    """The mirror is further from its setpoint than it may get while no loop holds it."""
+    away_um = abs(scene.observer.displacement_um - scene.setpoint_um - scene.trim_um)
+    return away_um > scene.config.states.manual_range_um
+
+
+def _manual_over(scene: Scene) -> str:
+    """Why the loop takes the mirror back from whoever set the flow; empty if it does not."""
+    states = scene.config.states
+    if scene.ladder.rung != Rung.NONE:
+        return "the safety table holds the mean flow"
+    if _strayed(scene):
+        return f"more than {states.manual_range_um:g} um from the setpoint"
+    if scene.now_s - scene.manual_since_s > states.manual_max_s:
+        return f"no flow was set for {states.manual_max_s:g} s"
+    return ""
 
 
 def _keep_flowing(scene: Scene) -> None:
@@ -306,6 +357,7 @@ def _asked_elsewhere(scene: Scene) -> State | None:
     if scene.manual_wanted:
         scene.hold_wanted = False
         scene.why = f"{scene.asked_by} has taken the pump"
+        scene.mean_flow_um_per_s = scene.loop.mean_flow_um_per_s
         _keep_flowing(scene)
         return State.MANUAL
     return None
@@ -378,11 +430,6 @@ def _missing(scene: Scene) -> str:
     if reading.latched_faults:
         return f"the board has latched faults {reading.latched_faults:#x}"
     return ""
-
-
-def _pump_seen_off(scene: Scene) -> bool:
-    reading = scene.observer.reading
-    return scene.state_age_s > 0 and reading is not None and reading.pump_fraction <= 0.001
 
 
 def _why_hold(scene: Scene, output: LoopOutput) -> str:

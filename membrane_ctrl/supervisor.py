@@ -9,10 +9,10 @@ from __future__ import annotations
 import asyncio
 import json
 import math
-import pickle
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 from firmware_iface.roles import Bench, BenchCommand, BenchReading, LinkDownError, LinkError
 from membrane_ctrl.clock import RunClock
@@ -20,7 +20,7 @@ from membrane_ctrl.commands import Command
 from membrane_ctrl.controller import Controller
 from membrane_ctrl.controller_memory import remember
 from membrane_ctrl.errors import Exit
-from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.estimate import ShapeEstimate, unpack_estimate
 from membrane_ctrl.ipc.ring import RingReader, RingWriter
 from membrane_ctrl.tick import Event, TickInputs, TickOutputs
 from membrane_ctrl.tick_record import pack_tick
@@ -45,9 +45,9 @@ class Wiring:
     shapes: RingReader | None = None
     truth: Callable[[], tuple[float, float]] | None = None  # (displacement_um, laser_bias_um) of the twin
     reports: Callable[[], list[Event]] = list  # what the children have said since the last call
-    tasks: dict[str, asyncio.Task[None]] = field(default_factory=dict)
-    heard: Sequence[Callable[[TickOutputs], None]] = ()  # who wants to know what each tick decided; must not raise
-    told: Sequence[Callable[[Event], None]] = ()  # who wants to know what the children report; must not raise
+    # who wants to know what each tick decided, and what the children report; one that raises is a fault
+    heard: Mapping[str, Callable[[TickOutputs], None]] = field(default_factory=dict)
+    told: Mapping[str, Callable[[Event], None]] = field(default_factory=dict)
 
 
 class Supervisor:
@@ -73,10 +73,11 @@ class Supervisor:
         self._pending: list[Command] = []
         self._link_up = True
         self._link_error = ""
-        self._inputs_error = ""
+        self._inputs_error = self._shape_error = ""
         self._next_watch_s = 0.0
         self._next_memory_s = MEMORY_EVERY_S
         self._vent_fraction = 0.0
+        self._broken: dict[str, str] = {}  # parts of the program that raised, with what
         self.ticks = 0
         self.missed_ticks = 0
 
@@ -122,7 +123,7 @@ class Supervisor:
         reading = await self._read() if self._link_up else None
         if now_s >= self._next_watch_s:
             self._next_watch_s = now_s + _CHILD_WATCH_S
-            self._watch()
+            self._guarded("children", self._watch)
         truth_um, bias_um = wiring.truth() if wiring.truth else (math.nan, math.nan)
         commands, self._pending = tuple(self._pending), []
         inputs = TickInputs(
@@ -134,21 +135,21 @@ class Supervisor:
             link_up=self._link_up,
             estimate=self._newest_shape(),
             commands=commands,
-            dead_tasks=tuple(name for name, task in wiring.tasks.items() if task.done()),
+            dead_tasks=(*wiring.bench.dead_guards(), *self._broken.values()),
             truth_displacement_um=truth_um,
             truth_laser_bias_um=bias_um,
         )
         memory = self._remember(now_s)
         outputs = self._controller.tick(inputs)
         self._vent_fraction = outputs.command.vent_fraction
-        if outputs.clear_board:
-            await self._clear_board()
+        if outputs.clear_mask:
+            await self._clear_board(outputs.clear_mask)
         await self._write(outputs.command)
         self._record(inputs, outputs, memory)
         for event in outputs.events:
             self.tell(event)
-        for hear in wiring.heard:
-            hear(outputs)
+        for name, hear in wiring.heard.items():
+            self._guarded(name, partial(hear, outputs))
         return outputs.finished
 
     def _remember(self, now_s: float) -> bytes:
@@ -191,9 +192,9 @@ class Supervisor:
         self._link_up, self._link_error = True, ""
         self.tell({"kind": "link", "message": "connected again"})
 
-    async def _clear_board(self) -> None:
+    async def _clear_board(self, mask: int) -> None:
         try:
-            await self._wiring.bench.clear_faults()
+            await self._wiring.bench.clear_faults(mask)
         except LinkError as error:
             self._link_failed(error)
 
@@ -219,16 +220,27 @@ class Supervisor:
         messages = self._wiring.shapes.drain()
         if not messages:
             return None
-        estimate = pickle.loads(messages[-1])
-        assert isinstance(estimate, ShapeEstimate)
-        return estimate
+        try:
+            return unpack_estimate(messages[-1])
+        except ValueError as error:  # as good as no shape, which the shape loop bears
+            if str(error) != self._shape_error:
+                self._shape_error = str(error)
+                self.tell({"kind": "shape_unreadable", "message": str(error)})
+            return None
 
     def _watch(self) -> None:
         """The hold goes on without its children, and says so."""
         for report in self._wiring.reports():
             self.tell(report)
-            for told in self._wiring.told:
-                told(report)
+            for name, told in self._wiring.told.items():
+                self._guarded(name, partial(told, report))
+
+    def _guarded(self, name: str, act: Callable[[], None]) -> None:
+        """Let a part of the program act. If it raises, the next tick sees it (`dead_task`) and goes down in order."""
+        try:
+            act()
+        except Exception as error:
+            self._broken.setdefault(name, f"{name} ({type(error).__name__}: {error})")
 
 
 def _line(event: Event, most_bytes: int) -> bytes:

@@ -76,8 +76,8 @@ class TickOutputs:
         The run is over, with this exit code.
     answers : tuple of (int, str)
         Number of each command of this tick, and why it was refused (empty: obeyed).
-    clear_board : bool
-        The board's own latches are to be cleared: a person said so, or the resume rule does.
+    clear_mask : int
+        Which of the board's own latches to clear: all on a person's word, the watchdog's by the resume rule.
     """
 
     command: BenchCommand
@@ -85,4 +85,4 @@ class TickOutputs:
     events: tuple[Event, ...]
     finished: Exit | None
     answers: tuple[tuple[int, str], ...] = ()
-    clear_board: bool = False
+    clear_mask: int = 0

@@ -31,6 +31,7 @@ MESSAGE_BYTES = 512  # a slot of the ring: a tick takes less, a longer command c
 
 _FORMATS = {
     "displacement_quality": "i8", "sample_counter": "i8", "latched_faults": "i8", "watchdog_tripped": "u1",
+    "foreign": "u1",
 }  # fmt: skip
 _READING = tuple(field.name for field in fields(BenchReading))
 _LINK_UP, _HAS_READING = 1, 2
@@ -96,8 +97,9 @@ def _pieces(kind: bytes, data: bytes) -> list[bytes]:
 def output_crc(outputs: TickOutputs, row: bytes) -> int:
     """Checksum of everything a tick decided: command and row, events, end."""
     crc = zlib.crc32(row)
-    if outputs.events or outputs.finished is not None or outputs.answers or outputs.clear_board:
-        rest = [outputs.events, outputs.finished, outputs.answers, outputs.clear_board]
+    if outputs.events or outputs.finished is not None or outputs.answers or outputs.clear_mask:
+        # a truth value, as in runs recorded before the mask: their replay still gives the same checksum
+        rest = [outputs.events, outputs.finished, outputs.answers, outputs.clear_mask != 0]
         crc = zlib.crc32(json.dumps(rest, default=str).encode(), crc)
     return crc
 
@@ -181,38 +183,3 @@ class TickAssembler:
             else:
                 (self._memory if message[:1] == MEMORY else self._pieces).append(message[1:])
         return TickBatch(np.frombuffer(b"".join(ticks), dtype=RECORD), tails, memories)
-
-
-_ARRAYS = ("coeffs_um", "covariance_um2")
-
-
-def pack_estimate(estimate: ShapeEstimate) -> bytes:
-    """A shape estimate as bytes: one line of JSON, then its arrays; of a symmetric covariance one half."""
-    covariance = np.asarray(estimate.covariance_um2, dtype="<f8")
-    symmetric = np.array_equal(covariance, covariance.T)
-    half = covariance[np.triu_indices(len(covariance))] if symmetric else covariance.ravel()
-    single = np.array_equal(half, half.astype("<f4"), equal_nan=True)  # as the acquisition sends them
-    head = {field.name: getattr(estimate, field.name) for field in fields(ShapeEstimate) if field.name not in _ARRAYS}
-    line = json.dumps({**head, "terms": len(covariance), "symmetric": symmetric, "single": single}, default=float)
-    return (
-        line.encode()
-        + b"\n"
-        + np.asarray(estimate.coeffs_um, dtype="<f8").tobytes()
-        + half.astype("<f4" if single else "<f8").tobytes()
-    )
-
-
-def unpack_estimate(data: bytes) -> ShapeEstimate:
-    """The estimate of `pack_estimate`. Raises ValueError if these are not its bytes."""
-    line, _, arrays = data.partition(b"\n")
-    head = json.loads(line)
-    terms, symmetric = head.pop("terms"), head.pop("symmetric")
-    coeffs_um = np.frombuffer(arrays[: 8 * terms], dtype="<f8")
-    numbers = np.frombuffer(arrays[8 * terms :], dtype="<f4" if head.pop("single") else "<f8")
-    covariance = np.empty((terms, terms))
-    if symmetric:
-        rows, columns = np.triu_indices(terms)
-        covariance[rows, columns] = covariance[columns, rows] = numbers
-    else:
-        covariance[:] = numbers.reshape(terms, terms)
-    return ShapeEstimate(**head, coeffs_um=coeffs_um.copy(), covariance_um2=covariance)

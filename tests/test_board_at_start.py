@@ -14,7 +14,7 @@ from membrane_ctrl.bench import connect, open_bench
 from membrane_ctrl.config import Config, DevicesConfig, ResumeConfig
 from membrane_ctrl.errors import DeviceError
 from membrane_ctrl.hold import BoardAtStart, HoldOptions, _identify, _latched
-from membrane_ctrl.latched import NAME, LatchedFile
+from membrane_ctrl.latched import NAME, LatchedFile, ResumeLog
 
 WATCHDOG, OVER_PRESSURE = (default_map().fault_mask(name) for name in ("watchdog", "over_pressure"))
 
@@ -41,9 +41,12 @@ def options(standby: bool = False, clear_faults: bool = False) -> HoldOptions:
     return HoldOptions(Config(), "lab.toml", False, None, "test", None, clear_faults, False, standby)
 
 
-async def identified(board: PumpBoardEmulator, asked: HoldOptions, resumes: tuple[str, ...] = ()) -> BoardAtStart:
+async def identified(
+    board: PumpBoardEmulator, asked: HoldOptions, resumes: tuple[str, ...] = (), log: ResumeLog | None = None
+) -> BoardAtStart:
     devices = DevicesConfig(board=f"tcp://127.0.0.1:{board.port}")
-    return await _identify(open_bench(devices), Config(devices=devices, resume=ResumeConfig(faults=resumes)), asked)
+    config = Config(devices=devices, resume=ResumeConfig(faults=resumes, most_per_day=2))
+    return await _identify(open_bench(devices), config, asked, log)
 
 
 async def test_a_board_without_faults_is_taken(board: PumpBoardEmulator) -> None:
@@ -68,10 +71,34 @@ async def test_the_watchdogs_own_trip_is_cleared_only_if_the_resume_rule_names_i
     assert await identified(board, options()) == BoardAtStart()
 
 
-async def test_the_watchdog_beside_another_fault_is_not_cleared(board: PumpBoardEmulator) -> None:
-    board.state._latch(WATCHDOG | OVER_PRESSURE)
+@pytest.mark.parametrize("other", [OVER_PRESSURE, default_map().fault_mask("stopped")])
+async def test_the_watchdog_beside_another_fault_is_not_cleared(board: PumpBoardEmulator, other: int) -> None:
+    board.state._latch(WATCHDOG | other)
     with pytest.raises(DeviceError, match="latched"):
         await identified(board, options(), ("watchdog_tripped",))
+
+
+async def test_a_watchdog_that_stopped_a_venting_board_is_not_cleared(board: PumpBoardEmulator) -> None:
+    """The controller before this one was killed while it vented; the board leaves the vent as it was."""
+    board.state._settable["vent_command_fraction"] = 1.0
+    board.state._latch(WATCHDOG)
+    with pytest.raises(DeviceError, match="latched"):
+        await identified(board, options(), ("watchdog_tripped",))
+
+
+async def test_starts_that_clear_the_watchdog_use_up_the_number(board: PumpBoardEmulator, tmp_path: Path) -> None:
+    for _ in range(2):
+        board.state._latch(WATCHDOG)
+        assert (await identified(board, options(), ("watchdog_tripped",), ResumeLog(tmp_path))).cleared
+    board.state._latch(WATCHDOG)
+    with pytest.raises(DeviceError, match="latched"):
+        await identified(board, options(), ("watchdog_tripped",), ResumeLog(tmp_path))
+
+
+async def test_a_clearing_that_cannot_be_counted_is_not_done(board: PumpBoardEmulator, tmp_path: Path) -> None:
+    board.state._latch(WATCHDOG)
+    with pytest.raises(DeviceError, match="latched"):
+        await identified(board, options(), ("watchdog_tripped",), ResumeLog(tmp_path / "nowhere"))
 
 
 @pytest.mark.parametrize("standby", [False, True])
@@ -98,3 +125,12 @@ async def test_a_board_that_is_not_there_is_told_by_why_it_could_not_be_reached(
         await connect(open_bench(devices), devices)
     reason = "no connection; is the device on, and is this its address?"
     assert str(caught.value) == f"tcp://127.0.0.1:{unused_tcp_port}: {reason}"
+
+
+@pytest.mark.parametrize("content", ["{", '{"schema": "another"}'])
+def test_a_latched_fault_keeps_the_next_hold_down_and_standby_waits(tmp_path: Path, content: str) -> None:
+    (tmp_path / NAME).write_text(content)
+    with pytest.raises(DeviceError, match=r"a fault is latched.*--clear-faults"):
+        _latched(Config(), tmp_path, options())
+    assert _latched(Config(), tmp_path, options(standby=True)) is not None
+    assert (tmp_path / NAME).read_text() == content

@@ -16,3 +16,8 @@ def test_no_picture_is_promised_where_nothing_measures(state: State) -> None:
     capture = Command("capture", "tester")
     assert "no camera measures" in refusal(capture, state, WITHOUT_SHAPE)
     assert refusal(capture, state, Config()) == ""
+
+
+@pytest.mark.parametrize("state", sorted(set(State) - {State.STANDBY, State.FAULT}))
+def test_nothing_is_acknowledged_where_nothing_is_latched(state: State) -> None:
+    assert "ack makes no sense" in refusal(Command("ack", "anybody"), state, Config())

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_iface.roles import BenchReading
+from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.commands import Command
 from membrane_ctrl.config import Config, LimitsConfig, LoopConfig, StatesConfig, TwinConfig
 from membrane_ctrl.errors import Exit
@@ -244,3 +244,33 @@ def test_the_same_seed_gives_the_same_run() -> None:
     first, second = Run(config, 20.0), Run(config, 20.0)
     assert [row.pack() for row in first.rows] == [row.pack() for row in second.rows]
     assert first.events == second.events
+
+
+@pytest.mark.parametrize("field", ["pump_fraction", "vent_fraction"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -0.1, 1.1])
+def test_a_command_that_no_bench_takes_is_an_error_of_the_control_code(
+    monkeypatch: pytest.MonkeyPatch, field: str, value: float
+) -> None:
+    from membrane_ctrl import states
+
+    def broken(scene: states.Scene) -> State:
+        scene.pump_fraction = 0.5
+        setattr(scene, field, value)
+        return State.STANDBY
+
+    monkeypatch.setitem(states.HANDLERS, State.STANDBY, broken)
+    run = Run(CALM, 5.0)
+    assert [f["name"] for f in run.of("fault")] == ["tick_error"]
+    assert all(tick.outputs.command == BenchCommand(0.0, 0.0) for tick in run.ticks)
+
+
+def test_an_error_in_a_vented_fault_leaves_the_vent_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    from membrane_ctrl import states
+
+    def broken(scene: states.Scene) -> State:
+        raise ZeroDivisionError("x / 0")
+
+    monkeypatch.setitem(states.HANDLERS, State.FAULT, broken)
+    run = Run(CALM, 60.0, after(25.0, math.inf, lambda r: replace(r, gauge_pressure_pa=900.0)))
+    assert run.finished == Exit.SAFETY_TRIP
+    assert run.ticks[-1].outputs.command == BenchCommand(0.0, 1.0)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
 from firmware_iface.roles import BenchCommand
 from membrane_ctrl.commands import AT_START
-from membrane_ctrl.latched import NAME, LatchedFault, LatchedFile
+from membrane_ctrl.latched import NAME, RESUMES_NAME, LatchedFault, LatchedFile, ResumeLog
 from membrane_ctrl.latcher import Latcher
 from membrane_ctrl.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.tick import Event, TickOutputs
@@ -82,7 +82,9 @@ def test_a_fault_of_many_lines_is_told_in_one(tmp_path: Path) -> None:
 
 
 def make(folder: Path, told: list[Event]) -> Latcher:
-    return Latcher(LatchedFile(folder), "run-7", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), told.append)
+    return Latcher(
+        LatchedFile(folder), ResumeLog(folder), "run-7", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), told.append
+    )
 
 
 def test_a_trip_is_latched_and_an_acknowledgement_clears_it(tmp_path: Path) -> None:
@@ -154,9 +156,24 @@ def test_a_disk_that_takes_files_again_is_told_once(tmp_path: Path) -> None:
 
 
 def test_the_twin_latches_nothing(tmp_path: Path) -> None:
-    with Latcher(None, "run", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), lambda event: None) as latcher:
+    with Latcher(None, None, "run", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), lambda event: None) as latcher:
         latcher.heard(outputs(*TRIP))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("aim", ["mine.txt", "nowhere.txt"])
+def test_a_link_in_place_of_the_reserve_takes_nothing_of_anybody(tmp_path: Path, aim: str) -> None:
+    """A folder of runs may have been unpacked: the fault is latched, and what the link leads to stays."""
+    (tmp_path / "mine.txt").write_text("mine")
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    (logs / f".{NAME}.reserve").symlink_to(tmp_path / aim)
+    file = LatchedFile(logs)
+    file.write(LatchedFault("over_pressure", "", "", "", "", ""))
+    latched = file.read()
+    assert latched is not None
+    assert latched.name == "over_pressure"
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir() if path.is_file()] == [("mine.txt", "mine")]
 
 
 def test_a_fault_on_a_full_disk_is_latched_in_the_room_that_was_kept(
@@ -164,12 +181,12 @@ def test_a_fault_on_a_full_disk_is_latched_in_the_room_that_was_kept(
 ) -> None:
     told: list[Event] = []
 
-    def full(self: Path, data: bytes) -> int:
+    def full(self: LatchedFile) -> None:
         raise OSError(28, "No space left on device")
 
     with make(tmp_path, told) as latcher:
         (reserve,) = tmp_path.iterdir()
-        monkeypatch.setattr(Path, "write_bytes", full)  # nothing new finds room from here on
+        monkeypatch.setattr(LatchedFile, "reserve", full)  # nothing new finds room from here on
         latcher.heard(outputs(*TRIP))
         latcher._disk.submit(lambda: None).result()
         assert not reserve.exists()
@@ -178,3 +195,26 @@ def test_a_fault_on_a_full_disk_is_latched_in_the_room_that_was_kept(
     assert latched is not None
     assert latched.name == TRIP[0]["name"]
     assert [path.name for path in tmp_path.iterdir()] == [NAME]
+
+
+NOW = datetime(2026, 1, 2, 12, tzinfo=UTC)
+
+
+def test_resumes_are_counted_for_a_day_and_beyond_a_restart(tmp_path: Path) -> None:
+    assert ResumeLog(tmp_path).ages_s(NOW) == ()
+    for hours in (30.0, 5.0, -1.0):  # the last one after the clock was set back
+        ResumeLog(tmp_path).add(NOW - timedelta(hours=hours))
+    assert ResumeLog(tmp_path).ages_s(NOW) == (18_000.0, 0.0)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff", b"3", b"[3]", b'["tomorrow"]', b'["2026-01-02T11:00:00"]'])
+def test_a_count_of_resumes_that_cannot_be_read_is_full(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / RESUMES_NAME).write_bytes(content)
+    assert len(ResumeLog(tmp_path).ages_s(NOW)) == 1000
+
+
+def test_a_resume_of_the_run_is_counted_for_the_next_one(tmp_path: Path) -> None:
+    with make(tmp_path, []) as latcher:
+        assert latcher.resumes_s == ()
+        latcher.heard(outputs({"kind": "resumed", "name": "link_lost"}))
+    assert ResumeLog(tmp_path).ages_s(datetime(2026, 1, 1, 1, tzinfo=UTC)) == (3600.0,)

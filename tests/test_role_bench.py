@@ -12,6 +12,7 @@ import pytest
 from firmware_iface.emulators.virtual_time import run_virtual
 from firmware_iface.role_bench import NO_ANSWER, RoleBench, RoleDevices
 from firmware_iface.roles import (
+    ALL_FAULTS,
     BenchCommand,
     DeviceIdentity,
     DeviceRefusedError,
@@ -28,7 +29,7 @@ class FakeDevice:
 
     def __init__(self, kind: str, log: list[str]) -> None:
         self.kind = kind
-        self.error: LinkError | None = None
+        self.error: Exception | None = None
         self.value = 0.0
         self.samples = 0
         self.opened = 0
@@ -237,7 +238,7 @@ def test_the_watchdog_stops_the_pump_of_a_silent_controller_and_says_so_until_a_
         await devices.bench.write(BenchCommand(0.5, 0.0))
         reading = await devices.bench.read()
         assert (devices.pump.value, reading.watchdog_tripped, reading.latched_faults) == (0.0, True, 1)
-        await devices.bench.clear_faults()
+        await devices.bench.clear_faults(ALL_FAULTS)
         await devices.bench.write(BenchCommand(0.5, 0.0))
         reading = await devices.bench.read()
         assert (reading.pump_fraction, reading.watchdog_tripped) == (0.5, False)
@@ -272,6 +273,138 @@ def test_a_write_that_failed_still_counts_as_commanded() -> None:
         assert devices.pump.value == 0.5
         await asyncio.sleep(1.5 * WATCHDOG_S)
         assert devices.pump.value == 0.0
+        await devices.bench.close()
+
+    virtual(run())
+
+
+@pytest.mark.parametrize("error", [LinkError("noise"), OSError("gone"), ValueError("bad"), TimeoutError()])
+def test_the_watchdog_survives_whatever_a_driver_raises(error: Exception) -> None:
+    async def run() -> None:
+        devices = Devices()
+        await devices.bench.open()
+        await devices.bench.write(BenchCommand(0.7, 0.0))
+        devices.pump.error = error
+        await asyncio.sleep(4 * WATCHDOG_S)
+        assert devices.pump.value == 0.7
+        devices.pump.error = None
+        await asyncio.sleep(WATCHDOG_S / 2)
+        assert devices.pump.value == 0.0
+        assert (await devices.bench.read()).watchdog_tripped
+        await devices.bench.close()
+
+    virtual(run())
+
+
+def dead_watchdog(devices: Devices) -> None:
+    """Ends it as a defect of the program would."""
+    assert devices.bench._watchdog is not None
+    devices.bench._watchdog.cancel()
+
+
+@pytest.mark.parametrize("call", ["read", "write"])
+def test_a_watchdog_that_ended_stops_the_pump_and_is_a_lost_bench_at_the_next_call(call: str) -> None:
+    async def run() -> None:
+        devices = Devices()
+        await devices.bench.open()
+        await devices.bench.write(BenchCommand(0.7, 0.0))
+        dead_watchdog(devices)
+        await asyncio.sleep(0.01)
+        with pytest.raises(LinkDownError, match="the software watchdog was cancelled; the pump was set to 0"):
+            await (devices.bench.read() if call == "read" else devices.bench.write(BenchCommand(0.7, 0.0)))
+        assert devices.pump.value == 0.0
+        await devices.bench.open()
+        reading = await devices.bench.read()
+        assert reading.watchdog_tripped  # a person's, or the resume rule's, to clear
+        await devices.bench.write(BenchCommand(0.7, 0.0))
+        assert devices.pump.value == 0.0
+        await devices.bench.clear_faults(0xFFFF)
+        await devices.bench.write(BenchCommand(0.7, 0.0))
+        await asyncio.sleep(2 * WATCHDOG_S)
+        assert devices.pump.value == 0.0  # the new watchdog works
+        await devices.bench.close()
+
+    virtual(run())
+
+
+def test_opening_again_does_not_forget_a_trip() -> None:
+    async def run() -> None:
+        devices = Devices()
+        await devices.bench.open()
+        await devices.bench.write(BenchCommand(0.5, 0.0))
+        await asyncio.sleep(2 * WATCHDOG_S)
+        await devices.bench.open()
+        await devices.bench.write(BenchCommand(0.5, 0.0))
+        assert ((await devices.bench.read()).watchdog_tripped, devices.pump.value) == (True, 0.0)
+        await devices.bench.close()
+
+    virtual(run())
+
+
+def test_the_watchdog_acts_while_the_bench_is_opened_again() -> None:
+    async def run() -> None:
+        devices = Devices()
+        await devices.bench.open()
+        await devices.bench.write(BenchCommand(0.5, 0.0))
+        devices.laser.took_s = 4 * WATCHDOG_S  # the first that is opened hangs
+        opening = asyncio.create_task(devices.bench.open())
+        await asyncio.sleep(2 * WATCHDOG_S)
+        assert devices.pump.value == 0.0
+        await opening
+        await devices.bench.close()
+
+    virtual(run())
+
+
+@pytest.mark.parametrize("name", ["laser", "gauge", "barometer", "air", "pump", "vent"])
+def test_an_error_that_no_driver_should_raise_is_one_of_that_device(name: str) -> None:
+    async def run() -> None:
+        devices = Devices()
+        await devices.bench.open()
+        getattr(devices, name).error = ZeroDivisionError("division by zero")
+        if name in ("pump", "vent"):
+            with pytest.raises(LinkError, match=f"{name}: ZeroDivisionError: division by zero"):
+                await devices.bench.read()
+            with pytest.raises(LinkError, match=f"{name}: ZeroDivisionError"):
+                await devices.bench.write(BenchCommand(0.5, 0.0))
+        else:
+            await devices.bench.read()
+            await devices.bench.write(BenchCommand(0.5, 0.0))
+            assert devices.pump.value == 0.5
+        devices.pump.error = None
+        await devices.bench.close()
+
+    virtual(run())
+
+
+def test_a_pump_that_comes_back_without_the_laser_is_stopped() -> None:
+    async def run() -> None:
+        devices = Devices()
+        await devices.bench.open()
+        await devices.bench.write(BenchCommand(0.5, 0.0))
+        devices.pump.error = devices.laser.error = LinkDownError("unplugged")
+        for _ in range(3):
+            with pytest.raises(LinkDownError):
+                await devices.bench.open()
+        assert devices.pump.value == 0.5
+        devices.pump.error = None
+        with pytest.raises(LinkDownError, match="displacement"):
+            await devices.bench.open()
+        assert devices.pump.value == 0.0
+
+    virtual(run())
+
+
+def test_reading_does_not_feed_the_watchdog() -> None:
+    async def run() -> None:
+        devices = Devices()
+        await devices.bench.open()
+        await devices.bench.write(BenchCommand(0.5, 0.0))
+        for _ in range(8):
+            await asyncio.sleep(WATCHDOG_S / 4)
+            await devices.bench.read()
+        assert devices.pump.value == 0.0
+        assert (await devices.bench.read()).watchdog_tripped
         await devices.bench.close()
 
     virtual(run())

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD
 from membrane_ctrl.config import LimitsConfig
 from membrane_ctrl.names import Rung, State
 from membrane_ctrl.safety import TABLE, Observation, Rule, SafetyTable
@@ -40,12 +41,20 @@ BAD = {
     "displacement_frozen": replace(GOOD, advance_age_s=LIMITS.stale_s + 0.01),
     "laser_implausible": replace(GOOD, laser_lies="laser +30 um, camera 0 um, gauge 0 um"),
     "displacement_stuck": replace(GOOD, same_s=LIMITS.stuck_s + 0.01),
+    "laser_gauge_apart": replace(GOOD, laser_gauge_apart="laser +0 um, gauge +40 um"),
+    "gauge_stuck": replace(GOOD, gauge_same_s=LIMITS.gauge_stuck_s + 0.01),
+    "gas_excess": replace(GOOD, gas_excess="3.2 um/s, before 1.2 um/s"),
+    "gauge_jump": replace(GOOD, gauge_jumps=1),
     "displacement_jump": replace(GOOD, jumps=1),
     "displacement_missing": replace(GOOD, displacement_valid=False),
     "pressure_missing": replace(GOOD, gauge_pressure_pa=math.nan),
     "following_error": replace(GOOD, error_um=-LIMITS.following_error_max_um - 0.1),
     "overdue": replace(GOOD, overdue="waited too long"),
     "actuator_test": replace(GOOD, unfit="the vent does nothing"),
+    "pump_runs_on": replace(GOOD, runs_on="read-back 100 %"),
+    "gas_comes_in": replace(GOOD, inflow="+40 um in 20 s"),
+    "board_taken": replace(GOOD, foreign=FOREIGN_PERIOD),
+    "locked": replace(GOOD, locked="hands inside"),
     "late": replace(GOOD, lateness_ms=LIMITS.lateness_max_ms + 1),
 }
 
@@ -122,6 +131,21 @@ def test_what_the_operator_is_told_carries_the_value() -> None:
     assert table.judge(State.HOLD, BAD["over_pressure"]).seen == "750.1 Pa"
 
 
+@pytest.mark.parametrize("state", [state for state in State if state != State.FAULT])
+@pytest.mark.parametrize(
+    ("foreign", "seen"),
+    [
+        (FOREIGN_CLAIM, "another claim is in force"),
+        (FOREIGN_PERIOD, "another watchdog period is in force"),
+        (FOREIGN_CLAIM | FOREIGN_PERIOD, "another claim is in force and another watchdog period is in force"),
+    ],
+)
+def test_a_board_that_is_not_as_it_was_set_is_a_fault_in_the_same_tick(state: State, foreign: int, seen: str) -> None:
+    verdict = SafetyTable(LIMITS).judge(state, replace(GOOD, foreign=foreign))
+    assert verdict.rule is not None
+    assert (verdict.rule.name, verdict.rule.may_resume, verdict.seen) == ("board_taken", False, seen)
+
+
 UNSEEN = {
     "over_pressure": replace(GOOD, gauge_pressure_pa=math.nan),
     "over_displacement": replace(GOOD, displacement_um=math.nan, displacement_valid=False),
@@ -149,3 +173,20 @@ def test_a_visit_to_another_state_forgets_what_was_seen_before() -> None:
         table.judge(State.HOLD, BAD[rule.name])
     table.judge(State.STANDBY, GOOD)
     assert table.judge(State.HOLD, BAD[rule.name]).rule is None
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("name", ["over_pressure", "over_displacement"])
+def test_what_must_never_be_passed_opens_the_vent_in_every_state(name: str, state: State) -> None:
+    table = SafetyTable(LIMITS)
+    table.judge(state, BAD[name])
+    rule = table.judge(state, BAD[name]).rule
+    assert rule is not None
+    assert (rule.name, rule.rung) == (name, Rung.VENT)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_mirror_may_be_far_from_its_setpoint_on_neither_side(side: float) -> None:
+    table = SafetyTable(LIMITS)
+    far = replace(GOOD, error_um=side * (LIMITS.following_error_max_um + 0.1))
+    assert any(table.judge(State.HOLD, far).rule is not None for _ in range(100))

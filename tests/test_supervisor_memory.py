@@ -40,8 +40,11 @@ class PromptBench:
     async def write(self, command: BenchCommand) -> None:
         self._bench.write(command)
 
-    async def clear_faults(self) -> None:
+    async def clear_faults(self, mask: int) -> None:
         raise AssertionError("nothing is latched")
+
+    def dead_guards(self) -> tuple[str, ...]:
+        return ()
 
     async def close(self) -> None:
         self._bench.close()
@@ -51,7 +54,7 @@ async def test_the_memory_is_the_one_before_its_tick(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("membrane_ctrl.supervisor.MEMORY_EVERY_S", 0.1)
     with ExitStack() as stack:
         sizes = {"telemetry": ROW_BYTES, "events": 4096, "inputs": MESSAGE_BYTES}
-        addresses = {name: stack.enter_context(ring(400, size)) for name, size in sizes.items()}
+        addresses = {name: stack.enter_context(ring(2000, size)) for name, size in sizes.items()}
         writers = {name: RingWriter(address) for name, address in addresses.items()}
         inputs = RingReader(addresses["inputs"])
         for end in (*writers.values(), inputs):
@@ -77,3 +80,23 @@ def test_an_event_that_is_too_long_for_its_slot_is_cut() -> None:
         supervisor.tell({"kind": "fault", "name": "tick_error", **texts})
         (told,) = reader.drain()
     assert json.loads(told)["name"] == "tick_error"
+
+
+async def test_a_shape_that_cannot_be_read_is_told_once_and_the_hold_goes_on() -> None:
+    with ExitStack() as stack:
+        addresses = {name: stack.enter_context(ring(64, 4096)) for name in ("telemetry", "events", "shapes")}
+        writers = {name: RingWriter(address) for name, address in addresses.items()}
+        shapes, events = RingReader(addresses["shapes"]), RingReader(addresses["events"])
+        for end in (*writers.values(), shapes, events):
+            stack.callback(end.close)
+
+        def truth() -> tuple[float, float]:
+            writers["shapes"].put(b"{}\nno shape")
+            return 0.0, 0.0
+
+        wiring = Wiring(PromptBench(), writers["telemetry"], writers["events"], shapes=shapes, truth=truth)
+        supervisor = Supervisor(Controller(CONFIG, zernike_projection()), wiring, RunClock.start(), 50.0)
+        assert await supervisor.run(0.2) == Exit.DONE
+        told = [event for event in map(json.loads, events.drain()) if event["kind"] == "shape_unreadable"]
+    assert supervisor.ticks > 3
+    assert [event["message"] for event in told] == ["shape estimate: not of 36 terms"]

@@ -132,6 +132,15 @@ def test_a_lost_laser_ends_it_at_the_holding_flow() -> None:
     assert held.furthest_um(held.rows[-1].mono_s - 5.0) < 2.0
 
 
+def test_a_laser_that_is_distrusted_ends_it_although_it_reads() -> None:
+    held = Held()
+    held.go(5.0, tune(duration_s=60.0))
+    held.bench.wrong.laser_stuck = True
+    held.go(CONFIG.limits.stuck_s + 1.0)
+    assert held.state == State.HOLD
+    assert not held.of("experiment")[-1]["completed"]
+
+
 @pytest.mark.parametrize(("kind", "state"), [("hold", State.HOLD), ("lower", State.STANDBY), ("vent", State.LOWER)])
 def test_whoever_operates_ends_it(kind: Any, state: State) -> None:
     held = Held()

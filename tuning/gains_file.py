@@ -17,7 +17,7 @@ from pydantic import Field
 from membrane_ctrl import config_file
 from membrane_ctrl.config import LoopConfig, Section
 from membrane_ctrl.errors import InputError
-from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.recording.atomic import users, write_text_atomic
 from tuning.identify import Identified
 from tuning.loop_model import Gains
 from tuning.margins import margins
@@ -69,7 +69,7 @@ class GainsFile(Section):
 def save_gains(path: Path, gains: GainsFile) -> None:
     """Write a gains file in one step; without the setpoint, which is the hold's own."""
     text = tomli_w.dumps(gains.model_dump(mode="json", exclude={"loop": {"setpoint_um"}}))
-    write_text_atomic(path, text)
+    write_text_atomic(users(path), text)
 
 
 def load_gains(path: Path) -> GainsFile:

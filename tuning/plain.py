@@ -14,9 +14,11 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from membrane_ctrl.errors import InputError
-from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.recording import plain_json
+from membrane_ctrl.recording.atomic import read_text, users, write_text_atomic
 
 T = TypeVar("T")
+_BYTES_MAX = 64_000_000  # candidates with their curves are some megabytes
 
 
 def plain(value: Any) -> Any:
@@ -64,14 +66,14 @@ def _built(kind: Any, data: Any) -> Any:
 
 def write(path: Path, value: Any) -> None:
     """Write a result in one step."""
-    write_text_atomic(path, json.dumps(plain(value), indent=1, allow_nan=False) + "\n")
+    write_text_atomic(users(path), json.dumps(plain(value), indent=1, allow_nan=False) + "\n")
 
 
 def read(path: Path, kind: type[T]) -> T:
     """Read a result back. Raises InputError (one line) if it is not there or is no such result."""
     try:
-        return built(kind, json.loads(path.read_text(encoding="utf-8")))
+        return built(kind, plain_json.loads(read_text(users(path), _BYTES_MAX)))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (ValueError, TypeError, KeyError, ValidationError) as error:
+    except (OSError, ValueError, TypeError, KeyError, ValidationError) as error:
         raise InputError(f"{path}: damaged ({str(error).splitlines()[0]}); repeat the step that wrote it") from None

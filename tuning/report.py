@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+from membrane_ctrl.recording.atomic import users, write_text_atomic
 from tuning import pictures, session
 from tuning.gains_file import load_gains
 from tuning.records_file import load_record
@@ -36,7 +37,7 @@ def write_report(folder: SessionFolder) -> Path:
     ]
     path = folder.file("report.html")
     text = f"<!doctype html><meta charset=utf-8><title>{html.escape(head.name)}</title><style>{_STYLE}</style>"
-    path.write_text(text + "\n".join(parts), encoding="utf-8")
+    write_text_atomic(users(path), text + "\n".join(parts))
     write_recording(folder)
     return path
 

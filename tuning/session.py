@@ -18,7 +18,7 @@ from membrane_ctrl.config import LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments.machine import Around, Finished
 from membrane_ctrl.control.experiments.pump_map import PumpMap
 from membrane_ctrl.errors import RejectedError
-from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.recording.atomic import users, write_text_atomic
 from tuning import plain
 from tuning.characterise import ExperimentError, Experiments, experiment, fitted, spec_of
 from tuning.design import Candidate, RefusedError, propose, table
@@ -181,7 +181,7 @@ def design_step(session: SessionFolder, reason: str = "tuning session") -> Gains
         plant=PlantSection.of(found.identified),
         loop=made.loop,
     )
-    write_text_atomic(session.file("candidates.md"), table(made.candidates) + "\n")
+    write_text_atomic(users(session.file("candidates.md")), table(made.candidates) + "\n")
     plain.write(
         session.file("proposal.json"), Design(made.candidates, made.least_std_um, made.preview, made.robustness)
     )
@@ -301,6 +301,6 @@ def map_pump(session: SessionFolder, rig: HoldRig) -> PumpMap:
     if not (math.isfinite(found.start_fraction) and math.isfinite(found.stall_fraction)):
         raise RejectedError("pump map: the pump never started or never stalled; check the pump and its supply")
     mapped = found.applied_to(session.config.pump)
-    write_text_atomic(session.file("pump.toml"), config_file.dump(mapped))
+    write_text_atomic(users(session.file("pump.toml")), config_file.dump(mapped))
     plain.write(session.file("pump_map.json"), found)
     return found

@@ -7,7 +7,7 @@ lags of up to a second is nearly all movement; how much is the loop's answer to 
 
 The weather of these ten minutes is not that of the hour before. So the comparison is with what the *old* gains would
 have done in it: the weather is taken out of the same record (`observe`) and the old loop's answer to it predicted
-(docs/decisions/95-verified-against-the-old-gains-in-the-same-weather.md).
+(docs/decisions/78-gains-on-trial.md).
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
@@ -191,7 +191,8 @@ class BronkhorstPressure:
             )
         self._unit_pa = _GAUGE_UNITS_PA[unit]
         self._full_pa = await self._port.number(CAPACITY) * self._unit_pa
-        return identity
+        low, high = self._FRACTIONS
+        return replace(identity, shows=(low * self._full_pa, high * self._full_pa))
 
     async def gauge_pressure_pa(self) -> float:
         """The measured value. Raises LinkError, also for one that the instrument cannot have."""

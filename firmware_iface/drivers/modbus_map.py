@@ -177,7 +177,7 @@ class ModbusValue:
         if self._rest is not None:
             await self._set(self._rest)
         await self._get()
-        return DeviceIdentity("Modbus device", "", version, detail)
+        return DeviceIdentity("Modbus device", "", version, detail, self._map.limits)
 
     async def close(self) -> None:
         """Put an actuator to rest and disconnect. Never raises."""

@@ -167,7 +167,9 @@ class Optoncdt1420(LinkedDevice):
                 f"{self._port.name}: {name} measures {self._range_mm:g} mm, range_mm = {self._range_wanted_mm:g}"
             )
         self._zero_mm = self._range_mm / 2 if self._zero_wanted_mm is None else self._zero_wanted_mm
-        return DeviceIdentity(name, fields.get("Serial", ""), fields.get("Version", ""), f"{self._range_mm:g} mm")
+        ends = [1000 * self._direction * (end_mm - self._zero_mm) for end_mm in (0.0, self._range_mm)]
+        serial, version = fields.get("Serial", ""), fields.get("Version", "")
+        return DeviceIdentity(name, serial, version, f"{self._range_mm:g} mm", (min(ends), max(ends)))
 
     async def _set(self, setting: str) -> None:
         name = setting.split()[0]

@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
+import secrets
+from collections.abc import Mapping
+from dataclasses import replace
+
 from firmware_iface.drivers.linked_device import LinkedDevice
 from firmware_iface.links.modbus_links import ModbusLinks
 from firmware_iface.links.modbus_rules import ModbusLink
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import Block, default_map, known_maps
 from firmware_iface.roles import (
+    FOREIGN_CLAIM,
+    FOREIGN_PERIOD,
     BenchCommand,
     BenchIdentity,
     BenchReading,
+    DeviceBusyError,
     DeviceRefusedError,
     LinkDownError,
     LinkError,
 )
 
 _KIND = "membrane pump board"
+# of a board of map version 1, for people
+NO_CLAIM = (
+    "this board knows no claim (register map 1): whatever reaches it can run its pump, and two programs on two "
+    "machines are not kept apart; update its firmware"
+)
 _HEARTBEATS = 2**16
+_U32_MAX = 2**32 - 1
+# refused writes in a row until a claim counts as lost although its name still stands: one may be a gateway's answer
+_BUSY_WRITES_MAX = 3
 
 
 class PumpBoard(LinkedDevice):
@@ -25,6 +42,9 @@ class PumpBoard(LinkedDevice):
     After a lost link (LinkDownError) call `open` again, as often as wanted: it tries when its back-off allows.
     Whether the watchdog tripped meanwhile is in the next reading; nothing but `clear_faults` clears it, and until
     then the board keeps the pump off.
+
+    `open` claims a board of map version 2 for this object: until it is closed, or its watchdog has run out, the board
+    takes commands from nobody else. A board of map version 1 knows no claim and obeys whoever writes.
 
     Parameters
     ----------
@@ -55,27 +75,24 @@ class PumpBoard(LinkedDevice):
     ) -> None:
         if link is None:
             link = ModbusLinks().link(url, unit_id, timeout_s)
-        registers = default_map()
-        self._map_version = registers.map_version
-        self._device_kind = registers.device_kind
-        self._identity = registers.block("identity")
-        self._sensors = registers.block("sensors")
-        self._settings = registers.block("settings")
-        self._command = registers.block("command")
-        self._reset = registers.block("reset")
-        self._heartbeat_echo = registers.register("heartbeat_echo")
-        period = registers.register("watchdog_period_s")
+        self._registers = default_map()  # of the board that answers, once it has said its version
+        period = self._registers.register("watchdog_period_s")
         if not period.allows(watchdog_s):
             raise ValueError(
                 f"watchdog_s = {watchdog_s:g}: the board takes {period.minimum:g} .. {period.maximum:g} s"
             )
-        self._watchdog_s = watchdog_s
+        self._watchdog_s = period.to_value(period.to_raw(watchdog_s))  # as the board will say it back
+        # The same for every opening by this object: a claim whose answer was lost is simply made again. The name is
+        # for everybody to read, the key for nobody.
+        self._claim_id, self._claim_key = (1 + secrets.randbelow(_U32_MAX) for _ in range(2))
+        self._armed = False  # by this object, since it last connected
         self._heartbeat = 0
+        self._busy_writes = 0  # in a row
         self._link = link
         super().__init__(self._link)
 
     async def open(self) -> BenchIdentity:
-        """Connect, check kind and map version, arm the watchdog and read it back.
+        """Connect, check kind and map version, claim the board, arm its watchdog and read both back.
 
         The watchdog runs from here on: write within its period, pump 0 too.
 
@@ -83,45 +100,84 @@ class PumpBoard(LinkedDevice):
         ------
         LinkError
             No connection or no valid answer.
+        DeviceBusyError
+            Another program holds the board.
         DeviceRefusedError
             Another kind of device, an unknown map version, or a watchdog that does not take its setting.
         """
-        await self._link.connect()
+        identity = await self.identify()
         try:
-            firmware = await self._identify()
-            # go on from the heartbeat that the board was fed last: the first write has to differ from it
-            (self._heartbeat,) = await self._link.read_holding(self._heartbeat_echo.address, 1)
-            period_s = await self._arm()
+            await self._arm()
         except LinkError:
             await self._link.close()
             raise
-        return BenchIdentity(_KIND, self._map_version, firmware, period_s)
+        return replace(identity, watchdog_s=self._watchdog_s)
 
-    async def _identify(self) -> str:
+    async def identify(self) -> BenchIdentity:
+        """Connect and check kind and map version; nothing is written. `read` then works, `write` does not.
+
+        Raises as `open`; the identity's `watchdog_s` is NaN, as nothing was set.
+        """
+        self._armed = False
+        await self._link.connect()
+        try:
+            return await self._identify()
+        except LinkError:
+            await self._link.close()
+            raise
+
+    async def _identify(self) -> BenchIdentity:
         # these two never move; the rest means something only when they are right
-        kind, version = await self._link.read_holding(self._identity.address, 2)
-        if kind != self._device_kind:
-            raise DeviceRefusedError(f"{self._link.name}: device kind {kind} is not a {_KIND} ({self._device_kind})")
-        if version != self._map_version:
+        identity = default_map().block("identity")
+        kind, version = await self._link.read_holding(identity.address, 2)
+        if kind != default_map().device_kind:
             raise DeviceRefusedError(
-                f"{self._link.name}: register map version {version}, this program knows {self._map_version}; "
+                f"{self._link.name}: device kind {kind} is not a {_KIND} ({default_map().device_kind})"
+            )
+        if version not in known_maps():
+            known = " and ".join(str(known) for known in known_maps())
+            raise DeviceRefusedError(
+                f"{self._link.name}: register map version {version}, this program knows {known}; "
                 "update the firmware or the program"
             )
-        words = await self._link.read_holding(self._identity.address, self._identity.count)
-        firmware = int(self._identity.decode(words)["firmware_version"])
-        return f"{firmware >> 16}.{firmware >> 8 & 0xFF}.{firmware & 0xFF}"
+        self._registers = known_maps()[version]
+        found = await self._read(identity)
+        firmware = int(found["firmware_version"])
+        return BenchIdentity(
+            _KIND,
+            version,
+            f"{firmware >> 16}.{firmware >> 8 & 0xFF}.{firmware & 0xFF}",
+            math.nan,
+            found["gauge_pressure_limit_pa"],
+            found["pump_limit_fraction"],
+        )
 
-    async def _arm(self) -> float:
-        settings = {"watchdog_period_s": self._watchdog_s, "watchdog_arm": 1.0}
-        words = self._settings.encode(settings)
-        await self._link.write_registers(self._settings.address, words)
-        found_words = await self._link.read_holding(self._settings.address, self._settings.count)
-        found = self._settings.decode(found_words)
-        if found_words != words:
+    async def _arm(self) -> None:
+        try:
+            await self._write_settings(arm=1.0)
+        except DeviceBusyError:
+            raise await self._held_by_another() from None
+        settings = await self._read(self._registers.block("settings"))
+        sensors = await self._sensors()
+        set_s = settings["watchdog_period_s"]
+        if (set_s, settings["watchdog_arm"]) != (self._watchdog_s, 1.0) or self._foreign(sensors):
             raise DeviceRefusedError(
-                f"{self._link.name}: watchdog set to {settings}, read back as {found}; not safe to run"
+                f"{self._link.name}: watchdog set to {self._watchdog_s:g} s and armed, read back as {set_s:g} s, "
+                f"armed {settings['watchdog_arm']:g}, claim {int(sensors.get('claim_in_force', 0)):#x}; "
+                "not safe to run"
             )
-        return found["watchdog_period_s"]
+        # go on from the heartbeat that the board was fed last: the first write has to differ from it
+        self._heartbeat = int(sensors["heartbeat_echo"])
+        self._armed, self._busy_writes = True, 0
+
+    async def _held_by_another(self) -> DeviceBusyError:
+        sensors = await self._sensors()
+        period_s = sensors["period_in_force_s"]
+        return DeviceBusyError(
+            f"{self._link.name}: another program holds the board (claim {int(sensors['claim_in_force']):#x}, "
+            f"watchdog {period_s:g} s); stop that one first",
+            lapses_in_s=period_s,
+        )
 
     async def read(self) -> BenchReading:
         """One sample of everything, in one transaction.
@@ -133,9 +189,8 @@ class PumpBoard(LinkedDevice):
         LinkDownError
             No connection, or the board restarted and lost its settings: call `open` again.
         """
-        words = await self._link.read_holding(self._sensors.address, self._sensors.count)
-        values = self._sensors.decode(words)
-        if not values["watchdog_armed"]:
+        values = await self._sensors()
+        if self._armed and not values["watchdog_armed"]:
             await self._link.close()
             raise LinkDownError(f"{self._link.name}: the watchdog is off, so the board restarted; open it again")
         return BenchReading(
@@ -151,7 +206,15 @@ class PumpBoard(LinkedDevice):
             device_time_s=values["device_time_s"] + values["device_time_fraction_s"],
             watchdog_tripped=bool(values["watchdog_tripped"]),
             latched_faults=int(values["latched_faults"]),
+            foreign=self._foreign(values) if self._armed else 0,
         )
+
+    def _foreign(self, sensors: Mapping[str, float]) -> int:
+        """What of claim and period in force is not as this object set it; a board without claims cannot say."""
+        if self._registers.map_version == 1:
+            return 0
+        taken = sensors["claim_in_force"] != self._claim_id or self._busy_writes >= _BUSY_WRITES_MAX
+        return FOREIGN_CLAIM * taken | FOREIGN_PERIOD * (sensors["period_in_force_s"] != self._watchdog_s)
 
     async def write(self, command: BenchCommand) -> None:
         """Write pump and vent with a new heartbeat, in one transaction: what feeds the watchdog.
@@ -162,6 +225,8 @@ class PumpBoard(LinkedDevice):
             A fraction that is not within 0..1, or NaN; nothing is sent.
         LinkError
             No valid answer: the board may or may not have it.
+        DeviceBusyError
+            The board is another program's by now.
         """
         for name, fraction in (("pump", command.pump_fraction), ("vent", command.vent_fraction)):
             if not 0.0 <= fraction <= 1.0:
@@ -171,22 +236,55 @@ class PumpBoard(LinkedDevice):
             "pump_command_fraction": command.pump_fraction,
             "vent_command_fraction": command.vent_fraction,
             "heartbeat": self._heartbeat,
+            "command_key": self._claim_key,
         }
-        await self._link.write_registers(self._command.address, self._command.encode(values))
+        try:
+            await self._write("command", values)
+        except DeviceBusyError:
+            self._busy_writes += 1
+            raise
+        self._busy_writes = 0
 
-    async def clear_faults(self) -> None:
-        """Clear all latched faults of the board; the pump stays off until the next `write`. Raises LinkError."""
-        await self._link.write_registers(self._reset.address, [0xFFFF])
+    async def clear_faults(self, mask: int) -> None:
+        """Clear these latched faults of the board; the pump stays off until the next `write`. Raises LinkError."""
+        await self._write("reset", {"clear_faults": mask, "clear_key": self._claim_key})
+
+    async def stop(self) -> None:
+        """Stop the pump of a board that was identified, whoever holds it; the vent stays as it is. Raises LinkError.
+
+        A board of map version 2 latches it as a fault. One of version 1 gets pump 0 without a heartbeat, which
+        neither feeds nor arms its watchdog: whoever holds it may run the pump again with his next command.
+        """
+        if self._registers.map_version == 1:
+            await self._link.write_register(self._registers.register("pump_command_fraction").address, 0)
+        else:
+            await self._write("stop", {"stop": 1.0})
+
+    def dead_guards(self) -> tuple[str, ...]:
+        """None: the watchdog is the board's own, and each reading tells of it."""
+        return ()
 
     async def close(self) -> None:
-        """Disarm the watchdog and close the link; never raises.
+        """Disarm the watchdog, which gives the claim back, and close the link; never raises.
 
         The board refuses to be disarmed while the pump is commanded: then the watchdog stays and turns it off.
         """
-        if self._link.connected:
-            try:
-                words = self._settings.encode({"watchdog_period_s": self._watchdog_s, "watchdog_arm": 0.0})
-                await self._link.write_registers(self._settings.address, words)
-            except LinkError:
-                pass  # the watchdog then does what it is for
+        if self._armed and self._link.connected:
+            with contextlib.suppress(LinkError):  # the watchdog then does what it is for
+                await self._write_settings(arm=0.0)
+        self._armed = False
         await self._link.close()
+
+    async def _read(self, block: Block) -> dict[str, float]:
+        return block.decode(await self._link.read_holding(block.address, block.count))
+
+    async def _sensors(self) -> dict[str, float]:
+        return await self._read(self._registers.block("sensors"))
+
+    async def _write_settings(self, arm: float) -> None:
+        claim = {"claim_id": self._claim_id, "claim_key": self._claim_key}
+        await self._write("settings", {"watchdog_period_s": self._watchdog_s, "watchdog_arm": arm, **claim})
+
+    async def _write(self, name: str, values: Mapping[str, float]) -> None:
+        block = self._registers.block(name)
+        await self._link.write_registers(block.address, block.encode(values))

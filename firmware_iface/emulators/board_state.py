@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from firmware_iface.emulators.modbus_server import ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterRefusal
+from firmware_iface.emulators.modbus_server import BUSY, ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterRefusal
 from firmware_iface.register_map import Block, Register, RegisterMap, make_block
 
 FIRMWARE_VERSION = 0x00_01_00_00  # 1.0.0
@@ -13,6 +13,9 @@ FIRMWARE_VERSION = 0x00_01_00_00  # 1.0.0
 GAUGE_PRESSURE_LIMIT_PA = 800.0
 PUMP_LIMIT_FRACTION = 1.0
 WATCHDOG_PERIOD_S = 1.0  # after power-up; the watchdog itself is then off, as on most devices
+_SECRETS = dict.fromkeys(("claim_key", "command_key", "clear_key", "stop"), 0.0)  # what reads as 0
+# the register of a block that carries the claim's secret; a block without one needs no claim
+_KEYS = {"settings": "claim_key", "command": "command_key", "reset": "clear_key"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +33,7 @@ class BoardSample:
 
 
 class BoardState:
-    """The board between two requests.
+    """The board between two requests, of the map version that `registers` has.
 
     `advance` is called before every request and every few milliseconds: the watchdog and the pressure limit depend
     on the time passed in and on nothing else.
@@ -43,13 +46,15 @@ class BoardState:
 
     def __init__(self, registers: RegisterMap, sample: BoardSample) -> None:
         self.map_version = registers.map_version
-        self._registers = registers
+        self.registers = registers
         self._by_address = {register.address: register for register in registers}
         # what drivers ask for is whole blocks, over and over: found at once
         self._by_span = {(block.address, block.count): block for block in registers.blocks}
         self._command = registers.block("command")
+        self._claims = registers.map_version >= 2
         self._watchdog_mask = registers.fault_mask("watchdog")
         self._over_pressure_mask = registers.fault_mask("over_pressure")
+        self._stopped_mask = registers.fault_mask("stopped") if self._claims else 0
         self._sample = sample
         self._now_s = 0.0
         self.restart()
@@ -64,6 +69,7 @@ class BoardState:
             "heartbeat": 0.0,
             "clear_faults": 0.0,
         }
+        self._claim_id = self._claim_key = 0.0
         self._heartbeat_fed = 0.0
         self._fed_s = 0.0
         self._faults = 0
@@ -99,6 +105,14 @@ class BoardState:
         if self._settable["watchdog_arm"] and now_s - self._fed_s > self._settable["watchdog_period_s"]:
             self._latch(self._watchdog_mask)
 
+    @property
+    def held(self) -> bool:
+        """Somebody holds a claim and has fed the watchdog in time: nobody else may have the board.
+
+        Not by the latched fault: who claims a board that is latched holds it as well.
+        """
+        return bool(self._claim_key) and self._now_s - self._fed_s <= self._settable["watchdog_period_s"]
+
     def _latch(self, mask: int) -> None:
         self._faults |= mask
         self._settable["pump_command_fraction"] = 0.0  # so that nothing moves when the fault is cleared
@@ -111,7 +125,7 @@ class BoardState:
             return whole.encode(values)
         end = address + count
         words: dict[int, int] = {}
-        for block in self._registers.blocks:
+        for block in self.registers.blocks:
             if block.address < end and address < block.address + block.count:
                 words.update(enumerate(block.encode(values), block.address))
         if len(words) < count or not all(at in words for at in range(address, end)):
@@ -122,21 +136,46 @@ class BoardState:
         """Write whole registers, all or none.
 
         Raises RegisterRefusal: illegal address for a read-only or unknown register or for a part of one, illegal
-        value outside the limits and for disarming the watchdog while the pump is commanded.
+        value outside the limits and for disarming the watchdog while the pump is commanded. With claims, illegal
+        address for a part of a block, busy while another holds the board, illegal value without any claim.
         """
         target = self._written_block(address, len(words))
         written = target.decode(words)
         if not all(register.allows(written[register.name]) for register in target.registers):
             raise RegisterRefusal(ILLEGAL_VALUE)
+        if self._claims:
+            self._check_claim(target.name, written)
         disarms = written.get("watchdog_arm") == 0 and self._settable["watchdog_arm"]
         if disarms and self._settable["pump_command_fraction"] > 0:
             raise RegisterRefusal(ILLEGAL_VALUE)
+        if self._claims and target.name == "settings":
+            self._claim(written)
         self._apply(written, whole_command=target.registers == self._command.registers)
+
+    def _check_claim(self, block: str, written: dict[str, float]) -> None:
+        key = _KEYS.get(block)
+        if key is None or written[key] == self._claim_key:
+            return
+        if self.held:
+            raise RegisterRefusal(BUSY)
+        if not written.get("watchdog_arm"):  # only arming makes a claim
+            raise RegisterRefusal(ILLEGAL_VALUE)
+
+    def _claim(self, written: dict[str, float]) -> None:
+        """Arming claims the board, disarming gives it back; a new claim has a whole period from now on."""
+        if not written["watchdog_arm"]:
+            self._claim_id = self._claim_key = 0.0
+            return
+        if written["claim_key"] != self._claim_key:
+            self._fed_s = self._now_s
+        self._claim_id, self._claim_key = written["claim_id"], written["claim_key"]
 
     def _written_block(self, address: int, count: int) -> Block:
         whole = self._by_span.get((address, count))
         if whole is not None and whole.access == "rw":
             return whole
+        if self._claims:
+            raise RegisterRefusal(ILLEGAL_ADDRESS)
         found: list[Register] = []
         end = address + count
         while address < end:
@@ -158,6 +197,8 @@ class BoardState:
             self._faults &= ~cleared
             self._settable["pump_command_fraction"] = 0.0
         self._settable["clear_faults"] = 0.0
+        if written.get("stop"):
+            self._latch(self._stopped_mask)
         if arms or feeds or cleared & self._watchdog_mask:
             self._fed_s = self._now_s
 
@@ -166,7 +207,7 @@ class BoardState:
         whole_s = int(sample.device_time_s)
         return {
             **self._settable,
-            "device_kind": self._registers.device_kind,
+            "device_kind": self.registers.device_kind,
             "map_version": self.map_version,
             "firmware_version": FIRMWARE_VERSION,
             "gauge_pressure_limit_pa": GAUGE_PRESSURE_LIMIT_PA,
@@ -187,4 +228,8 @@ class BoardState:
             "watchdog_armed": self._settable["watchdog_arm"],
             "watchdog_tripped": float(bool(self._faults & self._watchdog_mask)),
             "latched_faults": self._faults,
+            "period_in_force_s": self._settable["watchdog_period_s"],
+            "claim_in_force": self._claim_id,
+            "claim_id": self._claim_id,
+            **_SECRETS,
         }

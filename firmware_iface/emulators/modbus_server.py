@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 READ_HOLDING, WRITE_SINGLE, WRITE_MULTIPLE, READ_WRITE = 3, 6, 16, 23
-ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
+ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, BUSY = 1, 2, 3, 6
 
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), length of what follows, unit
 _LENGTH_MAX = 254  # unit + the longest PDU of 253 bytes

@@ -11,7 +11,7 @@ from typing import Protocol
 
 from firmware_iface.emulators.board_state import BoardSample, BoardState
 from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer, exception_pdu, respond
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import RegisterMap, default_map
 
 _PERIOD_S = 0.01  # the board's own loop; the pump is off at most this and one wake-up after the watchdog period
 _GATEWAY_NO_RESPONSE = 11
@@ -82,6 +82,8 @@ class PumpBoardEmulator:
         Seconds on any axis that does not go back; what the watchdog runs on.
     unit_id : int
         Requests to other units are answered with exception 11, as a gateway does.
+    registers : RegisterMap, optional
+        A board of another map version than the newest.
 
     Attributes
     ----------
@@ -98,13 +100,15 @@ class PumpBoardEmulator:
         port: int = 0,
         clock: Callable[[], float] = time.monotonic,
         unit_id: int = 1,
+        registers: RegisterMap | None = None,
     ) -> None:
         self.faults = Faults()
         self._plant = plant
         self._clock = clock
         self._unit_id = unit_id
         self._sample = plant.sample()
-        self.state = BoardState(default_map(), self._sample)
+        self._registers = registers or default_map()
+        self.state = BoardState(self._registers, self._sample)
         self._actuated = (0.0, 0.0)
         self._server = ModbusTcpServer(self._handle, host, port)
         self._task: asyncio.Task[None] | None = None
@@ -167,7 +171,7 @@ class PumpBoardEmulator:
             return Answer(hang_up=True)
         if faults.exception_code:
             return Answer(exception_pdu(pdu, faults.exception_code), faults.delay_s)
-        self.state.map_version = faults.map_version or default_map().map_version
+        self.state.map_version = faults.map_version or self._registers.map_version
         self._advance()
         reply = respond(pdu, self.state)
         self._actuate()

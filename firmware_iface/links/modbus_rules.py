@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from firmware_iface.roles import DeviceRefusedError, LinkError
+from firmware_iface.roles import DeviceBusyError, DeviceRefusedError, LinkError
 
 READ_HOLDING, READ_INPUT, WRITE_SINGLE, DIAGNOSTICS, WRITE_MULTIPLE = 3, 4, 6, 8, 16
 EXCEPTION_FLAG = 0x80
@@ -20,6 +20,7 @@ EXCEPTIONS = {
     11: "no device behind the gateway",
 }
 _REFUSALS = (1, 2, 3)  # the request itself is wrong for this device; the others may pass
+_BUSY = 6
 
 
 class ModbusLink(Protocol):
@@ -72,5 +73,5 @@ class ModbusLink(Protocol):
 
 def exception_error(what: str, code: int) -> LinkError:
     """The error for an exception answer."""
-    kind = DeviceRefusedError if code in _REFUSALS else LinkError
+    kind = DeviceRefusedError if code in _REFUSALS else DeviceBusyError if code == _BUSY else LinkError
     return kind(f"{what}: exception {code} ({EXCEPTIONS.get(code, 'unknown')})")

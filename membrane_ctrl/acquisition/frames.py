@@ -24,7 +24,6 @@ from membrane_ctrl.config import OpticsConfig
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 _ALIGN_BYTES = 64  # a cache line: pixels start on one, and the write counter has one of its own
-_U64 = struct.Struct("<Q")
 _HEAD = struct.Struct("<QddQ24s")  # sequence, time_s, displacement_um, cycle, pattern name in ASCII
 _SHARED_MEMORY_FOLDER = Path("/dev/shm")
 
@@ -181,6 +180,7 @@ class _Slots:
     def __init__(self, memory: SharedMemory, address: FrameAddress) -> None:
         assert memory.buf is not None  # None only after close()
         self._buffer = memory.buf
+        self._words = memory.buf.cast("Q")  # each assignment is one store (`membrane_ctrl.ipc.ring`)
         self._stride = _stride(address)
         shape = (address.height_px, address.width_px)
         # frombuffer keeps hold of the memory, so that closing under a living view raises; ndarray(buffer=...)
@@ -206,25 +206,26 @@ class _Slots:
         _HEAD.pack_into(self._buffer, self._start(head.index), *fields)
 
     def before(self, index: int) -> int:
-        return int(_U64.unpack_from(self._buffer, self._start(index))[0])
+        return self._words[self._start(index) // 8]
 
     def set_before(self, index: int) -> None:
-        _U64.pack_into(self._buffer, self._start(index), index + 1)
+        self._words[self._start(index) // 8] = index + 1
 
     def after(self, index: int) -> int:
-        return int(_U64.unpack_from(self._buffer, self._start(index) + self._stride - 8)[0])
+        return self._words[(self._start(index) + self._stride) // 8 - 1]
 
     def set_after(self, index: int) -> None:
-        _U64.pack_into(self._buffer, self._start(index) + self._stride - 8, index + 1)
+        self._words[(self._start(index) + self._stride) // 8 - 1] = index + 1
 
     def written(self) -> int:
-        return int(_U64.unpack_from(self._buffer, 0)[0])
+        return self._words[0]
 
     def set_written(self, count: int) -> None:
-        _U64.pack_into(self._buffer, 0, count)
+        self._words[0] = count
 
     def release(self) -> None:
         self._pixels.clear()
+        self._words.release()
 
     def _start(self, index: int) -> int:
         return _ALIGN_BYTES + (index % len(self._pixels)) * self._stride

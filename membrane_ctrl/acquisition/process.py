@@ -37,7 +37,7 @@ class AcquisitionSpec:
     telemetry : RingAddress
         Where the laser readings are.
     shapes : RingAddress
-        Where the estimates go, pickled.
+        Where the estimates go (`estimate.pack_estimate`).
     truth : RingAddress or None
         The twin's truth, which its camera renders; None on a real bench.
     frames : FrameAddress

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 
 from membrane_ctrl.acquisition.cycle import CycleClock, CycleDone, CycleFailed, ShapeCycle
 from membrane_ctrl.acquisition.remote import Remote
-from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.estimate import ShapeEstimate, pack_estimate
 from membrane_ctrl.tick import Event
 
 
@@ -70,13 +69,13 @@ def next_deadline_s(last_s: float, period_s: float, earliest_s: float) -> float:
 
 
 def estimate_message(estimate: ShapeEstimate) -> bytes:
-    """An estimate as it crosses in the ring of shapes (pickled); its covariance in the 24 bits of a single.
+    """An estimate as it crosses in the ring of shapes, its covariance in the 24 bits of a single.
 
     A variance known to 1e-7 is known better than its noise model, and what the controller is given has to be
     recorded to the last bit: in doubles that would be 0.2 GB a day.
     """
     covariance_um2 = estimate.covariance_um2.astype(np.float32).astype(np.float64)
-    return pickle.dumps(replace(estimate, covariance_um2=covariance_um2), pickle.HIGHEST_PROTOCOL)
+    return pack_estimate(replace(estimate, covariance_um2=covariance_um2))
 
 
 def _captured(result: CycleDone | CycleFailed | None, keep: Callable[[ShapeEstimate], Path]) -> Event:

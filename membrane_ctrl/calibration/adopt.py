@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -12,7 +11,14 @@ from membrane_ctrl.calibration.geometry_file import GeometryFile, GeometryOrigin
 from membrane_ctrl.config import OpticsConfig
 from membrane_ctrl.errors import DeviceError, InputError
 from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.recording.atomic import (
+    SMALL_BYTES,
+    read_bytes,
+    read_text,
+    users,
+    write_bytes_atomic,
+    write_text_atomic,
+)
 
 
 def compared(optics: OpticsConfig, origin: GeometryOrigin, new: GeometryFile) -> list[str]:
@@ -57,11 +63,12 @@ def adopt(new: Path, place: Path) -> Path | None:
         If it cannot be written; then the old one is still there.
     """
     try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place = users(place)
         kept = _kept(place) if place.exists() else None
         if kept is not None:
-            shutil.copy2(place, kept)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        write_text_atomic(place, new.read_text(encoding="utf-8"))
+            write_bytes_atomic(kept, read_bytes(place, SMALL_BYTES, follow=True))
+        write_text_atomic(place, read_text(new))
     except OSError as error:
         raise DeviceError(f"{place}: cannot be written ({(error.strerror or str(error)).lower()})") from None
     return kept

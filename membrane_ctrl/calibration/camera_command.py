@@ -17,6 +17,8 @@ from membrane_ctrl.errors import Exit, InputError, RejectedError
 from membrane_ctrl.metrology.calibrate.board import Board, on_screen
 from membrane_ctrl.metrology.calibrate.lens import Lens, View, calibrate_lens
 from membrane_ctrl.metrology.calibrate.parameters import usual_sigma
+from membrane_ctrl.recording.atomic import read_bytes, users, write_bytes_atomic
+from membrane_ctrl.sets.images import IMAGE_BYTES_MAX, decoded_image
 
 _IMAGES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 
@@ -64,7 +66,9 @@ def draw_board(out: Path, board_text: str, square_px: int, width_px: int, height
         raise InputError(f"calibrate-board: {error}") from None
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        written = cv2.imwrite(str(out), levels)
+        written, picture = cv2.imencode(out.suffix, levels)
+        if written:
+            write_bytes_atomic(users(out), picture.tobytes())
     except (OSError, cv2.error):
         written = False
     if not written:
@@ -90,16 +94,17 @@ def _images(folder: Path) -> list[Path]:
 
 
 def _view(path: Path, board: Board, camera: CameraConfig) -> View:
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-    if image is None:
-        raise InputError(f"{path}: not an image")
+    try:
+        image = decoded_image(read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: {(error.strerror if isinstance(error, OSError) else None) or error}") from None
     if image.shape != (camera.height_px, camera.width_px):
         raise InputError(
             f"{path}: {image.shape[1]} x {image.shape[0]} pixels, the configuration's optics.camera has "
             f"{camera.width_px} x {camera.height_px}"
         )
     if image.dtype != np.uint8:  # the detectors know 8 bits only; a corner needs no more
-        image = (image * (255.0 / max(1, int(image.max())))).astype(np.uint8)
+        image = (np.asarray(image, float) * (255.0 / max(1, int(image.max())))).astype(np.uint8)
     place, seen_px = board.corners(np.asarray(image, np.uint8))
     return View(path.name, place, seen_px)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from membrane_ctrl.calibration.geometry_file import CalibrationTable, GeometryOrigin, origin_of, read_geometry
 from membrane_ctrl.config import Config, OpticsConfig
 from membrane_ctrl.errors import InputError
+from membrane_ctrl.recording.atomic import write_text_atomic
 
 KEPT = "geometry.toml"  # in the run's folder
 
@@ -41,7 +42,7 @@ class InForce:
         if not self.text:
             return
         try:
-            (run_dir / KEPT).write_text(self.text, encoding="utf-8")
+            write_text_atomic(run_dir / KEPT, self.text)
         except OSError as error:
             raise InputError(f"{run_dir / KEPT}: cannot be written: {error.strerror or error}") from None
 

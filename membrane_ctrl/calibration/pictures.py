@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.calibrate.solve import Solution
+from membrane_ctrl.recording.atomic import users
+from membrane_ctrl.sets.result_files import write_figure
 
 FloatArray = NDArray[np.float64]
 
@@ -31,18 +32,17 @@ def draw_residuals(path: Path, solution: Solution) -> None:
     reach = float(np.nanpercentile(np.abs(maps), 98)) or 1.0  # single cells at the edge must not set the scale
     colours = ScalarMappable(Normalize(-reach, reach), "RdBu_r")
     figure = Figure(figsize=(_INCHES * count, 2 * _INCHES), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(2, count, squeeze=False, sharex=True, sharey=True)
     for axis, name in enumerate(("s_x", "s_y")):
         for k, phases in enumerate(solution.problem.sets):
             panel = panels[axis][k]
             panel.pcolormesh(*edges, maps[axis][k], cmap=colours.cmap, norm=colours.norm)
             panel.set_aspect("equal")
-            panel.set_title(f"{phases.name}: {name}", fontsize=8)
+            panel.set_title(f"{phases.name}: {name}", fontsize=8, parse_math=False)
             panel.tick_params(labelsize=6)
     panels[0][0].invert_yaxis()  # rows count downwards; the axes are shared
     figure.colorbar(colours, ax=panels, label="seen minus predicted, um on the screen")
-    figure.savefig(path, dpi=_DPI)
+    write_figure(users(path), figure, _DPI)
 
 
 def _edges(solution: Solution) -> tuple[FloatArray, FloatArray]:

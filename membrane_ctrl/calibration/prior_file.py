@@ -16,6 +16,7 @@ from membrane_ctrl.config import GeometryConfig, OpticsConfig, Section
 from membrane_ctrl.config_file import load, parse
 from membrane_ctrl.errors import InputError
 from membrane_ctrl.metrology.calibrate.parameters import NAMES
+from membrane_ctrl.recording.atomic import users, write_text_atomic
 
 SCHEMA = "membrane-prior/1"
 
@@ -73,8 +74,6 @@ def write_prior(path: Path, tables: dict[str, Any], made_by: str, made_of: Seque
     }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        fresh = path.with_name(path.name + ".new")
-        fresh.write_text(tomli_w.dumps({"schema": SCHEMA, **tables, "made": made}), encoding="utf-8")
-        fresh.replace(path)
+        write_text_atomic(users(path), tomli_w.dumps({"schema": SCHEMA, **tables, "made": made}))
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None

@@ -30,6 +30,7 @@ from membrane_ctrl.metrology.calibrate.separable import Witness
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, slope_residual, solve
 from membrane_ctrl.metrology.calibrate.verdict import Finding, after, before
 from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.recording.atomic import users, write_text_atomic
 from membrane_ctrl.sets.set_figure import Figures
 
 
@@ -227,9 +228,7 @@ def _write(path: Path, solution: Solution, problem: Problem, bundle: Bundle, fin
     tables = tables_of(solution, bundle.optics, origin)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        fresh = path.with_name(path.name + ".new")
-        fresh.write_text(tomli_w.dumps(tables), encoding="utf-8")
-        fresh.replace(path)  # never half a geometry
+        write_text_atomic(users(path), tomli_w.dumps(tables))  # never half a geometry
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
     return str(tables["calibration"]["hash"])

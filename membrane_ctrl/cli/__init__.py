@@ -12,25 +12,28 @@ from membrane_ctrl import __version__
 from membrane_ctrl.cli import auxiliary, calibrating, devices, holding, optics, records
 from membrane_ctrl.errors import CommandError, Exit
 from membrane_ctrl.review.cli import add_commands as add_review_commands
+from membrane_ctrl.terminal import one_line, only_text
 from membrane_ctrl.tune.cli import app as tune_app
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run one command and return its exit code; every expected failure is one line on stderr."""
-    try:
-        result = app(list(arguments), prog_name="membrane-ctrl", standalone_mode=False)
-    except CommandError as error:
-        print(f"membrane-ctrl: {error}", file=sys.stderr)
-        return error.exit
-    except typer.TyperException as error:
-        print(f"membrane-ctrl: {error.format_message()} (see --help)", file=sys.stderr)
-        return Exit.BAD_INPUT
-    except (KeyboardInterrupt, typer.Abort):
-        print("membrane-ctrl: interrupted", file=sys.stderr)
-        return Exit.INTERRUPTED
-    return int(result or 0)
+    """Run one command and return its exit code; an expected failure is a line on stderr, a finding each its own."""
+    with only_text():
+        try:
+            result = app(list(arguments), prog_name="membrane-ctrl", standalone_mode=False)
+        except CommandError as error:
+            for line in error.lines:
+                print(f"membrane-ctrl: {one_line(line)}", file=sys.stderr)
+            return error.exit
+        except typer.TyperException as error:
+            print(f"membrane-ctrl: {one_line(error.format_message())} (see --help)", file=sys.stderr)
+            return Exit.BAD_INPUT
+        except (KeyboardInterrupt, typer.Abort):
+            print("membrane-ctrl: interrupted", file=sys.stderr)
+            return Exit.INTERRUPTED
+        return int(result or 0)
 
 
 @app.callback(invoke_without_command=True)

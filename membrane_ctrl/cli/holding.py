@@ -75,11 +75,18 @@ def twin(
     return serve_twin(_started(configured(config), from_flat), speed)
 
 
-def safe(config: ConfigArgument) -> int:
+def safe(
+    config: ConfigArgument,
+    logs: Annotated[Path | None, typer.Option(help="The folder of the runs; the configuration's by default.")] = None,
+    latch: Annotated[
+        bool,
+        typer.Option(help="Keep it stopped until a person clears it; without, a running program is left alone."),
+    ] = True,
+) -> int:
     """Stop the pump of the devices that a configuration names, whatever runs or ran; the vent stays as it is."""
     from membrane_ctrl.safe_state import make_safe
 
-    return make_safe(configured(config), str(config))
+    return make_safe(configured(config), str(config), logs, latch)
 
 
 def ctl(

@@ -127,6 +127,11 @@ class InnerLoop:
         self._setpoint_um = math.nan
         self._shaped_um = math.nan
 
+    @property
+    def mean_flow_um_per_s(self) -> float:
+        """The mean flow, which `stale` puts out."""
+        return self._pid.integral_um_per_s
+
     def start(self, displacement_um: float, flow_um_per_s: float) -> None:
         """Begin at a reading: the setpoint ramps from there, the integrator stands at the flow.
 

@@ -1,21 +1,30 @@
 """The rings of a run for programs that the run did not start: their addresses in its folder, `rings.json`.
 
 Reading them costs the control process nothing, and every tick is there for a minute: what a session needs and a
-stream of status lines through the port is not (docs/decisions/96-a-session-reads-the-rings.md).
+stream of status lines through the port is not (docs/decisions/79-tuning-sessions.md). The folder may have
+been made by somebody else: only shared memory of this user that is the ring it is said to be is opened, to be read.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import re
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import asdict
-from multiprocessing import resource_tracker
+from mmap import PROT_READ, mmap
 from pathlib import Path
+from typing import Any
 
-from membrane_ctrl.ipc.ring import RingAddress, RingReader
-from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.ipc.ring import RingAddress, RingError, RingReader
+from membrane_ctrl.recording.atomic import open_plain, read_bytes, write_text_atomic
 
 _FILE = "rings.json"
+_FILE_BYTES_MAX = 4096  # three rings take 250
+_NAME = re.compile(r"psm_[0-9a-f]{8}")  # as Python's `SharedMemory` names what it makes
+_RINGS = frozenset({"telemetry", "events", "shapes"})
+_SHARED_MEMORY_FOLDER = Path("/dev/shm")
 
 
 def publish(run_dir: Path, rings: Mapping[str, RingAddress | None]) -> None:
@@ -31,13 +40,40 @@ def attach(run_dir: Path) -> dict[str, RingReader]:
     ------
     FileNotFoundError
         The run has published none, or is over.
+    OSError, RingError
+        `rings.json` or what it names is none of ours.
     """
-    found = json.loads((run_dir / _FILE).read_text(encoding="utf-8"))
     readers: dict[str, RingReader] = {}
-    for name, values in found.items():
-        address = RingAddress(**values)
-        readers[name] = RingReader(address)
-        # Python below 3.13 takes whoever attaches for the owner and would remove the memory at our end.
-        resource_tracker.unregister(f"/{address.name.lstrip('/')}", "shared_memory")
-        readers[name].latest()
+    with ExitStack() as stack:
+        for name, address in _addresses(run_dir / _FILE).items():
+            readers[name] = RingReader(address, _mapped(address))
+            stack.callback(readers[name].close)
+            readers[name].latest()
+        stack.pop_all()
     return readers
+
+
+def _addresses(path: Path) -> dict[str, RingAddress]:
+    text = read_bytes(path, _FILE_BYTES_MAX)
+    try:
+        return {name: _address(name, values) for name, values in json.loads(text).items()}
+    except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
+        raise RingError(f"{_FILE} is damaged: {error}") from None
+
+
+def _address(ring: str, values: dict[str, Any]) -> RingAddress:
+    name, slots, slot_bytes = values["name"], values["slots"], values["slot_bytes"]
+    if ring not in _RINGS or not _NAME.fullmatch(name) or type(slots) is not int or type(slot_bytes) is not int:
+        raise RingError(f"{ring!r:.40} is the address of no ring")
+    return RingAddress(name, slots, slot_bytes)
+
+
+def _mapped(address: RingAddress) -> mmap:
+    """The ring's memory, read only. Raises OSError, RingError."""
+    with open_plain(_SHARED_MEMORY_FOLDER / address.name) as file:
+        found, size_bytes = os.fstat(file.fileno()), address.size_bytes
+        if found.st_uid != os.geteuid():
+            raise RingError(f"{address.name} belongs to user {found.st_uid}: tune as that user")
+        if found.st_size != size_bytes:
+            raise RingError(f"{address.name} has {found.st_size} bytes, not the {size_bytes} of the ring")
+        return mmap(file.fileno(), size_bytes, prot=PROT_READ)

@@ -1,22 +1,38 @@
 """A ring of messages in shared memory: one writer that never waits, any number of readers.
 
 The writer overwrites the oldest slot; a reader that was too slow sees a gap in the sequence numbers and counts
-it. What a killed writer had put is still there for its readers. Each slot carries its sequence number before
-and after the message: a reader takes a slot only if both are the one it expects, before and after copying.
-Numbers are 8-byte aligned, which x86-64 and ARM64 write at once.
+it. What a killed writer had put is still there for its readers.
+
+Counter and sequence numbers are 8-byte aligned and written through a memoryview of 8-byte words, which makes one
+store of each assignment. (`struct.pack_into` clears the bytes first, and a racing reader sees the counter as 0.)
+Each slot carries its sequence number before and after the message. A reader takes a message only if both are the one
+it expects: it reads the one behind before it copies and the one in front afterwards. That is enough on x86-64, where
+stores become visible in their order. On ARM64 they may not, so each slot also has a CRC-32 of its message, seeded
+with the sequence number: a message that is not all there yet does not fit, and the reader looks again at its next
+call.
 """
 
 from __future__ import annotations
 
-import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from mmap import mmap
 from multiprocessing.shared_memory import SharedMemory
 
+_MAGIC = int.from_bytes(b"MBRring1", "little")
+_WRITTEN, _IS_RING, _SLOTS, _SLOT_BYTES = range(4)  # words of the header
 _HEADER_BYTES = 64  # a cache line of its own for the write counter
-_U64 = struct.Struct("<Q")
-_SLOT_OVERHEAD = 3 * 8  # sequence, length, sequence again
+_SLOT_OVERHEAD = 3 * 8  # sequence; length and CRC-32; sequence again
+# The largest ring of a run, a minute of inputs at 1 kHz, is 32 MB
+_RING_BYTES_MAX = 1 << 27
+# A writer that goes round meanwhile takes a few tries; a newest slot that never fits is damage and must end `latest`
+_TRIES = 100
+
+
+class RingError(ValueError):
+    """The memory is no ring, or not the one that the address tells of."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +42,14 @@ class RingAddress:
     name: str
     slots: int
     slot_bytes: int
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the shared memory. Raises RingError if no ring of ours is like that."""
+        size_bytes = _HEADER_BYTES + self.slots * _stride(self.slot_bytes)
+        if self.slots < 1 or self.slot_bytes < 0 or size_bytes > _RING_BYTES_MAX:
+            raise RingError(f"no ring has {self.slots} slots of {self.slot_bytes} bytes")
+        return size_bytes
 
 
 class Ring:
@@ -40,9 +64,12 @@ class Ring:
     """
 
     def __init__(self, slots: int, slot_bytes: int) -> None:
-        stride = _stride(slot_bytes)
-        self._memory = SharedMemory(create=True, size=_HEADER_BYTES + slots * stride)
+        size_bytes = RingAddress("", slots, slot_bytes).size_bytes
+        self._memory = SharedMemory(create=True, size=size_bytes)
         self.address = RingAddress(self._memory.name, slots, slot_bytes)
+        assert self._memory.buf is not None  # None only after close()
+        with self._memory.buf[:_HEADER_BYTES].cast("Q") as words:
+            words[_IS_RING], words[_SLOTS], words[_SLOT_BYTES] = _MAGIC, slots, slot_bytes
 
     def close(self) -> None:
         """Give the memory back; readers that are still attached keep theirs."""
@@ -50,70 +77,112 @@ class Ring:
         self._memory.unlink()
 
 
-class RingWriter:
-    """The one writer of a ring."""
+class _Slots:
+    """The layout, over memory that is checked against its address. Raises RingError."""
 
-    def __init__(self, address: RingAddress) -> None:
-        self._memory = SharedMemory(address.name)
-        self._buffer = _buffer(self._memory)
-        self._address = address
-        self._stride = _stride(address.slot_bytes)
-        self._next = _U64.unpack_from(self._buffer, 0)[0]
+    def __init__(self, memory: SharedMemory | mmap, address: RingAddress) -> None:
+        whole = memoryview(memory) if isinstance(memory, mmap) else memory.buf
+        assert whole is not None  # None only after close()
+        self._memory, self._views = memory, [whole]
+        size_bytes = address.size_bytes
+        if whole.nbytes < size_bytes:
+            raise RingError(f"{address.name}: {whole.nbytes} bytes where a ring of {size_bytes} is expected")
+        self.bytes = whole[:size_bytes]
+        self.words = self.bytes.cast("Q")
+        self._views[:0] = self.words, self.bytes
+        self.count, self._stride = address.slots, _stride(address.slot_bytes)
+        head = [self.words[word] for word in (_IS_RING, _SLOTS, _SLOT_BYTES)]
+        if head != [_MAGIC, address.slots, address.slot_bytes]:
+            raise RingError(f"{address.name}: not the ring of {address.slots} slots that is expected")
 
     @property
-    def slot_bytes(self) -> int:
-        """Longest message."""
-        return self._address.slot_bytes
+    def written(self) -> int:
+        """Messages put so far."""
+        return self.words[_WRITTEN]
+
+    def span(self, index: int) -> tuple[int, int]:
+        """First and last word of a message's slot."""
+        start = _HEADER_BYTES + (index % self.count) * self._stride
+        return start // 8, (start + self._stride) // 8 - 1
+
+    def close(self) -> None:
+        """Detach: memory with a view of it cannot be closed."""
+        for view in self._views:
+            view.release()
+        self._memory.close()
+
+    __del__ = close  # before the memory's own end, which would complain of the views
+
+
+class RingWriter:
+    """The one writer of a ring. Raises RingError for what is none."""
+
+    def __init__(self, address: RingAddress) -> None:
+        self._slots = _Slots(SharedMemory(address.name), address)
+        self._next = self._slots.written
+        self.slot_bytes = address.slot_bytes
 
     def put(self, message: bytes) -> None:
         """Write one message over the oldest. Raises ValueError if it is longer than a slot."""
         length = len(message)
-        if length > self._address.slot_bytes:
-            raise ValueError(f"message of {length} bytes in a ring of {self._address.slot_bytes}-byte slots")
-        buffer = self._buffer
+        if length > self.slot_bytes:
+            raise ValueError(f"message of {length} bytes in a ring of {self.slot_bytes}-byte slots")
+        words = self._slots.words
+        first, last = self._slots.span(self._next)
         sequence = self._next + 1
-        start = _HEADER_BYTES + (self._next % self._address.slots) * self._stride
-        _U64.pack_into(buffer, start, sequence)
-        _U64.pack_into(buffer, start + 8, length)
-        buffer[start + 16 : start + 16 + length] = message
-        _U64.pack_into(buffer, start + self._stride - 8, sequence)
+        words[first] = sequence
+        words[first + 1] = _seal(message, sequence)
+        self._slots.bytes[8 * first + 16 : 8 * first + 16 + length] = message
+        words[last] = sequence
         self._next = sequence
-        _U64.pack_into(buffer, 0, sequence)
+        words[_WRITTEN] = sequence
 
     def close(self) -> None:
         """Detach."""
-        self._memory.close()
+        self._slots.close()
 
 
 class RingReader:
     """One reader; it starts at the oldest message still in the ring.
 
+    Parameters
+    ----------
+    address : RingAddress
+        Of the ring.
+    memory : mmap, optional
+        The ring's memory, if the caller has mapped it.
+
     Attributes
     ----------
     dropped : int
         Messages overwritten before this reader got to them.
+
+    Raises
+    ------
+    RingError
     """
 
-    def __init__(self, address: RingAddress) -> None:
-        self._memory = SharedMemory(address.name)
-        self._buffer = _buffer(self._memory)
-        self._address = address
-        self._stride = _stride(address.slot_bytes)
+    def __init__(self, address: RingAddress, memory: mmap | None = None) -> None:
+        self._slots = _Slots(SharedMemory(address.name) if memory is None else memory, address)
+        self._slot_bytes = address.slot_bytes
         self._read = 0
+        self._looked_at = -1
         self.dropped = 0
 
     def drain(self, limit: int | None = None) -> list[bytes]:
-        """All messages since the last call (at most `limit`), oldest first."""
+        """All messages since the last call (at most `limit`, and one round of the ring), oldest first."""
         messages: list[bytes] = []
-        while limit is None or len(messages) < limit:
-            written = self._written()
-            if self._read >= written:
+        for _ in range(self._slots.count):
+            written = self._slots.written
+            if self._read >= written or (limit is not None and len(messages) >= limit):
                 break
-            oldest = max(0, written - self._address.slots)
+            oldest = max(0, written - self._slots.count)
             if self._read < oldest:
                 self.dropped += oldest - self._read
                 self._read = oldest
             message = self._take(self._read)
+            if message is None and self._not_there_yet():
+                break
             self._read += 1
             if message is None:
                 self.dropped += 1
@@ -123,27 +192,34 @@ class RingReader:
 
     def latest(self) -> bytes | None:
         """The newest message, or None if there is none yet; older ones are passed over and not counted."""
-        while written := self._written():
+        for _ in range(_TRIES):
+            written = self._slots.written
+            if not written:
+                break
             self._read = written
             if (message := self._take(written - 1)) is not None:
                 return message
         return None
 
-    def _written(self) -> int:
-        return int(_U64.unpack_from(self._buffer, 0)[0])
+    def _not_there_yet(self) -> bool:
+        """Nobody has written over the message, so it has yet to become visible; True once for each message."""
+        again = self._looked_at != self._read and self._read > self._slots.written - self._slots.count
+        self._looked_at = self._read
+        return again
 
     def _take(self, index: int) -> bytes | None:
-        buffer = self._buffer
-        start = _HEADER_BYTES + (index % self._address.slots) * self._stride
-        after = _U64.unpack_from(buffer, start + self._stride - 8)[0]
-        length = min(_U64.unpack_from(buffer, start + 8)[0], self._address.slot_bytes)
-        message = bytes(buffer[start + 16 : start + 16 + length])
-        before = _U64.unpack_from(buffer, start)[0]
-        return message if before == after == index + 1 else None
+        slots = self._slots
+        first, last = slots.span(index)
+        after = slots.words[last]
+        seal = slots.words[first + 1]
+        length = min(seal & 0xFFFFFFFF, self._slot_bytes)
+        message = bytes(slots.bytes[8 * first + 16 : 8 * first + 16 + length])
+        before = slots.words[first]
+        return message if before == after == index + 1 and seal == _seal(message, index + 1) else None
 
     def close(self) -> None:
         """Detach."""
-        self._memory.close()
+        self._slots.close()
 
 
 @contextmanager
@@ -156,9 +232,9 @@ def ring(slots: int, slot_bytes: int) -> Iterator[RingAddress]:
         owner.close()
 
 
-def _buffer(memory: SharedMemory) -> memoryview:
-    assert memory.buf is not None  # None only after close()
-    return memory.buf
+def _seal(message: bytes, sequence: int) -> int:
+    """Length and CRC-32 of a message, in one word."""
+    return len(message) | zlib.crc32(message, sequence & 0xFFFFFFFF) << 32
 
 
 def _stride(slot_bytes: int) -> int:

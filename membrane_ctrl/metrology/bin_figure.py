@@ -1,6 +1,6 @@
 """The figure of a checked set from its bins: what every analysis of many sets uses.
 
-For 36 terms the bins carry all that the pixels do, at a sixteenth of the cost (decision 45).
+For 36 terms the bins carry all that the pixels do, at a sixteenth of the cost (decision 41).
 """
 
 from __future__ import annotations

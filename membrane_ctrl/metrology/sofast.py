@@ -22,6 +22,7 @@ FloatArray = NDArray[np.float64]
 
 STEPS = 4  # SOFAST always takes four
 _MM_PER_M = 1e3
+_ELEMENTS_MAX = 100_000_000  # 24 frames of 4 megapixels; each takes eight bytes once it is read
 _FACET = "DataSofastCalculation/facet/facet_000"
 
 
@@ -220,10 +221,29 @@ def _open(path: Path) -> Any:
 
 
 def _item(file: Any, name: str) -> Any:
-    if name not in file:
-        raise ValueError(f"{file.filename}: {name} is missing")
-    return file[name][()]
+    """A data set of the file itself: none behind a link to another file, and none of more than is ever measured."""
+    import h5py
+
+    try:
+        parts = name.split("/")
+        for end in range(1, len(parts) + 1):
+            link = file.get("/".join(parts[:end]), getlink=True)
+            if link is None:
+                raise ValueError(f"{file.filename}: {name} is missing")
+            if not isinstance(link, h5py.HardLink):
+                raise ValueError(f"{file.filename}: {name} is a link, and links are not followed here")
+        found = file[name]
+        if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
+            raise ValueError(f"{file.filename}: {name} is not a data set of this file")
+        if found.size is None or found.size > _ELEMENTS_MAX:
+            raise ValueError(f"{file.filename}: {name} has {found.shape} elements, more than are read")
+        return found[()]
+    except (OSError, RuntimeError, KeyError, TypeError) as error:  # what a damaged file makes of HDF5
+        raise ValueError(f"{file.filename}: {name} cannot be read ({error})") from None
 
 
 def _floats(file: Any, name: str) -> FloatArray:
-    return np.asarray(_item(file, name), float)
+    try:
+        return np.asarray(_item(file, name), float)
+    except TypeError:
+        raise ValueError(f"{file.filename}: {name} holds no numbers") from None

@@ -11,8 +11,8 @@ from membrane_ctrl.port.protocol import Action
 _RANK: dict[Role, int] = {"read": 0, "operate": 1, "tune": 2}
 _ERRANDS: dict[str, Role] = {"status": "read", "watch": "read", "release": "operate", "quiet": "operate"}
 
-# Nobody has to have the command for these: a stop is always taken, the others move nothing
-FREE = frozenset({"status", "watch", "stop", "mark", "release", "quiet"})
+# Nobody has to have the command for these: what stops the pump is always taken, the others move nothing
+FREE = frozenset({"status", "watch", "stop", "latch", "mark", "release", "quiet"})
 
 
 @dataclass(frozen=True, slots=True)

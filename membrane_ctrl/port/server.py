@@ -14,7 +14,6 @@ import math
 import socket
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from membrane_ctrl.commands import TABLE, Command
@@ -22,7 +21,7 @@ from membrane_ctrl.config import LoopConfig
 from membrane_ctrl.config_file import parse
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.errors import InputError
-from membrane_ctrl.port.door import Door
+from membrane_ctrl.port.door import Door, LetIn, Welcome
 from membrane_ctrl.port.listeners import Listeners
 from membrane_ctrl.port.metrics import metrics_text, serve_metrics
 from membrane_ctrl.port.people import FREE, Helm, Peer, may_not
@@ -111,14 +110,14 @@ class Port:
     async def open(self) -> AsyncIterator[None]:
         """Let clients in for the length of a `with` block."""
         listeners = self._listeners
-        doors = []
+        asked: list[tuple[str, socket.socket, Welcome]] = []
         if listeners.unix is not None:
-            doors.append(Door("unix", listeners.unix.socket, self._welcome_unix, self._tell))
+            asked.append(("unix", listeners.unix.socket, self._welcome_unix))
         if listeners.tls is not None:
-            doors.append(Door("tls", listeners.tls.socket, self._welcome_tls, self._tell))
+            asked.append(("tls", listeners.tls.socket, self._welcome_tls))
         if listeners.metrics is not None:
-            welcome = partial(serve_metrics, text=self.metrics)
-            doors.append(Door("metrics", listeners.metrics, welcome, self._tell))
+            asked.append(("metrics", listeners.metrics, self._welcome_metrics))
+        doors = [Door(*each, self._tell, self._turned_away) for each in asked]
         for door in doors:
             door.open()
         if doors:
@@ -149,18 +148,25 @@ class Port:
         recording_ok = not self._picture.recorder.standing
         return metrics_text(self._picture.row, len(self._sessions), self._refusals.count, recording_ok)
 
-    async def _welcome_unix(self, connection: socket.socket) -> None:
+    def _turned_away(self, who: str, reason: str) -> None:
+        self._refusals.record(who, "", reason)
+
+    async def _welcome_metrics(self, connection: socket.socket, let_in: LetIn) -> None:
+        await serve_metrics(connection, self.metrics)
+
+    async def _welcome_unix(self, connection: socket.socket, let_in: LetIn) -> None:
         assert self._listeners.unix is not None
         peer = self._listeners.unix.peer(connection)
         await self._serve(await Wire.on(connection), peer)
 
-    async def _welcome_tls(self, connection: socket.socket) -> None:
+    async def _welcome_tls(self, connection: socket.socket, let_in: LetIn) -> None:
         assert self._listeners.tls is not None
         try:
             wire = await Wire.on(connection, self._listeners.tls.context)
         except OSError as error:  # no certificate, an expired one, one of a stranger, no TLS at all, too slow
             self._refusals.record("tls:unknown", "", f"handshake: {error}")
             return
+        let_in()
         tls, certificate = self._listeners.tls, wire.certificate
         await self._serve(wire, tls.peer(certificate), tls.lasts_s(certificate))
 

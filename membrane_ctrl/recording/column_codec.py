@@ -25,13 +25,20 @@ def encode_columns(records: NDArray[np.void]) -> bytes:
 
 def decode_columns(data: bytes, kind: np.dtype[np.void], count: int) -> tuple[NDArray[np.void], int]:
     """(count,) records of a kind, and how many bytes of `data` they took. Raises ValueError if there are too few."""
+    # before the memory is taken: a count may be anything
+    if count * sum(min(4, kind[name].itemsize) for name in kind.names or ()) > len(data):
+        raise ValueError(f"{count} ticks are said to be in {len(data)} bytes")
     records = np.empty(count, dtype=kind)
     if not count:
         return records, 0
     place = 0
     for name in kind.names or ():
         field = kind[name]
+        if place >= len(data):
+            raise ValueError("too short for its ticks")
         code = data[place]
+        if code != _AS_IT_IS and (code > _DIGITS_MAX or field.kind != "f"):
+            raise ValueError(f"column {name} has no code {code}")
         size = count * (4 if code != _AS_IT_IS else field.itemsize)
         records[name] = _decode(code, data[place + 1 : place + 1 + size], field, count)
         place += 1 + size

@@ -23,7 +23,7 @@ def parse(message: bytes) -> Event:
     """The event of a ring message; one that is not a JSON object becomes an event that says so."""
     try:
         event = json.loads(message)
-    except ValueError:
+    except (ValueError, RecursionError):
         event = None
     return event if isinstance(event, dict) else {"kind": "unreadable_event", "message": repr(message[:200])}
 

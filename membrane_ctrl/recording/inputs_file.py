@@ -21,9 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
-from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.estimate import ShapeEstimate, pack_estimate, unpack_estimate
+from membrane_ctrl.recording import plain_json
+from membrane_ctrl.recording.atomic import open_plain, read_bytes
 from membrane_ctrl.recording.column_codec import decode_columns, encode_columns
-from membrane_ctrl.tick_record import RECORD, Records, TickBatch, pack_estimate, unpack_estimate
+from membrane_ctrl.tick_record import RECORD, Records, TickBatch
 
 SCHEMA = "membrane-inputs/1"
 _MAGIC = b"MBRNin01"
@@ -34,6 +36,13 @@ _TAIL, _SHAPE, _MEMORY = b"C", b"S", b"M"
 _LOOK_BYTES = 1 << 20  # holds a first frame, whatever is in it
 # While the disk is full frames wait here, one a second: ten minutes, in which a person who was told makes room; 2 MB.
 WAITING_MAX = 600
+# A file of six hours at 200 Hz is 130 MB, a second 100 kB; a shape with its covariance is 12 kB, a memory 30 kB.
+_FILE_BYTES_MAX = 300_000_000
+_BODY_BYTES_MAX = 16_000_000
+_HEAD_BYTES_MAX = 65_536
+# What a record's fields may be: no objects, no arrays.
+_CODES = {code: code for code in ("<i8", "<f8", "|u1", "<u4")}
+_NEEDED = ("tick", "now_s", "output_crc", "tail_bytes")
 
 
 class InputsFile:
@@ -158,12 +167,20 @@ class InputsReader:
         """All frames in order; a tick that was written twice (a recorder that went on) comes once. Raises OSError."""
         last = 0
         for path in self.paths:
-            data = path.read_bytes()
+            try:
+                data = read_bytes(path, _FILE_BYTES_MAX)
+            except OSError as error:
+                self.damage.append(f"{path.name}: cannot be read ({error.strerror})")
+                continue
             kind = self._kind_of(data, path.name)
             if kind is None:
                 continue
             for body in self._bodies(data, path.name):
-                frame = _frame_of(body, kind)
+                try:
+                    frame = _frame_of(body, kind)
+                except (ValueError, struct.error, LookupError, TypeError) as error:
+                    self.damage.append(f"{path.name}: a frame holds no ticks ({error})")
+                    continue
                 fresh = frame.records[frame.records["tick"] > last]
                 if len(fresh):
                     last = int(fresh["tick"][-1])
@@ -178,20 +195,24 @@ class InputsReader:
         return found
 
     def _first_s(self, path: Path) -> float:
-        with path.open("rb") as file:
-            data = file.read(_LOOK_BYTES)
-        kind = self._kind_of(data, path.name)
-        body = next(self._bodies(data, path.name), None)
-        frame = None if kind is None or body is None else _frame_of(body, kind)
+        try:
+            with open_plain(path) as file:
+                data = file.read(_LOOK_BYTES)
+            kind = self._kind_of(data, path.name)
+            body = next(self._bodies(data, path.name), None)
+            frame = None if kind is None or body is None else _frame_of(body, kind)
+        except (OSError, ValueError, struct.error, LookupError, TypeError):  # told when it is read
+            return math.inf
         return math.inf if frame is None or not len(frame.records) else float(frame.records["now_s"][0])
 
     def _kind_of(self, data: bytes, name: str) -> np.dtype[np.void] | None:
         """The file's own record: one of an older program may lack a field, one of a newer have more."""
-        line, _, _ = data.partition(b"\n")
+        line, _, _ = data[:_HEAD_BYTES_MAX].partition(b"\n")  # of all of it the rest would be a copy
         try:
-            head = json.loads(line)
-            kind = np.dtype([(str(field), str(code)) for field, code in head["fields"]])
-            self.program = head["program"]
+            head = plain_json.loads(line.decode())
+            fields = [(str(field), _CODES[code]) for field, code in head["fields"]]
+            kind = np.dtype(fields)
+            self.program = str(head["program"])
         except (ValueError, KeyError, TypeError):
             self.damage.append(f"{name}: its first line is damaged; taken for one of this program")
             return RECORD
@@ -204,9 +225,11 @@ class InputsReader:
         """Bodies of all whole frames; between them anything may lie."""
         place = 0
         good_until = data.find(b"\n") + 1
-        while (place := data.find(_MAGIC, place)) >= 0:
+        in_vain = 0
+        while (place := data.find(_MAGIC, place)) >= 0 and in_vain <= len(data):
             body, end = _body_at(data, place)
             if body is None:
+                in_vain += min(end, len(data)) - place
                 place += 1
                 continue
             self._note_damage(name, good_until, place)
@@ -220,19 +243,28 @@ class InputsReader:
 
 
 def _body_at(data: bytes, place: int) -> tuple[bytes | None, int]:
-    """A frame's body and where the frame ends; None if it is not whole."""
+    """A frame's body and where the frame ends; None if it is not whole, and how far it was looked at."""
     if place + _HEAD.size > len(data):
         return None, place
     _, length, crc = _HEAD.unpack_from(data, place)
     end = place + _HEAD.size + length
+    if end > len(data) or length > _BODY_BYTES_MAX:
+        return None, place + _HEAD.size
     packed = data[place + _HEAD.size : end]
-    if end > len(data) or zlib.crc32(packed) != crc:
-        return None, place
-    return zlib.decompress(packed), end
+    if zlib.crc32(packed) != crc:
+        return None, end
+    inflating = zlib.decompressobj()
+    try:
+        body = inflating.decompress(packed, _BODY_BYTES_MAX)
+    except zlib.error:
+        return None, end
+    return (body, end) if inflating.eof else (None, end)
 
 
 def _frame_of(body: bytes, kind: np.dtype[np.void]) -> Frame:
     (count,) = _COUNT.unpack_from(body)
+    if len({*(kind.names or ()), *_NEEDED}) != len(kind.names or ()):
+        raise ValueError("without a field that every record has")
     records, taken = decode_columns(body[_COUNT.size :], kind, count)
     place = _COUNT.size + taken
     frame = Frame(_known_fields(records), {}, {}, {})

@@ -48,7 +48,7 @@ class RecorderSpec:
     events : RingAddress
         JSON objects with `time_utc`, `mono_s`, `kind`, ...; the one of kind "end" (with `exit`) is the last.
     shapes : RingAddress or None
-        Pickled `ShapeEstimate`s.
+        `estimate.pack_estimate`.
     frames : FrameAddress or None
         Shared camera frames, for thumbnails.
     inputs : RingAddress or None

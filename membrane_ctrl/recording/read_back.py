@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from membrane_ctrl.recording.rows import COLUMN, Rows
+from membrane_ctrl.recording.segment_bounds import panics_are_faults, require_bounded
 from membrane_ctrl.recording.sink import RUN_TIME
 from membrane_ctrl.recording.streams import STREAMS
 from membrane_ctrl.telemetry import FIELDS
@@ -29,10 +30,16 @@ def read_rows(path: Path) -> Rows:
     -------
     (n, len(FIELDS)) array
         `mono_s` is the recording's time, in whole nanoseconds.
+
+    Raises
+    ------
+    RuntimeError, ValueError, OSError
+        Rerun's ways to say that nothing can be read.
     """
     where = {stream.path: [COLUMN[line.field] for line in stream.lines] for stream in STREAMS}
     found: dict[str, tuple[list[NDArray[np.int64]], list[Rows]]] = {path: ([], []) for path in where}
-    with warnings.catch_warnings():
+    require_bounded(path)
+    with warnings.catch_warnings(), panics_are_faults():
         warnings.simplefilter("ignore")  # a segment without its footer is what this is for
         for chunk in RrdReader(path).stream():
             if chunk.entity_path not in where:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 from membrane_ctrl import __version__
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
-from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.estimate import ShapeEstimate, unpack_estimate
 from membrane_ctrl.ipc.ring import RingReader
 from membrane_ctrl.recording import events
 from membrane_ctrl.recording.atomic import write_text_atomic
@@ -125,7 +124,7 @@ class Recorder:
         self._complaints.guarded("events.jsonl", lambda: self._events_file.append(new))
 
     def _take_shape(self, message: bytes) -> None:
-        estimate: ShapeEstimate = pickle.loads(message)
+        estimate = unpack_estimate(message)
         self._summary.add_shape(estimate)
         self._shapes.append(estimate)
         self._complaints.guarded("shape columns", lambda: self._columns.add_shape(estimate))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+
+from membrane_ctrl.recording.atomic import folder_handle
 
 _RUN = re.compile(r"(\d{8}T\d{6}Z)-.+")
 _DOOMED = ".deleted-"
@@ -102,9 +105,10 @@ def expired(
 
 def delete_run(run: OldRun) -> None:
     """Delete a run; renamed first, so that what a crash leaves of it is no run. Raises OSError."""
-    doomed = run.folder.with_name(f"{_DOOMED}{run.folder.name}")
-    run.folder.rename(doomed)
-    shutil.rmtree(doomed)
+    doomed = f"{_DOOMED}{run.folder.name}"
+    with folder_handle(run.folder.parent.resolve()) as logs:
+        os.rename(run.folder.name, doomed, src_dir_fd=logs, dst_dir_fd=logs)
+        shutil.rmtree(doomed, dir_fd=logs)  # of a link in it the link goes
 
 
 def delete_remains(logs_dir: Path) -> None:

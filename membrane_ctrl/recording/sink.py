@@ -27,6 +27,7 @@ from membrane_ctrl.recording.atomic import sync_data
 from membrane_ctrl.recording.blueprint import run_blueprint
 from membrane_ctrl.recording.height_map import outside_disc
 from membrane_ctrl.recording.lanes import LANES
+from membrane_ctrl.recording.segment_bounds import panics_are_faults
 from membrane_ctrl.recording.streams import DERIVED, SHAPE_STREAMS, STREAMS, Stream
 
 APPLICATION = "membrane_ctrl"
@@ -194,7 +195,8 @@ def is_whole(path: Path) -> bool:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the reader's own way to say that there is none
         try:
-            RrdReader(path).store()
+            with panics_are_faults():
+                RrdReader(path).store()
         except (RuntimeError, ValueError, OSError):
             return False
     return True

@@ -1,21 +1,26 @@
 """What a recorder hands on to the one that takes its place: how far it got, and the statistics so far.
 
-Pickled, for it never leaves the run: written and read by the same program, removed at the run's end.
+Plain JSON (`object_codec`), written and read by the same program and removed at the run's end.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import math
-import pickle
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from membrane_ctrl.config import Config
 from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.object_codec import ESTIMATE, Decoder, Specials, encode
+from membrane_ctrl.recording.atomic import fresh_file, move, read_bytes
 from membrane_ctrl.recording.column_tables import OpenWindows
 from membrane_ctrl.recording.summary import Summary
 
 _NAME = ".recorder-state"
+_BYTES_MAX = 16_000_000  # it takes 0.2 MB, and 0.5 MB with all the transitions and faults that a summary lists
+_SPECIALS: Specials = {ShapeEstimate: ESTIMATE}
 
 
 @dataclass(slots=True)
@@ -58,17 +63,20 @@ def save_state(run_dir: Path, state: RecorderState) -> None:
     Not synced: it is of use after a killed recorder, not after a power cut, when the rings are gone as well.
     """
     part = run_dir / f"{_NAME}.part"
-    part.write_bytes(pickle.dumps(state))
-    part.replace(run_dir / _NAME)
+    with fresh_file(part) as file:
+        file.write(json.dumps(encode(state, _SPECIALS)).encode())
+    move(part, run_dir / _NAME)
 
 
 def load_state(run_dir: Path) -> RecorderState | None:
     """The state left behind; None if there is none that can be read."""
+    decoder = Decoder((RecorderState(Summary(Config())),), _SPECIALS)
     try:
-        state = pickle.loads((run_dir / _NAME).read_bytes())
-    except Exception:  # whatever is wrong with the bytes, the recorder begins anew and says so
+        state = decoder.decode(json.loads(read_bytes(run_dir / _NAME, _BYTES_MAX)), RecorderState)
+    except (OSError, ValueError, RecursionError):  # the recorder begins anew and says so
         return None
-    return state if isinstance(state, RecorderState) else None
+    assert isinstance(state, RecorderState)
+    return state
 
 
 def remove_state(run_dir: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.errors import DeviceError
+from membrane_ctrl.recording.atomic import append_text
 
 ANNOTATIONS_FILE = "annotations.jsonl"
 MARK = "mark"
@@ -43,8 +44,7 @@ def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> di
         "made_utc": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     try:
-        with (folder / ANNOTATIONS_FILE).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(event, ensure_ascii=False) + "\n")
+        append_text(folder / ANNOTATIONS_FILE, json.dumps(event, ensure_ascii=False) + "\n")
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise DeviceError(f"{folder / ANNOTATIONS_FILE}: cannot be written ({reason})") from None

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.errors import InputError
+from membrane_ctrl.recording.atomic import SMALL_BYTES, read_bytes
 from membrane_ctrl.recording.column_tables import level_table
 from membrane_ctrl.recording.retention import OldRun, deletable_runs, delete_run, expired, size_bytes
 from membrane_ctrl.review.column_reader import column_files, read_file
@@ -100,8 +101,18 @@ def entries(logs_dir: Path, wanted: Filter | None = None) -> list[Entry]:
     """The runs of a folder, oldest first. Raises InputError if there is no such folder."""
     if not logs_dir.is_dir():
         raise InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
-    found = [entry(folder) for folder in _folders(logs_dir)]
+    found = [_entry_or_why(folder) for folder in _folders(logs_dir)]
     return [item for item in found if wanted is None or wanted.takes(item)]
+
+
+def _entry_or_why(folder: Path) -> Entry:
+    """A folder that cannot be looked into costs its line, not the list."""
+    try:
+        return entry(folder)
+    except OSError as error:
+        began, why = origin_of(folder, ()), f"cannot be read ({(error.strerror or str(error)).lower()})"
+        nan = math.nan
+        return Entry(folder, began, nan, nan, nan, 0, why, nan, nan, "", nan, 0, False)
 
 
 def entry(folder: Path) -> Entry:
@@ -150,7 +161,16 @@ def resolve(run: Path, logs_dir: Path = Path("logs")) -> Path:
 
 def _folders(logs_dir: Path) -> list[Path]:
     """The folders of runs, by their names; hidden ones are what is left of runs that were deleted."""
-    return [folder for folder in sorted(logs_dir.iterdir()) if not folder.name.startswith(".") and is_run(folder)]
+    return [
+        folder for folder in sorted(logs_dir.iterdir()) if not folder.name.startswith(".") and _may_be_run(folder)
+    ]
+
+
+def _may_be_run(folder: Path) -> bool:
+    try:
+        return is_run(folder)
+    except OSError:  # it may not be looked into: whether it is one is not known
+        return True
 
 
 def to_prune(
@@ -198,7 +218,7 @@ def _number(value: object) -> float:
 
 def _hash(path: Path) -> str:
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()[:8]
+        return hashlib.sha256(read_bytes(path, SMALL_BYTES)).hexdigest()[:8]
     except OSError:
         return ""
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from membrane_ctrl.recording.arrow_bounds import FILE_BYTES_MAX, require_bounded
+from membrane_ctrl.recording.atomic import open_plain, read_bytes
 from membrane_ctrl.recording.column_file import FOLDER, SUFFIX
 from membrane_ctrl.recording.sealed_stream import Damage, Unsealed, unseal
 from membrane_ctrl.review.possible_times import possible_times
@@ -17,6 +21,12 @@ from membrane_ctrl.review.possible_times import possible_times
 # The column that says when: of ticks, and of the other tables.
 _TIMES = ("mono_s", "time_s")
 _LOOK_BYTES = 1 << 20  # holds the head and a first batch
+# Columns of `shapes` that are no numbers.
+_WORDS = frozenset({"kind", "verdict", "reason"})
+_LISTS = frozenset({"coeffs_um", "covariance_um2"})
+# What is in memory at a time, whatever a file is: numbers of eight bytes, and what a batch holds besides.
+_PART_CELLS = 24_000_000
+_PART_BYTES = 200_000_000
 
 
 def column_files(folder: Path, table: str) -> list[Path]:
@@ -46,7 +56,18 @@ def missing_files(files: Sequence[Path], first: str, count: int = 0) -> list[str
 
 
 def read_file(path: Path, names: Sequence[str] | None, notes: list[str], over: bool = False) -> pa.Table | None:
-    """One file's columns; None if nothing of it can be read.
+    """One file's columns in one table, as `read_parts`; None if nothing of it can be read."""
+    parts = read_parts(path, names, notes, over)
+    found = list(itertools.islice(parts, 1))
+    if not found:
+        return None
+    if next(parts, None) is not None:
+        add_note(notes, f"{path.name}: more rows than a recorder writes: what is behind the first is left out")
+    return found[0]
+
+
+def read_parts(path: Path, names: Sequence[str] | None, notes: list[str], over: bool = False) -> Iterator[pa.Table]:
+    """One file's columns, in parts of at most `_PART_CELLS`; none if nothing of it can be read.
 
     Parameters
     ----------
@@ -61,43 +82,81 @@ def read_file(path: Path, names: Sequence[str] | None, notes: list[str], over: b
     """
     try:
         # a plain read: the pages of a mapped file would count as ours
-        content = unseal(path.read_bytes())
+        content = unseal(read_bytes(path, FILE_BYTES_MAX))
         if not content.data:
             add_note(notes, f"{path.name}: cannot be read ({'its head is damaged' if content.damage else 'empty'})")
-            return None
-        return _read(path, content, names, notes, over)
-    except (pa.ArrowException, OSError) as error:
+            return
+        require_bounded(content.data)
+        for table in _parts(path, content, names, notes, over):
+            yield table if content.sealed else _possible(path, table, notes)
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         add_note(notes, f"{path.name}: cannot be read ({_first_line(error)})")
-        return None
 
 
-def _read(
+def _parts(
     path: Path, content: Unsealed, names: Sequence[str] | None, notes: list[str], over: bool
-) -> pa.Table | None:
+) -> Iterator[pa.Table]:
     schema = pa.ipc.open_stream(content.data).schema
-    wanted = schema.names if names is None else [name for name in names if name in schema.names]
+    known = [name for name in dict.fromkeys(schema.names) if _is_ours(schema, name)]
+    wanted = known if names is None else [name for name in names if name in known]
     absent = sorted(set(names or ()) - set(wanted))
     if absent:
         add_note(notes, f"{path.name}: written by another version, without {', '.join(absent)}")
     if not wanted:
-        return None
+        return
     # one thread: buffers of a minute are too small to hand around
     options = pa.ipc.IpcReadOptions(included_fields=[schema.names.index(n) for n in wanted], use_threads=False)
     reader = pa.ipc.open_stream(content.data, options=options)
-    batches, error = _batches(reader)
+    waiting: list[pa.RecordBatch] = []
+    spans: list[_Span] = []
+    rows_max = _PART_CELLS // max(len(wanted), len(names or ()))
+    error: Exception | None = None
+    try:
+        for batch in reader:
+            batch.validate(full=True)  # Arrow trusts lengths and offsets otherwise, and reads what is not its own
+            if batch.num_rows > rows_max or any(column.null_count for column in batch.columns):
+                raise pa.ArrowInvalid("a batch that no recorder writes")
+            if waiting and (
+                sum(each.num_rows for each in waiting) + batch.num_rows > rows_max
+                or sum(each.nbytes for each in waiting) + batch.nbytes > _PART_BYTES
+            ):
+                yield pa.Table.from_batches(waiting, schema=reader.schema).select(wanted)
+                waiting = []
+            waiting.append(batch)
+            spans.append(_span(batch))
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as found:
+        error = found
+    _note_damage(path, content, spans, notes, over, error)
+    yield pa.Table.from_batches(waiting, schema=reader.schema).select(wanted)
+
+
+def _note_damage(
+    path: Path, content: Unsealed, spans: Sequence[_Span], notes: list[str], over: bool, error: Exception | None
+) -> None:
     if error is not None:
-        add_note(notes, f"{path.name}: damaged or cut short behind batch {len(batches)} ({_first_line(error)})")
+        add_note(notes, f"{path.name}: damaged or cut short behind batch {len(spans)} ({_first_line(error)})")
     if not content.sealed:
         add_note(notes, "tables without checksums, of an earlier version: a flipped byte in them would not be seen")
     for damage in content.damage:
         size_kb = damage.size_bytes / 1e3
         what = "cut short" if damage.at_end and not content.ended else "damaged"
-        add_note(notes, f"{path.name}: {what}, {size_kb:.1f} kB: {_rows_lost(batches, damage)} left out")
+        add_note(notes, f"{path.name}: {what}, {size_kb:.1f} kB: {_rows_lost(spans, damage)} left out")
     if content.sealed and over and not content.ended and not content.damage:
-        lost = _rows_lost(batches, Damage(len(batches), 0, True))
+        lost = _rows_lost(spans, Damage(len(spans), 0, True))
         add_note(notes, f"{path.name}: without the mark of its end: {lost} missing, if there were any")
-    table = pa.Table.from_batches(batches, schema=reader.schema).select(wanted)
-    return table if content.sealed else _possible(path, table, notes)
+
+
+def _is_ours(schema: pa.Schema, name: str) -> bool:
+    """Whether a column is of the kind that a recorder writes under its name, and there once."""
+    places = schema.get_all_field_indices(name)
+    kind = schema.field(places[0]).type
+    if name in _WORDS:
+        right = pa.types.is_string(kind)
+    elif name in _LISTS:
+        right = isinstance(kind, (pa.ListType, pa.FixedSizeListType)) and pa.types.is_floating(kind.value_type)
+    else:
+        right = pa.types.is_floating(kind) or pa.types.is_integer(kind)
+    return len(places) == 1 and right
 
 
 def _possible(path: Path, table: pa.Table, notes: list[str]) -> pa.Table:
@@ -120,39 +179,45 @@ def first_s(path: Path, time_name: str) -> float | None:
 def first_column(path: Path, name: str) -> NDArray[np.float64]:
     """A column of the first batch; empty if the file's beginning does not give it."""
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             content = unseal(file.read(_LOOK_BYTES))
-        batch = pa.ipc.open_stream(content.data).read_next_batch()
+        require_bounded(content.data)
+        reader = pa.ipc.open_stream(content.data)
+        if name not in reader.schema.names or not _is_ours(reader.schema, name):
+            return np.empty(0)
+        batch = reader.read_next_batch()
+        batch.validate(full=True)
         return np.asarray(batch.column(name).to_numpy(zero_copy_only=False), dtype=np.float64)
-    except (pa.ArrowException, OSError, KeyError, StopIteration):
+    except (pa.ArrowException, OSError, StopIteration, UnicodeDecodeError):
         return np.empty(0)
 
 
-def _batches(reader: pa.RecordBatchReader) -> tuple[list[pa.RecordBatch], Exception | None]:
-    """All batches up to the one that cannot be read, and why it cannot."""
-    found: list[pa.RecordBatch] = []
-    try:
-        found.extend(iter(reader))
-    except (pa.ArrowException, OSError) as error:
-        return found, error
-    return found, None
+@dataclass(frozen=True, slots=True)
+class _Span:
+    """Times of a batch's first and last row; None where it does not say."""
+
+    first_s: float | None
+    last_s: float | None
 
 
-def _rows_lost(batches: Sequence[pa.RecordBatch], damage: Damage) -> str:
+def _span(batch: pa.RecordBatch) -> _Span:
+    name = next((name for name in _TIMES if name in batch.schema.names), None)
+    if name is None or not batch.num_rows:
+        return _Span(None, None)
+    column = batch.column(name)
+    return _Span(float(column[0].as_py()), float(column[-1].as_py()))
+
+
+def _rows_lost(spans: Sequence[_Span], damage: Damage) -> str:
     """The rows that a stretch has held, by the times of those around it."""
     after = damage.batches
-    last_s = _time_s(batches[after - 1], -1) if 0 < after <= len(batches) else None
-    next_s = _time_s(batches[after], 0) if after < len(batches) else None
+    last_s = spans[after - 1].last_s if 0 < after <= len(spans) else None
+    next_s = spans[after].first_s if after < len(spans) else None
     if last_s is not None and next_s is not None:
         return f"rows between {last_s:.2f} s and {next_s:.2f} s are"
     if last_s is not None:
         return f"rows behind {last_s:.2f} s are"
     return "all rows are" if next_s is None else f"rows before {next_s:.2f} s are"
-
-
-def _time_s(batch: pa.RecordBatch, row: int) -> float | None:
-    name = next((name for name in _TIMES if name in batch.schema.names), None)
-    return None if name is None or not batch.num_rows else float(batch.column(name)[row].as_py())
 
 
 def add_note(notes: list[str], text: str) -> None:

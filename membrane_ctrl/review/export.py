@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from membrane_ctrl.errors import DeviceError, InputError
+from membrane_ctrl.recording.atomic import make_folder, move, scratch_folder, write_text_atomic
 from membrane_ctrl.recording.streams import STREAMS
 from membrane_ctrl.review.run import Run
 from membrane_ctrl.review.targets import refuse_originals
@@ -59,11 +59,13 @@ def export(
     fields, extras = _selected(streams)
     refuse_originals(out)
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
         # beside what is there already, so that an export that fails leaves that alone
-        with tempfile.TemporaryDirectory(prefix=".export-", dir=out) as folder:
-            files = (_hdf5 if to == "hdf5" else _files)(run, to, Path(folder), fields, extras, start_s, end_s)
-            return [path.replace(out / path.name) for path in files]
+        with scratch_folder(out, ".export-") as folder:
+            files = (_hdf5 if to == "hdf5" else _files)(run, to, folder, fields, extras, start_s, end_s)
+            for path in files:
+                move(path, out / path.name)
+            return [out / path.name for path in files]
     except OSError as error:
         raise DeviceError(f"{out}: cannot be written ({(error.strerror or str(error)).lower()})") from None
 
@@ -80,7 +82,7 @@ def _files(
         written += _tables(iter([shapes]), out / f"shapes.{to}", to)
     if EVENTS in extras and (lines := _event_lines(run, start_s, end_s)):
         path = out / "events.jsonl"
-        path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+        write_text_atomic(path, "".join(f"{line}\n" for line in lines))
         written.append(path)
     if not written:
         raise _nothing(run)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from membrane_ctrl.errors import DeviceError, InputError
 from membrane_ctrl.recording import plain_json
-from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.recording.atomic import make_folder, write_text_atomic
 from membrane_ctrl.review.analysis import Analysis, analyse
 from membrane_ctrl.review.catalogue import resolve
 from membrane_ctrl.review.compare import compare
@@ -47,7 +47,7 @@ def report_command(
             "report": report_table(other),
             "differences": [asdict(difference) | {"said": difference.said} for difference in differences],
         }
-    folder = out or opened.folder / "report"
+    folder = out.resolve() if out else opened.folder / "report"  # a link that a person names is meant
     text = plain_json.dumps(table, indent=1)
     _write(folder, {"report.json": text + "\n", "report.html": render(analysis, other, differences)})
     if json:
@@ -73,7 +73,7 @@ def _other(run: Run, start: str | None, end: str | None) -> Analysis:
 
 def _write(folder: Path, files: dict[str, str]) -> None:
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         for name, text in files.items():
             write_text_atomic(folder / name, text)
     except OSError as error:

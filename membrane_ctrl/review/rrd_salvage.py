@@ -15,7 +15,9 @@ from typing import BinaryIO
 
 from rerun.chunk import Chunk, RrdReader
 
-from membrane_ctrl.review.rrd_place import END, HEAD_BYTES, STORE, Message, whole_messages
+from membrane_ctrl.recording.atomic import open_plain
+from membrane_ctrl.recording.segment_bounds import END, HEAD_BYTES, Message, panics_are_faults, require_bounded
+from membrane_ctrl.review.rrd_place import STORE, whole_messages
 
 # Rerun's ways to say that something cannot be read.
 FAULTS = (RuntimeError, ValueError, OSError)
@@ -25,7 +27,8 @@ _FAULTS_MAX = 50
 
 def read_chunks(path: Path, entities: set[str]) -> list[Chunk]:
     """Chunks of some entities. Raises one of `FAULTS` if Rerun refuses the file."""
-    with warnings.catch_warnings():
+    require_bounded(path)
+    with warnings.catch_warnings(), panics_are_faults():
         warnings.simplefilter("ignore")  # the reader's way to say that a file has no footer
         return [chunk for chunk in RrdReader(path).stream() if chunk.entity_path in entities]
 
@@ -39,10 +42,10 @@ def salvage(path: Path, entities: set[str]) -> tuple[list[Chunk], int]:
         If the segment cannot be read, or there is no room for the copy.
     """
     found = whole_messages(path)
-    size = path.stat().st_size
+    size = path.lstat().st_size
     if not found:
         return [], size
-    with tempfile.TemporaryDirectory(prefix="membrane-review-") as folder, path.open("rb") as source:
+    with tempfile.TemporaryDirectory(prefix="membrane-review-") as folder, open_plain(path) as source:
         stores = [message for message in found if message.kind == STORE]
         copy = _Copy(source, Path(folder) / "whole.rrd", stores, entities)
         chunks = copy.chunks([message for message in found if message.kind not in {STORE, END}])

@@ -20,7 +20,7 @@ from membrane_ctrl.recording.column_tables import SHAPES, TICKS, level_table
 from membrane_ctrl.recording.levels import NAMES as LEVEL_NAMES
 from membrane_ctrl.recording.levels import TICK_FIELDS, WINDOWS_S, coarser_level, first_level
 from membrane_ctrl.review import rrd_reader, shapes
-from membrane_ctrl.review.column_reader import add_note, column_files, first_s, missing_files, read_file
+from membrane_ctrl.review.column_reader import add_note, column_files, first_s, missing_files, read_parts
 from membrane_ctrl.review.folder import event_s, find_folder, read_config, read_events, read_summary
 from membrane_ctrl.review.recorded_rate import at_recorded_rate
 from membrane_ctrl.review.rrd_place import is_closed
@@ -37,6 +37,9 @@ _WAY_DOWN_S = 60.0
 # A batch of a level spans minutes; in shorter gaps there was nothing to record.
 _HOLE_S = 30.0
 _FILES_MAX = 100_000  # ten years of hours
+# What a damaged line may say else is no time of a run, and dates end.
+_YEARS = range(1970, 2200)
+_RUN_MAX_S = 1e9
 TABLES = (TICKS, *(level_table(window_s) for window_s in WINDOWS_S), SHAPES)
 _STAND_IN = "Rerun segments stand in for ticks that the tables lack: without every tick, and without checksums"
 
@@ -81,8 +84,8 @@ class Run:
         return self.folder.name
 
     def utc(self, mono_s: float) -> datetime:
-        """UTC of a second of the run."""
-        return self.origin_utc + timedelta(seconds=mono_s)
+        """UTC of a second of the run; of one that is none, as damaged tables may have, of its start."""
+        return self.origin_utc + timedelta(seconds=mono_s if abs(mono_s) < _RUN_MAX_S else 0.0)
 
     def events_between(self, start_s: float, end_s: float) -> tuple[dict[str, Any], ...]:
         """Events of a part of the run."""
@@ -163,8 +166,8 @@ class Run:
     def shapes(self) -> Shapes:
         """Every measured figure of the run."""
         files = column_files(self.folder, SHAPES)
-        tables = (self._file(path, files[-1], shapes.TABLE_COLUMNS) for path in files)
-        found = [shapes.from_table(table) for table in tables if table is not None and table.num_rows]
+        tables = (part for path in files for part in self._parts(path, files[-1], shapes.TABLE_COLUMNS))
+        found = [shapes.from_table(table) for table in tables if table.num_rows]
         if not found:
             columns = [rrd_reader.read_shapes(path, self.notes) for path in rrd_reader.segments(self.folder)]
             found = [shapes.from_columns(part) for part in columns if part]
@@ -178,15 +181,16 @@ class Run:
         for table in TABLES:
             files = column_files(self.folder, table)
             for path in files:
-                self._file(path, files[-1], ["mono_s" if table == TICKS else "time_s"])
+                for _ in self._parts(path, files[-1], ["mono_s" if table == TICKS else "time_s"]):
+                    pass
         for path in rrd_reader.segments(self.folder):
             if not _is_closed(path):
                 rrd_reader.read_ticks(path, ["mono_s"], self.notes)
 
-    def _file(self, path: Path, last: Path, names: Sequence[str]) -> pa.Table | None:
+    def _parts(self, path: Path, last: Path, names: Sequence[str]) -> Iterator[pa.Table]:
         """Columns of a file; the last one of a run that was closed has an end."""
         closed = self.summary is not None and not self.summary.get("rebuilt")
-        return read_file(path, names, self.notes, closed and path == last)
+        return read_parts(path, names, self.notes, closed and path == last)
 
     def _table_blocks(
         self, table: str, time_name: str, names: Sequence[str], start_s: float, end_s: float
@@ -201,16 +205,16 @@ class Run:
             known_s = max(known_s, -np.inf if begins is None else begins)
             if (begins is not None and begins >= end_s) or (ends is not None and ends <= start_s):
                 continue
-            read = self._file(path, files[-1], names)
-            if read is None or time_name not in read.column_names:
-                continue
-            block = {name: _array(read, name) for name in names}
-            known_s = max(known_s, block[time_name][-1] if block[time_name].size else -np.inf)
-            # a journal may repeat what the recorder had just written when it was killed
-            block = cut(block, time_name, max(start_s, np.nextafter(last_s, np.inf)), end_s)
-            if block[time_name].size:
-                last_s = float(block[time_name][-1])
-                yield block
+            for read in self._parts(path, files[-1], names):
+                if time_name not in read.column_names:
+                    continue
+                block = {name: _array(read, name) for name in names}
+                known_s = max(known_s, block[time_name][-1] if block[time_name].size else -np.inf)
+                # a journal may repeat what the recorder had just written when it was killed
+                block = cut(block, time_name, max(start_s, np.nextafter(last_s, np.inf)), end_s)
+                if block[time_name].size:
+                    last_s = float(block[time_name][-1])
+                    yield block
         return _Reach(last_s, float(known_s))
 
 
@@ -285,13 +289,18 @@ def origin_of(folder: Path, events: Sequence[dict[str, Any]]) -> datetime:
     for event in events:
         try:
             moment = datetime.fromisoformat(event["time_utc"])
-            return moment.astimezone(UTC) - timedelta(seconds=float(event["mono_s"]))
-        except (KeyError, TypeError, ValueError):
+            began = moment.astimezone(UTC) - timedelta(seconds=float(event["mono_s"]))
+        except (KeyError, TypeError, ValueError, OverflowError):
             continue
+        if began.year in _YEARS:
+            return began
     try:
-        return datetime.strptime(folder.name[:16], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+        began = datetime.strptime(folder.name[:16], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+        if began.year in _YEARS:
+            return began
     except ValueError:
-        return datetime.fromtimestamp(folder.stat().st_mtime, UTC)
+        pass
+    return datetime.fromtimestamp(folder.stat().st_mtime, UTC)
 
 
 def _holes(time_s: Column, window_s: float, start_s: float) -> list[tuple[float, float]]:

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from membrane_ctrl.errors import Exit, InputError
@@ -22,6 +23,7 @@ from membrane_ctrl.review.folder import event_s
 from membrane_ctrl.review.run import Run, open_run
 from membrane_ctrl.review.span import end_s, not_in
 from membrane_ctrl.review.words import moment_s, number, one_line, span
+from membrane_ctrl.terminal import table_console
 
 
 def list_command(logs: Path, wanted: Filter, since: str | None, until: str | None, json: bool) -> int:
@@ -97,7 +99,9 @@ def export_command(
 ) -> int:
     """Write a run for other programs and say where."""
     opened = open_run(resolve(run))
-    files = export(opened, to, out or opened.folder / "export", streams, *_part(opened, start, end))
+    files = export(
+        opened, to, out.resolve() if out else opened.folder / "export", streams, *_part(opened, start, end)
+    )
     for note in opened.notes:
         print(f"note: {note}")
     for path in files:
@@ -124,7 +128,7 @@ def _day(text: str | None) -> datetime | None:
 
 def _console() -> Console:
     """As wide as the terminal; into a file or pipe, as wide as the table."""
-    return Console(width=None if sys.stdout.isatty() else 170)
+    return table_console(width=None if sys.stdout.isatty() else 170)
 
 
 def _table(found: list[Entry]) -> Table:
@@ -147,7 +151,7 @@ def _table(found: list[Entry]) -> Table:
         )
     for entry in found:
         table.add_row(
-            entry.name,
+            escape(one_line(entry.name)),
             f"{entry.started_utc:%Y-%m-%d %H:%M}",
             span(entry.duration_s),
             number(entry.std_um),
@@ -155,8 +159,10 @@ def _table(found: list[Entry]) -> Table:
             str(entry.faults),
             number(entry.kp_per_s),
             number(entry.ti_s),
-            entry.configuration,
+            escape(entry.configuration),
             f"{entry.size_mb:.1f}",
-            entry.exit + (f", {entry.marks} marked" if entry.marks else "") + (", kept" if entry.kept else ""),
+            escape(one_line(entry.exit))
+            + (f", {entry.marks} marked" if entry.marks else "")
+            + (", kept" if entry.kept else ""),
         )
     return table

@@ -21,10 +21,11 @@ def understood(tables: dict[str, Any]) -> tuple[Config, list[str]]:
         try:
             return Config.model_validate(tables), left_out
         except ValidationError as error:
-            name = _take_out(tables, error.errors()[0]["loc"])
-        if not name:  # tables that do not go together
+            # all at once: of ten thousand keys each alone would take as many looks at all of them
+            names = [_take_out(tables, found["loc"]) for found in error.errors(include_url=False)]
+        if not any(names):  # tables that do not go together
             return Config(), [*left_out, "tables that do not go together"]
-        left_out.append(name)
+        left_out += filter(None, names)
 
 
 def _take_out(tables: dict[str, Any], location: Sequence[int | str]) -> str:

@@ -15,6 +15,7 @@ import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import ViewerClient
 
 from membrane_ctrl.errors import DeviceError
+from membrane_ctrl.recording.atomic import open_plain
 from membrane_ctrl.review.rrd_place import first_message_after
 from membrane_ctrl.review.rrd_reader import segments
 
@@ -156,7 +157,7 @@ def _grown(folder: Path, wanted: Callable[[], bool], sleep: Callable[[float], No
         files = segments(folder)
         data = b""
         if number < len(files):
-            with files[number].open("rb") as file:
+            with open_plain(files[number]) as file:
                 file.seek(place)
                 data = file.read(_CHUNK_BYTES)
         if data:
@@ -172,7 +173,7 @@ def _grown(folder: Path, wanted: Callable[[], bool], sleep: Callable[[float], No
 
 def _recent(files: list[Path]) -> tuple[int, int, bytes]:
     """Number of the segment to begin with, the place in it, and what has to come before that."""
-    sizes = [file.stat().st_size for file in files]
+    sizes = [file.lstat().st_size for file in files]
     number = max(0, len(files) - 1)
     if number > 0 and sizes[number] < _RECENT_BYTES:
         number -= 1
@@ -180,7 +181,7 @@ def _recent(files: list[Path]) -> tuple[int, int, bytes]:
         return number, 0, b""
     style_ends = first_message_after(files[number], _STYLE_BYTES)
     place = first_message_after(files[number], sizes[number] - _RECENT_BYTES)
-    with files[number].open("rb") as file:
+    with open_plain(files[number]) as file:
         return number, place, file.read(style_ends) if place else b""
 
 

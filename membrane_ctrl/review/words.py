@@ -30,7 +30,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def one_line(text: str) -> str:
-    """What people wrote, for a terminal: a space for line ends and whatever else cannot be printed."""
+    """What people wrote, in one line: a space for line ends and whatever else cannot be printed."""
     return "".join(letter if letter.isprintable() else " " for letter in text)
 
 

@@ -6,7 +6,6 @@ import json
 import math
 import multiprocessing
 import os
-import pickle
 import signal
 import struct
 import sys
@@ -24,12 +23,14 @@ from rich.live import Live
 from membrane_ctrl.child_report import alive, reporter
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
+from membrane_ctrl.estimate import unpack_estimate
 from membrane_ctrl.ipc.ring import RingAddress, RingReader
 from membrane_ctrl.processes import STOP
 from membrane_ctrl.screen.model import Event, ScreenModel
 from membrane_ctrl.screen.plain import at_once, event_line, line
 from membrane_ctrl.screen.view import screen
 from membrane_ctrl.telemetry import FIELDS, TelemetryRow
+from membrane_ctrl.terminal import Plain
 
 _LOOK_S = 0.2  # as fast as a person reads changing figures
 _PLAIN_S = 1.0
@@ -104,9 +105,10 @@ def _draw(spec: ScreenSpec, feed: _Feed, rounds: Callable[[Callable[[], object]]
 def give_back_terminal() -> None:
     """For a screen that was killed: the first page of the terminal, and its cursor. Nothing without a terminal."""
     with suppress(OSError):
-        if sys.stderr.isatty():
-            sys.stderr.write("\x1b[?1049l\x1b[?25h")
-            sys.stderr.flush()
+        terminal = getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # this once, control bytes are ours
+        if terminal.isatty():
+            terminal.write("\x1b[?1049l\x1b[?25h")
+            terminal.flush()
 
 
 class _Feed:
@@ -123,7 +125,7 @@ class _Feed:
         for message in self._telemetry.drain():
             self.model.take_row(TelemetryRow(*_ROW.unpack(message)))
         for message in self._shapes.drain() if self._shapes else ():
-            self.model.take_shape(pickle.loads(message))
+            self.model.take_shape(unpack_estimate(message))
         events: list[Event] = [json.loads(message) for message in self._events.drain()]
         for event in events:
             self.model.take_event(event)
@@ -142,7 +144,7 @@ def _live(console: Console, spec: ScreenSpec, feed: _Feed) -> Iterator[Callable[
 
     def show() -> None:
         feed.update()
-        live.update(screen(feed.model.view(spec.clock.now()), spec.config, run), refresh=True)
+        live.update(Plain(screen(feed.model.view(spec.clock.now()), spec.config, run)), refresh=True)
 
     with Live(console=console, screen=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False) as live:
         yield show

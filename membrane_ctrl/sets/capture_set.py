@@ -25,12 +25,16 @@ from membrane_ctrl.config import CameraConfig, GeometryConfig, MirrorConfig, Opt
 from membrane_ctrl.config_file import parse, prune, read_toml, with_height_map
 from membrane_ctrl.errors import InputError
 from membrane_ctrl.metrology.patterns import AXES, GRAY_BITS
+from membrane_ctrl.recording.atomic import read_bytes
+from membrane_ctrl.sets.images import IMAGE_BYTES_MAX, decoded_image
 
 FloatArray = NDArray[np.float64]
 Frames = NDArray[np.uint8] | NDArray[np.uint16]
 
 _DEPTHS = (10, 12, 14, 16)  # bits of a sensor in 16-bit files, when the set does not say
 _READERS = 2
+# All frames of a set are in memory at once: 18 of a camera of 16 megapixels.
+_PIXELS_MAX = 300_000_000
 
 
 class FrameRow(Section):
@@ -139,8 +143,8 @@ def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead
     path = folder / "capture.toml"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such capture set")
-    tables = read_toml(path)
-    with_height_map(tables.get("geometry"), path)
+    tables = read_toml(path, follow=False)
+    with_height_map(tables.get("geometry"), path, follow=False)
     ignored = prune(tables, CaptureFile)
     if geometry is not None:
         tables["geometry"] = geometry.geometry.model_dump(exclude_none=True)
@@ -148,6 +152,8 @@ def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead
     content = parse(tables, CaptureFile, str(path))
     rows = _ordered(content, path)
     reference = None
+    for row in content.frames:
+        _require_inside(row.file, folder, path)
     if content.kind == "fringes":
         if content.reference is None:
             raise InputError(f"{path}: reference: a fringes set names the full set that anchors it")
@@ -175,6 +181,12 @@ def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead
 def read_set(folder: Path, geometry: GeometryFile | None = None) -> CaptureSet:
     """Read a capture set with its images. Raises InputError as `read_head`, and if no frame is usable."""
     head = read_head(folder, geometry)
+    camera = head.optics.camera
+    if len(head.files) * camera.width_px * camera.height_px > _PIXELS_MAX:
+        raise InputError(
+            f"{folder / 'capture.toml'}: camera.width_px, height_px: {len(head.files)} frames of {camera.width_px} x "
+            f"{camera.height_px} pixels are more than the {_PIXELS_MAX / 1e6:.0f} million that a set may have"
+        )
     with ThreadPoolExecutor(_READERS) as pool:
         images = list(pool.map(_read_image, [folder / name for name in head.files]))
     return assemble(head, images)
@@ -244,26 +256,17 @@ def _with_reference_displacement(optics: OpticsConfig, displacement_um: float | 
 
 def _read_image(path: Path) -> Frames | str:
     """The image, or why there is none."""
-    if not path.is_file():
+    try:
+        image = decoded_image(read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_UNCHANGED)
+    except FileNotFoundError:
         return "missing: no such file"
-    if _cut_short(path):
-        return "unreadable: the file ends too early"
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        return "unreadable: not an image"
+    except (OSError, ValueError) as error:
+        return f"unreadable: {(error.strerror if isinstance(error, OSError) else None) or error}"
     if image.ndim != 2:
         return f"unreadable: {image.shape[2]} colour channels instead of one"
     if image.dtype not in (np.uint8, np.uint16):
         return f"wrong bit depth: {image.dtype} pixels"
     return image  # type: ignore[return-value]  # checked above
-
-
-def _cut_short(path: Path) -> bool:
-    """Whether a PNG lacks its end. The decoder would write to the terminal, and might fill the rest with black."""
-    with path.open("rb") as file:
-        png = file.read(8) == b"\x89PNG\r\n\x1a\n"
-        file.seek(max(0, path.stat().st_size - 12))
-        return png and b"IEND" not in file.read()
 
 
 def _depth(head: CaptureHead, frames: Frames, path: Path) -> int:
@@ -276,6 +279,16 @@ def _depth(head: CaptureHead, frames: Frames, path: Path) -> int:
     if int(frames.max()) >= 2**bits:
         raise InputError(f"{path}: camera.bits = {bits}, but pixels reach {int(frames.max())}")
     return bits
+
+
+def _require_inside(name: str, folder: Path, path: Path) -> None:
+    """Raise InputError for a frame that is not the set's own: a set may come from anywhere."""
+    try:
+        inside = bool(name) and (folder / name).resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):  # a NUL, a name too long, links in a ring
+        inside = False
+    if not inside or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise InputError(f"{path}: frames: {name!r} is outside the set's folder")
 
 
 def _ordered(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]:

@@ -35,7 +35,7 @@ def measure_command(
     measurement = measure_set(folder, None if geometry is None else read_geometry(geometry))
     for key in measurement.head.ignored:
         print(f"{folder / 'capture.toml'}: {key}: not known, ignored", file=sys.stderr)
-    target = out or folder / "result"
+    target = out.resolve() if out else folder / "result"  # a link that a person names is meant
     light, outline = _outline(measurement)
     profile = _profile(measurement)
     bars = error_bars(measurement, geometry)

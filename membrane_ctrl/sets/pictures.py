@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -15,10 +14,11 @@ from membrane_ctrl.metrology.outline import Outline
 from membrane_ctrl.metrology.radial import RadialProfile
 from membrane_ctrl.sets.error_bars import ErrorBars
 from membrane_ctrl.sets.measurement import Measurement
+from membrane_ctrl.sets.result_files import write_figure
+from membrane_ctrl.terminal import plain
 
 FloatArray = NDArray[np.float64]
 
-_DPI = 110
 _SHOWN_PX = 600  # a side, of maps of pixels
 
 
@@ -37,21 +37,21 @@ def draw_all(
     light : (H, W) array
         The scene, of any size: white, or the mean of the fringes.
     """
-    files = [_save(out / "frames.png", _frames(measurement))]
+    files = [write_figure(out / "frames.png", _frames(measurement))]
     full = measurement.full
     if full is None or profile is None:
         return files
     axis, height = full.grid.axis_mm, full.height_mm()
     residual_um = 1e3 * full.residual_mm
     files += [
-        _save(out / "sag.png", _map("height (mm)", axis, height, "viridis")),
-        _save(out / "residual.png", _map("height over the fit (um)", axis, residual_um, "RdBu_r", even=True)),
-        _save(out / "slopes.png", _slopes(full)),
-        _save(out / "modulation.png", _modulation(measurement, full, light, outline)),
-        _save(out / "profile.png", _profile(profile)),
-        _save(out / "convergence.png", _convergence(full)),
+        write_figure(out / "sag.png", _map("height (mm)", axis, height, "viridis")),
+        write_figure(out / "residual.png", _map("height over the fit (um)", axis, residual_um, "RdBu_r", even=True)),
+        write_figure(out / "slopes.png", _slopes(full)),
+        write_figure(out / "modulation.png", _modulation(measurement, full, light, outline)),
+        write_figure(out / "profile.png", _profile(profile)),
+        write_figure(out / "convergence.png", _convergence(full)),
     ]
-    return files if bars is None else [*files, _save(out / "uncertainty.png", _uncertainty(bars))]
+    return files if bars is None else [*files, write_figure(out / "uncertainty.png", _uncertainty(bars))]
 
 
 def _uncertainty(bars: ErrorBars) -> Figure:
@@ -121,16 +121,17 @@ def _modulation(measurement: Measurement, full: FullResult, light: FloatArray, o
 def _frames(measurement: Measurement) -> Figure:
     """One tile a frame, the flagged ones with their reason."""
     names = [pattern.name for pattern in measurement.head.patterns]
-    reasons = {flag.frame: flag.reason for flag in measurement.flags}
+    reasons = {flag.frame: plain(flag.reason) for flag in measurement.flags}
     figure = Figure(figsize=(9, 0.28 * len(names) + 1.2), layout="constrained")
     axes = figure.subplots()
     colours = ["tab:red" if k in reasons else "tab:green" for k in range(len(names))]
     axes.barh(range(len(names)), 1.0, color=colours, alpha=0.5)
     for k in range(len(names)):
-        axes.text(0.02, k, reasons.get(k, "as predicted"), va="center", fontsize=8)
+        axes.text(0.02, k, reasons.get(k, "as predicted"), va="center", fontsize=8, parse_math=False)
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
-    axes.set(title=f"{measurement.verdict} {measurement.reason}"[:110], xticks=[], xlim=(0, 1))
+    axes.set(xticks=[], xlim=(0, 1))
+    axes.set_title(plain(f"{measurement.verdict} {measurement.reason}")[:110], parse_math=False)
     return figure
 
 
@@ -157,8 +158,3 @@ def _convergence(full: FullResult) -> Figure:
     axes.axhline(1e-6, linestyle="--", color="tab:red")
     axes.set(xlabel="iteration", ylabel="largest change of height (mm)", title="bins first, then every pixel")
     return figure
-
-
-def _save(path: Path, figure: Figure) -> Path:
-    FigureCanvasAgg(figure).print_figure(str(path), dpi=_DPI)
-    return path

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.full import FullResult
 from membrane_ctrl.metrology.outline import Outline
 from membrane_ctrl.metrology.radial import RadialProfile
+from membrane_ctrl.recording.atomic import make_folder, write_bytes_atomic, write_text_atomic
 from membrane_ctrl.sets.error_bars import ErrorBars
 from membrane_ctrl.sets.measurement import Measurement, noise_seen_adu
+
+if TYPE_CHECKING:  # matplotlib takes a second to load
+    from matplotlib.figure import Figure
 
 
 def result_table(measurement: Measurement) -> dict[str, Any]:
@@ -100,21 +106,38 @@ def details_table(
 
 def write_result(out: Path, measurement: Measurement, details: dict[str, Any], bars: ErrorBars | None) -> None:
     """Write `result.json`, `details.json` and, if there is a figure to be used, two maps. Raises OSError."""
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     write_json(out / "result.json", result_table(measurement))
     write_json(out / "details.json", details)
     if measurement.full is not None and measurement.verdict != "rejected":
         axis = measurement.full.grid.axis_mm
-        np.savez(out / "height.npz", x_mm=axis, y_mm=axis, h_mm=measurement.full.height_mm())
+        write_arrays(out / "height.npz", x_mm=axis, y_mm=axis, h_mm=measurement.full.height_mm())
         if bars is not None:
             axis, (of_noise, of_geometry) = bars.grid.axis_mm, bars.maps_um()
             file = out / "sigma.npz"
-            np.savez(file, x_mm=axis, y_mm=axis, sigma_noise_um=of_noise, sigma_geometry_um=of_geometry)
+            write_arrays(file, x_mm=axis, y_mm=axis, sigma_noise_um=of_noise, sigma_geometry_um=of_geometry)
 
 
 def write_json(path: Path, table: dict[str, Any]) -> None:
     """Write strict JSON: no NaN."""
-    path.write_text(json.dumps(table, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_text_atomic(path, json.dumps(table, indent=1, allow_nan=False) + "\n")
+
+
+def write_arrays(path: Path, **arrays: NDArray[np.float64]) -> None:
+    """Write an `.npz`. Raises OSError."""
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **arrays)
+    write_bytes_atomic(path, file.getvalue())
+
+
+def write_figure(path: Path, figure: Figure, dpi: int = 110) -> Path:
+    """Write a figure as PNG; returns its path. Raises OSError."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    picture = io.BytesIO()
+    FigureCanvasAgg(figure).print_figure(picture, format="png", dpi=dpi)
+    write_bytes_atomic(path, picture.getvalue())
+    return path
 
 
 def _number(value: float) -> float | None:

@@ -15,6 +15,7 @@ from rich.progress import Progress
 from membrane_ctrl.calibration.geometry_file import read_geometry
 from membrane_ctrl.errors import CommandError, InputError, RejectedError
 from membrane_ctrl.metrology.stability import default_points_mm
+from membrane_ctrl.recording.atomic import make_folder
 from membrane_ctrl.sets.capture_set import read_head
 from membrane_ctrl.sets.result_files import write_json
 from membrane_ctrl.sets.set_figure import Figures
@@ -37,13 +38,13 @@ class StabilityOptions:
 
 def stability_command(options: StabilityOptions) -> int:
     """Analyse a run, write tables and pictures, say what came out. Raises CommandError."""
-    out = options.out or options.folder / "stability"
+    out = options.out.resolve() if options.out else options.folder / "stability"
     figures = Figures(None if options.geometry is None else read_geometry(options.geometry))
     folders = set_folders(options.folder, out)
     size_px, analysis_radius_mm = common_size(folders)
     points = points_mm(options.points, analysis_radius_mm)
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
         with StabilityRun(out, points, options.trials, options.seed, options.geometry) as run:
             _analyse(folders, figures, run)
         if run.used == 0:

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.sets.result_files import write_figure
 
-_DPI = 110
+FloatArray = NDArray[np.float64]
 
 
 def draw_uncertainty(path: Path, axis_mm: FloatArray, height_um: FloatArray, rmse_um: FloatArray, pair: bool) -> None:
@@ -25,7 +24,7 @@ def draw_uncertainty(path: Path, axis_mm: FloatArray, height_um: FloatArray, rms
     else:
         _image(left, "height (mm)", axis_mm, height_um / 1e3, "viridis")
     _image(right, f"RMSE (um), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
-    _save(path, figure)
+    write_figure(path, figure)
 
 
 def draw_stability(
@@ -50,7 +49,7 @@ def draw_stability(
         shown.plot(x, y, "o", color="white", markeredgecolor="black")
         frame = {"boxstyle": "round,pad=0.15", "facecolor": "black", "alpha": 0.6}  # readable on any colour
         shown.annotate(name, (x, y), xytext=(7, 7), textcoords="offset points", color="white", bbox=frame)
-    _save(path, figure)
+    write_figure(path, figure)
 
 
 def draw_zernike(path: Path, time_s: FloatArray, coeffs_um: FloatArray) -> None:
@@ -62,7 +61,7 @@ def draw_zernike(path: Path, time_s: FloatArray, coeffs_um: FloatArray) -> None:
         axes.plot(time_s, change[:, j], linewidth=0.9, label=f"Z{j + 1}")
     axes.set(xlabel="time (s)", ylabel="change (um RMS)", title="Zernike terms that move most")
     axes.legend(ncols=4)
-    _save(path, figure)
+    write_figure(path, figure)
 
 
 def draw_pairs(path: Path, axis_mm: FloatArray, maps: Mapping[float, tuple[FloatArray, FloatArray]]) -> None:
@@ -72,7 +71,7 @@ def draw_pairs(path: Path, axis_mm: FloatArray, maps: Mapping[float, tuple[Float
     for row, (lag_s, (change_um, rmse_um)) in zip(axes, maps.items(), strict=True):
         _image(row[0], f"change over {lag_s / 60:g} min (um)", axis_mm, change_um, "RdBu_r", even=True)
         _image(row[1], f"RMSE (um), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
-    _save(path, figure)
+    write_figure(path, figure)
 
 
 def _image(axes: Any, title: str, axis_mm: FloatArray, values: FloatArray, colours: str, even: bool = False) -> None:
@@ -84,7 +83,3 @@ def _image(axes: Any, title: str, axis_mm: FloatArray, values: FloatArray, colou
     shown = axes.imshow(values, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high)
     axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)")
     axes.figure.colorbar(shown, ax=axes, shrink=0.85)
-
-
-def _save(path: Path, figure: Figure) -> None:
-    FigureCanvasAgg(figure).print_figure(str(path), dpi=_DPI)

@@ -20,6 +20,8 @@ from membrane_ctrl.metrology.pairs import LAGS_S, Moment, Pair, PairFinder
 from membrane_ctrl.metrology.stability import RunningCovariance, Tally
 from membrane_ctrl.metrology.surface import PARAMETERS, parameter_to_coeffs
 from membrane_ctrl.metrology.uncertainty import HeightMap, height_matrix, trial_covariance
+from membrane_ctrl.recording.atomic import fresh_text
+from membrane_ctrl.sets.result_files import write_arrays
 from membrane_ctrl.sets.set_figure import SetFigure
 from membrane_ctrl.sets.stability_series import SeriesFile, read_series
 
@@ -62,7 +64,7 @@ class StabilityRun:
         self._points_mm = dict(points_mm)
         self._trials, self._seed, self._geometry = trials, seed, geometry
         self._series = SeriesFile(out / SERIES, list(points_mm))
-        self._pair_file = (out / "pairs.csv").open("w", newline="", encoding="utf-8")
+        self._pair_file = fresh_text(out / "pairs.csv")
         self._pair_rows = csv.writer(self._pair_file, lineterminator="\n")
         self._pair_rows.writerow(_PAIR_HEAD)
         self._grid: HeightMap | None = None
@@ -188,7 +190,7 @@ class StabilityRun:
         if grid is None:
             return []
         axis, sd = grid.axis_mm, grid.picture(self._sd_um())
-        np.savez(self._out / "sd.npz", x_mm=axis, y_mm=axis, sd_um=sd)
+        write_arrays(self._out / "sd.npz", x_mm=axis, y_mm=axis, sd_um=sd)
         times, heights, coeffs = self._followed()
         drawn = [self._out / f"{name}.png" for name in ("stability", "zernike", "pairs")]
         draw_stability(drawn[0], axis, sd, times, self._points_mm, heights)

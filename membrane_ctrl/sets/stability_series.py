@@ -10,6 +10,8 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
+from membrane_ctrl.recording.atomic import fresh_text
+
 FloatArray = NDArray[np.float64]
 
 _HEAD = ("set", "verdict", "reason")
@@ -29,7 +31,7 @@ class SeriesFile:
     """
 
     def __init__(self, path: Path, points: Sequence[str]) -> None:
-        self._file = path.open("w", newline="", encoding="utf-8")
+        self._file = fresh_text(path)
         self._writer = csv.writer(self._file, lineterminator="\n")
         self._writer.writerow((*_HEAD, *_NUMBERS, *(f"{name}_um" for name in points), *_ZERNIKE))
 

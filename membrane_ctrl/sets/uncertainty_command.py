@@ -19,7 +19,8 @@ from membrane_ctrl.metrology.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.monte_carlo import TrialBench
 from membrane_ctrl.metrology.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty import HeightMap, linear_covariance, noise_covariance, trial_covariance
-from membrane_ctrl.sets.result_files import write_json
+from membrane_ctrl.recording.atomic import make_folder
+from membrane_ctrl.sets.result_files import write_arrays, write_json
 from membrane_ctrl.sets.set_figure import Figures, SetFigure
 from membrane_ctrl.trial_runner import run_everywhere
 
@@ -74,7 +75,8 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
     mirror = sets[0].head.optics.mirror
     grid = HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
     table = _table(options, sets, spread, source, result, grid) | {"timing_s": {"trials": seconds}}
-    _write(options.out or options.folder / "uncertainty", grid, result, _height_um(sets, grid), table)
+    out = options.out.resolve() if options.out else options.folder / "uncertainty"
+    _write(out, grid, result, _height_um(sets, grid), table)
     print(json.dumps(table) if options.as_json else "\n".join(_lines(table)))
     return 0
 
@@ -126,9 +128,9 @@ def _write(out: Path, grid: HeightMap, result: Spread, height_um: FloatArray, ta
 
     rmse = grid.picture(1e3 * grid.sigma(result.covariance))
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
         write_json(out / "uncertainty.json", table)
-        np.savez(out / "rmse.npz", x_mm=grid.axis_mm, y_mm=grid.axis_mm, rmse_um=rmse)
+        write_arrays(out / "rmse.npz", x_mm=grid.axis_mm, y_mm=grid.axis_mm, rmse_um=rmse)
         height = grid.picture(height_um)
         draw_uncertainty(out / "uncertainty.png", grid.axis_mm, height, rmse, table["against"] is not None)
     except OSError as error:

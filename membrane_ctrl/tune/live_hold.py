@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
-import pickle
 import struct
 import time
 from pathlib import Path
@@ -14,9 +12,10 @@ from membrane_ctrl import config_file
 from membrane_ctrl.commands import Command
 from membrane_ctrl.config import Config, LoopConfig
 from membrane_ctrl.errors import DeviceError, InputError
-from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.estimate import unpack_estimate
 from membrane_ctrl.ipc.published import attach
 from membrane_ctrl.port.client import PortClient
+from membrane_ctrl.recording import events
 from membrane_ctrl.telemetry import FIELDS, TelemetryRow
 from tuning.hold_link import HoldError, News
 
@@ -77,17 +76,24 @@ class LiveHold:
     def news(self) -> News:
         """What has come in a fifth of a second."""
         time.sleep(_NEWS_S)
-        rows = tuple(TelemetryRow(*_ROW.unpack(message)) for message in self._readers["telemetry"].drain())
-        events = tuple(json.loads(message) for message in self._readers["events"].drain())
-        shapes: tuple[ShapeEstimate, ...] = ()
-        if "shapes" in self._readers:
-            shapes = tuple(pickle.loads(message) for message in self._readers["shapes"].drain())
+        try:
+            found = self._read_rings()
+        except (struct.error, ValueError) as error:
+            raise HoldError(f"the rings of {self.name} hold what no hold writes ({error})") from None
         now_s = time.monotonic()
-        if rows:
+        if found.rows:
             self._heard_s = now_s
         elif now_s - self._heard_s > _SILENT_S:
             raise HoldError(f"no tick for {_SILENT_S:g} s: has the hold {self.name} ended?")
-        return News(rows, events, shapes)
+        return found
+
+    def _read_rings(self) -> News:
+        messages = {name: reader.drain() for name, reader in self._readers.items()}
+        return News(
+            rows=tuple(TelemetryRow(*_ROW.unpack(message)) for message in messages.get("telemetry", ())),
+            events=tuple(events.parse(message) for message in messages.get("events", ())),
+            shapes=tuple(unpack_estimate(message) for message in messages.get("shapes", ())),
+        )
 
     def close(self) -> None:
         """Give the command back and hang up; the hold goes on."""

@@ -6,15 +6,18 @@ actuators is a set of switches (`Wrong`), so that a scenario or a campaign turns
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Coroutine, Sequence
+from collections.abc import Coroutine, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.board_state import BoardSample, BoardState
+from firmware_iface.emulators.modbus_server import RegisterRefusal
+from firmware_iface.links.modbus_rules import exception_error
 from firmware_iface.register_map import default_map
-from firmware_iface.roles import BenchCommand, BenchReading, LinkDownError, LinkError
+from firmware_iface.roles import ALL_FAULTS, BenchCommand, BenchReading, LinkDownError, LinkError
 from membrane_ctrl.twin.plant import Plant
 
 T = TypeVar("T")
@@ -39,6 +42,8 @@ class Wrong:
         No value.
     gauge_offset_pa : float
         The gauge reads this much too much.
+    gauge_stuck : bool
+        It repeats its value.
     silent : bool
         Requests are carried out and not answered.
     unreachable : bool
@@ -71,6 +76,7 @@ class Wrong:
     barometer_lost: bool = False
     thermometer_lost: bool = False
     gauge_offset_pa: float = 0.0
+    gauge_stuck: bool = False
     silent: bool = False
     unreachable: bool = False
     lost_every: int = 0
@@ -128,6 +134,17 @@ class VirtualBench:
             vent if math.isnan(wrong.vent_stuck_fraction) else wrong.vent_stuck_fraction,
         )
 
+    def intrude(self, pump_fraction: float, watchdog_s: float = 10.0) -> str:
+        """Another program claims the board, clears its faults and pumps; what it is told, empty if it was obeyed."""
+        other = PumpBoard("", watchdog_s=watchdog_s, link=_MemoryLink(self))
+        try:
+            _at_once(other.open())
+            _at_once(other.clear_faults(ALL_FAULTS))
+            _at_once(other.write(BenchCommand(pump_fraction, 0.0)))
+        except LinkError as error:
+            return str(error)
+        return ""
+
     def power_cycle(self) -> None:
         """The board restarts: outputs off, watchdog off, faults forgotten."""
         self.board.restart()
@@ -148,9 +165,9 @@ class VirtualBench:
         """Write pump and vent, and feed the watchdog. Raises LinkError."""
         _at_once(self._driver.write(command))
 
-    def clear_faults(self) -> None:
-        """Clear what the board has latched. Raises LinkError."""
-        _at_once(self._driver.clear_faults())
+    def clear_faults(self, mask: int) -> None:
+        """Clear these bits of what the board has latched. Raises LinkError."""
+        _at_once(self._driver.clear_faults(mask))
 
     def close(self) -> None:
         """Disarm if the board allows it, and go."""
@@ -165,10 +182,13 @@ class VirtualBench:
         displacement_um = sample.displacement_um + wrong.laser_offset_um
         if wrong.laser_stuck and last is not None:
             displacement_um = last.displacement_um
+        gauge_pa = sample.gauge_pressure_pa + wrong.gauge_offset_pa
+        if wrong.gauge_stuck and last is not None:
+            gauge_pa = last.gauge_pressure_pa
         return BoardSample(
             displacement_um=math.nan if wrong.no_light else displacement_um,
             displacement_quality=_LASER_NO_LIGHT if wrong.no_light else sample.displacement_quality,
-            gauge_pressure_pa=math.nan if wrong.gauge_lost else sample.gauge_pressure_pa + wrong.gauge_offset_pa,
+            gauge_pressure_pa=math.nan if wrong.gauge_lost else gauge_pa,
             ambient_pressure_pa=math.nan if wrong.barometer_lost else sample.ambient_pressure_pa,
             air_temperature_c=math.nan if wrong.thermometer_lost else sample.air_temperature_c,
             gas_temperature_c=sample.gas_temperature_c,
@@ -196,7 +216,8 @@ class _MemoryLink:
 
     async def read_holding(self, address: int, count: int) -> list[int]:
         self._begin()
-        words = self._bench.board.read(address, count)
+        with _refusals(self.name):
+            words = self._bench.board.read(address, count)
         self._answer()
         return words
 
@@ -208,7 +229,8 @@ class _MemoryLink:
 
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         self._begin()
-        self._bench.board.write(address, words)
+        with _refusals(self.name):
+            self._bench.board.write(address, words)
         self._bench.drive()
         self._answer()
 
@@ -225,6 +247,15 @@ class _MemoryLink:
         self._requests += 1
         if wrong.silent or (wrong.lost_every and self._requests % wrong.lost_every == 0):
             raise LinkError(f"{self.name}: no answer")
+
+
+@contextlib.contextmanager
+def _refusals(name: str) -> Iterator[None]:
+    """What the board refuses, as a link says it."""
+    try:
+        yield
+    except RegisterRefusal as refusal:
+        raise exception_error(name, refusal.code) from None
 
 
 def _at_once(coroutine: Coroutine[Any, Any, T]) -> T:

@@ -137,8 +137,8 @@ class VirtualRun:
 
     def _act(self, outputs: TickOutputs) -> None:
         self._vent_fraction = outputs.command.vent_fraction
-        if outputs.clear_board:
-            self._try(self._bench.clear_faults)
+        if outputs.clear_mask:
+            self._try(lambda: self._bench.clear_faults(outputs.clear_mask))
         self._try(lambda: self._bench.write(outputs.command))
         if outputs.finished is not None:
             self.finished = outputs.finished

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import pickle
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -20,7 +19,7 @@ from membrane_ctrl.acquisition.warm_up import small
 from membrane_ctrl.calibration.geometry_file import origin_of
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import CameraConfig, Config, OpticsConfig, ShapeConfig
-from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.estimate import ShapeEstimate, unpack_estimate
 from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
 from membrane_ctrl.metrology.patterns import fringe_sequence
 from membrane_ctrl.processes import STOP
@@ -79,7 +78,7 @@ class Run:
                     self.reports.append(self.control.recv())
             except EOFError:
                 self.process.join(PATIENCE_S)
-            self.estimates += [pickle.loads(message) for message in self._shapes.drain()]
+            self.estimates += [unpack_estimate(message) for message in self._shapes.drain()]
 
     def states(self) -> list[str]:
         return [report["state"] for report in self.reports if report["kind"] == "acquisition"]

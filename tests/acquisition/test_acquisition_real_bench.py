@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import pickle
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -23,7 +22,7 @@ from membrane_ctrl.cli import run as command
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
 from membrane_ctrl.config_file import dump
-from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.estimate import ShapeEstimate, unpack_estimate
 from membrane_ctrl.ipc.ring import RingReader, ring
 from membrane_ctrl.metrology.patterns import full_sequence
 from membrane_ctrl.telemetry import ROW_BYTES
@@ -113,7 +112,7 @@ class Run:
                     self.reports.append(self.control.recv())
             except EOFError:
                 self.process.join(PATIENCE_S)
-            self.estimates += [pickle.loads(message) for message in self._shapes.drain()]
+            self.estimates += [unpack_estimate(message) for message in self._shapes.drain()]
 
     def said(self, state: str, words: str) -> bool:
         """Whether a report says so."""

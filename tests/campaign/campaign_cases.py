@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from membrane_ctrl.names import Rung, State
-from membrane_ctrl.safety import MOVING
+from campaign_times import GAUGE_STUCK_S, HOLD_FLOW_S, STALE_S, TICK_S
 
-# limits close to the work, so that a run of a minute can reach them: 40 um are 2 Pa, the gauge's noise is 0.5 Pa
-DISPLACEMENT_MIN_UM, DISPLACEMENT_MAX_UM = -80.0, 40.0
-GAUGE_PRESSURE_MAX_PA = 605.0
-FOLLOWING_ERROR_MAX_UM = 25.0
+from membrane_ctrl.commands import Kind
+from membrane_ctrl.names import Rung, State
+
+MOVING = frozenset({State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
 
 
 @dataclass(frozen=True)
@@ -33,8 +32,9 @@ class Case:
         Switches of `virtual_bench.Wrong`.
     said : frozenset of str
         Rules that may name it; empty: harmless, nothing may trip.
-    moving, checking, always : Reaction or None
-        What must follow in MOVING states, in `check`, in every state (in `fault` only what vents is still judged).
+    moving, holding, checking, always : Reaction or None
+        What must follow in MOVING states, in `hold` alone, in `check`, in every state (in `fault` only what vents is
+        still judged).
     for_s : float
         It goes away after this.
     every_s : float
@@ -47,12 +47,15 @@ class Case:
         The laser's reading is not the mirror's place.
     gauge_lies : bool
         The gauge's reading is not the pressure.
+    believed : bool
+        It may be taken for the truth after a while: nothing has to follow its first reaction.
     """
 
     name: str
     wrong: dict[str, float] = field(default_factory=dict)
     said: frozenset[str] = frozenset()
     moving: Reaction | None = None
+    holding: Reaction | None = None
     checking: Reaction | None = None
     always: Reaction | None = None
     for_s: float = math.inf
@@ -63,6 +66,25 @@ class Case:
     raises: bool = False
     laser_lies: bool = False
     gauge_lies: bool = False
+    believed: bool = False
+
+    @property
+    def lasting(self) -> bool:
+        """It stays to the end, and what has to follow it has to follow it to the end."""
+        return math.isinf(self.for_s) and not self.believed
+
+    @property
+    def hidden(self) -> bool:
+        """It shows only while the mirror is held: in `fault` nobody can say whether it is still there."""
+        of_actuators = {"pump_share", "pump_stuck_fraction", "vent_stuck_fraction"}
+        return (
+            self.power_cycle or self.leak_factor != 1.0 or self.door_pa != 0 or bool(of_actuators & self.wrong.keys())
+        )
+
+    @property
+    def lies(self) -> bool:
+        """The mirror is not where a sensor says."""
+        return self.laser_lies or "camera_offset_um" in self.wrong
 
     @property
     def harmless(self) -> bool:
@@ -73,6 +95,8 @@ class Case:
         """What must follow when it sets in while the controller is in `state`."""
         if self.always is not None and (state != State.FAULT or self.always.rung == Rung.VENT):
             return self.always
+        if self.holding is not None and state == State.HOLD:
+            return self.holding
         return self.moving if state in MOVING else self.checking if state == State.CHECK else None
 
 
@@ -81,28 +105,36 @@ def _case(name: str, said: str = "", **rest: object) -> Case:
 
 
 _LOST = "displacement_missing displacement_frozen overdue"
-_TICK_S = 0.04
-_SOON = 4 * _TICK_S  # two ticks after a rule that looks once, and the tick in which it sets in
+_SOON = 4 * TICK_S  # two ticks after a rule that looks once, and the tick in which it sets in
 
 CASES: tuple[Case, ...] = (
     _case("nothing"),
-    _case("no light", _LOST, wrong={"no_light": 1}, moving=Reaction(Rung.HOLD_FLOW, 6 * _TICK_S)),
+    _case("no light", _LOST, wrong={"no_light": 1}, moving=Reaction(Rung.HOLD_FLOW, 6 * TICK_S)),
     _case("no light for 5 s", _LOST, wrong={"no_light": 1}, for_s=5.0),
+    _case(
+        "light a fifth of the time",
+        _LOST,
+        wrong={"no_light": 1},
+        for_s=1.6,
+        every_s=2.0,
+        moving=Reaction(Rung.RAMP_DOWN, 3.0 * HOLD_FLOW_S),  # two thirds of what is used of the rung come back
+    ),
     _case("light comes and goes", _LOST, wrong={"no_light": 1}, for_s=1.0, every_s=2.0),
     _case("laser 20 um off", "", wrong={"laser_offset_um": -20}, laser_lies=True, for_s=0.2, every_s=20.0),
     _case(
         "laser 200 um off",
-        f"{_LOST} displacement_jump following_error over_displacement under_displacement actuator_test",
+        f"{_LOST} displacement_jump following_error over_displacement under_displacement over_pressure actuator_test",
         wrong={"laser_offset_um": -200},
         laser_lies=True,
-        moving=Reaction(Rung.HOLD_FLOW, 8 * _TICK_S),
+        believed=True,
+        moving=Reaction(Rung.HOLD_FLOW, 8 * TICK_S),
     ),
     _case(
         "laser 600 um too deep",
         "over_displacement",
         wrong={"laser_offset_um": 600},
         laser_lies=True,
-        always=Reaction(Rung.VENT, 5 * _TICK_S),
+        always=Reaction(Rung.VENT, 5 * TICK_S),
     ),
     _case(
         "laser stuck",
@@ -117,38 +149,60 @@ CASES: tuple[Case, ...] = (
         wrong={"samples_frozen": 1},
         laser_lies=True,
         gauge_lies=True,
-        moving=Reaction(Rung.HOLD_FLOW, 6 * _TICK_S),
+        moving=Reaction(Rung.HOLD_FLOW, 6 * TICK_S),
     ),
     _case(
         "gauge lost",
         "pressure_missing overdue",
         wrong={"gauge_lost": 1},
         gauge_lies=True,
-        moving=Reaction(Rung.RAMP_DOWN, 13 * _TICK_S),
+        moving=Reaction(Rung.RAMP_DOWN, 13 * TICK_S),
     ),
     _case(
         "gauge reads too much",
         "over_pressure",
         wrong={"gauge_offset_pa": 100},
         gauge_lies=True,
-        always=Reaction(Rung.VENT, 5 * _TICK_S),
+        always=Reaction(Rung.VENT, 5 * TICK_S),
     ),
     _case(
         "gauge reads above the board's limit",
         "over_pressure board_fault",
         wrong={"gauge_offset_pa": 300},
         gauge_lies=True,
-        always=Reaction(Rung.VENT, 5 * _TICK_S),
+        always=Reaction(Rung.VENT, 5 * TICK_S),
     ),
-    _case("gauge reads too little", "", wrong={"gauge_offset_pa": -100}, gauge_lies=True),
+    _case(
+        "gauge above the board's limit for one sample",
+        "board_fault over_pressure",
+        wrong={"gauge_offset_pa": 300},
+        for_s=TICK_S,
+        gauge_lies=True,
+        moving=Reaction(Rung.PUMP_OFF, _SOON),
+    ),
+    _case(
+        "gauge reads too little",
+        "gauge_jump laser_gauge_apart",
+        wrong={"gauge_offset_pa": -100},
+        gauge_lies=True,
+        moving=Reaction(Rung.HOLD_FLOW, 8 * TICK_S),
+        believed=True,
+    ),
+    _case(
+        "gauge stuck",
+        "gauge_stuck laser_gauge_apart",
+        wrong={"gauge_stuck": 1},
+        gauge_lies=True,
+        moving=Reaction(Rung.RAMP_DOWN, GAUGE_STUCK_S + _SOON),
+    ),
     _case("barometer lost", wrong={"barometer_lost": 1}),
     _case("thermometer lost", wrong={"thermometer_lost": 1}),
     _case(
         "no answers",
         "device_silent displacement_missing overdue",
         wrong={"silent": 1},
-        moving=Reaction(Rung.PUMP_OFF, 0.3 + _SOON),
-        checking=Reaction(Rung.PUMP_OFF, 0.3 + _SOON),
+        moving=Reaction(Rung.PUMP_OFF, STALE_S + _SOON),
+        checking=Reaction(Rung.PUMP_OFF, STALE_S + _SOON),
     ),
     _case("no answers for 0.2 s", "displacement_missing", wrong={"silent": 1}, for_s=0.2),
     _case("every 15th answer lost", wrong={"lost_every": 15}),
@@ -174,7 +228,7 @@ CASES: tuple[Case, ...] = (
     _case("board loses its power", "link_lost actuator_test", power_cycle=True),
     _case(
         "pump's read-back stays at 1",
-        "pump_mismatch",
+        "pump_mismatch pump_runs_on",
         wrong={"readback_fraction": 1.0},
         moving=Reaction(Rung.PUMP_OFF, 8.0),  # the command itself may be near 1 while the mirror rises
     ),
@@ -182,29 +236,31 @@ CASES: tuple[Case, ...] = (
         "pump gives nothing",
         "following_error actuator_test under_displacement",
         wrong={"pump_share": 0.0},
+        holding=Reaction(Rung.RAMP_DOWN, 40.0),
     ),
     _case("pump gives 60 %", "", wrong={"pump_share": 0.6}),
     _case(
         "pump runs at full",
-        "over_displacement over_pressure following_error actuator_test",
+        "over_displacement over_pressure gas_comes_in following_error actuator_test",
         wrong={"pump_stuck_fraction": 1.0},
         moving=Reaction(Rung.RAMP_DOWN, 25.0),
     ),
     _case(
         "pump stays at 0.5",
-        "over_displacement over_pressure following_error actuator_test",
+        "over_displacement over_pressure gas_comes_in following_error actuator_test",
         wrong={"pump_stuck_fraction": 0.5},
     ),
     _case(
         "vent stays open",
         f"{_LOST} following_error under_displacement displacement_jump actuator_test",
         wrong={"vent_stuck_fraction": 1.0},
+        holding=Reaction(Rung.RAMP_DOWN, 2.0),
     ),
     _case("vent stays shut", "actuator_test", wrong={"vent_stuck_fraction": 0.0}),
     _case("process stopped for 0.2 s", "late", wrong={"stalled": 1}, for_s=0.2),
     _case(
         "process stopped for 2 s",
-        "watchdog_tripped board_fault device_silent displacement_frozen late overdue actuator_test",
+        "watchdog_tripped device_silent displacement_frozen late overdue actuator_test",
         wrong={"stalled": 1},
         for_s=2.0,
     ),
@@ -213,7 +269,7 @@ CASES: tuple[Case, ...] = (
         "ticks 150 ms late",
         "late",
         wrong={"late_ms": 150},
-        moving=Reaction(Rung.RAMP_DOWN, 8 * _TICK_S),
+        moving=Reaction(Rung.RAMP_DOWN, 8 * TICK_S),
     ),
     _case("task dead", "dead_task", wrong={"dead_task": 1}, always=Reaction(Rung.PUMP_OFF, _SOON)),
     _case("control code raises", "tick_error", raises=True, always=Reaction(Rung.PUMP_OFF, _SOON)),
@@ -227,17 +283,17 @@ CASES: tuple[Case, ...] = (
         f"{_LOST} pressure_missing",
         wrong={"no_light": 1, "gauge_lost": 1},
         gauge_lies=True,
-        moving=Reaction(Rung.RAMP_DOWN, 13 * _TICK_S),
+        moving=Reaction(Rung.RAMP_DOWN, 13 * TICK_S),
     ),
     _case(
         "laser lost while the pump runs at full",
-        f"{_LOST} over_pressure over_displacement following_error actuator_test",
+        f"{_LOST} over_pressure over_displacement following_error actuator_test gas_comes_in",
         wrong={"no_light": 1, "pump_stuck_fraction": 1.0},
-        moving=Reaction(Rung.HOLD_FLOW, 6 * _TICK_S),
+        moving=Reaction(Rung.HOLD_FLOW, 6 * TICK_S),
     ),
     _case(
         "process stopped while the laser is lost",
-        f"{_LOST} watchdog_tripped board_fault device_silent late",
+        f"{_LOST} watchdog_tripped device_silent late",
         wrong={"no_light": 1, "stalled": 1},
         for_s=1.0,
     ),
@@ -245,17 +301,47 @@ CASES: tuple[Case, ...] = (
         "no answers and late",
         f"{_LOST} device_silent late",
         wrong={"silent": 1, "late_ms": 150},
-        moving=Reaction(Rung.RAMP_DOWN, 0.3 + _SOON),
+        moving=Reaction(Rung.RAMP_DOWN, STALE_S + _SOON),
     ),
 )
-STATES: tuple[State, ...] = (
-    State.STANDBY,
-    State.CHECK,
-    State.INFLATE,
-    State.SETTLE,
-    State.HOLD,
-    State.MANUAL,
-    State.TUNE,
-    State.LOWER,
-    State.FAULT,
+
+
+@dataclass(frozen=True)
+class Situation:
+    """Where the controller is when something goes wrong, and how it got there.
+
+    Attributes
+    ----------
+    name : str
+    state : State
+        The fault sets in a while after it was reached.
+    asks : tuple of (str, float)
+        Commands in `hold` that lead to it, with their values.
+    again_s : float
+        The commands are asked again and again with this period.
+    held : bool
+        An undisturbed mirror is at `target_um` in the end.
+    """
+
+    name: str
+    state: State
+    asks: tuple[tuple[Kind, float], ...] = ()
+    again_s: float = math.inf
+    held: bool = False
+    target_um: float = 0.0
+
+
+SITUATIONS: tuple[Situation, ...] = (
+    Situation("standby", State.STANDBY),
+    Situation("check", State.CHECK, held=True),
+    Situation("inflate", State.INFLATE, held=True),
+    Situation("settle", State.SETTLE, held=True),
+    Situation("hold", State.HOLD, held=True),
+    Situation("paused", State.HOLD, (("pause", math.nan),), held=True),
+    # as `calibrate --live` does: from one pressure to the next
+    Situation("stepped", State.HOLD, (("setpoint", -10.0), ("setpoint", 10.0)), again_s=12.0),
+    Situation("manual", State.MANUAL, (("manual", math.nan),)),
+    Situation("tune", State.TUNE, (("tune", math.nan),)),
+    Situation("lower", State.LOWER, (("vent", math.nan),)),
+    Situation("fault", State.FAULT),
 )

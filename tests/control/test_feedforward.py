@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config import LoopConfig
-from membrane_ctrl.control.feedforward import FeedForward
+from membrane_ctrl.control.feedforward import FeedForward, weather_complaint
 
 DT_S = 0.02
 
@@ -75,3 +75,18 @@ def test_switching_at_run_time_is_no_bump() -> None:
     assert np.abs(np.diff(flows)).max() < 0.358 * 5.0 * DT_S / 0.2 * 1.01
     assert flows[399] == pytest.approx(0.0, abs=1e-6)
     assert flows[599] == pytest.approx(0.358 * 5.0, rel=1e-3)
+
+
+@pytest.mark.parametrize(("pressure_pa", "air_c"), [(1013.25, 20.0), (101_325.0, 293.15), (14.7, math.nan)])
+def test_a_weather_sensor_in_another_unit_moves_nothing_and_is_named(pressure_pa: float, air_c: float) -> None:
+    wave = np.sin(np.arange(200) / 10)
+    wrong_pressure = weather_complaint(pressure_pa, 20.0) != ""
+    pressure = pressure_pa + (wave if wrong_pressure else 0.0 * wave)
+    air = air_c + (0.0 * wave if wrong_pressure else wave)
+    assert not answered(LoopConfig(), pressure, air).any()
+    assert "check its unit" in weather_complaint(pressure_pa, air_c)
+
+
+@pytest.mark.parametrize(("pressure_pa", "air_c"), [(101_325.0, 20.0), (54_000.0, -5.0), (math.nan, math.nan)])
+def test_weather_of_places_where_people_work_is_believed(pressure_pa: float, air_c: float) -> None:
+    assert weather_complaint(pressure_pa, air_c) == ""

@@ -8,6 +8,7 @@ import pytest
 from counting_plant import CountingPlant, ManualClock
 
 from firmware_iface.emulators.pump_board import PumpBoardEmulator
+from firmware_iface.register_map import default_map, known_maps
 
 
 @pytest.fixture
@@ -21,9 +22,15 @@ async def plant() -> CountingPlant:
 
 
 @pytest.fixture
-async def board(plant: CountingPlant, clock: ManualClock) -> AsyncIterator[PumpBoardEmulator]:
+def map_version() -> int:
+    """Of the emulated board; a module whose tests run on an earlier one as well parametrizes it."""
+    return default_map().map_version
+
+
+@pytest.fixture
+async def board(plant: CountingPlant, clock: ManualClock, map_version: int) -> AsyncIterator[PumpBoardEmulator]:
     """The emulated board, running."""
-    emulator = PumpBoardEmulator(plant, clock=clock)
+    emulator = PumpBoardEmulator(plant, clock=clock, registers=known_maps()[map_version])
     await emulator.start()
     yield emulator
     await emulator.stop()

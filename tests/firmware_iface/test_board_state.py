@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from firmware_iface.emulators.board_state import GAUGE_PRESSURE_LIMIT_PA, BoardSample, BoardState
 from firmware_iface.emulators.modbus_server import RegisterRefusal
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import known_maps
 
-MAP = default_map()
 SAMPLE = BoardSample(1.5, 0, 600.0, 101_325.0, 20.0, 21.0, 7, 3.25)
 PERIOD_S = 0.5
+KEY = 0x1234_5678
 
 
 class Bench:
-    """A board with a hand on its clock."""
+    """A board with a hand on its clock, and somebody who claims it where it knows claims."""
 
-    def __init__(self) -> None:
-        self.state = BoardState(MAP, SAMPLE)
+    def __init__(self, version: int, key: int = KEY) -> None:
+        self.map = known_maps()[version]
+        self.state = BoardState(self.map, SAMPLE)
         self.now_s = 0.0
+        self.claim = {"claim_id": 7, "claim_key": key, "command_key": key, "clear_key": key}
 
     def at(self, now_s: float, sample: BoardSample = SAMPLE) -> None:
         self.now_s = now_s
@@ -31,23 +34,42 @@ class Bench:
         self.put("settings", watchdog_period_s=PERIOD_S, watchdog_arm=1)
 
     def put(self, block: str, **values: float) -> None:
-        found = MAP.block(block)
-        self.state.write(found.address, found.encode(values))
+        found = self.map.block(block)
+        self.state.write(found.address, found.encode(self.claim | values))
 
     def command(self, pump: float, heartbeat: int, vent: float = 0.0) -> None:
         self.put("command", pump_command_fraction=pump, vent_command_fraction=vent, heartbeat=heartbeat)
 
     def get(self, block: str) -> dict[str, float]:
-        found = MAP.block(block)
+        found = self.map.block(block)
         return found.decode(self.state.read(found.address, found.count))
+
+    def everything(self) -> dict[str, float]:
+        return self.get("settings") | self.get("command") | self.get("sensors")
 
     def clear(self, mask: int = 0xFFFF) -> None:
         self.put("reset", clear_faults=mask)
 
 
+@pytest.fixture(params=[1, 2])
+def bench(request: pytest.FixtureRequest) -> Bench:
+    """What boards of every map do."""
+    return Bench(request.param)
+
+
 @pytest.fixture
-def bench() -> Bench:
-    return Bench()
+def old() -> Bench:
+    """A board that obeys whoever writes."""
+    return Bench(1)
+
+
+@pytest.fixture
+def claimed() -> Bench:
+    """A board that is claimed and armed, with its pump running."""
+    made = Bench(2)
+    made.arm()
+    made.command(0.3, 1, vent=0.25)
+    return made
 
 
 def test_power_up_is_off_and_unarmed(bench: Bench) -> None:
@@ -86,32 +108,32 @@ def test_the_same_heartbeat_does_not_feed(bench: Bench) -> None:
     assert bench.state.pump_fraction == 0.0
 
 
-def test_neither_reads_nor_partial_writes_nor_arming_feed(bench: Bench) -> None:
-    bench.arm()
-    bench.command(0.3, 1)
-    bench.at(0.4)
-    bench.get("sensors")
-    bench.state.write(MAP.register("heartbeat").address, [9])
-    bench.state.write(MAP.register("pump_command_fraction").address, [10_000])
-    bench.arm()
-    assert bench.state.pump_fraction == 0.2  # a part of the block commands ...
-    bench.at(0.6)
-    assert bench.state.pump_fraction == 0.0  # ... but does not feed
+def test_neither_reads_nor_partial_writes_nor_arming_feed(old: Bench) -> None:
+    old.arm()
+    old.command(0.3, 1)
+    old.at(0.4)
+    old.get("sensors")
+    old.state.write(old.map.register("heartbeat").address, [9])
+    old.state.write(old.map.register("pump_command_fraction").address, [10_000])
+    old.arm()
+    assert old.state.pump_fraction == 0.2  # a part of the block commands ...
+    old.at(0.6)
+    assert old.state.pump_fraction == 0.0  # ... but does not feed
 
 
-def test_a_heartbeat_seen_in_a_partial_write_still_feeds_later(bench: Bench) -> None:
-    bench.arm()
-    bench.state.write(MAP.register("heartbeat").address, [9])
-    bench.at(0.4)
-    bench.command(0.3, 9)
-    bench.at(0.8)
-    assert bench.state.pump_fraction == 0.3
+def test_a_heartbeat_seen_in_a_partial_write_still_feeds_later(old: Bench) -> None:
+    old.arm()
+    old.state.write(old.map.register("heartbeat").address, [9])
+    old.at(0.4)
+    old.command(0.3, 9)
+    old.at(0.8)
+    assert old.state.pump_fraction == 0.3
 
 
-def test_unarmed_it_never_trips(bench: Bench) -> None:
-    bench.command(0.3, 1)
-    bench.at(1e6)
-    assert bench.state.pump_fraction == 0.3
+def test_unarmed_it_never_trips(old: Bench) -> None:
+    old.command(0.3, 1)
+    old.at(1e6)
+    assert old.state.pump_fraction == 0.3
 
 
 def test_a_trip_leaves_the_vent_as_it_was(bench: Bench) -> None:
@@ -145,14 +167,15 @@ def test_clearing_starts_a_new_period(bench: Bench) -> None:
 
 
 def test_over_pressure_stops_the_pump_and_opens_the_vent(bench: Bench) -> None:
+    bench.arm()
     bench.command(0.5, 1)
     bench.at(0.1, replace(SAMPLE, gauge_pressure_pa=GAUGE_PRESSURE_LIMIT_PA))
     assert bench.state.pump_fraction == 0.5
     bench.at(0.2, replace(SAMPLE, gauge_pressure_pa=GAUGE_PRESSURE_LIMIT_PA + 0.1))
     bench.at(0.3)
     assert (bench.state.pump_fraction, bench.state.vent_fraction) == (0.0, 1.0)
-    assert bench.get("sensors")["latched_faults"] == MAP.fault_mask("over_pressure")
-    bench.clear(MAP.fault_mask("watchdog"))  # the other fault's bit clears nothing
+    assert bench.get("sensors")["latched_faults"] == bench.map.fault_mask("over_pressure")
+    bench.clear(bench.map.fault_mask("watchdog"))  # the other fault's bit clears nothing
     assert bench.state.vent_fraction == 1.0
     bench.clear()
     assert (bench.state.pump_fraction, bench.state.vent_fraction) == (0.0, 0.0)
@@ -160,6 +183,7 @@ def test_over_pressure_stops_the_pump_and_opens_the_vent(bench: Bench) -> None:
 
 def test_clearing_while_the_cause_lasts_latches_again(bench: Bench) -> None:
     high = replace(SAMPLE, gauge_pressure_pa=GAUGE_PRESSURE_LIMIT_PA + 1)
+    bench.arm()
     bench.at(0.1, high)
     bench.clear()
     bench.at(0.2, high)
@@ -192,16 +216,16 @@ def test_disarming_is_refused_while_the_pump_is_commanded(bench: Bench) -> None:
         (0, [1], 2),
     ],
 )
-def test_a_refused_write_changes_nothing(bench: Bench, address: int, words: list[int], code: int) -> None:
-    bench.command(0.5, 1, vent=0.5)
-    before = bench.get("settings") | bench.get("command") | bench.get("sensors")
+def test_a_refused_write_changes_nothing(old: Bench, address: int, words: list[int], code: int) -> None:
+    old.command(0.5, 1, vent=0.5)
+    before = old.everything()
     with pytest.raises(RegisterRefusal) as refused:
-        bench.state.write(address, words)
+        old.state.write(address, words)
     assert refused.value.code == code
-    assert bench.get("settings") | bench.get("command") | bench.get("sensors") == before
+    assert old.everything() == before
 
 
-@pytest.mark.parametrize(("address", "count"), [(7, 1), (6, 2), (15, 2), (30, 20), (65, 1), (65_535, 1), (65_535, 2)])
+@pytest.mark.parametrize(("address", "count"), [(7, 1), (6, 2), (15, 2), (30, 20), (67, 1), (65_535, 1), (65_535, 2)])
 def test_unknown_addresses_cannot_be_read(bench: Bench, address: int, count: int) -> None:
     with pytest.raises(RegisterRefusal) as refused:
         bench.state.read(address, count)
@@ -213,7 +237,7 @@ def test_a_restart_forgets_everything(bench: Bench) -> None:
     bench.command(0.5, 1, vent=0.5)
     bench.at(5.0)
     bench.state.restart()
-    assert bench.get("command") == {"pump_command_fraction": 0.0, "vent_command_fraction": 0.0, "heartbeat": 0.0}
+    assert set(bench.get("command").values()) == {0.0}
     assert bench.get("sensors")["latched_faults"] == bench.get("sensors")["watchdog_armed"] == 0
 
 
@@ -231,3 +255,147 @@ def test_device_time_is_never_rounded_up(bench: Bench, device_time_s: float) -> 
     sensors = bench.get("sensors")
     assert 0 <= device_time_s - sensors["device_time_s"] - sensors["device_time_fraction_s"] < 1.01e-4
     assert sensors["sample_counter"] == 5  # wraps
+
+
+def refused(code: int) -> Any:
+    return pytest.raises(RegisterRefusal, match=f"exception {code}")
+
+
+STRANGERS = [KEY ^ 1, KEY ^ (1 << 31), 1]  # one that differs in its low word, in its high word, in both
+
+
+@pytest.mark.parametrize("key", STRANGERS)
+def test_a_stranger_can_do_nothing_to_a_fed_board(claimed: Bench, key: int) -> None:
+    stranger = {"claim_id": 9, "claim_key": key, "command_key": key, "clear_key": key}
+    before = claimed.everything()
+    for block, values in (
+        ("settings", {"watchdog_period_s": 10.0, "watchdog_arm": 1}),  # a second claim
+        ("settings", {"watchdog_period_s": PERIOD_S, "watchdog_arm": 0}),
+        ("command", {"pump_command_fraction": 1.0, "vent_command_fraction": 0.0, "heartbeat": 2}),
+        ("reset", {"clear_faults": 0xFFFF}),
+    ):
+        with refused(6):
+            claimed.put(block, **values, **stranger)
+    assert claimed.everything() == before
+    claimed.at(PERIOD_S + 1e-6)
+    assert claimed.state.pump_fraction == 0.0  # none of it fed
+
+
+def test_parts_of_a_block_are_refused_and_do_not_feed(claimed: Bench) -> None:
+    command = claimed.map.block("command")
+    before = claimed.everything()
+    for address, words in ((56, [50_000]), (56, [50_000, 0, 2]), (58, [2]), (49, [0]), (48, [10_000, 1]), (64, [1])):
+        with refused(2):
+            claimed.state.write(address, words)
+    assert claimed.everything() == before
+    claimed.at(0.4)
+    with refused(2):
+        claimed.state.write(command.address + 1, [0, 2, *divmod(KEY, 2**16)])  # all but the pump, with the right key
+    claimed.at(PERIOD_S + 1e-6)
+    assert claimed.state.pump_fraction == 0.0
+
+
+@pytest.mark.parametrize("block", ["command", "reset"])
+def test_without_a_claim_nobody_commands_or_clears(block: str) -> None:
+    bench = Bench(2)
+    with refused(3):
+        bench.put(block, pump_command_fraction=0.5, vent_command_fraction=0, heartbeat=1, clear_faults=0xFFFF)
+    with refused(3):  # neither is there anything to disarm
+        bench.put("settings", watchdog_period_s=PERIOD_S, watchdog_arm=0)
+    assert bench.state.pump_fraction == 0.0
+
+
+@pytest.mark.parametrize("name", ["claim_id", "claim_key", "command_key", "clear_key"])
+def test_no_claim_is_zero(claimed: Bench, name: str) -> None:
+    values = {"watchdog_period_s": 1, "watchdog_arm": 1, "pump_command_fraction": 0.5, "vent_command_fraction": 0}
+    block = {"command_key": "command", "clear_key": "reset"}.get(name, "settings")
+    with refused(3):
+        claimed.put(block, **values, heartbeat=2, clear_faults=1, **{name: 0})
+
+
+def test_the_key_is_never_read_back(claimed: Bench) -> None:
+    for name, key in (("settings", "claim_key"), ("command", "command_key"), ("reset", "clear_key")):
+        assert claimed.get(name)[key] == 0
+    assert claimed.get("sensors")["claim_in_force"] == claimed.get("settings")["claim_id"] == 7
+    assert claimed.get("sensors")["period_in_force_s"] == PERIOD_S
+
+
+def test_claiming_again_with_the_same_key_does_no_harm_and_does_not_feed(claimed: Bench) -> None:
+    before = claimed.everything()
+    claimed.at(0.4)
+    claimed.arm()  # the answer to the first one was lost
+    assert claimed.everything() == before
+    claimed.at(PERIOD_S + 1e-6)
+    assert claimed.state.pump_fraction == 0.0
+
+
+def test_a_claim_lapses_with_its_watchdog_and_the_next_one_has_a_whole_period(claimed: Bench) -> None:
+    claimed.at(PERIOD_S)
+    with refused(6):
+        claimed.put("settings", watchdog_period_s=10.0, watchdog_arm=1, claim_id=9, claim_key=9)
+    claimed.at(PERIOD_S + 1e-3)
+    claimed.put("settings", watchdog_period_s=0.25, watchdog_arm=1, claim_id=9, claim_key=9)
+    sensors = claimed.get("sensors")
+    assert (sensors["claim_in_force"], sensors["period_in_force_s"]) == (9, 0.25)
+    assert sensors["latched_faults"] == claimed.map.fault_mask("watchdog")  # the claim clears nothing
+    with refused(6):  # the one before has lost it, also while the fault stays latched
+        claimed.command(0.3, 2)
+    claimed.at(PERIOD_S + 1e-3 + 0.25)
+    assert claimed.state.held
+    claimed.at(PERIOD_S + 2e-3 + 0.25)
+    assert not claimed.state.held
+
+
+def test_who_was_stopped_by_the_watchdog_may_go_on_while_nobody_else_came(claimed: Bench) -> None:
+    claimed.at(1.0)
+    assert not claimed.state.held
+    claimed.command(0.3, 2, vent=1.0)  # to vent, for instance
+    assert (claimed.state.pump_fraction, claimed.state.vent_fraction) == (0.0, 1.0)
+    with refused(6):
+        claimed.put("settings", watchdog_period_s=PERIOD_S, watchdog_arm=1, claim_id=9, claim_key=9)
+    claimed.clear()
+    claimed.command(0.3, 3)
+    assert claimed.state.pump_fraction == 0.3
+
+
+def test_disarming_gives_the_claim_back(claimed: Bench) -> None:
+    claimed.command(0.0, 2)
+    claimed.put("settings", watchdog_period_s=PERIOD_S, watchdog_arm=0)
+    assert claimed.get("sensors")["claim_in_force"] == 0
+    with refused(3):
+        claimed.command(0.3, 3)
+    claimed.put("settings", watchdog_period_s=PERIOD_S, watchdog_arm=1, claim_id=9, claim_key=9)
+    assert claimed.get("sensors")["claim_in_force"] == 9
+
+
+def test_anybody_may_stop_and_only_the_holder_clears_it(claimed: Bench) -> None:
+    stop = claimed.map.register("stop")
+    with refused(3):
+        claimed.state.write(stop.address, [0])
+    claimed.state.write(stop.address, [1])
+    assert (claimed.state.pump_fraction, claimed.state.vent_fraction) == (0.0, 0.25)
+    assert claimed.get("sensors")["latched_faults"] == claimed.map.fault_mask("stopped")
+    assert claimed.get("stop")["stop"] == 0
+    claimed.command(0.5, 2)
+    assert claimed.state.pump_fraction == 0.0
+    with refused(6):
+        claimed.put("reset", clear_faults=0xFFFF, clear_key=9)
+    claimed.clear()
+    assert claimed.state.pump_fraction == 0.0  # nothing starts by being cleared
+    claimed.command(0.5, 3)
+    assert claimed.state.pump_fraction == 0.5
+
+
+def test_a_board_nobody_holds_can_be_stopped_too_and_stays_stopped() -> None:
+    bench = Bench(2)
+    bench.state.write(bench.map.register("stop").address, [1])
+    bench.arm()
+    bench.command(0.5, 1)
+    assert bench.state.pump_fraction == 0.0
+
+
+def test_an_old_board_knows_neither_claim_nor_stop(old: Bench) -> None:
+    assert {block.name for block in old.map.blocks} == {"identity", "sensors", "settings", "command", "reset"}
+    assert [block.count for block in old.map.blocks] == [7, 22, 2, 3, 1]
+    with refused(2):
+        old.state.write(72, [1])

@@ -12,15 +12,16 @@ import pytest
 from counting_plant import CountingPlant, ManualClock
 
 from firmware_iface.conformance import Conformance, Finding, examine
+from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.board_state import BoardSample, BoardState
 from firmware_iface.emulators.modbus_rtu import RtuBusEmulator
-from firmware_iface.emulators.modbus_server import RegisterRefusal, respond
+from firmware_iface.emulators.modbus_server import ILLEGAL_VALUE, RegisterRefusal, respond
 from firmware_iface.emulators.pump_board import PumpBoardEmulator
 from firmware_iface.emulators.wires import PtyWire
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp
 from firmware_iface.links.serial_port import SerialSettings
-from firmware_iface.register_map import default_map
-from firmware_iface.roles import LinkError
+from firmware_iface.register_map import known_maps
+from firmware_iface.roles import BenchCommand, DeviceBusyError, LinkError
 
 PUMP, VENT, HEARTBEAT = 56, 57, 58
 
@@ -49,13 +50,13 @@ class HoldsLastValue(BoardState):
 
 
 class AcceptsOutOfRange(BoardState):
-    """Takes whatever is written to a single register, without doing anything about it."""
+    """Says yes to any value, without doing anything about it."""
 
     def write(self, address: int, words: Sequence[int]) -> None:
         try:
             super().write(address, words)
-        except RegisterRefusal:
-            if len(words) != 1 or address < 48:
+        except RegisterRefusal as refusal:
+            if refusal.code != ILLEGAL_VALUE:
                 raise
 
 
@@ -63,16 +64,18 @@ class AnyWriteFeeds(BoardState):
     """Feeds the watchdog with every write of the pump command, whatever the heartbeat."""
 
     def write(self, address: int, words: Sequence[int]) -> None:
-        super().write(address, words)
-        if address == PUMP:
-            self._fed_s = self._now_s
+        try:
+            super().write(address, words)
+        finally:
+            if address == PUMP:
+                self._fed_s = self._now_s
 
 
 class DisarmsAnyTime(BoardState):
     """Lets itself be disarmed with the pump running."""
 
     def write(self, address: int, words: Sequence[int]) -> None:
-        if list(words[-1:]) == [0] and address == 48:
+        if address == 48 and words[1] == 0:
             self._settable["pump_command_fraction"] = 0.0
         super().write(address, words)
 
@@ -103,6 +106,55 @@ class StartsWhenCleared(BoardState):
             self.last = words[0] / 50_000
         elif address == 64:
             self._settable["pump_command_fraction"] = self.last
+
+
+class Claimless(BoardState):
+    """Obeys whoever writes."""
+
+    def _check_claim(self, block: str, written: dict[str, float]) -> None:
+        pass
+
+
+class ClaimedForEver(BoardState):
+    """Its claim outlives the watchdog."""
+
+    @property
+    def held(self) -> bool:
+        return bool(self._claim_key)
+
+
+class HalfKey(BoardState):
+    """Looks at the low word of a key only."""
+
+    def _check_claim(self, block: str, written: dict[str, float]) -> None:
+        low = {name: float(int(value) & 0xFFFF) for name, value in written.items() if name.endswith("_key")}
+        own, self._claim_key = self._claim_key, float(int(self._claim_key) & 0xFFFF)
+        try:
+            super()._check_claim(block, written | low)
+        finally:
+            self._claim_key = own
+
+
+class ShowsKey(BoardState):
+    """Lets everybody read the key."""
+
+    def _values(self) -> dict[str, float]:
+        return super()._values() | {"command_key": self._claim_key}
+
+
+class ClaimFeeds(BoardState):
+    """Feeds its watchdog with every claim."""
+
+    def _claim(self, written: dict[str, float]) -> None:
+        super()._claim(written)
+        self._fed_s = self._now_s
+
+
+class StopsForATick(BoardState):
+    """Forgets that it was stopped."""
+
+    def _latch(self, mask: int) -> None:
+        super()._latch(mask & ~self._stopped_mask)
 
 
 class OtherMap(BoardState):
@@ -145,14 +197,15 @@ class Bench:
 
 
 @pytest.fixture
-async def serve() -> AsyncIterator[Callable[[type[BoardState]], Awaitable[Bench]]]:
+async def serve() -> AsyncIterator[Callable[[type[BoardState], int], Awaitable[Bench]]]:
     benches: list[Bench] = []
 
-    async def make(kind: type[BoardState]) -> Bench:
+    async def make(kind: type[BoardState], version: int = 2) -> Bench:
         clock = ManualClock()
         plant = ClockedPlant(clock)
-        bench = Bench(PumpBoardEmulator(plant, clock=clock), clock)
-        bench.board.state = kind(default_map(), plant.sample())
+        registers = known_maps()[version]
+        bench = Bench(PumpBoardEmulator(plant, clock=clock, registers=registers), clock)
+        bench.board.state = kind(registers, plant.sample())
         benches.append(bench)
         await bench.board.start()
         return bench
@@ -166,11 +219,14 @@ def problems(findings: list[Finding]) -> dict[str, str]:
     return {finding.check: finding.problem for finding in findings if finding.problem}
 
 
-async def test_the_emulator_conforms(serve: Callable[[type[BoardState]], Awaitable[Bench]]) -> None:
-    bench = await serve(BoardState)
+@pytest.mark.parametrize(("version", "checks"), [(1, 14), (2, 21)])
+async def test_the_emulator_conforms(
+    serve: Callable[[type[BoardState], int], Awaitable[Bench]], version: int, checks: int
+) -> None:
+    bench = await serve(BoardState, version)
     findings = await bench.examine()
     assert problems(findings) == {}
-    assert len(findings) == 14
+    assert len(findings) == checks
     assert bench.board.state.pump_fraction == 0.0
     assert bench.board.state.read(49, 1) == [0]  # left as it was found: watchdog off
 
@@ -190,27 +246,60 @@ async def test_the_emulator_conforms_over_rtu_and_in_real_time(tmp_path: Path) -
     assert problems(findings) == {}
 
 
+BROKEN = [
+    (NoWatchdog, "a silent host stops the pump", "holds the pump at 0.05 after a host silent"),
+    (HoldsLastValue, "a silent host stops the pump", "holds the pump at 0.05 after a host silent"),
+    (AcceptsOutOfRange, "values outside the limits are refused", "accepts watchdog_period_s = 0.049"),
+    (AnyWriteFeeds, "the same heartbeat does not feed", "writes that repeat one heartbeat"),
+    (AnyWriteFeeds, "half a command does not feed", "writes of the pump command alone"),
+    (DisarmsAnyTime, "disarming is refused while the pump is commanded", "be disarmed while the pump is comm"),
+    (Frozen, "samples advance", "sample_counter stands still"),
+    (ForgetsPeriod, "settings are read back as written", "written 0.3, read back 1"),
+    (StartsWhenCleared, "clearing sets the pump to 0", "starts the pump at 0.05"),
+    (OtherMap, "identity", "map version is 7, this test knows 1 and 2"),
+]
+CLAIMS_BROKEN = [
+    (Claimless, "another claim is refused", "accepts a second claim"),
+    (Claimless, "nobody else commands, clears or disarms", "accepts a command with another key"),
+    (Claimless, "without a claim nothing is commanded", "a write to command without a claim"),
+    (ClaimedForEver, "the claim lapses with the watchdog", "exception 6"),
+    (HalfKey, "nobody else commands, clears or disarms", "accepts a command with another key"),
+    (ShowsKey, "the claim and the period are shown, the key is not", "command_key can be read"),
+    (ClaimFeeds, "the same claim may be made again", "claims that are made again"),
+    (StopsForATick, "anybody may stop the pump", "runs the pump at 0.05 after stop"),
+]
+
+
 @pytest.mark.parametrize(
-    ("kind", "check", "words"),
-    [
-        (NoWatchdog, "a silent host stops the pump", "holds the pump at 0.05 after a host silent"),
-        (HoldsLastValue, "a silent host stops the pump", "holds the pump at 0.05 after a host silent"),
-        (AcceptsOutOfRange, "values outside the limits are refused", "accepts watchdog_period_s = 0.049"),
-        (AnyWriteFeeds, "the same heartbeat does not feed", "writes that repeat one heartbeat"),
-        (AnyWriteFeeds, "half a command does not feed", "writes of the pump command alone"),
-        (DisarmsAnyTime, "disarming is refused while the pump is commanded", "be disarmed while the pump is comm"),
-        (Frozen, "samples advance", "sample_counter stands still"),
-        (ForgetsPeriod, "settings are read back as written", "written 0.3, read back 1"),
-        (StartsWhenCleared, "clearing sets the pump to 0", "starts the pump at 0.05"),
-        (OtherMap, "identity", "map version is 7"),
-    ],
+    ("version", "kind", "check", "words"),
+    [(2, *row) for row in BROKEN + CLAIMS_BROKEN] + [(1, *row) for row in BROKEN if row[0] is AnyWriteFeeds],
 )
 async def test_a_broken_board_fails_for_the_right_reason(
-    serve: Callable[[type[BoardState]], Awaitable[Bench]], kind: type[BoardState], check: str, words: str
+    serve: Callable[[type[BoardState], int], Awaitable[Bench]],
+    version: int,
+    kind: type[BoardState],
+    check: str,
+    words: str,
 ) -> None:
-    bench = await serve(kind)
+    bench = await serve(kind, version)
     found = problems(await bench.examine())
     assert words in found[check]
+
+
+async def test_a_board_that_somebody_holds_is_left_alone(
+    serve: Callable[[type[BoardState]], Awaitable[Bench]],
+) -> None:
+    bench = await serve(BoardState)
+    holder = PumpBoard(f"tcp://127.0.0.1:{bench.board.port}", timeout_s=5.0)
+    await holder.open()
+    await holder.write(BenchCommand(0.5, 0.0))
+    before = bench.board.state.read(48, 6)
+    with pytest.raises(DeviceBusyError):
+        await bench.examine()
+    assert bench.board.state.pump_fraction == 0.5
+    assert bench.board.state.read(48, 6) == before
+    await holder.write(BenchCommand(0.0, 0.0))
+    await holder.close()
 
 
 async def test_nobody_there_is_an_error_and_no_finding() -> None:

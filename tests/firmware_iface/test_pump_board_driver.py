@@ -16,6 +16,7 @@ from firmware_iface.emulators.pump_board import Faults, PumpBoardEmulator
 from firmware_iface.links.modbus_links import parse_tcp_url
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import (
+    ALL_FAULTS,
     BenchCommand,
     BenchIdentity,
     BenchReading,
@@ -26,6 +27,7 @@ from firmware_iface.roles import (
 
 WATCHDOG_S = 0.5
 OFF = BenchCommand(0.0, 0.0)
+both_maps = pytest.mark.parametrize("map_version", [1, 2])
 
 
 @pytest.fixture
@@ -48,10 +50,14 @@ def agrees(reading: BenchReading) -> bool:
     )
 
 
-async def test_open_says_who_answers_and_arms_the_watchdog(driver: PumpBoard, board: PumpBoardEmulator) -> None:
+@both_maps
+async def test_open_says_who_answers_and_arms_the_watchdog(
+    driver: PumpBoard, board: PumpBoardEmulator, map_version: int
+) -> None:
     identity = await driver.open()
-    assert identity == BenchIdentity("membrane pump board", default_map().map_version, "1.0.0", WATCHDOG_S)
+    assert identity == BenchIdentity("membrane pump board", map_version, "1.0.0", WATCHDOG_S, 800.0, 1.0)
     assert board.state.read(48, 2) == [500, 1]
+    assert (await driver.read()).foreign == 0
 
 
 async def test_a_reading_is_one_new_sample_in_si_units(driver: PumpBoard, plant: CountingPlant) -> None:
@@ -64,6 +70,7 @@ async def test_a_reading_is_one_new_sample_in_si_units(driver: PumpBoard, plant:
     assert (reading.displacement_quality, reading.watchdog_tripped, reading.latched_faults) == (0, False, 0)
 
 
+@both_maps
 async def test_a_command_reaches_the_plant_and_is_read_back(driver: PumpBoard, plant: CountingPlant) -> None:
     await driver.open()
     await driver.write(BenchCommand(0.125, 1.0))
@@ -107,7 +114,7 @@ def test_a_watchdog_period_the_board_cannot_have_is_refused(watchdog_s: float) -
 
 async def test_an_unknown_map_version_is_refused_with_both_named(driver: PumpBoard, board: PumpBoardEmulator) -> None:
     board.faults.map_version = 9
-    with pytest.raises(DeviceRefusedError, match="version 9, this program knows 1"):
+    with pytest.raises(DeviceRefusedError, match="version 9, this program knows 1 and 2"):
         await driver.open()
     assert board.state.read(49, 1) == [0]  # nothing was written to it
     with pytest.raises(LinkDownError):
@@ -123,6 +130,7 @@ async def test_another_kind_of_device_is_refused(
         await driver.open()
 
 
+@both_maps
 async def test_a_watchdog_that_does_not_take_its_setting_is_refused(
     driver: PumpBoard, board: PumpBoardEmulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -224,13 +232,15 @@ async def test_watchdog_trips_when_only_readers_are_there(
 async def test_watchdog_trips_when_the_heartbeat_stands(
     board: PumpBoardEmulator, driver: PumpBoard, plant: CountingPlant, clock: ManualClock
 ) -> None:
-    await driver.open()
     stuck = AsyncModbusTcpClient("127.0.0.1", port=board.port, timeout=5, retries=0, reconnect_delay=0)
     assert await stuck.connect()
+    await stuck.write_registers(48, [500, 1, 0, 7, 0, 9], device_id=1)
     for _ in range(6):
-        await stuck.write_registers(56, [25_000, 0, 77], device_id=1)
+        reply = await stuck.write_registers(56, [25_000, 0, 77, 0, 9], device_id=1)
+        assert not reply.isError()
         clock.now_s += 0.1
     await plant.reaches((0.0, 0.0))
+    await driver.open()
     assert (await driver.read()).watchdog_tripped
     stuck.close()
 
@@ -247,6 +257,7 @@ async def test_writing_every_tick_keeps_the_pump_on(
     await driver.write(OFF)
 
 
+@both_maps
 async def test_after_a_trip_only_a_person_gets_the_pump_back(
     driver: PumpBoard, board: PumpBoardEmulator, plant: CountingPlant, clock: ManualClock
 ) -> None:
@@ -259,7 +270,7 @@ async def test_after_a_trip_only_a_person_gets_the_pump_back(
     assert (await driver.read()).watchdog_tripped  # what happened while we were away
     await driver.write(BenchCommand(0.5, 0.0))
     assert (await driver.read()).pump_fraction == 0.0
-    await driver.clear_faults()
+    await driver.clear_faults(ALL_FAULTS)
     reading = await driver.read()
     assert (reading.pump_fraction, reading.watchdog_tripped, reading.latched_faults) == (0.0, False, 0)
     await driver.write(BenchCommand(0.5, 0.0))
@@ -267,25 +278,26 @@ async def test_after_a_trip_only_a_person_gets_the_pump_back(
     await driver.write(OFF)
 
 
+@both_maps
 async def test_a_reconnect_within_the_period_goes_on_without_a_trip(
     driver: PumpBoard, board: PumpBoardEmulator, plant: CountingPlant, clock: ManualClock
 ) -> None:
     await driver.open()
-    await driver.write(BenchCommand(0.5, 0.0))  # a new driver's own first heartbeat would be the same
+    await driver.write(BenchCommand(0.5, 0.0))
     board.drop_connections()
     with pytest.raises(LinkDownError):
         await driver.read()
     clock.now_s += 0.4
-    successor = PumpBoard(f"tcp://127.0.0.1:{board.port}", timeout_s=5.0, watchdog_s=WATCHDOG_S)
-    await successor.open()
-    await successor.write(BenchCommand(0.5, 0.0))
+    await driver.open()
+    await driver.write(BenchCommand(0.5, 0.0))
     clock.now_s += 0.4
-    assert not (await successor.read()).watchdog_tripped
+    reading = await driver.read()
+    assert (reading.watchdog_tripped, reading.foreign) == (False, 0)
     assert plant.outputs[-1] == (0.5, 0.0)
-    await successor.write(OFF)
-    await successor.close()
+    await driver.write(OFF)
 
 
+@both_maps
 async def test_a_restarted_board_is_not_read_on(driver: PumpBoard, board: PumpBoardEmulator) -> None:
     await driver.open()
     await driver.write(BenchCommand(0.5, 0.0))
@@ -307,6 +319,7 @@ async def test_over_pressure_is_acted_on_by_the_board_itself(driver: PumpBoard, 
     assert (await driver.read()).latched_faults == default_map().fault_mask("over_pressure")
 
 
+@both_maps
 async def test_a_clean_close_disarms_the_watchdog(
     driver: PumpBoard, board: PumpBoardEmulator, clock: ManualClock
 ) -> None:
@@ -318,6 +331,7 @@ async def test_a_clean_close_disarms_the_watchdog(
     assert not (await driver.read()).watchdog_tripped
 
 
+@both_maps
 async def test_a_close_with_the_pump_on_leaves_it_to_the_watchdog(
     driver: PumpBoard, plant: CountingPlant, clock: ManualClock
 ) -> None:

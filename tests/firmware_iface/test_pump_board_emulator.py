@@ -16,6 +16,9 @@ from firmware_iface.register_map import default_map
 DOCS = DOCS_PATH.read_text(encoding="utf-8")
 ROW = re.compile(r"\| (\d+) \| `(\w+)` \| (\w\d\d) \| \S+ \| (\d+) \|")
 
+KEY = [0x1234, 0x5678]
+CLAIM = [500, 1, 0, 7, *KEY]  # period, armed, id, key
+
 
 @pytest.fixture
 async def client(board: PumpBoardEmulator) -> AsyncIterator[AsyncModbusTcpClient]:
@@ -54,7 +57,9 @@ async def test_a_plain_client_reads_what_the_documentation_says(
     assert values["gauge_pressure_limit_pa"] == 800.0
 
 
-@pytest.mark.parametrize(("address", "words", "code"), [(56, [50_001], 3), (16, [0, 0], 2), (200, [1], 2)])
+@pytest.mark.parametrize(
+    ("address", "words", "code"), [(56, [50_001, 0, 1, 0, 1], 3), (56, [1], 2), (16, [0, 0], 2), (200, [1], 2)]
+)
 async def test_wrong_writes_get_an_exception(
     board: PumpBoardEmulator, client: AsyncModbusTcpClient, address: int, words: list[int], code: int
 ) -> None:
@@ -67,13 +72,14 @@ async def test_wrong_writes_get_an_exception(
 async def test_function_codes_6_and_23_reach_the_registers(
     plant: CountingPlant, board: PumpBoardEmulator, client: AsyncModbusTcpClient
 ) -> None:
-    assert not (await client.write_register(57, 25_000, device_id=1)).isError()
-    assert plant.outputs[-1] == (0.0, 0.5)
+    assert not (await client.write_registers(48, CLAIM, device_id=1)).isError()
     reply = await client.readwrite_registers(
-        read_address=32, read_count=2, address=56, values=[10_000, 5_000, 1], device_id=1
+        read_address=32, read_count=2, address=56, values=[10_000, 5_000, 1, *KEY], device_id=1
     )
     assert reply.registers == [10_000, 5_000]
     assert plant.outputs[-1] == (0.2, 0.1)
+    assert not (await client.write_register(72, 1, device_id=1)).isError()
+    assert plant.outputs[-1] == (0.0, 0.1)
 
 
 async def test_another_unit_is_not_there(board: PumpBoardEmulator, client: AsyncModbusTcpClient) -> None:
@@ -85,15 +91,18 @@ async def test_the_plant_is_driven_off_at_start_and_at_stop(plant: CountingPlant
     emulator = PumpBoardEmulator(plant, clock=clock)
     await emulator.start()
     assert plant.outputs == [(0.0, 0.0)]
-    emulator.state.write(56, [50_000, 10_000, 1])
+    emulator.state.write(48, CLAIM)
+    emulator.state.write(56, [50_000, 10_000, 1, *KEY])
     await plant.reaches((1.0, 0.2))
     await emulator.stop()
     assert plant.outputs[-1] == (0.0, 0.2)
     await emulator.stop()  # a second time is nothing
 
 
-async def test_a_failing_plant_is_not_hidden(plant: CountingPlant, monkeypatch: pytest.MonkeyPatch) -> None:
-    emulator = PumpBoardEmulator(plant)
+async def test_a_failing_plant_is_not_hidden(
+    plant: CountingPlant, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    emulator = PumpBoardEmulator(plant, clock=clock)
     await emulator.start()
 
     def broken(pump_fraction: float, vent_fraction: float) -> None:
@@ -102,7 +111,8 @@ async def test_a_failing_plant_is_not_hidden(plant: CountingPlant, monkeypatch: 
 
     plant.actuated.clear()
     monkeypatch.setattr(plant, "actuate", broken)
-    emulator.state.write(56, [50_000, 0, 1])
+    emulator.state.write(48, CLAIM)
+    emulator.state.write(56, [50_000, 0, 1, *KEY])
     await plant.actuated.wait()
     with pytest.raises(RuntimeError, match="wire off"):
         await emulator.stop()

@@ -71,9 +71,10 @@ async def test_a_plain_pymodbus_client_reads_and_writes_the_board(wire: PtyWire,
         assert client.connect()
         try:
             words = client.read_holding_registers(block.address, count=block.count, device_id=1).registers
-            written = client.write_registers(56, [6250, 25_000, 7], device_id=1)
-            refused = client.write_registers(56, [50_001, 0, 8], device_id=1)
-            return words, written.isError(), refused.isError()
+            claimed = client.write_registers(48, [500, 1, 0, 7, 0x1234, 0x5678], device_id=1)
+            written = client.write_registers(56, [6250, 25_000, 7, 0x1234, 0x5678], device_id=1)
+            refused = client.write_registers(56, [50_001, 0, 8, 0x1234, 0x5678], device_id=1)
+            return words, claimed.isError() or written.isError(), refused.isError()
         finally:
             client.close()
 

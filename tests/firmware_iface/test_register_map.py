@@ -13,7 +13,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_iface.register_map import DEFAULT_PATH, I32_NO_VALUE, RegisterMapError, default_map, load, parse
+from firmware_iface.register_map import (
+    DEFAULT_PATH,
+    I32_NO_VALUE,
+    RegisterMapError,
+    default_map,
+    known_maps,
+    load,
+    parse,
+)
 
 
 @pytest.fixture
@@ -29,6 +37,16 @@ def test_sensor_and_command_blocks_are_one_transaction_each() -> None:
             at for register in block.registers for at in range(register.address, register.address + register.words)
         ]
         assert addresses == list(range(block.address, block.address + block.count))
+
+
+def test_an_earlier_map_is_the_newest_without_what_came_later() -> None:
+    newest, first = default_map(), known_maps()[1]
+    assert (newest.map_version, first.map_version) == (2, 1)
+    assert [register for register in newest if register.since == 1] == list(first)
+    assert [(block.address, block.count) for block in first.blocks] == [(0, 7), (16, 22), (48, 2), (56, 3), (64, 1)]
+    for version in (0, 3):
+        with pytest.raises(RegisterMapError, match=f"map version {version} is none of"):
+            newest.of_version(version)
 
 
 def test_resolutions_are_finer_than_the_sensors() -> None:
@@ -94,7 +112,7 @@ def test_a_value_that_does_not_fit_is_refused(name: str, value: float) -> None:
 
 
 def test_a_block_of_wrong_length_is_refused() -> None:
-    with pytest.raises(ValueError, match="command has 3 registers, not 2"):
+    with pytest.raises(ValueError, match="command has 5 registers, not 2"):
         default_map().block("command").decode([0, 0])
 
 
@@ -114,7 +132,7 @@ def _edit(table: dict[str, Any], block: int, register: int, **changes: Any) -> d
         (0, 3, {"address": 3}, "gauge_pressure_limit_pa .* overlaps firmware_version"),
         (2, 0, {"address": 8}, "gap between watchdog_period_s and watchdog_arm"),
         (3, 2, {"address": 60}, "gap between vent_command_fraction and heartbeat"),
-        (4, 0, {"address": 20}, "clear_faults .* comes after heartbeat"),
+        (5, 0, {"address": 20}, "stop .* comes after clear_key"),
         (0, 0, {"type": "u8"}, "device_kind: type 'u8' is none of u16, u32, i32, f32"),
         (1, 4, {"unit": "furlong"}, "displacement_um: unit 'furlong'"),
         (1, 4, {"name": "displacement"}, "displacement: the name must end in _um"),
@@ -125,6 +143,8 @@ def _edit(table: dict[str, Any], block: int, register: int, **changes: Any) -> d
         (3, 0, {"max": 2.0}, "pump_command_fraction: a limit is out of its type"),
         (1, 4, {"min": 0, "max": 1}, "displacement_um: .* a ro one has no limits"),
         (4, 0, {"address": 65536}, "clear_faults: address 65536 is outside"),
+        (1, 16, {"since": 3}, "claim_in_force: since must be a map version, 1..2"),
+        (1, 0, {"since": 2}, "device_time_s is older than sample_counter before it"),
         (3, 0, {"meaning": None}, "pump_command_fraction: meaning is missing"),
         (3, 2, {"name": "vent_command_fraction", "unit": "fraction"}, "vent_command_fraction is there twice"),
     ],

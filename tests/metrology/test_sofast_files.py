@@ -86,3 +86,28 @@ def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(ImportError, match=r"membrane-ctrl\[sofast\]"):
         sofast.read_camera(tmp_path / "c.h5")
+
+
+def test_what_leads_out_of_the_file_or_is_too_large_is_refused(tmp_path):
+    other = write(tmp_path / "other.h5", Camera__intrinsic_mat=np.eye(3))
+    path = tmp_path / "e.h5"
+    with h5py.File(path, "w") as file:
+        file["Camera/intrinsic_mat"] = h5py.ExternalLink(other.name, "Camera/intrinsic_mat")
+    with pytest.raises(ValueError, match="intrinsic_mat is a link, and links are not followed here"):
+        sofast.read_camera(path)
+    with h5py.File(path, "w") as file:
+        file["Camera"] = h5py.ExternalLink(other.name, "Camera")
+    with pytest.raises(ValueError, match="is a link"):
+        sofast.read_camera(path)
+    with h5py.File(path, "w") as file:
+        file.create_dataset("Camera/intrinsic_mat", (2**38,), "f8", chunks=(2**16,))  # 2 TB of nothing, in 1 kB
+    with pytest.raises(ValueError, match="more than are read"):
+        sofast.read_camera(path)
+    with h5py.File(path, "w") as file:
+        file.create_group("Camera/intrinsic_mat")
+    with pytest.raises(ValueError, match="not a data set"):
+        sofast.read_camera(path)
+    with h5py.File(path, "w") as file:
+        file.create_dataset("Camera/intrinsic_mat", (3, 3), "f8", external=[(str(other), 0, 72)])
+    with pytest.raises(ValueError, match="not a data set of this file"):
+        sofast.read_camera(path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import pickle
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
@@ -38,16 +38,16 @@ def feed(tables: ColumnTables, number: int) -> None:
 @pytest.mark.parametrize("repeated", [0, 1], ids=["the state was newer", "the state was older"])
 def test_after_four_deaths_every_tick_window_and_shape_is_there_once(tmp_path: Path, repeated: int) -> None:
     tables = ColumnTables(tmp_path)
-    handed_on = pickle.dumps(tables.open_windows)
+    handed_on = deepcopy(tables.open_windows)
     for number in SECONDS:
         feed(tables, number)
         if number in KILLED:
             if not repeated:
-                handed_on = pickle.dumps(tables.open_windows)
-            tables = ColumnTables(tmp_path, pickle.loads(handed_on))
+                handed_on = deepcopy(tables.open_windows)
+            tables = ColumnTables(tmp_path, handed_on)
             if repeated:
                 feed(tables, number)
-        handed_on = pickle.dumps(tables.open_windows)
+        handed_on = deepcopy(tables.open_windows)
     tables.close()
     assert np.array_equal(ticks_of(tmp_path), ROWS[:, 1])
     run = open_run(tmp_path)

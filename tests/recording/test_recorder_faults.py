@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import pickle
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -20,6 +19,7 @@ from synthetic_run import STARTED_UTC, rows_of, shape_of
 from membrane_ctrl import config_file
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config, RecordingConfig
+from membrane_ctrl.estimate import pack_estimate
 from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
 from membrane_ctrl.recording import recorder as recorder_module
 from membrane_ctrl.recording.checked_text import dumps_checked
@@ -237,12 +237,12 @@ def test_segments_are_changed_in_time_without_losing_a_row(bench: Bench) -> None
 
 
 def test_a_broken_shape_is_reported_and_the_next_one_taken(bench: Bench) -> None:
-    bench.writers["shapes"].put(b"no pickle")
-    bench.writers["shapes"].put(pickle.dumps(shape_of(1.0, 1)))
+    bench.writers["shapes"].put(b"no shape")
+    bench.writers["shapes"].put(pack_estimate(shape_of(1.0, 1)))
     bench.second(0)
     bench.recorder.finish()
     assert bench.kinds() == ["recorder_error", "recorder_recovered", "recorder_done"]
-    assert "shape estimate: UnpicklingError" in bench.reports[0]["message"]
+    assert "shape estimate: JSONDecodeError" in bench.reports[0]["message"]
     assert json.loads((bench.run_dir / "summary.json").read_text())["cycles"] == 1
 
 

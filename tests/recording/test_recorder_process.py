@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-import pickle
 import resource
 import signal
 import subprocess
@@ -27,6 +26,7 @@ from synthetic_run import rows_of, shape_of
 from membrane_ctrl.child_report import reporter
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
+from membrane_ctrl.estimate import pack_estimate
 from membrane_ctrl.ipc.ring import RingWriter, ring
 from membrane_ctrl.processes import STOP
 from membrane_ctrl.recording.process import RecorderSpec, parent_died, recorder_main
@@ -127,7 +127,7 @@ def test_every_row_event_and_shape_is_found_again(feed: Feed) -> None:
         for row in rows:
             feed.telemetry.put(row.pack())
         for cycle in range(5):
-            feed.shapes.put(pickle.dumps(shape_of(2.0 * cycle, cycle, "rejected" if cycle == 3 else "ok")))
+            feed.shapes.put(pack_estimate(shape_of(2.0 * cycle, cycle, "rejected" if cycle == 3 else "ok")))
         feed.event("fault", mono_s=19.0, cause="over_pressure")
         feed.event("end", mono_s=20.0, exit=0)
         process.join(DEADLINE_S)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -16,6 +15,7 @@ from synthetic_run import STARTED_UTC, rows_of, shape_of
 
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config, RecordingConfig
+from membrane_ctrl.estimate import pack_estimate
 from membrane_ctrl.ipc.ring import RingAddress, RingReader, RingWriter, ring
 from membrane_ctrl.recording.checked_text import dumps_checked
 from membrane_ctrl.recording.events import EventsFile
@@ -23,6 +23,7 @@ from membrane_ctrl.recording.optimizer import Optimizer
 from membrane_ctrl.recording.read_back import read_rows
 from membrane_ctrl.recording.recorder import Recorder
 from membrane_ctrl.recording.sink import Recording, is_whole
+from membrane_ctrl.recording.state_file import load_state, save_state
 from membrane_ctrl.recording.thrift import Thrift
 from membrane_ctrl.telemetry import ROW_BYTES
 
@@ -97,7 +98,7 @@ def recorded(run_dir: Path) -> np.ndarray:
 def test_the_next_recorder_goes_on_and_everything_is_there_once(tmp_path: Path, stack: ExitStack) -> None:
     run = Run(tmp_path, stack, Config())
     first = run.recorder(0)
-    run.writers["shapes"].put(pickle.dumps(shape_of(0.5, 0)))
+    run.writers["shapes"].put(pack_estimate(shape_of(0.5, 0)))
     for number in range(5):
         run.second(first, number)
     run.second(first, 5, write=False)  # its events are in the file, its rows are not: then it is killed
@@ -122,7 +123,31 @@ def test_the_next_recorder_goes_on_and_everything_is_there_once(tmp_path: Path, 
     assert not (tmp_path / ".recorder-state").exists()
 
 
-@pytest.mark.parametrize("left", [None, b"", b"no pickle", b"\x80\x04N."])
+def test_what_is_handed_on_comes_back_to_the_last_bit(tmp_path: Path, stack: ExitStack) -> None:
+    run = Run(tmp_path, stack, Config())
+    recorder = run.recorder(0)
+    run.writers["shapes"].put(pack_estimate(shape_of(0.5, 0)))
+    run.event("fault", 0.5)
+    for number in range(12):
+        run.second(recorder, number)
+    path = tmp_path / ".recorder-state"
+    state = load_state(tmp_path)
+    assert state is not None
+    assert state.windows.levels
+    state.reference = shape_of(1.0, 1)
+    save_state(tmp_path, state)
+    written = path.read_bytes()
+    again = load_state(tmp_path)
+    assert again is not None
+    assert again.reference is not None
+    assert np.array_equal(again.reference.covariance_um2, state.reference.covariance_um2)
+    save_state(tmp_path, again)
+    assert path.read_bytes() == written
+    path.write_bytes(written.replace(b'"errors": 0', b'"errors": "0"'))
+    assert load_state(tmp_path) is None
+
+
+@pytest.mark.parametrize("left", [None, b"", b"no state", b"\x80\x04N.", b"[]", b"[" * 10_000, b"{}", b"null"])
 @pytest.mark.parametrize(("rows_kept", "partial", "ticks"), [(3000, False, 100), (75, True, 100)])
 def test_without_what_the_first_knew_the_statistics_begin_with_what_the_ring_has_and_say_so(
     tmp_path: Path, stack: ExitStack, left: bytes | None, rows_kept: int, partial: bool, ticks: int
@@ -194,7 +219,7 @@ def test_with_little_room_maps_are_left_out(
     monkeypatch.setattr("membrane_ctrl.recording.housekeeping.free_mb", lambda _: 700.0)
     run = Run(tmp_path, stack, Config())
     recorder = run.recorder(0)
-    run.writers["shapes"].put(pickle.dumps(shape_of(0.5, 0)))
+    run.writers["shapes"].put(pack_estimate(shape_of(0.5, 0)))
     run.second(recorder, 0)
     recorder.finish()
     assert recorder._housekeeping.thrift == Thrift.NO_PICTURES

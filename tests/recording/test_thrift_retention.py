@@ -128,14 +128,14 @@ def test_one_run_that_cannot_go_keeps_no_other_and_remains_of_a_crash_go_too(
         make_run(tmp_path, f"202610{day:02d}T110000Z-old")
     make_run(tmp_path, "20261399T999999Z-no-time")
     make_run(tmp_path, ".deleted-20260901T110000Z-half")
-    rename = Path.rename
+    rename = os.rename
 
-    def guarded(path: Path, target: Path) -> Path:
-        if path.name.startswith("20261001"):
-            raise PermissionError(13, "Permission denied", str(path))
-        return rename(path, target)
+    def guarded(name: str, target: str, **folders: int) -> None:
+        if name.startswith("20261001"):
+            raise PermissionError(13, "Permission denied", name)
+        rename(name, target, **folders)
 
-    monkeypatch.setattr(Path, "rename", guarded)
+    monkeypatch.setattr(os, "rename", guarded)
     reports: list[dict[str, object]] = []
     config = RecordingConfig(keep_days=30.0, min_free_mb=1.0)
     keeping = Housekeeping(present, HandClock(0.0, NOW), config, Complaints(reports.append))

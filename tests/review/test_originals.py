@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -70,14 +71,14 @@ def test_a_run_that_cannot_be_deleted_keeps_no_other(
     first, second = written(tmp_path, 0.01), written(tmp_path, 0.01, name="20261122T180000Z-later")
     for folder in (first, second):
         (folder / "summary.json").write_text("{}")
-    rename = Path.rename
+    rename = os.rename
 
-    def refused(path: Path, target: Path) -> Path:
-        if path == first:
+    def refused(source: str, target: str, **folders: int) -> None:
+        if source == first.name:
             raise PermissionError(13, "Permission denied")
-        return rename(path, target)
+        rename(source, target, **folders)
 
-    monkeypatch.setattr(Path, "rename", refused)
+    monkeypatch.setattr("membrane_ctrl.recording.retention.os.rename", refused)
     assert command(["runs", "prune", "--logs", str(tmp_path), "--keep-gb", "0", "--delete"]) == 4
     said = capsys.readouterr()
     assert f"{first}: cannot be deleted" in said.err

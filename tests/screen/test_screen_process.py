@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import pickle
 import pty
 import select
 import signal
@@ -21,6 +20,7 @@ from screen_feed import FAULT, event, packed, rows, shape
 from membrane_ctrl.child_report import ALIVE
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config
+from membrane_ctrl.estimate import pack_estimate
 from membrane_ctrl.ipc.ring import RingWriter, ring
 from membrane_ctrl.processes import STOP
 from membrane_ctrl.screen.process import ScreenSpec, give_back_terminal, screen_main
@@ -46,7 +46,7 @@ class Run:
     def tick(self) -> None:
         for row in rows(0.1, self.spec.clock.now()):
             self._telemetry.put(row.pack())
-        self._shapes.put(pickle.dumps(shape()))
+        self._shapes.put(pack_estimate(shape()))
 
     def tell(self, kind: str, **more: object) -> None:
         self._events.put(packed(event(self.spec.clock.now(), kind, **more)))

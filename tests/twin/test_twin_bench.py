@@ -88,6 +88,14 @@ class Client:
         data = self._ask(struct.pack(">BHH", 3, block.address, block.count))
         return block.decode(struct.unpack(f">{block.count}H", data[1:]))
 
+    def claim(self, period_s: float) -> None:
+        claim = {"claim_id": 1.0, "claim_key": 2.0}
+        self.write("settings", {"watchdog_period_s": period_s, "watchdog_arm": 1.0, **claim})
+
+    def command(self, pump: float) -> None:
+        values = {"pump_command_fraction": pump, "vent_command_fraction": 0.0, "heartbeat": 1.0, "command_key": 2.0}
+        self.write("command", values)
+
     def write(self, name: str, values: dict[str, float]) -> None:
         block = default_map().block(name)
         words = block.encode(values)
@@ -105,7 +113,8 @@ def test_serves_the_plant_in_real_time_and_publishes_the_truth() -> None:
         assert report.error == ""
         reader = RingReader(address)
         started_s, first = clock.now(), client.read("sensors")
-        client.write("command", {"pump_command_fraction": 1.0, "vent_command_fraction": 0.0, "heartbeat": 1.0})
+        client.claim(10.0)
+        client.command(1.0)
         time.sleep(1.0)
         ended_s, last = clock.now(), client.read("sensors")
         truths = [Truth.unpack(message) for message in reader.drain()]
@@ -179,8 +188,8 @@ def test_outlives_its_parent_for_a_while_with_the_watchdog_tripped() -> None:
     pid, report = here.recv()
     try:
         with Client(report.port) as client:
-            client.write("settings", {"watchdog_period_s": 0.2, "watchdog_arm": 1.0})
-            client.write("command", {"pump_command_fraction": 0.5, "vent_command_fraction": 0.0, "heartbeat": 1.0})
+            client.claim(0.2)
+            client.command(0.5)
             parent.kill()
             parent.join()
             while not (sensors := client.read("sensors"))["watchdog_tripped"]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import pickle
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from membrane_ctrl.commands import Command
 from membrane_ctrl.config import Config, LoopConfig, TwinConfig
 from membrane_ctrl.controller import Controller
 from membrane_ctrl.errors import Exit
+from membrane_ctrl.estimate import pack_estimate
 from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
 from membrane_ctrl.metrology.hencky import zernike_projection
 from membrane_ctrl.supervisor import Supervisor, Wiring
@@ -120,7 +120,7 @@ class WaitingBench:
             self._shape_due_s += CONFIG.shape.period_s
             estimate = self._shape(self._at_s)
             if estimate is not None and self.shapes is not None:
-                self.shapes.put(pickle.dumps(estimate))
+                self.shapes.put(pack_estimate(estimate))
         return truth.displacement_um, truth.laser_bias_um
 
     async def open(self) -> BenchIdentity:
@@ -133,8 +133,11 @@ class WaitingBench:
     async def write(self, command: BenchCommand) -> None:
         self._now().write(command)
 
-    async def clear_faults(self) -> None:
-        self._now().clear_faults()
+    async def clear_faults(self, mask: int) -> None:
+        self._now().clear_faults(mask)
+
+    def dead_guards(self) -> tuple[str, ...]:
+        return ()
 
     async def close(self) -> None:
         self._now().close()
@@ -158,7 +161,7 @@ def supervised(upset: Upset) -> tuple[list[TickOutputs], Exit]:
                 stack.callback(end.close)
             bench = WaitingBench(made(upset))
             bench.shapes = shapes
-            wiring = Wiring(bench, telemetry, events, shapes=reader, truth=bench.truth, heard=[heard.append])
+            wiring = Wiring(bench, telemetry, events, shapes=reader, truth=bench.truth, heard={"test": heard.append})
             controller = Controller(CONFIG, zernike_projection())
             await bench.open()
             supervisor = Supervisor(controller, wiring, cast(RunClock, LoopClock()), RATE_HZ)

@@ -6,12 +6,14 @@ import math
 
 import pytest
 
-from firmware_iface.roles import BenchCommand, LinkDownError, LinkError
+from firmware_iface.register_map import default_map
+from firmware_iface.roles import ALL_FAULTS, BenchCommand, LinkDownError, LinkError
 from membrane_ctrl.config import Config, TwinConfig
 from membrane_ctrl.twin.plant import Plant
 from membrane_ctrl.virtual.bench import VirtualBench
 
 CONFIG = Config(twin=TwinConfig(scenario="calm"))
+WATCHDOG, OVER_PRESSURE = (default_map().fault_mask(name) for name in ("watchdog", "over_pressure"))
 
 
 @pytest.fixture
@@ -32,7 +34,7 @@ def test_without_a_write_the_pump_stands_after_the_watchdog_period(bench: Virtua
     assert bench.read().watchdog_tripped
     bench.write(BenchCommand(0.5, 0.0))
     assert bench.board.pump_fraction == 0.0  # latched
-    bench.clear_faults()
+    bench.clear_faults(ALL_FAULTS)
     bench.write(BenchCommand(0.5, 0.0))
     assert bench.board.pump_fraction > 0.0
 
@@ -99,3 +101,24 @@ def test_actuators_that_do_not_follow(bench: VirtualBench) -> None:
         bench.write(BenchCommand(0.0, 0.0))
     assert bench.plant.truth().displacement_um > start_um + 10.0
     assert bench.read().pump_fraction == 0.0  # the board knows nothing of it
+
+
+def test_only_the_bits_of_the_mask_are_cleared(bench: VirtualBench) -> None:
+    bench.write(BenchCommand(0.5, 0.0))
+    bench.wrong.gauge_offset_pa = 300.0
+    bench.advance(1.0)
+    assert bench.read().latched_faults == WATCHDOG | OVER_PRESSURE
+    bench.wrong.gauge_offset_pa = 0.0
+    bench.clear_faults(WATCHDOG)
+    bench.advance(0.02)
+    assert bench.read().latched_faults == OVER_PRESSURE
+    assert (bench.board.pump_fraction, bench.board.vent_fraction) == (0.0, 1.0)
+
+
+def test_the_heartbeat_goes_round_and_keeps_the_watchdog_fed(bench: VirtualBench) -> None:
+    bench._driver._heartbeat = 0xFFFD  # after 22 minutes at 50 Hz
+    for _ in range(6):
+        bench.write(BenchCommand(0.5, 0.0))
+        bench.advance(0.4)
+        assert not bench.read().watchdog_tripped
+    assert bench.board.pump_fraction == pytest.approx(0.5, abs=1e-4)

@@ -1,0 +1,127 @@
+"""A board under test: how the conformance test talks to it, and how it says that something is wrong."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from collections.abc import Awaitable, Callable, Sequence
+from functools import partial
+
+from firmware_iface.links.modbus_rules import ModbusLink
+from firmware_iface.register_map import Block, RegisterMap, default_map
+from firmware_iface.roles import DeviceBusyError, DeviceRefusedError, LinkDownError, LinkError
+
+PUMP_FRACTION = 0.05  # below what starts a diaphragm pump
+PERIOD_S = 0.3  # watchdog period during the test
+REST_S = 10.0  # watchdog period between the checks and where a check is not about it
+_U32_MAX = 2**32 - 1
+
+
+class ConformanceError(Exception):
+    """The board did not do what it must; the message says what it did."""
+
+
+def require(right: bool, problem: str) -> None:
+    """Raise ConformanceError with the problem unless the board did right."""
+    if not right:
+        raise ConformanceError(problem)
+
+
+class BoardUnderTest:
+    """A board, the claim that the test has on it, and its heartbeat.
+
+    Parameters
+    ----------
+    link : ModbusLink
+        The board, connected.
+    sleep : callable
+        Waits; the board's clock is what counts.
+    """
+
+    def __init__(self, link: ModbusLink, sleep: Callable[[float], Awaitable[None]] = asyncio.sleep) -> None:
+        self._link = link
+        self._sleep = sleep
+        self._registers: RegisterMap = default_map()  # of the board, once it has said its version
+        self._heartbeat = 0
+        self._id, self._key = (1 + secrets.randbelow(_U32_MAX) for _ in range(2))
+
+    @property
+    def _claims(self) -> bool:
+        return self._registers.map_version >= 2
+
+    async def _read(self, block: Block) -> dict[str, float]:
+        return block.decode(await self._link.read_holding(block.address, block.count))
+
+    async def _sensors(self) -> dict[str, float]:
+        return await self._read(self._registers.block("sensors"))
+
+    async def _put(self, name: str, values: dict[str, float]) -> None:
+        block = self._registers.block(name)
+        await self._link.write_registers(block.address, block.encode(values))
+
+    def _command(self, pump: float, vent: float, key: int = 0) -> dict[str, float]:
+        return {
+            "pump_command_fraction": pump,
+            "vent_command_fraction": vent,
+            "heartbeat": self._heartbeat,
+            "command_key": key or self._key,
+        }
+
+    async def _write(self, pump: float, vent: float = 0.0, *, fresh: bool = True) -> None:
+        self._heartbeat = (self._heartbeat + fresh) % 2**16
+        await self._put("command", self._command(pump, vent))
+
+    async def _arm(self, period_s: float = PERIOD_S, arm: float = 1.0) -> None:
+        claim = {"claim_id": self._id, "claim_key": self._key}
+        await self._put("settings", {"watchdog_period_s": period_s, "watchdog_arm": arm, **claim})
+
+    async def _clear(self, key: int = 0) -> None:
+        await self._put("reset", {"clear_faults": 0xFFFF, "clear_key": key or self._key})
+
+    async def _rest(self) -> None:
+        """Pump off, faults cleared, watchdog off: how every check begins and ends."""
+        steps: tuple[Callable[[], Awaitable[None]], ...] = (
+            partial(self._arm, REST_S), self._clear, partial(self._write, 0.0), partial(self._arm, arm=0.0),
+        )  # fmt: skip
+        for step in steps:
+            try:
+                await step()
+            except LinkDownError:
+                raise
+            except LinkError:
+                continue  # what the board cannot do is said by the check that asks for it
+
+    async def _tripped(self, after: str) -> None:
+        found = await self._sensors()
+        value = found["pump_readback_fraction"]
+        require(value == 0, f"holds the pump at {value:g} after {after}")
+        mask = self._registers.fault_mask("watchdog")
+        require(found["watchdog_tripped"] == 1, f"does not report watchdog_tripped after {after}")
+        require(bool(int(found["latched_faults"]) & mask), f"does not latch the watchdog fault after {after}")
+
+    async def _refused(self, words: Sequence[int], address: int, what: str, why: str) -> None:
+        try:
+            await self._link.write_registers(address, words)
+        except DeviceRefusedError:
+            return
+        raise ConformanceError(f"accepts {what}, which is outside its {why}")
+
+    async def _busy(self, write: Awaitable[None], what: str) -> None:
+        """A write that has to be refused because somebody else holds the board."""
+        try:
+            await write
+        except DeviceBusyError:
+            return
+        except DeviceRefusedError as error:
+            raise ConformanceError(f"refuses {what}, but not with exception 6: {error}") from None
+        raise ConformanceError(f"accepts {what}")
+
+    def _claim(self, key: int, period_s: float = REST_S, arm: float = 1.0) -> Awaitable[None]:
+        """Somebody else's claim."""
+        claim = {"claim_id": self._id ^ 1 or 2, "claim_key": key}
+        return self._put("settings", {"watchdog_period_s": period_s, "watchdog_arm": arm, **claim})
+
+
+def other_key(key: int) -> int:
+    """A key that is not this one."""
+    return key % _U32_MAX + 1

@@ -1,0 +1,262 @@
+"""Stories of the board: two programs on it, a gateway between, counters that wrap, its own limits and latches."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+
+from campaign_stage import OldBoard, Stage, another_client
+from campaign_times import BOARD_PRESSURE_MAX_PA, TICK_S, WATCHDOG_S
+from campaign_world import WatchedPlant
+
+from firmware_iface.emulators.modbus_server import RegisterRefusal
+from firmware_iface.register_map import default_map
+from firmware_iface.roles import BenchCommand, LinkError
+from membrane_ctrl.names import State
+from membrane_ctrl.virtual.bench import VirtualBench, _at_once
+
+
+def counters_wrap() -> list[str]:
+    """Heartbeat and sample counter wrap in a hold, and nothing happens."""
+    stage = OldBoard().held()
+    stage.wait(40.0, lambda: "" if stage.state == State.HOLD else "the hold was lost")
+    stage.near()
+    return stage.violations
+
+
+def a_gateway_repeats_the_last_write() -> list[str]:
+    """The controller has died; what a gateway repeats, and what others read, does not feed the watchdog."""
+    stage = Stage()
+    board, command = stage.bench.board, default_map().block("command")
+    written: list[list[int]] = []
+    write = board.write
+
+    def noting(address: int, words: Sequence[int]) -> None:
+        if address == command.address:
+            written.append(list(words))
+        write(address, words)
+
+    board.write = noting  # type: ignore[method-assign]
+    stage.held()
+    board.write = write  # type: ignore[method-assign]
+    stage.bench.wrong.stalled = True
+    sensors = default_map().block("sensors")
+    died_s = stage.run.now_s
+
+    def repeat() -> str:
+        board.write(command.address, written[-1])
+        board.read(sensors.address, sensors.count)
+        stage.bench.drive()
+        return stage.still() if stage.run.now_s > died_s + WATCHDOG_S + 3 * TICK_S else ""
+
+    stage.wait(5.0, repeat)
+    return stage.violations
+
+
+def others_disarm_the_watchdog() -> list[str]:
+    """Somebody writes `watchdog_arm` 0 while the pump runs, in every way there is; then the controller dies."""
+    stage = Stage().held()
+    settings = default_map().block("settings")
+    arm = default_map().register("watchdog_arm")
+    off = settings.encode({register.name: 0.0 for register in settings.registers} | {"watchdog_period_s": 10.0})
+    for address, words in ((arm.address, [0]), (settings.address, off)):
+        with contextlib.suppress(RegisterRefusal):
+            stage.bench.board.write(address, words)
+    with contextlib.suppress(LinkError):  # the holder itself, in the middle of its hold
+        stage.bench.close()
+    stage.bench.wrong.stalled = True
+    stage.wait(WATCHDOG_S + 3 * TICK_S)
+    stage.wait(5.0, stage.still)
+    return stage.violations
+
+
+def a_stranger_writes_the_command() -> list[str]:
+    """Who has no claim writes full pump, over and over, beside a hold: nothing of it arrives."""
+    stage = Stage().held()
+    command = default_map().block("command")
+    values = dict.fromkeys((register.name for register in command.registers), 0.0) | {"pump_command_fraction": 1.0}
+    for number in range(50):
+        stage.tick()
+        before = stage.plant.pump_given
+        with contextlib.suppress(RegisterRefusal):
+            stage.bench.board.write(command.address, command.encode(values | {"heartbeat": number}))
+        stage.bench.drive()
+        stage.must(stage.plant.pump_given == before, "a stranger's command arrives")
+    return stage.violations
+
+
+def a_board_that_takes_no_settings() -> list[str]:
+    """Watchdog period and arming do not arrive: nobody holds a mirror with such a board."""
+    stage = Stage()
+    bench = VirtualBench(WatchedPlant(stage.world, stage.config.twin, stage.config.pump), WATCHDOG_S)
+    settings, write = default_map().block("settings"), bench.board.write
+
+    def deaf(address: int, words: Sequence[int]) -> None:
+        if address != settings.address:
+            write(address, words)
+
+    bench.board.write = deaf  # type: ignore[method-assign]
+    with contextlib.suppress(LinkError):
+        bench.open()
+        stage.must(False, "a board without its watchdog is opened")
+    return stage.violations
+
+
+def faults_are_cleared_and_the_pump_stands() -> list[str]:
+    """Faults of the board are cleared while nobody commands: the pump stands until somebody does."""
+    stage = Stage().held()
+    stage.bench.wrong.stalled = True
+    stage.wait(2.0)
+    stage.bench.open()
+    stage.bench.clear_faults(0xFFFF)
+    stage.bench.drive()
+    stage.must(not stage.still(), "clearing the faults starts the pump")
+    stage.bench.power_cycle()
+    stage.must(not stage.still(), "the pump runs after a restart of the board")
+    return stage.violations
+
+
+def a_latched_board_keeps_the_pump_off() -> list[str]:
+    """Whatever is commanded: a board that has latched over-pressure gives the pump nothing, and vents."""
+    stage = Stage()
+    stage.bench.wrong.gauge_offset_pa = 300.0
+    stage.wait(1.0)
+    stage.bench.wrong.gauge_offset_pa = 0.0
+    for _ in range(50):
+        stage.bench.advance(TICK_S)
+        stage.bench.write(BenchCommand(0.7, 0.0))
+        stage.must(not stage.still(), "the board pumps with a fault latched")
+        stage.must(stage.plant.vent_given == 1.0, "the board's vent is shut with over-pressure latched")
+    return stage.violations
+
+
+def another_program_opens_the_board_of_a_hold() -> list[str]:
+    """It is refused, and the watchdog of the hold stays what it was: the hold dies, and its pump stands."""
+    stage = Stage().held()
+    other = another_client(stage, 10.0)
+    refused = False
+    try:
+        _at_once(other.open())
+    except LinkError:
+        refused = True
+    stage.must(refused, "two programs hold one board")
+    stage.wait(1.0, lambda: "" if stage.state == State.HOLD else "the hold was lost to a client that was refused")
+    stage.bench.wrong.stalled = True
+    stage.wait(WATCHDOG_S + 3 * TICK_S)
+    stage.wait(10.0, stage.still)
+    return stage.violations
+
+
+def another_program_takes_the_board_of_a_dead_hold() -> list[str]:
+    """A hold is stopped for a second, and another program takes its board: the hold that wakes moves no gas."""
+    stage = Stage().held()
+    stage.bench.wrong.stalled = True
+    stage.wait(1.0)
+    other = another_client(stage)
+    _at_once(other.open())
+    _at_once(other.clear_faults(0xFFFF))
+    stage.bench.wrong.stalled = False
+
+    def goes_on() -> str:
+        _at_once(other.write(BenchCommand(0.0, 0.0)))
+        return stage.still()
+
+    stage.wait(20.0, goes_on)
+    stage.must(stage.state == State.FAULT, "the hold does not notice that its board is another's")
+    return stage.violations
+
+
+def anybody_may_stop_the_pump() -> list[str]:
+    """`safe`, beside a hold that may resume everything: the pump stands until a person says otherwise."""
+    for resumes in (False, True):
+        stage = Stage(resumes=resumes).held()
+        other = another_client(stage)
+        _at_once(other.identify())
+        _at_once(other.stop())
+        stage.bench.drive()
+        stage.wait(60.0, stage.still)
+        stage.must(stage.state == State.FAULT, "the hold does not notice that it was stopped")
+        if stage.violations:
+            break
+    return stage.violations
+
+
+def over_pressure_while_the_network_is_cut(resumes: bool = True) -> list[str]:
+    """The board vents while nobody can ask it; nobody but a person may inflate again."""
+    stage = Stage(resumes=resumes).held()
+    stage.bench.wrong.unreachable = True
+    stage.wait(1.0)
+    stage.bench.wrong.gauge_offset_pa = 300.0
+    stage.wait(1.0)
+    stage.bench.wrong.gauge_offset_pa = 0.0
+    stage.wait(1.0)
+    stage.bench.wrong.unreachable = False
+    stage.wait(60.0, stage.still)
+    stage.must(stage.plant.vent_given == 1.0, "the vent is shut after the board's over-pressure")
+    return stage.violations
+
+
+def hold_is_asked_of_a_latched_board() -> list[str]:
+    """A board that has latched over-pressure is not inflated, however often a hold is asked for."""
+    stage = Stage()
+    stage.bench.wrong.gauge_offset_pa = 300.0
+    stage.tick()
+    stage.bench.wrong.gauge_offset_pa = 0.0
+    stage.wait(1.0, stage.still)
+    stage.ask("hold")
+    stage.wait(30.0, lambda: stage.still() or ("went on" if stage.state in (State.INFLATE, State.SETTLE) else ""))
+    return stage.violations
+
+
+def what_is_read_is_true() -> list[str]:
+    """The driver's numbers are the plant's."""
+    stage = Stage().held()
+    for _ in range(20):
+        stage.bench.advance(TICK_S)
+        stage.bench.write(BenchCommand(0.4, 0.25))
+        stage.bench.advance(TICK_S)
+        reading, truth = stage.bench.read(), stage.bench.truth
+        stage.must(
+            abs(reading.gauge_pressure_pa - truth.gauge_pressure_pa) < 4.0, "the pressure read is not the true one"
+        )
+        stage.must(abs(reading.displacement_um - truth.displacement_um) < 8.0, "the sag read is not the true one")
+        stage.must(
+            abs(reading.pump_fraction - stage.plant.pump_given) < 0.01, "the pump's read-back is not its drive"
+        )
+        stage.must(abs(stage.plant.pump_given - 0.4) < 0.01, "the pump is not given what was written")
+        stage.must(abs(stage.plant.vent_given - 0.25) < 0.01, "the vent is not given what was written")
+    return stage.violations
+
+
+def the_board_alone_keeps_its_limit() -> list[str]:
+    """A controller that writes full pump for ever: the board stops it at its own limit and vents."""
+    stage = Stage()
+    for _ in range(round(1500.0 / TICK_S)):
+        stage.bench.advance(TICK_S)
+        stage.bench.write(BenchCommand(1.0, 0.0))
+        pressure_pa = stage.plant.truth().gauge_pressure_pa
+        if pressure_pa > BOARD_PRESSURE_MAX_PA + 2.5:
+            stage.must(False, f"the board let the pressure rise to {pressure_pa:.0f} Pa")
+            break
+        if stage.plant.vent_given == 1.0:
+            break
+    stage.must(stage.plant.vent_given == 1.0, "the board never vented")
+    return stage.violations
+
+
+STORIES: Sequence[Callable[[], list[str]]] = (
+    counters_wrap,
+    a_gateway_repeats_the_last_write,
+    others_disarm_the_watchdog,
+    a_stranger_writes_the_command,
+    a_board_that_takes_no_settings,
+    faults_are_cleared_and_the_pump_stands,
+    a_latched_board_keeps_the_pump_off,
+    another_program_opens_the_board_of_a_hold,
+    another_program_takes_the_board_of_a_dead_hold,
+    anybody_may_stop_the_pump,
+    over_pressure_while_the_network_is_cut,
+    hold_is_asked_of_a_latched_board,
+    what_is_read_is_true,
+    the_board_alone_keeps_its_limit,
+)

@@ -1,0 +1,418 @@
+"""Stories with the real supervisor, drivers and files.
+
+The matrix runs `virtual.run` in the supervisor's place. Here it is the supervisor itself, over the board and over a
+bench of single instruments, with its way out, its guards, its latched-fault file and its software watchdog.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import tempfile
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from campaign_lab import Instruments, TableLink
+from campaign_room import BoardBench, LoopClock, Room, a_room, board_of, on_board
+from campaign_times import HOLD_FLOW_S, RAMP_S, RATE_HZ, TICK_S, WATCHDOG_S
+from campaign_world import WatchedPlant, World
+
+from firmware_iface.drivers.bronkhorst import BronkhorstFlow
+from firmware_iface.drivers.bronkhorst_modbus import ModbusParameters
+from firmware_iface.emulators.bronkhorst import BronkhorstRegisters, Instrument
+from firmware_iface.emulators.virtual_time import run_virtual as in_virtual_time
+from firmware_iface.roles import (
+    Bench,
+    BenchCommand,
+    DeviceRefusedError,
+)
+from membrane_ctrl.config import Config
+from membrane_ctrl.errors import DeviceError
+from membrane_ctrl.latched import NAME, LatchedFile
+from membrane_ctrl.latcher import Latcher
+from membrane_ctrl.names import State
+from membrane_ctrl.tick import Event, TickOutputs
+
+
+async def the_program_ends_in_a_hold() -> list[str]:
+    """The program ends by whatever way: the last write is pump 0, at once and not by the watchdog."""
+    violations = []
+    for way in ("cancelled", "a driver raises"):
+        async with a_room(on_board) as room:
+            if way == "cancelled":
+                room.task.cancel()
+            board_of(room).raises = way != "cancelled"
+            await asyncio.sleep(2.5 * TICK_S)
+            room.now()
+            room.must(room.task.done(), "the run goes on")
+            room.must(not room.still(), "the program ended and left the pump running")
+            violations += [f"{way}: {what}" for what in room.violations]
+    return violations
+
+
+def _raise(outputs: TickOutputs) -> None:
+    raise RuntimeError("a listener that must not raise")
+
+
+async def cancelled_while_it_vents() -> list[str]:
+    """The end of the program does not shut the vent of a mirror that is being vented."""
+    async with a_room(on_board) as room:
+        board_of(room).virtual.wrong.gauge_offset_pa = 60.0
+        await room.until(State.FAULT)
+        await room.wait(1.0)
+        room.task.cancel()
+        await room.wait(1.0, room.still)
+        room.must(room.plant.vent_given == 1.0, "the program ended and shut the vent")
+        return room.violations
+
+
+async def a_guard_ends() -> list[str]:
+    """A guard of the bench, or whoever listens to the ticks, has come to an end: the pump stands."""
+    violations = []
+    for what in ("guard", "listener"):
+        async with a_room(on_board) as room:
+            board_of(room).guards = ("software watchdog",) if what == "guard" else ()
+            room.listeners += [_raise] if what == "listener" else []
+            await room.wait(4 * TICK_S)
+            await room.wait(5.0, room.still)
+            room.must(room.state == State.FAULT, "no fault")
+            violations += [f"{what}: {found}" for found in room.violations]
+    return violations
+
+
+async def a_slow_board() -> list[str]:
+    """Every answer takes 0.2 s: no control loop, the pump ramps down; one answer of 0.4 s makes no burst of ticks."""
+    async with a_room(on_board) as room:
+        board_of(room).slow_s = 0.4
+        await asyncio.sleep(0.4)
+        board_of(room).slow_s = 0.0
+        await asyncio.sleep(0.5)
+        before = room.supervisor.ticks
+        await asyncio.sleep(1.0)
+        room.must(room.supervisor.ticks - before < RATE_HZ * 1.1, "missed ticks are made up in a burst")
+        writes = [b.row.mono_s - a.row.mono_s for a, b in zip(room.heard, room.heard[1:], strict=False)]
+        room.must(min(writes) > 0.2 * TICK_S, f"two ticks {1e3 * min(writes):.1f} ms apart")
+    async with a_room(on_board) as slow:
+        board_of(slow).slow_s = 0.2
+        await slow.wait(RAMP_S + 6.0)
+        await slow.wait(3.0, slow.still)
+        return room.violations + slow.violations
+
+
+async def a_board_that_latched_stays_latched() -> list[str]:
+    """Nobody has acknowledged: the board's over-pressure stays latched whatever the supervisor does."""
+    async with a_room(on_board) as room:
+        board_of(room).virtual.wrong.gauge_offset_pa = 300.0
+        await room.wait(1.0)
+        board_of(room).virtual.wrong.gauge_offset_pa = 0.0
+        await room.wait(20.0, room.still)
+        room.must(board_of(room).virtual.read().latched_faults & 2 != 0, "the board's latch is gone")
+        room.must(room.plant.vent_given == 1.0, "the vent is shut")
+        return room.violations
+
+
+async def the_network_comes_back() -> list[str]:
+    """A cut network: the fault comes, the link is opened again, and the next hold works."""
+    async with a_room(on_board) as room:
+        wrong = board_of(room).virtual.wrong
+        wrong.unreachable = True
+        await room.wait(3.0)
+        room.must(room.state == State.FAULT, "no fault without a network")
+        wrong.unreachable = False
+        await room.wait(5.0, room.still)
+        room.must(math.isfinite(room.heard[-1].row.gauge_pressure_pa), "the link was not opened again")
+        room.ask("ack")
+        await room.until(State.STANDBY, 10.0)
+        room.ask("hold")
+        await room.until(State.HOLD)
+        room.near()
+        return room.violations
+
+
+async def faults_that_outlive_the_run() -> list[str]:
+    """A trip is in the file, what cannot be read is a fault, a refused acknowledgement clears nothing."""
+    from membrane_ctrl.hold import HoldOptions, _latched
+
+    with tempfile.TemporaryDirectory() as folder:
+        file = LatchedFile(Path(folder))
+        options = HoldOptions(Config(), "lab.toml", False, None, "campaign", None, False, False)
+
+        def refused() -> bool:
+            try:
+                _latched(Config(), Path(folder), options)
+            except DeviceError:
+                return True
+            return False
+
+        async with a_room(on_board) as room:
+            with Latcher(file, None, "run", LoopClock().utc, room.events.append) as latcher:
+                room.listeners.append(latcher.heard)
+                board_of(room).virtual.wrong.late_ms = 0.0
+                board_of(room).virtual.wrong.gauge_offset_pa = 60.0
+                await room.until(State.FAULT)
+                await room.wait(1.0)
+            first = file.read()
+            room.must(first is not None and first.name == "over_pressure", f"in the file: {first}")
+            room.must(refused(), "the next hold starts over a latched fault")
+            with Latcher(file, None, "run", LoopClock().utc, room.events.append) as latcher:
+                locked = {"kind": "command", "command": "latch", "who": "somebody", "text": "later"}
+                denied = {"kind": "command", "command": "ack", "who": "somebody", "refused": "not now"}
+                for event in (locked, denied):
+                    latcher.heard(cast(TickOutputs, _Told(room.heard[-1], (event,))))
+            room.must(file.read() == first, "the first cause was replaced, or cleared by a refused acknowledgement")
+            for content in ("", "{", "[]", '{"schema": "other"}', "null"):
+                (Path(folder) / NAME).write_text(content)
+                room.must(refused(), f"a file that holds {content!r} is no fault")
+            return room.violations
+
+
+@dataclass
+class _Told:
+    """A tick that told one event."""
+
+    of: TickOutputs
+    events: tuple[Event, ...]
+
+    @property
+    def row(self) -> Any:
+        """As in the tick."""
+        return self.of.row
+
+
+async def a_board_that_is_latched_at_the_start() -> list[str]:
+    """The resume rule may clear a watchdog's trip at the start, and nothing else."""
+    from membrane_ctrl.config import DevicesConfig, ResumeConfig
+    from membrane_ctrl.hold import HoldOptions, _identify
+
+    config, devices = Config(), DevicesConfig(board="tcp://127.0.0.1:1")
+    asked = config.model_copy(update={"devices": devices, "resume": ResumeConfig(faults=("watchdog_tripped",))})
+    options = HoldOptions(asked, "lab.toml", False, None, "campaign", None, False, False)
+    bench = BoardBench(WatchedPlant(World(), config.twin, config.pump))
+    bench.virtual.wrong.gauge_offset_pa = 300.0
+    await asyncio.sleep(0.1)
+    bench.now()
+    bench.virtual.wrong.gauge_offset_pa = 0.0
+    try:
+        await _identify(bench, asked, options)
+    except DeviceError:
+        return []
+    return ["a hold starts on a board that has latched over-pressure"]
+
+
+def _composed(
+    bronkhorst: bool, made: list[Instruments]
+) -> Callable[[WatchedPlant], tuple[Bench, Callable[[], object]]]:
+    def make(plant: WatchedPlant) -> tuple[Bench, Callable[[], object]]:
+        made.append(Instruments(plant, bronkhorst))
+        return made[-1].bench, made[-1].now
+
+    return make
+
+
+@contextlib.asynccontextmanager
+async def instruments(bronkhorst: bool) -> AsyncIterator[tuple[Room, Instruments]]:
+    """A supervisor over single instruments."""
+    made: list[Instruments] = []
+    async with a_room(_composed(bronkhorst, made)) as room:
+        yield room, made[-1]
+
+
+async def _both(story: Callable[[Room, Instruments], Awaitable[None]]) -> list[str]:
+    violations = []
+    for bronkhorst in (False, True):
+        async with instruments(bronkhorst) as (room, lab):
+            await story(room, lab)
+            violations += [f"{'Bronkhorst' if bronkhorst else 'Modbus'}: {what}" for what in room.violations]
+    return violations
+
+
+async def instruments_hold_a_mirror() -> list[str]:
+    """What is commanded arrives, what is measured is told, and the mirror is held."""
+
+    async def story(room: Room, lab: Instruments) -> None:
+        await room.wait(10.0)
+        room.near()
+        for _ in range(50):
+            await asyncio.sleep(TICK_S)
+            lab.now()
+            row, truth = room.heard[-1].row, room.plant.truth()
+            off = room.plant.pump_given - row.pump_fraction
+            room.must(abs(off) < 2e-3, f"commanded {row.pump_fraction:.3f}, given {room.plant.pump_given:.3f}")
+            room.must(
+                abs(row.gauge_pressure_pa - truth.gauge_pressure_pa) < 4.0, "the pressure told is not the true one"
+            )
+            readback = row.pump_readback_fraction
+            room.must(abs(readback - room.plant.pump_given) < 0.2, f"read-back {readback:.2f}")
+
+    return await _both(story)
+
+
+async def over_pressure_of_instruments() -> list[str]:
+    """Too much pressure: the pump stands and the vent is open."""
+
+    async def story(room: Room, lab: Instruments) -> None:
+        lab.offset_pa = 60.0
+        await room.wait(5 * TICK_S)
+        await room.wait(3.0, room.still)
+        room.must(room.plant.vent_given > 0.99, "over-pressure, and the vent is shut")
+
+    return await _both(story)
+
+
+async def a_gauge_out_of_its_range() -> list[str]:
+    """A gauge that shows what it cannot show is no gauge."""
+
+    async def story(room: Room, lab: Instruments) -> None:
+        lab.offset_pa = -900.0
+        await room.wait(RAMP_S + 1.5)
+        await room.wait(3.0, room.still)
+
+    return await _both(story)
+
+
+async def a_laser_is_unplugged() -> list[str]:
+    """The mean flow is held for its time, and then the pump stands."""
+
+    async def story(room: Room, lab: Instruments) -> None:
+        lab.laser.plugged = False
+        before_um = lab.now().truth().displacement_um
+        await room.wait(HOLD_FLOW_S + RAMP_S + 1.0)
+        went_um = lab.now().truth().displacement_um - before_um
+        room.must(went_um < 30.0, f"blind, and the bowl went {went_um:.0f} um deeper")
+        await room.wait(5.0, room.still)
+
+    return await _both(story)
+
+
+async def the_supervisor_hangs() -> list[str]:
+    """No tick any more: the software watchdog stops the pump, and nobody starts it again but a person."""
+
+    async def story(room: Room, lab: Instruments) -> None:
+        hung = asyncio.Event()
+        write = lab.bench.write
+
+        async def hang(command: BenchCommand) -> None:
+            await hung.wait()
+            await write(command)  # what was under way when it hung
+
+        lab.bench.write = hang  # type: ignore[method-assign]
+        await room.wait(WATCHDOG_S * 1.5 + 2 * TICK_S)
+        await room.wait(3.0, room.still)
+        lab.bench.write = write  # type: ignore[method-assign]
+        hung.set()
+        await room.wait(4 * TICK_S, room.still)
+        room.must(room.state == State.FAULT, "a trip of the software watchdog is no fault")
+        await room.wait(20.0, room.still)
+
+    return await _both(story)
+
+
+async def the_software_watchdog_ends() -> list[str]:
+    """The software watchdog itself comes to an end: the pump stands."""
+
+    async def story(room: Room, lab: Instruments) -> None:
+        next(task for task in asyncio.all_tasks() if task.get_name() == "software watchdog").cancel()
+        await room.wait(4 * TICK_S)
+        await room.wait(5.0, room.still)
+        room.must(room.state == State.FAULT, "a bench without its watchdog is no fault")
+
+    return await _both(story)
+
+
+async def a_pump_that_gives_no_answer() -> list[str]:
+    """The pump's line is dead: a fault, and 0 as soon as it lives."""
+
+    async def story(room: Room, lab: Instruments) -> None:
+        lab.pump.lose = 10**9
+        await room.wait(3.0)
+        room.must(room.state == State.FAULT, "a pump that does not answer is no fault")
+        lab.pump.lose = 0
+        await room.wait(1.0)
+        await room.wait(5.0, room.still)
+
+    return await _both(story)
+
+
+async def a_pump_that_hears_nothing() -> list[str]:
+    """The pump is read well, and takes no command any more: a fault at once, not at the next stop."""
+
+    async def story(room: Room, lab: Instruments) -> None:
+        lab.pump.deaf = True
+        await room.wait(2.0)
+        room.must(room.state == State.FAULT, "a pump that takes no command is no fault")
+        lab.pump.deaf = False
+        await room.wait(1.0)
+        await room.wait(5.0, room.still)
+
+    return await _both(story)
+
+
+async def the_pump_does_not_hear_the_last_write() -> list[str]:
+    """The last write is lost: closing the bench puts the pump to rest."""
+
+    async def story(room: Room, lab: Instruments) -> None:
+        await asyncio.sleep(0.37 * TICK_S)
+        lab.pump.lose = 1
+        room.task.cancel()
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        await lab.bench.close()
+        room.must(not room.still(), "the bench is closed and the pump runs")
+
+    return await _both(story)
+
+
+async def another_instrument_in_its_place() -> list[str]:
+    """A gauge is unplugged and another one plugged in: it is not believed."""
+    async with instruments(True) as (room, lab):
+        other = Instrument("DEPC", "M9", 10.0, "mbar(g)", lambda: 1.0)
+        lab.gauge.plugged = False
+        await room.wait(0.2)
+        lab.gauge.table, lab.gauge.plugged = BronkhorstRegisters(other), True
+        await room.wait(2.0)
+        room.must(math.isnan(room.heard[-1].row.gauge_pressure_pa), "another gauge is believed")
+        await room.wait(RAMP_S)
+        await room.wait(3.0, room.still)
+        return room.violations
+
+
+async def a_lab_with_another_serial_number() -> list[str]:
+    """The configuration names an instrument, and another one answers."""
+    answers = Instrument("DMFC", "M7", 360.0, "mln/min")
+    port = ModbusParameters(TableLink("p", BronkhorstRegisters(answers)))
+    try:
+        await BronkhorstFlow(port, "M1").open()
+    except DeviceRefusedError:
+        return []
+    return ["another flow controller is taken"]
+
+
+def tell(story: Callable[[], Awaitable[list[str]]]) -> list[str]:
+    """Run a story of a room."""
+    return in_virtual_time(cast(Any, story()))
+
+
+ROOMS: Sequence[Callable[[], Awaitable[list[str]]]] = (
+    the_program_ends_in_a_hold,
+    cancelled_while_it_vents,
+    a_guard_ends,
+    a_slow_board,
+    a_board_that_latched_stays_latched,
+    the_network_comes_back,
+    faults_that_outlive_the_run,
+    a_board_that_is_latched_at_the_start,
+    instruments_hold_a_mirror,
+    over_pressure_of_instruments,
+    a_gauge_out_of_its_range,
+    a_laser_is_unplugged,
+    the_supervisor_hangs,
+    the_software_watchdog_ends,
+    a_pump_that_gives_no_answer,
+    a_pump_that_hears_nothing,
+    the_pump_does_not_hear_the_last_write,
+    another_instrument_in_its_place,
+    a_lab_with_another_serial_number,
+)

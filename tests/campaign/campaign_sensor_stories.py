@@ -1,0 +1,197 @@
+"""Stories of sensors and actuators: clocks that stand, lasers that creep, pumps that do not obey."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from campaign_run import config_of
+from campaign_stage import Stage, sensors_say
+from campaign_times import DISPLACEMENT_MAX_UM, TICK_S
+from campaign_world import World
+
+from membrane_ctrl.errors import Exit
+from membrane_ctrl.names import State
+
+
+def a_clock_that_stands() -> list[str]:
+    """Samples are counted, but of one moment: they are not new."""
+    stage = Stage().held()
+    at_s = stage.plant.time_s
+    sensors_say(stage, lambda sample: replace(sample, device_time_s=at_s))
+    stage.wait(1.0)
+    stage.bench.wrong.laser_offset_um = -15.0
+    before_um = stage.plant.truth().displacement_um
+    stage.wait(12.0)
+    went_um = stage.plant.truth().displacement_um - before_um
+    stage.must(abs(went_um) < 10.0, f"followed samples of the past by {went_um:.0f} um")
+    stage.wait(15.0)
+    stage.wait(5.0, stage.still)
+    return stage.violations
+
+
+def a_laser_that_doubts_itself() -> list[str]:
+    """The laser's quality says that its reading is none: nobody follows it."""
+    stage = Stage().held()
+    sensors_say(stage, lambda sample: replace(sample, displacement_um=-15.0, displacement_quality=2))
+    before_um = stage.plant.truth().displacement_um
+    stage.wait(7.0)
+    went_um = stage.plant.truth().displacement_um - before_um
+    stage.must(abs(went_um) < 10.0, f"followed a reading of bad quality by {went_um:.0f} um")
+    stage.wait(10.0)
+    stage.wait(5.0, stage.still)
+    return stage.violations
+
+
+def pressure_that_is_seen_now_and_then() -> list[str]:
+    """A gauge that speaks on every fourth tick, over its limit each time: the vent opens."""
+    stage = Stage().held()
+    stage.bench.wrong.gauge_offset_pa = 60.0
+    for number in range(40):
+        stage.bench.wrong.gauge_lost = number % 4 != 0
+        stage.tick()
+    stage.must(stage.plant.vent_given == 1.0, "over its limit whenever it speaks, and the vent is shut")
+    return stage.violations
+
+
+def pressure_in_standby() -> list[str]:
+    """Over-pressure opens the vent in standby as well."""
+    stage = Stage()
+    stage.wait(2.0)
+    stage.bench.wrong.gauge_offset_pa = 60.0
+    stage.wait(1.0)
+    stage.must(stage.plant.vent_given == 1.0, "over-pressure in standby, and the vent is shut")
+    return stage.violations
+
+
+def creeping(stage: Stage, um_per_s: float, deepest_um: float) -> Callable[[], str]:
+    """The laser's mount moves on by a tick; what is wrong if the bowl has followed it too far."""
+
+    def creep() -> str:
+        stage.bench.wrong.laser_offset_um -= um_per_s * TICK_S
+        deep_um = stage.plant.truth().displacement_um
+        return f"the bowl followed the laser to {deep_um:.0f} um" if deep_um > deepest_um else ""
+
+    return creep
+
+
+def a_creeping_laser() -> list[str]:
+    """The laser's mount sets off at 0.5 um/s; camera and gauge see it."""
+    stage = Stage(camera=True).held()
+    stage.wait(60.0)
+    stage.wait(150.0, creeping(stage, 0.5, DISPLACEMENT_MAX_UM))
+    return stage.violations
+
+
+def a_stuck_gauge_and_a_creeping_laser() -> list[str]:
+    """No camera; the gauge stands still, then the laser's mount sets off by 2 um/s."""
+    stage = Stage().held()
+    stage.wait(10.0)
+    stage.bench.wrong.gauge_stuck = True
+    stage.wait(120.0, creeping(stage, 2.0, 60.0))
+    stage.wait(5.0, stage.still)
+    return stage.violations
+
+
+def a_creeping_laser_without_a_camera() -> list[str]:
+    """The laser's mount sets off by 1 um/s; the gauge alone sees it."""
+    stage = Stage().held()
+    stage.wait(60.0)
+    stage.wait(300.0, creeping(stage, 1.0, 70.0))
+    stage.wait(5.0, stage.still)
+    return stage.violations
+
+
+def a_setpoint_is_reached() -> list[str]:
+    """What the laser measures is the mirror: 15 um more are 15 um more, and the gauge tells the pressure."""
+    stage = Stage(camera=True).held()
+    stage.ask("setpoint", value=15.0)
+    stage.wait(40.0)
+    stage.near(15.0, 6.0)
+    return stage.violations
+
+
+def dead_actuators_are_found() -> list[str]:
+    """A vent that does not lower is found before the hold, a pump that does not lift soon after (noise may help)."""
+    violations = []
+    config = config_of(1, World(), False)
+    timed = config.states.model_copy(update={"inflate_timeout_s": 60.0})
+    for name in ("pump_stuck_fraction", "vent_stuck_fraction"):
+        stage = Stage(config=config.model_copy(update={"states": timed}))
+        setattr(stage.bench.wrong, name, 0.0)
+        stage.ask("hold")
+        stage.wait(90.0, lambda at=stage: "held" if at.state == State.HOLD else "")
+        stage.must(stage.state == State.FAULT, f"{name}: no fault")
+        if name == "vent_stuck_fraction":
+            stage.must(stage.plant.truth().displacement_um < 0.0, "inflated without a vent")
+        violations += stage.violations
+    return violations
+
+
+def a_fill_that_leaks_ends() -> list[str]:
+    """A mirror that does not rise: the fill is given up in its time."""
+    config = config_of(1, World(), False)
+    timed = config.states.model_copy(update={"inflate_timeout_s": 40.0})
+    stage = Stage(config=config.model_copy(update={"states": timed}))
+    stage.ask("hold")
+    stage.until(State.INFLATE)
+    stage.bench.wrong.vent_stuck_fraction = 0.08  # 8 um/s: more than the pump has
+    stage.wait(60.0)
+    stage.wait(20.0, stage.still)
+    stage.must(stage.state == State.FAULT, "a fill without an end")
+    return stage.violations
+
+
+def a_pump_that_does_not_obey_the_stop() -> list[str]:
+    """The read-back stays, and so does the pump: no success, and the vent is open."""
+    violations = []
+    for way in ("stop", "lower", "vent"):
+        stage = Stage().held()
+        stage.bench.wrong.readback_fraction = stage.bench.wrong.pump_stuck_fraction = 0.9
+        stage.ask(way)  # type: ignore[arg-type]
+        stage.wait(30.0)
+        stage.must(stage.plant.vent_given == 1.0, "the pump runs on, and the vent is shut")
+        finished = stage.run.finished
+        stage.must(finished not in (Exit.DONE, Exit.INTERRUPTED), "the stop is called a success")
+        stage.must(way == "stop" or stage.state == State.FAULT, "called no fault")
+        violations += [f"{way}: {what}" for what in stage.violations]
+    return violations
+
+
+def a_pump_that_runs_behind_its_readback() -> list[str]:
+    """In standby the read-back says 0, and gas comes in: the vent opens long before a limit is reached."""
+    config = config_of(1, World(), False)
+    wide = config.limits.model_copy(update={"gauge_pressure_max_pa": 750.0, "displacement_max_um": 1000.0})
+    stage = Stage(config=config.model_copy(update={"limits": wide}))
+    stage.wait(10.0)
+    stage.bench.wrong.pump_stuck_fraction = 0.9
+    stage.wait(60.0)
+    stage.must(stage.plant.vent_given == 1.0, "gas comes in, and the vent is shut")
+    return stage.violations
+
+
+def a_pump_that_starts_in_standby() -> list[str]:
+    """Nobody has asked for anything, and the pump runs."""
+    stage = Stage()
+    stage.wait(5.0)
+    stage.bench.wrong.readback_fraction = stage.bench.wrong.pump_stuck_fraction = 0.9
+    stage.wait(30.0)
+    stage.must(stage.plant.vent_given == 1.0, "the pump runs in standby, and the vent is shut")
+    return stage.violations
+
+
+STORIES: Sequence[Callable[[], list[str]]] = (
+    a_clock_that_stands,
+    a_laser_that_doubts_itself,
+    pressure_that_is_seen_now_and_then,
+    pressure_in_standby,
+    a_creeping_laser,
+    a_stuck_gauge_and_a_creeping_laser,
+    a_creeping_laser_without_a_camera,
+    a_setpoint_is_reached,
+    dead_actuators_are_found,
+    a_fill_that_leaks_ends,
+    a_pump_that_does_not_obey_the_stop,
+    a_pump_that_runs_behind_its_readback,
+    a_pump_that_starts_in_standby,
+)

@@ -1,0 +1,279 @@
+"""Wrong code on purpose: what do the fast tests notice, what the campaign alone? Writes docs/mutants.md.
+
+python tests/mutants/mutants.py                       # all, 2 at a time, and the document
+python tests/mutants/mutants.py --only "no wait" "ladder"     # those whose words contain one of these; no document
+python tests/mutants/mutants.py --sample 80           # so many, drawn at random, and the document
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Queue
+
+ROOT = Path(__file__).parents[2]
+LIST = Path(__file__).with_name("mutants.toml")
+DOCUMENT = ROOT / "docs" / "mutants.md"
+PRODUCT = ("membrane_ctrl", "firmware_iface")
+# after the tests that an area names: everything fast that concerns control and devices
+ALL_FAST = ("tests/test_*.py", "tests/virtual/test_*.py", "tests/control/test_*.py", "tests/firmware_iface/test_*.py")
+# These compare a generated document with its source: any change of the source would count as noticed ...
+COMPARISONS = ("test_faults_page.py", "test_register_generate.py")
+# ... and this one waits for real devices' time-outs: on a busy machine it fails by itself.
+_OF_TIME = ("test_examples.py",)
+_LEAVE = shutil.ignore_patterns(".git", ".venv", "__pycache__", ".mypy_cache", ".ruff_cache", "logs", "images")
+PATIENCE_S = 400.0  # a mutation that waits for ever is noticed, too
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One entry of the list."""
+
+    what: str
+    area: str
+    find: str
+    replace: str
+    lives: str = ""
+
+    def place(self, root: Path) -> Path:
+        """The file that holds the text. Raises LookupError unless it is there exactly once."""
+        found = [path for path, text in _sources(root) for _ in range(text.count(self.find))]
+        if len(found) != 1:
+            raise LookupError(f"{self.what!r}: `find` occurs {len(found)} times, not once")
+        return found[0]
+
+    def applied(self, text: str) -> str:
+        """The file's text with the mutation. Raises SyntaxError if that is no Python."""
+        mutated = text.replace(self.find, self.replace)
+        compile(mutated, self.what, "exec")
+        return mutated
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Who noticed a mutation; empty: nobody."""
+
+    mutant: Mutant
+    place: str
+    by_tests: str
+    by_campaign: str
+    lasted_s: float
+
+
+def _sources(root: Path) -> Iterator[tuple[Path, str]]:
+    for folder in PRODUCT:
+        for path in sorted((root / folder).rglob("*.py")):
+            yield path, path.read_text(encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class First:
+    """What is asked first about the mutations of an area; the rest follows."""
+
+    tests: tuple[str, ...]
+    campaign: str
+
+
+def load(root: Path = ROOT) -> tuple[list[Mutant], dict[str, First]]:
+    """All mutations, and what is asked first, by area. Raises LookupError for a test that is not there."""
+    table = tomllib.loads(LIST.read_text(encoding="utf-8"))
+    firsts = {
+        name: First(_paths_of_tests(root, area["tests"]), area["campaign"]) for name, area in table["area"].items()
+    }
+    return [Mutant(**entry) for entry in table["mutant"]], firsts
+
+
+def _paths_of_tests(root: Path, names: Sequence[str]) -> tuple[str, ...]:
+    """Paths of tests by file name."""
+    found = {name: list((root / "tests").rglob(name)) for name in names}
+    if missing := {name: len(paths) for name, paths in found.items() if len(paths) != 1}:
+        raise LookupError(f"test files that are not there exactly once: {missing}")
+    return tuple(str(paths[0].relative_to(root)) for paths in found.values())
+
+
+@contextmanager
+def mutated(tree: Path, mutant: Mutant) -> Iterator[str]:
+    """The tree with the mutation in it, for a while; its place."""
+    path = mutant.place(tree)
+    text = path.read_text(encoding="utf-8")
+    compiled = Path(importlib.util.cache_from_source(str(path)))
+    path.write_text(mutant.applied(text), encoding="utf-8")
+    compiled.unlink(missing_ok=True)  # it is told from the source by its size and second alone
+    try:
+        yield str(path.relative_to(tree))
+    finally:
+        path.write_text(text, encoding="utf-8")
+        compiled.unlink(missing_ok=True)
+
+
+def ask_tests(tree: Path, first: Sequence[str]) -> str:
+    """The first fast test that fails; empty if all pass."""
+    rest = [str(p.relative_to(tree)) for pattern in ALL_FAST for p in sorted(tree.glob(pattern))]
+    left = [path for path in rest if path not in first and Path(path).name not in (*COMPARISONS, *_OF_TIME)]
+    for files in (first, left):
+        if found := _failed_test(_run(tree, "-m", "pytest", *_PYTEST, *files)):
+            return found
+    return ""
+
+
+_PYTEST = ("-x", "-q", "-p", "no:cacheprovider", "-m", "not campaign and not real_time")
+
+
+def ask_campaign(tree: Path, first: str) -> str:
+    """The first violation that the short campaign finds, with one of its parts first; empty if there is none."""
+    ended = _run(tree, "tests/campaign/campaign.py", "--short", "--first", first)
+    if ended is None:
+        return "hangs"
+    return "" if ended.returncode == 0 else _last_line(ended.stdout or ended.stderr)
+
+
+def _run(tree: Path, *arguments: str) -> subprocess.CompletedProcess[str] | None:
+    """A Python of the tree, two steps back in priority; None if it hangs."""
+    environment = {**os.environ, "PYTHONPATH": str(tree)}
+    command = ["nice", "-n", "5", sys.executable, *arguments]
+    try:
+        return subprocess.run(
+            command, cwd=tree, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return None
+
+
+def _failed_test(ended: subprocess.CompletedProcess[str] | None) -> str:
+    if ended is None:
+        return "hangs"
+    if ended.returncode == 0:
+        return ""
+    found = re.search(r"^(?:FAILED|ERROR) \S*?([^/\s]+\.py\S*)", ended.stdout, re.MULTILINE)
+    return found[1] if found else _last_line(ended.stdout + ended.stderr)
+
+
+def _last_line(text: str) -> str:
+    return (text.strip().splitlines() or ["no word"])[-1][:120]
+
+
+def examine(mutant: Mutant, tree: Path, first: First) -> Verdict:
+    """One mutation in a tree of its own."""
+    begun_s = time.monotonic()
+    with mutated(tree, mutant) as place:
+        by_tests, by_campaign = ask_tests(tree, first.tests), ask_campaign(tree, first.campaign)
+    return Verdict(mutant, place, by_tests, by_campaign, time.monotonic() - begun_s)
+
+
+def examine_all(mutants: Sequence[Mutant], firsts: dict[str, First], at_once: int) -> list[Verdict]:
+    """All mutations, each worker with a copy of the tree outside the repository."""
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+        trees: Queue[Path] = Queue()
+        for number in range(at_once):
+            shutil.copytree(ROOT, Path(folder) / str(number), ignore=_LEAVE)
+            trees.put(Path(folder) / str(number))
+
+        def one(mutant: Mutant) -> Verdict:
+            tree = trees.get()
+            try:
+                verdict = examine(mutant, tree, firsts[mutant.area])
+            finally:
+                trees.put(tree)
+            print(
+                f"{verdict.lasted_s:4.0f} s  {mutant.what}\n        tests:    {verdict.by_tests or 'LIVES'}"
+                f"\n        campaign: {verdict.by_campaign or 'LIVES'}",
+                flush=True,
+            )
+            return verdict
+
+        with ThreadPoolExecutor(at_once) as workers:
+            return list(workers.map(one, mutants))
+
+
+def sample(mutants: Sequence[Mutant], number: int) -> list[Mutant]:
+    """So many of them, drawn at random, the same at every call."""
+    shuffled = list(mutants)
+    random.Random(3).shuffle(shuffled)
+    return shuffled[:number]
+
+
+def document(verdicts: Sequence[Verdict], listed: int) -> str:
+    """The result as Markdown; of `listed` mutations these were examined."""
+    total = len(verdicts)
+    tests, campaign = (sum(bool(found) for found in column) for column in _columns(verdicts))
+    lines = [
+        "# Mutants",
+        "",
+        "Generated by `make mutants` from `tests/mutants/mutants.toml`: wrong code on purpose, one mutation at a "
+        "time, and who notices. The list says how the mutations are chosen. A list, not a tool such as mutmut: a "
+        "tool changes every operator, most of them in ways that no mirror would feel, and takes days for it; this "
+        "list holds the ways in which each decision about gas can be wrong.",
+        "",
+        (
+            f"{listed} mutations are listed"
+            if total == listed
+            else f"{total} of {listed}, drawn at random, were examined"
+        )
+        + f". **Fast tests kill {tests} of {total} ({100 * tests / total:.0f} %), the campaign alone {campaign} "
+        f"({100 * campaign / total:.0f} %).**",
+        "",
+        "The fast tests are those of control and devices without the campaign, without real time, and without the "
+        f"comparisons of generated documents ({', '.join(f'`{name}`' for name in COMPARISONS)}). The campaign is its "
+        "short part (`python tests/campaign/campaign.py --short`).",
+        "",
+        "| mutation | in | killed by test | killed by campaign |",
+        "|---|---|---|---|",
+    ]
+    lines += [f"| {v.mutant.what} | `{v.place}` | {_cell(v.by_tests)} | {_cell(v.by_campaign)} |" for v in verdicts]
+    lines += ["", "## Survivors", ""]
+    for verdict in verdicts:
+        who = [name for name, found in (("tests", verdict.by_tests), ("campaign", verdict.by_campaign)) if not found]
+        if who:
+            lines.append(
+                f"- {verdict.mutant.what} ({' and '.join(who)}): {verdict.mutant.lives or 'not looked into'}"
+            )
+    return "\n".join(lines) + "\n"
+
+
+def _columns(verdicts: Sequence[Verdict]) -> tuple[list[str], list[str]]:
+    return [v.by_tests for v in verdicts], [v.by_campaign for v in verdicts]
+
+
+def _cell(found: str) -> str:
+    return f"`{found.replace('|', '/')}`" if found else "**no**"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Examine the mutants; 1 if a share is below its goal."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", metavar="WORDS", help="mutations whose words contain one of these")
+    parser.add_argument("--sample", type=int, metavar="NUMBER")
+    parser.add_argument("--processes", type=int, default=2)
+    options = parser.parse_args(arguments)
+    mutants, firsts = load()
+    listed = len(mutants)
+    if options.sample:
+        mutants = sample(mutants, options.sample)
+    if options.only:
+        mutants = [m for m in mutants if any(words in m.what for words in options.only)]
+    verdicts = examine_all(mutants, firsts, options.processes)
+    if not options.only:
+        DOCUMENT.write_text(document(verdicts, listed), encoding="utf-8")
+    tests_share, campaign_share = (sum(map(bool, column)) / len(verdicts) for column in _columns(verdicts))
+    print(f"{len(verdicts)} mutants: tests kill {100 * tests_share:.0f} %, the campaign {100 * campaign_share:.0f} %")
+    return int(tests_share < TESTS_GOAL or campaign_share < CAMPAIGN_GOAL)
+
+
+TESTS_GOAL, CAMPAIGN_GOAL = 0.95, 0.75
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,35 @@
+"""The list of mutants is about the code as it is."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+
+from mutants import CAMPAIGN_GOAL, DOCUMENT, ROOT, TESTS_GOAL, load
+
+
+def test_every_mutation_applies_exactly_once_and_is_python() -> None:
+    for mutant in load()[0]:
+        text = mutant.place(ROOT).read_text(encoding="utf-8")
+        assert mutant.applied(text) != text, mutant.what
+
+
+def test_there_are_enough_and_no_two_are_called_the_same() -> None:
+    mutants = load()[0]
+    assert len(mutants) >= 80
+    assert max(Counter(mutant.what for mutant in mutants).values()) == 1
+
+
+def test_every_area_has_mutations_and_what_is_asked_first() -> None:
+    mutants, firsts = load()
+    assert {mutant.area for mutant in mutants} == firsts.keys()
+    assert all(first.tests for first in firsts.values())
+    assert {first.campaign for first in firsts.values()} <= {"rooms", "board", "orders", "matrix", "sensors"}
+
+
+def test_the_committed_document_reaches_the_goals() -> None:
+    text = DOCUMENT.read_text(encoding="utf-8")
+    tests, total, campaign = map(int, re.findall(r"kill (\d+) of (\d+) .*?alone (\d+) ", text)[0])
+    assert total >= 80
+    assert tests >= TESTS_GOAL * total
+    assert campaign >= CAMPAIGN_GOAL * total
