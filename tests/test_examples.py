@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
+from patience import patient_check
 
 from firmware_iface.emulators.board_state import BoardSample
 from membrane_ctrl.cli import run
@@ -52,7 +53,8 @@ async def test_the_example_passes_check(example: Path, tmp_path: Path, capsys: p
         devices = _without_optics(await lab.start())  # those: tests/acquisition/test_example_optics.py
         path = tmp_path / "moved.toml"
         path.write_text(dump(config.model_copy(update={"devices": devices})))
-        code = await asyncio.to_thread(run, ["check", str(path), "--json"])
+        with patient_check():
+            code = await asyncio.to_thread(run, ["check", str(path), "--json"])
     finally:
         await lab.stop()
     printed = capsys.readouterr()
@@ -78,7 +80,8 @@ async def test_check_names_every_broken_device_and_the_remedy(
         lab.wires[config.devices.barometer.port].unplug()  # type: ignore[union-attr]
         path = tmp_path / "moved.toml"
         path.write_text(dump(config.model_copy(update={"devices": devices})))
-        code = await asyncio.to_thread(run, ["check", str(path)])
+        with patient_check():
+            code = await asyncio.to_thread(run, ["check", str(path)])
     finally:
         await lab.stop()
     printed = capsys.readouterr()

@@ -184,15 +184,15 @@ class Optoncdt1420(LinkedDevice):
         self._heard = b""
         self._port.write(command.encode("ascii") + b"\n")
         what = f"{self._port.name}: {command}"
-        try:
+        with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._timeout_s):
                 while not self._heard.rstrip().endswith(_PROMPT):
                     await self._stirred()
-        except TimeoutError:
+        if not self._heard.rstrip().endswith(_PROMPT):  # it may have come while this process was kept from running
             hint = f"no answer within {self._timeout_s:g} s; is it on, wired and set to {self._port.settings}?"
             if self._heard:
                 hint = f"{len(self._heard)} bytes but no prompt within {self._timeout_s:g} s; wrong baud rate?"
-            raise LinkError(f"{what}: {hint}") from None
+            raise LinkError(f"{what}: {hint}")
         # bytes of a stream that is just being stopped have no text in them that could be an error: see the marks
         text = self._heard.rstrip()[: -len(_PROMPT)].decode("ascii", "replace")
         if error := _ERROR.search(text):
@@ -250,12 +250,12 @@ class Optoncdt1420(LinkedDevice):
     async def _wait_for_values(self) -> None:
         if not self._port.is_open:
             raise LinkDownError(f"{self._port.name}: not connected")
-        try:
+        with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._timeout_s):
                 while not self._batches:
                     await self._stirred()
-        except TimeoutError:
-            raise LinkError(f"{self._port.name}: no value within {self._timeout_s:g} s") from None
+        if not self._batches:
+            raise LinkError(f"{self._port.name}: no value within {self._timeout_s:g} s")
 
     def _taken(self) -> NDArray[np.int64]:
         values = np.concatenate(self._batches)

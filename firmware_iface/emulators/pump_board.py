@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -78,8 +77,8 @@ class PumpBoardEmulator:
         Called from the event loop's thread only.
     host, port
         Where to listen; port 0 takes any free one (see `port` after `start`).
-    clock : callable
-        Seconds on any axis that does not go back; what the watchdog runs on.
+    clock : callable, optional
+        Seconds on any axis that does not go back; what the watchdog runs on. By default the event loop's.
     unit_id : int
         Requests to other units are answered with exception 11, as a gateway does.
     registers : RegisterMap, optional
@@ -98,13 +97,13 @@ class PumpBoardEmulator:
         plant: Plant,
         host: str = "127.0.0.1",
         port: int = 0,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] | None = None,
         unit_id: int = 1,
         registers: RegisterMap | None = None,
     ) -> None:
         self.faults = Faults()
         self._plant = plant
-        self._clock = clock
+        self._clock = clock or (lambda: asyncio.get_running_loop().time())
         self._unit_id = unit_id
         self._sample = plant.sample()
         self._registers = registers or default_map()

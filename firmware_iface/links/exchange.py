@@ -188,15 +188,17 @@ class SerialExchange:
         self._require_open(question.what)
         self._port.write(question.data)
         self._heard, self._take = b"", question.take
-        self._answer = asyncio.get_running_loop().create_future()
+        answer: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+        self._answer = answer
         wire_s = (len(question.data) + question.answer_bytes) * self._port.settings.char_s
         try:
-            async with asyncio.timeout(timeout_s + wire_s):
-                return await self._answer
-        except TimeoutError:
-            raise LinkError(f"{question.what}: {self._missing(timeout_s)}") from None
+            # not asyncio.timeout: it throws away an answer that has come while this process was kept from running
+            await asyncio.wait([answer], timeout=timeout_s + wire_s)
         finally:
             self._answer = None
+        if not answer.done():
+            raise LinkError(f"{question.what}: {self._missing(timeout_s)}")
+        return answer.result()
 
     def _require_open(self, what: str) -> None:
         if not self._port.is_open:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import socket
 import ssl
@@ -65,6 +66,7 @@ class PortClient:
         try:
             with short(path) as address:
                 connection.connect(address)
+            connection.getpeername()  # a signal ends the wait for one's turn, which Python takes for connected
             connection.settimeout(_ANSWER_S)
         except (FileNotFoundError, ConnectionRefusedError):
             connection.close()
@@ -74,6 +76,8 @@ class PortClient:
             raise DeviceError(f"{path}: too many wait there to be let in; try again") from None
         except OSError as error:
             connection.close()
+            if error.errno == errno.ENOTCONN:
+                return cls.unix(path, notice)
             raise DeviceError(f"{path}: {(error.strerror or str(error)).lower()}") from None
         return cls(connection, str(path), notice)
 

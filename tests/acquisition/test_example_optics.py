@@ -84,7 +84,8 @@ def camera(tmp_path: Path) -> Iterator[GigeCameraEmulator]:
 async def check(config: Config, path: Path) -> tuple[int, dict[str, Any], str]:
     """Exit code, the camera's probe, standard error."""
     path.write_text(dump(config), encoding="utf-8")  # noqa: ASYNC240
-    command = [sys.executable, "-m", "membrane_ctrl", "check", str(path), "--json"]
+    patient = Path(__file__).parents[1] / "patience.py"
+    command = [sys.executable, str(patient), "check", str(path), "--json"]
     pipe = asyncio.subprocess.PIPE
     process = await asyncio.create_subprocess_exec(*command, stdout=pipe, stderr=pipe)
     out, err = await process.communicate()

@@ -279,6 +279,7 @@ def test_the_vendors_own_master_reads_and_writes_the_emulator(
         monkeypatch.setattr(propar_library, "_PROPAR_MASTERS", {})
         instrument = propar_library.instrument(str(path))
         instrument.master.propar.auto_reopen = False
+        instrument.master.response_timeout = 20.0
         answers = [instrument.readParameter(number) for number in (90, 92, 129, 12)]
         answers.append(instrument.writeParameter(12, 0))
         answers.append(instrument.writeParameter(9, 8000))

@@ -13,7 +13,7 @@ import pytest
 from firmware_iface.emulators.modbus_rtu import RtuBusEmulator, bitwise_crc
 from firmware_iface.emulators.modbus_server import respond
 from firmware_iface.emulators.serial_device import SerialFaults
-from firmware_iface.emulators.virtual_time import run_virtual
+from firmware_iface.emulators.virtual_time import run_virtual, stand_still
 from firmware_iface.emulators.wires import MemoryWire
 from firmware_iface.links.modbus_rtu import RtuBus, crc16, parse_rtu_url, rtu_frame, take_reply
 from firmware_iface.links.serial_port import SerialSettings
@@ -203,6 +203,18 @@ def test_a_late_answer_is_never_the_next_one(lateness: float, echo_test: bool) -
         assert await bus.first.read_holding(9, 1) == [109]
 
     on_bus(test, echo_test)
+
+
+def test_an_answer_that_came_while_the_process_stood_still_is_taken() -> None:
+    async def test(bus: Bus) -> None:
+        await bus.first.read_holding(0, 1)
+        bus.emulator.faults.delay_s = 0.5 * TIMEOUT_S
+        asked = asyncio.create_task(bus.first.read_holding(5, 1))
+        await asyncio.sleep(0.3 * TIMEOUT_S)
+        stand_still(1.0)
+        assert await asked == [105]
+
+    on_bus(test)
 
 
 def test_a_cancelled_request_is_finished_before_the_next() -> None:

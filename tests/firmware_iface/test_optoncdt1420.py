@@ -16,7 +16,7 @@ from firmware_iface.drivers.optoncdt1420 import Optoncdt1420, middle
 from firmware_iface.drivers.optoncdt_stream import StreamParser, distance_mm
 from firmware_iface.drivers.step_gate import StepGate
 from firmware_iface.emulators.optoncdt1420 import NO_PEAK, Optoncdt1420Emulator, three_bytes
-from firmware_iface.emulators.virtual_time import run_virtual
+from firmware_iface.emulators.virtual_time import run_virtual, stand_still
 from firmware_iface.emulators.wires import MemoryWire, PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 
@@ -116,6 +116,25 @@ def test_identity_settings_and_readings() -> None:
         assert after.sample_counter > before.sample_counter + 80
         assert after.device_time_s > before.device_time_s
         assert "0.0" not in bench.driver.describe()["settings"]
+        await bench.driver.close()
+
+    run_virtual(test())
+
+
+def test_what_came_while_the_process_stood_still_is_taken() -> None:
+    async def test() -> None:
+        bench = Bench()
+        bench.emulator.faults.delay_s = 0.1
+        opened = asyncio.create_task(bench.driver.open())
+        await asyncio.sleep(0.05)
+        stand_still(1.0)
+        await opened
+        bench.emulator.faults.delay_s = 0.0
+        await bench.driver.displacement()
+        read = asyncio.create_task(bench.driver.displacement())
+        await asyncio.sleep(0)
+        stand_still(1.0)
+        assert (await read).displacement_um == pytest.approx(12.0, abs=STEP_UM)
         await bench.driver.close()
 
     run_virtual(test())

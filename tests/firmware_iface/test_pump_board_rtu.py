@@ -36,7 +36,7 @@ def url(wire: PtyWire) -> str:
 
 
 async def test_the_driver_works_over_rtu_as_over_tcp(wire: PtyWire, board: PumpBoardEmulator) -> None:
-    driver = PumpBoard(url(wire), timeout_s=2.0)
+    driver = PumpBoard(url(wire), timeout_s=20.0)
     identity = await driver.open()
     assert (identity.kind, identity.watchdog_s) == ("membrane pump board", 0.5)
     await driver.write(BenchCommand(0.125, 0.5))
@@ -52,7 +52,7 @@ async def test_the_driver_works_over_rtu_as_over_tcp(wire: PtyWire, board: PumpB
 async def test_a_pulled_cable_is_a_lost_link_and_its_watchdog_acts(
     wire: PtyWire, board: PumpBoardEmulator, plant: CountingPlant, clock: ManualClock
 ) -> None:
-    driver = PumpBoard(url(wire), timeout_s=2.0, watchdog_s=0.5)
+    driver = PumpBoard(url(wire), timeout_s=20.0, watchdog_s=0.5)
     await driver.open()
     await driver.write(BenchCommand(0.5, 0.0))
     wire.unplug()
@@ -67,7 +67,7 @@ async def test_a_plain_pymodbus_client_reads_and_writes_the_board(wire: PtyWire,
     block = default_map().block("identity")
 
     def plain() -> tuple[list[int], bool, bool]:
-        client = ModbusSerialClient(str(wire.path), baudrate=115_200, timeout=2)  # a pty has no parity
+        client = ModbusSerialClient(str(wire.path), baudrate=115_200, timeout=20)  # a pty has no parity
         assert client.connect()
         try:
             words = client.read_holding_registers(block.address, count=block.count, device_id=1).registers

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
 import socket
 import struct
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -339,3 +342,10 @@ def test_a_door_that_stays_crowded_is_said(tmp_path: Path, monkeypatch: pytest.M
         first.connect(str(tmp_path / "control.sock"))
         with pytest.raises(DeviceError, match="too many wait"):
             PortClient.unix(tmp_path / "control.sock", print)
+        before = signal.signal(signal.SIGWINCH, lambda *_: None)
+        resize = threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGWINCH))  # of the terminal, while one waits
+        resize.start()
+        with pytest.raises(DeviceError, match="too many wait"):
+            PortClient.unix(tmp_path / "control.sock", print)
+        resize.join()
+        signal.signal(signal.SIGWINCH, before)
