@@ -1,7 +1,8 @@
-"""`check` with links that wait 20 s for an answer, for tests whose emulators stand still whenever the machine does.
+"""Time for devices that stand still whenever the machine does: for tests whose emulators or bench are processes.
 
-The configuration is judged as it is written; only then its devices are given more time. Run as a program, it is the
-command line.
+`slow_machine` is as patient as a configuration may be: a hold bears a standstill of 1.9 s. For `check` there is more:
+the configuration is judged as it is written, and only then its devices are given 20 s for an answer. Run as a
+program, this is the command line with that `check`.
 """
 
 from __future__ import annotations
@@ -17,6 +18,14 @@ from membrane_ctrl.device_config import DevicesConfig
 from membrane_ctrl.probe import Probe
 
 ANSWER_S = 20.0
+
+
+def slow_machine(board: str = "tcp://127.0.0.1:1") -> str:
+    """The tables of such a configuration; with `--twin`, the twin's address takes the place of the board's."""
+    return (
+        f'[devices]\nboard = "{board}"\ntimeout_s = 1.9\nwatchdog_s = 2.0\n'
+        "[limits]\nstale_s = 2.0\nlateness_max_ms = 1900.0\n"
+    )
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import slow_machine
 
 from firmware_iface.emulators.board_state import BoardSample
 from firmware_iface.emulators.pump_board import PumpBoardEmulator
@@ -317,7 +318,7 @@ async def test_a_limit_beyond_the_boards_own_is_refused_by_whoever_asks_it(
     await board.start()
     try:
         (tmp_path / "lab.toml").write_text(
-            f'[devices]\nboard = "tcp://127.0.0.1:{board.port}"\n[limits]\ngauge_pressure_max_pa = 801.0\n'
+            slow_machine(f"tcp://127.0.0.1:{board.port}") + "gauge_pressure_max_pa = 801.0\n"
         )
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "membrane_ctrl", *command, "lab.toml"),

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from patience import slow_machine
 
 from membrane_ctrl.cli import run
 
@@ -40,7 +41,7 @@ def ctl(folder: Path, *arguments: str) -> Asked:
 
 def hold_command(folder: Path) -> list[str]:
     config = folder / "lab.toml"
-    config.write_text("[twin]\nport = 0\n[shape]\nenabled = false\n")
+    config.write_text(f"{slow_machine()}[twin]\nport = 0\n[shape]\nenabled = false\n")
     return [*COMMAND, "hold", "--twin", "--config", str(config), "--logs", str(folder / "logs"), "--name", "ctl"]
 
 

@@ -12,13 +12,14 @@ from pathlib import Path
 
 import psutil
 import pytest
+from patience import slow_machine
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.errors import Exit
 
 pytestmark = pytest.mark.real_time
 
-PATIENCE_S = 40.0
+PATIENCE_S = 60.0
 
 
 def recorder_of(hold: subprocess.Popen[bytes], run_dir: Path) -> psutil.Process:
@@ -38,9 +39,13 @@ def recorder_of(hold: subprocess.Popen[bytes], run_dir: Path) -> psutil.Process:
 def test_a_killed_recorder_is_replaced_and_every_tick_replayed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["hold", "--twin", "--duration", "8s", "--name", "kill", "--logs", str(tmp_path)]
+    config = tmp_path / "lab.toml"
+    config.write_text(slow_machine() + "[twin]\nport = 0\n")
+    command = ["hold", "--twin", "--config", str(config), "--duration", "8s", "--name", "kill"]
     with subprocess.Popen(
-        [sys.executable, "-m", "membrane_ctrl", *command], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [sys.executable, "-m", "membrane_ctrl", *command, "--logs", str(tmp_path)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     ) as hold:
         try:
             until_s = time.monotonic() + PATIENCE_S

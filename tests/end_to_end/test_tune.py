@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from patience import slow_machine
 
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.errors import DeviceError, InputError
@@ -20,7 +21,8 @@ from tuning.hold_rig import HoldRig
 
 pytestmark = pytest.mark.real_time
 
-CONFIG = """
+CONFIG = f"""
+{slow_machine()}
 [twin]
 port = 0
 scenario = "quiet"
@@ -73,11 +75,11 @@ def steps(rig: HoldRig, duration_s: float) -> ExperimentSpec:
 def test_an_experiment_and_gains_on_a_live_hold(logs: Path) -> None:
     link = connected(logs)
     rig = HoldRig(link, "tester")
-    record, finished, event = rig.performed(steps(rig, 6.0))
+    record, finished, event = rig.performed(steps(rig, 12.0))
     assert finished.completed, finished.reason
     assert event["experiment"] == "steps"
-    assert 6.0 <= record.duration_s < 12.0
-    assert record.lost_fraction < 0.2  # a busy machine may skip ticks; they are counted, not hidden
+    assert 12.0 <= record.duration_s < 24.0
+    assert record.lost_fraction < 0.3  # a machine that stands still twice skips ticks; they are counted, not hidden
     rig.set_gains(rig.loop.model_copy(update={"kp_per_s": 0.4}), "test", 60.0)
     rig.keep()
     link.close()

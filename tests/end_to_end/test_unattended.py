@@ -9,13 +9,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from patience import slow_machine
 
 from membrane_ctrl.errors import Exit
 from membrane_ctrl.latched import NAME
 
 pytestmark = pytest.mark.real_time
 
-CONFIG = "[twin]\nport = 0\n[shape]\nenabled = false\n[states]\nlatch_twin_faults = true\n"
+CONFIG = slow_machine() + "[twin]\nport = 0\n[shape]\nenabled = false\n[states]\nlatch_twin_faults = true\n"
 
 
 def start(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
