@@ -22,6 +22,7 @@ from membrane_ctrl.cross_check_plant import (
     Findings,
     flow_um_per_s,
     judge_alarms,
+    judge_film,
     judge_gauge,
     judge_loop,
     judge_optics,
@@ -33,20 +34,6 @@ from membrane_ctrl.device_config import VaisalaPtb330
 from membrane_ctrl.errors import FindingsError
 from membrane_ctrl.safety import TABLE
 
-# The cause of these is a message or a sensor that was lost for a while, and that it is back is seen. All others need
-# a person: somebody has to find out why before gas flows again.
-MAY_RESUME = frozenset(
-    {
-        "link_lost",
-        "device_silent",
-        "watchdog_tripped",
-        "late",
-        "displacement_missing",
-        "displacement_frozen",
-        "displacement_jump",
-        "pressure_missing",
-    }
-)
 _RESUMES_MOST = 24  # a day: what comes back more often than once an hour has a cause that is not passing
 # How long the pump may run with nobody in control, and give a flow that nobody corrects. At 5 um/s and at the
 # 1.2 um/s of a doubled leak that is 10 um and 70 um, well inside what the default limits leave.
@@ -118,16 +105,17 @@ def _numbers(value: Any, field: str) -> Iterator[tuple[str, float]]:
 def _resume(config: Config, say: Findings) -> None:
     resume = config.resume
     known = [rule.name for rule in TABLE]
+    may = sorted(rule.name for rule in TABLE if rule.may_resume)
     for index, name in enumerate(resume.faults):
         field = f"resume.faults.{index}"
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]}?" if near else f"may resume: {', '.join(sorted(MAY_RESUME))}"
+        hint = f"did you mean {near[0]}?" if near else f"may resume: {', '.join(may)}"
         say.error(name not in known, field, "no fault has this name, so nothing would resume", hint)
         say.error(
-            name in known and name not in MAY_RESUME,
+            name in known and name not in may,
             field,
             "this fault needs a person before gas flows again",
-            f"take it out; may resume: {', '.join(sorted(MAY_RESUME))}",
+            f"take it out; may resume: {', '.join(may)}",
         )
     say.error(
         resume.most_per_day > _RESUMES_MOST,
@@ -342,6 +330,7 @@ _RULES = (
     _states,
     _limits,
     judge_gauge,
+    judge_film,
     judge_alarms,
     judge_pump,
     judge_loop,

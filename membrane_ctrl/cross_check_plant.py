@@ -9,6 +9,7 @@ from typing import Any, Literal
 from firmware_iface.roles import BenchIdentity
 from membrane_ctrl.actuator_test import PARTS
 from membrane_ctrl.config import Config, GeometryConfig
+from membrane_ctrl.control.film_witness import CONTRADICTED_MOST, LEAK_LEAST_UM_PER_S, TAUT_PA
 from membrane_ctrl.control.margins import peak_sensitivity
 from membrane_ctrl.control.pump_curve import PumpCurve
 from membrane_ctrl.device_config import ModbusMap, Optoncdt1420
@@ -22,6 +23,10 @@ _FEEDFORWARD_MOST = 2.0  # times the physical gain: from there on it does more h
 _VENT_FULL_UM_PER_S = 100.0  # of an open vent at the nominal pressure
 _GRAZING_DEG = 10.0
 _GAUGE_BLIND_S = 600.0  # a slow, filtered gauge of a calm mirror repeats itself for minutes
+_STORM_PA = 5.0  # what 250 Pa of weather at once move the gauge by
+# What parts laser and gauge although none of them lies: the gauge's noise at 1 Hz and a mount that warms up; a fresh
+# film's creep (control/film_witness.py)
+_APART_UM, _CREEP_UM = 7.0, 31.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,9 +259,43 @@ def judge_gauge(config: Config, say: Findings) -> None:
     say.error(
         limits.gauge_stuck_s > _GAUGE_BLIND_S, "limits.gauge_stuck_s", why, f"give at most {_GAUGE_BLIND_S:g} s"
     )
-    for name in ("laser_gauge_apart_max_um", "laser_gauge_drift_max_um"):
+    tick_s = 1.0 / config.loop.rate_hz
+    why = "two equal readings by chance are a fault"
+    say.error(limits.gauge_stuck_s < 3.0 * tick_s, "limits.gauge_stuck_s", why, f"give at least {3.0 * tick_s:g} s")
+    why = "a storm alone moves the gauge so far"
+    say.error(
+        limits.gauge_step_max_pa < _STORM_PA, "limits.gauge_step_max_pa", why, f"give at least {_STORM_PA:g} Pa"
+    )
+    for name, least_um, by in (
+        ("laser_gauge_apart_max_um", _APART_UM, "the gauge's noise and a mount that warms up"),
+        ("laser_gauge_drift_max_um", _CREEP_UM, "the creep of a fresh film"),
+    ):
         why = f"can never trip: limits.displacement_max_um is {above_um:g} um above the setpoint"
         say.error(getattr(limits, name) >= above_um, f"limits.{name}", why, "give less")
+        why = f"{by} alone reach it"
+        say.error(getattr(limits, name) < least_um, f"limits.{name}", why, f"give at least {least_um:g} um")
+
+
+def judge_film(config: Config, say: Findings) -> None:
+    """What is said of the film, which gas, laser and gauge are judged by."""
+    limits, mirror = config.limits, config.optics.mirror
+    most = 1.0 + flow_um_per_s(config) / LEAK_LEAST_UM_PER_S
+    why = f"can never trip: the pump gives {flow_um_per_s(config):g} um/s"
+    say.error(limits.leak_growth_max >= most, "limits.leak_growth_max", why, f"give less than {most:.1f}")
+    why = "what the weather moves a leak by trips it"
+    least = CONTRADICTED_MOST
+    say.error(limits.leak_growth_max < least, "limits.leak_growth_max", why, f"give at least {least:g}")
+    why = f"no film is so deep for its radius ({mirror.radius_mm:g} mm)"
+    say.error(mirror.sag_mm >= 0.5 * mirror.radius_mm, "optics.mirror.sag_mm", why, "give the bowl's depth in mm")
+    why = f"the bowl is only {mirror.sag_mm:g} mm deep (optics.mirror.sag_mm): it can never trip"
+    say.error(limits.displacement_min_um <= -1e3 * mirror.sag_mm, "limits.displacement_min_um", why, "give more")
+    why = f"below {TAUT_PA:g} Pa laser and gauge are not held against each other"
+    slack = 0.0 < mirror.pressure_pa <= TAUT_PA
+    say.warn(slack, "optics.mirror.pressure_pa", why, "measure it with the film taut")
+    why = "not known: a gauge in a wrong unit is not noticed"
+    say.warn(
+        mirror.pressure_pa == 0.0, "optics.mirror.pressure_pa", why, "give the gauge's reading at displacement 0"
+    )
 
 
 def judge_ranges(config: Config, board: BenchIdentity, say: Findings) -> None:

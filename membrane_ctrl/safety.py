@@ -127,7 +127,9 @@ class Rule:
     broken: Callable[[Observation, LimitsConfig], bool]
     seen_in: tuple[int, int] = (1, 1)  # ticks that must show the cause, of so many
     states: Collection[State] = MOVING
-    resumable: bool = True  # `resume.faults` may name it
+    # `resume.faults` may name it: the cause is a message or a sensor that was lost for a while, and whether it is
+    # back is seen. All others need a person, who finds out why before gas flows again.
+    may_resume: bool = False
     unseen: Callable[[Observation], bool] = lambda o: False
 
     @property
@@ -144,11 +146,6 @@ class Rule:
     def latching(self) -> bool:
         """Whether the fault stays until somebody acknowledges it."""
         return self.rung > Rung.HOLD_FLOW
-
-    @property
-    def may_resume(self) -> bool:
-        """Whether it may ever clear by itself: never what has vented."""
-        return self.resumable and self.rung < Rung.VENT
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +219,6 @@ TABLE: tuple[Rule, ...] = (
         states=CONNECTED | {State.FAULT},
         remedy="see with whoever latched it that the mirror may move",
         broken=lambda o, c: bool(o.locked),
-        resumable=False,
     ),
     Rule(
         code=50,
@@ -252,6 +248,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.PUMP_OFF,
         states=CONNECTED,
         remedy="check cable, power and address; the board's watchdog has stopped the pump",
+        may_resume=True,
         broken=lambda o, c: not o.link_up,
     ),
     Rule(
@@ -262,6 +259,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.PUMP_OFF,
         states=CONNECTED,
         remedy="check the board; its watchdog has stopped the pump",
+        may_resume=True,
         broken=lambda o, c: o.reading_age_s > c.stale_s,
     ),
     Rule(
@@ -273,7 +271,6 @@ TABLE: tuple[Rule, ...] = (
         states=NOT_YET_FAULT,
         remedy="find the other program that controls the board, and stop one of the two",
         broken=lambda o, c: o.foreign != 0,
-        resumable=False,
     ),
     Rule(
         code=32,
@@ -283,6 +280,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.PUMP_OFF,
         states=CONNECTED,
         remedy="look at the lateness in the recording; the machine may be overloaded",
+        may_resume=True,
         broken=lambda o, c: o.watchdog_tripped,
     ),
     Rule(
@@ -294,7 +292,6 @@ TABLE: tuple[Rule, ...] = (
         states=CONNECTED,
         remedy="read the board's fault bits (docs/registers.md)",
         broken=lambda o, c: o.board_faults != 0,
-        resumable=False,
     ),
     Rule(
         code=34,
@@ -305,7 +302,6 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.PUMP_OFF,
         remedy="check the pump's drive and its limits on the board",
         broken=lambda o, c: o.pump_mismatch > 0.05,
-        resumable=False,
     ),
     Rule(
         code=12,
@@ -314,6 +310,7 @@ TABLE: tuple[Rule, ...] = (
         limit="limits.stale_s",
         rung=Rung.HOLD_FLOW,
         remedy="restart the sensor",
+        may_resume=True,
         broken=lambda o, c: o.advance_age_s > c.stale_s,
     ),
     Rule(
@@ -333,7 +330,6 @@ TABLE: tuple[Rule, ...] = (
         limit="limits.laser_gauge_apart_max_um, limits.laser_gauge_drift_max_um",
         rung=Rung.RAMP_DOWN,
         states=CONNECTED,
-        resumable=False,
         remedy="see which of them is wrong: laser mount, gauge hose, units; for another film set [optics.mirror] "
         "sag_mm and pressure_pa",
         broken=lambda o, c: bool(o.laser_gauge_apart),
@@ -355,7 +351,6 @@ TABLE: tuple[Rule, ...] = (
         limit="limits.leak_growth_max",
         rung=Rung.RAMP_DOWN,
         states=HOLDING,
-        resumable=False,
         remedy="look for an opening seam, then for a laser that creeps: compare it with a ruler",
         broken=lambda o, c: bool(o.gas_excess),
     ),
@@ -386,6 +381,7 @@ TABLE: tuple[Rule, ...] = (
         limit="limits.step_max_um",
         rung=Rung.HOLD_FLOW,
         remedy="look for something in the beam or a bumped laser",
+        may_resume=True,
         broken=lambda o, c: o.jumps > 0,
     ),
     Rule(
@@ -396,6 +392,7 @@ TABLE: tuple[Rule, ...] = (
         limit="3 ticks in a row",
         rung=Rung.HOLD_FLOW,
         remedy="check the laser's aim and its error code",
+        may_resume=True,
         broken=lambda o, c: not o.displacement_valid,
     ),
     Rule(
@@ -406,6 +403,7 @@ TABLE: tuple[Rule, ...] = (
         limit="every tick",
         rung=Rung.RAMP_DOWN,
         remedy="check the pressure sensor: without it over-pressure is not seen",
+        may_resume=True,
         broken=lambda o, c: not math.isfinite(o.gauge_pressure_pa) and o.reading_age_s == 0,
         unseen=lambda o: o.reading_age_s > 0,
     ),
@@ -461,6 +459,7 @@ TABLE: tuple[Rule, ...] = (
         limit="limits.lateness_max_ms",
         rung=Rung.RAMP_DOWN,
         remedy="take other work off this machine",
+        may_resume=True,
         broken=lambda o, c: o.lateness_ms > c.lateness_max_ms,
     ),
 )

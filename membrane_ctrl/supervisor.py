@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
-from firmware_iface.roles import Bench, BenchCommand, BenchReading, LinkDownError, LinkError
+from firmware_iface.roles import Bench, BenchCommand, BenchReading, LinkDownError, LinkError, LinkWaitsError
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.commands import Command
 from membrane_ctrl.controller import Controller
@@ -187,7 +187,10 @@ class Supervisor:
         """Try the lost link again; the link backs off by itself, and there is nothing to be late for meanwhile."""
         try:
             await self._wiring.bench.open()
-        except LinkError:
+        except LinkWaitsError:
+            return
+        except LinkError as error:  # another one than that which broke it: it answers, and another program holds it
+            self._link_failed(error)
             return
         self._link_up, self._link_error = True, ""
         self.tell({"kind": "link", "message": "connected again"})

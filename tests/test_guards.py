@@ -16,7 +16,16 @@ import pytest
 
 from firmware_iface.emulators.virtual_time import run_virtual
 from firmware_iface.role_bench import RoleBench, RoleDevices
-from firmware_iface.roles import BenchCommand, BenchReading, DeviceIdentity, DisplacementSample
+from firmware_iface.roles import (
+    BenchCommand,
+    BenchIdentity,
+    BenchReading,
+    DeviceBusyError,
+    DeviceIdentity,
+    DisplacementSample,
+    LinkDownError,
+    LinkWaitsError,
+)
 from membrane_ctrl.clock import RunClock
 from membrane_ctrl.config import Config, DevicesConfig, LoopConfig, ShapeConfig
 from membrane_ctrl.controller import Controller
@@ -254,3 +263,47 @@ def test_missed_deadlines_are_skipped_and_lateness_is_told_in_milliseconds() -> 
     assert [inputs.now_s for inputs in seen] == pytest.approx([0.1, 0.2, 0.3, 0.65, 0.7, 0.8])
     assert [inputs.lateness_ms for inputs in seen] == pytest.approx([0.0, 0.0, 0.0, 250.0, 0.0, 0.0], abs=1e-6)
     assert [inputs.missed_ticks for inputs in seen] == [0, 0, 0, 2, 2, 2]
+
+
+def test_why_a_lost_link_does_not_come_back_is_told_once() -> None:
+    """The link breaks in the third tick; then another program holds the board, and leaves it."""
+    reads, opened = 0, 0
+
+    class Taken(RoleBench):
+        async def open(self) -> BenchIdentity:
+            nonlocal opened
+            opened += 1
+            if reads and opened % 2:
+                raise LinkWaitsError("not yet time")
+            if reads and opened < 8:
+                raise DeviceBusyError("another program holds the board")
+            return await super().open()
+
+        async def read(self) -> BenchReading:
+            nonlocal reads
+            reads += 1
+            if reads == 3:
+                raise LinkDownError("the board has gone")
+            return await super().read()
+
+    class Ending:
+        def tick(self, inputs: TickInputs) -> TickOutputs:
+            row = TelemetryRow(**dict.fromkeys(FIELDS, 1.0))
+            return TickOutputs(BenchCommand(0.0, 0.0), row, (), Exit.DONE if reads == 5 else None)
+
+    async def run() -> list[str]:
+        bench = Taken(RoleDevices(Instrument(), Instrument(), Instrument(600.0)), 0.5)
+        await bench.open()
+        with ExitStack() as stack:
+            address = stack.enter_context(ring(16, 4096))
+            writer, reader = RingWriter(address), RingReader(address)
+            telemetry = RingWriter(stack.enter_context(ring(16, ROW_BYTES)))
+            for end in (writer, reader, telemetry):
+                stack.callback(end.close)
+            wiring, clock = Wiring(bench, telemetry, writer), cast(RunClock, LoopClock())
+            await Supervisor(cast(Controller, Ending()), wiring, clock, 10.0).run(None)
+            events = [json.loads(line) for line in reader.drain()]
+        await bench.close()
+        return [event["message"] for event in events if event["kind"] == "link"]
+
+    assert run_virtual(run()) == ["the board has gone", "another program holds the board", "connected again"]

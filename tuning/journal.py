@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,6 +10,8 @@ from typing import Literal
 
 from membrane_ctrl.config import LoopConfig
 from membrane_ctrl.errors import InputError
+from membrane_ctrl.recording import plain_json
+from membrane_ctrl.recording.atomic import append_text, make_folder, read_text, sync_data
 from tuning import plain
 
 _FILE = "journal.jsonl"
@@ -46,24 +47,29 @@ def entry(what: What, session: str, author: str, reason: str, before: LoopConfig
 
 
 def note(logs: Path, what: Entry) -> None:
-    """Append an entry. Raises OSError."""
+    """Append an entry. Raises InputError where it cannot be written: a link in its place is not followed."""
     path = logs / "tuning" / _FILE
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(plain.plain(what), allow_nan=False) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
+    try:
+        make_folder(path.parent)
+        append_text(path, json.dumps(plain.plain(what), allow_nan=False) + "\n")
+        sync_data(path)
+    except OSError as error:
+        raise InputError(f"{path}: not noted: {error.strerror}") from None
 
 
 def entries(logs: Path) -> list[Entry]:
-    """All entries, oldest first; a line that was cut off is left out."""
+    """All entries, oldest first; a line that was cut off is left out. Raises InputError for no plain file."""
     path = logs / "tuning" / _FILE
-    if not path.exists():
+    try:
+        text = read_text(path, errors="replace")
+    except FileNotFoundError:
         return []
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from None
     found: list[Entry] = []
-    for line in path.read_text(encoding="utf-8").splitlines():
+    for line in text.splitlines():
         try:
-            found.append(plain.built(Entry, json.loads(line)))
+            found.append(plain.built(Entry, plain_json.loads(line)))
         except (ValueError, TypeError, KeyError):
             continue
     return found

@@ -194,6 +194,21 @@ def test_the_journal_survives_a_torn_line(tmp_path: Path) -> None:
     assert journal.to_roll_back(tmp_path).session == "s1"
 
 
+@pytest.mark.parametrize("place", ["tuning", "tuning/journal.jsonl"])
+def test_the_journal_follows_no_link(tmp_path: Path, place: str) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "journal.jsonl").write_text("theirs\n")
+    link = tmp_path / "logs" / place
+    link.parent.mkdir(parents=True)
+    link.symlink_to(elsewhere if place == "tuning" else elsewhere / "journal.jsonl")
+    with pytest.raises(InputError, match="link"):
+        journal.note(tmp_path / "logs", journal.entry("kept", "s1", "eve", "why", LOOP, LOOP))
+    with pytest.raises(InputError, match="link"):
+        journal.entries(tmp_path / "logs")
+    assert (elsewhere / "journal.jsonl").read_text() == "theirs\n"
+
+
 def test_nothing_to_roll_back_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no kept gains"):
         journal.to_roll_back(tmp_path)
