@@ -3,6 +3,9 @@
 A short scripted sequence; in each part the speed of the centre is the slope of the laser readings. What it checks
 is sign and size within a factor, not calibration: a disconnected hose, a stuck valve or a laser on the wrong spot
 are found, a pump that is 30 % weaker than stated is not.
+
+Where the answer is not clear, all of it is done once more, and the mean of both decides. With 1 um of noise a good
+bench needs that in one start of a hundred.
 """
 
 from __future__ import annotations
@@ -24,17 +27,18 @@ class Part:
     measure_s: float
 
 
-# The vent first, for it costs height that the pump then has to bring back; little of it, 4 um. The pump last and at
-# 0.8: what it adds is on the way to the setpoint anyway.
+# First nothing: the pump has stood and the vent was shut until now. The vent costs height that the pump then has to
+# bring back; little of it, 7 um. The pump last and at 0.8: what it adds is on the way to the setpoint anyway.
 PARTS = (
-    Part("vent", 0.0, 0.08, 0.35, 0.35),
-    Part("off", 0.0, 0.0, 0.35, 1.2),
-    Part("pump", 0.8, 0.0, 0.4, 0.7),
+    Part("off", 0.0, 0.0, 0.0, 1.2),
+    Part("vent", 0.0, 0.08, 0.35, 0.5),
+    Part("pump", 0.8, 0.0, 0.5, 1.0),
 )
 _RATE_HZ = 50.0  # for which the parts' times are
-# Slopes over 0.35 s at 50 Hz and 1 um of noise have a standard deviation of 2.4 um/s, those of the pump 0.8 um/s
-_VENT_LEAST_UM_PER_S = 2.0
-_PUMP_LEAST_SHARE, _PUMP_MOST_SHARE = 0.3, 3.0
+# At 50 Hz and with 1 um of noise the vent's speed has a standard deviation of 1.4 um/s, the pump's 0.6 um/s, and the
+# means of two 1.0 and 0.4 um/s. What is clear is three of them from nothing, what decides in the end two and a half.
+_VENT_CLEAR_UM_PER_S, _VENT_LEAST_UM_PER_S = 4.5, 2.5
+_PUMP_CLEAR_SHARE, _PUMP_LEAST_SHARE, _PUMP_MOST_SHARE = 0.5, 0.3, 3.0
 
 
 class ActuatorTest:
@@ -57,8 +61,20 @@ class ActuatorTest:
         self._parts = [
             replace(part, measure_s=part.measure_s * longer) for part in PARTS if test_vent or part.name != "vent"
         ]
+        self._before: dict[str, float] = {}
         self._speeds = {part.name: Slope() for part in self._parts}
         self._elapsed_s = 0.0
+
+    def again(self) -> None:
+        """Begin once more; the mean of both will be judged."""
+        self._before = {name: slope.per_s for name, slope in self._speeds.items()}
+        self._speeds = {part.name: Slope() for part in self._parts}
+        self._elapsed_s = 0.0
+
+    @property
+    def is_second(self) -> bool:
+        """What it says is the last word."""
+        return bool(self._before)
 
     @property
     def duration_s(self) -> float:
@@ -88,19 +104,24 @@ class ActuatorTest:
     @property
     def leak_um_per_s(self) -> float:
         """How fast the mirror sank with the pump off and the vent closed."""
-        return max(0.0, -self._speeds["off"].per_s)
+        return max(0.0, -self._speed("off"))
+
+    def _speed(self, part: str) -> float:
+        speed_um_per_s = self._speeds[part].per_s
+        return (speed_um_per_s + self._before[part]) / 2 if self._before else speed_um_per_s
 
     def complaint(self) -> str:
-        """What did not answer as it should; empty when all did."""
-        off_um_per_s = self._speeds["off"].per_s
+        """What did not answer as it should, the first time what did not do so clearly; empty when all did."""
+        off_um_per_s = self._speed("off")
         if "vent" in self._speeds:
-            vent_um_per_s = off_um_per_s - self._speeds["vent"].per_s
-            if vent_um_per_s < _VENT_LEAST_UM_PER_S:
+            vent_um_per_s = off_um_per_s - self._speed("vent")
+            if vent_um_per_s < (_VENT_LEAST_UM_PER_S if self.is_second else _VENT_CLEAR_UM_PER_S):
                 return f"the vent lets the mirror down by only {vent_um_per_s:.1f} um/s"
         pump = self._pump
         share = (PARTS[-1].pump_fraction - pump.dead_fraction) / (1.0 - pump.dead_fraction)
         expected_um_per_s = pump.flow_full_um_per_s * share
-        rise_um_per_s = self._speeds["pump"].per_s - off_um_per_s
-        if not _PUMP_LEAST_SHARE <= rise_um_per_s / expected_um_per_s <= _PUMP_MOST_SHARE:
+        rise_um_per_s = self._speed("pump") - off_um_per_s
+        least_share = _PUMP_LEAST_SHARE if self.is_second else _PUMP_CLEAR_SHARE
+        if not least_share <= rise_um_per_s / expected_um_per_s <= _PUMP_MOST_SHARE:
             return f"the pump lifts the mirror by {rise_um_per_s:.1f} um/s, not by about {expected_um_per_s:.1f} um/s"
         return ""

@@ -344,7 +344,7 @@ class Controller:
         self._state_since_s = math.nan
         scene.good_since_s = scene.last_good_s = math.nan
         scene.overdue = scene.unfit = ""
-        scene.test, scene.tested_once = None, False
+        scene.test = None
 
     def _tell_trial(self, why: str, events: list[Event]) -> None:
         """How the experiment ended: by itself, or because the state was left."""

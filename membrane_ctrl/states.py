@@ -69,7 +69,6 @@ class Scene:
     last_good_s: float = math.nan  # in `check`
     sinking: Slope = field(default_factory=Slope)  # of the mirror with the pump off, seen in `check`
     test: ActuatorTest | None = None
-    tested_once: bool = False  # with a complaint, which a second test must confirm
     ramp_from_fraction: float = 0.0
     last_pump_fraction: float = 0.0
     # decisions of this tick
@@ -379,11 +378,10 @@ def _test_actuators(scene: Scene) -> State:
         return State.CHECK  # the loop begins at a reading
     complaint = scene.test.complaint()
     if complaint:
-        scene.why = f"the film does not answer: {complaint}"
-        if scene.tested_once:
+        if scene.test.is_second:
             scene.unfit = complaint
-        # one start in 160 misses by noise alone (2.5 sigma); twice in a row is no noise
-        scene.test, scene.tested_once = None, True
+        scene.why = f"the film does not answer{'' if scene.unfit else ' clearly'}: {complaint}"
+        scene.test.again()
         return State.CHECK
     return _begin(scene, scene.test.leak_um_per_s)
 

@@ -64,7 +64,7 @@ def write_record(
 
 
 def laser_lost(now_s: float, reading: BenchReading) -> BenchReading:
-    """The laser sees nothing from second 14 to 15."""
+    """The laser sees nothing for a second of the hold."""
     from dataclasses import replace
 
-    return replace(reading, displacement_um=np.nan, displacement_quality=1) if 14.0 <= now_s < 15.0 else reading
+    return replace(reading, displacement_um=np.nan, displacement_quality=1) if 14.3 <= now_s < 15.3 else reading

@@ -14,7 +14,8 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from itertools import chain
 from multiprocessing import get_context
 from pathlib import Path
@@ -28,7 +29,8 @@ from campaign_run import Result, run_case
 from campaign_times import RATE_HZ
 from process_run import ProcessResult, process_table
 
-from membrane_ctrl.names import Rung
+from membrane_ctrl.names import Rung, State
+from membrane_ctrl.safety import TABLE, Observation, SafetyTable, Verdict
 
 SEEDS = range(1, 5)
 _BEGIN, _END = "## With real processes\n", "<!-- end of the part with real processes -->"
@@ -48,22 +50,49 @@ class Told:
     name: str
     about: str
     violations: tuple[str, ...]
+    tripped: tuple[str, ...] = ()
+
+
+@contextmanager
+def listening() -> Iterator[set[str]]:
+    """The names of the rules that trip meanwhile, the first cause or not."""
+    tripped: set[str] = set()
+    judge = SafetyTable.judge
+
+    def heard(self: SafetyTable, state: State, observation: Observation) -> Verdict:
+        verdict = judge(self, state, observation)
+        if verdict.rule is not None:
+            tripped.add(verdict.rule.name)
+        return verdict
+
+    SafetyTable.judge = heard  # type: ignore[method-assign]
+    try:
+        yield tripped
+    finally:
+        SafetyTable.judge = judge  # type: ignore[method-assign]
 
 
 def run_row(name: str, seeds: Iterable[int], situations: Iterable[Situation] = SITUATIONS) -> list[Result]:
     """All runs of one fault."""
-    return [run_case(_BY_NAME[name], at, seed) for at in situations for seed in seeds]
+    results = []
+    for at in situations:
+        for seed in seeds:
+            with listening() as tripped:
+                result = run_case(_BY_NAME[name], at, seed)
+            results.append(replace(result, tripped=tuple(sorted(tripped))))
+    return results
 
 
 def run_story(name: str) -> Told:
     """One story; what it raises is a violation."""
     story = _STORIES.get(name) or _ROOMS[name]
     about = (story.__doc__ or "").strip().splitlines()[0]
-    try:
-        found = _STORIES[name]() if name in _STORIES else tell(_ROOMS[name])
-    except Exception as error:
-        found = [f"raised {type(error).__name__}: {error}"]
-    return Told(name, about, tuple(found))
+    with listening() as tripped:
+        try:
+            found = _STORIES[name]() if name in _STORIES else tell(_ROOMS[name])
+        except Exception as error:
+            found = [f"raised {type(error).__name__}: {error}"]
+    return Told(name, about, tuple(found), tuple(sorted(tripped)))
 
 
 def run_all(processes: int) -> tuple[list[Result], list[Told]]:
@@ -133,7 +162,7 @@ def document(results: list[Result], told: list[Told]) -> str:
     lines += ["", "## Invariants, judged from outside in every period, to the end of the story", "", *_INVARIANTS]
     lines += ["", "## Stories", "", "| story | what has to be |", "|---|---|"]
     lines += [f"| {t.name.replace('_', ' ')} | {t.about}{' **bad**' if t.violations else ''} |" for t in told]
-    lines += ["", *_processes()]
+    lines += ["", "## Rules of the safety table", "", *_rules(results, told), "", *_processes()]
     if violations:
         lines += ["## Violations", ""]
         lines += [f"- {where}: {what}" for where, what in violations] + [""]
@@ -157,6 +186,18 @@ _INVARIANTS = (
     "- A stop ends; one that the pump does not obey is no success, and opens the vent.",
     "- Every event can be recorded.",
 )
+
+
+def _rules(results: list[Result], told: list[Told]) -> list[str]:
+    """In how many runs each rule has tripped, and in which stories."""
+    lines = ["| rule | trips in | and in the stories |", "|---|---|---|"]
+    for rule in sorted(TABLE, key=lambda rule: rule.code):
+        runs = sum(rule.name in result.tripped for result in results)
+        stories = [t.name.replace("_", " ") for t in told if rule.name in t.tripped]
+        more = f" and {len(stories) - 2} more" if len(stories) > 2 else ""
+        nowhere = "" if runs or stories else "**nowhere**"
+        lines.append(f"| {rule.code} `{rule.name}` | {runs} runs | {nowhere}{', '.join(stories[:2])}{more} |")
+    return lines
 
 
 def _processes() -> list[str]:

@@ -106,6 +106,7 @@ def _case(name: str, said: str = "", **rest: object) -> Case:
 
 _LOST = "displacement_missing displacement_frozen overdue"
 _SOON = 4 * TICK_S  # two ticks after a rule that looks once, and the tick in which it sets in
+_TESTED = Reaction(Rung.PUMP_OFF, 10.0)  # the actuator test, twice
 
 CASES: tuple[Case, ...] = (
     _case("nothing"),
@@ -174,7 +175,7 @@ CASES: tuple[Case, ...] = (
     ),
     _case(
         "gauge above the board's limit for one sample",
-        "board_fault over_pressure",
+        "board_fault",
         wrong={"gauge_offset_pa": 300},
         for_s=TICK_S,
         gauge_lies=True,
@@ -237,6 +238,7 @@ CASES: tuple[Case, ...] = (
         "following_error actuator_test under_displacement",
         wrong={"pump_share": 0.0},
         holding=Reaction(Rung.RAMP_DOWN, 40.0),
+        checking=_TESTED,
     ),
     _case("pump gives 60 %", "", wrong={"pump_share": 0.6}),
     _case(
@@ -256,7 +258,7 @@ CASES: tuple[Case, ...] = (
         wrong={"vent_stuck_fraction": 1.0},
         holding=Reaction(Rung.RAMP_DOWN, 2.0),
     ),
-    _case("vent stays shut", "actuator_test", wrong={"vent_stuck_fraction": 0.0}),
+    _case("vent stays shut", "actuator_test", wrong={"vent_stuck_fraction": 0.0}, checking=_TESTED),
     _case("process stopped for 0.2 s", "late", wrong={"stalled": 1}, for_s=0.2),
     _case(
         "process stopped for 2 s",

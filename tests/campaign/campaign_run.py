@@ -52,6 +52,7 @@ from membrane_ctrl.virtual.shape import TruthShape
 AFTERMATH_S = 45.0
 THE_STOP_S = 12.0
 GIVE_UP_S = 120.0
+_ROUNDING_S = 1e-6  # one tick is one tick, wherever on the clock it lies
 PAUSE_S, MANUAL_S, MANUAL_RANGE_UM = 20.0, 60.0, 20.0
 # what a person might list; what has vented may not resume whatever is listed
 RESUMABLE = (
@@ -62,7 +63,7 @@ RESUMABLE = (
 
 @dataclass(frozen=True)
 class Result:
-    """What came of one run; `violations` is empty when every invariant held."""
+    """What came of one run; `violations` is empty when every invariant held, `tripped` names rules."""
 
     case: str
     situation: str
@@ -71,6 +72,7 @@ class Result:
     rung: Rung
     reaction_s: float
     violations: tuple[str, ...]
+    tripped: tuple[str, ...] = ()
 
 
 class Injection:
@@ -95,9 +97,9 @@ class Injection:
         if math.isinf(case.for_s):
             on = True
         elif math.isinf(case.every_s):
-            on = age_s < case.for_s
+            on = age_s < case.for_s - _ROUNDING_S
         else:
-            on = age_s % case.every_s < case.for_s
+            on = age_s % case.every_s < case.for_s - _ROUNDING_S
         if on:
             self.last_on_s = now_s
         if on != self._on:

@@ -102,6 +102,16 @@ def a_creeping_laser_without_a_camera() -> list[str]:
     return stage.violations
 
 
+def a_seam_that_opens() -> list[str]:
+    """No camera; from one moment on the film takes three times the gas that it used to: gas no longer flows."""
+    stage = Stage().held()
+    stage.wait(90.0)
+    stage.bench.wrong.vent_stuck_fraction = 0.024
+    stage.wait(150.0)
+    stage.wait(5.0, stage.still)
+    return stage.violations
+
+
 def a_setpoint_is_reached() -> list[str]:
     """What the laser measures is the mirror: 15 um more are 15 um more, and the gauge tells the pressure."""
     stage = Stage(camera=True).held()
@@ -188,6 +198,7 @@ STORIES: Sequence[Callable[[], list[str]]] = (
     a_creeping_laser,
     a_stuck_gauge_and_a_creeping_laser,
     a_creeping_laser_without_a_camera,
+    a_seam_that_opens,
     a_setpoint_is_reached,
     dead_actuators_are_found,
     a_fill_that_leaks_ends,
