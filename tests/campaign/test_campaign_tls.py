@@ -25,7 +25,7 @@ from membrane_ctrl.port.client import PortClient
 from membrane_ctrl.port.tls import client_context
 
 sys.path.append(str(Path(__file__).parents[1] / "port"))
-from test_port_tls import Authority
+from port_certificates import Authority
 
 pytestmark = [pytest.mark.real_time, pytest.mark.campaign, pytest.mark.timeout(300)]
 

@@ -10,8 +10,9 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
+from port_certificates import Authority
 from port_run import PortRun, client, port_run
-from test_port_tls import Authority, address_of, greet
+from test_port_tls import address_of, greet
 
 from membrane_ctrl.port.client import PortClient
 from membrane_ctrl.port.door import Door, LetIn, Turns

@@ -6,12 +6,11 @@ import asyncio
 import shutil
 import socket
 import ssl
-import subprocess
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from port_certificates import Authority
 from port_run import PortRun, port_run
 
 from membrane_ctrl.errors import DeviceError, InputError
@@ -21,56 +20,6 @@ from membrane_ctrl.port.tls import TlsListener, client_context
 from membrane_ctrl.port_config import PortConfig, TlsConfig
 
 pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="makes certificates with openssl")
-
-CA_CONFIG = """
-[ca]
-default_ca = own
-[own]
-database = index.txt
-new_certs_dir = .
-serial = serial
-default_md = sha256
-policy = any
-unique_subject = no
-copy_extensions = copy
-[any]
-commonName = supplied
-organizationalUnitName = optional
-"""
-
-
-def openssl(folder: Path, *arguments: str) -> None:
-    subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True, timeout=30)
-
-
-@dataclass(frozen=True)
-class Authority:
-    """Makes certificates in its folder; NAME.pem and NAME.key."""
-
-    folder: Path
-
-    @classmethod
-    def new(cls, folder: Path) -> Authority:
-        folder.mkdir()
-        (folder / "ca.cnf").write_text(CA_CONFIG)
-        (folder / "index.txt").write_text("")
-        (folder / "serial").write_text("01\n")
-        key = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
-        openssl(folder, "req", "-x509", *key, "-keyout", "ca.key", "-out", "ca.pem", "-subj", "/CN=lab", "-days", "2")
-        return cls(folder)
-
-    def certificate(self, name: str, role: str = "", dates: tuple[str, ...] = ("-days", "1")) -> tuple[Path, Path]:
-        subject = (f"/OU={role}" if role else "") + f"/CN={name}"
-        key = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
-        names = ("-addext", "subjectAltName=IP:127.0.0.1")
-        openssl(self.folder, "req", *key, "-keyout", f"{name}.key", "-out", f"{name}.csr", "-subj", subject, *names)
-        ca = ("-config", "ca.cnf", "-cert", "ca.pem", "-keyfile", "ca.key", "-batch", "-notext")
-        openssl(self.folder, "ca", *ca, "-in", f"{name}.csr", "-out", f"{name}.pem", *dates)
-        return self.folder / f"{name}.pem", self.folder / f"{name}.key"
-
-    @property
-    def own(self) -> Path:
-        return self.folder / "ca.pem"
 
 
 @pytest.fixture(scope="module")
