@@ -49,7 +49,8 @@ def faults_page() -> str:
         "latches: the state is `fault` until a person acknowledges it, or until the cause has stayed away for",
         "`resume.wait_s`, the rule's name is in `resume.faults`, and the day's `resume.most_per_day` is not used up.",
         "What has vented never resumes by itself, nor what the board has latched but its watchdog's trip, nor what a",
-        "person has latched; seen once during a fault, they decide for the whole of it.",
+        "person has latched; seen once during a fault, they decide for the whole of it. `resume.faults` takes only",
+        "the names of faults that may resume.",
         "",
         "## Ladder of safe actions",
         "",
@@ -62,8 +63,13 @@ def faults_page() -> str:
         Rung.PUMP_OFF: "`states.pump_off_max_s`",
     }
     lines += [f"| {rung.name.lower()} | {does} | {after.get(rung, '-')} |" for rung, does in _RUNGS.items()]
-    lines += ["", "## Rules", "", "| code | name | cause | needed / window | limit | enters | latches | judged in |"]
-    lines += ["|---|---|---|---|---|---|---|---|"]
+    lines += [
+        "",
+        "## Rules",
+        "",
+        "| code | name | cause | needed / window | limit | enters | latches | may resume | judged in |",
+    ]
+    lines += ["|---|---|---|---|---|---|---|---|---|"]
     lines += [_row(rule) for rule in sorted(TABLE, key=lambda rule: rule.code)]
     lines += ["", "## What the board does by itself", "", "| bit | name | meaning |", "|---|---|---|"]
     lines += [f"| {fault.bit} | {fault.name} | {fault.meaning} |" for fault in default_map().faults]
@@ -81,6 +87,7 @@ def _row(rule: Rule) -> str:
         _limit(rule.limit),
         rule.rung.name.lower(),
         "yes" if rule.latching else "when it times out",
+        "yes" if rule.may_resume else "-",
         where,
     )
     return "| " + " | ".join(cells) + " |"
