@@ -73,3 +73,20 @@ def test_noise_alone_hides_a_dead_actuator_hardly_ever(
 ) -> None:
     passed = sum(not noisy_test(rate_hz, seed, pump_share, vent_um_per_s).complaint() for seed in range(300))
     assert passed <= 5  # two in a thousand of a pump, six of a vent, are to be expected
+
+
+def test_something_in_the_beam_during_the_first_does_not_spoil_the_second() -> None:
+    pump = PumpConfig()
+    test = ActuatorTest(pump, True, 50.0)
+    height_um = 0.0
+    for error_um in (-20.0, 0.0):
+        seen = 0
+        while (part := test.part) is not None:
+            flow = max(0.0, part.pump_fraction - pump.dead_fraction) / (1 - pump.dead_fraction)
+            height_um += 0.02 * (pump.flow_full_um_per_s * flow - 100.0 * part.vent_fraction - 1.2)
+            seen += part.name == "pump"
+            test.step(height_um + error_um * (seen > 65), 0.02)
+        if not test.is_second:
+            assert "pump" in test.complaint()
+            test.again()
+    assert test.complaint() == ""

@@ -171,7 +171,8 @@ def document(results: list[Result], told: list[Told]) -> str:
 
 _INVARIANTS = (
     "- The true sag and pressure stay within the limits as long as their sensor tells the truth; without a laser the "
-    "bowl goes no further than 40 um; the pressure stays below the board's own limit always.",
+    "bowl goes no further than 40 um; the pressure stays below the board's own limit always. Behind a run "
+    "that has ended, a pump that runs on although its read-back says 0 is bounded by the board alone.",
     "- What arrives at the pump's motor is 0 in standby and on the way down, at and below PUMP_OFF, 14 s after "
     "the last laser reading (8 s of mean flow, 6 s of ramp), after a vent was open, and after the end of the run; "
     "during the ramp it falls at least as the ramp does.",

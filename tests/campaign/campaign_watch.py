@@ -73,7 +73,7 @@ class Watch:
         self._fault_s = self._blind_s = math.nan
         self._fault_pump = self._blind_um = 0.0
         self._still_ticks, self._met = 0, False
-        self._vented = self._board_vents = False
+        self._vented = self._board_vents = self._ended = False
         self._restarts = self._held_ticks = 0
         self._held_pump = 0.0
         self.wrong_s = math.nan
@@ -93,6 +93,7 @@ class Watch:
         if tick is not None:
             self._last_tick_s = now_s
             self._look_at_tick(tick, now_s)
+        self._ended = tick is None and not self._bench.wrong.stalled
         self._look_at_board(now_s)
         self._look_at_pressure_and_sag(now_s)
         self._look_at_the_way_down(now_s)
@@ -213,7 +214,8 @@ class Watch:
         board_max_pa = max(self._gauge_max_pa, BOARD_PRESSURE_MAX_PA) + hidden_pa + _GAUGE_SLACK_PA
         if truth.gauge_pressure_pa > board_max_pa:
             self._say(now_s, f"gauge pressure {truth.gauge_pressure_pa:.1f} Pa, above the board's limit")
-        if unseen:
+        ended = self._ended and not self._obeys  # from then on only the board's own limit is there
+        if unseen or ended:
             return
         if not case.gauge_lies and truth.gauge_pressure_pa > self._gauge_max_pa + _GAUGE_SLACK_PA:
             self._say(now_s, f"gauge pressure {truth.gauge_pressure_pa:.1f} Pa")
