@@ -96,7 +96,7 @@ def _designed(folder: SessionFolder) -> list[str]:
     if not folder.done("design"):
         return parts
     design, gains = session.design_of(folder), load_gains(folder.file("gains.toml"))
-    lines = folder.file("candidates.md").read_text(encoding="utf-8").splitlines()
+    lines = folder.candidates().splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     parts += [
         "<h2>Candidates</h2>",
@@ -149,5 +149,5 @@ def _image(folder: SessionFolder, name: str) -> str:
     path = folder.file(name)
     if not path.exists():
         return ""
-    data = base64.b64encode(path.read_bytes()).decode()
+    data = base64.b64encode(folder.content(name)).decode()
     return f'<img alt="{path.stem}" src="data:image/png;base64,{data}">'

@@ -10,7 +10,7 @@ from pathlib import Path
 from membrane_ctrl import config_file
 from membrane_ctrl.config import Config, LoopConfig
 from membrane_ctrl.errors import DeviceError, InputError
-from membrane_ctrl.recording.atomic import write_text_atomic
+from membrane_ctrl.recording.atomic import read_bytes, users, write_text_atomic
 from tuning import plain
 
 FORMAT = "membrane-session/1"
@@ -25,6 +25,7 @@ FILES: dict[str, tuple[str, ...]] = {
     "apply": ("applied.json",),
     "verify": ("verified.json", "verify.npz"),
 }
+_BYTES_MAX = 16_000_000  # a picture is some 100 kB
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
@@ -59,6 +60,21 @@ class SessionFolder:
     def file(self, name: str) -> Path:
         """A file in it."""
         return self.path / name
+
+    def content(self, name: str) -> bytes:
+        """All of a file that people read. Raises InputError if it is no plain file."""
+        path = self.file(name)
+        try:
+            return read_bytes(users(path), _BYTES_MAX)
+        except OSError as error:
+            raise InputError(f"{path}: {(error.strerror or str(error)).lower()}") from None
+
+    def candidates(self) -> str:
+        """The table of candidates, Markdown of at least a head, a rule and a row. Raises InputError."""
+        text = self.content("candidates.md").decode("utf-8", "replace")
+        if len(text.splitlines()) < 3:
+            raise InputError(f"{self.file('candidates.md')}: damaged; repeat the step design")
+        return text
 
     def done(self, step: str) -> bool:
         """The step has left its result."""

@@ -31,7 +31,7 @@ def write_recording(folder: SessionFolder) -> None:
     if folder.done("observe"):
         _record(stream, "before", load_record(folder.file("quiet.npz")))
     if folder.done("design"):
-        markdown = folder.file("candidates.md").read_text(encoding="utf-8")
+        markdown = folder.candidates()
         stream.log("candidates/table", rr.TextDocument(markdown, media_type="text/markdown"), static=True)
         rows = [row for row in session.design_of(folder).candidates if row.predicted is not None]
         stds = [row.predicted.std_um for row in rows if row.predicted is not None]
