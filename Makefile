@@ -21,6 +21,7 @@ test: lint types unit  ## everything CI runs
 lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
+	$(BIN)/python -m benchmarks.house
 
 types: $(STAMP)
 	$(BIN)/mypy
@@ -45,7 +46,7 @@ fuzz: $(STAMP)  ## mutated run folders and capture sets through every command th
 
 generate: $(STAMP)  ## the files made from firmware_iface/registers.toml and the safety table
 	$(BIN)/python -m firmware_iface.generate
-	$(BIN)/python -m membrane_ctrl.faults_page
+	$(BIN)/python -m membrane_ctrl.controller.faults_page
 
 clean:
 	rm -rf $(VENV) .mypy_cache .ruff_cache

@@ -19,22 +19,22 @@ import cv2
 import numpy as np
 
 from benchmarks.figures import Figure, at_most
-from firmware_iface.display.pattern_image import ScreenRaster
+from firmware_iface.display.response import ScreenRaster
 from firmware_iface.drivers.camera_aravis import AravisCamera, AravisSettings
 from firmware_iface.drivers.screen_pygame import PygameScreen, ScreenSettings
-from firmware_iface.emulators.gige_camera import GigeCameraEmulator
-from firmware_iface.emulators.panel import EmulatedPanel, PanelResponse
 from firmware_iface.roles import Pattern
 from membrane_ctrl.acquisition.cycle import CycleDone, CyclePlan, ShapeCycle
-from membrane_ctrl.acquisition.frames import FrameRing, FrameWriter
-from membrane_ctrl.acquisition.self_test import DisplayTest
+from membrane_ctrl.acquisition.optical_bench import DisplayTest
 from membrane_ctrl.acquisition.session import WaitingClock
-from membrane_ctrl.clock import RunClock
-from membrane_ctrl.config import OpticsConfig
+from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.live import LiveReconstructor
-from membrane_ctrl.metrology.patterns import fringe_sequence, full_sequence
-from membrane_ctrl.twin.film_shape import typical_film
-from membrane_ctrl.twin.render import OpticsRenderer
+from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.processes.frames import FrameRing, FrameWriter
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import typical_film
+from tests.support.gige_camera import GigeCameraEmulator
+from tests.support.panel import EmulatedPanel, PanelResponse
 
 OPTICS = OpticsConfig()
 WIDTH_PX, HEIGHT_PX, PIXEL_MM = 1920, 1080, 0.4

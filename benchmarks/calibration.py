@@ -14,22 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import Figure, at_least, at_most
-from membrane_ctrl.config import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
+from membrane_ctrl.calibration.sets import phases_of
+from membrane_ctrl.config.optics import ScreenPoseConfig
+from membrane_ctrl.config.schema import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.metrology.calibrate.diagnose import suspects
-from membrane_ctrl.metrology.calibrate.from_checked import phases_of
 from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, Bench, bench_at, sigmas
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
 from membrane_ctrl.metrology.calibrate.separable import Witness
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, solve, surface_of
 from membrane_ctrl.metrology.checked import check
-from membrane_ctrl.metrology.frame_stack import FrameStack
-from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.surface import Surface
-from membrane_ctrl.twin.film_shape import FilmShape, typical_film
-from membrane_ctrl.twin.illumination import pattern_sequence
-from membrane_ctrl.twin.rays import CameraPose, ScreenError, ScreenPose
-from membrane_ctrl.twin.render import OpticsRenderer
-from membrane_ctrl.twin.trace import trace
+from membrane_ctrl.metrology.frames.frame_stack import FrameStack
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
+from membrane_ctrl.sim.optics.shade import pattern_sequence
+from membrane_ctrl.sim.optics.trace import CameraPose, ScreenError, ScreenPose, trace
 
 FloatArray = NDArray[np.float64]
 

@@ -11,12 +11,12 @@ import time
 from pathlib import Path
 
 from benchmarks.figures import Figure, at_most
-from membrane_ctrl.calibration.sets_command import problem_of, read_sets
-from membrane_ctrl.config import CameraConfig, GeometryConfig, OpticsConfig
+from membrane_ctrl.calibration.sets import problem_of, read_sets
+from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.metrology.calibrate.solve import solve
-from membrane_ctrl.twin.film_shape import typical_film
-from membrane_ctrl.twin.simulate import simulate_set
-from membrane_ctrl.twin.simulation_spec import Motion, SimulationSpec
+from membrane_ctrl.sim.optics.film_shape import typical_film
+from membrane_ctrl.sim.optics.simulate import simulate_set
+from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec
 
 STATED = GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9, reference_displacement_um=0.0)
 

@@ -8,12 +8,12 @@ import numpy as np
 
 from benchmarks.figures import Figure, at_least, at_most
 from benchmarks.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night, planted
-from membrane_ctrl.config import Config
-from membrane_ctrl.recording.levels import TICK_FIELDS, first_level
-from membrane_ctrl.recording.rows import column
-from membrane_ctrl.review.found import find_events
-from membrane_ctrl.review.found_event import Found
-from membrane_ctrl.review.shapes import Shapes, from_estimates
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.telemetry import column
+from membrane_ctrl.review.events.found import find_events
+from membrane_ctrl.review.events.steps import Found
+from membrane_ctrl.run_files.shapes import Shapes, from_estimates
+from membrane_ctrl.run_files.tables import TICK_FIELDS, first_level
 
 HOURS = 8.0
 # How far from the truth an event may be found, s: leaks are judged on minutes.

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.minimum_variance import WRITE_S, least_std_um
-from membrane_ctrl.config import LoopConfig, PumpConfig, TwinConfig
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput, LoopOutput
-from membrane_ctrl.twin.events import AmbientChange, Event, LeakChange
-from membrane_ctrl.twin.plant import Plant
+from membrane_ctrl.sim.events import AmbientChange, Event, LeakChange
+from membrane_ctrl.sim.plant import Plant
 
 SETTLED_S = 40.0
 SCENARIOS = ("quiet", "typical", "gusty")

@@ -10,12 +10,12 @@ import numpy as np
 
 from benchmarks import reference_pmd
 from benchmarks.figures import Figure, at_least, at_most
-from membrane_ctrl.config import OpticsConfig
-from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.live import LiveReconstructor
-from membrane_ctrl.metrology.patterns import fringe_sequence, full_sequence
-from membrane_ctrl.twin.film_shape import FilmShape
-from membrane_ctrl.twin.render import OpticsRenderer
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import FilmShape
 
 OPTICS = OpticsConfig()
 FILM = FilmShape(37.1, 500.0, "hencky", (0, 0, 0, 0, 800, -500, 300, 0, 400, 0, 0, 0, 50, *[0] * 23))

@@ -9,13 +9,13 @@ import time
 import numpy as np
 
 from benchmarks.figures import Figure, at_most
-from membrane_ctrl.config import OpticsConfig
+from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.checked import check
-from membrane_ctrl.metrology.frame_stack import FrameStack
+from membrane_ctrl.metrology.frames.frame_stack import FrameStack
 from membrane_ctrl.metrology.full import FullResult, measure_pixels, reconstruct_full
-from membrane_ctrl.twin.film_shape import typical_film
-from membrane_ctrl.twin.illumination import pattern_sequence
-from membrane_ctrl.twin.render import OpticsRenderer
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import typical_film
+from membrane_ctrl.sim.optics.shade import pattern_sequence
 
 FILM = typical_film(37.1, 500.0, seed=1)
 

@@ -30,17 +30,17 @@ from benchmarks.figures import Figure, at_most
 from benchmarks.memory_acquisition import acquisition_figures
 from benchmarks.recorded_hold import Part, parts_of
 from membrane_ctrl.alarms.process import AlarmsSpec, watch
-from membrane_ctrl.clock import RunClock
-from membrane_ctrl.config import Config, LoopConfig, RecordingConfig, ShapeConfig
-from membrane_ctrl.estimate import pack_estimate, unpack_estimate
-from membrane_ctrl.ipc.ring import RingAddress, RingWriter, ring
-from membrane_ctrl.processes import Child, pipe
-from membrane_ctrl.recording import process
-from membrane_ctrl.recording.process import RecorderSpec
-from membrane_ctrl.recording.run_folder import create_run_folder
-from membrane_ctrl.screen.process import ScreenSpec, screen_main
-from membrane_ctrl.telemetry import FIELDS, ROW_BYTES
-from membrane_ctrl.tick_record import MESSAGE_BYTES
+from membrane_ctrl.config.schema import Config, LoopConfig, RecordingConfig, ShapeConfig
+from membrane_ctrl.console.process import ScreenSpec, screen_main
+from membrane_ctrl.controller.tick import MESSAGE_BYTES
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.shape_estimate import pack_estimate, unpack_estimate
+from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES
+from membrane_ctrl.processes.child import Child, pipe
+from membrane_ctrl.processes.ring import RingAddress, RingWriter, ring
+from membrane_ctrl.recorder import process
+from membrane_ctrl.recorder.process import RecorderSpec
+from membrane_ctrl.run_files.run_folder import create_run_folder
 
 HOUR_S, WEEK_S = 3600.0, 7 * 86_400.0
 ROUND_S = 1200.0

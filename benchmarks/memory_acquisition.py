@@ -9,14 +9,14 @@ from dataclasses import fields, replace
 import psutil
 
 from benchmarks.figures import Figure, at_most
-from membrane_ctrl.acquisition.frames import FrameRing
 from membrane_ctrl.acquisition.process import AcquisitionSpec
-from membrane_ctrl.clock import RunClock
-from membrane_ctrl.config import CameraConfig, Config, OpticsConfig, ShapeConfig
-from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
-from membrane_ctrl.processes import Child, pipe
-from membrane_ctrl.telemetry import FIELDS, ROW_BYTES, TelemetryRow
-from membrane_ctrl.twin.truth import TRUTH_BYTES, Truth
+from membrane_ctrl.config.schema import CameraConfig, Config, OpticsConfig, ShapeConfig
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
+from membrane_ctrl.processes.child import Child, pipe
+from membrane_ctrl.processes.frames import FrameRing
+from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
+from membrane_ctrl.sim.sensors import TRUTH_BYTES, Truth
 
 WARM_CYCLES, CYCLES = 200, 1500
 _CONFIG = Config(

@@ -10,18 +10,22 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.figures import Figure, at_most
-from membrane_ctrl.config import OpticsConfig
-from membrane_ctrl.metrology.covariance import pixel_sigma_adu, slope_per_screen
-from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.geometry_spread import PAPER_SPREAD
-from membrane_ctrl.metrology.monte_carlo import TrialBench, run_trials
-from membrane_ctrl.metrology.phase import equal_shifts, phase_sigma_rad
-from membrane_ctrl.metrology.uncertainty import HeightMap, linear_covariance, trial_covariance
-from membrane_ctrl.metrology.unwrap import mm_per_rad
-from membrane_ctrl.sets.set_figure import Figures
-from membrane_ctrl.twin.film_shape import typical_film
-from membrane_ctrl.twin.simulate import simulate_run
-from membrane_ctrl.twin.simulation_spec import Motion, SimulationSpec
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.measure.measurement import Figures
+from membrane_ctrl.metrology.bins import pixel_sigma_adu, slope_per_screen
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.phase import equal_shifts, mm_per_rad, phase_sigma_rad
+from membrane_ctrl.metrology.uncertainty.geometry_spread import PAPER_SPREAD
+from membrane_ctrl.metrology.uncertainty.monte_carlo import (
+    HeightMap,
+    TrialBench,
+    linear_covariance,
+    run_trials,
+    trial_covariance,
+)
+from membrane_ctrl.sim.optics.film_shape import typical_film
+from membrane_ctrl.sim.optics.simulate import simulate_run
+from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec
 
 OPTICS = OpticsConfig()
 MEASURED, PAPERS_SETS, TRIALS = 5, 451, 100  # sets measured here, sets and trials of the paper

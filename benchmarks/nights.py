@@ -17,13 +17,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from membrane_ctrl import config_file
-from membrane_ctrl.config import Config, LoopConfig
-from membrane_ctrl.estimate import ShapeEstimate
-from membrane_ctrl.names import ShapeState, State
-from membrane_ctrl.recording.column_tables import ColumnTables
-from membrane_ctrl.recording.rows import COLUMN, Rows
-from membrane_ctrl.telemetry import FIELDS
+from membrane_ctrl.config import toml_file as config_file
+from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.states import ShapeState, State
+from membrane_ctrl.model.telemetry import COLUMN, FIELDS, Rows
+from membrane_ctrl.run_files.tables import ColumnTables
 
 RATE_HZ = 10.0
 CONFIG = Config(loop=LoopConfig(rate_hz=RATE_HZ))

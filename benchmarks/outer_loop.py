@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.minimum_variance import WRITE_S
-from membrane_ctrl.config import LoopConfig, PumpConfig, ShapeConfig, TwinConfig
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig, ShapeConfig, TwinConfig
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput
 from membrane_ctrl.control.shape_loop import ShapeLoop, ShapeOutput
-from membrane_ctrl.estimate import ShapeEstimate
-from membrane_ctrl.names import ShapeState
-from membrane_ctrl.twin.plant import Plant
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.states import ShapeState
+from membrane_ctrl.sim.plant import Plant
 
 # Of a paraboloid with a little of the Hencky bowl's spherical terms (Noll 4, 11, 22); piston follows the vertex.
 SENSITIVITY = np.zeros(36)

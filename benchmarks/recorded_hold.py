@@ -9,16 +9,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from membrane_ctrl.acquisition.worker import estimate_message
-from membrane_ctrl.commands import Command
-from membrane_ctrl.config import Config
-from membrane_ctrl.estimate import ShapeEstimate, unpack_estimate
-from membrane_ctrl.ipc.ring import RingWriter
-from membrane_ctrl.metrology.hencky import zernike_projection
-from membrane_ctrl.tick_record import pack_tick
-from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual.bench import VirtualBench
-from membrane_ctrl.virtual.run import VirtualRun, VirtualTick
-from membrane_ctrl.virtual.shape import TruthShape
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.tick import pack_tick
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.shape_estimate import ShapeEstimate, unpack_estimate
+from membrane_ctrl.processes.ring import RingWriter
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.virtual.bench import VirtualBench
+from membrane_ctrl.sim.virtual.run import TruthShape, VirtualRun, VirtualTick
 
 Rings = dict[str, RingWriter]
 

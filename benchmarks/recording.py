@@ -13,15 +13,15 @@ from pathlib import Path
 
 from benchmarks.figures import Figure, at_most
 from benchmarks.recorded_hold import parts_of
-from membrane_ctrl.clock import RunClock
-from membrane_ctrl.config import Config
-from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
-from membrane_ctrl.recording.optimizer import Optimizer
-from membrane_ctrl.recording.recorder import Recorder
-from membrane_ctrl.recording.run_folder import create_run_folder
-from membrane_ctrl.recording.sink import Recording
-from membrane_ctrl.telemetry import ROW_BYTES
-from membrane_ctrl.tick_record import MESSAGE_BYTES
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller.tick import MESSAGE_BYTES
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.telemetry import ROW_BYTES
+from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
+from membrane_ctrl.recorder.housekeeping import Optimizer
+from membrane_ctrl.recorder.recorder import Recorder
+from membrane_ctrl.recorder.sink import Recording
+from membrane_ctrl.run_files.run_folder import create_run_folder
 
 DAY_S = 86_400.0
 WRITE_S = 0.8  # the recorder's rounds: 0.75 s and a little

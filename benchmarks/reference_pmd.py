@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.metrology import zernike
-from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.optics import zernike
+from membrane_ctrl.metrology.optics.geometry import Geometry
 
 FloatArray = NDArray[np.float64]
 ITERATIONS = 5

@@ -20,8 +20,8 @@ import numpy as np
 
 from benchmarks.figures import Figure, at_most
 from benchmarks.nights import RATE_HZ, night, planted, write_run
-from membrane_ctrl.estimate import ShapeEstimate
-from membrane_ctrl.recording.rows import Rows
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.telemetry import Rows
 
 MONTH_DAYS = 30.0
 # Written part by part: a part is this long, and all there is of it in memory.

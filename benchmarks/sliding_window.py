@@ -8,11 +8,11 @@ import time
 import numpy as np
 
 from benchmarks.figures import Figure, at_most
-from membrane_ctrl.config import OpticsConfig
-from membrane_ctrl.metrology.patterns import fringe_sequence, full_sequence
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
 from membrane_ctrl.metrology.sliding import SlidingWindow
-from membrane_ctrl.twin.film_shape import FilmShape
-from membrane_ctrl.twin.render import OpticsRenderer
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import FilmShape
 
 OPTICS = OpticsConfig()
 FILM = FilmShape(37.1, 500.0, "hencky", (0, 0, 0, 0, 800, -500, 300, 0, 400, *[0] * 27))

@@ -18,16 +18,15 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.figures import Figure, at_least, at_most, show
-from membrane_ctrl.commands import Command
-from membrane_ctrl.config import Config, LoopConfig, ResumeConfig, StatesConfig, TwinConfig
-from membrane_ctrl.metrology.hencky import zernike_projection
-from membrane_ctrl.names import State
-from membrane_ctrl.twin.events import DailyTemperature, LaserDropout, PressureWeather
-from membrane_ctrl.twin.events import Event as Happening
-from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual.bench import VirtualBench
-from membrane_ctrl.virtual.run import VirtualRun, VirtualTick
-from membrane_ctrl.virtual.shape import TruthShape
+from membrane_ctrl.config.schema import Config, LoopConfig, ResumeConfig, StatesConfig, TwinConfig
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.states import State
+from membrane_ctrl.sim.events import DailyTemperature, LaserDropout, PressureWeather
+from membrane_ctrl.sim.events import Event as Happening
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.virtual.bench import VirtualBench
+from membrane_ctrl.sim.virtual.run import TruthShape, VirtualRun, VirtualTick
 
 DAY_S = 86_400.0
 RATE_HZ = 10.0

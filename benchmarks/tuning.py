@@ -14,15 +14,15 @@ from unittest.mock import patch
 import numpy as np
 
 from benchmarks.minimum_variance import least_std_um
-from membrane_ctrl.config import LoopConfig, PumpConfig, TwinConfig
-from membrane_ctrl.control.experiments.measurement import Measurement
-from membrane_ctrl.twin import pump as twin_pump
-from membrane_ctrl.twin.events import Event
-from membrane_ctrl.twin.plant import STEP_S, Plant
-from tuning.candidates import amigo, simc, ziegler_nichols
-from tuning.characterise import Characterised, characterise
-from tuning.design import propose, relay_ultimate
-from tuning.disturbance_model import observe
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
+from membrane_ctrl.control.experiments.machine import Measurement
+from membrane_ctrl.sim import plant as twin_pump
+from membrane_ctrl.sim.events import Event
+from membrane_ctrl.sim.plant import STEP_S, Plant
+from tuning.identification.characterise import Characterised, characterise
+from tuning.identification.disturbance import observe
+from tuning.proposal.candidates import amigo, simc, ziegler_nichols
+from tuning.proposal.design import propose, relay_ultimate
 from tuning.rig import Rig
 
 SETTLE_S = 40.0

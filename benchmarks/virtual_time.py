@@ -9,19 +9,25 @@ from collections import defaultdict
 from pathlib import Path
 
 from benchmarks.figures import Figure, at_least, at_most
-from membrane_ctrl.config import Config, LoopConfig, ShapeConfig
-from membrane_ctrl.metrology.hencky import zernike_projection
-from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.virtual.bench import VirtualBench
-from membrane_ctrl.virtual.run import VirtualRun, run_virtual
-from membrane_ctrl.virtual.shape import TruthShape
+from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.virtual.bench import VirtualBench
+from membrane_ctrl.sim.virtual.run import TruthShape, VirtualRun, run_virtual
 
 RATE_HZ = 10.0
 VIRTUAL_S = 3600.0
 _SHARES = {
     "plant": ("twin/",),
     "board, registers, driver": ("firmware_iface/", "virtual_bench.py"),
-    "safety and states": ("safety.py", "states.py", "observer.py", "ladder.py", "resume.py", "witnesses.py"),
+    "safety and states": (
+        "safety.py",
+        "states.py",
+        "observer.py",
+        "safe_levels.py",
+        "safe_levels.py",
+        "sensor_consistency.py",
+    ),
     "loops": ("control/",),
     "tick, telemetry": ("controller.py", "telemetry.py", "tick.py", "virtual_run.py"),
 }
@@ -34,7 +40,7 @@ def _hold(shape: bool) -> None:
         for _ in run_virtual(config, plant, VIRTUAL_S, zernike_projection()):
             pass
         return
-    from membrane_ctrl.commands import Command
+    from membrane_ctrl.controller.commands import Command
 
     bench = VirtualBench(plant)
     run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, config, 1))

@@ -1,15 +1,12 @@
 """A board under test: how the conformance test talks to it, and how it says that something is wrong."""
 
-from __future__ import annotations
-
 import asyncio
 import secrets
 from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 
+from firmware_iface import register_map, roles
 from firmware_iface.links.modbus_rules import ModbusLink
-from firmware_iface.register_map import Block, RegisterMap, default_map
-from firmware_iface.roles import DeviceBusyError, DeviceRefusedError, LinkDownError, LinkError
 
 PUMP_FRACTION = 0.05  # below what starts a diaphragm pump
 PERIOD_S = 0.3  # watchdog period during the test
@@ -41,7 +38,9 @@ class BoardUnderTest:
     def __init__(self, link: ModbusLink, sleep: Callable[[float], Awaitable[None]] = asyncio.sleep) -> None:
         self._link = link
         self._sleep = sleep
-        self._registers: RegisterMap = default_map()  # of the board, once it has said its version
+        self._registers: register_map.RegisterMap = (
+            register_map.default_map()
+        )  # of the board, once it has said its version
         self._heartbeat = 0
         self._id, self._key = (1 + secrets.randbelow(_U32_MAX) for _ in range(2))
 
@@ -49,7 +48,7 @@ class BoardUnderTest:
     def _claims(self) -> bool:
         return self._registers.map_version >= 2
 
-    async def _read(self, block: Block) -> dict[str, float]:
+    async def _read(self, block: register_map.Block) -> dict[str, float]:
         return block.decode(await self._link.read_holding(block.address, block.count))
 
     async def _sensors(self) -> dict[str, float]:
@@ -86,9 +85,9 @@ class BoardUnderTest:
         for step in steps:
             try:
                 await step()
-            except LinkDownError:
+            except roles.LinkDownError:
                 raise
-            except LinkError:
+            except roles.LinkError:
                 continue  # what the board cannot do is said by the check that asks for it
 
     async def _tripped(self, after: str) -> None:
@@ -102,7 +101,7 @@ class BoardUnderTest:
     async def _refused(self, words: Sequence[int], address: int, what: str, why: str) -> None:
         try:
             await self._link.write_registers(address, words)
-        except DeviceRefusedError:
+        except roles.DeviceRefusedError:
             return
         raise ConformanceError(f"accepts {what}, which is outside its {why}")
 
@@ -110,9 +109,9 @@ class BoardUnderTest:
         """A write that has to be refused because somebody else holds the board."""
         try:
             await write
-        except DeviceBusyError:
+        except roles.DeviceBusyError:
             return
-        except DeviceRefusedError as error:
+        except roles.DeviceRefusedError as error:
             raise ConformanceError(f"refuses {what}, but not with exception 6: {error}") from None
         raise ConformanceError(f"accepts {what}")
 

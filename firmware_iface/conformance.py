@@ -4,14 +4,13 @@ What is tested, and why, is in docs/firmware.md; each check names its section. T
 for moments: do not run it on a mirror that must not move.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
 
+from firmware_iface import register_map, roles
 from firmware_iface.board_under_test import (
     PERIOD_S,
     PUMP_FRACTION,
@@ -22,8 +21,6 @@ from firmware_iface.board_under_test import (
     require,
 )
 from firmware_iface.links.modbus_links import ModbusLinks
-from firmware_iface.register_map import Register, known_maps
-from firmware_iface.roles import DeviceBusyError, DeviceRefusedError, LinkDownError, LinkError
 
 _GRACE_S = 0.1  # the board's own loop and one wake-up after the period
 _NEAR = 0.002  # of a fraction: counts of a board that rounds its output
@@ -56,7 +53,9 @@ class Conformance(BoardUnderTest):
         findings = [await self._made("identity", "Registers", self._identity)]
         if findings[0].problem:
             return findings
-        with contextlib.suppress(DeviceRefusedError):  # what cannot be armed is said by the check that asks for it
+        with contextlib.suppress(
+            roles.DeviceRefusedError
+        ):  # what cannot be armed is said by the check that asks for it
             await self._arm(REST_S)
         await self._rest()
         for check, section, test in self._checks():
@@ -74,9 +73,9 @@ class Conformance(BoardUnderTest):
             await test()
         except ConformanceError as error:
             problem = str(error)
-        except LinkDownError:
+        except roles.LinkDownError:
             raise
-        except LinkError as error:
+        except roles.LinkError as error:
             problem = f"no valid answer: {error}"
         return Finding(check, section, problem)
 
@@ -114,9 +113,9 @@ class Conformance(BoardUnderTest):
         kind, version = int(found["device_kind"]), int(found["map_version"])
         wanted = self._registers.device_kind
         require(kind == wanted, f"device kind is {kind}, wanted {wanted}")
-        known = " and ".join(str(known) for known in known_maps())
-        require(version in known_maps(), f"map version is {version}, this test knows {known}")
-        self._registers = known_maps()[version]
+        known = " and ".join(str(known) for known in register_map.known_maps())
+        require(version in register_map.known_maps(), f"map version is {version}, this test knows {known}")
+        self._registers = register_map.known_maps()[version]
         require(found["gauge_pressure_limit_pa"] > 0, "gauge_pressure_limit_pa is not above 0")
         require(0 < found["pump_limit_fraction"] <= 1, "pump_limit_fraction is not within 0..1")
         self._heartbeat = int((await self._sensors())["heartbeat_echo"])
@@ -174,7 +173,7 @@ class Conformance(BoardUnderTest):
         last = max(block.address + block.count for block in self._registers.blocks)
         try:
             await self._link.read_holding(last, 1)
-        except DeviceRefusedError:
+        except roles.DeviceRefusedError:
             return
         raise ConformanceError(f"answers a read of register {last}, which the map does not have")
 
@@ -191,7 +190,7 @@ class Conformance(BoardUnderTest):
         await self._write(PUMP_FRACTION)
         try:
             await self._arm(REST_S, 0.0)
-        except DeviceRefusedError:
+        except roles.DeviceRefusedError:
             return
         raise ConformanceError("lets the watchdog be disarmed while the pump is commanded")
 
@@ -220,7 +219,7 @@ class Conformance(BoardUnderTest):
             await self._sleep((PERIOD_S + _GRACE_S) / 4)
             try:
                 await self._link.write_registers(pump.address, [round(PUMP_FRACTION * pump.counts_per_unit)])
-            except DeviceRefusedError:
+            except roles.DeviceRefusedError:
                 continue  # as a board with claims has to
             require(not self._claims, "accepts a part of the command block, which carries no claim")
         await self._tripped("writes of the pump command alone")
@@ -318,7 +317,7 @@ def _time_s(values: dict[str, float]) -> float:
     return values["device_time_s"] + values["device_time_fraction_s"]
 
 
-def _outside(register: Register) -> list[int]:
+def _outside(register: register_map.Register) -> list[int]:
     """Words just outside a register's limits, where the type has such; of a claim only 0 is."""
     if register.access != "rw" or math.isinf(register.maximum):
         return []
@@ -337,7 +336,7 @@ async def examine(url: str, unit_id: int = 1, timeout_s: float = 0.5) -> list[Fi
     await link.connect()
     try:
         return await Conformance(link).run()
-    except DeviceBusyError as error:
-        raise DeviceBusyError(f"{error}: another program holds the board; stop that one first") from None
+    except roles.DeviceBusyError as error:
+        raise roles.DeviceBusyError(f"{error}: another program holds the board; stop that one first") from None
     finally:
         await link.close()

@@ -4,8 +4,6 @@ Run `python -m firmware_iface.generate` after a change of the map; with `--check
 when a file is out of date.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

@@ -11,8 +11,6 @@ hangs in a tick, not one that is killed: then the last flow stays until the gas 
 valve. docs/decisions/35-single-instruments.md and `check` say so.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import math

@@ -3,8 +3,6 @@
 A driver converts to these units at its edge; nothing behind it knows registers, counts or byte orders.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Protocol

@@ -3,8 +3,6 @@
 Kept thin: child processes started with `spawn` import this module again.
 """
 
-from __future__ import annotations
-
 import sys
 
 

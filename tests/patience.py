@@ -12,10 +12,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from unittest.mock import patch
 
-from membrane_ctrl import check
 from membrane_ctrl.cli import run
-from membrane_ctrl.device_config import DevicesConfig
-from membrane_ctrl.probe import Probe
+from membrane_ctrl.commissioning import check
+from membrane_ctrl.commissioning.probe import Probe
+from membrane_ctrl.config.devices import DevicesConfig
 
 ANSWER_S = 20.0
 
@@ -37,7 +37,7 @@ def patient_check() -> Iterator[None]:
         waits = {role: table.model_copy(update={"timeout_s": ANSWER_S}) for role, table in devices.roles().items()}
         return await probes(devices.model_copy(update={"timeout_s": ANSWER_S, **waits}))
 
-    with patch("membrane_ctrl.check._probes", patient):
+    with patch("membrane_ctrl.commissioning.check._probes", patient):
         yield
 
 

@@ -11,9 +11,10 @@ from patience import patient_check
 
 from firmware_iface.emulators.board_state import BoardSample
 from membrane_ctrl.cli import run
-from membrane_ctrl.config import Config, DevicesConfig
-from membrane_ctrl.config_file import dump, load
-from membrane_ctrl.twin.lab import Lab
+from membrane_ctrl.config.devices import DevicesConfig
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.toml_file import dump, load
+from membrane_ctrl.sim.lab import Lab
 
 EXAMPLES = sorted(Path(__file__).parents[1].glob("examples/*.toml"))
 

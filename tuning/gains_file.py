@@ -6,22 +6,22 @@ or has too little margin is refused by name.
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tomli_w
 from pydantic import Field
 
-from membrane_ctrl import config_file
-from membrane_ctrl.config import LoopConfig, Section
-from membrane_ctrl.errors import InputError
-from membrane_ctrl.recording.atomic import users, write_text_atomic
-from tuning.identify import Identified
-from tuning.loop_model import Gains
-from tuning.margins import margins
-from tuning.plant_model import PlantModel
+from membrane_ctrl.config import toml_file as config_file
+from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.config.section import Section
+from membrane_ctrl.model import errors, files, plain_json
+from membrane_ctrl.sessions import folder as plain
+from tuning.identification import identify, loop_model
 
 # A little above what the design demands (1.4): the grid of the search, and a plant that was identified again.
 MS_MAX = 1.6
@@ -40,15 +40,15 @@ class PlantSection(Section):
     delay_sigma_s: Annotated[float, Field(ge=0)]
 
     @classmethod
-    def of(cls, identified: Identified) -> PlantSection:
+    def of(cls, identified: identify.Identified) -> PlantSection:
         """The section for a fit."""
         sigma = identified.sigma
         return cls(**asdict(identified.model), gain_sigma=sigma.gain, delay_sigma_s=sigma.delay_s)
 
     @property
-    def model(self) -> PlantModel:
+    def model(self) -> loop_model.PlantModel:
         """The plant."""
-        return PlantModel(self.gain, self.dead_time_s, self.lag_s, self.leak_um_per_s)
+        return loop_model.PlantModel(self.gain, self.dead_time_s, self.lag_s, self.leak_um_per_s)
 
 
 class GainsFile(Section):
@@ -69,7 +69,7 @@ class GainsFile(Section):
 def save_gains(path: Path, gains: GainsFile) -> None:
     """Write a gains file in one step; without the setpoint, which is the hold's own."""
     text = tomli_w.dumps(gains.model_dump(mode="json", exclude={"loop": {"setpoint_um"}}))
-    write_text_atomic(users(path), text)
+    files.write_text_atomic(files.users(path), text)
 
 
 def load_gains(path: Path) -> GainsFile:
@@ -94,16 +94,16 @@ def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
         If the loop would be unstable on the file's own plant or has too little margin, or ticks differently.
     """
     dt_s = 1 / gains.loop.rate_hz
-    found = margins(Gains.of(gains.loop), gains.plant.model, dt_s)
+    found = loop_model.margins(loop_model.Gains.of(gains.loop), gains.plant.model, dt_s)
     if not found.stable:
-        raise InputError(f"{where}: loop: unstable on the plant of this very file; was it edited by hand?")
+        raise errors.InputError(f"{where}: loop: unstable on the plant of this very file; was it edited by hand?")
     if not found.ms <= MS_MAX or math.isnan(found.ms):
-        raise InputError(
+        raise errors.InputError(
             f"{where}: loop: sensitivity {found.ms:.2f} on the plant of this file, {MS_MAX:g} is the most that is "
             "applied; was it edited by hand?"
         )
     if gains.loop.rate_hz != running.rate_hz:
-        raise InputError(
+        raise errors.InputError(
             f"{where}: loop.rate_hz: {gains.loop.rate_hz:g} Hz, the hold ticks at {running.rate_hz:g} Hz"
         )
 
@@ -112,3 +112,93 @@ def for_hold(gains: LoopConfig, running: LoopConfig) -> LoopConfig:
     """The gains for a hold whose setpoint and bleed are its own: those are no gains."""
     kept = {"setpoint_um": running.setpoint_um, "bleed_fraction": running.bleed_fraction}
     return LoopConfig.model_validate(gains.model_dump() | kept)
+
+
+# `<logs>/tuning/journal.jsonl`: which gains were kept, taken back or rolled back, when, by whom and why.
+
+
+_FILE = "journal.jsonl"
+What = Literal["kept", "taken_back", "rolled_back"]
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One line.
+
+    Attributes
+    ----------
+    time_utc : str
+    what : str
+        "kept": verified; "taken_back": the verification failed; "rolled_back": by a person.
+    session, author, reason : str
+    before, after : LoopConfig
+        Gains before and with it; after "taken_back" those before run again.
+    """
+
+    time_utc: str
+    what: What
+    session: str
+    author: str
+    reason: str
+    before: LoopConfig
+    after: LoopConfig
+
+
+def entry(what: What, session: str, author: str, reason: str, before: LoopConfig, after: LoopConfig) -> Entry:
+    """An entry of now."""
+    return Entry(datetime.now(UTC).isoformat(timespec="seconds"), what, session, author, reason, before, after)
+
+
+def note(logs: Path, what: Entry) -> None:
+    """Append an entry. Raises InputError where it cannot be written: a link in its place is not followed."""
+    path = logs / "tuning" / _FILE
+    try:
+        files.make_folder(path.parent)
+        files.append_text(path, json.dumps(plain.plain(what), allow_nan=False) + "\n")
+        files.sync_data(path)
+    except OSError as error:
+        raise errors.InputError(f"{path}: not noted: {error.strerror}") from None
+
+
+def entries(logs: Path) -> list[Entry]:
+    """All entries, oldest first; a line that was cut off is left out. Raises InputError for no plain file."""
+    path = logs / "tuning" / _FILE
+    try:
+        text = files.read_text(path, errors="replace")
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise errors.InputError(f"{path}: {error.strerror}") from None
+    found: list[Entry] = []
+    for line in text.splitlines():
+        try:
+            found.append(plain.built(Entry, plain_json.loads(line)))
+        except (ValueError, TypeError, KeyError):
+            continue
+    return found
+
+
+def to_roll_back(logs: Path) -> Entry:
+    """The newest gains that were kept and not rolled back since. Raises InputError if there are none."""
+    undone: set[str] = set()
+    for found in reversed(entries(logs)):
+        if found.what == "rolled_back":
+            undone.add(found.session)
+        elif found.what == "kept" and found.session not in undone:
+            return found
+    raise errors.InputError(f"{logs / 'tuning' / _FILE}: no kept gains to roll back")
+
+
+def history_table(found: list[Entry]) -> str:
+    """The journal as a Markdown table."""
+    lines = [
+        "| time | what | session | author | K 1/s | Ti s | filter s | reason |",
+        "|---|---|---|---|---:|---:|---:|---|",
+    ]
+    for line in found:
+        loop = line.before if line.what == "rolled_back" else line.after
+        lines.append(
+            f"| {line.time_utc} | {line.what} | {line.session} | {line.author} | {loop.kp_per_s:.3f} "
+            f"| {loop.ti_s:.2f} | {loop.measurement_filter_s:.2f} | {line.reason} |"
+        )
+    return "\n".join(lines)

@@ -1,19 +1,144 @@
 """The report of a session: one HTML file with everything in it, and a Rerun recording; renewed after each step."""
 
-from __future__ import annotations
-
 import base64
 import html
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from membrane_ctrl.recording.atomic import users, write_text_atomic
-from tuning import pictures, session
-from tuning.gains_file import load_gains
-from tuning.records_file import load_record
-from tuning.session_folder import STEPS, SessionFolder
-from tuning.session_recording import write_recording
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy.signal import welch
+
+from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.model.files import users, write_text_atomic
+from membrane_ctrl.sessions.folder import STEPS, SessionFolder
+from tuning import gains_file, session, session_recording
+from tuning.identification import disturbance, identify, loop_model, records
+from tuning.session import Design, Verified
+
+# Pictures of a session: the experiments and their fit, the weather, the candidates, and before against after.
+
+
+_DPI = 100
+_SEGMENT_S = 40.0
+
+
+def draw_experiments(path: Path, record: records.Record, found: identify.Identified | None) -> None:
+    """Flow, reading, and (once fitted) what the model makes of the flow, with the residuals."""
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    upper, middle, lower = figure.subplots(3, 1, sharex=True)
+    time_s = np.arange(len(record)) * record.dt_s
+    upper.step(time_s, record.flow_um_per_s, where="post", linewidth=0.8)
+    upper.set(ylabel="flow (um/s)")
+    middle.plot(time_s, record.displacement_um, ".", markersize=1, color="tab:gray", label="reading")
+    if found is not None:
+        model = found.model
+        x = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
+        way = model.gain * x - model.leak_um_per_s * time_s
+        off = record.filled_displacement_um() - way
+        middle.plot(time_s, way + off.mean(), linewidth=1, label="the pump's share, by the model")
+        lower.plot(time_s[1:], found.residual_um, linewidth=0.4)
+    middle.set(ylabel="centre (um)")
+    middle.legend(loc="upper right")
+    lower.set(ylabel="prediction error (um)", xlabel="time (s)")
+    _save(path, figure)
+
+
+def draw_weather(
+    path: Path, record: records.Record, model: loop_model.PlantModel, weather: disturbance.Disturbance
+) -> None:
+    """Spectrum of a quiet hold's readings without the pump's share, and the fitted parts."""
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axes = figure.subplots()
+    x = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
+    rest = record.filled_displacement_um() - model.gain * x
+    frequency_hz, power = welch(np.diff(rest), 1 / record.dt_s, nperseg=round(_SEGMENT_S / record.dt_s))
+    w: records.Series = 2 * np.pi * frequency_hz[1:]
+    back = 1 / np.abs(1 - np.exp(-1j * w * record.dt_s)) ** 2  # from increments to readings
+    axes.loglog(frequency_hz[1:], power[1:] * back, linewidth=0.7, color="tab:gray", label="readings, pump taken out")
+    blind = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
+    axes.loglog(frequency_hz[1:], 2 * weather.psd(w, model, blind), label="movement, fitted")  # one-sided
+    axes.loglog(frequency_hz[1:], 2 * weather.rest.moving_psd(w), label="movement that no weather sensor explains")
+    axes.axhline(2 * weather.rest.white_psd, color="tab:red", linestyle="--", label="laser noise")
+    axes.set(xlabel="frequency (Hz)", ylabel="um^2/Hz", ylim=(1e-4 * weather.rest.white_psd, None))
+    axes.legend()
+    _save(path, figure)
+
+
+def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt_s: float) -> None:
+    """All candidates: predicted standard deviation, sensitivity peak, load peak, pump activity, and |S|."""
+    rows = [row for row in design.candidates if row.predicted is not None]
+    names = [row.name for row in rows]
+    stds = [row.predicted.std_um for row in rows if row.predicted is not None]
+    flows = [row.predicted.flow_std_um_per_s for row in rows if row.predicted is not None]
+    figure = Figure(figsize=(12, 8), layout="constrained")
+    (a, b, c), (d, e, f) = figure.subplots(2, 3)
+    f.remove()
+    places = np.arange(len(names))
+    for axes, values, title, limit in (
+        (a, stds, "predicted std (um)", design.least_std_um),
+        (b, [row.margins.ms for row in rows], "Ms", 1.4),
+        (c, [row.load_peak_um for row in rows], "load peak (um)", math.nan),
+        (d, np.minimum(flows, 3.0), "flow std (um/s, cut at 3)", math.nan),
+    ):
+        colours = ["tab:green"] + ["tab:blue"] * (len(names) - 1)
+        axes.barh(places, values, color=colours)
+        axes.set_yticks(places, names, fontsize=7)
+        axes.invert_yaxis()
+        axes.set_title(title, fontsize=9)
+        if math.isfinite(limit):
+            axes.axvline(limit, color="tab:red", linestyle="--")
+    w = loop_model.frequencies(dt_s)
+    for row in rows:
+        size = np.abs(1 / (1 + loop_model.loop_response(row.gains, model, w, dt_s)))
+        e.semilogx(w, size, linewidth=2 if row is rows[0] else 0.8, label=row.name)
+    e.set(xlim=(0.05, w[-1]), xlabel="rad/s", title="|S|")
+    e.legend(fontsize=6)
+    _save(path, figure)
+
+
+def draw_verification(
+    path: Path, before: records.Record, after: records.Record | None, model: loop_model.PlantModel, done: Verified
+) -> None:
+    """Spectra of the readings before and after, and how the trial grew or shrank stage by stage."""
+    figure = Figure(figsize=(11, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    dt_s = before.dt_s
+    for record, loop, name in ((before, done.before, "before"), (after, done.after, "after")):
+        if record is None:
+            continue
+        readings = record.filled_displacement_um()
+        f, power = welch(readings - readings.mean(), 1 / dt_s, nperseg=min(readings.size, round(_SEGMENT_S / dt_s)))
+        ms = float(
+            np.max(
+                np.abs(
+                    1
+                    / (
+                        1
+                        + loop_model.loop_response(
+                            loop_model.Gains.of(loop), model, loop_model.frequencies(dt_s), dt_s
+                        )
+                    )
+                )
+            )
+        )
+        left.loglog(f[1:], power[1:], linewidth=0.8, label=f"{name}, Ms {ms:.2f}")
+    left.set(xlabel="frequency (Hz)", ylabel="readings (um^2/Hz)")
+    left.legend()
+    times = [stage.time_s for stage in done.stages]
+    right.plot(times, [stage.growth for stage in done.stages], "o-", label="std over that of the gains before")
+    right.plot(times, [stage.growth_max for stage in done.stages], "r--", label="most that passes")
+    right.set(xlabel="time (s)", title="kept" if done.kept else f"taken back: {done.reason}"[:90])
+    right.title.set_fontsize(8)
+    right.legend()
+    _save(path, figure)
+
+
+def _save(path: Path, figure: Figure) -> None:
+    FigureCanvasAgg(figure).print_figure(str(path), dpi=_DPI)
+
 
 _STYLE = (
     "body{font-family:sans-serif;max-width:70em;margin:2em auto;padding:0 1em}table{border-collapse:collapse}"
@@ -38,7 +163,7 @@ def write_report(folder: SessionFolder) -> Path:
     path = folder.file("report.html")
     text = f"<!doctype html><meta charset=utf-8><title>{html.escape(head.name)}</title><style>{_STYLE}</style>"
     write_text_atomic(users(path), text + "\n".join(parts))
-    write_recording(folder)
+    session_recording.write_recording(folder)
     return path
 
 
@@ -46,18 +171,18 @@ def draw(folder: SessionFolder) -> None:
     """Renew the pictures of all steps that are done."""
     if folder.done("characterise"):
         found = session.found_of(folder).identified if folder.done("identify") else None
-        pictures.draw_experiments(folder.file("experiments.png"), session.experiments_of(folder).record, found)
+        draw_experiments(folder.file("experiments.png"), session.experiments_of(folder).record, found)
     if not folder.done("observe"):
         return
     model = session.found_of(folder).identified.model
-    quiet = load_record(folder.file("quiet.npz"))
-    pictures.draw_weather(folder.file("weather.png"), quiet, model, session.disturbance_of(folder))
+    quiet = records.load_record(folder.file("quiet.npz"))
+    draw_weather(folder.file("weather.png"), quiet, model, session.disturbance_of(folder))
     if folder.done("design"):
-        pictures.draw_candidates(folder.file("candidates.png"), session.design_of(folder), model, quiet.dt_s)
+        draw_candidates(folder.file("candidates.png"), session.design_of(folder), model, quiet.dt_s)
     if folder.done("verify"):
         path = folder.file("verify.npz")
-        after = load_record(path) if path.exists() else None
-        pictures.draw_verification(folder.file("verify.png"), quiet, after, model, session.verified_of(folder))
+        after = records.load_record(path) if path.exists() else None
+        draw_verification(folder.file("verify.png"), quiet, after, model, session.verified_of(folder))
 
 
 def _identified(folder: SessionFolder) -> list[str]:
@@ -95,7 +220,7 @@ def _designed(folder: SessionFolder) -> list[str]:
     ]
     if not folder.done("design"):
         return parts
-    design, gains = session.design_of(folder), load_gains(folder.file("gains.toml"))
+    design, gains = session.design_of(folder), gains_file.load_gains(folder.file("gains.toml"))
     lines = folder.candidates().splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     parts += [

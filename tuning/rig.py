@@ -1,29 +1,28 @@
 """A bench under the tuner's hand: holds and experiments on one loop, without a bump between them, each a record."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
 
-from membrane_ctrl.config import LoopConfig, PumpConfig
-from membrane_ctrl.control.experiments.machine import Around, ExcursionGuard, Experiment, Finished
-from membrane_ctrl.control.experiments.measurement import Measurement
-from membrane_ctrl.control.experiments.spec import ExperimentSpec
-from membrane_ctrl.control.experiments.trial import Trial
-from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput, LoopOutput
-from membrane_ctrl.control.pump_curve import PumpCurve
-from tuning.records import Record
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from membrane_ctrl.control import gas, inner_loop
+from membrane_ctrl.control.experiments import machine, trial
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.model import events, shape_estimate, telemetry
+from membrane_ctrl.model.states import State
+from membrane_ctrl.sessions.live_hold import HoldError, HoldLink
+from tuning.identification.records import Record, Series
 
-Tick = Callable[[LoopOutput], None]
+Tick = Callable[[inner_loop.LoopOutput], None]
 
 
 class Bench(Protocol):
     """What a rig drives: the twin, a fitted model, or a live hold in its `tune` state."""
 
-    def exchange(self, pump_fraction: float, vent_fraction: float) -> Measurement:
+    def exchange(self, pump_fraction: float, vent_fraction: float) -> machine.Measurement:
         """Put out the commands, wait for the next tick, and return its reading."""
         ...
 
@@ -43,7 +42,7 @@ class Rig:
     def __init__(self, bench: Bench, loop: LoopConfig, pump: PumpConfig, leak_um_per_s: float) -> None:
         self._bench = bench
         self._config, self._pump = loop, pump
-        self._loop = InnerLoop(loop, pump)
+        self._loop = inner_loop.InnerLoop(loop, pump)
         self.dt_s = 1 / loop.rate_hz
         self._last = bench.exchange(self._fraction(leak_um_per_s), loop.bleed_fraction)
         self._loop.start(self._last.displacement_um, leak_um_per_s)
@@ -56,7 +55,7 @@ class Rig:
     def hold(self, duration_s: float, target_um: float = 0.0) -> Record:
         """Hold at a target."""
         flows: list[float] = []
-        samples: list[Measurement] = []
+        samples: list[machine.Measurement] = []
         for _ in range(round(duration_s / self.dt_s)):
             out = self._loop.step(self._given(target_um), self.dt_s)
             flows.append(out.flow_um_per_s)
@@ -64,20 +63,24 @@ class Rig:
             self._last = self._bench.exchange(out.pump_fraction, self._config.bleed_fraction)
         return Record.from_samples(self.dt_s, flows, samples)
 
-    def perform(self, spec: ExperimentSpec) -> tuple[Record, Finished]:
+    def perform(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished]:
         """Run an experiment about 0 until it says that it is finished; the loop may hold from there on."""
-        return self._run(Trial(spec, self._config, self._pump, 0.0), spec.holding_flow_um_per_s)
+        return self._run(trial.Trial(spec, self._config, self._pump, 0.0), spec.holding_flow_um_per_s)
 
-    def run(self, experiment: Experiment, around: Around, centre_um: float) -> tuple[Record, Finished]:
+    def run(
+        self, experiment: machine.Experiment, around: machine.Around, centre_um: float
+    ) -> tuple[Record, machine.Finished]:
         """The same for an experiment of one's own, inside the guard."""
-        return self._run(ExcursionGuard(experiment, around, centre_um, 1 / self.dt_s), around.holding_flow_um_per_s)
+        return self._run(
+            machine.ExcursionGuard(experiment, around, centre_um, 1 / self.dt_s), around.holding_flow_um_per_s
+        )
 
-    def _run(self, guard: Experiment, holding_flow_um_per_s: float) -> tuple[Record, Finished]:
+    def _run(self, guard: machine.Experiment, holding_flow_um_per_s: float) -> tuple[Record, machine.Finished]:
         flows: list[float] = []
-        samples: list[Measurement] = []
+        samples: list[machine.Measurement] = []
         while True:
             wanted = guard.step(self._last, self.dt_s)
-            if isinstance(wanted, Finished):
+            if isinstance(wanted, machine.Finished):
                 self._loop.follow(self._given(0.0), holding_flow_um_per_s, self.dt_s)
                 return Record.from_samples(self.dt_s, flows, samples), wanted
             out = self._loop.follow(self._given(0.0), wanted, self.dt_s)
@@ -85,23 +88,25 @@ class Rig:
             samples.append(self._last)
             self._last = self._bench.exchange(out.pump_fraction, self._config.bleed_fraction)
 
-    def around(self, held: Record, limit_um: float = 10.0) -> Around:
+    def around(self, held: Record, limit_um: float = 10.0) -> machine.Around:
         """The frame of an experiment, from a hold before it."""
         return around_of(held, self._config, self._pump, limit_um)
 
-    def _given(self, target_um: float) -> LoopInput:
+    def _given(self, target_um: float) -> inner_loop.LoopInput:
         now = self._last
-        return LoopInput(target_um, 0.0, now.displacement_um, now.ambient_pressure_pa, now.air_temperature_c)
+        return inner_loop.LoopInput(
+            target_um, 0.0, now.displacement_um, now.ambient_pressure_pa, now.air_temperature_c
+        )
 
     def _fraction(self, flow_um_per_s: float) -> float:
-        return PumpCurve(self._pump).command(flow_um_per_s, self.dt_s) if flow_um_per_s > 0 else 0.0
+        return gas.PumpCurve(self._pump).command(flow_um_per_s, self.dt_s) if flow_um_per_s > 0 else 0.0
 
 
-def around_of(held: Record, loop: LoopConfig, pump: PumpConfig, limit_um: float) -> Around:
+def around_of(held: Record, loop: LoopConfig, pump: PumpConfig, limit_um: float) -> machine.Around:
     """The frame of an experiment: what a hold before it shows, and the pump's range."""
-    return Around(
+    return machine.Around(
         holding_flow_um_per_s=float(held.flow_um_per_s.mean()),
-        least_flow_um_per_s=PumpCurve(pump).least_flow_um_per_s,
+        least_flow_um_per_s=gas.PumpCurve(pump).least_flow_um_per_s,
         full_flow_um_per_s=min(pump.flow_full_um_per_s, loop.flow_max_um_per_s),
         laser_um=laser_noise_um(held),
         limit_um=limit_um,
@@ -117,3 +122,154 @@ def laser_noise_um(record: Record) -> float:
     if steps_um.size == 0:
         raise ValueError("no laser reading in the record")
     return float(np.median(np.abs(steps_um)) / 0.6745 / math.sqrt(2))
+
+
+# A running hold under the tuner's hand: the supervisor stays in charge, its ticks are the record.
+#
+# Records that follow each other have no gap: each begins with the tick after the last one taken, so that what a
+# session did in between (a fit takes a second) is in the next record and not lost.
+
+
+Progress = Callable[[float], None]  # seconds of the hold that have been recorded since the last call
+_HELD = frozenset({State.HOLD, State.TUNE})
+_ANSWER_TICKS = 500  # until the state changes after a command was obeyed: 10 s at 50 Hz
+
+
+class HoldRig:
+    """Holds, experiments and gains on a hold that somebody else runs.
+
+    Parameters
+    ----------
+    link : HoldLink
+    who : str
+        Recorded with every command.
+    progress : callable
+
+    Attributes
+    ----------
+    loop : LoopConfig
+        Gains as they were last set.
+    shapes : list of ShapeEstimate
+        All that came so far.
+    """
+
+    def __init__(self, link: HoldLink, who: str, progress: Progress = lambda seconds: None) -> None:
+        self._link, self._who, self._progress = link, who, progress
+        self._rows: deque[telemetry.TelemetryRow] = deque()
+        self._events: deque[events.Event] = deque()
+        self.loop = link.config.loop
+        self.dt_s = 1 / self.loop.rate_hz
+        self.shapes: list[shape_estimate.ShapeEstimate] = []
+
+    def hold(self, duration_s: float) -> Record:
+        """The next seconds of hold. Raises HoldError if the mirror is not held throughout."""
+        return self.record([self._next_held() for _ in range(round(duration_s / self.dt_s))])
+
+    def hold_about(self, duration_s: float) -> tuple[Record, Series]:
+        """As `hold`, with the setpoint of each sample in um: the outer loop moves it, and the mirror with it."""
+        rows = [self._next_held() for _ in range(round(duration_s / self.dt_s))]
+        record = self.record(rows)
+        ticks = np.array([row.tick + row.missed_ticks for row in rows])
+        setpoints = np.interp(ticks[0] + np.arange(len(record)), ticks, [row.setpoint_um for row in rows])
+        return record, setpoints
+
+    def around(self, held: Record, limit_um: float = 10.0) -> machine.Around:
+        """The frame of an experiment, from a hold before it."""
+        return around_of(held, self.loop, self._link.config.pump, limit_um)
+
+    def perform(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished]:
+        """Let the controller run an experiment; the record ends with the tick that gave the mirror back.
+
+        Raises HoldError if it is refused, or ends in another state than hold.
+        """
+        return self.performed(spec)[:2]
+
+    def performed(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished, events.Event]:
+        """As `perform`, with the event that tells its end (and the pump map's figures)."""
+        self._events.clear()
+        self._link.ask(Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec))
+        rows: list[telemetry.TelemetryRow] = []
+        begun = False
+        while not begun or rows[-1].state == State.TUNE:
+            rows.append(self._next_held())
+            begun = begun or rows[-1].state == State.TUNE
+            if not begun and len(rows) > _ANSWER_TICKS:
+                raise HoldError("the hold took the experiment and did not begin it")
+        told = self._event("experiment")
+        return self.record(rows), machine.Finished(bool(told["completed"]), str(told["reason"])), told
+
+    def set_gains(self, loop: LoopConfig, why: str = "tuning session", trial_s: float = math.nan) -> None:
+        """Bumpless. On trial for a time, the hold goes back by itself without `keep`."""
+        self._link.ask(Command("gains", self._who, why, value=trial_s, loop=loop))
+        self.loop = loop
+
+    def keep(self) -> None:
+        """The gains on trial are good."""
+        self._link.ask(Command("keep", self._who, "verified"))
+
+    def setpoint(self, setpoint_um: float, why: str) -> None:
+        """Move the setpoint."""
+        self._link.ask(Command("setpoint", self._who, why, value=setpoint_um))
+
+    def shape_loop(self, on: bool, why: str) -> None:
+        """Switch the outer loop."""
+        self._link.ask(Command("shape_on" if on else "shape_off", self._who, why))
+
+    def go_back(self, loop: LoopConfig) -> None:
+        """End an experiment that may be running, and set the last good gains."""
+        self._take()
+        if self._rows and self._rows[-1].state == State.TUNE:
+            self._link.ask(Command("hold", self._who, "tuning session interrupted"))
+        if loop != self.loop:
+            self.set_gains(loop, "back to the last good gains")
+
+    def record(self, rows: Sequence[telemetry.TelemetryRow]) -> Record:
+        """Ticks as an even record; one that was skipped has no reading and the flow before it."""
+        flows: list[float] = []
+        samples: list[machine.Measurement] = []
+        flow = next((row.flow_um_per_s for row in rows if math.isfinite(row.flow_um_per_s)), 0.0)
+        tick = rows[0].tick + rows[0].missed_ticks if rows else 0.0
+        for row in rows:
+            place = row.tick + row.missed_ticks
+            gap = max(0, round(place - tick))
+            flows += [flow] * gap
+            samples += [machine.Measurement(math.nan, row.ambient_pressure_pa, row.air_temperature_c)] * gap
+            flow = row.flow_um_per_s if math.isfinite(row.flow_um_per_s) else flow
+            flows.append(flow)
+            samples.append(machine.Measurement(row.displacement_um, row.ambient_pressure_pa, row.air_temperature_c))
+            tick = place + 1
+        return Record.from_samples(self.dt_s, flows, samples)
+
+    def _next_held(self) -> telemetry.TelemetryRow:
+        row = self._peek()
+        if row.state not in _HELD:
+            raise HoldError(
+                f"the mirror is not held (state {State(int(row.state)).name.lower()}): {self._why()}; "
+                "start or resume the hold, then repeat this step"
+            )
+        self._progress(self.dt_s)
+        return self._rows.popleft()
+
+    def _peek(self) -> telemetry.TelemetryRow:
+        while not self._rows:
+            self._take()
+        return self._rows[0]
+
+    def _take(self) -> None:
+        news = self._link.news()
+        self._rows.extend(news.rows)
+        self._events.extend(news.events)
+        self.shapes += news.shapes
+
+    def _event(self, kind: str) -> events.Event:
+        """The newest event of a kind; it may come a moment after its tick."""
+        for _ in range(20):
+            found = [event for event in self._events if event["kind"] == kind]
+            if found:
+                return found[-1]
+            self._take()
+        raise HoldError(f"the hold did not tell of the end of the {kind}")
+
+    def _why(self) -> str:
+        said = [str(e["why"]) for e in self._events if e["kind"] == "state"]
+        return said[-1] if said else "no reason was told"

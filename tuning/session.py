@@ -5,35 +5,24 @@ What a step needs is read from the folder, what it has found is left there.
 Steps that move the mirror take a `HoldRig`; the others run anywhere, at any later time.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl import config_file
-from membrane_ctrl.config import LoopConfig, PumpConfig
-from membrane_ctrl.control.experiments.machine import Around, Finished
-from membrane_ctrl.control.experiments.pump_map import PumpMap
-from membrane_ctrl.errors import RejectedError
-from membrane_ctrl.recording.atomic import users, write_text_atomic
-from tuning import plain
-from tuning.characterise import ExperimentError, Experiments, experiment, fitted, spec_of
-from tuning.design import Candidate, RefusedError, propose, table
-from tuning.disturbance_model import Disturbance, observe
+from membrane_ctrl.config import toml_file as config_file
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from membrane_ctrl.control.experiments import machine, pump_map
+from membrane_ctrl.model import errors, files
+from membrane_ctrl.sessions import folder, live_hold
+from membrane_ctrl.sessions import folder as plain
 from tuning.gains_file import GainsFile, PlantSection, for_hold, load_gains, require_sound, save_gains
-from tuning.hold_link import HoldError
-from tuning.hold_rig import HoldRig
-from tuning.identify import Identified
-from tuning.preview import Preview, preview
-from tuning.quality import Quality
-from tuning.records import Record
-from tuning.records_file import load_record, save_record
-from tuning.robustness import Robustness
-from tuning.session_folder import SessionFolder
-from tuning.verify import STAGES, Stage, Trial, look, settle_s
+from tuning.identification import characterise, identify, records
+from tuning.identification.disturbance import Disturbance, observe
+from tuning.proposal import design, prediction, verify
+from tuning.proposal.preview import Preview, preview
+from tuning.rig import HoldRig
 
 OBSERVE_S = 600.0
 _PREVIEW_SEEDS = 3
@@ -46,18 +35,18 @@ _SPARE_S = 120.0
 class ExperimentsHead:
     """`experiments.json`: what `characterise.Experiments` holds beside its record."""
 
-    around: Around
+    around: machine.Around
     relays_s: float
     pulses_s: tuple[float, float]
-    finished: Finished
+    finished: machine.Finished
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
     """`identified.json`."""
 
-    identified: Identified
-    quality: Quality
+    identified: identify.Identified
+    quality: characterise.Quality
     data_sha256: str
 
 
@@ -65,10 +54,10 @@ class Found:
 class Design:
     """`proposal.json`: a `design.Proposal` without its loop, which is in the gains file."""
 
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[design.Candidate, ...]
     least_std_um: float
     preview: Preview
-    robustness: Robustness
+    robustness: prediction.Robustness
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,52 +84,54 @@ class Verified:
 
     kept: bool
     reason: str
-    stages: tuple[Stage, ...]
+    stages: tuple[verify.Stage, ...]
     before: LoopConfig
     after: LoopConfig
 
 
-def characterise_step(session: SessionFolder, rig: HoldRig, limit_um: float = 10.0) -> Experiments:
+def characterise_step(
+    session: folder.SessionFolder, rig: HoldRig, limit_um: float = 10.0
+) -> characterise.Experiments:
     """Experiments on the mirror. Raises RejectedError naming what would help if none could be completed."""
     session.begin("characterise")
     try:
-        done = experiment(rig, limit_um)
-    except (ExperimentError, ValueError) as error:
-        raise RejectedError(f"characterise: {error}") from None
-    save_record(session.file("experiments.npz"), done.record)
+        done = characterise.experiment(rig, limit_um)
+    except (characterise.ExperimentError, ValueError) as error:
+        raise errors.RejectedError(f"characterise: {error}") from None
+    records.save_record(session.file("experiments.npz"), done.record)
     head = ExperimentsHead(done.around, done.relays_s, done.pulses_s, done.finished)
     plain.write(session.file("experiments.json"), head)
     return done
 
 
-def experiments_of(session: SessionFolder) -> Experiments:
+def experiments_of(session: folder.SessionFolder) -> characterise.Experiments:
     """What the experiments left."""
     session.require("characterise")
     head = plain.read(session.file("experiments.json"), ExperimentsHead)
-    record = load_record(session.file("experiments.npz"))
-    return Experiments(head.around, record, head.relays_s, head.pulses_s, head.finished)
+    record = records.load_record(session.file("experiments.npz"))
+    return characterise.Experiments(head.around, record, head.relays_s, head.pulses_s, head.finished)
 
 
-def identify_step(session: SessionFolder) -> Found:
+def identify_step(session: folder.SessionFolder) -> Found:
     """Fit and verdict; a refused one is kept too, for the report."""
     done = experiments_of(session)
     session.begin("identify")
     try:
-        all_of_it = fitted(done)
+        all_of_it = characterise.fitted(done)
     except ValueError as error:
-        raise RejectedError(f"identify: {error}") from None
+        raise errors.RejectedError(f"identify: {error}") from None
     found = Found(all_of_it.identified, all_of_it.quality, done.record.sha256())
     plain.write(session.file("identified.json"), found)
     return found
 
 
-def found_of(session: SessionFolder) -> Found:
+def found_of(session: folder.SessionFolder) -> Found:
     """What was identified."""
     session.require("identify")
     return plain.read(session.file("identified.json"), Found)
 
 
-def observe_step(session: SessionFolder, rig: HoldRig, duration_s: float = OBSERVE_S) -> Disturbance:
+def observe_step(session: folder.SessionFolder, rig: HoldRig, duration_s: float = OBSERVE_S) -> Disturbance:
     """A quiet hold: the laser's noise and the weather."""
     model = found_of(session).identified.model
     session.begin("observe")
@@ -148,27 +139,27 @@ def observe_step(session: SessionFolder, rig: HoldRig, duration_s: float = OBSER
     try:
         disturbance = observe(record, model, rig.loop)
     except ValueError as error:
-        raise RejectedError(f"observe: {error}") from None
-    save_record(session.file("quiet.npz"), record)
+        raise errors.RejectedError(f"observe: {error}") from None
+    records.save_record(session.file("quiet.npz"), record)
     plain.write(session.file("disturbance.json"), disturbance)
     return disturbance
 
 
-def disturbance_of(session: SessionFolder) -> Disturbance:
+def disturbance_of(session: folder.SessionFolder) -> Disturbance:
     """What was observed."""
     session.require("observe")
     return plain.read(session.file("disturbance.json"), Disturbance)
 
 
-def design_step(session: SessionFolder, reason: str = "tuning session") -> GainsFile:
+def design_step(session: folder.SessionFolder, reason: str = "tuning session") -> GainsFile:
     """Candidates and the proposed gains. Raises RejectedError if the data do not carry a proposal."""
     found, disturbance = found_of(session), disturbance_of(session)
     session.begin("design")
     before = session.head.before
     try:
-        made = propose(found.identified, disturbance, before, pump_of(session), found.quality)
-    except RefusedError as error:
-        raise RejectedError(f"design: {error}") from None
+        made = design.propose(found.identified, disturbance, before, pump_of(session), found.quality)
+    except design.RefusedError as error:
+        raise errors.RejectedError(f"design: {error}") from None
     assert made.chosen.predicted is not None  # a proposal keeps its margins
     gains = GainsFile(
         author=session.head.author,
@@ -181,7 +172,7 @@ def design_step(session: SessionFolder, reason: str = "tuning session") -> Gains
         plant=PlantSection.of(found.identified),
         loop=made.loop,
     )
-    write_text_atomic(users(session.file("candidates.md")), table(made.candidates) + "\n")
+    files.write_text_atomic(files.users(session.file("candidates.md")), design.table(made.candidates) + "\n")
     plain.write(
         session.file("proposal.json"), Design(made.candidates, made.least_std_um, made.preview, made.robustness)
     )
@@ -189,13 +180,13 @@ def design_step(session: SessionFolder, reason: str = "tuning session") -> Gains
     return gains
 
 
-def design_of(session: SessionFolder) -> Design:
+def design_of(session: folder.SessionFolder) -> Design:
     """The candidates."""
     session.require("design")
     return plain.read(session.file("proposal.json"), Design)
 
 
-def preview_step(session: SessionFolder) -> Previewed:
+def preview_step(session: folder.SessionFolder) -> Previewed:
     """Present and proposed gains on the fitted twin with its one-sided pump, over some seeds of weather."""
     session.require("design")
     found, disturbance = found_of(session), disturbance_of(session)
@@ -211,19 +202,19 @@ def preview_step(session: SessionFolder) -> Previewed:
     return done
 
 
-def preview_of(session: SessionFolder) -> Previewed:
+def preview_of(session: folder.SessionFolder) -> Previewed:
     """What the preview showed."""
     session.require("preview")
     return plain.read(session.file("preview.json"), Previewed)
 
 
-def pump_of(session: SessionFolder) -> PumpConfig:
+def pump_of(session: folder.SessionFolder) -> PumpConfig:
     """The pump as mapped in this session, or as configured."""
     path = session.file("pump.toml")
     return config_file.load(path, PumpConfig) if path.exists() else session.config.pump
 
 
-def checked_gains(session: SessionFolder) -> LoopConfig:
+def checked_gains(session: folder.SessionFolder) -> LoopConfig:
     """The session's gains for its hold. Raises InputError if they must not be applied."""
     session.require("design")
     path = session.file("gains.toml")
@@ -232,7 +223,7 @@ def checked_gains(session: SessionFolder) -> LoopConfig:
     return for_hold(gains.loop, session.head.before)
 
 
-def apply_step(session: SessionFolder, rig: HoldRig) -> LoopConfig:
+def apply_step(session: folder.SessionFolder, rig: HoldRig) -> LoopConfig:
     """Set the gains, on trial: without `verify` they go back by themselves."""
     loop = checked_gains(session)
     session.begin("apply")
@@ -242,33 +233,35 @@ def apply_step(session: SessionFolder, rig: HoldRig) -> LoopConfig:
 
 
 def verify_step(
-    session: SessionFolder,
+    session: folder.SessionFolder,
     rig: HoldRig,
-    told: Callable[[Stage], None] = lambda stage: None,
-    stages: tuple[tuple[float, float], ...] = STAGES,
+    told: Callable[[verify.Stage], None] = lambda stage: None,
+    stages: tuple[tuple[float, float], ...] = verify.STAGES,
 ) -> Verified:
     """Hold with the new gains and judge in stages; they are kept, or the old ones are set again at once."""
     session.require("apply")
     after, before = checked_gains(session), session.head.before
     session.begin("verify")
-    trial = Trial(found_of(session).identified.model, disturbance_of(session), before, after)
-    rig.set_gains(after, f"session {session.path.name}: verification", settle_s(after) + stages[-1][0] + _SPARE_S)
-    looks: list[Stage] = []
-    record: Record | None = None
+    trial = verify.Trial(found_of(session).identified.model, disturbance_of(session), before, after)
+    rig.set_gains(
+        after, f"session {session.path.name}: verification", verify.settle_s(after) + stages[-1][0] + _SPARE_S
+    )
+    looks: list[verify.Stage] = []
+    record: records.Record | None = None
     setpoint_um = np.empty(0)
     reason = ""
     try:
-        rig.hold(settle_s(after))
+        rig.hold(verify.settle_s(after))
         for until_s, growth_max in stages:
             more, about_um = rig.hold_about(until_s - setpoint_um.size * rig.dt_s)
             record = more if record is None else record.followed_by(more)
             setpoint_um = np.concatenate((setpoint_um, about_um))
-            looks.append(look(record, setpoint_um, trial, growth_max))
+            looks.append(verify.look(record, setpoint_um, trial, growth_max))
             told(looks[-1])
             reason = looks[-1].reason
             if reason:
                 break
-    except HoldError as error:
+    except live_hold.HoldError as error:
         reason = str(error)
     if reason:
         rig.set_gains(before, f"verification failed: {reason}"[:250])
@@ -276,31 +269,31 @@ def verify_step(
         rig.keep()
     done = Verified(not reason, reason, tuple(looks), before, after)
     if record is not None:
-        save_record(session.file("verify.npz"), record)
+        records.save_record(session.file("verify.npz"), record)
     plain.write(session.file("verified.json"), done)
     return done
 
 
-def verified_of(session: SessionFolder) -> Verified:
+def verified_of(session: folder.SessionFolder) -> Verified:
     """How the verification ended."""
     session.require("verify")
     return plain.read(session.file("verified.json"), Verified)
 
 
-def map_pump(session: SessionFolder, rig: HoldRig) -> PumpMap:
+def map_pump(session: folder.SessionFolder, rig: HoldRig) -> pump_map.PumpMap:
     """Measure the pump on the mirror; later steps of this session use what was found.
 
     Raises RejectedError if the map could not be completed, or is none a pump could have.
     """
     around = rig.around(rig.hold(40.0))
-    _, finished, event = rig.performed(spec_of("pump_map", around, 1200.0))
+    _, finished, event = rig.performed(characterise.spec_of("pump_map", around, 1200.0))
     if not finished.completed:
-        raise RejectedError(f"pump map: {finished.reason}")
+        raise errors.RejectedError(f"pump map: {finished.reason}")
     values = {name: math.nan if value is None else value for name, value in event["pump_map"].items()}
-    found = plain.built(PumpMap, values)
+    found = plain.built(pump_map.PumpMap, values)
     if not (math.isfinite(found.start_fraction) and math.isfinite(found.stall_fraction)):
-        raise RejectedError("pump map: the pump never started or never stalled; check the pump and its supply")
+        raise errors.RejectedError("pump map: the pump never started or never stalled; check the pump and its supply")
     mapped = found.applied_to(session.config.pump)
-    write_text_atomic(users(session.file("pump.toml")), config_file.dump(mapped))
+    files.write_text_atomic(files.users(session.file("pump.toml")), config_file.dump(mapped))
     plain.write(session.file("pump_map.json"), found)
     return found

@@ -1,7 +1,5 @@
 """A session as a Rerun recording with its own blueprint: experiment, fit, residual, candidates, before and after."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -9,11 +7,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from membrane_ctrl.sessions.folder import SessionFolder
 from tuning import session
-from tuning.plant_model import driven_um
-from tuning.records import Record
-from tuning.records_file import load_record
-from tuning.session_folder import SessionFolder
+from tuning.identification import loop_model, records
 
 Values = NDArray[np.floating[Any]]
 
@@ -29,7 +25,7 @@ def write_recording(folder: SessionFolder) -> None:
     if folder.done("characterise"):
         _experiments(stream, folder)
     if folder.done("observe"):
-        _record(stream, "before", load_record(folder.file("quiet.npz")))
+        _record(stream, "before", records.load_record(folder.file("quiet.npz")))
     if folder.done("design"):
         markdown = folder.candidates()
         stream.log("candidates/table", rr.TextDocument(markdown, media_type="text/markdown"), static=True)
@@ -38,7 +34,7 @@ def write_recording(folder: SessionFolder) -> None:
         stream.log("candidates/std_um", rr.BarChart(stds), static=True)
         stream.log("candidates/ms", rr.BarChart([row.margins.ms for row in rows]), static=True)
     if folder.file("verify.npz").exists():
-        _record(stream, "after", load_record(folder.file("verify.npz")))
+        _record(stream, "after", records.load_record(folder.file("verify.npz")))
     stream.flush()
     stream.disconnect()
 
@@ -51,14 +47,14 @@ def _experiments(stream: rr.RecordingStream, folder: SessionFolder) -> None:
     found = session.found_of(folder).identified
     model = found.model
     time_s = np.arange(len(record)) * record.dt_s
-    way = model.gain * driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
+    way = model.gain * loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
     way = way - model.leak_um_per_s * time_s
     way += float(np.mean(record.filled_displacement_um() - way))
     _series(stream, "fit/pump_share_um", time_s, way)
     _series(stream, "residual/prediction_error_um", time_s[1:], found.residual_um)
 
 
-def _record(stream: rr.RecordingStream, name: str, record: Record) -> None:
+def _record(stream: rr.RecordingStream, name: str, record: records.Record) -> None:
     time_s = np.arange(len(record)) * record.dt_s
     _series(stream, f"{name}/flow_um_per_s", time_s, record.flow_um_per_s)
     _series(stream, f"{name}/displacement_um", time_s, record.displacement_um)

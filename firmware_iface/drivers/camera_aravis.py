@@ -7,8 +7,6 @@ frame that does not come whole is lost and counted; `grab` takes it again. After
 anew, since a late frame would be taken for the answer to the next trigger.
 """
 
-from __future__ import annotations
-
 import ctypes
 import threading
 import time

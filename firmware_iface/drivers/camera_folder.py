@@ -3,8 +3,6 @@
 For trying the cycle without a camera: pictures of a bench, or what `membrane-ctrl simulate` writes.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

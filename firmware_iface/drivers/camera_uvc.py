@@ -5,8 +5,6 @@ frames in a queue; a frame belongs to a pattern only if it was begun after the p
 which may have been begun before is read and thrown away.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

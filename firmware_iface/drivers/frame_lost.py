@@ -1,7 +1,5 @@
 """A frame that did not come whole, and taking it again."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np

@@ -9,16 +9,12 @@ checksum. Even parity at the unit's switches (and here) stops most hit bytes; a 
 by more than `step_max_um` is not believed; a smaller error passes as noise.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 import re
 
-from firmware_iface.drivers.linked_device import LinkedDevice
-from firmware_iface.drivers.step_gate import StepGate
-from firmware_iface.links.lines import LineFence, LineLink
-from firmware_iface.links.serial_port import BytePort, SerialSettings, as_port
+from firmware_iface.drivers.linked_device import LinkedDevice, StepGate
+from firmware_iface.links import exchange, serial_port
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, DisplacementSample, LinkError
 
 MANUAL = "DL-RS1A user's manual, IL edition, pages 7-16"
@@ -71,7 +67,7 @@ class KeyenceDlRs1a(LinkedDevice):
 
     def __init__(
         self,
-        port: str | BytePort,
+        port: str | serial_port.BytePort,
         baud: int = 9600,
         parity: str = "N",
         amplifier: int = 0,
@@ -86,7 +82,7 @@ class KeyenceDlRs1a(LinkedDevice):
             raise ValueError(f"amplifier = {amplifier}: wanted 0 .. 14")
         if direction not in (-1, 1):
             raise ValueError(f"direction = {direction}: wanted 1 or -1")
-        self._settings = SerialSettings(baud, parity=parity)
+        self._settings = serial_port.SerialSettings(baud, parity=parity)
         self._amplifier, self._zero_mm, self._direction = amplifier, zero_mm, direction
         self._step_max_um = step_max_um
         number = f"{amplifier:02d}"
@@ -95,7 +91,9 @@ class KeyenceDlRs1a(LinkedDevice):
         self._errors_command = f"SR,{number},033"
         self._errors_answer = re.compile(rf"(?:SR,{number},033,(\d{{5}})|ER,SR,(\d\d))\r\n?")
         # the fence has to differ from a reading also when it is refused, as when the amplifier is pulled off: `M0`
-        self._link = LineLink(as_port(port, self._settings), "\r\n", timeout_s, LineFence("M0", _ALL, _ALL_CHARS))
+        self._link = exchange.LineLink(
+            serial_port.as_port(port, self._settings), "\r\n", timeout_s, exchange.LineFence("M0", _ALL, _ALL_CHARS)
+        )
         super().__init__(self._link)
         self._gate = StepGate(step_max_um)
         self._decimals = 3

@@ -1,7 +1,5 @@
 """Any Modbus device by a map from the configuration: one register is one role's value."""
 
-from __future__ import annotations
-
 import contextlib
 import struct
 import time

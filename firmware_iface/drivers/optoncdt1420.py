@@ -9,8 +9,6 @@ of 80 values). A hit byte, which nothing in the protocol shows, is one outlier a
 median, the mean resolves less than a digital step (0.8 um at 50 mm range).
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import math
@@ -19,9 +17,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.drivers.linked_device import LinkedDevice
-from firmware_iface.drivers.optoncdt_stream import BYTES, RAW_MAX, StreamParser, distance_mm
-from firmware_iface.drivers.step_gate import StepGate
+from firmware_iface.drivers import linked_device, optoncdt_stream
 from firmware_iface.links.serial_port import BytePort, SerialSettings, as_port
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, DisplacementSample, LinkDownError, LinkError
 
@@ -46,7 +42,7 @@ _BATCHES_MAX = 1024  # of a caller that stays away; old ones go first
 _SILENT_MAX = 3  # readings without a single value: the sensor restarted or lost its power
 
 
-class Optoncdt1420(LinkedDevice):
+class Optoncdt1420(linked_device.LinkedDevice):
     """A `DisplacementSensor`.
 
     Displacement = direction * (distance - zero). The sensor stands behind the mirror: when the bowl deepens the
@@ -94,7 +90,7 @@ class Optoncdt1420(LinkedDevice):
         if direction not in (-1, 1):
             raise ValueError(f"direction = {direction}: wanted 1 or -1")
         settings = SerialSettings(baud)
-        if (needed := 1000 * rate_khz * BYTES * settings.char_s) > 0.9:
+        if (needed := 1000 * rate_khz * optoncdt_stream.BYTES * settings.char_s) > 0.9:
             raise ValueError(f"baud = {baud} cannot carry rate_khz = {rate_khz:g} (line {needed:.0%} busy)")
         self._port = as_port(port, settings)
         super().__init__(self._port)
@@ -109,9 +105,9 @@ class Optoncdt1420(LinkedDevice):
         self._range_mm = self._zero_mm = math.nan
         self._heard: bytes | None = b""  # None while streaming
         self._stir = asyncio.Event()
-        self._parser = StreamParser()
+        self._parser = optoncdt_stream.StreamParser()
         self._batches: list[NDArray[np.int64]] = []
-        self._gate = StepGate(self._step_max_um)
+        self._gate = linked_device.StepGate(self._step_max_um)
         self._counted = 0
         self._arrived_s = 0.0
         self._silent = 0
@@ -204,7 +200,7 @@ class Optoncdt1420(LinkedDevice):
         for _ in range(2):
             await self._wait_for_values()
             values = self._taken()
-            good = values[values <= RAW_MAX]
+            good = values[values <= optoncdt_stream.RAW_MAX]
             if len(good):
                 self._gate.passes(self._displacement_um(middle(good)))
 
@@ -231,9 +227,9 @@ class Optoncdt1420(LinkedDevice):
         self._silent = 0
         self._port.succeeded()
         values = self._taken()
-        good = values[values <= RAW_MAX]
+        good = values[values <= optoncdt_stream.RAW_MAX]
         if 2 * len(good) <= len(values):
-            codes, counts = np.unique(values[values > RAW_MAX], return_counts=True)
+            codes, counts = np.unique(values[values > optoncdt_stream.RAW_MAX], return_counts=True)
             return DisplacementSample(math.nan, int(codes[np.argmax(counts)]), self._counted, self._arrived_s)
         raw = middle(good)
         displacement_um = self._displacement_um(raw)
@@ -245,7 +241,7 @@ class Optoncdt1420(LinkedDevice):
         return DisplacementSample(math.nan if quality else displacement_um, quality, self._counted, self._arrived_s)
 
     def _displacement_um(self, raw: float) -> float:
-        return 1000 * self._direction * (distance_mm(raw, self._range_mm) - self._zero_mm)
+        return 1000 * self._direction * (optoncdt_stream.distance_mm(raw, self._range_mm) - self._zero_mm)
 
     async def _wait_for_values(self) -> None:
         if not self._port.is_open:

@@ -8,8 +8,6 @@ There is no checksum, and where bytes are lost two measurements can join to one 
 a measurement is trusted only when its counter is the one before plus one.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

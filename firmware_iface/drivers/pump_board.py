@@ -1,28 +1,15 @@
 """The membrane pump board over Modbus TCP or RTU as a `Bench`."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import secrets
 from collections.abc import Mapping
 from dataclasses import replace
 
+from firmware_iface import roles
 from firmware_iface.drivers.linked_device import LinkedDevice
-from firmware_iface.links.modbus_links import ModbusLinks
-from firmware_iface.links.modbus_rules import ModbusLink
+from firmware_iface.links import modbus_links, modbus_rules
 from firmware_iface.register_map import Block, default_map, known_maps
-from firmware_iface.roles import (
-    FOREIGN_CLAIM,
-    FOREIGN_PERIOD,
-    BenchCommand,
-    BenchIdentity,
-    BenchReading,
-    DeviceBusyError,
-    DeviceRefusedError,
-    LinkDownError,
-    LinkError,
-)
 
 _KIND = "membrane pump board"
 # of a board of map version 1, for people
@@ -71,10 +58,10 @@ class PumpBoard(LinkedDevice):
         unit_id: int = 1,
         timeout_s: float = 0.2,
         watchdog_s: float = 0.5,
-        link: ModbusLink | None = None,
+        link: modbus_rules.ModbusLink | None = None,
     ) -> None:
         if link is None:
-            link = ModbusLinks().link(url, unit_id, timeout_s)
+            link = modbus_links.ModbusLinks().link(url, unit_id, timeout_s)
         self._registers = default_map()  # of the board that answers, once it has said its version
         period = self._registers.register("watchdog_period_s")
         if not period.allows(watchdog_s):
@@ -91,7 +78,7 @@ class PumpBoard(LinkedDevice):
         self._link = link
         super().__init__(self._link)
 
-    async def open(self) -> BenchIdentity:
+    async def open(self) -> roles.BenchIdentity:
         """Connect, check kind and map version, claim the board, arm its watchdog and read both back.
 
         The watchdog runs from here on: write within its period, pump 0 too.
@@ -108,12 +95,12 @@ class PumpBoard(LinkedDevice):
         identity = await self.identify()
         try:
             await self._arm()
-        except LinkError:
+        except roles.LinkError:
             await self._link.close()
             raise
         return replace(identity, watchdog_s=self._watchdog_s)
 
-    async def identify(self) -> BenchIdentity:
+    async def identify(self) -> roles.BenchIdentity:
         """Connect and check kind and map version; nothing is written. `read` then works, `write` does not.
 
         Raises as `open`; the identity's `watchdog_s` is NaN, as nothing was set.
@@ -122,28 +109,28 @@ class PumpBoard(LinkedDevice):
         await self._link.connect()
         try:
             return await self._identify()
-        except LinkError:
+        except roles.LinkError:
             await self._link.close()
             raise
 
-    async def _identify(self) -> BenchIdentity:
+    async def _identify(self) -> roles.BenchIdentity:
         # these two never move; the rest means something only when they are right
         identity = default_map().block("identity")
         kind, version = await self._link.read_holding(identity.address, 2)
         if kind != default_map().device_kind:
-            raise DeviceRefusedError(
+            raise roles.DeviceRefusedError(
                 f"{self._link.name}: device kind {kind} is not a {_KIND} ({default_map().device_kind})"
             )
         if version not in known_maps():
             known = " and ".join(str(known) for known in known_maps())
-            raise DeviceRefusedError(
+            raise roles.DeviceRefusedError(
                 f"{self._link.name}: register map version {version}, this program knows {known}; "
                 "update the firmware or the program"
             )
         self._registers = known_maps()[version]
         found = await self._read(identity)
         firmware = int(found["firmware_version"])
-        return BenchIdentity(
+        return roles.BenchIdentity(
             _KIND,
             version,
             f"{firmware >> 16}.{firmware >> 8 & 0xFF}.{firmware & 0xFF}",
@@ -155,13 +142,13 @@ class PumpBoard(LinkedDevice):
     async def _arm(self) -> None:
         try:
             await self._write_settings(arm=1.0)
-        except DeviceBusyError:
+        except roles.DeviceBusyError:
             raise await self._held_by_another() from None
         settings = await self._read(self._registers.block("settings"))
         sensors = await self._sensors()
         set_s = settings["watchdog_period_s"]
         if (set_s, settings["watchdog_arm"]) != (self._watchdog_s, 1.0) or self._foreign(sensors):
-            raise DeviceRefusedError(
+            raise roles.DeviceRefusedError(
                 f"{self._link.name}: watchdog set to {self._watchdog_s:g} s and armed, read back as {set_s:g} s, "
                 f"armed {settings['watchdog_arm']:g}, claim {int(sensors.get('claim_in_force', 0)):#x}; "
                 "not safe to run"
@@ -170,16 +157,16 @@ class PumpBoard(LinkedDevice):
         self._heartbeat = int(sensors["heartbeat_echo"])
         self._armed, self._busy_writes = True, 0
 
-    async def _held_by_another(self) -> DeviceBusyError:
+    async def _held_by_another(self) -> roles.DeviceBusyError:
         sensors = await self._sensors()
         period_s = sensors["period_in_force_s"]
-        return DeviceBusyError(
+        return roles.DeviceBusyError(
             f"{self._link.name}: another program holds the board (claim {int(sensors['claim_in_force']):#x}, "
             f"watchdog {period_s:g} s); stop that one first",
             lapses_in_s=period_s,
         )
 
-    async def read(self) -> BenchReading:
+    async def read(self) -> roles.BenchReading:
         """One sample of everything, in one transaction.
 
         Raises
@@ -192,8 +179,10 @@ class PumpBoard(LinkedDevice):
         values = await self._sensors()
         if self._armed and not values["watchdog_armed"]:
             await self._link.close()
-            raise LinkDownError(f"{self._link.name}: the watchdog is off, so the board restarted; open it again")
-        return BenchReading(
+            raise roles.LinkDownError(
+                f"{self._link.name}: the watchdog is off, so the board restarted; open it again"
+            )
+        return roles.BenchReading(
             displacement_um=values["displacement_um"],
             displacement_quality=int(values["displacement_quality"]),
             gauge_pressure_pa=values["gauge_pressure_pa"],
@@ -214,9 +203,9 @@ class PumpBoard(LinkedDevice):
         if self._registers.map_version == 1:
             return 0
         taken = sensors["claim_in_force"] != self._claim_id or self._busy_writes >= _BUSY_WRITES_MAX
-        return FOREIGN_CLAIM * taken | FOREIGN_PERIOD * (sensors["period_in_force_s"] != self._watchdog_s)
+        return roles.FOREIGN_CLAIM * taken | roles.FOREIGN_PERIOD * (sensors["period_in_force_s"] != self._watchdog_s)
 
-    async def write(self, command: BenchCommand) -> None:
+    async def write(self, command: roles.BenchCommand) -> None:
         """Write pump and vent with a new heartbeat, in one transaction: what feeds the watchdog.
 
         Raises
@@ -240,7 +229,7 @@ class PumpBoard(LinkedDevice):
         }
         try:
             await self._write("command", values)
-        except DeviceBusyError:
+        except roles.DeviceBusyError:
             self._busy_writes += 1
             raise
         self._busy_writes = 0
@@ -270,7 +259,7 @@ class PumpBoard(LinkedDevice):
         The board refuses to be disarmed while the pump is commanded: then the watchdog stays and turns it off.
         """
         if self._armed and self._link.connected:
-            with contextlib.suppress(LinkError):  # the watchdog then does what it is for
+            with contextlib.suppress(roles.LinkError):  # the watchdog then does what it is for
                 await self._write_settings(arm=0.0)
         self._armed = False
         await self._link.close()

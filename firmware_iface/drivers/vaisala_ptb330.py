@@ -8,16 +8,13 @@ value is seen), the serial number (another instrument is seen) and a checksum (s
 65536): `FORM 4.3 P U3 ERR MCTR SN CS4`.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 import re
 from dataclasses import dataclass
 
 from firmware_iface.drivers.linked_device import LinkedDevice
-from firmware_iface.links.lines import LineFence, LineLink
-from firmware_iface.links.serial_port import BytePort, SerialSettings, as_port
+from firmware_iface.links import exchange, serial_port
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
 
 MANUAL = "PTB330 user's guide M210855EN, pages 70-88"
@@ -62,14 +59,16 @@ class VaisalaPtb330(LinkedDevice):
 
     def __init__(
         self,
-        port: str | BytePort,
+        port: str | serial_port.BytePort,
         baud: int = 4800,
         period_s: float = 0.2,
         age_max_s: float = 3.0,
         timeout_s: float = 0.3,
     ) -> None:
-        self._settings = SerialSettings(baud, data_bits=7, parity="E")
-        self._link = LineLink(as_port(port, self._settings), "\r\n", timeout_s, LineFence("VERS", _VERSION))
+        self._settings = serial_port.SerialSettings(baud, data_bits=7, parity="E")
+        self._link = exchange.LineLink(
+            serial_port.as_port(port, self._settings), "\r\n", timeout_s, exchange.LineFence("VERS", _VERSION)
+        )
         super().__init__(self._link)
         self._period_s, self._age_max_s = period_s, age_max_s
         self._task: asyncio.Task[None] | None = None

@@ -7,14 +7,11 @@ The pump has no watchdog: it runs on at its last power when the host is gone, an
 its analogue input says, until it is told otherwise. Where gas must stop by itself, something else has to see to it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 
 from firmware_iface.drivers.linked_device import LinkedDevice
-from firmware_iface.links.lines import LineFence, LineLink
-from firmware_iface.links.serial_port import BytePort, SerialSettings, as_port
+from firmware_iface.links import exchange, serial_port
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
 
 MANUAL = "TN003 Communications Guide; no watchdog: the pump runs on when the host is gone"
@@ -48,14 +45,18 @@ class Ventus(LinkedDevice):
         More power than these pumps are made for.
     """
 
-    def __init__(self, port: str | BytePort, power_max_mw: float = 1000.0, timeout_s: float = 0.1) -> None:
+    def __init__(
+        self, port: str | serial_port.BytePort, power_max_mw: float = 1000.0, timeout_s: float = 0.1
+    ) -> None:
         if not 0 < power_max_mw <= POWER_MAX_MW:
             raise ValueError(f"power_max_mw = {power_max_mw:g}: wanted more than 0, at most {POWER_MAX_MW:g}")
         self._power_max_mw = power_max_mw
         # streamed lines may be on their way when the stream is switched off
-        fence = LineFence(f"#R{DEVICE_TYPE}", re.compile(rf"(?:#S[^\n]*\n)*#R{DEVICE_TYPE},({_NUMBER})\r?\n"))
-        self._settings = SerialSettings(115_200)
-        self._link = LineLink(as_port(port, self._settings), "\n", timeout_s, fence)
+        fence = exchange.LineFence(
+            f"#R{DEVICE_TYPE}", re.compile(rf"(?:#S[^\n]*\n)*#R{DEVICE_TYPE},({_NUMBER})\r?\n")
+        )
+        self._settings = serial_port.SerialSettings(115_200)
+        self._link = exchange.LineLink(serial_port.as_port(port, self._settings), "\n", timeout_s, fence)
         super().__init__(self._link)
         self._commanded_mw = 0.0
 

@@ -1,7 +1,5 @@
 """What the pump board does, without bytes, clock or asyncio: registers, watchdog, latches, its own limits."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,49 +1,17 @@
 """Bronkhorst EL-FLOW and EL-PRESS over any plant, as Modbus registers or as a ProPar device on a serial line."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Sequence
 
-from firmware_iface.drivers.bronkhorst import (
-    ALL,
-    BUS_SETPOINT,
-    CAPACITY,
-    CAPACITY_UNIT,
-    CONTROL_MODE,
-    DEVICE_TYPE,
-    FIRMWARE,
-    FMEASURE,
-    FSETPOINT,
-    FULL_SCALE,
-    MEASURE,
-    SERIAL_NUMBER,
-    SETPOINT,
-    TEMPERATURE,
-    Parameter,
-)
-from firmware_iface.drivers.bronkhorst_modbus import register_of
-from firmware_iface.drivers.propar import (
-    REQUEST,
-    STATUS,
-    VALUES,
-    WRITE,
-    Message,
-    ascii_frame,
-    binary_frame,
-    parse_ascii,
-    split_binary,
-    values,
-)
-from firmware_iface.emulators.modbus_server import ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterRefusal
-from firmware_iface.emulators.serial_device import SerialDevice
+from firmware_iface.drivers import bronkhorst, bronkhorst_propar
+from firmware_iface.emulators import modbus_server, serial_device
 from firmware_iface.links.serial_port import SerialSettings
 
 ANALOG_INPUT = 1  # control mode after power-up: not the bus
 _COUNTS_MAX = 41_942
 _NODE_ANY = 128
 _PARAMETER_ERROR, _TYPE_ERROR, _VALUE_ERROR, _COMMAND_ERROR, _READ_ONLY = 4, 5, 6, 2, 13
-_BY_PLACE = {(parameter.process, parameter.number): parameter for parameter in ALL}
+_BY_PLACE = {(parameter.process, parameter.number): parameter for parameter in bronkhorst.ALL}
 _FORMATS = {"u8": ">B", "u16": ">H", "f32": ">f"}
 _TYPES = {"u8": 0x00, "u16": 0x20, "f32": 0x40, "text": 0x60}
 
@@ -76,7 +44,12 @@ class Instrument:
         measured: Callable[[], float] | None = None,
         actuate: Callable[[float], None] | None = None,
     ) -> None:
-        self._texts = {DEVICE_TYPE: device_type, SERIAL_NUMBER: serial, CAPACITY_UNIT: unit, FIRMWARE: "V1.10"}
+        self._texts = {
+            bronkhorst.DEVICE_TYPE: device_type,
+            bronkhorst.SERIAL_NUMBER: serial,
+            bronkhorst.CAPACITY_UNIT: unit,
+            bronkhorst.FIRMWARE: "V1.10",
+        }
         self._capacity = capacity
         self._measured = measured
         self._actuate = actuate
@@ -84,51 +57,58 @@ class Instrument:
 
     def restart(self) -> None:
         """Power-up: valve closed, and the setpoint from the analog input again."""
-        self._settings = {SETPOINT: 0, CONTROL_MODE: ANALOG_INPUT}
+        self._settings = {bronkhorst.SETPOINT: 0, bronkhorst.CONTROL_MODE: ANALOG_INPUT}
         self._drive()
 
     @property
     def fraction(self) -> float:
         """What flows, of the capacity."""
-        return self._settings[SETPOINT] / FULL_SCALE if self._settings[CONTROL_MODE] == BUS_SETPOINT else 0.0
+        return (
+            self._settings[bronkhorst.SETPOINT] / bronkhorst.FULL_SCALE
+            if self._settings[bronkhorst.CONTROL_MODE] == bronkhorst.BUS_SETPOINT
+            else 0.0
+        )
 
     def _drive(self) -> None:
         if self._actuate is not None:
             self._actuate(self.fraction)
 
-    def raw(self, parameter: Parameter) -> bytes:
+    def raw(self, parameter: bronkhorst.Parameter) -> bytes:
         """A parameter as bytes, big end first; a text has its full length."""
         if parameter.kind == "text":
             return self._texts[parameter].encode().ljust(parameter.chars, b"\0")[: parameter.chars]
         return struct.pack(_FORMATS[parameter.kind], self._number(parameter))
 
-    def _number(self, parameter: Parameter) -> float:
+    def _number(self, parameter: bronkhorst.Parameter) -> float:
         if parameter in self._settings:
             return self._settings[parameter]
         measured = self.fraction * self._capacity if self._measured is None else self._measured()
-        counts = round(measured / self._capacity * FULL_SCALE)
+        counts = round(measured / self._capacity * bronkhorst.FULL_SCALE)
         return {
-            MEASURE: min(max(counts, _COUNTS_MAX - 0x10000 + 1), _COUNTS_MAX) % 0x10000,
-            FMEASURE: measured,
-            FSETPOINT: self._settings[SETPOINT] / FULL_SCALE * self._capacity,
-            CAPACITY: self._capacity,
-            TEMPERATURE: 20.0,
+            bronkhorst.MEASURE: min(max(counts, _COUNTS_MAX - 0x10000 + 1), _COUNTS_MAX) % 0x10000,
+            bronkhorst.FMEASURE: measured,
+            bronkhorst.FSETPOINT: self._settings[bronkhorst.SETPOINT] / bronkhorst.FULL_SCALE * self._capacity,
+            bronkhorst.CAPACITY: self._capacity,
+            bronkhorst.TEMPERATURE: 20.0,
         }[parameter]
 
-    def write(self, parameter: Parameter, raw: bytes) -> bool:
+    def write(self, parameter: bronkhorst.Parameter, raw: bytes) -> bool:
         """Take a setting; False when the value is impossible."""
-        if parameter == FSETPOINT:
-            parameter, value = SETPOINT, round(struct.unpack(">f", raw)[0] / self._capacity * FULL_SCALE)
+        if parameter == bronkhorst.FSETPOINT:
+            parameter, value = (
+                bronkhorst.SETPOINT,
+                round(struct.unpack(">f", raw)[0] / self._capacity * bronkhorst.FULL_SCALE),
+            )
         else:
             (value,) = struct.unpack(_FORMATS[parameter.kind], raw)
-        if not 0 <= value <= (FULL_SCALE if parameter == SETPOINT else 255):
+        if not 0 <= value <= (bronkhorst.FULL_SCALE if parameter == bronkhorst.SETPOINT else 255):
             return False
         self._settings[parameter] = value
         self._drive()
         return True
 
 
-WRITABLE = (SETPOINT, FSETPOINT, CONTROL_MODE)
+WRITABLE = (bronkhorst.SETPOINT, bronkhorst.FSETPOINT, bronkhorst.CONTROL_MODE)
 
 
 class BronkhorstRegisters:
@@ -140,8 +120,8 @@ class BronkhorstRegisters:
     def read(self, address: int, count: int) -> list[int]:
         """Words. Raises RegisterRefusal."""
         words: dict[int, int] = {}
-        for parameter in ALL:
-            first, length = register_of(parameter)
+        for parameter in bronkhorst.ALL:
+            first, length = bronkhorst.register_of(parameter)
             if first < address + count and address < first + length:
                 raw = self._instrument.raw(parameter).rjust(2, b"\0")
                 raw += b"\0" * (2 * length - len(raw))
@@ -149,22 +129,22 @@ class BronkhorstRegisters:
         try:
             return [words[at] for at in range(address, address + count)]
         except KeyError:
-            raise RegisterRefusal(ILLEGAL_ADDRESS) from None
+            raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_ADDRESS) from None
 
     def write(self, address: int, words: Sequence[int]) -> None:
         """One parameter. Raises RegisterRefusal."""
         for parameter in WRITABLE:
-            if register_of(parameter) == (address, len(words)):
+            if bronkhorst.register_of(parameter) == (address, len(words)):
                 raw = struct.pack(f">{len(words)}H", *words)
                 if parameter.kind == "u8" and raw[0]:
-                    raise RegisterRefusal(ILLEGAL_VALUE)
+                    raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_VALUE)
                 if not self._instrument.write(parameter, raw[1:] if parameter.kind == "u8" else raw):
-                    raise RegisterRefusal(ILLEGAL_VALUE)
+                    raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_VALUE)
                 return
-        raise RegisterRefusal(ILLEGAL_ADDRESS)
+        raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_ADDRESS)
 
 
-class ProparDevice(SerialDevice):
+class ProparDevice(serial_device.SerialDevice):
     """The instrument on a serial line; answers in the form it is asked in, binary or ASCII."""
 
     def __init__(self, instrument: Instrument, settings: SerialSettings, node: int = 3, seed: int = 0) -> None:
@@ -182,35 +162,35 @@ class ProparDevice(SerialDevice):
         """Answer every whole message."""
         self._heard += data
         if b"\x10\x02" in self._heard:
-            messages, self._heard = split_binary(self._heard)
+            messages, self._heard = bronkhorst_propar.split_binary(self._heard)
             for message in messages:
-                self._hear(message, binary_frame)
+                self._hear(message, bronkhorst_propar.binary_frame)
         while b"\r\n" in self._heard:
             line, self._heard = self._heard.split(b"\r\n", 1)
-            ascii_message = parse_ascii(line)
+            ascii_message = bronkhorst_propar.parse_ascii(line)
             if ascii_message is not None:
-                self._hear(ascii_message, ascii_frame)
+                self._hear(ascii_message, bronkhorst_propar.ascii_frame)
 
-    def _hear(self, message: Message, frame: Callable[[Message], bytes]) -> None:
+    def _hear(self, message: bronkhorst_propar.Message, frame: Callable[[bronkhorst_propar.Message], bytes]) -> None:
         if message.node not in (self._node, _NODE_ANY):
             return
         try:
             answer = self._answer(message.data)
         except (ValueError, IndexError):
-            answer = bytes([STATUS, _COMMAND_ERROR, 0])
+            answer = bytes([bronkhorst_propar.STATUS, _COMMAND_ERROR, 0])
         if answer:
-            self.say(frame(Message(message.sequence, message.node, answer)))
+            self.say(frame(bronkhorst_propar.Message(message.sequence, message.node, answer)))
 
     def _answer(self, data: bytes) -> bytes:
-        if data[0] == REQUEST:
+        if data[0] == bronkhorst_propar.REQUEST:
             return self._values(data)
-        if data[0] in (WRITE, VALUES):
+        if data[0] in (bronkhorst_propar.WRITE, bronkhorst_propar.VALUES):
             status = self._written(data)
-            return bytes([STATUS, status, len(data)]) if data[0] == WRITE else b""
-        return bytes([STATUS, _COMMAND_ERROR, 0])
+            return bytes([bronkhorst_propar.STATUS, status, len(data)]) if data[0] == bronkhorst_propar.WRITE else b""
+        return bytes([bronkhorst_propar.STATUS, _COMMAND_ERROR, 0])
 
     def _written(self, data: bytes) -> int:
-        for process, number, raw in values(data):
+        for process, number, raw in bronkhorst_propar.values(data):
             parameter = _BY_PLACE.get((process, number))
             if parameter is None:
                 return _PARAMETER_ERROR
@@ -224,7 +204,7 @@ class ProparDevice(SerialDevice):
 
     def _values(self, data: bytes) -> bytes:
         """The answer to a request: each value under the indices that the request gave it."""
-        answer, at, chained = bytearray([VALUES]), 1, False
+        answer, at, chained = bytearray([bronkhorst_propar.VALUES]), 1, False
         while at < len(data):
             if not chained:
                 answer.append(data[at])
@@ -234,9 +214,9 @@ class ProparDevice(SerialDevice):
             at += 3
             parameter = _BY_PLACE.get((process, asked & 0x1F))
             if parameter is None:
-                return bytes([STATUS, _PARAMETER_ERROR, at])
+                return bytes([bronkhorst_propar.STATUS, _PARAMETER_ERROR, at])
             if kind != _TYPES[parameter.kind]:
-                return bytes([STATUS, _TYPE_ERROR, at])
+                return bytes([bronkhorst_propar.STATUS, _TYPE_ERROR, at])
             answer.append(index)
             raw = self.instrument.raw(parameter)
             if kind == 0x60:

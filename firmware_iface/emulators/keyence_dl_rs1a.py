@@ -1,7 +1,5 @@
 """A Keyence DL-RS1A with amplifiers on it (manual of the IL edition, pages 7-16)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,18 +1,9 @@
 """A device of Modbus registers with nothing but values in them: what a configured map talks to."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 from firmware_iface.drivers.modbus_map import ValueMap
-from firmware_iface.emulators.modbus_server import (
-    ILLEGAL_ADDRESS,
-    ILLEGAL_VALUE,
-    READ_HOLDING,
-    RegisterRefusal,
-    RegisterTable,
-    respond,
-)
+from firmware_iface.emulators import modbus_server
 
 READ_INPUT = 4
 
@@ -59,15 +50,15 @@ class MapDevice:
         try:
             return [words[at] for at in range(address, address + count)]
         except KeyError:
-            raise RegisterRefusal(ILLEGAL_ADDRESS) from None
+            raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_ADDRESS) from None
 
     def write(self, address: int, words: Sequence[int]) -> None:
         """All or nothing. Raises RegisterRefusal."""
         places = range(address, address + len(words))
         if not all(at in self._written for at in places):
-            raise RegisterRefusal(ILLEGAL_ADDRESS)
+            raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_ADDRESS)
         if not all(self._raw_limits[0] <= word <= self._raw_limits[1] for word in words):
-            raise RegisterRefusal(ILLEGAL_VALUE)
+            raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_VALUE)
         self._written.update(zip(places, words, strict=True))
         for found, tell in self._outputs.items():
             self._tell(found, tell)
@@ -78,9 +69,9 @@ class MapDevice:
         tell(value if found.allows(value) else 0.0)
 
 
-def respond_to_input(pdu: bytes, table: RegisterTable) -> bytes:
+def respond_to_input(pdu: bytes, table: modbus_server.RegisterTable) -> bytes:
     """`respond`, and "read input registers" (function 4) answered from the same registers."""
     if pdu[0] != READ_INPUT:
-        return respond(pdu, table)
-    reply = respond(bytes([READ_HOLDING]) + pdu[1:], table)
-    return bytes([reply[0] - READ_HOLDING + READ_INPUT]) + reply[1:]
+        return modbus_server.respond(pdu, table)
+    reply = modbus_server.respond(bytes([modbus_server.READ_HOLDING]) + pdu[1:], table)
+    return bytes([reply[0] - modbus_server.READ_HOLDING + READ_INPUT]) + reply[1:]

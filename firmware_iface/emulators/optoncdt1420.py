@@ -1,7 +1,5 @@
 """An optoNCDT 1420 that answers commands and streams bytes (manual 7.5.2 and appendix A 3)."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 from collections.abc import Callable

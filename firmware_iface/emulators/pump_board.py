@@ -1,15 +1,12 @@
 """The membrane pump board as a Modbus TCP device over any plant, with faults that can be switched on."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from firmware_iface.emulators.board_state import BoardSample, BoardState
-from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer, exception_pdu, respond
+from firmware_iface.emulators import board_state, modbus_server
 from firmware_iface.register_map import RegisterMap, default_map
 
 _PERIOD_S = 0.01  # the board's own loop; the pump is off at most this and one wake-up after the watchdog period
@@ -19,7 +16,7 @@ _GATEWAY_NO_RESPONSE = 11
 class Plant(Protocol):
     """What hangs on the board's wires."""
 
-    def sample(self) -> BoardSample:
+    def sample(self) -> board_state.BoardSample:
         """The newest sample of the sensors; called every 10 ms and at every request."""
         ...
 
@@ -107,9 +104,9 @@ class PumpBoardEmulator:
         self._unit_id = unit_id
         self._sample = plant.sample()
         self._registers = registers or default_map()
-        self.state = BoardState(self._registers, self._sample)
+        self.state = board_state.BoardState(self._registers, self._sample)
         self._actuated = (0.0, 0.0)
-        self._server = ModbusTcpServer(self._handle, host, port)
+        self._server = modbus_server.ModbusTcpServer(self._handle, host, port)
         self._task: asyncio.Task[None] | None = None
 
     @property
@@ -162,22 +159,22 @@ class PumpBoardEmulator:
             self._actuated = outputs
             self._plant.actuate(*outputs)
 
-    def _handle(self, unit: int, pdu: bytes) -> Answer:
+    def _handle(self, unit: int, pdu: bytes) -> modbus_server.Answer:
         if unit != self._unit_id:
-            return Answer(exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
+            return modbus_server.Answer(modbus_server.exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
         faults = self.faults
         if faults.hang_up:
-            return Answer(hang_up=True)
+            return modbus_server.Answer(hang_up=True)
         if faults.exception_code:
-            return Answer(exception_pdu(pdu, faults.exception_code), faults.delay_s)
+            return modbus_server.Answer(modbus_server.exception_pdu(pdu, faults.exception_code), faults.delay_s)
         self.state.map_version = faults.map_version or self._registers.map_version
         self._advance()
-        reply = respond(pdu, self.state)
+        reply = modbus_server.respond(pdu, self.state)
         self._actuate()
         if faults.silent:
-            return Answer()
+            return modbus_server.Answer()
         if faults.short_reply and reply[0] == 3:
             reply = bytes([3, reply[1] - 2]) + reply[2:-2]
         if faults.wrong_function:
             reply = bytes([{3: 23, 16: 6}.get(reply[0], reply[0])]) + reply[1:]
-        return Answer(reply, faults.delay_s, transaction_offset=int(faults.wrong_transaction))
+        return modbus_server.Answer(reply, faults.delay_s, transaction_offset=int(faults.wrong_transaction))

@@ -1,7 +1,5 @@
 """A Vaisala PTB330 on its serial line (user's guide M210855EN, pages 70-103)."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import re

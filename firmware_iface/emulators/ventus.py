@@ -1,7 +1,5 @@
 """A Ventus disc pump's driver board on its UART (TN003 Communications Guide)."""
 
-from __future__ import annotations
-
 import asyncio
 import re
 from collections.abc import Callable

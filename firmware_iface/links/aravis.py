@@ -4,8 +4,6 @@ Source: headers of aravis 0.8 (`arvcamera.h`, `arvstream.h`, `arvbuffer.h`, `arv
 is fixed by the library's version in its name. ctypes gives the interpreter free during every call.
 """
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Iterator
 from ctypes import POINTER, c_char_p, c_double, c_int, c_size_t, c_uint, c_uint64, c_void_p

@@ -1,12 +1,8 @@
 """Modbus devices by URL, so that those on one serial bus share it."""
 
-from __future__ import annotations
-
 from urllib.parse import urlsplit
 
-from firmware_iface.links.modbus_rtu import RtuBus
-from firmware_iface.links.modbus_rules import ModbusLink
-from firmware_iface.links.modbus_tcp import GuardedModbusTcp
+from firmware_iface.links import modbus_rtu, modbus_rules, modbus_tcp
 
 DEFAULT_PORT = 502
 
@@ -15,18 +11,18 @@ class ModbusLinks:
     """Makes links; one per bench, because a serial bus has one owner."""
 
     def __init__(self) -> None:
-        self._buses: dict[str, RtuBus] = {}
+        self._buses: dict[str, modbus_rtu.RtuBus] = {}
 
-    def link(self, url: str, unit_id: int, timeout_s: float, fence: bool = True) -> ModbusLink:
+    def link(self, url: str, unit_id: int, timeout_s: float, fence: bool = True) -> modbus_rules.ModbusLink:
         """The device `unit_id` at `tcp://HOST[:PORT]` or `rtu://PORT[?baud=..&parity=..]`, not yet connected.
 
         `fence`: see `links.exchange`; of no meaning for TCP. Raises ValueError for a URL that is neither.
         """
         if not url.startswith("rtu:"):
             host, port = parse_tcp_url(url)
-            return GuardedModbusTcp(host, port, unit_id, timeout_s)
+            return modbus_tcp.GuardedModbusTcp(host, port, unit_id, timeout_s)
         if url not in self._buses:
-            self._buses[url] = RtuBus.from_url(url)
+            self._buses[url] = modbus_rtu.RtuBus.from_url(url)
         return self._buses[url].device(unit_id, timeout_s, fence)
 
 

@@ -13,17 +13,7 @@ import struct
 from collections.abc import Sequence
 from urllib.parse import parse_qsl, urlsplit
 
-from firmware_iface.links.exchange import Question, SerialExchange
-from firmware_iface.links.modbus_rules import (
-    DIAGNOSTICS,
-    EXCEPTION_FLAG,
-    READ_HOLDING,
-    READ_INPUT,
-    WRITE_MULTIPLE,
-    WRITE_SINGLE,
-    exception_error,
-)
-from firmware_iface.links.serial_port import BytePort, SerialPort, SerialSettings
+from firmware_iface.links import exchange, modbus_rules, serial_port
 from firmware_iface.roles import LinkError
 
 DEFAULT_BAUD = 19_200  # section 2.5.1: the default of the standard
@@ -56,7 +46,7 @@ def rtu_frame(unit_id: int, pdu: bytes) -> bytes:
     return body + struct.pack("<H", crc16(body))
 
 
-def parse_rtu_url(url: str) -> tuple[str, SerialSettings]:
+def parse_rtu_url(url: str) -> tuple[str, serial_port.SerialSettings]:
     """Port and settings of `rtu://PORT[?baud=..&parity=..&data_bits=..&stop_bits=..]`.
 
     PORT is a path (`rtu:///dev/ttyUSB0`) or a USB identity (`rtu://usb:0403:6001:A50285BI`). Raises ValueError.
@@ -71,7 +61,7 @@ def parse_rtu_url(url: str) -> tuple[str, SerialSettings]:
     except ValueError as error:
         raise ValueError(f"{url}: {error}") from error
     numbers.setdefault("baud", DEFAULT_BAUD)
-    return port, SerialSettings(**numbers, parity=options.get("parity", "E"))
+    return port, serial_port.SerialSettings(**numbers, parity=options.get("parity", "E"))
 
 
 class RtuBus:
@@ -85,17 +75,17 @@ class RtuBus:
         Silence after a loss, before the next request: as long as devices are usually late at most.
     """
 
-    def __init__(self, port: BytePort, quiet_s: float = 0.2) -> None:
+    def __init__(self, port: serial_port.BytePort, quiet_s: float = 0.2) -> None:
         baud = port.settings.baud
         gap_s = _FAST_GAP_S if baud > _FAST_BAUD else 3.5 * port.settings.char_s
-        self.exchange = SerialExchange(port, gap_s, quiet_s)
+        self.exchange = exchange.SerialExchange(port, gap_s, quiet_s)
         self._tokens = 0
 
     @classmethod
     def from_url(cls, url: str) -> RtuBus:
         """The bus at `rtu://...`. Raises ValueError."""
         port, settings = parse_rtu_url(url)
-        return cls(SerialPort(port, settings))
+        return cls(serial_port.SerialPort(port, settings))
 
     def device(self, unit_id: int, timeout_s: float, fence: bool = True) -> GuardedModbusRtu:
         """The device with this unit id (1..247). Raises ValueError."""
@@ -161,16 +151,16 @@ class GuardedModbusRtu:
 
     async def read_holding(self, address: int, count: int) -> list[int]:
         """Read holding registers (function code 3). Raises LinkError, LinkDownError, DeviceRefusedError."""
-        return await self._read(READ_HOLDING, address, count)
+        return await self._read(modbus_rules.READ_HOLDING, address, count)
 
     async def read_input(self, address: int, count: int) -> list[int]:
         """Read input registers (function code 4). Raises as `read_holding`."""
-        return await self._read(READ_INPUT, address, count)
+        return await self._read(modbus_rules.READ_INPUT, address, count)
 
     async def write_register(self, address: int, word: int) -> None:
         """Write one holding register (function code 6) and check the echo. Raises as `read_holding`."""
         what = f"{self.name}: writing {address}"
-        pdu = struct.pack(">BHH", WRITE_SINGLE, address, word)
+        pdu = struct.pack(">BHH", modbus_rules.WRITE_SINGLE, address, word)
         if (await self._transact(pdu, _WRITE_BYTES, what)) != pdu:
             raise LinkError(f"{what}: the reply confirms something else")
 
@@ -187,7 +177,9 @@ class GuardedModbusRtu:
             The device refused and changed nothing.
         """
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
-        pdu = struct.pack(f">BHHB{len(words)}H", WRITE_MULTIPLE, address, len(words), 2 * len(words), *words)
+        pdu = struct.pack(
+            f">BHHB{len(words)}H", modbus_rules.WRITE_MULTIPLE, address, len(words), 2 * len(words), *words
+        )
         reply = await self._transact(pdu, _WRITE_BYTES, what)
         if reply != pdu[:5]:
             raise LinkError(f"{what}: the reply confirms something else")
@@ -200,24 +192,24 @@ class GuardedModbusRtu:
     async def _transact(self, pdu: bytes, answer_bytes: int, what: str) -> bytes:
         question = self._question(pdu, answer_bytes, what)
         reply = await self._bus.exchange.ask(question, self._timeout_s, self._fence_question(), self._unit_id)
-        if reply[0] & EXCEPTION_FLAG:
-            raise exception_error(what, reply[1])
+        if reply[0] & modbus_rules.EXCEPTION_FLAG:
+            raise modbus_rules.exception_error(what, reply[1])
         return reply
 
-    def _fence_question(self) -> Question | None:
+    def _fence_question(self) -> exchange.Question | None:
         if not self._fence:
             return None
-        pdu = struct.pack(">BHH", DIAGNOSTICS, 0, self._bus.next_token())
+        pdu = struct.pack(">BHH", modbus_rules.DIAGNOSTICS, 0, self._bus.next_token())
         return self._question(pdu, _WRITE_BYTES, f"{self.name}: echo test after a loss (function 8)", pdu)
 
-    def _question(self, pdu: bytes, answer_bytes: int, what: str, exactly: bytes = b"") -> Question:
+    def _question(self, pdu: bytes, answer_bytes: int, what: str, exactly: bytes = b"") -> exchange.Question:
         def take(heard: bytes) -> bytes | None:
             reply = take_reply(heard, self._unit_id, pdu[0], answer_bytes, what)
-            if exactly and reply is not None and reply != exactly and not reply[0] & EXCEPTION_FLAG:
+            if exactly and reply is not None and reply != exactly and not reply[0] & modbus_rules.EXCEPTION_FLAG:
                 raise LinkError(f"{what}: another echo came back than was sent")
             return reply
 
-        return Question(rtu_frame(self._unit_id, pdu), take, answer_bytes, what)
+        return exchange.Question(rtu_frame(self._unit_id, pdu), take, answer_bytes, what)
 
 
 def take_reply(heard: bytes, unit_id: int, function_code: int, answer_bytes: int, what: str) -> bytes | None:
@@ -235,13 +227,17 @@ def take_reply(heard: bytes, unit_id: int, function_code: int, answer_bytes: int
         raise LinkError(f"{what}: answer of unit {heard[0]}, asked was {unit_id}")
     if len(heard) < 3:
         return None
-    if heard[1] == function_code | EXCEPTION_FLAG:
+    if heard[1] == function_code | modbus_rules.EXCEPTION_FLAG:
         length = _EXCEPTION_BYTES
     elif heard[1] == function_code:
         length = answer_bytes
     else:
         raise LinkError(f"{what}: answer has function code {heard[1]}, asked was {function_code}")
-    if function_code in (READ_HOLDING, READ_INPUT) and length == answer_bytes and heard[2] != answer_bytes - 5:
+    if (
+        function_code in (modbus_rules.READ_HOLDING, modbus_rules.READ_INPUT)
+        and length == answer_bytes
+        and heard[2] != answer_bytes - 5
+    ):
         raise LinkError(f"{what}: {heard[2] / 2:g} registers came instead of {(answer_bytes - 5) // 2}")
     if len(heard) < length:
         return None

@@ -1,7 +1,5 @@
 """What Modbus means, whichever wire it comes over."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Protocol
 

@@ -5,8 +5,6 @@ id 0 is accepted; a connection lost in mid-request waits for the full timeout; a
 that accepts and hangs up is called ten times a second.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import time
@@ -16,14 +14,7 @@ from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusIOException
 from pymodbus.pdu import ExceptionResponse, ModbusPDU
 
-from firmware_iface.links.backoff import BackOff
-from firmware_iface.links.modbus_rules import (
-    READ_HOLDING,
-    READ_INPUT,
-    WRITE_MULTIPLE,
-    WRITE_SINGLE,
-    exception_error,
-)
+from firmware_iface.links import modbus_rules, serial_port
 from firmware_iface.roles import LinkDownError, LinkError, LinkWaitsError
 
 # the library reports in its log what is raised here as well; without a handler it would write into the live screen
@@ -63,7 +54,7 @@ class GuardedModbusTcp:
         self._client: AsyncModbusTcpClient | None = None
         self._turn = asyncio.Lock()  # released when the request has ended, whatever became of its caller
         self._in_flight: asyncio.Task[ModbusPDU] | None = None
-        self._back_off = BackOff()
+        self._back_off = serial_port.BackOff()
         self._connections = 0
 
     @property
@@ -130,17 +121,19 @@ class GuardedModbusTcp:
         DeviceRefusedError
             The device does not have these registers.
         """
-        return await self._read(READ_HOLDING, address, count)
+        return await self._read(modbus_rules.READ_HOLDING, address, count)
 
     async def read_input(self, address: int, count: int) -> list[int]:
         """Read `count` input registers (function code 4). Raises as `read_holding`."""
-        return await self._read(READ_INPUT, address, count)
+        return await self._read(modbus_rules.READ_INPUT, address, count)
 
     async def write_register(self, address: int, word: int) -> None:
         """Write one holding register (function code 6) and check the echo. Raises as `write_registers`."""
         what = f"{self.name}: writing {address}"
         reply = await self._exchange(
-            lambda client: client.write_register(address, word, device_id=self._unit_id), WRITE_SINGLE, what
+            lambda client: client.write_register(address, word, device_id=self._unit_id),
+            modbus_rules.WRITE_SINGLE,
+            what,
         )
         if (reply.address, list(reply.registers)) != (address, [word]):
             raise LinkError(f"{what}: the reply confirms {list(reply.registers)} in {reply.address}")
@@ -161,7 +154,7 @@ class GuardedModbusTcp:
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
         reply = await self._exchange(
             lambda client: client.write_registers(address, list(words), device_id=self._unit_id),
-            WRITE_MULTIPLE,
+            modbus_rules.WRITE_MULTIPLE,
             what,
         )
         if (reply.address, reply.count) != (address, len(words)):
@@ -172,7 +165,11 @@ class GuardedModbusTcp:
         what = f"{self.name}: reading {address}..{address + count - 1}"
 
         def send(client: AsyncModbusTcpClient) -> Awaitable[ModbusPDU]:
-            read = client.read_input_registers if function_code == READ_INPUT else client.read_holding_registers
+            read = (
+                client.read_input_registers
+                if function_code == modbus_rules.READ_INPUT
+                else client.read_holding_registers
+            )
             return read(address, count=count, device_id=self._unit_id)
 
         reply = await self._exchange(send, function_code, what)
@@ -229,7 +226,7 @@ def _check(reply: ModbusPDU, function_code: int, transaction_id: int, what: str)
     if reply.function_code & 0x7F != function_code:
         raise LinkError(f"{what}: answer has function code {reply.function_code}, asked was {function_code}")
     if isinstance(reply, ExceptionResponse):
-        raise exception_error(what, reply.exception_code)
+        raise modbus_rules.exception_error(what, reply.exception_code)
 
 
 def _fail_in_flight(client: AsyncModbusTcpClient, message: str) -> None:

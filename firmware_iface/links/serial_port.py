@@ -4,8 +4,6 @@ Through `loop.add_reader` on the port's own descriptor: no thread, no polling, a
 readable at once. pyserial opens and configures the port, nothing more.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import errno
@@ -19,9 +17,42 @@ from typing import Any, Protocol
 
 import serial
 
-from firmware_iface.links.backoff import BackOff
 from firmware_iface.links.usb_ports import check_port_name, port_path
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError, LinkWaitsError
+
+# How long to leave a device alone after a failed attempt to connect.
+
+
+# quick enough for a cable put back, slow enough not to hammer a server that accepts and hangs up
+FIRST_S = 0.1
+LONGEST_S = 5.0
+
+
+class BackOff:
+    """Doubling waits between attempts.
+
+    Every attempt counts as failed until `succeeded` is called; a connection that is accepted and dropped before one
+    valid answer is therefore no success.
+    """
+
+    def __init__(self) -> None:
+        self._wait_s = 0.0
+        self._earliest_s = float("-inf")
+
+    def remaining_s(self, now_s: float) -> float:
+        """Time until the next attempt is due; 0 when it is."""
+        return max(0.0, self._earliest_s - now_s)
+
+    def attempted(self, now_s: float) -> None:
+        """An attempt begins."""
+        self._wait_s = min(max(2 * self._wait_s, FIRST_S), LONGEST_S)
+        self._earliest_s = now_s + self._wait_s
+
+    def succeeded(self) -> None:
+        """A valid answer came: the next attempt may be made at once."""
+        self._wait_s = 0.0
+        self._earliest_s = float("-inf")
+
 
 _READ_BYTES = 65_536
 # a port that is not there costs one look-up: no reason to back off, and a replug is to be found at once

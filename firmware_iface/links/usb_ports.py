@@ -1,7 +1,5 @@
 """Serial ports by what they are (USB identity) instead of where they were plugged in."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

@@ -4,8 +4,9 @@ Synchronous and free of any real clock or device: everything it needs is passed 
 a camera, over the twin's renderer and over a fake in a test.
 """
 
-from __future__ import annotations
-
+import math
+import struct
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
@@ -14,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern, Screen
-from membrane_ctrl.acquisition.exposures import CycleCamera as CycleCamera
-from membrane_ctrl.acquisition.exposures import CycleClock as CycleClock
-from membrane_ctrl.acquisition.exposures import Exposures, Laser
-from membrane_ctrl.acquisition.frames import FrameWriter, Pixels
-from membrane_ctrl.acquisition.stages import Stage, StageError, during
-from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.acquisition import exposures
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.telemetry import FIELDS
+from membrane_ctrl.processes.frames import FrameWriter, Pixels
+from membrane_ctrl.processes.ring import RingAddress, RingReader
 
 # A full cycle may be spoilt by a door or by the mirror still moving: take two more at once. Three in a row mean
 # that there is no mirror to be seen (flat, dark, covered), which a pause does not worsen.
@@ -68,7 +68,7 @@ class CycleFailed:
     """A cycle that gave none, where and why; wait `pause_s` before the next."""
 
     cycle: int
-    stage: Stage
+    stage: exposures.Stage
     message: str
     pause_s: float
 
@@ -92,16 +92,16 @@ class ShapeCycle:
 
     def __init__(
         self,
-        camera: CycleCamera,
+        camera: exposures.CycleCamera,
         screen: Screen,
         reconstructor: Reconstructor,
         plan: CyclePlan,
         frames: FrameWriter,
-        clock: CycleClock,
-        laser: Laser,
+        clock: exposures.CycleClock,
+        laser: exposures.Laser,
         stopping: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._exposures = Exposures(camera, screen, frames, clock, laser, plan.frame_interval_s)
+        self._exposures = exposures.Exposures(camera, screen, frames, clock, laser, plan.frame_interval_s)
         self._reconstructor = reconstructor
         self._plan = plan
         self._clock = clock
@@ -121,7 +121,7 @@ class ShapeCycle:
         self._cycle += 1
         try:
             estimate = self._measure("full" if self._full_next else "fringes")
-        except StageError as error:
+        except exposures.StageError as error:
             self._failed_in_a_row += 1
             return CycleFailed(self._cycle, error.stage, str(error), pause_s(self._failed_in_a_row))
         if estimate is None:
@@ -148,7 +148,7 @@ class ShapeCycle:
         # asked again for all: when a frame arrives, the second half of the readings around it is still to come
         displacement_um = np.array([self._laser.at(frame.time_s) for frame in frames])
         time_s = np.array([frame.time_s for frame in frames])
-        with during("reconstruction"):
+        with exposures.during("reconstruction"):
             reconstruct = self._reconstructor.full if kind == "full" else self._reconstructor.fringes
             estimate = reconstruct([frame.pixels for frame in frames], time_s, displacement_um)
         return replace(estimate, latency_s=self._clock.now() - arrived_s, cycle=self._cycle)
@@ -159,3 +159,66 @@ def pause_s(failures: int) -> float:
     if failures <= 0:
         return 0.0
     return float(min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** min(failures - 1, 32)))
+
+
+# Which displacement the laser saw while a frame was exposed, from the telemetry of the control process.
+
+
+# One reading has 1 um of noise, which is ten times what the held centre moves between two frames: a frame gets
+# the mean of the readings around it. 0.2 s to each side is 20 readings at 50 Hz (0.22 um), symmetric in time so
+# that a steady motion cancels; in its 0.4 s the held centre moves less than the noise that is left.
+HALF_WINDOW_S = 0.2
+HALF_WINDOW_TICKS = 2.0  # below 10 Hz that would be fewer readings than make a mean
+LEAST_READINGS = 3
+_KEPT_S = 60.0  # longer than any full cycle takes
+
+_ROW = struct.Struct(f"<{len(FIELDS)}d")
+_TIME, _DISPLACEMENT, _QUALITY, _COUNTER = (
+    FIELDS.index(name) for name in ("mono_s", "displacement_um", "displacement_quality", "sample_counter")
+)
+
+
+class LaserHistory:
+    """The last minute of laser readings.
+
+    Parameters
+    ----------
+    telemetry : RingAddress
+        Rows of `membrane_ctrl.model.telemetry.TelemetryRow`.
+    rate_hz : float
+        How many of them come in a second.
+
+    Attributes
+    ----------
+    half_window_s : float
+        A frame gets the readings from so long before it to so long after.
+    """
+
+    def __init__(self, telemetry: RingAddress, rate_hz: float) -> None:
+        self._reader = RingReader(telemetry)
+        self.half_window_s = max(HALF_WINDOW_S, HALF_WINDOW_TICKS / rate_hz)
+        self._readings: deque[tuple[float, float]] = deque()  # (mono_s, displacement_um)
+        self._counter = math.nan
+
+    def at(self, time_s: float) -> float:
+        """Mean reading (um) within `half_window_s` of a moment on the run's clock.
+
+        NaN if there are fewer than `LEAST_READINGS` good ones: missing, flagged and repeated samples are none.
+        """
+        self._update()
+        near = [reading for mono_s, reading in self._readings if abs(mono_s - time_s) <= self.half_window_s]
+        return math.fsum(near) / len(near) if len(near) >= LEAST_READINGS else math.nan
+
+    def close(self) -> None:
+        """Detach from the telemetry."""
+        self._reader.close()
+
+    def _update(self) -> None:
+        for message in self._reader.drain():
+            row = _ROW.unpack(message)
+            repeated = row[_COUNTER] == self._counter
+            self._counter = row[_COUNTER]
+            if math.isfinite(row[_DISPLACEMENT]) and row[_QUALITY] == 0 and not repeated:
+                self._readings.append((row[_TIME], row[_DISPLACEMENT]))
+        while self._readings and self._readings[0][0] < self._readings[-1][0] - _KEPT_S:
+            self._readings.popleft()

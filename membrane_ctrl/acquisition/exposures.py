@@ -9,15 +9,35 @@ outside of Python), the consumer is the cycle.
     cycle    |                                                                       | reconstruct
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Sequence
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Literal, Protocol, runtime_checkable
 
 from firmware_iface.drivers.frame_lost import TRIES, FrameLostError
 from firmware_iface.roles import Frame, Pattern, Screen
-from membrane_ctrl.acquisition.frames import FrameSlot, FrameWriter, Pixels
-from membrane_ctrl.acquisition.stages import during
+from membrane_ctrl.processes.frames import FrameSlot, FrameWriter, Pixels
+
+# Where a cycle failed: whatever a device or the numerics raise becomes one kind of error that names the stage.
+
+
+Stage = Literal["screen", "camera", "reconstruction"]
+
+
+class StageError(Exception):
+    """What was raised, and in which stage."""
+
+    def __init__(self, stage: Stage, message: str) -> None:
+        super().__init__(message)
+        self.stage = stage
+
+
+@contextmanager
+def during(stage: Stage) -> Iterator[None]:
+    """Raise whatever the block raises as a StageError."""
+    try:
+        yield
+    except Exception as error:
+        raise StageError(stage, f"{type(error).__name__}: {error}") from error
 
 
 class CycleClock(Protocol):

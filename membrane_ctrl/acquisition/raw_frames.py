@@ -5,8 +5,6 @@ refers to the full cycle that anchors it, so that the newest accepted full cycle
 replaces it or something refers to it.
 """
 
-from __future__ import annotations
-
 import shutil
 import struct
 from collections.abc import Callable, Iterable
@@ -20,13 +18,12 @@ import tomli_w
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.acquisition.cycle import CyclePlan
-from membrane_ctrl.acquisition.frame_address import FrameAddress
-from membrane_ctrl.acquisition.frames import FrameHead, FrameReader, Pixels
-from membrane_ctrl.config import OpticsConfig, RecordingConfig
-from membrane_ctrl.estimate import ShapeEstimate
-from membrane_ctrl.ipc.ring import RingAddress, RingReader
-from membrane_ctrl.recording.thrift import PICTURES_FROM
-from membrane_ctrl.telemetry import FIELDS
+from membrane_ctrl.config.schema import OpticsConfig, RecordingConfig
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.telemetry import FIELDS
+from membrane_ctrl.processes.frames import FrameHead, FrameReader, Pixels
+from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
+from membrane_ctrl.run_files.disk_budget import PICTURES_FROM
 
 _ROW = struct.Struct(f"<{len(FIELDS)}d")
 _FAULT = FIELDS.index("fault")

@@ -1,36 +1,132 @@
 """Everything the acquisition holds, opened and closed around its loop."""
 
-from __future__ import annotations
-
 import signal
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from firmware_iface.roles import LinkError
-from membrane_ctrl.acquisition.cycle import CyclePlan, ShapeCycle, pause_s
-from membrane_ctrl.acquisition.frames import FrameWriter
-from membrane_ctrl.acquisition.geometry_watch import LiveDrift, geometry_event
-from membrane_ctrl.acquisition.laser import LaserHistory
-from membrane_ctrl.acquisition.optical_bench import OpticalBench, configured_bench, open_bench
-from membrane_ctrl.acquisition.process import AcquisitionSpec
-from membrane_ctrl.acquisition.raw_frames import RawFrames
-from membrane_ctrl.acquisition.remote import Remote
-from membrane_ctrl.acquisition.twin_bench import TwinTruth
-from membrane_ctrl.acquisition.warm_up import TYPICAL_FILM, small, warm_up
-from membrane_ctrl.acquisition.worker import estimate_message, keep_cycling
-from membrane_ctrl.calibration.geometry_in_force import KEPT, geometry_of_run
-from membrane_ctrl.calibration.geometry_spread_file import spread_of
-from membrane_ctrl.clock import RunClock
-from membrane_ctrl.config import Config, OpticsConfig
-from membrane_ctrl.estimate import ShapeEstimate
-from membrane_ctrl.ipc.ring import RingAddress, RingWriter
-from membrane_ctrl.metrology.geometry_spread import GeometrySpread
-from membrane_ctrl.metrology.live import LiveReconstructor
-from membrane_ctrl.metrology.patterns import fringe_sequence, full_sequence
-from membrane_ctrl.processes import STOP
-from membrane_ctrl.twin.camera import FilmPosition, TwinOptics
+import numpy as np
+
+from firmware_iface.roles import LinkError, Pattern
+from membrane_ctrl.acquisition import optical_bench, process, raw_frames, worker
+from membrane_ctrl.acquisition.cycle import CyclePlan, LaserHistory, Reconstructor, ShapeCycle, pause_s
+from membrane_ctrl.acquisition.exposures import CycleClock
+from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
+from membrane_ctrl.geometry import file, spread_file
+from membrane_ctrl.metrology import live, phase
+from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.processes import child, ring
+from membrane_ctrl.processes.frames import FrameWriter, Pixels
+from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics
+from membrane_ctrl.sim.sensors import Truth
+
+# The twin's film, screen and camera, as the acquisition finds them.
+
+
+class TwinTruth:
+    """Where the simulated film is now; call it.
+
+    Parameters
+    ----------
+    address : RingAddress
+        The ring in which the bench process publishes the truth.
+    """
+
+    def __init__(self, address: ring.RingAddress) -> None:
+        self._reader = ring.RingReader(address)
+
+    def __call__(self) -> Truth:
+        """The newest truth. Raises LinkError before the first."""
+        message = self._reader.latest()
+        if message is None:
+            raise LinkError("twin camera: the simulated bench has not started")
+        return Truth.unpack(message)
+
+    @property
+    def known(self) -> bool:
+        """There is one."""
+        return self._reader.latest() is not None
+
+    def close(self) -> None:
+        """Detach."""
+        self._reader.close()
+
+
+# Every kernel of the cycle once, on a small sensor: on a fresh machine they are compiled here, for many seconds.
+
+
+@dataclass(frozen=True, slots=True)
+class _StandingFilm:
+    """A film at its usual sag."""
+
+    displacement_um: float
+    sag_mm: float
+
+
+# A real film's sag is not known before it was measured; a meter of film at the usual pressure has this one
+TYPICAL_FILM: FilmPosition = _StandingFilm(0.0, 37.1)
+
+_SMALL_PX = 300  # this side still gives 36 terms enough points, in a hundredth of the work
+
+
+def small(optics: OpticsConfig) -> OpticsConfig:
+    """The same view on a sensor with larger pixels."""
+    camera = optics.camera
+    larger = max(1, min(camera.width_px, camera.height_px) // _SMALL_PX)
+    column_px, row_px = ((p + 0.5) / larger - 0.5 for p in camera.principal)  # pixel centres are at integers
+    coarse = camera.model_copy(
+        update={
+            "width_px": camera.width_px // larger,
+            "height_px": camera.height_px // larger,
+            "pixel_um": camera.pixel_um * larger,
+            "principal_px": (column_px, row_px),
+        }
+    )
+    return optics.model_copy(update={"camera": coarse})
+
+
+def warm_up(
+    reconstructor: Reconstructor, optics: OpticsConfig, plan: CyclePlan, position: FilmPosition, clock: CycleClock
+) -> None:
+    """A full cycle and two of fringes only, with and without known motion, of a film that stands still.
+
+    Parameters
+    ----------
+    reconstructor : Reconstructor
+        One to be thrown away, for `small(optics)`.
+    optics : OpticsConfig
+        The small ones.
+    plan : CyclePlan
+        The patterns.
+    position : FilmPosition
+        Where the film stands.
+    clock : CycleClock
+        The run's clock.
+    """
+    bench = TwinOptics(optics, TwinConfig(), lambda: position, clock)
+
+    def exposures(patterns: Sequence[Pattern]) -> list[Pixels]:
+        taken: list[Pixels] = []
+        for pattern in patterns:
+            bench.screen.show(pattern)
+            taken.append(bench.camera.grab().pixels)
+        return taken
+
+    # displacements that differ by more than noise let the kernels run that take the film's motion out
+    still, moving = np.zeros(1), np.array([-10.0, 10.0])
+    for patterns, reconstruct, motion_um in (
+        (plan.full, reconstructor.full, moving),
+        (plan.fringes, reconstructor.fringes, moving),
+        (plan.fringes, reconstructor.fringes, still),
+    ):
+        frames = exposures(patterns)
+        displacement_um = position.displacement_um + np.resize(motion_um, len(frames))
+        reconstruct(frames, 0.1 * np.arange(len(frames), dtype=np.float64), displacement_um)
+
 
 _TRUTH_LOOK_S = 0.1
 
@@ -50,7 +146,7 @@ class WaitingClock:
         time.sleep(duration_s)
 
 
-def run(spec: AcquisitionSpec, remote: Remote) -> None:
+def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
     """Prepare, then measure until told to stop.
 
     Until the first cycle `processes.STOP` simply ends the process, as nothing is held that would need care and a
@@ -64,27 +160,27 @@ def run(spec: AcquisitionSpec, remote: Remote) -> None:
     remote.listen()  # the first word, which promises the next one for when all this is over
     remote.report("preparing", "tracing the first picture, compiling what is not compiled yet")
     config, clock = spec.config, WaitingClock(spec.clock)
-    geometry = geometry_of_run(spec.run_dir, config)
-    remote.tell(geometry_event(geometry))
+    geometry = file.geometry_of_run(spec.run_dir, config)
+    remote.tell(worker.geometry_event(geometry))
     pattern = geometry.optics.pattern
-    plan = CyclePlan(full_sequence(pattern), fringe_sequence(pattern), config.shape.frame_interval_s)
+    plan = CyclePlan(phase.full_sequence(pattern), phase.fringe_sequence(pattern), config.shape.frame_interval_s)
     with ExitStack() as stack:
         if spec.truth is None:
-            bench = configured_bench(config, clock)
+            bench = optical_bench.configured_bench(config, clock)
             _warm_up(config, plan, TYPICAL_FILM, clock)
-            signal.signal(STOP, lambda number, frame: remote.end())
+            signal.signal(child.STOP, lambda number, frame: remote.end())
             stack.callback(bench.close)
             _open(bench, config, clock, remote)
         else:
             bench = _twin_bench(spec.truth, config, plan, clock, remote, stack)
-            signal.signal(STOP, lambda number, frame: remote.end())
+            signal.signal(child.STOP, lambda number, frame: remote.end())
             stack.callback(bench.close)
         if remote.stop:
             return
         spread = _spread(spec.run_dir, geometry.optics)
-        reconstructor = LiveReconstructor(geometry.optics, config.shape.bin_px, spread=spread)
-        drift = LiveDrift(geometry, config.shape.bin_px)
-        shapes = stack.enter_context(closing(RingWriter(spec.shapes)))
+        reconstructor = live.LiveReconstructor(geometry.optics, config.shape.bin_px, spread=spread)
+        drift = worker.LiveDrift(geometry, config.shape.bin_px)
+        shapes = stack.enter_context(closing(ring.RingWriter(spec.shapes)))
         frames = stack.enter_context(closing(FrameWriter(spec.frames)))
         stack.callback(bench.close)  # before the ring of frames: an exposure under way holds the pixels of a slot
         laser = stack.enter_context(closing(LaserHistory(spec.telemetry, config.loop.rate_hz)))
@@ -94,7 +190,7 @@ def run(spec: AcquisitionSpec, remote: Remote) -> None:
         )
 
         def publish(estimate: ShapeEstimate) -> None:
-            shapes.put(estimate_message(estimate))
+            shapes.put(worker.estimate_message(estimate))
             if (notice := drift.after(estimate)) is not None:
                 remote.tell(notice)
             if raw is not None:
@@ -107,12 +203,17 @@ def run(spec: AcquisitionSpec, remote: Remote) -> None:
 
         remote.prepared()
         remote.report("running", "first cycle")
-        keep_cycling(cycle, remote, publish, clock, config.shape.period_s, keep)
+        worker.keep_cycling(cycle, remote, publish, clock, config.shape.period_s, keep)
 
 
 def _twin_bench(
-    address: RingAddress, config: Config, plan: CyclePlan, clock: WaitingClock, remote: Remote, stack: ExitStack
-) -> OpticalBench:
+    address: ring.RingAddress,
+    config: Config,
+    plan: CyclePlan,
+    clock: WaitingClock,
+    remote: process.Remote,
+    stack: ExitStack,
+) -> optical_bench.OpticalBench:
     """The twin's camera and screen, once its bench has said where the film is."""
     truth = stack.enter_context(closing(TwinTruth(address)))
     while not truth.known and not remote.stop:
@@ -121,20 +222,20 @@ def _twin_bench(
     if not remote.stop:
         _warm_up(config, plan, truth(), clock)
         optics.prepare()
-    return OpticalBench(optics.camera, optics.screen)
+    return optical_bench.OpticalBench(optics.camera, optics.screen)
 
 
 def _warm_up(config: Config, plan: CyclePlan, position: FilmPosition, clock: WaitingClock) -> None:
     coarse = small(config.optics)
-    warm_up(LiveReconstructor(coarse, config.shape.bin_px), coarse, plan, position, clock)
+    warm_up(live.LiveReconstructor(coarse, config.shape.bin_px), coarse, plan, position, clock)
 
 
-def _open(bench: OpticalBench, config: Config, clock: WaitingClock, remote: Remote) -> None:
+def _open(bench: optical_bench.OpticalBench, config: Config, clock: WaitingClock, remote: process.Remote) -> None:
     """Open camera and screen; what is not there is tried again until told to stop: the hold goes on meanwhile."""
     failures = 0
     while not remote.stop:
         try:
-            found = open_bench(bench, config, clock)
+            found = optical_bench.open_bench(bench, config, clock)
             for line in (f"camera: {found.camera}", *found.measured, *found.problems):
                 remote.report("preparing", line)
             return
@@ -148,17 +249,17 @@ def _open(bench: OpticalBench, config: Config, clock: WaitingClock, remote: Remo
 
 def _spread(run_dir: Path | None, optics: OpticsConfig) -> GeometrySpread | None:
     """How well the run's geometry is known; None if nothing is stated of it."""
-    kept = None if run_dir is None else run_dir / KEPT
-    spread, _said = spread_of(optics.geometry, kept if kept is not None and kept.exists() else None)
+    kept = None if run_dir is None else run_dir / file.KEPT
+    spread, _said = spread_file.spread_of(optics.geometry, kept if kept is not None and kept.exists() else None)
     return spread if spread.names else None
 
 
 def _raw_frames(
-    spec: AcquisitionSpec, optics: OpticsConfig, plan: CyclePlan, stack: ExitStack, remote: Remote
-) -> RawFrames | None:
+    spec: process.AcquisitionSpec, optics: OpticsConfig, plan: CyclePlan, stack: ExitStack, remote: process.Remote
+) -> raw_frames.RawFrames | None:
     """What keeps frames, if there is a place for them."""
     if spec.run_dir is None:
         return None
     folder, recording = spec.run_dir / "raw", spec.config.recording
-    raw = RawFrames(folder, optics, plan, recording, spec.frames, spec.telemetry, remote.tell)
+    raw = raw_frames.RawFrames(folder, optics, plan, recording, spec.frames, spec.telemetry, remote.tell)
     return stack.enter_context(closing(raw))

@@ -1,7 +1,5 @@
 """The loop of the acquisition process: a cycle at each deadline, its estimate to the ring, its troubles reported."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,19 +7,23 @@ from pathlib import Path
 
 import numpy as np
 
-from membrane_ctrl.acquisition.cycle import CycleClock, CycleDone, CycleFailed, ShapeCycle
-from membrane_ctrl.acquisition.remote import Remote
-from membrane_ctrl.estimate import ShapeEstimate, pack_estimate
-from membrane_ctrl.tick import Event
+from membrane_ctrl.acquisition import exposures, process
+from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed, ShapeCycle
+from membrane_ctrl.geometry.file import InForce
+from membrane_ctrl.metrology import bins, phase
+from membrane_ctrl.metrology.calibrate.drift import DriftMonitor, RingMonitor, noise_urad
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.model import events, shape_estimate
 
 
 def keep_cycling(
     cycle: ShapeCycle,
-    remote: Remote,
-    publish: Callable[[ShapeEstimate], None],
-    clock: CycleClock,
+    remote: process.Remote,
+    publish: Callable[[shape_estimate.ShapeEstimate], None],
+    clock: exposures.CycleClock,
     period_s: float,
-    keep: Callable[[ShapeEstimate], Path],
+    keep: Callable[[shape_estimate.ShapeEstimate], Path],
 ) -> None:
     """Take cycles until told to stop.
 
@@ -68,17 +70,19 @@ def next_deadline_s(last_s: float, period_s: float, earliest_s: float) -> float:
     return last_s + max(1, math.ceil((earliest_s - last_s) / period_s)) * period_s
 
 
-def estimate_message(estimate: ShapeEstimate) -> bytes:
+def estimate_message(estimate: shape_estimate.ShapeEstimate) -> bytes:
     """An estimate as it crosses in the ring of shapes, its covariance in the 24 bits of a single.
 
     A variance known to 1e-7 is known better than its noise model, and what the controller is given has to be
     recorded to the last bit: in doubles that would be 0.2 GB a day.
     """
     covariance_um2 = estimate.covariance_um2.astype(np.float32).astype(np.float64)
-    return pack_estimate(replace(estimate, covariance_um2=covariance_um2))
+    return shape_estimate.pack_estimate(replace(estimate, covariance_um2=covariance_um2))
 
 
-def _captured(result: CycleDone | CycleFailed | None, keep: Callable[[ShapeEstimate], Path]) -> Event:
+def _captured(
+    result: CycleDone | CycleFailed | None, keep: Callable[[shape_estimate.ShapeEstimate], Path]
+) -> events.Event:
     """What became of a set that was asked for; a rejected one is not worth its room on the disk."""
     match result:
         case None:
@@ -92,12 +96,16 @@ def _captured(result: CycleDone | CycleFailed | None, keep: Callable[[ShapeEstim
         folder = keep(estimate)
     except OSError as error:
         return {"kind": "capture", "cycle": estimate.cycle, "failed": error.strerror or str(error)}
-    told: Event = {"kind": "capture", "cycle": estimate.cycle, "set": f"{folder.parent.name}/{folder.name}"}
+    told: events.Event = {"kind": "capture", "cycle": estimate.cycle, "set": f"{folder.parent.name}/{folder.name}"}
     moved_um = {"displacement_um": estimate.displacement_um} if math.isfinite(estimate.displacement_um) else {}
     return {**told, **moved_um, "verdict": estimate.verdict, "reason": estimate.reason}
 
 
-def _tell(result: CycleDone | CycleFailed | None, remote: Remote, publish: Callable[[ShapeEstimate], None]) -> None:
+def _tell(
+    result: CycleDone | CycleFailed | None,
+    remote: process.Remote,
+    publish: Callable[[shape_estimate.ShapeEstimate], None],
+) -> None:
     match result:
         case CycleDone(estimate, pause_s):
             publish(estimate)
@@ -106,3 +114,59 @@ def _tell(result: CycleDone | CycleFailed | None, remote: Remote, publish: Calla
             remote.report("running", verdict, cycle=estimate.cycle)
         case CycleFailed(number, stage, message, pause_s):
             remote.report("retrying", f"{stage}: {message}; again in {pause_s:g} s", cycle=number)
+
+
+# The geometry of a live cycle: which one it is, and whether it still fits what the cycles see.
+
+
+def geometry_event(geometry: InForce) -> events.Event:
+    """For the record of the run."""
+    return {"kind": "geometry", **geometry.origin.table(), "message": geometry.note}
+
+
+class LiveDrift:
+    """Compares residual and ring of each cycle with the calibrated ones; without a calibration it says nothing.
+
+    Parameters
+    ----------
+    geometry : InForce
+        What the cycles measure with.
+    bin_px : int
+        Side of their bins.
+    """
+
+    def __init__(self, geometry: InForce, bin_px: int) -> None:
+        optics = geometry.optics
+        self._geometry, self._radius_mm = Geometry.from_config(optics), optics.mirror.radius_mm
+        shifts = phase.equal_shifts(optics.pattern.steps)
+        sigma_rad = phase.phase_sigma_rad(shifts, bins.pixel_sigma_adu(optics.camera.noise_adu), 1.0)
+        self._sigma_mm_adu = phase.mm_per_rad(optics.pattern) * sigma_rad / bin_px  # over the modulation
+        known = geometry.calibration
+        self._monitors: tuple[DriftMonitor, RingMonitor] | None = None
+        if known is not None:
+            residual = DriftMonitor(known.slope_residual_urad, known.slope_noise_urad)
+            self._monitors = residual, RingMonitor(np.array(known.ring_um))
+        self._said = False
+
+    def noise_urad(self, estimate: shape_estimate.ShapeEstimate) -> float:
+        """What the camera's noise is in a cycle's residual."""
+        return noise_urad(
+            self._geometry, self._surface(estimate), self._sigma_mm_adu / estimate.modulation_median_adu
+        )
+
+    def after(self, estimate: shape_estimate.ShapeEstimate) -> events.Event | None:
+        """A notice when it is time to calibrate again, and when it no longer is."""
+        if self._monitors is None or estimate.verdict == "rejected":
+            return None
+        residual, ring = self._monitors
+        residual.add(estimate.slope_residual_urad, self.noise_urad(estimate))
+        ring.add(self._surface(estimate))
+        says = ring.says or residual.says
+        if bool(says) == self._said:
+            return None
+        self._said = not self._said
+        kind = "maintenance" if self._said else "maintenance_over"
+        return {"kind": kind, "name": "calibrate", "message": says or "the geometry fits again"}
+
+    def _surface(self, estimate: shape_estimate.ShapeEstimate) -> Surface:
+        return Surface(estimate.coeffs_um / 1e3, estimate.hencky_um / 1e3, self._radius_mm)

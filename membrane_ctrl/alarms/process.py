@@ -1,10 +1,10 @@
 """The process that tells people: mail servers may take a minute, and nothing of the run waits for them."""
 
-from __future__ import annotations
-
+import json
 import multiprocessing
 import os
 import signal
+import struct
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -12,16 +12,97 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
-from membrane_ctrl.alarms.apprise_sender import apprise_senders
-from membrane_ctrl.alarms.book import Notice
-from membrane_ctrl.alarms.outbox import Outbox, Send
-from membrane_ctrl.alarms.watcher import Watcher
-from membrane_ctrl.child_report import alive, reporter
-from membrane_ctrl.clock import RunClock
-from membrane_ctrl.ipc.ring import RingAddress, RingReader
-from membrane_ctrl.port_config import AlarmsConfig
-from membrane_ctrl.processes import STOP
-from membrane_ctrl.tick import Event
+from membrane_ctrl.alarms.book import AlarmBook, Notice, Sign, sign_of_value, signs_of
+from membrane_ctrl.alarms.senders import Outbox, Send, apprise_senders
+from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.telemetry import FIELDS
+from membrane_ctrl.processes import child, ring
+
+# One look at the run: rings in, notices out.
+
+
+# before its first tick a run connects its devices, with patience of its own
+_STARTS_S = 30.0
+_ROW = struct.Struct(f"<{len(FIELDS)}d")
+
+
+class Watcher:
+    """Turns what the rings hold into notices.
+
+    Parameters
+    ----------
+    config : AlarmsConfig
+        Rules and times.
+    outboxes : sequence of Outbox
+        The first gets every notice; the second, if there is one, those that are escalated.
+    now_s : float
+        When it begins to look.
+
+    Attributes
+    ----------
+    ended : bool
+        The run has said its last word.
+    """
+
+    def __init__(self, config: AlarmsConfig, outboxes: Sequence[Outbox], now_s: float) -> None:
+        self._config = config
+        self._book = AlarmBook(config)
+        self._outboxes = outboxes
+        self._last_row_s = now_s + _STARTS_S
+        self._fault: Event = {}
+        self.ended = False
+
+    def look(self, rows: Sequence[bytes], events: Sequence[bytes], now_s: float) -> None:
+        """Take in what came since the last look, and send what is due."""
+        for message in events:
+            self._take_event(json.loads(message), now_s)
+        for row in rows:
+            self._take_row(row, now_s)
+        self._listen(bool(rows), now_s)
+        self._send(now_s)
+
+    def orphaned(self, now_s: float) -> None:
+        """The control process is gone, and has not said why."""
+        text = "the control process has ended without a word; the board's watchdog has stopped the pump"
+        self._book.take(Sign("control_gone", True, "critical", text), now_s)
+        self._send(now_s)
+
+    def _take_event(self, event: Event, now_s: float) -> None:
+        kind = event.get("kind")
+        if kind == "fault":
+            self._fault = event
+        elif kind == "state" and event.get("state") == "fault" and not self._fault.get("latching"):
+            event = self._fault | {"latching": True}  # held on the mean flow for too long, it has latched
+        for sign in signs_of(event):
+            self._book.take(sign, now_s)
+        if kind == "alarms_acknowledged" or (kind == "command" and event.get("command") == "ack"):
+            self._book.acknowledge()  # whoever asks for `ack` has seen it, whether it is obeyed or not
+        self.ended |= kind == "end"
+
+    def _take_row(self, message: bytes, now_s: float) -> None:
+        row = dict(zip(FIELDS, _ROW.unpack(message), strict=True))
+        for rule in self._config.rules:
+            sign = sign_of_value(rule, row[rule.field], self._book.standing(rule.name))
+            if sign is not None:
+                self._book.take(sign, now_s)
+
+    def _listen(self, heard: bool, now_s: float) -> None:
+        if heard:
+            self._last_row_s = now_s
+            self._book.take(Sign("silent", False), now_s)
+        elif now_s - self._last_row_s >= self._config.silent_s and not self.ended:
+            text = f"no tick for {self._config.silent_s:g} s: the control process hangs"
+            self._book.take(Sign("silent", True, "critical", text), now_s)
+
+    def _send(self, now_s: float) -> None:
+        for notice in self._book.step(now_s):
+            for outbox in self._outboxes[: 2 if notice.escalated else 1]:
+                outbox.post(notice)
+        for outbox in self._outboxes:
+            outbox.step(now_s)
+
 
 _LOOK_S = 0.5
 # After the run's end, for the last notices; a longer one would keep a service manager from restarting
@@ -48,8 +129,8 @@ class AlarmsSpec:
     """
 
     clock: RunClock
-    telemetry: RingAddress
-    events: RingAddress
+    telemetry: ring.RingAddress
+    events: ring.RingAddress
     config: AlarmsConfig
     run: str
 
@@ -60,10 +141,10 @@ def alarms_main(spec: AlarmsSpec, status: Any) -> None:
     Target of a `spawn`ed process; `status` is its end of a pipe, for events about what it has sent.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(STOP, _leave)
+    signal.signal(child.STOP, _leave)
     parent = multiprocessing.parent_process()  # who started it, even if that is gone by now
     parent_pid = os.getppid() if parent is None else parent.pid
-    watch(spec, apprise_senders(spec.config, spec.run), reporter(status), lambda: os.getppid() == parent_pid)
+    watch(spec, apprise_senders(spec.config, spec.run), child.reporter(status), lambda: os.getppid() == parent_pid)
 
 
 def watch(
@@ -85,14 +166,14 @@ def watch(
     clock = spec.clock
     outboxes = [Outbox(_reporting(send, to, report)) for send, to in zip(senders, _TO, strict=False)]
     watcher = Watcher(spec.config, outboxes, clock.now())
-    with closing(RingReader(spec.telemetry)) as telemetry, closing(RingReader(spec.events)) as events:
+    with closing(ring.RingReader(spec.telemetry)) as telemetry, closing(ring.RingReader(spec.events)) as events:
         while True:
             lives = parent_lives()  # before the rings: who ends puts the last word in first
-            report(alive(_SENDING_S))
+            report(child.alive(_SENDING_S))
             watcher.look(telemetry.drain(), events.drain(), clock.now())
             if watcher.ended or not lives:
                 break
-            report(alive(_IDLE_S))
+            report(child.alive(_IDLE_S))
             time.sleep(_LOOK_S)
         if not watcher.ended:
             watcher.orphaned(clock.now())

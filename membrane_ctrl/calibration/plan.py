@@ -1,17 +1,15 @@
 """Where the mirror goes for a calibration, whether it may, and how long that takes. Pure."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from membrane_ctrl.config import Config
-from membrane_ctrl.control.setpoint import RAMP_SHARE
-from membrane_ctrl.errors import InputError
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.control.pid import RAMP_SHARE
 from membrane_ctrl.metrology.calibrate.verdict import GOOD_SPREAD_UM, LEAST_SPREAD_UM
+from membrane_ctrl.model.errors import InputError
 
 # Of the limit's pressure: the sag of a Hencky bowl is known from it to a per cent, the pressure of a sag to three;
 # a film with tension of its own needs less pressure for more depth than said here

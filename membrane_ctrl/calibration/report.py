@@ -1,23 +1,26 @@
 """What a calibration found, as a table for JSON and as lines for a person."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from membrane_ctrl.metrology.calibrate.determined import condition_number, weak_combinations
-from membrane_ctrl.metrology.calibrate.diagnose import laser_scale, left_out
-from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES
-from membrane_ctrl.metrology.calibrate.propagate import propagate
-from membrane_ctrl.metrology.calibrate.solve import Solution
-from membrane_ctrl.metrology.calibrate.verdict import Finding
+from membrane_ctrl.measure.results import write_figure
+from membrane_ctrl.metrology.calibrate import diagnose, parameters, solve, verdict
+from membrane_ctrl.metrology.calibrate.propagate import condition_number, propagate, weak_combinations
+from membrane_ctrl.model.files import users
 
 _SOME_LASER = 0.5  # sigma of the laser's scale without any reading: 1
 
 
-def report_of(solution: Solution | None, findings: Sequence[Finding], analysis_radius_mm: float) -> dict[str, Any]:
+def report_of(
+    solution: solve.Solution | None, findings: Sequence[verdict.Finding], analysis_radius_mm: float
+) -> dict[str, Any]:
     """The report, schema membrane-calibration/1; without a solution only what was found."""
     table: dict[str, Any] = {
         "schema": "membrane-calibration/1",
@@ -28,7 +31,7 @@ def report_of(solution: Solution | None, findings: Sequence[Finding], analysis_r
         return table
     middle = len(solution.states) // 2
     claim = propagate(solution, middle, analysis_radius_mm)
-    scale = laser_scale(solution)
+    scale = diagnose.laser_scale(solution)
     return table | {
         "iterations": len(solution.changes),
         "condition": condition_number(solution),
@@ -48,8 +51,8 @@ def report_of(solution: Solution | None, findings: Sequence[Finding], analysis_r
     }
 
 
-def _parameter(solution: Solution, name: str) -> dict[str, Any]:
-    k = NAMES.index(name)
+def _parameter(solution: solve.Solution, name: str) -> dict[str, Any]:
+    k = parameters.NAMES.index(name)
     return {
         "name": name,
         "value": float(solution.values[k]),
@@ -58,7 +61,7 @@ def _parameter(solution: Solution, name: str) -> dict[str, Any]:
     }
 
 
-def _sets(solution: Solution) -> list[dict[str, Any]]:
+def _sets(solution: solve.Solution) -> list[dict[str, Any]]:
     """Each set: its noise against the camera's, what the model leaves, and the set against the others."""
     return [
         {
@@ -71,7 +74,7 @@ def _sets(solution: Solution) -> list[dict[str, Any]]:
             "left_out_freedom": out.freedom,
         }
         for phases, state, linear, out in zip(
-            solution.problem.sets, solution.states, solution.equations, left_out(solution), strict=True
+            solution.problem.sets, solution.states, solution.equations, diagnose.left_out(solution), strict=True
         )
     ]
 
@@ -84,7 +87,7 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         return lines
     lines.append("what           stated wrong by   +-        known before")
     for row in report["parameters"]:
-        says = ALL[NAMES.index(row["name"])].says
+        says = parameters.ALL[parameters.NAMES.index(row["name"])].says
         lines.append(
             f"{row['name']:<18}{row['value']:>+11.4f}  {row['sigma']:<9.4f} {row['sigma_before']:<8.4g} {says}"
         )
@@ -109,3 +112,56 @@ def lines_of(report: dict[str, Any]) -> list[str]:
     if report.get("out"):
         lines.append(f"written: {report['out']} (hash {report['hash']})")
     return lines
+
+
+# What a calibration leaves of the seen screen points, set by set: noise if the model is right, a pattern if not.
+
+
+FloatArray = NDArray[np.float64]
+
+_INCHES = 2.6  # a panel
+_DPI = 110
+_CELLS = 24  # across the picture: enough points in each for a pattern below the noise to be seen
+
+
+def draw_residuals(path: Path, solution: solve.Solution) -> None:
+    """Draw means of the s_x and s_y residuals of all sets over the camera's picture, one scale for all.
+
+    Raises OSError if the file cannot be written.
+    """
+    count = len(solution.states)
+    edges = _edges(solution)
+    maps = [[_means(solution, k, axis, edges) for k in range(count)] for axis in range(2)]
+    reach = float(np.nanpercentile(np.abs(maps), 98)) or 1.0  # single cells at the edge must not set the scale
+    colours = ScalarMappable(Normalize(-reach, reach), "RdBu_r")
+    figure = Figure(figsize=(_INCHES * count, 2 * _INCHES), layout="constrained")
+    panels = figure.subplots(2, count, squeeze=False, sharex=True, sharey=True)
+    for axis, name in enumerate(("s_x", "s_y")):
+        for k, phases in enumerate(solution.problem.sets):
+            panel = panels[axis][k]
+            panel.pcolormesh(*edges, maps[axis][k], cmap=colours.cmap, norm=colours.norm)
+            panel.set_aspect("equal")
+            panel.set_title(f"{phases.name}: {name}", fontsize=8, parse_math=False)
+            panel.tick_params(labelsize=6)
+    panels[0][0].invert_yaxis()  # rows count downwards; the axes are shared
+    figure.colorbar(colours, ax=panels, label="seen minus predicted, um on the screen")
+    write_figure(users(path), figure, _DPI)
+
+
+def _edges(solution: solve.Solution) -> tuple[FloatArray, FloatArray]:
+    """Columns and rows at which square cells begin and end."""
+    column = np.concatenate([phases.column_px for phases in solution.problem.sets])
+    row = np.concatenate([phases.row_px for phases in solution.problem.sets])
+    side = max(float(np.ptp(column)), float(np.ptp(row)), 1.0) / _CELLS
+    across, down = (np.arange(part.min(), part.max() + side, side) for part in (column, row))
+    return across, down
+
+
+def _means(solution: solve.Solution, index: int, axis: int, edges: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """Weighted means over cells, (rows, columns); NaN where a set has no point."""
+    phases, linear = solution.problem.sets[index], solution.equations[index]
+    weights = linear.trust.weights / phases.sigma_mm**2
+    bins = (edges[1], edges[0])
+    total = np.histogram2d(phases.row_px, phases.column_px, bins, weights=weights)[0]
+    summed = np.histogram2d(phases.row_px, phases.column_px, bins, weights=weights * linear.residual_mm[axis])[0]
+    return np.divide(1e3 * summed, total, out=np.full_like(total, np.nan), where=total > 0)

@@ -1,21 +1,22 @@
 """A running hold under the hand of a calibration: look, go, settle, take a set. The supervisor stays in charge."""
 
-from __future__ import annotations
-
+import contextlib
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
-from membrane_ctrl.calibration.plan import SETTLE_S, Held
-from membrane_ctrl.commands import Command, Kind
-from membrane_ctrl.config import LimitsConfig
-from membrane_ctrl.errors import DeviceError, RejectedError
-from membrane_ctrl.names import ShapeState, State
-from membrane_ctrl.telemetry import TelemetryRow
-from membrane_ctrl.tick import Event
-from tuning.hold_link import HoldError, HoldLink, News
+from membrane_ctrl.calibration.plan import SETTLE_S, Held, reach_of, step_s, way_s
+from membrane_ctrl.calibration.session import Head, Session
+from membrane_ctrl.config.schema import LimitsConfig
+from membrane_ctrl.controller.commands import Command, Kind
+from membrane_ctrl.model import errors, events, states, telemetry
+from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News
+from membrane_ctrl.sessions.progress import Progress
 
 WHY = "calibration of the optics"
 _LOOK_S = 10.0  # at the pressure and the leak, which are noisy
@@ -62,14 +63,14 @@ class Sweep:
         DeviceError
             If no camera measures it.
         """
-        rows: deque[TelemetryRow] = deque()
+        rows: deque[telemetry.TelemetryRow] = deque()
         shape = None
         while shape is None or rows[-1].mono_s - rows[0].mono_s < _LOOK_S:
             news = self._news()
             rows.extend(news.rows)
             shape = next((each for each in reversed(news.shapes) if each.verdict != "rejected"), shape)
             if shape is None and rows and rows[-1].mono_s - rows[0].mono_s > _SHAPE_WITHIN_S:
-                raise DeviceError(
+                raise errors.DeviceError(
                     f"{self._link.name}: no shape within {_SHAPE_WITHIN_S:.0f} s; "
                     "has this run a camera that sees the mirror? (ctl status)"
                 )
@@ -82,7 +83,7 @@ class Sweep:
             # the mean flow makes up for the leak, which is estimated only after a while of hold
             leak_um_per_s=_mean(leaks or [row.i_um_per_s for row in rows]),
             swing_adu=shape.modulation_median_adu,
-            shape_on=newest.shape_state != ShapeState.OFF,
+            shape_on=newest.shape_state != states.ShapeState.OFF,
         )
 
     def claim(self, setpoint_um: float) -> None:
@@ -101,7 +102,7 @@ class Sweep:
         """
         self._ask("setpoint", setpoint_um)
         patience_s = _LATE[0] * expected_s + _LATE[1]
-        there: deque[TelemetryRow] = deque()
+        there: deque[telemetry.TelemetryRow] = deque()
         begin_s, obeyed = math.nan, False
         while True:
             for row in self._news().rows:
@@ -117,11 +118,11 @@ class Sweep:
             if there and there[-1].mono_s - there[0].mono_s >= SETTLE_S and self._inside(there):
                 return
             if self._last_s - begin_s > patience_s:
-                raise DeviceError(
+                raise errors.DeviceError(
                     f"the mirror does not settle at {setpoint_um:g} um in {patience_s:.0f} s; paused, or too tight?"
                 )
 
-    def take(self) -> Event:
+    def take(self) -> events.Event:
         """Have a set taken; one that is bad is taken again, once.
 
         Raises
@@ -134,14 +135,14 @@ class Sweep:
         first = self._capture()
         event = first if "set" in first else self._capture()
         if "set" not in event:
-            raise RejectedError(f"no good set in two attempts: {first['failed']}; {event['failed']}")
+            raise errors.RejectedError(f"no good set in two attempts: {first['failed']}; {event['failed']}")
         return event
 
     def shape_loop(self, on: bool) -> None:
         """Switch the outer loop."""
         self._ask("shape_on" if on else "shape_off")
 
-    def _capture(self) -> Event:
+    def _capture(self) -> events.Event:
         self._ask("capture")
         begin_s = self._last_s
         while self._last_s - begin_s < _SET_WITHIN_S:
@@ -150,7 +151,7 @@ class Sweep:
                 return told[-1]
         return {"kind": "capture", "failed": f"no set within {_SET_WITHIN_S:.0f} s"}
 
-    def _inside(self, rows: deque[TelemetryRow]) -> bool:
+    def _inside(self, rows: deque[telemetry.TelemetryRow]) -> bool:
         last = [row.error_um for row in rows if rows[-1].mono_s - row.mono_s <= _MEAN_S]
         return abs(_mean(last)) < self._limits.band_um
 
@@ -164,8 +165,8 @@ class Sweep:
             if event["kind"] == "state":
                 self._why = f" ({event['why']})"
         for row in news.rows:
-            if row.state != State.HOLD:
-                name = State(int(row.state)).name.lower()
+            if row.state != states.State.HOLD:
+                name = states.State(int(row.state)).name.lower()
                 raise HoldError(
                     f"the mirror is not held but in state {name}{self._why}; start or resume the hold first"
                 )
@@ -179,3 +180,105 @@ class Sweep:
 def _mean(values: list[float]) -> float:
     finite = [value for value in values if math.isfinite(value)]
     return sum(finite) / len(finite) if finite else math.nan
+
+
+# The sets of a session, one after the other, on a running hold; and the way back, whatever happens.
+
+
+@dataclass(frozen=True, slots=True)
+class Procedure:
+    """What moves the mirror for a calibration.
+
+    Attributes
+    ----------
+    link : CaptureLink
+        The hold.
+    sweep : Sweep
+        The hand on it.
+    held : Held
+        The mirror as it was found.
+    progress : Progress
+        For the person who waits.
+    """
+
+    link: CaptureLink
+    sweep: Sweep
+    held: Held
+    progress: Progress
+
+    def times_s(self, head: Head, missing: tuple[int, ...]) -> list[float]:
+        """How long each step takes: the sets that are missing, and the way back."""
+        stops = [self.held.setpoint_um, *(head.setpoints_um[k] for k in missing), head.start_um]
+        return [step_s(self.held, a, b, self.link.config) for a, b in pairwise(stops)]
+
+    def check(self, head: Head) -> None:
+        """Raises InputError if the setpoints are out of reach, or the mirror cannot be moved both ways."""
+        held, config = self.held, self.link.config
+        low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
+        reach = reach_of(held, config)
+        if low_um < reach.low_um or high_um > reach.high_um:
+            raise errors.InputError(
+                f"the sets from {low_um:g} to {high_um:g} um are beyond {reach.low_um:.0f} to {reach.high_um:.0f}, "
+                f"which {reach.low_why} and {reach.high_why} leave"
+            )
+        if way_s(held, low_um, high_um, config) + way_s(held, high_um, low_um, config) == float("inf"):
+            raise errors.InputError(
+                f"the mirror loses {held.leak_um_per_s:.2f} um/s: it cannot be moved both ways; "
+                "open the bleed (loop.bleed_fraction), or give the pump more reserve"
+            )
+
+    def take(self, session: Session) -> None:
+        """Take what is missing, come back.
+
+        Raises
+        ------
+        HoldError
+            If the mirror is held no more, or somebody else moves it; it is left alone then.
+        DeviceError, RejectedError, KeyboardInterrupt
+            After the mirror has come back.
+        """
+        with self.progress.catching(), self._coming_back(session):
+            self.sweep.shape_loop(False)
+            times_s = self.times_s(session.head, session.missing)
+            for number, index in enumerate(session.missing):
+                self._take(session, index, times_s[number], sum(times_s[number + 1 :]))
+
+    def _take(self, session: Session, index: int, expected_s: float, after_s: float) -> None:
+        setpoint_um = session.head.setpoints_um[index]
+        what = f"set {index + 1} of {len(session.sets)} at {setpoint_um:+g} um"
+        self.progress.begin(what, expected_s, after_s)
+        self.sweep.go(setpoint_um, expected_s)
+        event = self.sweep.take()
+        session.keep(index, self.link.run_dir / str(event["set"]))
+        self.progress.say(f"{what}: {event['verdict']}" + (f" ({event['reason']})" if event.get("reason") else ""))
+
+    @contextmanager
+    def _coming_back(self, session: Session) -> Iterator[None]:
+        say = self.progress.say
+        try:
+            yield
+        except HoldError:
+            off = "; the shape loop is off (ctl shape on)" if session.head.shape_on else ""
+            say(f"the mirror is left to whoever has it{off}; go on with --session {session.path}")
+            raise
+        except BaseException:
+            self.progress.interrupted = False
+            say(f"stopped with {len(session.missing)} sets missing; go on with --session {session.path}")
+            with contextlib.suppress(HoldError, errors.DeviceError):
+                self._come_back(session)
+            raise
+        self._come_back(session)
+
+    def _come_back(self, session: Session) -> None:
+        head = session.head
+        far_um = max(head.setpoints_um, key=lambda each: abs(each - head.start_um))
+        back_s = step_s(self.held, far_um, head.start_um, self.link.config)
+        self.progress.begin(f"back to {head.start_um:g} um (Ctrl-C leaves it on its way)", back_s, 0.0)
+        try:
+            self.sweep.go(head.start_um, back_s)
+        except KeyboardInterrupt:
+            off = "; then switch the shape loop on (ctl shape on)" if head.shape_on else ""
+            self.progress.say(f"left: the hold ramps on to {head.start_um:g} um by itself{off}")
+            raise
+        if head.shape_on:
+            self.sweep.shape_loop(True)

@@ -1,19 +1,17 @@
 """The command line: one thin function a command; errors end in one line and an exit code (INTERFACES section 4)."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
+from importlib.metadata import entry_points
 from typing import Annotated
 
 import typer
 
 from membrane_ctrl import __version__
-from membrane_ctrl.cli import auxiliary, calibrating, devices, holding, optics, records
-from membrane_ctrl.errors import CommandError, Exit
+from membrane_ctrl.cli import calibrating, devices, holding, optics, records
+from membrane_ctrl.model.errors import CommandError, Exit
+from membrane_ctrl.model.terminal import one_line, only_text
 from membrane_ctrl.review.cli import add_commands as add_review_commands
-from membrane_ctrl.terminal import one_line, only_text
-from membrane_ctrl.tune.cli import app as tune_app
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -44,7 +42,9 @@ def top(version: Annotated[bool, typer.Option("--version", help="Print the versi
         raise typer.Exit
 
 
-for _family in (holding, devices, optics, calibrating, auxiliary, records):
+for _family in (holding, devices, optics, calibrating, records):
     _family.add_commands(app)
-app.add_typer(tune_app, name="tune")
 add_review_commands(app)
+# tuning builds on this package, not the reverse: `tune` comes as an entry point
+for _entry in entry_points(group="membrane_ctrl.subcommands"):
+    app.add_typer(_entry.load(), name=_entry.name)

@@ -1,7 +1,5 @@
 """The commands that talk to devices without holding a mirror."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer
@@ -21,14 +19,14 @@ def check(
     json: JsonOption = False,
 ) -> int:
     """Validate a configuration, probe the devices it names, and say what would happen."""
-    from membrane_ctrl.check import check_config
+    from membrane_ctrl.commissioning.check import check_config
 
     return check_config(configured(config), str(config), json)
 
 
 def devices(json: JsonOption = False) -> int:
     """List serial ports, cameras and displays, with the text to paste into a configuration."""
-    from membrane_ctrl.devices import list_devices
+    from membrane_ctrl.commissioning.devices import list_devices
 
     return list_devices(json)
 
@@ -39,6 +37,6 @@ def conformance(
     json: JsonOption = False,
 ) -> int:
     """Test whether a board does what a pump board must do. The pump runs at a few per cent: vent the mirror first."""
-    from membrane_ctrl.conformance import run_conformance
+    from membrane_ctrl.commissioning.devices import run_conformance
 
     return run_conformance(url, unit_id, json)

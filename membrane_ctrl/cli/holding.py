@@ -1,16 +1,13 @@
 """The commands that hold a mirror, or talk to a hold."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, configured
-from membrane_ctrl.config import Config
-from membrane_ctrl.durations import parse_duration_s
-from membrane_ctrl.errors import InputError
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model import clock, errors
 
 alarm_app = typer.Typer(no_args_is_help=True)
 
@@ -47,13 +44,13 @@ def hold(
     json: JsonOption = False,
 ) -> int:
     """Hold the mirror until told to stop: the main job."""
-    from membrane_ctrl.hold import HoldOptions, hold_mirror
+    from membrane_ctrl.hold.start import HoldOptions, hold_mirror
 
     options = HoldOptions(
         config=_started(_with_devices(config, devices, twin), from_flat),
         source=str(config or devices or "the defaults"),
         twin=twin,
-        duration_s=None if duration is None else parse_duration_s(duration),
+        duration_s=None if duration is None else clock.parse_duration_s(duration),
         name=name,
         logs_dir=logs,
         clear_faults=clear_faults,
@@ -70,7 +67,7 @@ def twin(
     from_flat: FlatOption = False,
 ) -> int:
     """Serve the simulated bench on its real protocol, for any client, until interrupted."""
-    from membrane_ctrl.serve_twin import serve_twin
+    from membrane_ctrl.sim.bench import serve_twin
 
     return serve_twin(_started(configured(config), from_flat), speed)
 
@@ -84,7 +81,7 @@ def safe(
     ] = True,
 ) -> int:
     """Stop the pump of the devices that a configuration names, whatever runs or ran; the vent stays as it is."""
-    from membrane_ctrl.safe_state import make_safe
+    from membrane_ctrl.commissioning.safe import make_safe
 
     return make_safe(configured(config), str(config), logs, latch)
 
@@ -112,8 +109,8 @@ def ctl(
     json: JsonOption = False,
 ) -> int:
     """Talk to a running hold: ask how it is, or tell it what to do."""
-    from membrane_ctrl.ctl import CtlOptions, Where
-    from membrane_ctrl.ctl import ctl as ask
+    from membrane_ctrl.control_port.ctl import CtlOptions, Where
+    from membrane_ctrl.control_port.ctl import ctl as ask
 
     where = Where(socket, run, tls, certificate, key, authority)
     return ask(CtlOptions(action, argument, why, take_over, every, trial, json, where))
@@ -131,7 +128,7 @@ def alarm_test(
     json: JsonOption = False,
 ) -> int:
     """Send a test notice to all whom an alarm would reach."""
-    from membrane_ctrl.alarms.command import send_test_alarm
+    from membrane_ctrl.alarms.senders import send_test_alarm
 
     return send_test_alarm(configured(config), str(config or "the defaults"), escalated, json)
 
@@ -142,9 +139,9 @@ def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> Conf
         return configured(config)
     lab = configured(devices)
     if not twin:
-        raise InputError("--devices: only with --twin; without it --config names the devices")
+        raise errors.InputError("--devices: only with --twin; without it --config names the devices")
     if lab.devices is None:
-        raise InputError(f"{devices}: devices: missing; there is nothing to emulate")
+        raise errors.InputError(f"{devices}: devices: missing; there is nothing to emulate")
     return lab if config is None else configured(config).model_copy(update={"devices": lab.devices})
 
 

@@ -1,7 +1,5 @@
 """The commands over capture sets."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
@@ -27,7 +25,7 @@ def measure(
     json: JsonOption = False,
 ) -> int:
     """Measure one capture set: height, Zernike coefficients, quality."""
-    from membrane_ctrl.sets.measure import measure_command
+    from membrane_ctrl.measure.measure import measure_command
 
     return measure_command(capture_set, geometry, out, json, pictures, rerun)
 
@@ -52,7 +50,7 @@ def uncertainty(
     json: JsonOption = False,
 ) -> int:
     """Monte Carlo over geometry and pixel noise: RMSE of the height, or of the change between two sets."""
-    from membrane_ctrl.sets.uncertainty_command import UncertaintyOptions, uncertainty_command
+    from membrane_ctrl.measure.uncertainty import UncertaintyOptions, uncertainty_command
 
     options = UncertaintyOptions(
         folder=capture_set,
@@ -83,7 +81,7 @@ def stability(
     json: JsonOption = False,
 ) -> int:
     """Stability of a run of sets: standard deviation, points in time, pairs with their uncertainty."""
-    from membrane_ctrl.sets.stability_command import StabilityOptions, stability_command
+    from membrane_ctrl.measure.stability import StabilityOptions, stability_command
 
     options = StabilityOptions(run_of_sets, out, tuple(point or ()), geometry, trials, seed, json, rerun)
     return stability_command(options)
@@ -116,8 +114,8 @@ def simulate(
     interval_s: Annotated[float, typer.Option(min=0.0, help="From set to set of a run.")] = 4.0,
 ) -> int:
     """Write a capture set, or a run of sets, with its truth beside it."""
-    from membrane_ctrl.sets.simulate_command import SimulateOptions, simulate_command
-    from membrane_ctrl.twin.simulation_spec import Motion
+    from membrane_ctrl.measure.simulate import SimulateOptions, simulate_command
+    from membrane_ctrl.sim.optics.simulation_spec import Motion
 
     options = SimulateOptions(
         folder=set_dir,

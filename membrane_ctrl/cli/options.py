@@ -1,15 +1,13 @@
 """What several commands share: options, and the configuration that they name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, TypeVar
 
 import typer
 
-from membrane_ctrl.config import Config
-from membrane_ctrl.config_file import load
-from membrane_ctrl.section import Section
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.section import Section
+from membrane_ctrl.config.toml_file import load
 
 S = TypeVar("S", bound=Section)
 

@@ -1,7 +1,5 @@
 """The commands over recorded inputs: run them again, mend them."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 from typing import Annotated
@@ -9,8 +7,7 @@ from typing import Annotated
 import typer
 
 from membrane_ctrl.cli.options import JsonOption, RunArgument
-from membrane_ctrl.durations import parse_duration_s
-from membrane_ctrl.errors import InputError
+from membrane_ctrl.model import clock, errors
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -31,10 +28,10 @@ def replay(
     """Run a run's recorded inputs through today's control code and say what is not the same (exit 3)."""
     import math
 
-    from membrane_ctrl.replay_command import replay_command
+    from membrane_ctrl.replay.command import replay_command
 
-    from_s = 0.0 if start is None else parse_duration_s(start)
-    to_s = math.inf if end is None else parse_duration_s(end)
+    from_s = 0.0 if start is None else clock.parse_duration_s(start)
+    to_s = math.inf if end is None else clock.parse_duration_s(end)
     with _files_of_the_run():
         return replay_command(run_dir, from_s, to_s, to_test, json)
 
@@ -47,7 +44,7 @@ def repair(
     json: JsonOption = False,
 ) -> int:
     """Mend what a crash left of a run: torn segments, a torn event log, a missing summary."""
-    from membrane_ctrl.repair import repair_command
+    from membrane_ctrl.replay.repair import repair_command
 
     with _files_of_the_run():
         return repair_command(run_dir, in_place, json)
@@ -59,4 +56,4 @@ def _files_of_the_run() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(f"{error.filename or 'files'}: {(error.strerror or str(error)).lower()}") from None
+        raise errors.InputError(f"{error.filename or 'files'}: {(error.strerror or str(error)).lower()}") from None

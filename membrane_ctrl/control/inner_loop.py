@@ -4,19 +4,14 @@ Order of a tick: setpoint ramp and trim -> measurement filter -> P, I, D -> feed
 -> pump curve. The measurement filter stands before the limits: noise that meets a one-sided limit becomes a bias.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
-from membrane_ctrl.config import LoopConfig, PumpConfig
-from membrane_ctrl.control.feedforward import FeedForward
-from membrane_ctrl.control.filters import LowPass
-from membrane_ctrl.control.leak import LeakEstimate
-from membrane_ctrl.control.limiter import FlowLimiter
-from membrane_ctrl.control.pid import Pid, PidGains, PidTerms
-from membrane_ctrl.control.pump_curve import PumpCurve
-from membrane_ctrl.control.setpoint import SetpointRamp, SetpointWeight
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from membrane_ctrl.control import film_health, filters, gas, pid
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,16 +109,16 @@ class InnerLoop:
         self._loop = loop
         self._flow_full_um_per_s = pump.flow_full_um_per_s
         flow_max_um_per_s = min(loop.flow_max_um_per_s, pump.flow_full_um_per_s)
-        self._measured = LowPass(loop.measurement_filter_s)
+        self._measured = filters.LowPass(loop.measurement_filter_s)
         # The setpoint passes the same lag as the measurement: a ramp is then no error of its own.
-        self._matched = LowPass(loop.measurement_filter_s)
-        self._ramp = SetpointRamp(loop.setpoint_ramp_um_per_s, flow_max_um_per_s)
-        self._weight = SetpointWeight(loop.setpoint_weight, loop.ti_s)
-        self._pid = Pid(_gains(loop), flow_max_um_per_s)
-        self._feedforward = FeedForward(loop)
-        self._limiter = FlowLimiter(flow_max_um_per_s, loop.flow_rate_limit_um_per_s2)
-        self._curve = PumpCurve(pump)
-        self._leak = LeakEstimate()
+        self._matched = filters.LowPass(loop.measurement_filter_s)
+        self._ramp = pid.SetpointRamp(loop.setpoint_ramp_um_per_s, flow_max_um_per_s)
+        self._weight = pid.SetpointWeight(loop.setpoint_weight, loop.ti_s)
+        self._pid = pid.Pid(_gains(loop), flow_max_um_per_s)
+        self._feedforward = gas.FeedForward(loop)
+        self._limiter = pid.FlowLimiter(flow_max_um_per_s, loop.flow_rate_limit_um_per_s2)
+        self._curve = gas.PumpCurve(pump)
+        self._leak = film_health.LeakEstimate()
         self._setpoint_um = math.nan
         self._shaped_um = math.nan
 
@@ -183,7 +178,7 @@ class InnerLoop:
         mean_um_per_s = self._pid.integral_um_per_s
         self._limiter.limit(mean_um_per_s, dt_s)
         fraction = self._curve.command(self._limiter.flow_um_per_s, dt_s)
-        return self._output(PidTerms(0.0, mean_um_per_s, 0.0), 0.0, mean_um_per_s, fraction)
+        return self._output(pid.PidTerms(0.0, mean_um_per_s, 0.0), 0.0, mean_um_per_s, fraction)
 
     def follow(self, given: LoopInput, flow_um_per_s: float, dt_s: float) -> LoopOutput:
         """One tick in which somebody else gives the flow (manual, tuning, ramp-down).
@@ -211,7 +206,7 @@ class InnerLoop:
             self._leak.update(self._curve.flow(fraction), weather_um_per_s, self._measured.value, dt_s)
         else:
             self._leak.pause()
-        terms = PidTerms(0.0, self._pid.integral_um_per_s, 0.0)
+        terms = pid.PidTerms(0.0, self._pid.integral_um_per_s, 0.0)
         return self._output(terms, weather_um_per_s, flow_um_per_s, fraction)
 
     def follow_raw(self, given: LoopInput, fraction: float, dt_s: float) -> LoopOutput:
@@ -229,7 +224,7 @@ class InnerLoop:
         self.follow(given, flow_um_per_s, dt_s)
         self._curve.stopped()
         self._leak.pause()
-        return self._output(PidTerms(0.0, self._pid.integral_um_per_s, 0.0), 0.0, flow_um_per_s, fraction)
+        return self._output(pid.PidTerms(0.0, self._pid.integral_um_per_s, 0.0), 0.0, flow_um_per_s, fraction)
 
     def set_gains(self, loop: LoopConfig) -> None:
         """Take new settings without a bump in the flow."""
@@ -237,7 +232,7 @@ class InnerLoop:
         self._loop = loop
         self._measured.time_constant_s = self._matched.time_constant_s = loop.measurement_filter_s
         self._ramp.rate_um_per_s, self._ramp.flow_max_um_per_s = loop.setpoint_ramp_um_per_s, flow_max_um_per_s
-        self._weight = SetpointWeight(loop.setpoint_weight, loop.ti_s)
+        self._weight = pid.SetpointWeight(loop.setpoint_weight, loop.ti_s)
         self._weight.reset(self._shaped_um)
         self._limiter.flow_max_um_per_s = self._pid.flow_max_um_per_s = flow_max_um_per_s
         self._limiter.rate_um_per_s2 = loop.flow_rate_limit_um_per_s2
@@ -266,7 +261,7 @@ class InnerLoop:
         self._shaped_um = shaped_um
         return self._matched.update(shaped_um, dt_s) - filtered_um, speed_um_per_s
 
-    def _output(self, terms: PidTerms, feedforward: float, wanted: float, fraction: float) -> LoopOutput:
+    def _output(self, terms: pid.PidTerms, feedforward: float, wanted: float, fraction: float) -> LoopOutput:
         """The tick as it is told; flows in um/s."""
         return LoopOutput(
             setpoint_um=self._setpoint_um,
@@ -285,5 +280,50 @@ class InnerLoop:
         )
 
 
-def _gains(loop: LoopConfig) -> PidGains:
-    return PidGains(loop.kp_per_s, loop.ti_s, loop.td_s)
+def _gains(loop: LoopConfig) -> pid.PidGains:
+    return pid.PidGains(loop.kp_per_s, loop.ti_s, loop.td_s)
+
+
+# Margins of the linear inner loop: the sampled loop as it runs, its dead times exact, at every frequency.
+
+
+# docs/physics.md, inner loop; the tick itself takes 5 ms from sample to write
+PUMP_LAG_S = 0.15
+DEAD_S = 0.075 + 0.005
+# Below the corner frequencies of the controller by this factor, L is a double integrator
+_FAR_BELOW = 0.01
+_POINTS = 2000
+_ALIASES = 3  # they fall with the third power of the frequency
+
+
+def open_loop(loop: LoopConfig, omega: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return L of the sampled loop: PID and filter as difference equations, hold, dead time, pump lag, mirror."""
+    dt_s = 1 / loop.rate_hz
+    z = np.exp(1j * omega * dt_s)
+    share = filters.smoothing(dt_s, loop.measurement_filter_s)
+    measurement_filter = share / (1 - (1 - share) / z)
+    derivative = loop.td_s * (1 - 1 / z) / dt_s
+    pi = loop.kp_per_s * (1 + dt_s / loop.ti_s / (z - 1) + derivative)  # the integrator moves after the output
+    mirror = np.zeros_like(z)
+    for k in range(-_ALIASES, _ALIASES + 1):  # what the samples fold back; at 1 Hz it decides
+        s = 1j * (omega + 2 * math.pi * k / dt_s)
+        mirror += (1 - 1 / z) / (s * dt_s) * np.exp(-s * DEAD_S) / (1 + s * PUMP_LAG_S) / s
+    return np.asarray(pi * measurement_filter * mirror)
+
+
+def peak_sensitivity(loop: LoopConfig) -> float:
+    """Return the largest amplification of a disturbance at any frequency; infinity for an unstable loop.
+
+    1.4 is what the defaults stay below. A loop with `kp_per_s` 0 has none: NaN.
+    """
+    if loop.kp_per_s == 0.0:
+        return math.nan
+    low = _FAR_BELOW * min(loop.kp_per_s, 1 / loop.ti_s)
+    omega = np.geomspace(low, math.pi * loop.rate_hz * 0.999, _POINTS)
+    difference = 1 + open_loop(loop, omega)
+    # Nyquist: L has two poles at the origin and none outside, so 1 + L must turn by half a turn from far below to
+    # the sampling limit; each further encirclement of -1 is a pair of unstable poles.
+    turned = float(np.unwrap(np.angle(difference))[-1] - np.angle(difference)[0])
+    if abs(turned - math.pi) > math.pi / 2:
+        return math.inf
+    return float(np.max(1 / np.abs(difference)))

@@ -8,14 +8,12 @@ Compared are changes against references that follow slowly while all agree, so t
 mount, a gauge's zero, creep) is no lie; the shape loop is there for that.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import IntEnum
 
 from membrane_ctrl.control.filters import LowPass, smoothing
-from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 # The gauge's 0.5 Pa per sample are then 0.7 um at 10 Hz, 0.3 um at 50 Hz.
 SMOOTH_S = 10.0

@@ -1,16 +1,14 @@
 """The sensor as a grid of bins: rays of their centres, and what averaging over a bin does to a curved phase."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.config import CameraConfig
-from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.reconstruct import Points, Tracer
-from membrane_ctrl.metrology.surface import Surface
+from membrane_ctrl.config.schema import CameraConfig
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
+from membrane_ctrl.metrology.reconstruct import Fit, Points, Tracer
 
 FloatArray = NDArray[np.float64]
 
@@ -67,3 +65,59 @@ class BinGrid:
             tracer.intersect(moved, surface, newton=3)
             total += tracer.predict_screen(moved, surface)
         return total / len(self._around) - centre
+
+
+# Linear uncertainty of one cycle: white noise of the phase, or the scatter of the slopes if that is larger.
+#
+# cov(parameters) = M^-1 (var_x M_x + var_y M_y) M^-1 with M = M_x + M_y = D^T W D. It knows nothing of errors that
+# all pixels share (geometry, gamma of the display, motion of the film): those are the Monte Carlo's.
+
+
+QUANTISATION_VARIANCE_ADU2 = 1 / 12  # of a value rounded to an integer
+
+
+def pixel_sigma_adu(noise_adu: float) -> float:
+    """Noise of a pixel with the rounding of its converter."""
+    return math.sqrt(noise_adu**2 + QUANTISATION_VARIANCE_ADU2)
+
+
+def slope_per_screen(geometry: Geometry, radius_mm: float, sag_mm: float) -> FloatArray:
+    """Mean over the mirror of (d g_i / d s_k)^2 in 1/mm^2, (2, 2): rows the slopes x and y, columns s_x and s_y.
+
+    The normal is n = u - d with u the unit vector to the screen point, so d n = (e - u (u e)) / |q| d s and
+    g = -n_xy / n_z gives d g = -(d n_xy + g d n_z) / n_z. Taken on a bowl of the given sag, each point towards the
+    screen point that it really reflects (its normal is then the bowl's own).
+    """
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-0.9, 0.9, 15) * radius_mm] * 2))
+    inside = np.hypot(x, y) <= 0.95 * radius_mm
+    x, y = x[inside], y[inside]
+    point = np.stack([x, y, sag_mm * (x**2 + y**2) / radius_mm**2])
+    d = point - geometry.pinhole_mm[:, None]
+    d /= np.linalg.norm(d, axis=0)
+    n = np.stack([-2 * sag_mm * x / radius_mm**2, -2 * sag_mm * y / radius_mm**2, np.ones_like(x)])
+    u = d - 2 * np.sum(d * n, axis=0) / np.sum(n * n, axis=0) * n
+    face = np.cross(geometry.screen_s_x, geometry.screen_s_y)
+    reach = (face @ (geometry.screen_origin_mm[:, None] - point)) / (face @ u)
+    normal = u - d
+    squares = np.empty((2, 2))
+    for k, axis in enumerate((geometry.screen_s_x, geometry.screen_s_y)):
+        turn = (axis[:, None] - u * (axis @ u)) / reach
+        slopes = -(turn[:2] - normal[:2] / normal[2] * turn[2]) / normal[2]
+        squares[:, k] = np.mean(slopes**2, axis=1)
+    return squares
+
+
+def parameter_covariance(fit: Fit, slope_variance: FloatArray) -> FloatArray:
+    """Covariance (36, 36) in mm^2 of the fit's parameters.
+
+    Parameters
+    ----------
+    slope_variance : (2,) array
+        Expected variance of an x and of a y slope of unit weight. Where the fit's own residual is larger, that
+        counts.
+    """
+    free = max(fit.weight_sum - PARAMETERS / 2, 1.0)  # 36 parameters from two slopes a point
+    seen = np.array([fit.residual_x**2, fit.residual_y**2]) * fit.weight_sum / free
+    variance_x, variance_y = np.maximum(slope_variance, seen)
+    normal = fit.normal
+    return np.asarray(normal.inverse @ (variance_x * normal.x + variance_y * normal.y) @ normal.inverse)

@@ -5,8 +5,6 @@ are left out, one at a time since one bad frame spoils the prediction of the oth
 Then every pixel, its period taken from its bin.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -14,20 +12,13 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.config import OpticsConfig
-from membrane_ctrl.estimate import Verdict
-from membrane_ctrl.metrology.bins import BinGrid
-from membrane_ctrl.metrology.frame_evidence import Scene
-from membrane_ctrl.metrology.frame_stack import Binned, FrameStack, bin_frames
-from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.integrity import Flag, inspect, obvious
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.metrology import bins, motion, reconstruct
+from membrane_ctrl.metrology.frames import evidence, frame_stack, integrity
+from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.orders import Orders, gray_bit, orders
-from membrane_ctrl.metrology.patterns import AXES
-from membrane_ctrl.metrology.quality import RESIDUAL_REJECTED_URAD
-from membrane_ctrl.metrology.reconstruct import Tracer
-from membrane_ctrl.metrology.tracking import TrackedPoints, establish
-from membrane_ctrl.metrology.unwrap import centre_phase_rad, mm_per_rad
-from membrane_ctrl.metrology.view import NoFigureError, View, look
+from membrane_ctrl.metrology.phase import AXES, centre_phase_rad, mm_per_rad
+from membrane_ctrl.model.shape_estimate import RESIDUAL_REJECTED_URAD, Verdict
 
 FloatArray = NDArray[np.float64]
 
@@ -82,14 +73,14 @@ class Checked:
         Frames that do not belong.
     """
 
-    stack: FrameStack
-    binned: Binned
-    view: View
+    stack: frame_stack.FrameStack
+    binned: frame_stack.Binned
+    view: evidence.View
     phase_rad: FloatArray
     near: NDArray[np.bool_]
-    tracer: Tracer
-    state: TrackedPoints
-    flags: tuple[Flag, ...]
+    tracer: reconstruct.Tracer
+    state: motion.TrackedPoints
+    flags: tuple[integrity.Flag, ...]
 
     @property
     def verdict(self) -> tuple[Verdict, str]:
@@ -103,10 +94,10 @@ class Checked:
         return Anchor(self.phase_rad, self.view.light)
 
 
-class RejectedSetError(NoFigureError):
+class RejectedSetError(evidence.NoFigureError):
     """A set that gives no figure, with the frames to blame."""
 
-    def __init__(self, reason: str, flags: tuple[Flag, ...]) -> None:
+    def __init__(self, reason: str, flags: tuple[integrity.Flag, ...]) -> None:
         super().__init__(reason)
         self.flags = flags
 
@@ -117,7 +108,7 @@ def vertex_z_mm(optics: OpticsConfig, displacement_um: float) -> float:
     return 0.0 if reference is None or not math.isfinite(displacement_um) else -(displacement_um - reference) * 1e-3
 
 
-def check(stack: FrameStack, optics: OpticsConfig, anchor: Anchor | None = None) -> Checked:
+def check(stack: frame_stack.FrameStack, optics: OpticsConfig, anchor: Anchor | None = None) -> Checked:
     """Check the frames and fit the bins.
 
     Parameters
@@ -134,7 +125,7 @@ def check(stack: FrameStack, optics: OpticsConfig, anchor: Anchor | None = None)
     RejectedSetError
         If the frames do not give a figure.
     """
-    binned = bin_frames(stack, 2**optics.camera.bits - 1)
+    binned = frame_stack.bin_frames(stack, 2**optics.camera.bits - 1)
     try:
         found = _check(stack, binned, optics, anchor)
     except RejectedSetError as error:
@@ -145,7 +136,7 @@ def check(stack: FrameStack, optics: OpticsConfig, anchor: Anchor | None = None)
     return found if _believable_surface(found) else _put_back(stack, binned, optics, anchor) or found
 
 
-def _doubt(stack: FrameStack, flags: tuple[Flag, ...]) -> str:
+def _doubt(stack: frame_stack.FrameStack, flags: tuple[integrity.Flag, ...]) -> str:
     """What else may be wrong where many frames differ from a prediction: the prediction, that is the geometry.
 
     Pictures that are the same, unreadable or dark need no prediction.
@@ -163,7 +154,9 @@ def _believable_surface(checked: Checked) -> bool:
     return 1e6 * float(np.sqrt(np.mean(np.square(field[2:4] - field[4:6])))) <= RESIDUAL_REJECTED_URAD
 
 
-def _put_back(stack: FrameStack, binned: Binned, optics: OpticsConfig, anchor: Anchor | None) -> Checked | None:
+def _put_back(
+    stack: frame_stack.FrameStack, binned: frame_stack.Binned, optics: OpticsConfig, anchor: Anchor | None
+) -> Checked | None:
     """The set with two sinusoids of an axis exchanged, if one exchange alone makes all frames agree.
 
     Three steps that run backwards predict every frame wrongly, so that nobody can be blamed by what it shows. But the
@@ -182,28 +175,32 @@ def _put_back(stack: FrameStack, binned: Binned, optics: OpticsConfig, anchor: A
                 continue
             if not checked.flags and _believable_surface(checked):
                 pair = ((a, b), (b, a))
-                flags = (Flag(k, f"swapped with {stack.patterns[j].name}", math.inf, j) for k, j in pair)
+                flags = (integrity.Flag(k, f"swapped with {stack.patterns[j].name}", math.inf, j) for k, j in pair)
                 found.append(replace(checked, flags=tuple(flags)))
     return found[0] if len(found) == 1 else None
 
 
 def _check(
-    stack: FrameStack, binned: Binned, optics: OpticsConfig, anchor: Anchor | None, rounds: int = _ROUNDS
+    stack: frame_stack.FrameStack,
+    binned: frame_stack.Binned,
+    optics: OpticsConfig,
+    anchor: Anchor | None,
+    rounds: int = _ROUNDS,
 ) -> Checked:
     """The set as it is, frames that do not belong left out in so many rounds. Raises RejectedSetError."""
     geometry = Geometry.from_config(optics)
-    grid = BinGrid(geometry, optics.camera, binned.bin_px)
+    grid = bins.BinGrid(geometry, optics.camera, binned.bin_px)
     near = grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
-    known = {frame: Flag(frame, reason, math.inf) for frame, reason in stack.unusable.items()}
-    known |= {flag.frame: flag for flag in obvious(stack, binned)}
+    known = {frame: integrity.Flag(frame, reason, math.inf) for frame, reason in stack.unusable.items()}
+    known |= {flag.frame: flag for flag in integrity.obvious(stack, binned)}
     excluded = set(known)
-    flags: list[Flag] = []
+    flags: list[integrity.Flag] = []
     for _ in range(rounds):
         try:
             attempt = _attempt(stack, binned, optics, geometry, grid, near, excluded, anchor)
-        except (NoFigureError, ValueError) as error:
+        except (evidence.NoFigureError, ValueError) as error:
             raise RejectedSetError(str(error), _merged(_believable(stack, flags), known)) from None
-        flags = inspect(stack, binned, attempt.scene, excluded)
+        flags = integrity.inspect(stack, binned, attempt.scene, excluded)
         fresh = [flag for flag in flags if flag.frame not in excluded]
         if not fresh:
             _confirm_orders(stack, attempt.phase_rad, binned, attempt.view, excluded, _merged(flags, known))
@@ -226,52 +223,56 @@ def _check(
 
 @dataclass(frozen=True)
 class _Attempt:
-    view: View
+    view: evidence.View
     phase_rad: FloatArray
-    tracer: Tracer
-    state: TrackedPoints
-    scene: Scene
+    tracer: reconstruct.Tracer
+    state: motion.TrackedPoints
+    scene: evidence.Scene
 
 
 def _attempt(
-    stack: FrameStack,
-    binned: Binned,
+    stack: frame_stack.FrameStack,
+    binned: frame_stack.Binned,
     optics: OpticsConfig,
     geometry: Geometry,
-    grid: BinGrid,
+    grid: bins.BinGrid,
     near: NDArray[np.bool_],
     excluded: set[int],
     anchor: Anchor | None,
 ) -> _Attempt:
     """Fit the bins without the excluded frames. Raises NoFigureError or ValueError if that cannot be."""
-    tracer = Tracer(geometry, optics.mirror.radius_mm, vertex_z_mm(optics, stack.mean_reading_um))
-    view = look(stack, binned, excluded, None if anchor is None else anchor.light)
+    tracer = reconstruct.Tracer(geometry, optics.mirror.radius_mm, vertex_z_mm(optics, stack.mean_reading_um))
+    view = evidence.look(stack, binned, excluded, None if anchor is None else anchor.light)
     phase = _absolute(stack, binned, view, anchor, optics)
     candidates = np.flatnonzero(near)
     flat = phase.reshape(2, -1)[:, candidates]
-    state = establish(grid, tracer, candidates, flat, optics.pattern, optics.mirror.analysis_radius_mm)
+    state = motion.establish(grid, tracer, candidates, flat, optics.pattern, optics.mirror.analysis_radius_mm)
     return _Attempt(view, phase, tracer, state, _scene(tracer, state, view, optics))
 
 
-def _believable(stack: FrameStack, flags: list[Flag]) -> list[Flag]:
+def _believable(stack: frame_stack.FrameStack, flags: list[integrity.Flag]) -> list[integrity.Flag]:
     """While sinusoids are wrong so may be the prediction: then only they are named."""
     return [flag for flag in flags if stack.patterns[flag.frame].role == "sin"] or flags
 
 
-def _to_leave_out(stack: FrameStack, fresh: list[Flag]) -> list[Flag]:
+def _to_leave_out(stack: frame_stack.FrameStack, fresh: list[integrity.Flag]) -> list[integrity.Flag]:
     """The worst sinusoid, which may be all that is wrong with the others' predictions; else all that are flagged."""
     sinusoids = [flag for flag in fresh if stack.patterns[flag.frame].role == "sin"]
     return sinusoids[:1] or fresh
 
 
-def _merged(flags: list[Flag], known: dict[int, Flag]) -> tuple[Flag, ...]:
+def _merged(flags: list[integrity.Flag], known: dict[int, integrity.Flag]) -> tuple[integrity.Flag, ...]:
     """All flags in the order of the frames; the latest inspection knows best, and what is known before it stays."""
     named = {**known, **{flag.frame: flag for flag in flags if known.get(flag.frame, flag).swapped_with is None}}
     return tuple(named[frame] for frame in sorted(named))
 
 
 def _absolute(
-    stack: FrameStack, binned: Binned, view: View, anchor: Anchor | None, optics: OpticsConfig
+    stack: frame_stack.FrameStack,
+    binned: frame_stack.Binned,
+    view: evidence.View,
+    anchor: Anchor | None,
+    optics: OpticsConfig,
 ) -> FloatArray:
     """Absolute phases of the bins, (2, rows, columns); NaN where not valid."""
     if anchor is not None:
@@ -285,25 +286,31 @@ def _absolute(
     return out
 
 
-def _axis_orders(stack: FrameStack, binned: Binned, view: View, axis: str, k: int) -> Orders:
+def _axis_orders(
+    stack: frame_stack.FrameStack, binned: frame_stack.Binned, view: evidence.View, axis: str, k: int
+) -> Orders:
     """Gray bits against half the light: the fringes' own mean, which no single frame can spoil."""
     bits = binned.means[stack.gray(axis)] > view.light
     return orders(view.phase_rad[k], bits, view.mask)
 
 
-def _followed(view: View, anchor: Anchor) -> FloatArray:
+def _followed(view: evidence.View, anchor: Anchor) -> FloatArray:
     """Phases next to the anchor's. Raises NoFigureError if the film moved too far to tell."""
     change = np.angle(np.exp(1j * (view.phase_rad - anchor.phase_rad)))
     seen = view.mask & np.isfinite(anchor.phase_rad).all(axis=0)
     lost = float(np.mean(np.abs(change[:, seen]).max(axis=0) > _GUARD_RAD)) if seen.any() else 1.0
     if lost > _LOST_SHARE:
-        raise NoFigureError(f"the phase moved by half a period from the reference at {lost:.0%} of the points")
+        raise evidence.NoFigureError(
+            f"the phase moved by half a period from the reference at {lost:.0%} of the points"
+        )
     return np.where(seen, anchor.phase_rad + change, np.nan)
 
 
-def _scene(tracer: Tracer, state: TrackedPoints, view: View, optics: OpticsConfig) -> Scene:
+def _scene(
+    tracer: reconstruct.Tracer, state: motion.TrackedPoints, view: evidence.View, optics: OpticsConfig
+) -> evidence.Scene:
     phase = tracer.predict_screen(state.points, state.surface) / mm_per_rad(optics.pattern)
-    return Scene(
+    return evidence.Scene(
         state.index,
         view.light.reshape(-1)[state.index],
         phase + centre_phase_rad(optics.pattern),
@@ -312,12 +319,12 @@ def _scene(tracer: Tracer, state: TrackedPoints, view: View, optics: OpticsConfi
 
 
 def _confirm_orders(
-    stack: FrameStack,
+    stack: frame_stack.FrameStack,
     phase_rad: FloatArray,
-    binned: Binned,
-    view: View,
+    binned: frame_stack.Binned,
+    view: evidence.View,
     excluded: set[int],
-    flags: tuple[Flag, ...],
+    flags: tuple[integrity.Flag, ...],
 ) -> None:
     """Raise unless the usable Gray bits of each axis allow no other orders than those taken."""
     for k, axis in enumerate(AXES):

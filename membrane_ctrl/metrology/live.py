@@ -5,8 +5,6 @@ phase from the last accepted one, which is unambiguous while no phase moved by h
 and needs one or two Gauss-Newton steps with the normal matrix of the full cycle.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Literal
@@ -14,25 +12,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from membrane_ctrl.config import OpticsConfig
-from membrane_ctrl.estimate import ShapeEstimate
-from membrane_ctrl.metrology import hencky
-from membrane_ctrl.metrology.bins import BinGrid
-from membrane_ctrl.metrology.covariance import parameter_covariance, pixel_sigma_adu, slope_per_screen
-from membrane_ctrl.metrology.decode import FRINGE_SHARE, FullSlots, decode_full
-from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.geometry_spread import GeometrySpread
-from membrane_ctrl.metrology.monte_carlo import TrialBench
-from membrane_ctrl.metrology.motion import combine_steps, worth_correcting
-from membrane_ctrl.metrology.phase import equal_shifts, phase_sigma_rad, step_weights
-from membrane_ctrl.metrology.phasor import Binner, Image, track
-from membrane_ctrl.metrology.quality import Quality, judge
-from membrane_ctrl.metrology.reconstruct import Fit, Tracer, solve
-from membrane_ctrl.metrology.surface import PARAMETERS, Surface, parameter_to_coeffs, sag_gradient
-from membrane_ctrl.metrology.tracking import TrackedPoints, establish
-from membrane_ctrl.metrology.uncertainty import geometry_covariance, geometry_jacobian
-from membrane_ctrl.metrology.unwrap import mm_per_rad
-from membrane_ctrl.metrology.zernike import TERMS
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.metrology import bins, motion, phase, phasor, reconstruct
+from membrane_ctrl.metrology.optics import geometry, hencky, surface, zernike
+from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
+from membrane_ctrl.model.shape_estimate import Quality, ShapeEstimate, judge
 
 FloatArray = NDArray[np.float64]
 Kind = Literal["full", "fringes"]
@@ -82,29 +66,29 @@ class LiveReconstructor:
         *,
         laser_noise_um: float = 0.3,
         shifts_rad: ArrayLike | None = None,
-        spread: GeometrySpread | None = None,
+        spread: geometry_spread.GeometrySpread | None = None,
     ) -> None:
         self._optics = optics
-        self._geometry = Geometry.from_config(optics)
+        self._geometry = geometry.Geometry.from_config(optics)
         self._bin_px = bin_px
         self._laser_noise_um = laser_noise_um
-        given = equal_shifts(optics.pattern.steps) if shifts_rad is None else np.asarray(shifts_rad, float)
+        given = phase.equal_shifts(optics.pattern.steps) if shifts_rad is None else np.asarray(shifts_rad, float)
         self._shifts_rad = np.broadcast_to(given, (2, optics.pattern.steps))
-        self._weights = [step_weights(shifts) for shifts in self._shifts_rad]
+        self._weights = [phase.step_weights(shifts) for shifts in self._shifts_rad]
         self._spread = spread
-        self._geometry_covariance_mm2 = np.full((PARAMETERS, PARAMETERS), np.nan)
-        self._slots = FullSlots(optics.pattern.steps)
+        self._geometry_covariance_mm2 = np.full((surface.PARAMETERS, surface.PARAMETERS), np.nan)
+        self._slots = phase.FullSlots(optics.pattern.steps)
         self._full_scale_adu = 2**optics.camera.bits - 1
         size = (optics.camera.height_px, optics.camera.width_px)
-        self._binner = Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
-        self._grid = BinGrid(self._geometry, optics.camera, bin_px)
+        self._binner = phasor.Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
+        self._grid = bins.BinGrid(self._geometry, optics.camera, bin_px)
         self._near = np.flatnonzero(self._grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM))
         self._reference_um = optics.geometry.reference_displacement_um
-        self._mm_per_rad = mm_per_rad(optics.pattern)
-        self._pixel_sigma_adu = pixel_sigma_adu(optics.camera.noise_adu)
-        self._tracked: TrackedPoints | None = None
+        self._mm_per_rad = phase.mm_per_rad(optics.pattern)
+        self._pixel_sigma_adu = bins.pixel_sigma_adu(optics.camera.noise_adu)
+        self._tracked: motion.TrackedPoints | None = None
 
-    def full(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
+    def full(self, frames: Sequence[phasor.Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
         """One full cycle.
 
         Parameters
@@ -132,20 +116,20 @@ class LiveReconstructor:
         self._binner.add(frames, range(len(frames)), watched=sinusoids)
         optics = self._optics
         images = self._binner.sums.reshape(self._slots.count, -1)[:, self._near] / self._bin_px**2
-        phase_rad = decode_full(images, optics.pattern, self._shifts_rad).phase_rad
+        phase_rad = phase.decode_full(images, optics.pattern, self._shifts_rad).phase_rad
         phase_rad[:, self._binner.saturated.ravel()[self._near] > 0] = np.nan
         times, readings = times[sinusoids], readings[sinusoids]
         self._tracked = None  # until this cycle is accepted
         tracer, analysis_mm = self._tracer(readings), optics.mirror.analysis_radius_mm
         try:
-            state = establish(self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm)
+            state = motion.establish(self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm)
         except ValueError as error:
             return _rejected("full", times, readings, str(error))
         if self._spread is not None:
             self._geometry_covariance_mm2 = self._from_geometry(self._spread, tracer, state)
         return self._follow("full", state, times, readings)
 
-    def fringes(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
+    def fringes(self, frames: Sequence[phasor.Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
         """One fringes-only cycle of 2 N frames, in the order of `patterns.fringe_sequence`; else as `full`.
 
         Verdict "rejected" with a reason that starts with "tracking lost" asks for a full cycle.
@@ -164,7 +148,7 @@ class LiveReconstructor:
         mirror = self._optics.mirror
         axis = np.linspace(-mirror.radius_mm, mirror.radius_mm, n)
         x, y = np.meshgrid(axis, axis)
-        h = Surface(np.asarray(coeffs_um) / 1e3, hencky_um / 1e3, mirror.radius_mm).height(x, y)
+        h = surface.Surface(np.asarray(coeffs_um) / 1e3, hencky_um / 1e3, mirror.radius_mm).height(x, y)
         h[x**2 + y**2 > mirror.analysis_radius_mm**2] = np.nan
         return axis, axis.copy(), h
 
@@ -175,40 +159,44 @@ class LiveReconstructor:
         It is common to all cycles: to be added to a cycle's own for a figure that stands alone, and not for changes.
         NaN before the first full cycle and without a spread.
         """
-        to_coeffs = parameter_to_coeffs()
+        to_coeffs = surface.parameter_to_coeffs()
         return np.asarray(1e6 * to_coeffs @ self._geometry_covariance_mm2 @ to_coeffs.T)
 
     def sag_sensitivity(self) -> FloatArray:
         """Change of the 36 coefficients (um) per um of sag of a Hencky bowl."""
         return hencky.zernike_projection().copy()
 
-    def _tracer(self, readings_um: FloatArray) -> Tracer:
+    def _tracer(self, readings_um: FloatArray) -> reconstruct.Tracer:
         """The bench with the vertex where the laser saw it, on average over the frames."""
         mean = _finite_mean(readings_um)
         known = self._reference_um is not None and math.isfinite(mean)
         z = -(mean - self._reference_um) * 1e-3 if known and self._reference_um is not None else 0.0
-        return Tracer(self._geometry, self._optics.mirror.radius_mm, z)
+        return reconstruct.Tracer(self._geometry, self._optics.mirror.radius_mm, z)
 
-    def _from_geometry(self, spread: GeometrySpread, tracer: Tracer, state: TrackedPoints) -> FloatArray:
+    def _from_geometry(
+        self, spread: geometry_spread.GeometrySpread, tracer: reconstruct.Tracer, state: motion.TrackedPoints
+    ) -> FloatArray:
         """Covariance (36, 36) of the parameters; NaN if the spread is so wide that a fit at its end fails."""
         place_px = np.stack([self._grid.column_px, self._grid.row_px])[:, state.index]
         exact = np.zeros((2, state.index.size))
-        bench = TrialBench.of_points(
+        bench = monte_carlo.TrialBench.of_points(
             self._optics, tracer, state.surface, state.points, place_px, exact, _GEOMETRY_POINTS
         )
         try:
-            return geometry_covariance(geometry_jacobian(bench, spread), spread)
+            return monte_carlo.geometry_covariance(monte_carlo.geometry_jacobian(bench, spread), spread)
         except ArithmeticError:
-            return np.full((PARAMETERS, PARAMETERS), np.nan)
+            return np.full((surface.PARAMETERS, surface.PARAMETERS), np.nan)
 
-    def _follow(self, kind: Kind, state: TrackedPoints, times: FloatArray, readings: FloatArray) -> ShapeEstimate:
+    def _follow(
+        self, kind: Kind, state: motion.TrackedPoints, times: FloatArray, readings: FloatArray
+    ) -> ShapeEstimate:
         """Phases of the points against the last accepted ones, and the figure from them."""
         self._track_phases(state, readings)
         modulation_adu = float(
             np.median(state.fresh[:, 4, ::16])
         )  # every 16th point: the median costs more than the fit
         saturated = self._binner.saturated.ravel()[state.index] > 0
-        usable = ~saturated & (state.fresh[:, 4].min(axis=0) > FRINGE_SHARE * modulation_adu)
+        usable = ~saturated & (state.fresh[:, 4].min(axis=0) > phase.FRINGE_SHARE * modulation_adu)
         if reason := _lost(state.fresh[:, 3], usable):
             return _rejected(kind, times, readings, reason)
         fit = self._fit(state, usable, readings)
@@ -228,38 +216,38 @@ class LiveReconstructor:
             self._tracked = state
         return estimate
 
-    def _track_phases(self, state: TrackedPoints, readings: FloatArray) -> None:
+    def _track_phases(self, state: motion.TrackedPoints, readings: FloatArray) -> None:
         """Fresh phases from the bin sums, with the film's motion between the frames taken out."""
-        moved = worth_correcting(readings, self._laser_noise_um)
+        moved = motion.worth_correcting(readings, self._laser_noise_um)
         motion_um = np.reshape(readings - np.mean(readings), (2, -1)) if moved else None
         steps = self._slots.steps
         sums, combined = [], []
         for axis, slots in enumerate(self._slots.sinusoids):
             sums.append(self._binner.sums[slots].reshape(steps, -1))
             part = None if motion_um is None else motion_um[axis]
-            combined.append(combine_steps(self._weights[axis], self._shifts_rad[axis], self._bin_px, part))
-        track(sums, state.index, combined, state.sensitivity_rad_per_um, state.accepted, state.fresh)
+            combined.append(motion.combine_steps(self._weights[axis], self._shifts_rad[axis], self._bin_px, part))
+        phasor.track(sums, state.index, combined, state.sensitivity_rad_per_um, state.accepted, state.fresh)
 
-    def _fit(self, state: TrackedPoints, usable: NDArray[np.bool_], readings: FloatArray) -> Fit:
+    def _fit(self, state: motion.TrackedPoints, usable: NDArray[np.bool_], readings: FloatArray) -> reconstruct.Fit:
         """One or two steps from the last surface; the full cycle's normal matrix while its points are there."""
         state.points.weights[:] = usable
         np.multiply(state.fresh[:, 0], self._mm_per_rad, out=state.points.screen_mm)
         state.points.screen_mm -= state.offset_mm
         complete = np.count_nonzero(usable) > MATRIX_KEPT_SHARE * usable.size
         normal = state.normal if complete else None
-        return solve(self._tracer(readings), state.points, state.surface, normal=normal)
+        return reconstruct.solve(self._tracer(readings), state.points, state.surface, normal=normal)
 
     def _estimate(
-        self, kind: Kind, fit: Fit, quality: Quality, times: FloatArray, readings: FloatArray
+        self, kind: Kind, fit: reconstruct.Fit, quality: Quality, times: FloatArray, readings: FloatArray
     ) -> ShapeEstimate:
         """The result in micrometres, with its covariance and verdict."""
         modulation_adu = quality.modulation_share * self._full_scale_adu
-        sigmas_rad = [phase_sigma_rad(d, self._pixel_sigma_adu, modulation_adu) for d in self._shifts_rad]
+        sigmas_rad = [phase.phase_sigma_rad(d, self._pixel_sigma_adu, modulation_adu) for d in self._shifts_rad]
         sigma_mm = self._mm_per_rad * np.array(sigmas_rad) / self._bin_px
-        gain = slope_per_screen(self._geometry, fit.surface.radius_mm, fit.surface.sag_mm)
-        covariance = parameter_covariance(fit, gain @ sigma_mm**2)
-        to_coeffs = parameter_to_coeffs()
-        gradient = sag_gradient()
+        gain = bins.slope_per_screen(self._geometry, fit.surface.radius_mm, fit.surface.sag_mm)
+        covariance = bins.parameter_covariance(fit, gain @ sigma_mm**2)
+        to_coeffs = surface.parameter_to_coeffs()
+        gradient = surface.sag_gradient()
         verdict, reason = judge(quality)
         return ShapeEstimate(
             time_s=_finite_mean(times),
@@ -281,7 +269,7 @@ class LiveReconstructor:
 
 
 def _per_frame(
-    frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike, count: int, kind: Kind
+    frames: Sequence[phasor.Image], time_s: ArrayLike, displacement_um: ArrayLike, count: int, kind: Kind
 ) -> tuple[FloatArray, FloatArray]:
     """Times and readings as arrays. Raises ValueError unless there is one of each for each of `count` frames."""
     times, readings = np.asarray(time_s, float), np.asarray(displacement_um, float)
@@ -313,9 +301,9 @@ def _rejected(kind: Kind, times: FloatArray, readings: FloatArray, reason: str) 
     return ShapeEstimate(
         time_s=_finite_mean(times),
         kind=kind,
-        coeffs_um=np.full(TERMS, nan),
+        coeffs_um=np.full(zernike.TERMS, nan),
         hencky_um=nan,
-        covariance_um2=np.full((TERMS, TERMS), nan),
+        covariance_um2=np.full((zernike.TERMS, zernike.TERMS), nan),
         sag_um=nan,
         sag_sigma_um=nan,
         displacement_um=_finite_mean(readings),

@@ -5,18 +5,81 @@ number, which all of its pixels vote for: one wrong Gray frame scatters its vote
 contradicts the winner is known. Where the phase itself is torn (a wrong sinusoid) eq. 2 remains.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.metrology.flood import tear_share, unwrap_regions
-from membrane_ctrl.metrology.unwrap import absolute_phase
+from membrane_ctrl.metrology.optics.compiled import kernel
+from membrane_ctrl.metrology.phase import absolute_phase
+
+# Wrapped phase made continuous over a mask by walking from neighbour to neighbour.
+
 
 FloatArray = NDArray[np.float64]
+
+
+@kernel
+def _flood(phase, mask, out, region, queue):  # type: ignore[no-untyped-def]
+    """Breadth-first: each pixel takes the period nearest to the neighbour that reached it. Returns the regions."""
+    height, width = phase.shape
+    count = 0
+    for seed in range(height * width):
+        if not mask[seed // width, seed % width] or region[seed // width, seed % width] >= 0:
+            continue
+        head, tail = 0, 1
+        queue[0] = seed
+        region[seed // width, seed % width] = count
+        out[seed // width, seed % width] = phase[seed // width, seed % width]
+        while head < tail:
+            row, column = queue[head] // width, queue[head] % width
+            head += 1
+            for k in range(4):
+                r = row + (k == 0) - (k == 1)
+                c = column + (k == 2) - (k == 3)
+                if r < 0 or c < 0 or r >= height or c >= width or not mask[r, c] or region[r, c] >= 0:
+                    continue
+                step = phase[r, c] - out[row, column]
+                out[r, c] = phase[r, c] - 2 * math.pi * math.floor(step / (2 * math.pi) + 0.5)
+                region[r, c] = count
+                queue[tail] = r * width + c
+                tail += 1
+        count += 1
+    return count
+
+
+def unwrap_regions(wrapped_rad: FloatArray, mask: NDArray[np.bool_]) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Continuous phase of each connected region, up to whole periods.
+
+    Parameters
+    ----------
+    wrapped_rad, mask : (H, W) arrays
+        Phase, and where it is to be trusted. Neighbours must differ by less than half a period.
+
+    Returns
+    -------
+    phase_rad : (H, W) array
+        NaN outside the mask.
+    region : (H, W) int array
+        Number of the region, -1 outside the mask.
+    """
+    out = np.full(wrapped_rad.shape, np.nan)
+    region = np.full(wrapped_rad.shape, -1, np.int64)
+    _flood(np.ascontiguousarray(wrapped_rad), mask, out, region, np.empty(mask.size, np.int64))
+    return out, region
+
+
+def tear_share(phase_rad: FloatArray) -> float:
+    """Share of neighbours whose continuous phases differ by more than half a period; NaN is left out.
+
+    0 if the phase is the same whichever way the walk went.
+    """
+    steps = np.concatenate([np.diff(phase_rad, axis=0).ravel(), np.diff(phase_rad, axis=1).ravel()])
+    steps = steps[np.isfinite(steps)]
+    return float(np.mean(np.abs(steps) > math.pi)) if steps.size else 0.0
+
+
 BoolArray = NDArray[np.bool_]
 
 # A phase that is not torn has no tears at all but for dust; a stale frame of three tears at every quarter period.

@@ -8,13 +8,15 @@ The phasor C + iS is linear in the intensities: sums over pixels may be taken be
 each pixel by its modulation and never meets a phase jump.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from firmware_iface.roles import Pattern
+from membrane_ctrl.config.schema import PatternConfig
 
 FloatArray = NDArray[np.float64]
 
@@ -87,3 +89,185 @@ def phase_sigma_rad(shifts_rad: Sequence[float] | FloatArray, noise_adu: float, 
     """
     _, cosine, sine = step_weights(shifts_rad)
     return noise_adu * math.sqrt(float(cosine @ cosine + sine @ sine) / 2) / modulation_adu
+
+
+# Absolute phase: complementary Gray code (the paper's eq. 2), and its distance on the screen from O'.
+#
+# The wrapped phase starts at -pi on each period's low edge, so that the order K1 = floor(s / T) jumps exactly where
+# the phase does and cannot be trusted there. K2, from the fourth bit, jumps half a period away: eq. 2 takes K2 near
+# the ends of a period and K1 in the middle, and each is used only where it is a quarter period away from its jumps.
+
+
+def gray_orders(gray: ArrayLike, white: ArrayLike, black: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Fringe orders from the Gray-code frames.
+
+    Parameters
+    ----------
+    gray : (4, ...) array
+        Intensities of the bits, most significant first.
+    white, black : (...) array
+        Highest and lowest level at each pixel; the threshold is their mean, pixel by pixel.
+
+    Returns
+    -------
+    k1, k2 : (...) int arrays
+        floor(s / T) from bits 1-3 and floor((V2 + 1) / 2) from all four, V2 = floor(2 s / T).
+    """
+    threshold = (np.asarray(white, float) + np.asarray(black, float)) / 2
+    bits = (np.asarray(gray, float) > threshold).astype(np.int64)
+    binary = np.bitwise_xor.accumulate(bits, axis=0)  # Gray to binary: each bit is the xor of all above it
+    k1 = 4 * binary[0] + 2 * binary[1] + binary[2]
+    v2 = 2 * k1 + binary[3]
+    return k1, (v2 + 1) // 2
+
+
+def absolute_phase(wrapped_rad: FloatArray, k1: NDArray[np.int64], k2: NDArray[np.int64]) -> FloatArray:
+    """The paper's eq. 2: phase counted from the low edge's -pi."""
+    order = np.where(wrapped_rad <= -math.pi / 2, k2, np.where(wrapped_rad >= math.pi / 2, k2 - 1, k1))
+    return wrapped_rad + 2 * math.pi * order
+
+
+def centre_phase_rad(pattern: PatternConfig) -> float:
+    """Absolute phase at O': there s is half the region, where phi = 2 pi s / T - pi gives pi (periods - 1)."""
+    return math.pi * (pattern.periods - 1)
+
+
+def mm_per_rad(pattern: PatternConfig) -> float:
+    """T / (2 pi)."""
+    return pattern.period_mm / (2 * math.pi)
+
+
+def screen_mm(absolute_rad: FloatArray, pattern: PatternConfig) -> FloatArray:
+    """Distance from O' on the screen, the paper's O'A = T phi / (2 pi) with phi relative to O'."""
+    return (absolute_rad - centre_phase_rad(pattern)) * mm_per_rad(pattern)
+
+
+def inside_pattern(absolute_rad: FloatArray, pattern: PatternConfig) -> NDArray[np.bool_]:
+    """Whether the phase is one the pattern has; a wrong Gray bit at its rim is not."""
+    return np.abs(absolute_rad - centre_phase_rad(pattern)) <= math.pi * pattern.periods
+
+
+# The images of a measurement cycle, in their order on the screen and in the memory.
+#
+# A full cycle is, for x and then for y, N sinusoids and 4 Gray-code bits, then white and black: 18 images for N = 4.
+# A fringes-only cycle is the 2 N sinusoids, x first.
+
+
+GRAY_BITS = 4  # 16 half periods: enough for the 8 periods a configuration may ask for
+AXES = ("x", "y")
+
+
+def sinusoids(axis: str, steps: int) -> tuple[Pattern, ...]:
+    """The N phase steps of one axis: I = A + B cos(phi + 2 pi k / N), k = 0..N-1 (N = 4: the paper's eq. 1)."""
+    return tuple(Pattern("sin", axis, k, 2 * math.pi * k / steps) for k in range(steps))
+
+
+def gray_codes(axis: str) -> tuple[Pattern, ...]:
+    """The Gray-code bits of one axis, most significant first; bits count from 1."""
+    return tuple(Pattern("gray", axis, bit) for bit in range(1, GRAY_BITS + 1))
+
+
+def full_sequence(pattern: PatternConfig) -> tuple[Pattern, ...]:
+    """All images of a full cycle: 2 (N + 4) + 2."""
+    by_axis = (image for axis in AXES for image in (*sinusoids(axis, pattern.steps), *gray_codes(axis)))
+    return (*by_axis, Pattern("white"), Pattern("black"))
+
+
+def fringe_sequence(pattern: PatternConfig) -> tuple[Pattern, ...]:
+    """The images of a fringes-only cycle: 2 N."""
+    return tuple(image for axis in AXES for image in sinusoids(axis, pattern.steps))
+
+
+# A full cycle's images to absolute phases: the paper's section 2.2 on any stack, of pixels or of bins.
+
+
+# A pixel sees the screen in the mirror if white differs from black by this share of what the bright pixels show;
+# the rest of the room differs by stray light only.
+CONTRAST_SHARE = 0.2
+# ... and if the fringes swing by this share of it: less is a blurred edge, dust or a mixture of two places.
+FRINGE_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class FullSlots:
+    """Where the images of a full cycle stand in its sequence."""
+
+    steps: int
+
+    @property
+    def sinusoids(self) -> tuple[slice, slice]:
+        """x and y."""
+        second = self.steps + GRAY_BITS
+        return slice(0, self.steps), slice(second, second + self.steps)
+
+    @property
+    def gray(self) -> tuple[slice, slice]:
+        """x and y."""
+        return tuple(slice(s.stop, s.stop + GRAY_BITS) for s in self.sinusoids)  # type: ignore[return-value]
+
+    @property
+    def white(self) -> int:
+        """Highest level."""
+        return 2 * (self.steps + GRAY_BITS)
+
+    @property
+    def black(self) -> int:
+        """Lowest level."""
+        return self.white + 1
+
+    @property
+    def count(self) -> int:
+        """All images."""
+        return self.black + 1
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Absolute phases of a full cycle.
+
+    Attributes
+    ----------
+    phase_rad : (2, ...) array
+        x and y, counted from the low edge's -pi (see `unwrap`); NaN where not valid.
+    modulation_adu : (2, ...) array
+        Fringe amplitude.
+    valid : (...) bool array
+        Pixels that see the pattern in the mirror.
+    """
+
+    phase_rad: FloatArray
+    modulation_adu: FloatArray
+    valid: NDArray[np.bool_]
+
+
+def decode_full(images: FloatArray, pattern: PatternConfig, shifts_rad: FloatArray) -> Decoded:
+    """Decode the images of a full cycle (2 (N + 4) + 2, ...), in `patterns.full_sequence`'s order.
+
+    Parameters
+    ----------
+    shifts_rad : (2, N) array
+        Phase steps of x and y.
+
+    Raises
+    ------
+    ValueError
+        If there are more or fewer images.
+    """
+    slots = FullSlots(pattern.steps)
+    if len(images) != slots.count:
+        raise ValueError(f"a full cycle has {slots.count} frames, not {len(images)}")
+    white, black = images[slots.white], images[slots.black]
+    contrast = white - black
+    valid = contrast > CONTRAST_SHARE * np.percentile(contrast, 95)
+    phases, swings = [], []
+    for sinusoids, gray, shifts in zip(slots.sinusoids, slots.gray, shifts_rad, strict=True):
+        z = phasors(images[sinusoids], shifts)
+        k1, k2 = gray_orders(images[gray], white, black)
+        phase = absolute_phase(wrapped_phase(z), k1, k2)
+        swing = modulation(z)
+        valid &= (swing > FRINGE_SHARE * contrast) & inside_pattern(phase, pattern)
+        phases.append(phase)
+        swings.append(swing)
+    absolute = np.stack(phases)
+    absolute[:, ~valid] = np.nan
+    return Decoded(absolute, np.stack(swings), valid)

@@ -5,8 +5,6 @@ the order of its memory; the phase steps are then combined on 1/16 of the number
 is lost by 4 x 4 bins. Colour filters do no harm: a pixel's gain scales its phasor and leaves its phase.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Container, Sequence
 from dataclasses import dataclass
@@ -14,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.metrology.jit import kernel, step
-from membrane_ctrl.metrology.threads import split
+from membrane_ctrl.metrology.optics.compiled import kernel, split, step
 
 FloatArray = NDArray[np.float64]
 Image = NDArray[np.uint8] | NDArray[np.uint16]

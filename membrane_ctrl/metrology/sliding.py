@@ -6,23 +6,20 @@ brought to the mean displacement of the window, as in a cycle (see `motion`). Wi
 still over the length of the window.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from membrane_ctrl.config import OpticsConfig
-from membrane_ctrl.estimate import ShapeEstimate
-from membrane_ctrl.metrology.geometry_spread import GeometrySpread
-from membrane_ctrl.metrology.live import LiveReconstructor, _rejected
-from membrane_ctrl.metrology.phasor import Image
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.metrology import live, phasor
+from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 FloatArray = NDArray[np.float64]
 
 
-class SlidingWindow(LiveReconstructor):
+class SlidingWindow(live.LiveReconstructor):
     """The live reconstruction, renewed by each frame.
 
     Begin with `full`; then `frame` for each fringe frame, in any order. After a verdict whose reason starts with
@@ -45,20 +42,22 @@ class SlidingWindow(LiveReconstructor):
         self._burnt = np.zeros((count, *self._binner.saturated.shape), bool)
         self._burnt_frames = np.zeros(count, bool)
 
-    def full(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
+    def full(self, frames: Sequence[phasor.Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
         """One full cycle, whose sinusoids fill the window; else as `LiveReconstructor.full`."""
         estimate = super().full(frames, time_s, displacement_um)
         times, readings = (np.asarray(column, float)[self._fringe_slots] for column in (time_s, displacement_um))
         self._fill(times, readings)
         return estimate
 
-    def fringes(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
+    def fringes(self, frames: Sequence[phasor.Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
         """One fringes-only cycle, which fills the window; else as `LiveReconstructor.fringes`."""
         estimate = super().fringes(frames, time_s, displacement_um)
         self._fill(np.asarray(time_s, float), np.asarray(displacement_um, float))
         return estimate
 
-    def frame(self, image: Image, step: int, time_s: float, displacement_um: float = float("nan")) -> ShapeEstimate:
+    def frame(
+        self, image: phasor.Image, step: int, time_s: float, displacement_um: float = float("nan")
+    ) -> ShapeEstimate:
         """Renew the estimate with one frame.
 
         Parameters
@@ -88,7 +87,7 @@ class SlidingWindow(LiveReconstructor):
         self._note_saturation(step)
         if self._tracked is None:
             reason = "tracking lost: no accepted full cycle to follow"
-            return _rejected("fringes", self._times, self._readings, reason)
+            return live._rejected("fringes", self._times, self._readings, reason)
         return self._follow("fringes", self._tracked, self._times, self._readings)
 
     def _fill(self, times: FloatArray, readings: FloatArray) -> None:

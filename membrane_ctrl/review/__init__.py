@@ -3,7 +3,7 @@
 `open_run(path)` is the door for programs: columns as Arrow tables, shapes and maps as arrays, events as dicts.
 """
 
-from membrane_ctrl.review.run import Run, open_run
-from membrane_ctrl.review.shapes import Shapes
+from membrane_ctrl.run_files.run import Run, open_run
+from membrane_ctrl.run_files.shapes import Shapes
 
 __all__ = ["Run", "Shapes", "open_run"]

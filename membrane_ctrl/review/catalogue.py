@@ -1,7 +1,5 @@
 """The runs there are: listed, filtered, shown, pruned."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -11,13 +9,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from membrane_ctrl.errors import InputError
-from membrane_ctrl.recording.atomic import SMALL_BYTES, read_bytes
-from membrane_ctrl.recording.column_tables import level_table
-from membrane_ctrl.recording.retention import OldRun, deletable_runs, delete_run, expired, size_bytes
-from membrane_ctrl.review.column_reader import column_files, read_file
-from membrane_ctrl.review.folder import is_run, read_config, read_events, read_summary
-from membrane_ctrl.review.run import origin_of
+from membrane_ctrl.model import errors, files
+from membrane_ctrl.run_files import column_reader, disk_budget, run_folder, tables
+from membrane_ctrl.run_files.run import origin_of
 
 # A file of this name in a run's folder keeps it from being pruned.
 KEPT_FILE = ".keep"
@@ -100,7 +94,7 @@ class Filter:
 def entries(logs_dir: Path, wanted: Filter | None = None) -> list[Entry]:
     """The runs of a folder, oldest first. Raises InputError if there is no such folder."""
     if not logs_dir.is_dir():
-        raise InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
+        raise errors.InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
     found = [_entry_or_why(folder) for folder in _folders(logs_dir)]
     return [item for item in found if wanted is None or wanted.takes(item)]
 
@@ -118,9 +112,9 @@ def _entry_or_why(folder: Path) -> Entry:
 def entry(folder: Path) -> Entry:
     """One run's line, from its small files only, and of one without a summary from the end of its seconds."""
     notes: list[str] = []
-    events = read_events(folder, notes)
-    summary: dict[str, Any] = read_summary(folder, notes) or {}
-    loop = read_config(folder, notes).loop
+    events = run_folder.read_events(folder, notes)
+    summary: dict[str, Any] = run_folder.read_summary(folder, notes) or {}
+    loop = run_folder.read_config(folder, notes).loop
     std, duration_s = _number(summary.get("true_std_um")), _number(summary.get("duration_s"))
     return Entry(
         folder=folder,
@@ -133,7 +127,7 @@ def entry(folder: Path) -> Entry:
         kp_per_s=loop.kp_per_s,
         ti_s=loop.ti_s,
         configuration=_hash(folder / "config.toml"),
-        size_mb=size_bytes(folder) / 1e6,
+        size_mb=disk_budget.size_bytes(folder) / 1e6,
         marks=sum(event.get("kind") == "mark" for event in events),
         kept=(folder / KEPT_FILE).exists(),
     )
@@ -155,7 +149,9 @@ def resolve(run: Path, logs_dir: Path = Path("logs")) -> Path:
     near = [folder for folder in folders if folder.name == str(run)]
     near = near or [folder for folder in folders if str(run) in folder.name]
     if len(near) > 1:
-        raise InputError(f"{run}: more than one run is called so: {', '.join(folder.name for folder in near[:4])}")
+        raise errors.InputError(
+            f"{run}: more than one run is called so: {', '.join(folder.name for folder in near[:4])}"
+        )
     return near[0] if near else run
 
 
@@ -168,29 +164,29 @@ def _folders(logs_dir: Path) -> list[Path]:
 
 def _may_be_run(folder: Path) -> bool:
     try:
-        return is_run(folder)
+        return run_folder.is_run(folder)
     except OSError:  # it may not be looked into: whether it is one is not known
         return True
 
 
 def to_prune(
     logs_dir: Path, now_utc: datetime, keep_days: float | None, keep_gb: float | None
-) -> list[tuple[OldRun, str]]:
+) -> list[tuple[disk_budget.OldRun, str]]:
     """The runs that the recorder's retention rule (`recording.retention`) gives up, and why; oldest first."""
     if not logs_dir.is_dir():
-        raise InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
+        raise errors.InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
     if keep_days is None and keep_gb is None:
-        raise InputError("runs prune: say what to keep: --keep-days, --keep-gb or both")
-    runs = deletable_runs(logs_dir, logs_dir / "none", now_utc)
-    return expired(runs, 0, keep_gb, keep_days, now_utc)
+        raise errors.InputError("runs prune: say what to keep: --keep-days, --keep-gb or both")
+    runs = disk_budget.deletable_runs(logs_dir, logs_dir / "none", now_utc)
+    return disk_budget.expired(runs, 0, keep_gb, keep_days, now_utc)
 
 
-def prune(runs: Sequence[OldRun]) -> dict[Path, str]:
+def prune(runs: Sequence[disk_budget.OldRun]) -> dict[Path, str]:
     """Delete the folders of runs; one that cannot be deleted keeps no other. Returns those that stay, and why."""
     stay: dict[Path, str] = {}
     for run in runs:
         try:
-            delete_run(run)
+            disk_budget.delete_run(run)
         except OSError as error:
             stay[run.folder] = error.strerror or str(error)
     return stay
@@ -205,8 +201,8 @@ def as_dict(run: Entry) -> dict[str, Any]:
 
 def _recorded_s(folder: Path) -> float:
     """How far the seconds of a run go, by the last file that has some."""
-    for path in reversed(column_files(folder, level_table(_LEVEL_S))):
-        table = read_file(path, ["time_s"], [])
+    for path in reversed(column_reader.column_files(folder, tables.level_table(_LEVEL_S))):
+        table = column_reader.read_file(path, ["time_s"], [])
         if table is not None and table.num_rows:
             return float(table.column("time_s")[-1].as_py()) + _LEVEL_S
     return math.nan
@@ -218,7 +214,7 @@ def _number(value: object) -> float:
 
 def _hash(path: Path) -> str:
     try:
-        return hashlib.sha256(read_bytes(path, SMALL_BYTES)).hexdigest()[:8]
+        return hashlib.sha256(files.read_bytes(path, files.SMALL_BYTES)).hexdigest()[:8]
     except OSError:
         return ""
 

@@ -1,7 +1,5 @@
 """The commands over finished runs, added to the command line by `add_commands`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
@@ -48,10 +46,10 @@ def review(
     `review mark RUN TEXT --at 03:12` marks a moment: it stands on the timeline and in the report.
     """
     if runs[0] == "mark":  # what follows is text, too, and a path would lose its double slashes
-        from membrane_ctrl.review.runs_command import mark_command
+        from membrane_ctrl.review.runs import mark_command
 
         return mark_command(runs[1:], at)
-    from membrane_ctrl.review.review_command import ReviewOptions, review_command
+    from membrane_ctrl.review.viewer.command import ReviewOptions, review_command
 
     return review_command(
         ReviewOptions(
@@ -74,7 +72,7 @@ def report(
     json: JsonOption = False,
 ) -> int:
     """Write the stability report of a run: one HTML page and its figures as JSON."""
-    from membrane_ctrl.review.report_command import report_command
+    from membrane_ctrl.review.report.command import report_command
 
     return report_command(run, out, compare, start, end, json)
 
@@ -90,7 +88,7 @@ def export_run(
     end: Annotated[str | None, typer.Option("--until", help="Up to this moment.")] = None,
 ) -> int:
     """Write a run's columns for other programs."""
-    from membrane_ctrl.review.runs_command import export_command
+    from membrane_ctrl.review.runs import export_command
 
     return export_command(run, to, out, streams or [], start, end)
 
@@ -109,10 +107,10 @@ def list_runs(
     json: JsonOption = False,
 ) -> int:
     """List the runs there are, oldest first."""
-    from membrane_ctrl.durations import parse_duration_s
-    from membrane_ctrl.errors import InputError
+    from membrane_ctrl.model.clock import parse_duration_s
+    from membrane_ctrl.model.errors import InputError
     from membrane_ctrl.review.catalogue import Filter
-    from membrane_ctrl.review.runs_command import list_command
+    from membrane_ctrl.review.runs import list_command
 
     if context.invoked_subcommand is not None:
         sources = {name: context.get_parameter_source(name) for name in context.params}
@@ -131,7 +129,7 @@ def list_runs(
 @runs_app.command("show")
 def show_run(run: RunArgument, json: JsonOption = False) -> int:
     """Show one run: figures, states, faults, marks, what is missing."""
-    from membrane_ctrl.review.runs_command import show_command
+    from membrane_ctrl.review.runs import show_command
 
     return show_command(run, json)
 
@@ -147,6 +145,6 @@ def prune_runs(
     json: JsonOption = False,
 ) -> int:
     """Give up old runs by the recorder's rule: never the newest three for their age, nor one with a file `.keep`."""
-    from membrane_ctrl.review.runs_command import prune_command
+    from membrane_ctrl.review.runs import prune_command
 
     return prune_command(logs, keep_days, keep_gb, delete, json)

@@ -1,7 +1,5 @@
 """A run for other programs: Parquet, CSV or HDF5."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -12,12 +10,26 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
-from membrane_ctrl.errors import DeviceError, InputError
-from membrane_ctrl.recording.atomic import make_folder, move, scratch_folder, write_text_atomic
-from membrane_ctrl.recording.streams import STREAMS
-from membrane_ctrl.review.run import Run
-from membrane_ctrl.review.targets import refuse_originals
-from membrane_ctrl.telemetry import FIELDS
+from membrane_ctrl.model.errors import DeviceError, InputError
+from membrane_ctrl.model.files import make_folder, move, scratch_folder, write_text_atomic
+from membrane_ctrl.model.telemetry import FIELDS
+from membrane_ctrl.run_files.column_file import FOLDER
+from membrane_ctrl.run_files.run import Run
+from membrane_ctrl.run_files.streams import STREAMS
+
+# Where review may write: nowhere among what the recorder wrote.
+
+
+def refuse_originals(folder: Path) -> None:
+    """Raises InputError if a folder is a run's own, or its tables', whichever run that is.
+
+    A folder of exported files has `events.jsonl`, too, and may be written again.
+    """
+    folder = folder.resolve()
+    at = folder.parent if folder.name == FOLDER else folder
+    if (at / "config.toml").exists() or any(at.glob("*.rrd")) or any(at.glob(f"{FOLDER}/*.arrows")):
+        raise InputError(f"{folder}: there lies what the recorder wrote; choose another folder")
+
 
 FORMATS = ("parquet", "csv", "hdf5")
 SHAPES = "shapes"

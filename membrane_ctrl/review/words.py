@@ -1,13 +1,11 @@
 """Times and numbers as people read them."""
 
-from __future__ import annotations
-
 import math
 import re
 from datetime import datetime, timedelta
 
-from membrane_ctrl.durations import parse_duration_s
-from membrane_ctrl.errors import InputError
+from membrane_ctrl.model.clock import parse_duration_s
+from membrane_ctrl.model.errors import InputError
 
 
 def span(seconds: float) -> str:

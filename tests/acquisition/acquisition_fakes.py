@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from firmware_iface.roles import Frame, LinkError, Pattern
 from membrane_ctrl.acquisition.cycle import CyclePlan
-from membrane_ctrl.acquisition.frames import Pixels
-from membrane_ctrl.estimate import ShapeEstimate, Verdict
+from membrane_ctrl.model.shape_estimate import ShapeEstimate, Verdict
+from membrane_ctrl.processes.frames import Pixels
 
 HEIGHT_PX, WIDTH_PX = 4, 6
 FRINGES = [Pattern("sin", axis, k) for axis in "xy" for k in range(4)]

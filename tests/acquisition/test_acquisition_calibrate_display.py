@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from test_acquisition_display_test import HEIGHT_PX, WIDTH_PX, Bench
 
-from firmware_iface.display.gamma import RAMP_LEVELS, measured_response
-from firmware_iface.emulators.panel import PanelResponse
+from firmware_iface.display.response import RAMP_LEVELS, measured_response
 from membrane_ctrl.acquisition.optical_bench import OpticalBench
-from membrane_ctrl.calibration.display_command import fringe_error_mm, lines_of, measured, report_of
+from membrane_ctrl.calibration.display import fringe_error_mm, lines_of, measured, report_of
 from membrane_ctrl.cli import run
-from membrane_ctrl.config import PatternConfig
-from membrane_ctrl.metrology.unwrap import mm_per_rad
+from membrane_ctrl.config.schema import PatternConfig
+from membrane_ctrl.metrology.phase import mm_per_rad
+from tests.support.panel import PanelResponse
 
 
 class OpenedBench(Bench):

@@ -27,7 +27,7 @@ from membrane_ctrl.acquisition.cycle import (
     ShapeCycle,
     pause_s,
 )
-from membrane_ctrl.acquisition.frames import FrameReader, FrameRing, FrameWriter
+from membrane_ctrl.processes.frames import FrameReader, FrameRing, FrameWriter
 
 
 class Bench:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from acquisition_fakes import VirtualClock
 
-from firmware_iface.emulators.panel import EmulatedPanel, PanelResponse
 from firmware_iface.roles import Frame
-from membrane_ctrl.acquisition.self_test import DisplayTest, told
+from membrane_ctrl.acquisition.optical_bench import DisplayTest, told
+from tests.support.panel import EmulatedPanel, PanelResponse
 
 EXPOSURE_S, TRANSFER_S = 0.01, 0.005
 WIDTH_PX, HEIGHT_PX = 320, 240

@@ -11,9 +11,8 @@ from acquisition_fakes import FRINGES, HEIGHT_PX, WIDTH_PX, FakeCamera, FakeLase
 
 from firmware_iface.drivers.frame_lost import FrameLostError
 from firmware_iface.roles import Frame, Pattern
-from membrane_ctrl.acquisition.exposures import Exposures
-from membrane_ctrl.acquisition.frames import FrameReader, FrameRing, FrameWriter, Pixels
-from membrane_ctrl.acquisition.stages import StageError
+from membrane_ctrl.acquisition.exposures import Exposures, StageError
+from membrane_ctrl.processes.frames import FrameReader, FrameRing, FrameWriter, Pixels
 
 SETTLE_S, EXPOSE_S, TRANSFER_S = 0.1, 0.01, 0.04
 

@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from membrane_ctrl.acquisition.geometry_watch import LiveDrift, geometry_event
-from membrane_ctrl.calibration.geometry_file import CalibrationTable, origin_of
-from membrane_ctrl.calibration.geometry_in_force import InForce
-from membrane_ctrl.config import OpticsConfig
-from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.acquisition.worker import LiveDrift, geometry_event
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.geometry.file import CalibrationTable, InForce, origin_of
 from membrane_ctrl.metrology.calibrate.drift import CYCLES, ring_um
-from membrane_ctrl.metrology.hencky import zernike_projection
-from membrane_ctrl.metrology.surface import Surface
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 OPTICS = OpticsConfig()
 CYCLE = ShapeEstimate(

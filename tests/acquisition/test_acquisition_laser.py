@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from membrane_ctrl.acquisition.laser import HALF_WINDOW_S, LaserHistory
-from membrane_ctrl.ipc.ring import RingAddress, RingWriter, ring
-from membrane_ctrl.telemetry import FIELDS, ROW_BYTES, TelemetryRow
+from membrane_ctrl.acquisition.cycle import HALF_WINDOW_S, LaserHistory
+from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
+from membrane_ctrl.processes.ring import RingAddress, RingWriter, ring
 
 NOTHING = TelemetryRow(**dict.fromkeys(FIELDS, math.nan))
 

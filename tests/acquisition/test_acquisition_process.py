@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from membrane_ctrl.acquisition.frames import FrameReader, FrameRing
 from membrane_ctrl.acquisition.process import AcquisitionSpec, acquisition_main
-from membrane_ctrl.acquisition.warm_up import small
-from membrane_ctrl.calibration.geometry_file import origin_of
-from membrane_ctrl.clock import RunClock
-from membrane_ctrl.config import CameraConfig, Config, OpticsConfig, ShapeConfig
-from membrane_ctrl.estimate import ShapeEstimate, unpack_estimate
-from membrane_ctrl.ipc.ring import RingReader, RingWriter, ring
-from membrane_ctrl.metrology.patterns import fringe_sequence
-from membrane_ctrl.processes import STOP
-from membrane_ctrl.telemetry import FIELDS, ROW_BYTES, TelemetryRow
-from membrane_ctrl.twin.truth import TRUTH_BYTES, Truth
+from membrane_ctrl.acquisition.session import small
+from membrane_ctrl.config.schema import CameraConfig, Config, OpticsConfig, ShapeConfig
+from membrane_ctrl.geometry.file import origin_of
+from membrane_ctrl.metrology.phase import fringe_sequence
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.shape_estimate import ShapeEstimate, unpack_estimate
+from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
+from membrane_ctrl.processes.child import STOP
+from membrane_ctrl.processes.frames import FrameReader, FrameRing
+from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
+from membrane_ctrl.sim.sensors import TRUTH_BYTES, Truth
 
 pytestmark = pytest.mark.real_time
 

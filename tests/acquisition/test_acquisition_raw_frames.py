@@ -14,12 +14,12 @@ import pytest
 from acquisition_fakes import FRINGES, FULL, PLAN, estimate
 
 from membrane_ctrl.acquisition import raw_frames
-from membrane_ctrl.acquisition.frames import FrameRing, FrameWriter
 from membrane_ctrl.acquisition.raw_frames import RawFrames
-from membrane_ctrl.config import CameraConfig, OpticsConfig, RecordingConfig
-from membrane_ctrl.ipc.ring import RingWriter, ring
-from membrane_ctrl.sets.capture_set import read_head
-from membrane_ctrl.telemetry import FIELDS, ROW_BYTES, TelemetryRow
+from membrane_ctrl.config.schema import CameraConfig, OpticsConfig, RecordingConfig
+from membrane_ctrl.measure.capture_set import read_head
+from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
+from membrane_ctrl.processes.frames import FrameRing, FrameWriter
+from membrane_ctrl.processes.ring import RingWriter, ring
 
 OPTICS = OpticsConfig(camera=CameraConfig(width_px=16, height_px=8))
 

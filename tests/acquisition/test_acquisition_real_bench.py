@@ -11,23 +11,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from virtual_display import screenshot, virtual_display
 
-from firmware_iface.display.pattern_image import ScreenRaster, pattern_light
-from firmware_iface.emulators.gige_camera import GigeCameraEmulator
+from firmware_iface.display.response import ScreenRaster, pattern_light
 from firmware_iface.roles import LinkError
-from membrane_ctrl.acquisition.frames import FrameRing
 from membrane_ctrl.acquisition.process import AcquisitionSpec, acquisition_main
 from membrane_ctrl.cli import run as command
-from membrane_ctrl.clock import RunClock
-from membrane_ctrl.config import Config
-from membrane_ctrl.config_file import dump
-from membrane_ctrl.estimate import ShapeEstimate, unpack_estimate
-from membrane_ctrl.ipc.ring import RingReader, ring
-from membrane_ctrl.metrology.patterns import full_sequence
-from membrane_ctrl.telemetry import ROW_BYTES
-from membrane_ctrl.twin.film_shape import typical_film
-from membrane_ctrl.twin.render import OpticsRenderer
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.toml_file import dump
+from membrane_ctrl.metrology.phase import full_sequence
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.shape_estimate import ShapeEstimate, unpack_estimate
+from membrane_ctrl.model.telemetry import ROW_BYTES
+from membrane_ctrl.processes.frames import FrameRing
+from membrane_ctrl.processes.ring import RingReader, ring
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import typical_film
+from tests.support.gige_camera import GigeCameraEmulator
+from tests.support.virtual_display import screenshot, virtual_display
 
 pytestmark = pytest.mark.real_time
 

@@ -12,9 +12,9 @@ import pytest
 from acquisition_fakes import VirtualClock, estimate
 
 from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed
-from membrane_ctrl.acquisition.remote import Remote
+from membrane_ctrl.acquisition.process import Remote
 from membrane_ctrl.acquisition.worker import keep_cycling, next_deadline_s
-from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 
 class ScriptedRemote(Remote):

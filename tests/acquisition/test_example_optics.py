@@ -12,15 +12,15 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from virtual_display import screenshot, virtual_display
 
 from firmware_iface.emulators.board_state import BoardSample
-from firmware_iface.emulators.gige_camera import GigeCameraEmulator
 from firmware_iface.roles import LinkError
-from membrane_ctrl.config import Config
-from membrane_ctrl.config_file import dump, load
-from membrane_ctrl.device_config import DevicesConfig
-from membrane_ctrl.twin.lab import Lab
+from membrane_ctrl.config.devices import DevicesConfig
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.toml_file import dump, load
+from membrane_ctrl.sim.lab import Lab
+from tests.support.gige_camera import GigeCameraEmulator
+from tests.support.virtual_display import screenshot, virtual_display
 
 pytestmark = pytest.mark.real_time
 
@@ -84,7 +84,7 @@ def camera(tmp_path: Path) -> Iterator[GigeCameraEmulator]:
 async def check(config: Config, path: Path) -> tuple[int, dict[str, Any], str]:
     """Exit code, the camera's probe, standard error."""
     path.write_text(dump(config), encoding="utf-8")  # noqa: ASYNC240
-    patient = Path(__file__).parents[1] / "patience.py"
+    patient = Path(__file__).parents[2] / "patience.py"
     command = [sys.executable, str(patient), "check", str(path), "--json"]
     pipe = asyncio.subprocess.PIPE
     process = await asyncio.create_subprocess_exec(*command, stdout=pipe, stderr=pipe)

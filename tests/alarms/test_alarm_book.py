@@ -6,11 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from membrane_ctrl.alarms.book import AlarmBook, Notice
-from membrane_ctrl.alarms.signs import Sign, signs_of
-from membrane_ctrl.port_config import AlarmsConfig
-from membrane_ctrl.recording.complaints import Complaints
-from membrane_ctrl.tick import Event
+from membrane_ctrl.alarms.book import AlarmBook, Notice, Sign, signs_of
+from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.recorder.sink import Complaints
 
 CONFIG = AlarmsConfig(escalate_after_s=900, remind_every_s=3600, clear_after_s=30)
 BAD, GOOD = Sign("leak", True, "warning", "it leaks", for_s=10.0), Sign("leak", False)

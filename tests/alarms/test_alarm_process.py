@@ -12,19 +12,17 @@ from types import ModuleType
 
 import pytest
 
-from membrane_ctrl.alarms.apprise_sender import apprise_senders, read_urls, require_sendable
 from membrane_ctrl.alarms.book import Notice
-from membrane_ctrl.alarms.outbox import Outbox
-from membrane_ctrl.alarms.process import AlarmsSpec, watch
-from membrane_ctrl.alarms.watcher import Watcher
-from membrane_ctrl.child_report import reporter
+from membrane_ctrl.alarms.process import AlarmsSpec, Watcher, watch
+from membrane_ctrl.alarms.senders import Outbox, apprise_senders, read_urls, require_sendable
 from membrane_ctrl.cli import run
-from membrane_ctrl.clock import RunClock
-from membrane_ctrl.errors import DeviceError, InputError
-from membrane_ctrl.ipc.ring import RingWriter, ring
-from membrane_ctrl.port_config import AlarmsConfig
-from membrane_ctrl.telemetry import FIELDS, ROW_BYTES, TelemetryRow
-from membrane_ctrl.tick import Event
+from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.errors import DeviceError, InputError
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
+from membrane_ctrl.processes.child import reporter
+from membrane_ctrl.processes.ring import RingWriter, ring
 
 CONFIG = AlarmsConfig(silent_s=5.0)
 ROW = TelemetryRow(*(0.0 for _ in FIELDS))

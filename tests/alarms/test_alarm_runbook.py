@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl import alarms
-from membrane_ctrl.config import Config
+from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control import film_health
 
 RUNBOOK = (Path(__file__).parents[2] / "docs" / "operations.md").read_text(encoding="utf-8")

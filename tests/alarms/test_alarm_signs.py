@@ -2,12 +2,12 @@ from __future__ import annotations
 
 import pytest
 
-from membrane_ctrl.alarms.signs import sign_of_value, signs_of
-from membrane_ctrl.config import Config
-from membrane_ctrl.config_file import parse
-from membrane_ctrl.errors import InputError
-from membrane_ctrl.port_config import AlarmRule
-from membrane_ctrl.tick import Event
+from membrane_ctrl.alarms.book import sign_of_value, signs_of
+from membrane_ctrl.config.port import AlarmRule
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.toml_file import parse
+from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.events import Event
 
 HIGH = AlarmRule(name="high", field="error_um", raise_at=10.0, clear_at=3.0, magnitude=True)
 LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=200.0)

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from membrane_ctrl.commands import Command
-from membrane_ctrl.config import (
+from membrane_ctrl.config.schema import (
     CameraConfig,
     Config,
     GeometryConfig,
@@ -20,12 +19,13 @@ from membrane_ctrl.config import (
     ShapeConfig,
     TwinConfig,
 )
-from membrane_ctrl.tick import Event
-from membrane_ctrl.tune.twin_hold import TwinHold
-from membrane_ctrl.twin.film_shape import typical_film
-from membrane_ctrl.twin.simulate import simulate_set
-from membrane_ctrl.twin.simulation_spec import Motion, SimulationSpec
-from tuning.hold_link import News
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.sessions.live_hold import News
+from membrane_ctrl.sim.optics.film_shape import typical_film
+from membrane_ctrl.sim.optics.simulate import simulate_set
+from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec
+from tuning.twin_hold import TwinHold
 
 # 16-bit frames of large pixels with the noise of the 144 that each stands for
 SHRINK = 12

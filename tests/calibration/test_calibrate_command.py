@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.config import CameraConfig, GeometryConfig, OpticsConfig
-from membrane_ctrl.twin.film_shape import typical_film
-from membrane_ctrl.twin.rays import ScreenError
-from membrane_ctrl.twin.simulate import simulate_set
-from membrane_ctrl.twin.simulation_spec import Motion, SimulationSpec
+from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
+from membrane_ctrl.sim.optics.film_shape import typical_film
+from membrane_ctrl.sim.optics.simulate import simulate_set
+from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec
+from membrane_ctrl.sim.optics.trace import ScreenError
 
 # 16-bit frames of large pixels with the noise of the 64 that each stands for: what the paper's camera says
 SHRINK = 8

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 from live_bench import CAMERA, TRUE, LiveBench, config
 
-from membrane_ctrl.calibration import command
-from membrane_ctrl.calibration.command import LiveOptions
-from membrane_ctrl.calibration.geometry_file import read_geometry
+from membrane_ctrl.calibration import live as command
+from membrane_ctrl.calibration.live import LiveOptions
 from membrane_ctrl.cli import run
-from membrane_ctrl.config import OpticsConfig
-from membrane_ctrl.names import ShapeState
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.geometry.file import read_geometry
+from membrane_ctrl.model.states import ShapeState
 
 WORDS = ["calibrate", "--live", "--no-pictures"]
 OLD = "a_mm = 2672.0\nb_mm = 2871.0\nalpha_deg = 80.9\n"

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.calibration.adopt import adopt, compared
-from membrane_ctrl.calibration.geometry_file import origin_of, read_geometry
-from membrane_ctrl.config import GeometryConfig, OpticsConfig
-from membrane_ctrl.errors import DeviceError
+from membrane_ctrl.calibration.session import adopt, compared
+from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
+from membrane_ctrl.geometry.file import origin_of, read_geometry
+from membrane_ctrl.model.errors import DeviceError
 
 NEW = "a_mm = 2674.0\nb_mm = 2869.0\nalpha_deg = 81.2\n"
 

@@ -29,8 +29,8 @@ from campaign_run import Result, run_case
 from campaign_times import RATE_HZ
 from process_run import ProcessResult, process_table
 
-from membrane_ctrl.names import Rung, State
-from membrane_ctrl.safety import TABLE, Observation, SafetyTable, Verdict
+from membrane_ctrl.controller.safety import TABLE, Observation, SafetyTable, Verdict
+from membrane_ctrl.model.states import Rung, State
 
 SEEDS = range(1, 5)
 _BEGIN, _END = "## With real processes\n", "<!-- end of the part with real processes -->"

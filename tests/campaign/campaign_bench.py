@@ -20,9 +20,9 @@ from typing import Any
 import psutil
 
 from firmware_iface.emulators.pump_board import PumpBoardEmulator
-from membrane_ctrl.clock import RunClock
-from membrane_ctrl.config import PumpConfig, TwinConfig
-from membrane_ctrl.twin.bench import BenchSpec, LiveBench
+from membrane_ctrl.config.schema import PumpConfig, TwinConfig
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.sim.bench import BenchSpec, LiveBench
 
 PATIENCE_S = 60.0
 WATCHDOG_S = 0.5

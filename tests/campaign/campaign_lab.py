@@ -9,8 +9,7 @@ from typing import Any
 from campaign_times import WATCHDOG_S
 from campaign_world import WatchedPlant
 
-from firmware_iface.drivers.bronkhorst import BronkhorstFlow, BronkhorstPressure
-from firmware_iface.drivers.bronkhorst_modbus import ModbusParameters
+from firmware_iface.drivers.bronkhorst import BronkhorstFlow, BronkhorstPressure, ModbusParameters
 from firmware_iface.drivers.modbus_map import ModbusValue, make_map
 from firmware_iface.emulators.bronkhorst import BronkhorstRegisters, Instrument
 from firmware_iface.emulators.modbus_server import RegisterRefusal, RegisterTable

@@ -21,18 +21,19 @@ from firmware_iface.roles import (
     BenchReading,
     LinkError,
 )
-from membrane_ctrl.clock import RunClock
-from membrane_ctrl.commands import Command
-from membrane_ctrl.config import Config
-from membrane_ctrl.controller import Controller
-from membrane_ctrl.errors import Exit
-from membrane_ctrl.ipc.ring import RingWriter, ring
-from membrane_ctrl.metrology.hencky import zernike_projection
-from membrane_ctrl.names import State
-from membrane_ctrl.supervisor import Supervisor, Wiring
-from membrane_ctrl.telemetry import ROW_BYTES
-from membrane_ctrl.tick import Event, TickOutputs
-from membrane_ctrl.virtual.bench import VirtualBench
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.controller.tick import TickOutputs
+from membrane_ctrl.hold.supervisor import Supervisor, Wiring
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import ROW_BYTES
+from membrane_ctrl.processes.ring import RingWriter, ring
+from membrane_ctrl.sim.virtual.bench import VirtualBench
 
 _LOOK_S = 0.01
 

@@ -20,21 +20,21 @@ from campaign_room import BoardBench, LoopClock, Room, a_room, board_of, on_boar
 from campaign_times import HOLD_FLOW_S, RAMP_S, RATE_HZ, TICK_S, WATCHDOG_S
 from campaign_world import WatchedPlant, World
 
-from firmware_iface.drivers.bronkhorst import BronkhorstFlow
-from firmware_iface.drivers.bronkhorst_modbus import ModbusParameters
+from firmware_iface.drivers.bronkhorst import BronkhorstFlow, ModbusParameters
 from firmware_iface.emulators.bronkhorst import BronkhorstRegisters, Instrument
-from firmware_iface.emulators.virtual_time import run_virtual as in_virtual_time
 from firmware_iface.roles import (
     Bench,
     BenchCommand,
     DeviceRefusedError,
 )
-from membrane_ctrl.config import Config
-from membrane_ctrl.errors import DeviceError
-from membrane_ctrl.latched import NAME, LatchedFile
-from membrane_ctrl.latcher import Latcher
-from membrane_ctrl.names import State
-from membrane_ctrl.tick import Event, TickOutputs
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller.tick import TickOutputs
+from membrane_ctrl.hold.latched_fault import Latcher
+from membrane_ctrl.model.errors import DeviceError
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.states import State
+from membrane_ctrl.run_files.latched_fault import NAME, LatchedFile
+from tests.support.virtual_time import run_virtual as in_virtual_time
 
 
 async def the_program_ends_in_a_hold() -> list[str]:
@@ -134,7 +134,7 @@ async def the_network_comes_back() -> list[str]:
 
 async def faults_that_outlive_the_run() -> list[str]:
     """A trip is in the file, what cannot be read is a fault, a refused acknowledgement clears nothing."""
-    from membrane_ctrl.hold import HoldOptions, _latched
+    from membrane_ctrl.hold.start import HoldOptions, _latched
 
     with tempfile.TemporaryDirectory() as folder:
         file = LatchedFile(Path(folder))
@@ -184,8 +184,9 @@ class _Told:
 
 async def a_board_that_is_latched_at_the_start() -> list[str]:
     """The resume rule may clear a watchdog's trip at the start, and nothing else."""
-    from membrane_ctrl.config import DevicesConfig, ResumeConfig
-    from membrane_ctrl.hold import HoldOptions, _identify
+    from membrane_ctrl.config.devices import DevicesConfig
+    from membrane_ctrl.config.schema import ResumeConfig
+    from membrane_ctrl.hold.start import HoldOptions, _identify
 
     config, devices = Config(), DevicesConfig(board="tcp://127.0.0.1:1")
     asked = config.model_copy(update={"devices": devices, "resume": ResumeConfig(faults=("watchdog_tripped",))})

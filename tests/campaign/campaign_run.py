@@ -31,23 +31,15 @@ from campaign_times import (
 from campaign_watch import Watch
 from campaign_world import WatchedPlant, World, world_of
 
-from membrane_ctrl import states
-from membrane_ctrl.commands import Command, Kind
-from membrane_ctrl.config import (
-    Config,
-    LimitsConfig,
-    LoopConfig,
-    ResumeConfig,
-    ShapeConfig,
-    StatesConfig,
-)
-from membrane_ctrl.control.experiments.spec import ExperimentSpec
-from membrane_ctrl.metrology.hencky import zernike_projection
-from membrane_ctrl.names import Rung, State
-from membrane_ctrl.twin.events import AmbientChange, LeakChange
-from membrane_ctrl.virtual.bench import VirtualBench, Wrong
-from membrane_ctrl.virtual.run import VirtualRun
-from membrane_ctrl.virtual.shape import TruthShape
+from membrane_ctrl.config.schema import Config, LimitsConfig, LoopConfig, ResumeConfig, ShapeConfig, StatesConfig
+from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.controller import states
+from membrane_ctrl.controller.commands import Command, Kind
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.sim.events import AmbientChange, LeakChange
+from membrane_ctrl.sim.virtual.bench import VirtualBench, Wrong
+from membrane_ctrl.sim.virtual.run import TruthShape, VirtualRun
 
 AFTERMATH_S = 45.0
 THE_STOP_S = 12.0

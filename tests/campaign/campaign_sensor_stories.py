@@ -10,8 +10,8 @@ from campaign_stage import Stage, sensors_say
 from campaign_times import DISPLACEMENT_MAX_UM, TICK_S
 from campaign_world import World
 
-from membrane_ctrl.errors import Exit
-from membrane_ctrl.names import State
+from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.model.states import State
 
 
 def a_clock_that_stands() -> list[str]:

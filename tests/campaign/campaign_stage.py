@@ -11,14 +11,13 @@ from campaign_times import TICK_S, WATCHDOG_S
 from campaign_world import WatchedPlant, World
 
 from firmware_iface.drivers.pump_board import PumpBoard
-from membrane_ctrl.commands import Command, Kind
-from membrane_ctrl.config import Config
-from membrane_ctrl.metrology.hencky import zernike_projection
-from membrane_ctrl.names import State
-from membrane_ctrl.twin.sensors import PlantSample
-from membrane_ctrl.virtual.bench import VirtualBench, _MemoryLink
-from membrane_ctrl.virtual.run import VirtualRun
-from membrane_ctrl.virtual.shape import TruthShape
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller.commands import Command, Kind
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.states import State
+from membrane_ctrl.sim.sensors import PlantSample
+from membrane_ctrl.sim.virtual.bench import VirtualBench, _MemoryLink
+from membrane_ctrl.sim.virtual.run import TruthShape, VirtualRun
 
 _WORDS = 2**16
 

@@ -13,9 +13,9 @@ from campaign_stage import Stage
 from campaign_times import DISPLACEMENT_MAX_UM, TICK_S
 from campaign_world import World
 
-from membrane_ctrl import states
-from membrane_ctrl.commands import Command, Kind
-from membrane_ctrl.names import State
+from membrane_ctrl.controller import states
+from membrane_ctrl.controller.commands import Command, Kind
+from membrane_ctrl.model.states import State
 
 
 def an_acknowledgement_counts_once() -> list[str]:

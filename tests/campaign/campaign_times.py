@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from membrane_ctrl.names import Rung
+from membrane_ctrl.model.states import Rung
 
 RATE_HZ = 25.0
 TICK_S = 1 / RATE_HZ

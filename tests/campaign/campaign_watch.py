@@ -26,9 +26,9 @@ from campaign_times import (
 from campaign_world import WatchedPlant
 
 from firmware_iface.register_map import default_map
-from membrane_ctrl.names import Rung, State
-from membrane_ctrl.virtual.bench import VirtualBench
-from membrane_ctrl.virtual.run import VirtualRun, VirtualTick
+from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.sim.virtual.bench import VirtualBench
+from membrane_ctrl.sim.virtual.run import VirtualRun, VirtualTick
 
 _STILL = {State.STANDBY, State.LOWER}
 _LATCHED_FAULTS = default_map().register("latched_faults").address

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from campaign_bench import Run
 
-from membrane_ctrl.errors import Exit
+from membrane_ctrl.model.errors import Exit
 
 UPSET = Path(__file__).parent / "upset"
 HANG_S = 3.0

@@ -17,11 +17,11 @@ import numpy as np
 from campaign_bench import PATIENCE_S, WATCHDOG_S, Run, WatchedPlant, make_plant, running
 from process_cases import CLOCK, DISK, HANG_S, UPSET, WALL_CLOCK, ProcessCase
 
-from membrane_ctrl.config import LimitsConfig
-from membrane_ctrl.errors import Exit
-from membrane_ctrl.latched import LatchedFile
-from membrane_ctrl.repair import repair
-from membrane_ctrl.review.run import open_run
+from membrane_ctrl.config.schema import LimitsConfig
+from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.replay.repair import repair
+from membrane_ctrl.run_files.latched_fault import LatchedFile
+from membrane_ctrl.run_files.run import open_run
 
 RATE_HZ = 50.0
 _SMALL_DISK_MB = 24

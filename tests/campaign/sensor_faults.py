@@ -13,21 +13,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from firmware_iface.roles import BenchReading
-from membrane_ctrl.commands import Command
-from membrane_ctrl.config import Config, LoopConfig, PumpConfig, TwinConfig
-from membrane_ctrl.estimate import ShapeEstimate
-from membrane_ctrl.metrology.hencky import zernike_projection
-from membrane_ctrl.names import Rung, State
-from membrane_ctrl.safety import TABLE
-from membrane_ctrl.telemetry import TelemetryRow
-from membrane_ctrl.twin.events import AmbientChange, Event
-from membrane_ctrl.twin.film import NOMINAL_PRESSURE_PA
-from membrane_ctrl.twin.plant import Plant
-from membrane_ctrl.twin.sensors import PlantSample
-from membrane_ctrl.twin.truth import Truth
-from membrane_ctrl.virtual.bench import VirtualBench
-from membrane_ctrl.virtual.run import VirtualRun
-from membrane_ctrl.virtual.shape import TruthShape
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, TwinConfig
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.safety import TABLE
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.telemetry import TelemetryRow
+from membrane_ctrl.sim.events import AmbientChange, Event
+from membrane_ctrl.sim.film import NOMINAL_PRESSURE_PA
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.sensors import PlantSample, Truth
+from membrane_ctrl.sim.virtual.bench import VirtualBench
+from membrane_ctrl.sim.virtual.run import TruthShape, VirtualRun
 
 RATE_HZ = 10.0
 REGISTER_MAX = 2e6  # what does not fit a register of the board is sent as none

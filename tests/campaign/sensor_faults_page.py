@@ -20,7 +20,7 @@ from typing import Any
 from sensor_faults import CAMERA, FAULTS, PAIRS, SensorFault, Story, tell
 from sensor_peace import Peace, peace
 
-from membrane_ctrl.names import State
+from membrane_ctrl.model.states import State
 
 PAGE = Path(__file__).parents[2] / "docs" / "sensor-faults.md"
 SEED = 1

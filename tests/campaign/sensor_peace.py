@@ -8,12 +8,12 @@ from unittest.mock import patch
 import numpy as np
 from sensor_faults import Lying, LyingPlant
 
-from membrane_ctrl.commands import Command
-from membrane_ctrl.config import Config, LoopConfig, PumpConfig, TwinConfig
-from membrane_ctrl.metrology.hencky import zernike_projection
-from membrane_ctrl.twin import plant as plant_module
-from membrane_ctrl.twin import sensors as sensors_module
-from membrane_ctrl.twin.events import (
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, TwinConfig
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.sim import film as film_module
+from membrane_ctrl.sim import sensors as sensors_module
+from membrane_ctrl.sim.events import (
     AmbientChange,
     DailyTemperature,
     Event,
@@ -22,10 +22,9 @@ from membrane_ctrl.twin.events import (
     LeakChange,
     PressureWeather,
 )
-from membrane_ctrl.twin.film import Film
-from membrane_ctrl.virtual.bench import VirtualBench
-from membrane_ctrl.virtual.run import VirtualRun
-from membrane_ctrl.virtual.shape import TruthShape
+from membrane_ctrl.sim.film import Film
+from membrane_ctrl.sim.virtual.bench import VirtualBench
+from membrane_ctrl.sim.virtual.run import TruthShape, VirtualRun
 
 _DROPOUT = "displacement_missing"  # five seconds without light are no fault of the guards
 
@@ -55,7 +54,7 @@ def peace(seed: int, other_world: bool, hours: float, rate_hz: float = 5.0) -> P
         return _peace(seed, hours, rate_hz, PumpConfig(), TwinConfig(seed=seed), 0.0)
     twin = TwinConfig(seed=seed, leak_time_constant_s=5000.0, barometer_noise_pa=0.1)
     thin = Film(thickness_um=42.0, creep_per_decade=0.02)
-    with patch.object(plant_module, "MIRROR_FILM", thin), patch.object(sensors_module, "GAUGE_NOISE_PA", 1.0):
+    with patch.object(film_module, "MIRROR_FILM", thin), patch.object(sensors_module, "GAUGE_NOISE_PA", 1.0):
         return _peace(seed, hours, rate_hz, PumpConfig(flow_full_um_per_s=5.3 * 1.25), twin, 0.3)
 
 

@@ -10,9 +10,9 @@ from campaign_cases import CASES, SITUATIONS, Case, Situation
 from campaign_rooms import ROOMS
 from campaign_run import run_case
 
-from membrane_ctrl.ladder import Ladder
-from membrane_ctrl.names import Rung, State
-from membrane_ctrl.safety import Observation, SafetyTable, Verdict
+from membrane_ctrl.controller.safe_levels import Ladder
+from membrane_ctrl.controller.safety import Observation, SafetyTable, Verdict
+from membrane_ctrl.model.states import Rung, State
 
 
 def case_called(name: str) -> Case:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.calibration.geometry_file import read_geometry
+from membrane_ctrl.geometry.file import read_geometry
 
 pytestmark = [pytest.mark.campaign, pytest.mark.real_time, pytest.mark.timeout(1800)]
 

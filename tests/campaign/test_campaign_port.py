@@ -15,8 +15,8 @@ import port_attackers
 import pytest
 from campaign_bench import make_plant, running
 
-from membrane_ctrl.errors import Exit
-from membrane_ctrl.port.client import PortClient
+from membrane_ctrl.control_port.client import PortClient
+from membrane_ctrl.model.errors import Exit
 
 pytestmark = [pytest.mark.real_time, pytest.mark.campaign]
 

@@ -19,8 +19,8 @@ from campaign_bench import PATIENCE_S, make_plant, running
 from process_cases import PROCESS_CASES, ProcessCase
 from process_run import ProcessResult, lost_telemetry_s, missing, pump_stood_s, run_process_case
 
-from membrane_ctrl.errors import Exit
-from membrane_ctrl.latched import NAME, LatchedFile
+from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.run_files.latched_fault import NAME, LatchedFile
 
 CAMERA = """
 [twin]

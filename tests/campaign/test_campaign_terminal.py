@@ -14,7 +14,7 @@ import psutil
 import pytest
 from campaign_bench import Run, make_plant, running
 
-from membrane_ctrl.errors import Exit
+from membrane_ctrl.model.errors import Exit
 
 pytestmark = [pytest.mark.campaign, pytest.mark.timeout(180)]
 

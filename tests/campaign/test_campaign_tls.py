@@ -22,12 +22,12 @@ import pytest
 import tls_attackers
 from campaign_bench import Run, make_plant, running
 
-from membrane_ctrl.errors import DeviceError, Exit
-from membrane_ctrl.port.client import PortClient
-from membrane_ctrl.port.tls import client_context
-from membrane_ctrl.review.run import open_run
+from membrane_ctrl.control_port.client import PortClient
+from membrane_ctrl.control_port.tls import client_context
+from membrane_ctrl.model.errors import DeviceError, Exit
+from membrane_ctrl.run_files.run import open_run
 
-sys.path.append(str(Path(__file__).parents[1] / "port"))
+sys.path.append(str(Path(__file__).parents[1] / "control_port"))
 from port_certificates import Authority
 
 pytestmark = [pytest.mark.real_time, pytest.mark.campaign, pytest.mark.timeout(400)]

@@ -8,8 +8,8 @@ import pytest
 from sensor_faults import FAULTS, PAIRS, SensorFault, blocked, drift, scaled, stuck, tell
 from sensor_peace import peace
 
-from membrane_ctrl.config import LimitsConfig
-from membrane_ctrl.names import State
+from membrane_ctrl.config.schema import LimitsConfig
+from membrane_ctrl.model.states import State
 
 NOISE_ONLY = SensorFault("gauge", "shows only noise", blocked(0.5))
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from membrane_ctrl.config import LoopConfig
-from membrane_ctrl.control.feedforward import FeedForward, weather_complaint
+from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.control.gas import FeedForward, weather_complaint
 
 DT_S = 0.02
 

@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from membrane_ctrl.config import LimitsConfig, MirrorConfig
-from membrane_ctrl.control.film_witness import CONTRADICTED_MOST, FilmWitness, LeakGrowth
+from membrane_ctrl.config.schema import LimitsConfig, MirrorConfig
+from membrane_ctrl.control.film import CONTRADICTED_MOST, FilmWitness, LeakGrowth
 
 RATE_HZ = 10.0
 SAG_UM, PRESSURE_PA = 37_100.0, 600.0

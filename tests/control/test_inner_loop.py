@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from membrane_ctrl.config import LoopConfig, PumpConfig
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput, LoopOutput
 
 DT_S = 0.02

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from membrane_ctrl.config import LoopConfig, PumpConfig, TwinConfig
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput
-from membrane_ctrl.twin.plant import Plant
+from membrane_ctrl.sim.plant import Plant
 
 
 def true_centre_um(steps_s: np.ndarray) -> np.ndarray:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.inner_loop import answer, hold, lost_reading, run, start_up, steady
-from membrane_ctrl.config import LoopConfig, PumpConfig, TwinConfig
-from membrane_ctrl.twin.events import AmbientChange, LeakChange
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
+from membrane_ctrl.sim.events import AmbientChange, LeakChange
 
 SEEDS = (1, 2, 3)
 ALL = "barometer and thermometer"

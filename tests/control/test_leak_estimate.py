@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from membrane_ctrl.control.leak import FIRST_S, JUDGE_S, LeakEstimate
+from membrane_ctrl.control.film_health import FIRST_S, JUDGE_S, LeakEstimate
 
 DT_S = 0.02
 

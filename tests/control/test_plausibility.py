@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.control.plausibility import Liar, Plausibility
-from membrane_ctrl.estimate import ShapeEstimate
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 RATE_HZ = 10.0
 SAG_UM, PRESSURE_PA = 37_100.0, 600.0

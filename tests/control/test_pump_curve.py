@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from membrane_ctrl.config import PumpConfig
-from membrane_ctrl.control.pump_curve import KICK_S, PumpCurve
-from membrane_ctrl.twin.pump import Pump
+from membrane_ctrl.config.schema import PumpConfig
+from membrane_ctrl.control.gas import KICK_S, PumpCurve
+from membrane_ctrl.sim.plant import Pump
 
 PUMP = PumpConfig()
 DT_S = 0.02

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.control.sag_change import MODEL_FLOOR_UM, sag_change
+from membrane_ctrl.control.shape_loop import MODEL_FLOOR_UM, sag_change
 
 S = np.zeros(36)
 S[[0, 3, 10, 21]] = 0.5, 0.2887, -0.012, 0.001

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.control.filters import LowPass
-from membrane_ctrl.control.setpoint import RAMP_SHARE, SetpointRamp, SetpointWeight
+from membrane_ctrl.control.pid import RAMP_SHARE, SetpointRamp, SetpointWeight
 
 
 def ramped(target_um: float, mean_flow_um_per_s: float, ticks: int, dt_s: float = 0.02) -> np.ndarray:

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from benchmarks.outer_loop import SENSITIVITY, estimate_of
-from membrane_ctrl.config import ShapeConfig
-from membrane_ctrl.control.reference import SHAPES
-from membrane_ctrl.control.shape_loop import ShapeLoop, ShapeOutput
-from membrane_ctrl.estimate import ShapeEstimate
-from membrane_ctrl.names import ShapeState
+from membrane_ctrl.config.schema import ShapeConfig
+from membrane_ctrl.control.shape_loop import SHAPES, ShapeLoop, ShapeOutput
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.states import ShapeState
 
 CONFIG = ShapeConfig(time_constant_s=60.0)
 PERIOD_S, DT_S = 2.0, 0.1

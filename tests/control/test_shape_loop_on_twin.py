@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.outer_loop import ON_S, SHAPE, track
-from membrane_ctrl.config import TwinConfig
-from membrane_ctrl.names import ShapeState
+from membrane_ctrl.config.schema import TwinConfig
+from membrane_ctrl.model.states import ShapeState
 
 DRIFTING = TwinConfig(laser_drift_um_per_min=2.0, start_error_um=0.0)
 

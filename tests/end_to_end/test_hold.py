@@ -22,7 +22,7 @@ from rerun.chunk import RrdReader
 
 from firmware_iface.register_map import default_map
 from membrane_ctrl.cli import run
-from membrane_ctrl.sets.capture_set import read_head
+from membrane_ctrl.measure.capture_set import read_head
 
 pytestmark = pytest.mark.real_time
 
@@ -244,7 +244,7 @@ def test_a_full_disk_is_refused_before_anything_exists(tmp_path: Path) -> None:
 
 
 def test_nobody_at_the_address_is_a_device_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("membrane_ctrl.bench._PATIENCE_S", 0.3)
+    monkeypatch.setattr("membrane_ctrl.instruments.bench._PATIENCE_S", 0.3)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

@@ -17,7 +17,7 @@ from patience import slow_machine
 from pymodbus.client import ModbusTcpClient
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.latched import LatchedFile
+from membrane_ctrl.run_files.latched_fault import LatchedFile
 
 pytestmark = pytest.mark.real_time
 

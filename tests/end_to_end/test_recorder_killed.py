@@ -15,7 +15,7 @@ import pytest
 from patience import slow_machine
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.errors import Exit
+from membrane_ctrl.model.errors import Exit
 
 pytestmark = pytest.mark.real_time
 

@@ -11,13 +11,12 @@ from pathlib import Path
 import pytest
 from patience import slow_machine
 
-from membrane_ctrl.control.experiments.spec import ExperimentSpec
-from membrane_ctrl.errors import DeviceError, InputError
-from membrane_ctrl.names import State
-from membrane_ctrl.port.client import PortClient
-from membrane_ctrl.tune.live_hold import LiveHold
-from tuning.hold_link import HoldError
-from tuning.hold_rig import HoldRig
+from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.control_port.client import PortClient
+from membrane_ctrl.model.errors import DeviceError, InputError
+from membrane_ctrl.model.states import State
+from membrane_ctrl.sessions.live_hold import HoldError, LiveHold
+from tuning.rig import HoldRig
 
 pytestmark = pytest.mark.real_time
 

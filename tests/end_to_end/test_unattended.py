@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from patience import slow_machine
 
-from membrane_ctrl.errors import Exit
-from membrane_ctrl.latched import NAME
+from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.run_files.latched_fault import NAME
 
 pytestmark = pytest.mark.real_time
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import math
 
-from firmware_iface.emulators.pump_board import BoardSample, Faults, PumpBoardEmulator
+from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import Faults, PumpBoardEmulator
 
 
 class Still:

@@ -18,20 +18,26 @@ from firmware_iface.drivers.bronkhorst import (
     TEMPERATURE,
     BronkhorstFlow,
     BronkhorstPressure,
+    ModbusParameters,
     ParameterPort,
+    register_of,
 )
-from firmware_iface.drivers.bronkhorst_modbus import ModbusParameters, register_of
-from firmware_iface.drivers.bronkhorst_propar import ProparParameters
-from firmware_iface.drivers.propar import Message, ascii_frame, binary_frame, parse_ascii, split_binary, values
+from firmware_iface.drivers.bronkhorst_propar import (
+    Message,
+    ProparParameters,
+    ascii_frame,
+    binary_frame,
+    parse_ascii,
+    split_binary,
+    values,
+)
 from firmware_iface.emulators.bronkhorst import ANALOG_INPUT, BronkhorstRegisters, Instrument, ProparDevice
-from firmware_iface.emulators.modbus_rtu import RtuBusEmulator
-from firmware_iface.emulators.modbus_server import respond
-from firmware_iface.emulators.serial_device import SerialDevice, SerialFaults
-from firmware_iface.emulators.virtual_time import run_virtual
-from firmware_iface.emulators.wires import MemoryWire, PtyWire
+from firmware_iface.emulators.modbus_server import RtuBusEmulator, respond
+from firmware_iface.emulators.serial_device import MemoryWire, PtyWire, SerialDevice, SerialFaults
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from tests.support.virtual_time import run_virtual
 
 LINE = SerialSettings(38_400)
 Made = tuple[SerialDevice, Callable[[], ParameterPort], MemoryWire]

@@ -15,9 +15,9 @@ import pytest
 
 from firmware_iface.drivers.camera_aravis import AravisCamera, AravisSettings
 from firmware_iface.drivers.frame_lost import FrameLostError
-from firmware_iface.emulators.gige_camera import GigeCameraEmulator
 from firmware_iface.links import aravis
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from tests.support.gige_camera import GigeCameraEmulator
 
 pytestmark = pytest.mark.real_time
 

@@ -10,13 +10,17 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from firmware_iface.display.checkerboard import checkerboard_problem
-from firmware_iface.display.exposure import exposure_problem
-from firmware_iface.display.gamma import RAMP_LEVELS, linear_response, measured_response
-from firmware_iface.display.pattern_image import ScreenRaster, checkerboard, pattern_light
-from firmware_iface.display.settle import settling, share_left
-from firmware_iface.emulators.panel import EmulatedPanel, PanelResponse
+from firmware_iface.display.measures import checkerboard_problem, exposure_problem, settling, share_left
+from firmware_iface.display.response import (
+    RAMP_LEVELS,
+    ScreenRaster,
+    checkerboard,
+    linear_response,
+    measured_response,
+    pattern_light,
+)
 from firmware_iface.roles import Pattern
+from tests.support.panel import EmulatedPanel, PanelResponse
 
 RASTER = ScreenRaster(341, 257, 0.25, periods=4, period_mm=14.0)
 

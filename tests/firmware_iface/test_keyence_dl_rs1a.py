@@ -12,10 +12,9 @@ import pytest
 
 from firmware_iface.drivers.keyence_dl_rs1a import QUALITY_AMPLIFIER_ERROR, QUALITY_OUT_OF_RANGE, KeyenceDlRs1a
 from firmware_iface.emulators.keyence_dl_rs1a import KeyenceDlRs1aEmulator
-from firmware_iface.emulators.serial_device import SerialFaults
-from firmware_iface.emulators.virtual_time import run_virtual
-from firmware_iface.emulators.wires import MemoryWire, PtyWire
+from firmware_iface.emulators.serial_device import MemoryWire, PtyWire, SerialFaults
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from tests.support.virtual_time import run_virtual
 
 
 class Bench:

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from firmware_iface.drivers.modbus_map import ModbusValue, ValueMap, make_map
 from firmware_iface.emulators.modbus_map_device import MapDevice, respond_to_input
-from firmware_iface.emulators.modbus_rtu import RtuBusEmulator, bitwise_crc
-from firmware_iface.emulators.virtual_time import run_virtual
-from firmware_iface.emulators.wires import MemoryWire
+from firmware_iface.emulators.modbus_server import RtuBusEmulator, bitwise_crc
+from firmware_iface.emulators.serial_device import MemoryWire
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkError
+from tests.support.virtual_time import run_virtual
 
 LINE = SerialSettings(9600)
 PUMP, _ = make_map({"address": 0, "value": [0.0, 1.0]}, "waveshare_ao8")

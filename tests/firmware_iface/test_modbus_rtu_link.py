@@ -10,14 +10,12 @@ from typing import Any
 
 import pytest
 
-from firmware_iface.emulators.modbus_rtu import RtuBusEmulator, bitwise_crc
-from firmware_iface.emulators.modbus_server import respond
-from firmware_iface.emulators.serial_device import SerialFaults
-from firmware_iface.emulators.virtual_time import run_virtual, stand_still
-from firmware_iface.emulators.wires import MemoryWire
+from firmware_iface.emulators.modbus_server import RtuBusEmulator, bitwise_crc, respond
+from firmware_iface.emulators.serial_device import MemoryWire, SerialFaults
 from firmware_iface.links.modbus_rtu import RtuBus, crc16, parse_rtu_url, rtu_frame, take_reply
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from tests.support.virtual_time import run_virtual, stand_still
 
 LINE = SerialSettings(115_200)
 TIMEOUT_S = 0.05

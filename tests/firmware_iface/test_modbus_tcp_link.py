@@ -10,8 +10,8 @@ import pytest
 from counting_plant import ManualClock
 
 from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer
-from firmware_iface.links.backoff import FIRST_S, LONGEST_S, BackOff
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp
+from firmware_iface.links.serial_port import FIRST_S, LONGEST_S, BackOff
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 
 NEVER_S = 30.0  # a timeout that no test waits for

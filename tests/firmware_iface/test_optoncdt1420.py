@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from firmware_iface.drivers.linked_device import StepGate
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420, middle
 from firmware_iface.drivers.optoncdt_stream import StreamParser, distance_mm
-from firmware_iface.drivers.step_gate import StepGate
 from firmware_iface.emulators.optoncdt1420 import NO_PEAK, Optoncdt1420Emulator, three_bytes
-from firmware_iface.emulators.virtual_time import run_virtual, stand_still
-from firmware_iface.emulators.wires import MemoryWire, PtyWire
+from firmware_iface.emulators.serial_device import MemoryWire, PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from tests.support.virtual_time import run_virtual, stand_still
 
 STEP_UM = 50_000 * 1.02 / 65_520  # a digital step at 50 mm range
 

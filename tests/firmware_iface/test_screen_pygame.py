@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from virtual_display import screenshot, virtual_display
 
-from firmware_iface.display.gamma import DisplayResponse
-from firmware_iface.display.pattern_image import ScreenRaster, checkerboard, pattern_light
+from firmware_iface.display.response import DisplayResponse, ScreenRaster, checkerboard, pattern_light
 from firmware_iface.drivers.screen_pygame import PygameScreen, ScreenSettings
 from firmware_iface.roles import DeviceRefusedError, LinkError, Pattern
+from tests.support.virtual_display import screenshot, virtual_display
 
 pytestmark = pytest.mark.real_time
 

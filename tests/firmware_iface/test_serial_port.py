@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from firmware_iface.emulators.modbus_rtu import RtuBusEmulator
-from firmware_iface.emulators.serial_device import SerialDevice
-from firmware_iface.emulators.wires import PtyWire
+from firmware_iface.emulators.modbus_server import RtuBusEmulator
+from firmware_iface.emulators.serial_device import PtyWire, SerialDevice
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.serial_port import SerialPort, SerialSettings
 from firmware_iface.links.usb_ports import check_port_name, port_path, serial_ports

@@ -10,11 +10,10 @@ from typing import Any
 import pytest
 
 from firmware_iface.drivers.ventus import Ventus
-from firmware_iface.emulators.serial_device import SerialFaults
+from firmware_iface.emulators.serial_device import MemoryWire, PtyWire, SerialFaults
 from firmware_iface.emulators.ventus import VentusEmulator
-from firmware_iface.emulators.virtual_time import run_virtual
-from firmware_iface.emulators.wires import MemoryWire, PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from tests.support.virtual_time import run_virtual
 
 
 class Bench:

@@ -29,7 +29,7 @@ from pathlib import Path
 from types import FrameType
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE.parents[1]), str(HERE.parent), str(HERE.parent / "recording"), str(HERE)]
+sys.path[:0] = [str(HERE.parents[1]), str(HERE)]
 
 MEMORY_BYTES = 700_000_000  # of a case, above what the process has: a command begins with 0.2 GB
 _CASES_A_WORKER = 1000  # each review leaves some threads of Rerun behind, which a command takes with it

@@ -6,18 +6,17 @@ import json
 import shutil
 from pathlib import Path
 
-from synthetic_run import shape_of
-from virtual_record import CONFIG, kept_ticks, memory_at, write_record
-
 from membrane_ctrl.cli import run
-from membrane_ctrl.clock import RunClock
-from membrane_ctrl.config_file import dump
-from membrane_ctrl.recording.checked_text import dumps_checked, with_comment
-from membrane_ctrl.recording.column_tables import ColumnTables
-from membrane_ctrl.recording.rows import unpack
-from membrane_ctrl.recording.sink import LAYOUT, Recording
-from membrane_ctrl.recording.summary import Summary
-from membrane_ctrl.recording.telemetry_streams import TelemetryStreams
+from membrane_ctrl.config.toml_file import dump
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.plain_json import dumps_checked, with_comment
+from membrane_ctrl.model.telemetry import unpack
+from membrane_ctrl.recorder.rerun_streams import TelemetryStreams
+from membrane_ctrl.recorder.sink import LAYOUT, Recording
+from membrane_ctrl.run_files.summary import Summary
+from membrane_ctrl.run_files.tables import ColumnTables
+from tests.support.synthetic_run import shape_of
+from tests.support.virtual_record import CONFIG, kept_ticks, memory_at, write_record
 
 RUN = "20261121T010203Z-night"
 _SECONDS = 4.0

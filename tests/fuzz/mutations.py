@@ -17,7 +17,7 @@ from typing import Any
 
 import tomli_w
 
-from membrane_ctrl.recording.checked_text import KEY, dumps_checked, with_comment
+from membrane_ctrl.model.plain_json import KEY, dumps_checked, with_comment
 
 CANARY = "canary.txt"  # beside the folder: what nobody may read, change or remove
 _TEXT = "\x1b]0;owned\x07\x1b[2J\x9b31m\r\b\u202emirror\u2066[bold]\U000e0041"

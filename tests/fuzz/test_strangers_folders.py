@@ -25,14 +25,13 @@ from good_folders import RUN, good_run, good_sets
 from mutations import sealed_again
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.recording.arrow_bounds import require_bounded
-from membrane_ctrl.recording.checked_text import dumps_checked
-from membrane_ctrl.recording.column_codec import decode_columns
-from membrane_ctrl.recording.inputs_file import InputsReader
-from membrane_ctrl.recording.sealed_stream import SealedStream, unseal
-from membrane_ctrl.recording.segment_bounds import panics_are_faults
-from membrane_ctrl.review import catalogue
-from membrane_ctrl.tick_record import RECORD
+from membrane_ctrl.controller.tick import RECORD
+from membrane_ctrl.model.plain_json import dumps_checked
+from membrane_ctrl.run_files import run_folder
+from membrane_ctrl.run_files.column_file import decode_columns
+from membrane_ctrl.run_files.inputs_file import InputsReader
+from membrane_ctrl.run_files.sealed_stream import SealedStream, require_bounded, unseal
+from membrane_ctrl.run_files.segments import panics_are_faults
 
 HOSTILE = "\x1b]0;owned\x07\x9b2J\r\u202e[/red]"
 FRAME = struct.Struct("<8sII")
@@ -387,7 +386,7 @@ def test_a_picture_of_twenty_thousand_by_twenty_thousand(sets: Path, capsys: Sai
 
 @pytest.mark.parametrize("suffix", [".tiff", ".bmp", ".jpg"])
 def test_other_pictures_are_measured_before_they_are_decoded(suffix: str) -> None:
-    from membrane_ctrl.sets.images import decoded_image, image_size
+    from membrane_ctrl.measure.images import decoded_image, image_size
 
     picture = np.arange(35, dtype=np.uint8).reshape(5, 7)
     data = cv2.imencode(suffix, picture)[1].tobytes()
@@ -514,7 +513,7 @@ def test_a_folder_that_may_not_be_looked_into_costs_its_line(
         return exists(path)
 
     monkeypatch.setattr(Path, "exists", guarded)
-    monkeypatch.setattr(catalogue, "read_config", _closed(catalogue.read_config))
+    monkeypatch.setattr(run_folder, "read_config", _closed(run_folder.read_config))
     assert run(["runs", "--logs", str(folder.parent)]) == 0
     out = capsys.readouterr().out
     assert RUN in out

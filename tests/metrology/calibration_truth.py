@@ -7,16 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.config import OpticsConfig
+from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, Bench, bench_at, sigmas
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
 from membrane_ctrl.metrology.calibrate.separable import Witness
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, surface_of
-from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.surface import Surface
-from membrane_ctrl.twin.film_shape import FilmShape, typical_film
-from membrane_ctrl.twin.rays import CameraPose, ScreenPose
-from membrane_ctrl.twin.trace import trace
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
+from membrane_ctrl.sim.optics.trace import CameraPose, ScreenPose, trace
 
 FloatArray = NDArray[np.float64]
 

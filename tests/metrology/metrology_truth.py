@@ -15,7 +15,7 @@ from prysm.polynomials import noll_to_nm, zernike_nm
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from membrane_ctrl.config import CameraConfig, OpticsConfig
+from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 
 FloatArray = NDArray[np.float64]
 RADIUS_MM = 500.0

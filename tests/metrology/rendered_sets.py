@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern
-from membrane_ctrl.config import CameraConfig, OpticsConfig, PatternConfig
-from membrane_ctrl.metrology.frame_stack import FrameStack
-from membrane_ctrl.twin.film_shape import FilmShape, typical_film
-from membrane_ctrl.twin.illumination import Light, pattern_sequence
-from membrane_ctrl.twin.render import OpticsRenderer
+from membrane_ctrl.config.schema import CameraConfig, OpticsConfig, PatternConfig
+from membrane_ctrl.metrology.frames.frame_stack import FrameStack
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
+from membrane_ctrl.sim.optics.shade import Light, pattern_sequence
 
 FILM = typical_film(37.1, 500.0, seed=1)
 GAINS = {"saturated": 2.0, "dark": 0.05, "flicker": 0.8}

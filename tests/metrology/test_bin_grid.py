@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from metrology_truth import RADIUS_MM
 
-from membrane_ctrl.config import CameraConfig, OpticsConfig
+from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.metrology.bins import BinGrid
-from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer
-from membrane_ctrl.metrology.surface import Surface
 
 # 16 pixels of the paper's camera in one: bins of 4 pixels are 9 mm on the mirror, and the bias is large
 CAMERA = CameraConfig(width_px=612, height_px=512, pixel_um=3.45 * 4)

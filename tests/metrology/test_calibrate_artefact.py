@@ -10,13 +10,14 @@ import pytest
 import tomli_w
 from calibration_truth import OPTICS, make
 
-from membrane_ctrl.config import GeometryConfig, OpticsConfig, ScreenPoseConfig
+from membrane_ctrl.config.optics import ScreenPoseConfig
+from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
 from membrane_ctrl.metrology.calibrate.artefact import Origin, general_covariance, tables_of
-from membrane_ctrl.metrology.calibrate.content_hash import content_hash
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, sigmas
 from membrane_ctrl.metrology.calibrate.solve import Solution, solve
-from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.geometry_spread import GENERAL_NAMES, GeometrySpread, changed
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, GeometrySpread, changed
+from membrane_ctrl.model.plain_json import content_hash
 
 ORIGIN = Origin("2026-01-01T00:00:00+00:00", ("a", "b"), 1.0, 2.0, 1.5, 3.0, ("a note",))
 FREE = sigmas({"bow_mm": 1.5, "k1": 0.02, "pitch_relative": 1e-3})

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from board_photograph import Photographer, photographs
 
-from membrane_ctrl.calibration.prior_file import read_prior
 from membrane_ctrl.cli import run
-from membrane_ctrl.config import CameraConfig, OpticsConfig
-from membrane_ctrl.errors import InputError
+from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
+from membrane_ctrl.geometry.prior_file import read_prior
+from membrane_ctrl.model.errors import InputError
 
 CONFIG = """
 [optics.camera]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.config import CameraConfig, OpticsConfig
-from membrane_ctrl.metrology.calibrate.foresee import foresee
+from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.metrology.calibrate.parameters import sigmas
+from membrane_ctrl.metrology.calibrate.propagate import foresee
 
 
 # docs/calibration.md: claims of calibrations of the twin's film, sag and figure in um

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from calibration_truth import OPTICS, STATED, make
 
-from membrane_ctrl.config import CameraConfig, GeometryConfig, OpticsConfig
-from membrane_ctrl.metrology.calibrate.averaging import averaged
+from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.metrology.calibrate.parameters import (
     ALL,
     NAMES,
@@ -20,9 +19,9 @@ from membrane_ctrl.metrology.calibrate.parameters import (
     sigmas,
 )
 from membrane_ctrl.metrology.calibrate.residuals import COLUMNS, LOCAL, SetPhases, chunks, residual_mm
-from membrane_ctrl.metrology.calibrate.separable import SetState, rim_harmonics
-from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.surface import PARAMETERS, Surface
+from membrane_ctrl.metrology.calibrate.separable import SetState, averaged, rim_harmonics
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 
 RNG = np.random.default_rng(1)
 LENS = Geometry.from_config(OpticsConfig(camera=CameraConfig(distortion=(-0.05, 0.02, 1e-3, -5e-4))))

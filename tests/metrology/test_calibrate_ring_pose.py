@@ -8,10 +8,9 @@ from board_photograph import Photographer
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from membrane_ctrl.config import CameraConfig, OpticsConfig
+from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.metrology.calibrate.ring_pose import POSE_NAMES, RingPose, rim_edges, ring_pose
-from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.outline import find_outline
+from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
 
 FloatArray = NDArray[np.float64]
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from calibration_truth import Truth, calibrated_errors_um, errors_um, make, plain, stated_errors_um
 
-from membrane_ctrl.metrology.calibrate.determined import condition_number, weak_combinations
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, sigmas
-from membrane_ctrl.metrology.calibrate.propagate import propagate
+from membrane_ctrl.metrology.calibrate.propagate import condition_number, propagate, weak_combinations
 from membrane_ctrl.metrology.calibrate.solve import Solution, solve
 
 SIGMAS = sigmas()

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from rendered_sets import FILM, bench, faulty_set, good_set, patterns
 
-from membrane_ctrl.config import OpticsConfig, PatternConfig
+from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
 from membrane_ctrl.metrology.checked import RejectedSetError, check
-from membrane_ctrl.metrology.integrity import identical_frames
-from membrane_ctrl.metrology.surface import Surface
-from membrane_ctrl.twin.film_shape import Bump, FilmShape, Ripple, Wrinkle, typical_film
-from membrane_ctrl.twin.illumination import Light
+from membrane_ctrl.metrology.frames.integrity import identical_frames
+from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple, Wrinkle, typical_film
+from membrane_ctrl.sim.optics.shade import Light
 
 NAMES = [p.name for p in patterns(bench())]
 SINUSOIDS = [name for name in NAMES if "sin" in name]

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from rendered_sets import FILM, bench, good_set
 
-from membrane_ctrl.config import OpticsConfig
+from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.checked import check
-from membrane_ctrl.metrology.frame_stack import FrameStack
+from membrane_ctrl.metrology.frames.frame_stack import FrameStack
 from membrane_ctrl.metrology.full import FullResult, measure_pixels, reconstruct_full, tukey
+from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.metrology.reconstruct import HeightFunction, cone, parabola, v_fold
-from membrane_ctrl.metrology.surface import Surface
-from membrane_ctrl.twin.film_shape import Bump, FilmShape, Ripple
-from membrane_ctrl.twin.render import OpticsRenderer
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple
 
 X, Y = np.meshgrid(*[np.linspace(-475, 475, 81)] * 2)
 INSIDE = np.hypot(X, Y) <= 475

@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from membrane_ctrl.config import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
-from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.config.optics import ScreenPoseConfig
+from membrane_ctrl.config.schema import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig
+from membrane_ctrl.metrology.optics.geometry import Geometry
 
 OPTICS = OpticsConfig()
 GEOMETRY = Geometry.from_config(OPTICS)

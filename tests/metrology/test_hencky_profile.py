@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from metrology_truth import hencky_depth
 
-from membrane_ctrl.metrology import hencky, zernike
-from membrane_ctrl.metrology.surface import Surface
+from membrane_ctrl.metrology.optics import hencky, zernike
+from membrane_ctrl.metrology.optics.surface import Surface
 
 RHO = np.linspace(0, 1, 101)
 

@@ -8,22 +8,23 @@ import numpy as np
 import pytest
 from rendered_sets import FILM, bench, patterns, stack_of
 
-from membrane_ctrl.config import OpticsConfig
-from membrane_ctrl.metrology.bin_figure import BinFigure, bin_figure
+from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.checked import Checked, check
-from membrane_ctrl.metrology.frame_stack import FrameStack
-from membrane_ctrl.metrology.geometry_spread import PAPER_SPREAD, GeometrySpread, changed
-from membrane_ctrl.metrology.monte_carlo import TrialBench, run_trials
-from membrane_ctrl.metrology.surface import Surface
-from membrane_ctrl.metrology.uncertainty import (
+from membrane_ctrl.metrology.frames.frame_stack import FrameStack
+from membrane_ctrl.metrology.full import BinFigure, bin_figure
+from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.metrology.uncertainty.geometry_spread import PAPER_SPREAD, GeometrySpread, changed
+from membrane_ctrl.metrology.uncertainty.monte_carlo import (
     HeightMap,
+    TrialBench,
     geometry_covariance,
     geometry_jacobian,
     linear_covariance,
     noise_covariance,
+    run_trials,
     trial_covariance,
 )
-from membrane_ctrl.twin.render import OpticsRenderer
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
 
 OPTICS = bench()
 MAP = HeightMap.over(475.0, 500.0, 41)

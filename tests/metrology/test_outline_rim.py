@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from rendered_sets import FILM, bench, good_set
 
-from membrane_ctrl.metrology import hencky
-from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.outline import find_outline, project
-from membrane_ctrl.metrology.radial import pressure_pa, radial_profile
+from membrane_ctrl.metrology.optics import hencky
+from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline, project
+from membrane_ctrl.metrology.optics.surface import pressure_pa, radial_profile
 
 
 def white_minus_black() -> np.ndarray:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.config import PatternConfig
-from membrane_ctrl.metrology.decode import FullSlots
-from membrane_ctrl.metrology.patterns import fringe_sequence, full_sequence
+from membrane_ctrl.config.schema import PatternConfig
+from membrane_ctrl.metrology.phase import FullSlots, fringe_sequence, full_sequence
 
 
 def test_the_papers_18_images() -> None:

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.jit import kernel
 from membrane_ctrl.metrology.motion import combine_steps, worth_correcting
+from membrane_ctrl.metrology.optics.compiled import kernel
 from membrane_ctrl.metrology.phase import equal_shifts, step_weights
 from membrane_ctrl.metrology.phasor import FOLLOWED_ROWS, Binner, arctan2, track
 

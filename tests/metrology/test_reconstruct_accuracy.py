@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from metrology_truth import OPTICS, RADIUS_MM, SMALL, Seen, TrueFilm, look, pixel_grid
 
-from membrane_ctrl.config import CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
-from membrane_ctrl.metrology.covariance import parameter_covariance, slope_per_screen
-from membrane_ctrl.metrology.fit import NormalMatrix
-from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.kernels import invert
-from membrane_ctrl.metrology.reconstruct import Fit, Points, Tracer, cone, parabola, solve, v_fold
-from membrane_ctrl.metrology.surface import Surface, sag_gradient
-from membrane_ctrl.metrology.zernike import gradients
+from membrane_ctrl.config.optics import ScreenPoseConfig
+from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, OpticsConfig
+from membrane_ctrl.metrology.bins import parameter_covariance, slope_per_screen
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.kernels import invert
+from membrane_ctrl.metrology.optics.surface import Surface, sag_gradient
+from membrane_ctrl.metrology.optics.zernike import gradients
+from membrane_ctrl.metrology.reconstruct import Fit, NormalMatrix, Points, Tracer, cone, parabola, solve, v_fold
 
 GEOMETRY = Geometry.from_config(OPTICS)
 TRACER = Tracer(GEOMETRY, RADIUS_MM)

@@ -7,26 +7,20 @@ import pytest
 from metrology_truth import SMALL, pixel_grid
 from rendered_sets import FILM, bench, good_set
 
-from membrane_ctrl.config import (
-    CameraPoseConfig,
-    GeometryConfig,
-    HeightMapConfig,
-    OpticsConfig,
-    ScreenPoseConfig,
-)
+from membrane_ctrl.config.optics import HeightMapConfig, ScreenPoseConfig
+from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.metrology.calibrate.parameters import Bench
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
 from membrane_ctrl.metrology.checked import check
-from membrane_ctrl.metrology.face import Face
 from membrane_ctrl.metrology.full import measure_pixels, reconstruct_full
-from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.geometry_spread import GENERAL_NAMES, changed
 from membrane_ctrl.metrology.live import LiveReconstructor
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.screen_face import Face
+from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer
-from membrane_ctrl.metrology.surface import Surface
-from membrane_ctrl.twin.film_shape import FilmShape
-from membrane_ctrl.twin.rays import camera_pose, screen_pose
-from membrane_ctrl.twin.trace import trace
+from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, changed
+from membrane_ctrl.sim.optics.film_shape import FilmShape
+from membrane_ctrl.sim.optics.trace import camera_pose, screen_pose, trace
 
 RNG = np.random.default_rng(5)
 NODES_X, NODES_Y = np.linspace(-250, 250, 6), np.linspace(-210, 240, 5)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from membrane_ctrl.metrology.frames.series_integrity import Series, SeriesCheck, check_series
 from membrane_ctrl.metrology.phase import equal_shifts
-from membrane_ctrl.metrology.series_integrity import Series, SeriesCheck, check_series
 
 PERIODS = np.array([0.9, 3.9, 15.9])
 SHIFTS = -equal_shifts(4)

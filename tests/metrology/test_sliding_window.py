@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from metrology_truth import SMALL
 
-from membrane_ctrl.config import OpticsConfig
+from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.live import LiveReconstructor
-from membrane_ctrl.metrology.patterns import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
 from membrane_ctrl.metrology.sliding import SlidingWindow
-from membrane_ctrl.twin.film_shape import FilmShape
-from membrane_ctrl.twin.render import OpticsRenderer
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import FilmShape
 
 OPTICS = OpticsConfig(camera=SMALL)
 ZERNIKE_UM = (0, 0, 0, 0, 800, -500, 300, 0, 400, *[0] * 27)

@@ -6,20 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology import sofast
-from membrane_ctrl.metrology.closure import closure, closure_with_level, closure_with_phase
-from membrane_ctrl.metrology.facet import measure_on, solve_facet
-from membrane_ctrl.metrology.multifrequency import predicted_phase, unwrap
+from membrane_ctrl.metrology.facet import sofast
+from membrane_ctrl.metrology.facet.facet import measure_on, solve_facet
+from membrane_ctrl.metrology.facet.sofast import SHIFTS_RAD, decode, lit_pixels, series_of, sight, wrapped_phases
+from membrane_ctrl.metrology.frames.closure import closure, closure_with_level, closure_with_phase
+from membrane_ctrl.metrology.frames.series_integrity import check_series, predicted_phase, unwrap
 from membrane_ctrl.metrology.phase import modulation, phasors
-from membrane_ctrl.metrology.series_integrity import check_series
-from membrane_ctrl.metrology.sofast_facet import (
-    SHIFTS_RAD,
-    decode,
-    lit_pixels,
-    series_of,
-    sight,
-    wrapped_phases,
-)
 
 pytest.importorskip("h5py")
 DATA = Path(__file__).parents[2].parent / "shared" / "data" / "sofast"

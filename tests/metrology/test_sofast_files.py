@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology import sofast
+from membrane_ctrl.metrology.facet import sofast
 
 h5py = pytest.importorskip("h5py")
 

@@ -8,8 +8,13 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.pairs import Moment, PairFinder
-from membrane_ctrl.metrology.stability import RunningCovariance, Tally, default_points_mm
+from membrane_ctrl.metrology.uncertainty.stability import (
+    Moment,
+    PairFinder,
+    RunningCovariance,
+    Tally,
+    default_points_mm,
+)
 
 
 def test_running_covariance() -> None:

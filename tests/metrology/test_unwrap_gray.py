@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.config import PatternConfig
-from membrane_ctrl.metrology import unwrap
+from membrane_ctrl.config.schema import PatternConfig
+from membrane_ctrl.metrology import phase as unwrap
 
 S = np.linspace(0, 8, 4001)[:-1] + 1e-4  # place on the pattern in periods, from its low edge
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from prysm.polynomials import noll_to_nm, zernike_nm
 
-from membrane_ctrl.metrology import zernike
+from membrane_ctrl.metrology.optics import zernike
 
 RNG = np.random.default_rng(3)
 RHO, THETA = np.sqrt(RNG.uniform(0, 1, 200)), RNG.uniform(-np.pi, np.pi, 200)

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from review_runs import written
 from scipy import signal
 
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.analysis import Analysis, analyse
-from membrane_ctrl.review.block_tests import mean_p, spread_p, windowed
-from membrane_ctrl.review.compare import compare
+from membrane_ctrl.review.statistics.analysis import Analysis, analyse
+from membrane_ctrl.review.statistics.compare import compare
+from membrane_ctrl.review.statistics.drift import mean_p, spread_p, windowed
+from tests.support.review_runs import written
 
 HOURS = 0.5
 

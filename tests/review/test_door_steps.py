@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from benchmarks.nights import DOOR, Planted, night
-from membrane_ctrl.recording.levels import TICK_FIELDS, first_level
-from membrane_ctrl.recording.rows import COLUMN, Rows, column
-from membrane_ctrl.review.door_steps import quantum, update_s
-from membrane_ctrl.review.found import pressure_steps
-from membrane_ctrl.review.found_event import Found
+from membrane_ctrl.model.telemetry import COLUMN, Rows, column
+from membrane_ctrl.review.events.found import pressure_steps
+from membrane_ctrl.review.events.laser_and_door import quantum, update_s
+from membrane_ctrl.review.events.steps import Found
+from membrane_ctrl.run_files.tables import TICK_FIELDS, first_level
 
 HOURS = 2.0
 AMBIENT = COLUMN["ambient_pressure_pa"]

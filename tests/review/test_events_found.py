@@ -9,14 +9,13 @@ import pytest
 
 from benchmarks.events_found import matched
 from benchmarks.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night
-from membrane_ctrl.metrology.hencky import zernike_projection
-from membrane_ctrl.names import State
-from membrane_ctrl.recording.levels import TICK_FIELDS, Columns, first_level
-from membrane_ctrl.recording.rows import COLUMN, Rows, column
-from membrane_ctrl.review.found import find_events, noise_changes, weather_losses
-from membrane_ctrl.review.found_event import Found
-from membrane_ctrl.review.shapes import from_estimates
-from membrane_ctrl.review.steps import confidence, steps
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import COLUMN, Rows, column
+from membrane_ctrl.review.events.found import find_events, noise_changes, weather_losses
+from membrane_ctrl.review.events.steps import Found, confidence, steps
+from membrane_ctrl.run_files.shapes import from_estimates
+from membrane_ctrl.run_files.tables import TICK_FIELDS, Columns, first_level
 
 HOURS = 2.0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from membrane_ctrl.review.gaps import broken_at_gaps
+from membrane_ctrl.review.report.figures import broken_at_gaps
 
 
 def test_a_missing_hour_breaks_the_line_and_a_missing_second_does_not() -> None:

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from benchmarks.nights import CONFIG, night, write_run
-from membrane_ctrl.names import State
-from membrane_ctrl.recording.rows import COLUMN, Rows, column
+from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import COLUMN, Rows, column
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.analysis import analyse
-from membrane_ctrl.review.held_time import HeldTime
-from membrane_ctrl.review.report_json import report_table
-from membrane_ctrl.review.verdict import verdict
+from membrane_ctrl.review.report.json import report_table, verdict
+from membrane_ctrl.review.statistics.analysis import analyse
+from membrane_ctrl.review.statistics.windows import HeldTime
 
 HOURS = 0.1
 

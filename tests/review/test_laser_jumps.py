@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks.nights import DOOR, GLITCH, Planted, night
-from membrane_ctrl.recording.levels import TICK_FIELDS, first_level
-from membrane_ctrl.recording.rows import COLUMN, Rows, column
-from membrane_ctrl.review.found import laser_glitches
-from membrane_ctrl.review.found_event import Found
+from membrane_ctrl.model.telemetry import COLUMN, Rows, column
+from membrane_ctrl.review.events.found import laser_glitches
+from membrane_ctrl.review.events.steps import Found
+from membrane_ctrl.run_files.tables import TICK_FIELDS, first_level
 
 HOURS = 2.0
 AT_S = 3000.3

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import matplotlib as mpl
 import pytest
-from review_runs import written
 
 from benchmarks.nights import Planted
+from tests.support.review_runs import written
 
 NOTEBOOK = Path(__file__).parents[2] / "examples" / "review.ipynb"
 

@@ -10,23 +10,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from review_runs import same, set_summary, written
 
 from benchmarks.nights import Planted, night, write_run
 from membrane_ctrl.cli import run as command
-from membrane_ctrl.config import Config
-from membrane_ctrl.errors import InputError
-from membrane_ctrl.names import ShapeState, State
-from membrane_ctrl.recording import plain_json
-from membrane_ctrl.recording.rows import COLUMN, column
-from membrane_ctrl.recording.summary import SETTLED_AFTER_S, Summary
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model import plain_json
+from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.states import ShapeState, State
+from membrane_ctrl.model.telemetry import COLUMN, column
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.analysis import analyse, fill_short_gaps
-from membrane_ctrl.review.compare import compare
-from membrane_ctrl.review.feedforward import WithoutFeedforward
-from membrane_ctrl.review.report_html import render
-from membrane_ctrl.review.report_json import report_table
-from membrane_ctrl.review.settled import Settled
+from membrane_ctrl.review.report.html import render
+from membrane_ctrl.review.report.json import report_table
+from membrane_ctrl.review.statistics.analysis import analyse, fill_short_gaps
+from membrane_ctrl.review.statistics.compare import compare
+from membrane_ctrl.review.statistics.windows import WithoutFeedforward
+from membrane_ctrl.run_files.summary import SETTLED_AFTER_S, Settled, Summary
+from tests.support.review_runs import same, set_summary, written
 
 HOURS = 0.5
 

@@ -12,10 +12,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
-from review_runs import written
 
 from benchmarks.nights import Planted
 from membrane_ctrl.cli import run as command
+from tests.support.review_runs import written
 
 RATE_HZ = 10.0
 SETTLED_AFTER_S = 5.0

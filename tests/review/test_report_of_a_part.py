@@ -6,13 +6,13 @@ import json
 from pathlib import Path
 
 import pytest
-from review_runs import written
 
 from benchmarks.nights import night, write_run
 from membrane_ctrl.cli import run as command
-from membrane_ctrl.recording.rows import COLUMN, column
+from membrane_ctrl.model.telemetry import COLUMN, column
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.analysis import analyse
+from membrane_ctrl.review.statistics.analysis import analyse
+from tests.support.review_runs import written
 
 HOURS = 0.1
 

@@ -10,11 +10,12 @@ from types import SimpleNamespace
 
 import pytest
 from rerun.chunk import RrdReader
-from review_runs import written
 
 from benchmarks.nights import Planted
-from membrane_ctrl.review import open_run, viewer
-from membrane_ctrl.review.review_command import ReviewOptions, make_review
+from membrane_ctrl.review import open_run
+from membrane_ctrl.review.viewer import viewer
+from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
+from tests.support.review_runs import written
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from review_runs import written
 
 from benchmarks.nights import Planted
 from membrane_ctrl.cli import run as command
-from membrane_ctrl.review.blueprints import TABS
+from membrane_ctrl.review.viewer.blueprints import TABS
+from tests.support.review_runs import written
 
 ERROR_BLUE = (86, 180, 233)
 needs_vulkan = pytest.mark.skipif(

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from membrane_ctrl.review.allan import allan_deviation
-from membrane_ctrl.review.analysis import slow_spectrum
-from membrane_ctrl.review.bands import bands, unseen_s
-from membrane_ctrl.review.drift import slope
-from membrane_ctrl.review.psd import Spectrum, power_spectrum
+from membrane_ctrl.review.statistics.analysis import slow_spectrum
+from membrane_ctrl.review.statistics.drift import slope
+from membrane_ctrl.review.statistics.spectra import Spectrum, allan_deviation, bands, power_spectrum, unseen_s
 
 allantools = pytest.importorskip("allantools", reason="the reference for the Allan deviation is not installed")
 RATE_HZ = 10.0

@@ -20,19 +20,20 @@ import pyarrow.csv
 import pyarrow.parquet
 import pytest
 from rerun.chunk import RrdReader
-from review_runs import same, segment, set_summary, written
 
 from benchmarks.nights import Planted, night
 from membrane_ctrl.cli import run as command
-from membrane_ctrl.errors import DeviceError, InputError
-from membrane_ctrl.recording.rows import column
-from membrane_ctrl.review import open_run, viewer
+from membrane_ctrl.model.errors import DeviceError, InputError
+from membrane_ctrl.model.telemetry import column
+from membrane_ctrl.review import open_run
 from membrane_ctrl.review.catalogue import Filter, entries, resolve, to_prune
 from membrane_ctrl.review.export import export
-from membrane_ctrl.review.review_command import ReviewOptions, make_review
-from membrane_ctrl.review.rrd_place import first_message_after
-from membrane_ctrl.review.viewer import follow
+from membrane_ctrl.review.viewer import viewer
+from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
+from membrane_ctrl.review.viewer.viewer import follow
 from membrane_ctrl.review.words import moment_s, number, one_line, span
+from membrane_ctrl.run_files.segments import first_message_after
+from tests.support.review_runs import same, segment, set_summary, written
 
 Capsys = pytest.CaptureFixture[str]
 ORIGIN = datetime(2026, 11, 21, 18, 0, 30, tzinfo=UTC)

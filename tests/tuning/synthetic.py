@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import lfilter
 
-from tuning.plant_model import PlantModel
-from tuning.records import Record, Series
+from tuning.identification.loop_model import PlantModel
+from tuning.identification.records import Record, Series
 
 FINE = 40
 

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.config import Config, LoopConfig, ShapeConfig, TwinConfig
-from membrane_ctrl.errors import RejectedError
-from membrane_ctrl.names import State
-from membrane_ctrl.tune.twin_hold import TwinHold
-from membrane_ctrl.twin.events import AmbientChange
-from membrane_ctrl.twin.events import Event as TwinEvent
+from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, TwinConfig
+from membrane_ctrl.model.errors import RejectedError
+from membrane_ctrl.model.states import State
+from membrane_ctrl.sessions.folder import create_session
+from membrane_ctrl.sessions.live_hold import HoldError
+from membrane_ctrl.sim.events import AmbientChange
+from membrane_ctrl.sim.events import Event as TwinEvent
 from tuning import session
-from tuning.characterise import characterise, spec_of
-from tuning.hold_link import HoldError
-from tuning.hold_rig import HoldRig
-from tuning.session_folder import create_session
+from tuning.identification.characterise import characterise, spec_of
+from tuning.rig import HoldRig
+from tuning.twin_hold import TwinHold
 
 
 def held(events: Sequence[TwinEvent] = (), **twin: object) -> tuple[TwinHold, HoldRig]:

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.cli import run as command_line
-from membrane_ctrl.config import Config, ShapeConfig, TwinConfig
-from membrane_ctrl.errors import Exit, InputError
-from membrane_ctrl.names import State
-from membrane_ctrl.tune import command as tune
-from membrane_ctrl.tune.twin_hold import TwinHold
-from tuning import journal, session
-from tuning.compare import compare
+from membrane_ctrl.config.schema import Config, ShapeConfig, TwinConfig
+from membrane_ctrl.model.errors import Exit, InputError
+from membrane_ctrl.model.states import State
+from membrane_ctrl.sessions.folder import STEPS, SessionFolder, open_session
+from tuning import command as tune
+from tuning import gains_file as journal
+from tuning import session
+from tuning.cli import compared as compare
 from tuning.gains_file import load_gains
-from tuning.hold_rig import HoldRig
-from tuning.loop_model import Gains
-from tuning.margins import margins
-from tuning.session_folder import STEPS, SessionFolder, open_session
+from tuning.identification.loop_model import Gains, margins
+from tuning.rig import HoldRig
+from tuning.twin_hold import TwinHold
 
 CONFIG = """
 [twin]
@@ -176,7 +176,7 @@ def test_an_interrupt_gives_the_mirror_back_with_the_last_good_gains(
             self.interrupted = self.interrupted or after_s < self.heard_s < after_s + 0.03
             super().__call__(seconds)
 
-    monkeypatch.setattr(tune, "TwinHold", Kept)
+    monkeypatch.setattr(tune.twin_hold, "TwinHold", Kept)
     monkeypatch.setattr(tune, "Progress", Interrupted)
     code = tune_twin(tmp_path, step, "--session", str(done.path), *TIMES)
     assert code == Exit.INTERRUPTED
@@ -195,7 +195,7 @@ def test_history_rollback_and_comparison(
 ) -> None:
     copied = tmp_path / "logs"
     shutil.copytree(logs, copied)
-    monkeypatch.setattr(tune, "TwinHold", Kept)
+    monkeypatch.setattr(tune.twin_hold, "TwinHold", Kept)
     assert tune_twin(copied, "rollback", "--reason", "did not like it") == Exit.DONE
     assert [line.what for line in journal.entries(copied)] == ["kept", "rolled_back"]
     assert tune_twin(copied, "rollback") == Exit.BAD_INPUT
@@ -215,7 +215,7 @@ def test_a_comparison_crosses_gains_and_benches(done: SessionFolder, tmp_path: P
 def test_rolling_back_sets_the_gains_of_before(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copied = tmp_path / "logs"
     shutil.copytree(logs, copied)
-    monkeypatch.setattr(tune, "TwinHold", Kept)
+    monkeypatch.setattr(tune.twin_hold, "TwinHold", Kept)
     config = CONFIG + "kp_per_s = 0.3\n"
     assert tune_twin(copied, "rollback", config=config) == Exit.DONE
     for _ in range(12):

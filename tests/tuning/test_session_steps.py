@@ -9,22 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from membrane_ctrl.config import LoopConfig, PumpConfig
-from membrane_ctrl.errors import InputError
-from membrane_ctrl.estimate import ShapeEstimate
-from membrane_ctrl.metrology.hencky import zernike_projection
-from tuning import journal, plain
-from tuning.disturbance import Noise
-from tuning.disturbance_model import Disturbance
-from tuning.feedforward_fit import WeatherGain
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.sessions import folder as plain
+from tuning import gains_file as journal
 from tuning.gains_file import GainsFile, PlantSection
-from tuning.outer_loop import STEP_UM, evaluate
-from tuning.plant_model import PlantModel
-from tuning.preview import ModelBench
-from tuning.records import Record
+from tuning.identification.disturbance import Disturbance, Noise, WeatherGain
+from tuning.identification.loop_model import PlantModel
+from tuning.identification.outer_loop import STEP_UM, evaluate
+from tuning.identification.records import Record
+from tuning.proposal.preview import ModelBench
+from tuning.proposal.verify import SETTLE_LEAST_S, Trial, centre_std_um, health, look, settle_s
 from tuning.rig import Rig
-from tuning.verify import SETTLE_LEAST_S, Trial, centre_std_um, look, settle_s
-from tuning.watch import health
 
 PLANT = PlantModel(1.0, 0.08, 0.15, 1.24)
 WEATHER = Disturbance(Noise(1.0, 0.01, 0.01, 12.0, 0.05, 0.1, 0.1, 0.02), None, None)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tuning.disturbance import fit_noise
-from tuning.feedforward_fit import WeatherGain, fit_weather, lagged
-from tuning.plant_model import PlantModel
-from tuning.records import Record
+from tuning.identification.disturbance import WeatherGain, fit_noise, fit_weather, lagged
+from tuning.identification.loop_model import PlantModel
+from tuning.identification.records import Record
 
 DT_S = 0.02
 N = 30_000

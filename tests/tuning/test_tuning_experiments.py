@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 
 from benchmarks.tuning import Case, TwinBench
-from membrane_ctrl.config import PumpConfig
-from membrane_ctrl.control.experiments.machine import Around, ExcursionGuard, Finished, Patterned
-from membrane_ctrl.control.experiments.measurement import Measurement
-from membrane_ctrl.control.experiments.patterns import doublets, multisine, steps
+from membrane_ctrl.config.schema import PumpConfig
+from membrane_ctrl.control.experiments.machine import Around, ExcursionGuard, Finished, Measurement, Patterned
+from membrane_ctrl.control.experiments.patterns import Relay, doublets, multisine, steps
 from membrane_ctrl.control.experiments.pump_map import PumpMapper
-from membrane_ctrl.control.experiments.relay import Relay
-from membrane_ctrl.twin.events import AmbientChange, LaserDropout
-from tuning.characterise import ExperimentError, characterise
-from tuning.records import Record
+from membrane_ctrl.sim.events import AmbientChange, LaserDropout
+from tuning.identification.characterise import ExperimentError, characterise
+from tuning.identification.records import Record
 from tuning.rig import Rig, laser_noise_um
 
 AROUND = Around(1.24, 0.32, 5.3, 1.0)

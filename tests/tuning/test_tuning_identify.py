@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from synthetic import record, way_um
 
-from tuning.identify import identify, independence, whiteness
-from tuning.plant_model import PlantModel
-from tuning.quality import judge, validate
-from tuning.records import Record
-from tuning.straightness import two_gains
+from tuning.identification.characterise import judge, validate
+from tuning.identification.identify import identify, independence, two_gains, whiteness
+from tuning.identification.loop_model import PlantModel
+from tuning.identification.records import Record
 
 TRUTH = PlantModel(0.8, 0.09, 0.15, 1.1)
 

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from benchmarks.minimum_variance import least_std_um as least_of_the_twin
-from membrane_ctrl.config import LoopConfig, TwinConfig
-from tuning.candidates import (
+from membrane_ctrl.config.schema import LoopConfig, TwinConfig
+from tuning.identification.disturbance import Disturbance, Noise, WeatherGain
+from tuning.identification.loop_model import Gains, PlantModel, margins, sensitivity_peak
+from tuning.proposal.candidates import (
     RECOVERED_UM,
     Demands,
     amigo,
@@ -21,13 +23,7 @@ from tuning.candidates import (
     max_ki,
     simc,
 )
-from tuning.disturbance import Noise
-from tuning.disturbance_model import Disturbance
-from tuning.feedforward_fit import WeatherGain
-from tuning.loop_model import Gains
-from tuning.margins import margins, sensitivity_peak
-from tuning.minimum_variance import least_std_um, predict
-from tuning.plant_model import PlantModel
+from tuning.proposal.prediction import least_std_um, predict
 
 DT_S = 1e-3
 DELAY = PlantModel(1.0, 0.3, 1e-4, 1.24)  # as good as a pure delay

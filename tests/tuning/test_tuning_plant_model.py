@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from synthetic import telegraph, way_um
 
-from membrane_ctrl.control.experiments.measurement import Measurement
-from tuning.plant_model import PlantModel, driven_um
-from tuning.records import Record
+from membrane_ctrl.control.experiments.machine import Measurement
+from tuning.identification.loop_model import PlantModel, driven_um
+from tuning.identification.records import Record
 
 
 @pytest.mark.parametrize("dead_time_s", [0.0, 0.02, 0.0755, 0.313])

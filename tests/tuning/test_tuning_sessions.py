@@ -10,15 +10,14 @@ import pytest
 
 import tuning
 from benchmarks.tuning import SESSIONS, Case, TwinBench, session
-from membrane_ctrl.config import LoopConfig, PumpConfig
-from tuning.characterise import characterise
-from tuning.design import RefusedError, propose, table
-from tuning.disturbance_model import observe
-from tuning.loop_model import Gains
-from tuning.preview import ModelBench, preview
-from tuning.quality import Quality
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from tuning.identification.characterise import Quality, characterise
+from tuning.identification.disturbance import observe
+from tuning.identification.loop_model import Gains
+from tuning.proposal.design import RefusedError, propose, table
+from tuning.proposal.prediction import robustness, sampled_plants
+from tuning.proposal.preview import ModelBench, preview
 from tuning.rig import Rig
-from tuning.robustness import robustness, sampled_plants
 
 RATIO_MAX = {
     "quiet, 1 um": 1.15,

@@ -5,15 +5,24 @@ machine is run inside an `ExcursionGuard`, which ends it before the mirror is fu
 may go.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from membrane_ctrl.control.experiments.measurement import Measurement
 from membrane_ctrl.control.filters import LowPass
+
+# What an experiment sees of a tick.
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """One sample of the bench; NaN for what the bench does not have or has lost."""
+
+    displacement_um: float
+    ambient_pressure_pa: float = float("nan")
+    air_temperature_c: float = float("nan")
+
 
 FAST_S, SLOW_S = 0.1, 0.4  # of the two filters whose difference is the speed
 _LOST_MAX_S = 0.3  # as long as the safety table bears a stale reading

@@ -5,19 +5,15 @@ rest or from running; between probes the mirror is brought back to where it stoo
 are found by bisection, the leak with the pump off, the curve from two commands above.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.config import PumpConfig
-from membrane_ctrl.control.experiments.machine import Finished, Motion
-from membrane_ctrl.control.experiments.measurement import Measurement
-from membrane_ctrl.control.leak import TOO_TIGHT_UM_PER_S
-from membrane_ctrl.control.slope import Slope
+from membrane_ctrl.config.schema import PumpConfig
+from membrane_ctrl.control import film_health, filters
+from membrane_ctrl.control.experiments.machine import Finished, Measurement, Motion
 
 _PREPARE_S = 1.0  # seven lags of the pump: it stands, or runs
 _PROBE_MIN_S, _PROBE_MAX_S = 1.5, 5.0
@@ -111,7 +107,7 @@ class PumpMapper:
         self._plan = self._probes()
         self._probe = next(self._plan)
         self._returning, self._in_phase_s = True, 0.0
-        self._speed = Slope()
+        self._speed = filters.Slope()
         self._speed_um_per_s = math.nan
         self.result: PumpMap | None = None
 
@@ -141,7 +137,7 @@ class PumpMapper:
         sinks = self._probe.fraction < self._holding_fraction
         off_um = self._motion.position_um - self._centre_um - (_TRAVEL_UM / 2 if sinks else -_TRAVEL_UM / 2)
         if abs(off_um) < _NEAR_UM:
-            self._returning, self._in_phase_s, self._speed = False, 0.0, Slope()
+            self._returning, self._in_phase_s, self._speed = False, 0.0, filters.Slope()
             return self._probe.prepare_fraction
         if self._in_phase_s > _RETURN_MAX_S:
             way = "sink" if off_um > 0 else "rise"
@@ -184,7 +180,7 @@ class PumpMapper:
             stall_fraction=stall,
             dead_fraction=dead,
             flow_full_um_per_s=slope * (1 - dead),
-            too_tight=leak < TOO_TIGHT_UM_PER_S,
+            too_tight=leak < film_health.TOO_TIGHT_UM_PER_S,
         )
 
     def _edge(

@@ -1,21 +1,47 @@
 """One experiment of a running hold: made of its specification, stepped in ticks, guarded, with its result."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from membrane_ctrl.config import LoopConfig, PumpConfig
-from membrane_ctrl.control.experiments.machine import Around, ExcursionGuard, Experiment, Finished, Patterned
-from membrane_ctrl.control.experiments.measurement import Measurement
-from membrane_ctrl.control.experiments.patterns import doublets, multisine, steps
-from membrane_ctrl.control.experiments.pump_map import PumpMapper
-from membrane_ctrl.control.experiments.relay import Relay
-from membrane_ctrl.control.experiments.spec import ExperimentSpec
-from membrane_ctrl.control.pump_curve import PumpCurve
+from pydantic import Field
 
-_PATTERNS = {"steps": steps, "doublets": doublets, "multisine": multisine}
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from membrane_ctrl.config.section import Section
+from membrane_ctrl.control.experiments import patterns, pump_map
+from membrane_ctrl.control.experiments.machine import (
+    Around,
+    ExcursionGuard,
+    Experiment,
+    Finished,
+    Measurement,
+    Patterned,
+)
+from membrane_ctrl.control.gas import PumpCurve
+
+# What may be asked of an experiment: plain data with bounds, so that it can come over a wire.
+
+
+ExperimentKind = Literal["relay", "steps", "doublets", "multisine", "pump_map"]
+
+
+class ExperimentSpec(Section):
+    """A named, bounded experiment about the holding flow.
+
+    What the bounds are for: half an hour of a person's time; an excursion that the safety table's following error
+    (60 um) never sees; flows that a film pump can have.
+    """
+
+    version: Literal[1] = 1
+    kind: ExperimentKind
+    duration_s: Annotated[float, Field(ge=5, le=1800)] = 120.0  # the pump map ends when it is done
+    limit_um: Annotated[float, Field(ge=3, le=30)] = 10.0  # furthest from the setpoint
+    holding_flow_um_per_s: Annotated[float, Field(gt=0, le=100)]  # mean of the hold before
+    laser_um: Annotated[float, Field(ge=0, le=20)]  # standard deviation of a reading
+    gain: Annotated[float, Field(ge=0.02, le=50)] = 1.0  # k, of what was identified so far
+
+
+_PATTERNS = {"steps": patterns.steps, "doublets": patterns.doublets, "multisine": patterns.multisine}
 
 
 class Trial:
@@ -38,7 +64,7 @@ class Trial:
 
     def __init__(self, spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre_um: float) -> None:
         self.spec = spec
-        self._mapper: PumpMapper | None = None
+        self._mapper: pump_map.PumpMapper | None = None
         around = Around(
             holding_flow_um_per_s=spec.holding_flow_um_per_s,
             least_flow_um_per_s=PumpCurve(pump).least_flow_um_per_s,
@@ -53,11 +79,11 @@ class Trial:
     def _machine(self, around: Around, pump: PumpConfig, centre_um: float) -> Experiment:
         spec = self.spec
         if spec.kind == "relay":
-            return Relay(around, centre_um, spec.duration_s)
+            return patterns.Relay(around, centre_um, spec.duration_s)
         if spec.kind == "pump_map":
             share = spec.holding_flow_um_per_s / pump.flow_full_um_per_s
             fraction = pump.dead_fraction + (1 - pump.dead_fraction) * share
-            self._mapper = PumpMapper(centre_um, fraction, spec.holding_flow_um_per_s)
+            self._mapper = pump_map.PumpMapper(centre_um, fraction, spec.holding_flow_um_per_s)
             return self._mapper
         return Patterned(around, _PATTERNS[spec.kind](around, spec.gain), spec.duration_s, centre_um)
 

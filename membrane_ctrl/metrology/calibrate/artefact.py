@@ -7,20 +7,18 @@ that comes from. The screen's bow is in `[geometry.screen]`. `[camera]` and `[pa
 screen's pitch were calibrated; a measurement with such a file needs them too.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.config import CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig, Vector3
-from membrane_ctrl.metrology.calibrate.content_hash import SCHEMA, content_hash
-from membrane_ctrl.metrology.calibrate.parameters import NAMES, POSE, pose_derivatives
-from membrane_ctrl.metrology.calibrate.solve import Solution
-from membrane_ctrl.metrology.face import BOW_RADIUS_MM
-from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.config.optics import ScreenPoseConfig
+from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, OpticsConfig, Vector3
+from membrane_ctrl.metrology.calibrate import parameters, solve
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.screen_face import BOW_RADIUS_MM
+from membrane_ctrl.model.plain_json import SCHEMA, content_hash
 
 FloatArray = NDArray[np.float64]
 
@@ -58,7 +56,7 @@ class Origin:
     notes: tuple[str, ...] = ()
 
 
-def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[str, Any]:
+def tables_of(solution: solve.Solution, optics: OpticsConfig, origin: Origin) -> dict[str, Any]:
     """The content of `geometry.toml`.
 
     Parameters
@@ -66,13 +64,13 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
     optics : OpticsConfig
         The stated bench.
     """
-    free = [NAMES.index(name) for name in solution.free]
+    free = [parameters.NAMES.index(name) for name in solution.free]
     tables: dict[str, Any] = {
         "schema": SCHEMA,
         "geometry": geometry_of(solution, optics).model_dump(exclude_none=True),
         "covariance": {"names": list(general_names()), "matrix": general_covariance(solution).tolist()},
         "parameters": {
-            "names": [NAMES[k] for k in free],
+            "names": [parameters.NAMES[k] for k in free],
             "values": solution.values[free].tolist(),
             "sigmas": solution.sigmas[free].tolist(),
             "covariance": solution.covariance[np.ix_(free, free)].tolist(),
@@ -94,7 +92,7 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
         "screen_residual_um": origin.screen_residual_um,
         "slope_residual_urad": origin.slope_residual_urad,
         "slope_noise_urad": origin.slope_noise_urad,
-        "ring_um": (1e3 * solution.common[len(NAMES) + 1 :]).tolist(),
+        "ring_um": (1e3 * solution.common[len(parameters.NAMES) + 1 :]).tolist(),
         "condition": origin.condition,
         "notes": list(origin.notes),
         "hash": content_hash(tables),
@@ -102,7 +100,7 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
     return tables
 
 
-def geometry_of(solution: Solution, optics: OpticsConfig) -> GeometryConfig:
+def geometry_of(solution: solve.Solution, optics: OpticsConfig) -> GeometryConfig:
     """The calibrated geometry in the general form; the screen's height map is the stated bench's."""
     reference = {"reference_displacement_um": solution.problem.witness.reference_um}
     return general_form(solution.bench.geometry, optics).model_copy(update=reference)
@@ -133,7 +131,7 @@ def general_names() -> tuple[str, ...]:
     return tuple(f"{thing}_{move}_{axis}_{unit}" for thing, move, unit in moves for axis in "xyz")
 
 
-def general_covariance(solution: Solution) -> FloatArray:
+def general_covariance(solution: solve.Solution) -> FloatArray:
     """Covariance (12, 12) of `general_names`.
 
     Rows r of a body turned by a small w become r + w x r, so that C^T dC is minus the cross-product matrix of w.
@@ -149,10 +147,10 @@ def general_covariance(solution: Solution) -> FloatArray:
                 _turn_vector(rows.T @ turn.screen),
             ]
         )
-        for turn in pose_derivatives(solution.problem.stated, solution.values)
+        for turn in parameters.pose_derivatives(solution.problem.stated, solution.values)
     ]
     matrix = np.stack(columns, axis=1)
-    covariance = matrix @ solution.covariance[: len(POSE), : len(POSE)] @ matrix.T
+    covariance = matrix @ solution.covariance[: len(parameters.POSE), : len(parameters.POSE)] @ matrix.T
     return np.asarray((covariance + covariance.T) / 2)
 
 

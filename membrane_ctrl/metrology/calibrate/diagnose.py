@@ -5,8 +5,6 @@ chi-square of as many degrees of freedom if the data are good, whatever is asked
 screen, a lens that distorts), a camera that stands otherwise for some of the sets, one set that disagrees with all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -14,15 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from membrane_ctrl.metrology.calibrate.parameters import LASER, NAMES, OPTICAL, POSE, usual_sigma
-from membrane_ctrl.metrology.calibrate.propagate import disc, surface_response
-from membrane_ctrl.metrology.calibrate.separable import COMMON
-from membrane_ctrl.metrology.calibrate.solve import Solution, prior, step
+from membrane_ctrl.metrology.calibrate import parameters, propagate, separable, solve
 
 FloatArray = NDArray[np.float64]
 
 SURE = 1e-6  # probability that good data look as bad
-_CAMERA = tuple(NAMES.index(name) for name in ("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg"))
+_CAMERA = tuple(parameters.NAMES.index(name) for name in ("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg"))
 _CAMERA_SIGMA_DEG = 1.0  # of a bump: what a hand on the mount does
 _LASER_SIGMA = 1.0  # of its scale when the optics alone shall say it
 
@@ -64,7 +59,7 @@ class LaserScale:
     @property
     def sure(self) -> bool:
         """As for `Suspect`: whether it is off by more than its data sheet allows."""
-        return bool(chi2.sf(((self.value - 1) / np.hypot(self.sigma, LASER.sigma)) ** 2, 1) < SURE)
+        return bool(chi2.sf(((self.value - 1) / np.hypot(self.sigma, parameters.LASER.sigma)) ** 2, 1) < SURE)
 
 
 @dataclass(frozen=True)
@@ -105,52 +100,55 @@ class LeftOut:
         return bool(chi2.sf(self.fall, self.freedom) < SURE)
 
 
-def suspects(solution: Solution) -> tuple[Suspect, ...]:
+def suspects(solution: solve.Solution) -> tuple[Suspect, ...]:
     """Held optical parameters that would take more than noise out of the residuals, the strongest first."""
     sums = np.sum(_reduced(solution), axis=0)
-    response, (heights, plane) = surface_response(solution, len(solution.states) // 2)[:, :-1], disc(1.0)
+    response, (heights, plane) = (
+        propagate.surface_response(solution, len(solution.states) // 2)[:, :-1],
+        propagate.disc(1.0),
+    )
     flat = heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]
     out = []
-    for name in NAMES[len(POSE) : OPTICAL]:
+    for name in parameters.NAMES[len(parameters.POSE) : parameters.OPTICAL]:
         if name in solution.free:
             continue
-        k = NAMES.index(name)
+        k = parameters.NAMES.index(name)
         freed = solution.problem.sigmas.copy()
-        freed[k] = usual_sigma(name)
-        moved = step(sums + prior(freed, solution.common), freed)
+        freed[k] = parameters.usual_sigma(name)
+        moved = solve.step(sums + solve.prior(freed, solution.common), freed)
         fall = _squares(sums, solution.problem.sigmas, solution.common) - moved.squares
         sigma = float(np.sqrt(moved.covariance[k, k]))
-        figure_um = 1e3 * float(np.std(flat @ (response @ moved.delta[:OPTICAL])))
+        figure_um = 1e3 * float(np.std(flat @ (response @ moved.delta[: parameters.OPTICAL])))
         out.append(Suspect(name, float(moved.delta[k]), sigma, fall, figure_um))
     return tuple(sorted((s for s in out if s.sure), key=lambda s: -s.fall))
 
 
-def laser_scale(solution: Solution) -> LaserScale:
+def laser_scale(solution: solve.Solution) -> LaserScale:
     """The laser's scale, nothing known of it beforehand."""
-    k = NAMES.index(LASER.name)
+    k = parameters.NAMES.index(parameters.LASER.name)
     free = solution.problem.sigmas.copy()
     free[k] = _LASER_SIGMA
     sums = np.sum(_reduced(solution), axis=0)
-    moved = step(sums + prior(free, solution.common), free)
+    moved = solve.step(sums + solve.prior(free, solution.common), free)
     fall = _squares(sums, solution.problem.sigmas, solution.common) - moved.squares
     return LaserScale(1 + float(solution.common[k] + moved.delta[k]), float(np.sqrt(moved.covariance[k, k])), fall)
 
 
-def left_out(solution: Solution) -> tuple[LeftOut, ...]:
+def left_out(solution: solve.Solution) -> tuple[LeftOut, ...]:
     """Each set against the others."""
     reduced, sigmas = _reduced(solution), solution.problem.sigmas
-    own = prior(sigmas, solution.common)
-    everything = step(np.sum(reduced, axis=0) + own, sigmas).squares
+    own = solve.prior(sigmas, solution.common)
+    everything = solve.step(np.sum(reduced, axis=0) + own, sigmas).squares
     out = []
     for k, this in enumerate(reduced):
         others = np.sum([r for j, r in enumerate(reduced) if j != k], axis=0) + own
         alone, freedom = _alone(this, sigmas)
-        fall = everything - step(others, sigmas).squares - alone
+        fall = everything - solve.step(others, sigmas).squares - alone
         out.append(LeftOut(k, float(fall), freedom))
     return tuple(out)
 
 
-def bumps(solution: Solution) -> tuple[Bump, ...]:
+def bumps(solution: solve.Solution) -> tuple[Bump, ...]:
     """The camera turned for one set, or from one set on; those that are sure, the strongest first."""
     reduced, sigmas = _reduced(solution), solution.problem.sigmas
     count = len(reduced)
@@ -159,28 +157,33 @@ def bumps(solution: Solution) -> tuple[Bump, ...]:
     out = []
     for group in sorted(groups):
         sums = np.sum([_with_bump(each, k in group) for k, each in enumerate(reduced)], axis=0)
-        known = _with_bump(prior(sigmas, solution.common), False)
-        extra = np.arange(COMMON, COMMON + len(_CAMERA))
+        known = _with_bump(solve.prior(sigmas, solution.common), False)
+        extra = np.arange(separable.COMMON, separable.COMMON + len(_CAMERA))
         known[extra, extra] += 1 / _CAMERA_SIGMA_DEG**2
-        kept = np.append(np.append(sigmas > 0, np.ones(COMMON - len(NAMES), bool)), np.ones(len(_CAMERA), bool))
+        kept = np.append(
+            np.append(sigmas > 0, np.ones(separable.COMMON - len(parameters.NAMES), bool)),
+            np.ones(len(_CAMERA), bool),
+        )
         delta, squares = _solved(sums + known, np.flatnonzero(kept))
         yaw, pitch, roll = (float(v) for v in delta[-len(_CAMERA) :])
         out.append(Bump(group, (yaw, pitch, roll), before - squares))
     return tuple(sorted((bump for bump in out if bump.sure), key=lambda bump: -bump.fall))
 
 
-def without(solution: Solution, index: int) -> Solution:
+def without(solution: solve.Solution, index: int) -> solve.Solution:
     """The same to first order without one set: its equations and state are left out, the unknowns moved."""
     keep = [k for k in range(len(solution.states)) if k != index]
     problem = replace(solution.problem, sets=tuple(solution.problem.sets[k] for k in keep))
     linear = tuple(solution.equations[k] for k in keep)
     sigmas = problem.sigmas
-    moved = step(np.sum([each.reduced() for each in linear], axis=0) + prior(sigmas, solution.common), sigmas)
+    moved = solve.step(
+        np.sum([each.reduced() for each in linear], axis=0) + solve.prior(sigmas, solution.common), sigmas
+    )
     common = solution.common + moved.delta
     return replace(
         solution,
         problem=problem,
-        values=common[: len(NAMES)],
+        values=common[: len(parameters.NAMES)],
         common=common,
         states=tuple(solution.states[k] for k in keep),
         equations=linear,
@@ -188,17 +191,17 @@ def without(solution: Solution, index: int) -> Solution:
     )
 
 
-def _reduced(solution: Solution) -> list[FloatArray]:
+def _reduced(solution: solve.Solution) -> list[FloatArray]:
     return [each.reduced() for each in solution.equations]
 
 
 def _squares(sums: FloatArray, sigmas: FloatArray, common: FloatArray) -> float:
-    return step(sums + prior(sigmas, common), sigmas).squares
+    return solve.step(sums + solve.prior(sigmas, common), sigmas).squares
 
 
 def _alone(reduced: FloatArray, sigmas: FloatArray) -> tuple[float, int]:
     """Least sum of squares of one set by itself, and how many numbers it determines; no prior."""
-    free = np.flatnonzero(np.append(sigmas > 0, np.ones(COMMON - len(NAMES), bool)))
+    free = np.flatnonzero(np.append(sigmas > 0, np.ones(separable.COMMON - len(parameters.NAMES), bool)))
     matrix, right = reduced[np.ix_(free, free)], reduced[free, -1]
     scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
@@ -209,10 +212,10 @@ def _alone(reduced: FloatArray, sigmas: FloatArray) -> tuple[float, int]:
 
 def _with_bump(sums: FloatArray, bumped: bool) -> FloatArray:
     """The sums with three more unknowns before the residual; for a bumped set they act as the camera's turns do."""
-    order: Sequence[int] = [*range(COMMON), *_CAMERA, COMMON]
+    order: Sequence[int] = [*range(separable.COMMON), *_CAMERA, separable.COMMON]
     out = sums[np.ix_(order, order)].copy()
     if not bumped:
-        out[COMMON:-1, :], out[:, COMMON:-1] = 0.0, 0.0
+        out[separable.COMMON : -1, :], out[:, separable.COMMON : -1] = 0.0, 0.0
     return np.asarray(out)
 
 

@@ -10,18 +10,16 @@ it). Those are seen by the ring, which cannot have tilted.
 One bad cycle is no drift (a door, a hand before the screen); the median of many is.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from membrane_ctrl.metrology.bins import slope_per_screen
 from membrane_ctrl.metrology.calibrate.separable import rim_harmonics
-from membrane_ctrl.metrology.covariance import slope_per_screen
-from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.surface import Surface
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.surface import Surface
 
 FloatArray = NDArray[np.float64]
 

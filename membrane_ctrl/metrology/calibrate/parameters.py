@@ -12,8 +12,6 @@ therefore not among the parameters, it defines the direction of x. The other rig
 ring that stays where it is takes away, and two tilts, which only what was measured by hand takes away.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -21,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.metrology.face import BOW_RADIUS_MM
-from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.screen_face import BOW_RADIUS_MM
 
 FloatArray = NDArray[np.float64]
 

@@ -4,17 +4,18 @@ A wrong geometry is answered by the fit with a wrong surface: dq = -(J_q^T W J_q
 blocks are at hand. The vertex is put where the laser says, with the laser's own error.
 """
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.metrology.calibrate.parameters import OPTICAL
-from membrane_ctrl.metrology.calibrate.residuals import LOCAL, basis
-from membrane_ctrl.metrology.calibrate.solve import Solution
-from membrane_ctrl.metrology.surface import PARAMETERS, parameter_to_coeffs, sag_gradient
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.metrology import bins, phase
+from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
+from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, solve
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, parameter_to_coeffs, sag_gradient
 
 FloatArray = NDArray[np.float64]
 
@@ -42,14 +43,19 @@ class Propagated:
 def surface_response(solution: Solution, index: int) -> FloatArray:
     """d surface / d (optical parameters, vertex' height), (36, OPTICAL + 1), of one set."""
     sums = solution.equations[index].sums
-    mixed = np.hstack([sums[:PARAMETERS, LOCAL : LOCAL + OPTICAL], sums[:PARAMETERS, PARAMETERS : PARAMETERS + 1]])
+    mixed = np.hstack(
+        [
+            sums[:PARAMETERS, residuals.LOCAL : residuals.LOCAL + parameters.OPTICAL],
+            sums[:PARAMETERS, PARAMETERS : PARAMETERS + 1],
+        ]
+    )
     return np.asarray(-np.linalg.solve(sums[:PARAMETERS, :PARAMETERS], mixed))
 
 
 def surface_covariance(solution: Solution, index: int) -> FloatArray:
     """Covariance (36, 36) in mm^2 of the parameters of one set's surface."""
     response = surface_response(solution, index)
-    geometry = solution.covariance[:OPTICAL, :OPTICAL]
+    geometry = solution.covariance[: parameters.OPTICAL, : parameters.OPTICAL]
     vertex = response[:, -1] * solution.problem.witness.laser_sigma_um * 1e-3
     return np.asarray(response[:, :-1] @ geometry @ response[:, :-1].T + np.outer(vertex, vertex))
 
@@ -73,8 +79,207 @@ def disc(radius: float) -> tuple[FloatArray, FloatArray]:
     x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-radius, radius, 41)] * 2))
     inside = np.hypot(x, y) <= radius
     x, y = x[inside], y[inside]
-    return np.asarray(basis(x, y)[0].T), np.stack([np.ones_like(x), x, y], axis=1)
+    return np.asarray(residuals.basis(x, y)[0].T), np.stack([np.ones_like(x), x, y], axis=1)
 
 
 def _rms_um(heights: FloatArray, covariance: FloatArray) -> float:
     return 1e3 * float(np.sqrt(np.mean(np.einsum("ij,jk,ik->i", heights, covariance, heights))))
+
+
+# Which combinations of parameters the sets do not determine, and what a figure has of that, in words.
+#
+# In units of what was known by hand, the covariance has eigenvalues between 0 (the sets know far better) and 1 (they
+# know nothing). A combination near 1 is named by its largest parts and by what one sigma of it does to the surface.
+
+
+WEAK = 0.5  # of the hand's sigma: the sets have not even doubled the knowledge
+_PART = 0.3  # of a unit combination: smaller parts are not named
+_MOSTLY = 0.8  # share of a change's square that its name must explain
+_NOTHING_UM = 0.5
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A direction in the space of parameters.
+
+    Attributes
+    ----------
+    left : float
+        Sigma after over sigma before; 1: the sets say nothing.
+    parts : tuple of (name, amount)
+        Of one sigma, in the parameters' units, the largest first.
+    height_um, figure_um : float
+        What one sigma of it does to the surface, RMS, and without the best plane.
+    words : str
+        What that is.
+    """
+
+    left: float
+    parts: tuple[tuple[str, float], ...]
+    height_um: float
+    figure_um: float
+    words: str
+
+
+def condition_number(solution: Solution) -> float:
+    """Of the free parameters' covariance in units of what was known by hand."""
+    values = np.linalg.eigvalsh(_scaled(solution)[0])
+    return float(values[-1] / values[0])
+
+
+def weak_combinations(solution: Solution, index: int, analysis_radius_mm: float) -> tuple[Combination, ...]:
+    """Combinations that the sets leave undetermined, the worst first; `index` is the set whose surface shows it."""
+    covariance, free = _scaled(solution)
+    values, vectors = np.linalg.eigh(covariance)
+    out = []
+    for value, vector in sorted(zip(values, vectors.T, strict=True), key=lambda pair: -pair[0]):
+        if value < WEAK**2:
+            break
+        amounts = vector * np.sqrt(value) * solution.problem.sigmas[free]
+        order = np.argsort(-np.abs(vector))
+        parts = tuple((parameters.NAMES[free[k]], float(amounts[k])) for k in order if abs(vector[k]) > _PART)
+        out.append(_described(solution, index, analysis_radius_mm, float(np.sqrt(value)), parts, free, amounts))
+    return tuple(out)
+
+
+def _scaled(solution: Solution) -> tuple[FloatArray, NDArray[np.int64]]:
+    free = np.flatnonzero(solution.problem.sigmas > 0)
+    scale = solution.problem.sigmas[free]
+    return solution.covariance[np.ix_(free, free)] / np.outer(scale, scale), free
+
+
+def _described(
+    solution: Solution,
+    index: int,
+    radius_mm: float,
+    left: float,
+    parts: tuple[tuple[str, float], ...],
+    free: NDArray[np.int64],
+    amounts: FloatArray,
+) -> Combination:
+    optical = free < parameters.OPTICAL
+    change = surface_response(solution, index)[:, free[optical]] @ amounts[optical]
+    heights, plane = disc(radius_mm / solution.problem.radius_mm)
+    moved_um = 1e3 * heights @ change
+    figure_um = moved_um - plane @ np.linalg.lstsq(plane, moved_um, rcond=None)[0]
+    height, figure = (float(np.sqrt(np.mean(part**2))) for part in (moved_um, figure_um))
+    says = "; ".join(f"{amount:+.2g} {_unit(name)}: {_says(name)}" for name, amount in parts)
+    effect = _effect(solution, index, moved_um, figure_um, plane)
+    return Combination(left, parts, height, figure, f"{effect} ({says})")
+
+
+def _effect(solution: Solution, index: int, moved_um: FloatArray, figure_um: FloatArray, plane: FloatArray) -> str:
+    """The name of a change of the surface: one of the motions of a rigid body, a scale, or a figure."""
+    total = float(np.mean(moved_um**2))
+    if total < _NOTHING_UM**2:
+        return "nothing that a figure shows"
+    kept = f"; {np.sqrt(np.mean(figure_um**2)):.2g} um RMS of figure"
+    if 1 - float(np.mean(figure_um**2)) / total > _MOSTLY:
+        return f"a tilt of the surface by {np.hypot(*plane_slope(plane, moved_um)):.2g} um at the rim{kept}"
+    x, y = plane[:, 1], plane[:, 2]
+    surface = solution.states[index].surface.parameters
+    height, by_x, by_y = (part.T @ surface for part in residuals.basis(x, y))
+    for name, field in (("a scale of the surface", height), ("a turn about z", x * by_y - y * by_x)):
+        share = (moved_um @ field) ** 2 / (field @ field) / (moved_um @ moved_um)
+        if share > _MOSTLY:
+            return f"{name}{kept}"
+    return f"a change of figure of {np.sqrt(np.mean(figure_um**2)):.2g} um RMS"
+
+
+def plane_slope(plane: FloatArray, heights: FloatArray) -> FloatArray:
+    """x and y slope of the best plane, per radius."""
+    return np.asarray(np.linalg.lstsq(plane, heights, rcond=None)[0][1:])
+
+
+def _unit(name: str) -> str:
+    return parameters.ALL[parameters.NAMES.index(name)].unit
+
+
+def _says(name: str) -> str:
+    return parameters.ALL[parameters.NAMES.index(name)].says
+
+
+# What sets that are still to be taken will determine: the covariance at the stated bench, linear and without noise.
+#
+# A Hencky bowl at each depth is followed to the screen, and the problem is solved from there; its solution is the
+# bowl itself, and its covariance is what sets like these claim: within a tenth of what those of a rippled film do
+# (docs/calibration.md).
+
+
+_ACROSS = 48  # rays along the picture's longer side; twice as many change no claim by a fiftieth
+
+
+def foresee(
+    optics: OpticsConfig,
+    sigmas: FloatArray,
+    sags_mm: Sequence[float],
+    swing_adu: float,
+    laser_sigma_um: float,
+) -> Propagated:
+    """Standard deviations of a figure that is measured with the geometry of such sets.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The stated bench.
+    sigmas : (len(NAMES),) array
+        Of the hand's measurements; 0 holds a parameter.
+    sags_mm : sequence of float
+        Of the sets.
+    swing_adu : float
+        Amplitude of the fringes in the picture.
+    laser_sigma_um : float
+        Of a set's mean reading.
+
+    Raises
+    ------
+    ValueError
+        If no ray of such a set ends on the pattern.
+    """
+    geometry, middle_mm = Geometry.from_config(optics), sags_mm[len(sags_mm) // 2]
+    sets = [_set(geometry, optics, sag_mm, sag_mm - middle_mm, swing_adu) for sag_mm in sags_mm]
+    problem = Problem(geometry, tuple(sets), sigmas, separable.Witness(0.0, laser_sigma_um), optics.mirror.radius_mm)
+    return propagate(solve(problem), len(sets) // 2, optics.mirror.analysis_radius_mm)
+
+
+def _set(
+    geometry: Geometry, optics: OpticsConfig, sag_mm: float, moved_mm: float, swing_adu: float
+) -> residuals.SetPhases:
+    """The rays of a coarse grid, each with the noise of the pixels that it stands for."""
+    camera, mirror, pattern = optics.camera, optics.mirror, optics.pattern
+    every_px = max(camera.width_px, camera.height_px) / _ACROSS
+    phase_rad = phase.phase_sigma_rad(
+        phase.equal_shifts(pattern.steps), bins.pixel_sigma_adu(camera.noise_adu), swing_adu
+    )
+    sigma_mm = phase_rad * phase.mm_per_rad(pattern) / every_px
+    column, row = _towards_mirror(geometry, optics, every_px, sag_mm)
+    blind = f"at a sag of {sag_mm:.1f} mm the camera as stated sees no fringes in the mirror"
+    if column.size == 0:
+        raise ValueError(blind)
+    dark = residuals.SetPhases(
+        f"{sag_mm:.2f} mm", column, row, np.zeros((2, column.size)), np.full(column.size, sigma_mm), 1e3 * moved_mm
+    )
+    bench, surface = parameters.Bench(geometry), Surface.hencky_bowl(sag_mm, mirror.radius_mm)
+    points = residuals.place_rays(bench, dark, surface, -moved_mm)
+    x_mm, y_mm, _z = geometry.pinhole_mm[:, None] + points.t_mm * points.rays
+    screen_mm = -residuals.residual_mm(bench, dark, surface, -moved_mm)
+    inside = np.hypot(x_mm, y_mm) < mirror.analysis_radius_mm
+    seen = inside & (np.abs(screen_mm) < pattern.periods * pattern.period_mm / 2).all(axis=0)
+    if np.count_nonzero(seen) < PARAMETERS:
+        raise ValueError(blind)
+    return residuals.SetPhases(
+        dark.name, column[seen], row[seen], screen_mm[:, seen], dark.sigma_mm[seen], dark.displacement_um
+    )
+
+
+def _towards_mirror(
+    geometry: Geometry, optics: OpticsConfig, every_px: float, sag_mm: float
+) -> tuple[FloatArray, FloatArray]:
+    """Columns and rows whose rays meet the plane half way up the bowl inside its ring; others may miss the film."""
+    camera = optics.camera
+    grid = np.meshgrid(np.arange(0, camera.width_px, every_px), np.arange(0, camera.height_px, every_px))
+    column, row = (axis.ravel() for axis in grid)
+    rays = geometry.rays(column, row)
+    x_mm, y_mm, _z = geometry.pinhole_mm[:, None] + (sag_mm / 2 - geometry.pinhole_mm[2]) / rays[2] * rays
+    near = np.hypot(x_mm, y_mm) < optics.mirror.radius_mm
+    return column[near], row[near]

@@ -4,8 +4,6 @@ The sixth, a turn of everything about z, is seen by nothing and defines x (`para
 distance to the ring of the points where the rim's rays meet its plane, over a, alpha, yaw, pitch and roll.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +12,7 @@ from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, usual_sigma
-from membrane_ctrl.metrology.geometry import Geometry
+from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.reconstruct import HeightFunction
 
 FloatArray = NDArray[np.float64]

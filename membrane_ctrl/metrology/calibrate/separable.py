@@ -18,16 +18,14 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.metrology.calibrate.loops import gram
-from membrane_ctrl.metrology.calibrate.parameters import NAMES, OPTICAL, Bench, Poses
-from membrane_ctrl.metrology.calibrate.residuals import COLUMNS, LOCAL, SetPhases, basis, chunks
-from membrane_ctrl.metrology.surface import PARAMETERS, Surface
-from membrane_ctrl.metrology.zernike import DEGREE
+from membrane_ctrl.metrology.calibrate import parameters, residuals
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
+from membrane_ctrl.metrology.optics.zernike import DEGREE
 
 FloatArray = NDArray[np.float64]
 
 RING = 2 * DEGREE + 1  # harmonics of the rim: a constant, seven cosines, seven sines
-COMMON = len(NAMES) + RING  # parameters of `NAMES`, then the ring
+COMMON = len(parameters.NAMES) + RING  # parameters of `NAMES`, then the ring
 _HUBER = 1.9  # of the length of two normal components: keeps 95 % of the efficiency of least squares
 
 
@@ -67,12 +65,12 @@ class Trust:
     variance: float
 
     @classmethod
-    def full(cls, phases: SetPhases) -> Trust:
+    def full(cls, phases: residuals.SetPhases) -> Trust:
         """Every point as its noise says."""
         return cls(np.ones(phases.sigma_mm.size), 1.0)
 
     @classmethod
-    def seen(cls, phases: SetPhases, residual_mm: FloatArray) -> Trust:
+    def seen(cls, phases: residuals.SetPhases, residual_mm: FloatArray) -> Trust:
         """From residuals (2, n): Huber's weights against their own scatter."""
         length = np.hypot(*residual_mm) / phases.sigma_mm
         # the median of a Rayleigh distribution is 1.177 sigma; less noise than the camera must have is not believed
@@ -109,55 +107,57 @@ class Equations:
 
     def local_step(self, common_step: FloatArray) -> FloatArray:
         """Step (LOCAL,) of the set's own unknowns that goes with one of the common ones."""
-        own, mixed = self.sums[:LOCAL, :LOCAL], self.sums[:LOCAL, LOCAL:]
+        own, mixed = self.sums[: residuals.LOCAL, : residuals.LOCAL], self.sums[: residuals.LOCAL, residuals.LOCAL :]
         return np.asarray(np.linalg.solve(own, mixed[:, -1] - mixed[:, :-1] @ common_step))
 
     def reduced(self) -> FloatArray:
         """Schur complement over the set's own unknowns, (COMMON + 1, squared)."""
-        mixed = self.sums[:LOCAL, LOCAL:]
-        left = self.sums[LOCAL:, LOCAL:] - mixed.T @ np.linalg.solve(self.sums[:LOCAL, :LOCAL], mixed)
+        mixed = self.sums[: residuals.LOCAL, residuals.LOCAL :]
+        left = self.sums[residuals.LOCAL :, residuals.LOCAL :] - mixed.T @ np.linalg.solve(
+            self.sums[: residuals.LOCAL, : residuals.LOCAL], mixed
+        )
         return np.asarray((left + left.T) / 2)
 
 
 def equations(
-    bench: Bench,
-    turns: list[Poses],
-    phases: SetPhases,
+    bench: parameters.Bench,
+    turns: list[parameters.Poses],
+    phases: residuals.SetPhases,
     state: SetState,
     common: FloatArray,
     witness: Witness,
     trust: Trust,
 ) -> Equations:
     """Linearise one set; `common` (COMMON,) are parameters and ring."""
-    sums = np.zeros((LOCAL + COMMON + 1,) * 2)
-    keep = np.append(np.arange(COLUMNS), LOCAL + COMMON)
+    sums = np.zeros((residuals.LOCAL + COMMON + 1,) * 2)
+    keep = np.append(np.arange(residuals.COLUMNS), residuals.LOCAL + COMMON)
     root = np.sqrt(trust.weights / trust.variance) / phases.sigma_mm
     residual = np.empty_like(phases.screen_mm)
-    for part in chunks(bench, turns, phases, state.surface, state.vertex_z_mm):
+    for part in residuals.chunks(bench, turns, phases, state.surface, state.vertex_z_mm):
         residual[:, part.place] = part.residual_mm
         for derivatives, left in zip(part.derivatives, part.residual_mm, strict=True):
-            sums[np.ix_(keep, keep)] += gram(np.vstack([derivatives, left]) * root[part.place])
+            sums[np.ix_(keep, keep)] += residuals.gram(np.vstack([derivatives, left]) * root[part.place])
     rows = _witness_rows(phases, state, common, witness)
     weights = trust.weights / phases.sigma_mm**2
     rms = float(np.sqrt(np.mean(residual**2 @ weights) / np.sum(weights)))
     return Equations(sums + rows.T @ rows, residual, trust, rms)
 
 
-def _witness_rows(phases: SetPhases, state: SetState, common: FloatArray, witness: Witness) -> FloatArray:
+def _witness_rows(phases: residuals.SetPhases, state: SetState, common: FloatArray, witness: Witness) -> FloatArray:
     """Ring and laser as weighted rows [derivatives, miss]."""
-    rows = np.zeros((RING + 1, LOCAL + COMMON + 1))
+    rows = np.zeros((RING + 1, residuals.LOCAL + COMMON + 1))
     ring = rows[:RING]
     ring[:, :PARAMETERS] = rim_harmonics()
     ring[0, PARAMETERS] = 1.0
-    ring[:, LOCAL + len(NAMES) : -1] = -np.eye(RING)
-    ring[:, -1] = common[len(NAMES) :] - rim_of(state)
+    ring[:, residuals.LOCAL + len(parameters.NAMES) : -1] = -np.eye(RING)
+    ring[:, -1] = common[len(parameters.NAMES) :] - rim_of(state)
     ring /= witness.ring_sigma_um * 1e-3
     if np.isfinite(phases.displacement_um):
         moved_mm = (phases.displacement_um - witness.reference_um) * 1e-3
         laser = rows[RING]
         laser[PARAMETERS] = 1.0
-        laser[LOCAL + OPTICAL] = moved_mm
-        laser[-1] = -(1 + common[OPTICAL]) * moved_mm - state.vertex_z_mm
+        laser[residuals.LOCAL + parameters.OPTICAL] = moved_mm
+        laser[-1] = -(1 + common[parameters.OPTICAL]) * moved_mm - state.vertex_z_mm
         laser /= witness.laser_sigma_um * 1e-3
     return rows
 
@@ -173,7 +173,38 @@ def rim_of(state: SetState) -> FloatArray:
 def rim_harmonics() -> FloatArray:
     """Matrix (RING, 36) from the surface's parameters to the harmonics of the rim's height above the vertex."""
     theta = 2 * np.pi * np.arange(4 * RING) / (4 * RING)
-    heights = basis(np.cos(theta), np.sin(theta))[0]
+    heights = residuals.basis(np.cos(theta), np.sin(theta))[0]
     orders = np.outer(np.arange(1, DEGREE + 1), theta)
     waves = np.vstack([np.full((1, theta.size), 0.5), np.cos(orders), np.sin(orders)])
     return np.asarray(waves @ heights.T * 2 / theta.size)
+
+
+# Hundreds of thousands of bins as a few thousand points that say the same.
+#
+# About a bench and a surface that are nearly right, what is left of the seen screen points is smooth but for noise:
+# its mean over a cell of the picture keeps all that it says. The cell's point is the model's at its middle plus that
+# mean.
+
+
+def averaged(
+    bench: parameters.Bench, phases: residuals.SetPhases, state: SetState, about: int
+) -> residuals.SetPhases:
+    """The set with about so many points; robust, each with the noise of its mean."""
+    left = residuals.residual_mm(bench, phases, state.surface, state.vertex_z_mm)
+    weights = Trust.seen(phases, left).weights / phases.sigma_mm**2
+    width, height = np.ptp(phases.column_px), np.ptp(phases.row_px)
+    cell_px = max(float(np.sqrt(width * height * np.pi / 4 / about)), 1.0)  # the mirror is seen as an ellipse
+    column, row = (np.floor(place / cell_px).astype(int) for place in (phases.column_px, phases.row_px))
+    _, cell = np.unique(column + (row.max() + 1 - row) * (column.max() + 1), return_inverse=True)
+    total = np.bincount(cell, weights)
+    column_px, row_px, *rest = (
+        np.bincount(cell, weights * value) / total for value in (phases.column_px, phases.row_px, *left)
+    )
+    sigma_mm = 1 / np.sqrt(total)
+    bare = residuals.SetPhases(
+        phases.name, column_px, row_px, np.zeros((2, total.size)), sigma_mm, phases.displacement_um
+    )
+    model = -residuals.residual_mm(bench, bare, state.surface, state.vertex_z_mm)
+    return residuals.SetPhases(
+        phases.name, column_px, row_px, model + np.stack(rest), sigma_mm, phases.displacement_um
+    )

@@ -1,21 +1,15 @@
 """The one least-squares problem: Gauss-Newton on the common unknowns, surfaces eliminated (`separable`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.metrology.calibrate.averaging import averaged
-from membrane_ctrl.metrology.calibrate.parameters import NAMES, Bench, bench_at, pose_derivatives
-from membrane_ctrl.metrology.calibrate.residuals import SetPhases, camera_rays
-from membrane_ctrl.metrology.calibrate.separable import COMMON, Equations, SetState, Trust, Witness, equations, rim_of
-from membrane_ctrl.metrology.geometry import Geometry
-from membrane_ctrl.metrology.reconstruct import Fit, Points, Tracer, parabola
-from membrane_ctrl.metrology.reconstruct import solve as solve_surface
-from membrane_ctrl.metrology.surface import PARAMETERS, Surface
+from membrane_ctrl.metrology import reconstruct
+from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 
 FloatArray = NDArray[np.float64]
 
@@ -47,9 +41,9 @@ class Problem:
     """
 
     stated: Geometry
-    sets: tuple[SetPhases, ...]
+    sets: tuple[residuals.SetPhases, ...]
     sigmas: FloatArray
-    witness: Witness
+    witness: separable.Witness
     radius_mm: float
 
 
@@ -80,32 +74,32 @@ class Solution:
     problem: Problem
     values: FloatArray
     common: FloatArray
-    states: tuple[SetState, ...]
-    equations: tuple[Equations, ...]
+    states: tuple[separable.SetState, ...]
+    equations: tuple[separable.Equations, ...]
     covariance: FloatArray
     changes: tuple[float, ...]
     converged: bool
 
     @property
-    def bench(self) -> Bench:
+    def bench(self) -> parameters.Bench:
         """The calibrated bench."""
-        return bench_at(self.problem.stated, self.values)
+        return parameters.bench_at(self.problem.stated, self.values)
 
     @property
     def free(self) -> list[str]:
         """Names of the parameters that were free."""
-        return [name for name, sigma in zip(NAMES, self.problem.sigmas, strict=True) if sigma > 0]
+        return [name for name, sigma in zip(parameters.NAMES, self.problem.sigmas, strict=True) if sigma > 0]
 
     @property
     def sigmas(self) -> FloatArray:
         """Standard deviations of the parameters, in the order of `NAMES`."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)[: len(NAMES)]))
+        return np.asarray(np.sqrt(np.diag(self.covariance)[: len(parameters.NAMES)]))
 
 
 def prior(sigmas: FloatArray, common: FloatArray) -> FloatArray:
     """What is known without the sets, as sums (COMMON + 1, squared) about where the unknowns stand."""
-    wide = np.append(sigmas, np.full(COMMON - len(NAMES), _FREE_RING_MM))
-    weight = np.divide(1, wide**2, out=np.zeros(COMMON), where=wide > 0)
+    wide = np.append(sigmas, np.full(separable.COMMON - len(parameters.NAMES), _FREE_RING_MM))
+    weight = np.divide(1, wide**2, out=np.zeros(separable.COMMON), where=wide > 0)
     rows = np.hstack([np.diag(np.sqrt(weight)), -(np.sqrt(weight) * common)[:, None]])
     return np.asarray(rows.T @ rows)
 
@@ -121,11 +115,11 @@ class Step:
 
 def step(sums: FloatArray, sigmas: FloatArray) -> Step:
     """Solve for what is free. `sums` (COMMON + 1, squared) hold the sets and the prior."""
-    free = np.flatnonzero(np.append(sigmas > 0, np.ones(COMMON - len(NAMES), bool)))
+    free = np.flatnonzero(np.append(sigmas > 0, np.ones(separable.COMMON - len(parameters.NAMES), bool)))
     matrix, right = sums[np.ix_(free, free)], sums[free, -1]
     scale = 1 / np.sqrt(np.diag(matrix))  # parameters have units of their own: the scaled matrix loses fewer digits
     inverse = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
-    delta, covariance = np.zeros(COMMON), np.zeros((COMMON, COMMON))
+    delta, covariance = np.zeros(separable.COMMON), np.zeros((separable.COMMON, separable.COMMON))
     delta[free] = inverse @ right
     covariance[np.ix_(free, free)] = inverse
     return Step(delta, covariance, float(sums[-1, -1] - right @ delta[free]))
@@ -161,10 +155,10 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
         if not start.converged:
             return start  # means about a bench that is none would be no points of any
         pairs = zip(problem.sets, start.states, strict=True)
-        problem = replace(problem, sets=tuple(averaged(start.bench, *pair, _FEW) for pair in pairs))
+        problem = replace(problem, sets=tuple(separable.averaged(start.bench, *pair, _FEW) for pair in pairs))
     states = start.states if start is not None else first_states(problem)
     common = start.common if start is not None else _common(states)
-    trust = tuple(Trust.full(phases) for phases in problem.sets)
+    trust = tuple(separable.Trust.full(phases) for phases in problem.sets)
     free = problem.sigmas > 0
     changes: list[float] = []
     weighed = False  # whether the step before was the first with new weights
@@ -180,9 +174,9 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
             progress(len(changes), changes[-1])
         settled = weighed and changes[-1] < _SETTLED
         if settled or len(changes) == MAX_ITERATIONS:
-            values = common[: len(NAMES)].copy()
+            values = common[: len(parameters.NAMES)].copy()
             return Solution(problem, values, common, states, linear, moved.covariance, tuple(changes), settled)
-        far = float(np.max(np.abs(moved.delta[: len(NAMES)][free]) / problem.sigmas[free], initial=0.0))
+        far = float(np.max(np.abs(moved.delta[: len(parameters.NAMES)][free]) / problem.sigmas[free], initial=0.0))
         delta = moved.delta * min(1.0, _FURTHEST / far) if far > 0 else moved.delta
         states = tuple(_moved(s, each, delta) for s, each in zip(states, linear, strict=True))
         common = common + delta
@@ -191,54 +185,60 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
         weighed = changes[-1] < _NEARLY or far > _FURTHEST
         if weighed:
             left = (each.residual_mm for each in linear)
-            trust = tuple(Trust.seen(phases, residual) for phases, residual in zip(problem.sets, left, strict=True))
+            trust = tuple(
+                separable.Trust.seen(phases, residual) for phases, residual in zip(problem.sets, left, strict=True)
+            )
 
 
-def _common(states: Sequence[SetState]) -> FloatArray:
+def _common(states: Sequence[separable.SetState]) -> FloatArray:
     """Parameters as stated, and the ring as the sets' first surfaces have it."""
-    return np.append(np.zeros(len(NAMES)), np.mean([rim_of(state) for state in states], axis=0))
+    return np.append(np.zeros(len(parameters.NAMES)), np.mean([separable.rim_of(state) for state in states], axis=0))
 
 
 def _linearise(
-    problem: Problem, states: Sequence[SetState], common: FloatArray, trust: Sequence[Trust]
-) -> tuple[Equations, ...]:
-    values = common[: len(NAMES)]
-    bench, turns = bench_at(problem.stated, values), pose_derivatives(problem.stated, values)
+    problem: Problem, states: Sequence[separable.SetState], common: FloatArray, trust: Sequence[separable.Trust]
+) -> tuple[separable.Equations, ...]:
+    values = common[: len(parameters.NAMES)]
+    bench, turns = parameters.bench_at(problem.stated, values), parameters.pose_derivatives(problem.stated, values)
     return tuple(
-        equations(bench, turns, phases, state, common, problem.witness, believed)
+        separable.equations(bench, turns, phases, state, common, problem.witness, believed)
         for phases, state, believed in zip(problem.sets, states, trust, strict=True)
     )
 
 
-def _moved(state: SetState, linear: Equations, common_step: FloatArray) -> SetState:
+def _moved(state: separable.SetState, linear: separable.Equations, common_step: FloatArray) -> separable.SetState:
     own = linear.local_step(common_step)
     surface = Surface.from_parameters(state.surface.parameters + own[:PARAMETERS], state.surface.radius_mm)
-    return SetState(surface, state.vertex_z_mm + float(own[PARAMETERS]))
+    return separable.SetState(surface, state.vertex_z_mm + float(own[PARAMETERS]))
 
 
-def first_states(problem: Problem) -> tuple[SetState, ...]:
+def first_states(problem: Problem) -> tuple[separable.SetState, ...]:
     """The sets' surfaces as the stated geometry sees them. Raises ValueError if there is none."""
     return tuple(_first(problem, phases) for phases in problem.sets)
 
 
-def _first(problem: Problem, phases: SetPhases) -> SetState:
+def _first(problem: Problem, phases: residuals.SetPhases) -> separable.SetState:
     moved_um = phases.displacement_um - problem.witness.reference_um
     vertex_z_mm = -moved_um * 1e-3 if np.isfinite(moved_um) else 0.0
-    return SetState(surface_of(Bench(problem.stated), phases, problem.radius_mm, vertex_z_mm), vertex_z_mm)
+    return separable.SetState(
+        surface_of(parameters.Bench(problem.stated), phases, problem.radius_mm, vertex_z_mm), vertex_z_mm
+    )
 
 
-def surface_of(bench: Bench, phases: SetPhases, radius_mm: float, vertex_z_mm: float) -> Surface:
+def surface_of(bench: parameters.Bench, phases: residuals.SetPhases, radius_mm: float, vertex_z_mm: float) -> Surface:
     """One set's surface on a bench without bow, as `measure` fits it. Raises ValueError if there is none."""
     return _fit(bench, phases, radius_mm, vertex_z_mm).surface
 
 
-def slope_residual(solution: Solution, phases: SetPhases, index: int) -> float:
+def slope_residual(solution: Solution, phases: residuals.SetPhases, index: int) -> float:
     """RMS of measured minus fitted slopes of one set's bins on the calibrated bench, as a live cycle states it."""
     fit = _fit(solution.bench, phases, solution.problem.radius_mm, solution.states[index].vertex_z_mm)
     return float(np.hypot(fit.residual_x, fit.residual_y) / np.sqrt(2))
 
 
-def _fit(bench: Bench, phases: SetPhases, radius_mm: float, vertex_z_mm: float) -> Fit:
-    tracer = Tracer(bench.geometry, radius_mm, vertex_z_mm)
-    points = Points.of(camera_rays(bench.geometry, phases), phases.screen_mm * bench.pitch)
-    return solve_surface(tracer, points, parabola(_START_SAG_MM, radius_mm))
+def _fit(
+    bench: parameters.Bench, phases: residuals.SetPhases, radius_mm: float, vertex_z_mm: float
+) -> reconstruct.Fit:
+    tracer = reconstruct.Tracer(bench.geometry, radius_mm, vertex_z_mm)
+    points = reconstruct.Points.of(residuals.camera_rays(bench.geometry, phases), phases.screen_mm * bench.pitch)
+    return reconstruct.solve(tracer, points, reconstruct.parabola(_START_SAG_MM, radius_mm))

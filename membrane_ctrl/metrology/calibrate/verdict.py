@@ -1,14 +1,10 @@
 """May a solution be used? What speaks against it, in one line each, the cause before its consequences."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from membrane_ctrl.metrology.calibrate.diagnose import bumps, laser_scale, left_out, suspects, without
-from membrane_ctrl.metrology.calibrate.parameters import ALL, LASER, NAMES
-from membrane_ctrl.metrology.calibrate.separable import rim_of
+from membrane_ctrl.metrology.calibrate import diagnose, parameters, separable
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, solve
 
 # Sets closer together than this say no more than one set: the sag's sigma is then twice that of sets 8 mm apart
@@ -85,15 +81,17 @@ def _sets(solution: Solution) -> list[tuple[float, Finding]]:
     """A camera that was bumped, a set that is bad, sets that do not belong together, each with what it explains."""
     names = [phases.name for phases in solution.problem.sets]
     out = []
-    for bump in bumps(solution)[:1]:
+    for bump in diagnose.bumps(solution)[:1]:
         yaw, pitch, roll = bump.turned_deg
         where = f"in {names[bump.sets[0]]}" if len(bump.sets) == 1 else f"from {names[bump.sets[0]]} on"
         says = f"the camera stood otherwise {where}: yaw {yaw:+.3f}, pitch {pitch:+.3f}, roll {roll:+.3f} degrees"
         out.append((bump.fall - 2 * 3, Finding(True, says, bump.sets)))
-    worst = max(left_out(solution), key=lambda each: each.fall)
+    worst = max(diagnose.left_out(solution), key=lambda each: each.fall)
     if worst.disagrees:
         explained = worst.fall - 2 * worst.freedom
-        if len(names) > 2 and not any(each.disagrees for each in left_out(without(solution, worst.index))):
+        if len(names) > 2 and not any(
+            each.disagrees for each in diagnose.left_out(diagnose.without(solution, worst.index))
+        ):
             says = f"{names[worst.index]} disagrees with all the others: {_why(solution, worst.index)}"
             out.append((explained, Finding(True, says, (worst.index,))))
         else:
@@ -124,15 +122,17 @@ def _agree(problem: Problem) -> bool:
         solution = solve(few)
     except ValueError:
         return False
-    return solution.converged and not any(each.disagrees for each in left_out(solution))
+    return solution.converged and not any(each.disagrees for each in diagnose.left_out(solution))
 
 
 def _why(solution: Solution, index: int) -> str:
     """Whether it is one set's laser reading that is wrong, or its fringes."""
-    rest, phases = without(solution, index), solution.problem.sets[index]
-    vertex_um = 1e3 * (rest.common[len(NAMES)] - rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0])
+    rest, phases = diagnose.without(solution, index), solution.problem.sets[index]
+    vertex_um = 1e3 * (
+        rest.common[len(parameters.NAMES)] - separable.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
+    )
     moved_um = phases.displacement_um - solution.problem.witness.reference_um
-    miss_um = moved_um + vertex_um / (1 + rest.values[NAMES.index(LASER.name)])
+    miss_um = moved_um + vertex_um / (1 + rest.values[parameters.NAMES.index(parameters.LASER.name)])
     if abs(miss_um) > _LASER_SIGMAS * solution.problem.witness.laser_sigma_um:
         return f"its laser reads {miss_um:+.1f} um against the optics"
     return "its fringes show another bench"
@@ -150,7 +150,7 @@ def _scatter(solution: Solution) -> list[Finding]:
 
 
 def _laser(solution: Solution) -> list[tuple[float, Finding]]:
-    laser = laser_scale(solution)
+    laser = diagnose.laser_scale(solution)
     if not laser.sure:
         return []
     says = f"the laser's scale is wrong: the optics see {laser.value:.4f} +- {laser.sigma:.4f} um per um of it"
@@ -158,11 +158,11 @@ def _laser(solution: Solution) -> list[tuple[float, Finding]]:
 
 
 def _model(solution: Solution) -> list[tuple[float, Finding]]:
-    found = suspects(solution)
+    found = diagnose.suspects(solution)
     if not found:
         return []
     first, *others = found
-    parameter = ALL[NAMES.index(first.name)]
+    parameter = parameters.ALL[parameters.NAMES.index(first.name)]
     unit = f" {parameter.unit}" if parameter.unit else ""
     also = f" (or {', '.join(other.name for other in others)})" if others else ""
     says = (

@@ -1,0 +1,200 @@
+"""How long a display needs from the command to show a pattern until a frame may be exposed.
+
+After a step the light of a panel stands still for a latency L (queue, refresh, scan) and then approaches its end as
+exp(-(t - L) / tau). Frames exposed at known times after the step give both; the wait is where less than one of 256
+levels is left: L + tau ln 256. Doubling a settle time that was seen would double the latency too.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+_LEFT = 1.0 / 256.0  # of the step: one level
+_FIT_FROM, _FIT_TO = 0.6, 1.0 / 32.0  # of the step; below, noise bends the logarithm
+_NOISE_SIGMAS = 4.0
+_LEAST_POINTS = 3
+_BLOCK_PX = 16  # the mean of 256 pixels has a sixteenth of their noise
+
+
+@dataclass(frozen=True, slots=True)
+class Settling:
+    """What was found.
+
+    Attributes
+    ----------
+    settle_s : float
+        From the command to the start of an exposure.
+    latency_s, tau_s : float
+        Of the model; NaN where the display was too fast for the camera to see it on its way.
+    """
+
+    settle_s: float
+    latency_s: float
+    tau_s: float
+
+
+def share_left(frame: ArrayLike, before: ArrayLike, after: ArrayLike) -> float:
+    """How much of a step is left in a frame: the worst block's difference from the end, over the largest step.
+
+    Parameters
+    ----------
+    frame, before, after : (H, W) arrays
+        The frame, and the pictures before the step and long after it.
+    """
+    end = block_means(after)
+    step = np.abs(block_means(before) - end)
+    # the worst block but a thousandth: a glint or a dead pixel is no display
+    return float(np.quantile(np.abs(block_means(frame) - end), 0.999) / max(float(np.quantile(step, 0.999)), 1e-9))
+
+
+def settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settling:
+    """Latency, time constant and the time to wait.
+
+    Parameters
+    ----------
+    delay_s : (K,) array
+        Start of each exposure after the command, of any number of steps together.
+    left : (K,) array
+        What was left of the step (`share_left`).
+    noise : float
+        What `left` is when nothing is left.
+
+    Raises
+    ------
+    ValueError
+        If the display never settles.
+    """
+    delays, shares = np.asarray(delay_s, np.float64), np.asarray(left, np.float64)
+    order = np.argsort(delays)
+    delays, shares = delays[order], shares[order]
+    floor = max(_FIT_TO, _NOISE_SIGMAS * noise)
+    unsettled = np.flatnonzero(shares > floor)
+    if unsettled.size == 0:  # faster than the first frame; what that had left goes no slower than the rest went
+        still = max(float(shares[0]), _LEFT)
+        return Settling(float(delays[0]) * math.log(_LEFT) / math.log(still), math.nan, math.nan)
+    if unsettled[-1] == len(delays) - 1:
+        raise ValueError(
+            f"{100 * shares[-1]:.0f} % of a step is left after {delays[-1]:.2f} s: does the camera see the screen, "
+            "and is its light steady (dynamic backlight, another lamp)?"
+        )
+    seen_s = float(delays[unsettled[-1] + 1])  # the first frame after which all are good
+    falling = (shares < _FIT_FROM) & (shares > floor)
+    if np.count_nonzero(falling) < _LEAST_POINTS or np.ptp(delays[falling]) <= 0:
+        # too fast to fit: from _FIT_FROM to the floor in no more than this, and no slower afterwards
+        before = np.flatnonzero(shares[: unsettled[-1] + 1] >= _FIT_FROM)
+        fell_s = seen_s - (float(delays[before[-1]]) if before.size else 0.0)
+        rest_s = fell_s * max(0.0, math.log(floor / _LEFT)) / math.log(_FIT_FROM / floor)
+        return Settling(seen_s + rest_s, math.nan, math.nan)
+    slope, offset = np.polyfit(delays[falling], np.log(shares[falling]), 1)
+    if slope >= 0:
+        return Settling(2 * seen_s, math.nan, math.nan)
+    tau_s, latency_s = -1.0 / slope, offset / -slope
+    # a display slower at its tail than at its start is believed
+    return Settling(max(latency_s - tau_s * math.log(_LEFT), seen_s), float(latency_s), float(tau_s))
+
+
+def block_means(image: ArrayLike) -> FloatArray:
+    """Means of square blocks, the incomplete ones at the edges left out; of small images the pixels themselves."""
+    pixels = np.asarray(image, np.float64)
+    side = max(1, min(_BLOCK_PX, min(pixels.shape) // 8))
+    rows, columns = (length // side for length in pixels.shape)
+    blocks = pixels[: rows * side, : columns * side].reshape(rows, side, columns, side)
+    return np.asarray(blocks.mean(axis=(1, 3)))
+
+
+# Is the camera's exposure right for the screen? From one frame of white and one of black.
+
+
+_SATURATED_SHARE = 0.001  # of the pixels: dust and glints
+_TARGET = 0.8  # of full scale, for the brightest pixels but a hundredth
+_LEAST = 0.25  # below, noise and steps of the converter are three times what they need to be
+_LEAST_CONTRAST = 3.0
+
+
+def exposure_problem(
+    white: NDArray[np.uint8] | NDArray[np.uint16],
+    black: NDArray[np.uint8] | NDArray[np.uint16],
+    full_scale_adu: int,
+    exposure_ms: float,
+) -> str:
+    """What is wrong, with the remedy; empty when nothing is.
+
+    Parameters
+    ----------
+    white, black : (H, W) arrays
+        Frames of a white and of a black screen.
+    full_scale_adu : int
+        Highest count of the camera.
+    exposure_ms : float
+        What they were taken with.
+    """
+    saturated = float(np.mean(white >= full_scale_adu))
+    bright, dark = float(np.quantile(white, 0.99)), float(np.quantile(black, 0.99))
+    if saturated > _SATURATED_SHARE:
+        return (
+            f"{100 * saturated:.1f} % of the pixels are saturated on white; lower exposure_ms = {exposure_ms:g} "
+            f"to about {_two_digits(exposure_ms / 2)}, or the gain"
+        )
+    if bright < _LEAST * full_scale_adu:
+        wanted_ms = exposure_ms * _TARGET * full_scale_adu / max(bright, 1.0)
+        return (
+            f"white gives only {bright:.0f} of {full_scale_adu} counts; raise exposure_ms = {exposure_ms:g} to about "
+            f"{_two_digits(wanted_ms)}, open the lens, or is the mirror covered?"
+        )
+    if bright < _LEAST_CONTRAST * dark:
+        return (
+            f"black gives {dark:.0f} counts where white gives {bright:.0f}: other light reaches the camera; darken "
+            "the room"
+        )
+    return ""
+
+
+def _two_digits(number: float) -> str:
+    return f"{float(f'{number:.2g}'):g}"
+
+
+# Does the screen show every pixel as it is sent? A one-pixel checkerboard tells, unresolved by the camera.
+#
+# Shown as sent, half of the pixels are lit, and a camera that cannot tell them apart sees half of the white screen's
+# light everywhere. A scaler in between mixes neighbours before the display's gamma: 0 and 255 become 127, which is a
+# quarter of the light (gamma 2.2: 0.22); where its grid and the panel's agree again the half comes back. So a panel
+# that announces 1360 and has 1366 columns shows six bands.
+
+
+_LIT_SHARE = 0.3  # of the brightest block: where the mirror shows the screen
+_LEAST_LIT = 0.02  # of all blocks
+# A panel's own crosstalk between neighbours takes up to a tenth of the half
+_HALF_RANGE = (0.40, 0.60)
+_LARGEST_BAND = 0.10
+
+
+def checkerboard_problem(seen: ArrayLike, white: ArrayLike, black: ArrayLike) -> str:
+    """What is wrong, with the remedy; empty when the screen shows pixel for pixel.
+
+    Parameters
+    ----------
+    seen, white, black : (H, W) arrays
+        Frames of the checkerboard, of a white and of a black screen.
+    """
+    dark = block_means(black)
+    full = block_means(white) - dark
+    lit = full > _LIT_SHARE * float(np.max(full))
+    if float(np.max(full)) <= 0 or np.mean(lit) < _LEAST_LIT:
+        return "the camera does not see the screen: no block is brighter on white than on black"
+    share = (block_means(seen) - dark)[lit] / full[lit]
+    low, middle, high = (float(value) for value in np.percentile(share, (2, 50, 98)))
+    if high - low > _LARGEST_BAND:
+        return (
+            f"a one-pixel checkerboard shows bands ({100 * low:.0f} .. {100 * high:.0f} % of white): the screen "
+            "rescales; set the panel's own resolution and switch off overscan and scaling"
+        )
+    if not _HALF_RANGE[0] < middle < _HALF_RANGE[1]:
+        return (
+            f"a one-pixel checkerboard gives {100 * middle:.0f} % of white instead of 50: the screen sharpens or "
+            "mixes pixels; set the panel's own resolution and switch off picture improvements"
+        )
+    return ""

@@ -1,0 +1,139 @@
+"""The `calibrate-camera` command: the lens, from photographs of a board on the screen; and the board's picture."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from membrane_ctrl.config.schema import CameraConfig, Config
+from membrane_ctrl.geometry.prior_file import write_prior
+from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
+from membrane_ctrl.metrology.calibrate.lens import Board, Lens, View, calibrate_lens, on_screen
+from membrane_ctrl.metrology.calibrate.parameters import usual_sigma
+from membrane_ctrl.model import errors, files
+
+_IMAGES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """What the command was asked for: a folder of photographs, the board in them, the camera as it is known."""
+
+    folder: Path
+    board: str
+    config: Config
+    out: Path
+    as_json: bool
+
+
+def calibrate_camera(options: CameraOptions) -> int:
+    """Find the corners, fit the lens, write the prior, say what it improved. Raises CommandError."""
+    board, camera = _board(options.board), options.config.optics.camera
+    views = [_view(path, board, camera) for path in _images(options.folder)]
+    try:
+        lens = calibrate_lens(views, camera)
+    except ValueError as error:
+        raise errors.RejectedError(f"{options.folder}: {error}") from None
+    tables = {"camera": _camera_table(camera, lens), "sigmas": lens.sigmas}
+    write_prior(options.out, tables, "calibrate-camera", lens.used, lens.rms_px)
+    report = {
+        "schema": "membrane-calibrate-camera/1",
+        "out": str(options.out),
+        "rms_px": lens.rms_px,
+        "stated_rms_px": lens.stated_rms_px,
+        "used": list(lens.used),
+        "left_out": list(lens.left_out),
+        "camera": tables["camera"],
+        "sigmas": lens.sigmas,
+    }
+    print(json.dumps(report) if options.as_json else "\n".join(_lines(camera, lens, options.out)))
+    return int(errors.Exit.DONE)
+
+
+def draw_board(out: Path, board_text: str, square_px: int, width_px: int, height_px: int) -> int:
+    """Write the board as a picture for a screen of so many pixels. Raises InputError."""
+    try:
+        levels = on_screen(_board(board_text), square_px, width_px, height_px)
+    except ValueError as error:
+        raise errors.InputError(f"calibrate-board: {error}") from None
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        written, picture = cv2.imencode(out.suffix, levels)
+        if written:
+            files.write_bytes_atomic(files.users(out), picture.tobytes())
+    except (OSError, cv2.error):
+        written = False
+    if not written:
+        raise errors.InputError(f"{out}: cannot be written: a .png in a folder you may write to is needed")
+    print(f"{board_text} of {square_px} px squares written to {out}; show it pixel for pixel", file=sys.stderr)
+    return int(errors.Exit.DONE)
+
+
+def _board(text: str) -> Board:
+    try:
+        return Board.parse(text)
+    except ValueError as error:
+        raise errors.InputError(f"--board {error}") from None
+
+
+def _images(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise errors.InputError(f"{folder}: no such folder of photographs")
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in _IMAGES)
+    if not found:
+        raise errors.InputError(f"{folder}: holds no photographs ({', '.join(_IMAGES)})")
+    return found
+
+
+def _view(path: Path, board: Board, camera: CameraConfig) -> View:
+    try:
+        image = decoded_image(files.read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    except (OSError, ValueError) as error:
+        raise errors.InputError(
+            f"{path}: {(error.strerror if isinstance(error, OSError) else None) or error}"
+        ) from None
+    if image.shape != (camera.height_px, camera.width_px):
+        raise errors.InputError(
+            f"{path}: {image.shape[1]} x {image.shape[0]} pixels, the configuration's optics.camera has "
+            f"{camera.width_px} x {camera.height_px}"
+        )
+    if image.dtype != np.uint8:  # the detectors know 8 bits only; a corner needs no more
+        image = (np.asarray(image, float) * (255.0 / max(1, int(image.max())))).astype(np.uint8)
+    place, seen_px = board.corners(np.asarray(image, np.uint8))
+    return View(path.name, place, seen_px)
+
+
+def _camera_table(camera: CameraConfig, lens: Lens) -> dict[str, Any]:
+    return {
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+        "pixel_um": camera.pixel_um,
+        "focal_mm": lens.focal_px * camera.pixel_um * 1e-3,
+        "principal_px": list(lens.principal_px),
+        "distortion": list(lens.distortion),
+    }
+
+
+def _lines(camera: CameraConfig, lens: Lens, out: Path) -> list[str]:
+    found = _camera_table(camera, lens)
+    stated = (camera.focal_mm, *camera.principal, *(*camera.distortion, 0.0, 0.0, 0.0, 0.0)[:4])
+    values = (found["focal_mm"], *lens.principal_px, *lens.distortion)
+    scales = (found["focal_mm"], *[1.0] * 6)
+    lines = ["what              stated       found        +-           known before"]
+    for name, before, value, scale in zip(lens.sigmas, stated, values, scales, strict=True):
+        label = "focal_mm" if name == "focal_relative" else name
+        sigma, usual = lens.sigmas[name] * scale, usual_sigma(name) * scale
+        lines.append(f"{label:<16}{before:>10.5g}{value:>13.6g}  {sigma:<11.2g}  {usual:.2g}")
+    lines.append(
+        f"corners are left {lens.rms_px:.3f} px RMS in {len(lens.used)} photographs; "
+        f"with the stated lens {lens.stated_rms_px:.3f} px"
+    )
+    if lens.left_out:
+        lines.append(f"left out, no board or a bad fit: {', '.join(lens.left_out)}")
+    if lens.sigmas["focal_relative"] > usual_sigma("focal_relative"):
+        lines.append("the focal length is known no better than from its data sheet: tilt the board more, both ways")
+    return [*lines, f"written: {out}; use it with calibrate --prior {out}"]

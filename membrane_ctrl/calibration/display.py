@@ -1,0 +1,92 @@
+"""The `calibrate-display` command: how fast the screen settles and how its light goes with the level."""
+
+import json
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.display.measures import Settling
+from firmware_iface.display.response import DisplayResponse
+from firmware_iface.roles import LinkError
+from membrane_ctrl.acquisition import exposures, optical_bench, session
+from membrane_ctrl.config.schema import Config, PatternConfig
+from membrane_ctrl.metrology.phase import mm_per_rad
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.errors import DeviceError, Exit, InputError
+
+FloatArray = NDArray[np.float64]
+
+_PHASES = 720  # of a period, for the worst of it to be met
+
+
+def calibrate_display(config: Config, source: str, as_json: bool) -> int:
+    """Open camera and screen, measure, say what it is worth. Raises CommandError.
+
+    For the main thread only (the screen).
+    """
+    if config.devices is None or config.devices.camera is None or config.devices.screen is None:
+        raise InputError(f"{source}: devices.camera, devices.screen: both are needed to measure the screen")
+    section, clock = config.devices.screen, session.WaitingClock(RunClock.start())
+    try:
+        bench = optical_bench.configured_bench(config, clock)
+        try:
+            settling, response = measured(bench, clock, section.width_px, section.height_px)
+        finally:
+            bench.close()
+    except LinkError as error:
+        raise DeviceError(f"{source}: {error}") from None
+    except ValueError as error:
+        raise DeviceError(f"{source}: screen: {error}") from None
+    report = report_of(settling, response, config.optics.pattern)
+    print(json.dumps(report) if as_json else "\n".join(lines_of(report)))
+    return int(Exit.DONE)
+
+
+def measured(
+    bench: optical_bench.OpticalBench, clock: exposures.CycleClock, width_px: int, height_px: int
+) -> tuple[Settling, DisplayResponse]:
+    """Open the bench and look at its screen. Raises LinkError, or ValueError if nothing of the screen is seen."""
+    bench.camera.open()
+    bench.screen.open()
+    test = optical_bench.DisplayTest(bench.screen, bench.camera, clock, width_px, height_px)
+    return test.settling(), test.response()
+
+
+def report_of(settling: Settling, response: DisplayResponse, pattern: PatternConfig) -> dict[str, object]:
+    """The findings, schema membrane-calibrate-display/1."""
+    bare, corrected = (fringe_error_mm(response, pattern, linear) for linear in (False, True))
+    return {
+        "schema": "membrane-calibrate-display/1",
+        "settle_ms": 1e3 * settling.settle_s,
+        "latency_ms": 1e3 * settling.latency_s if np.isfinite(settling.latency_s) else None,
+        "time_constant_ms": 1e3 * settling.tau_s if np.isfinite(settling.tau_s) else None,
+        "gamma": response.gamma,
+        "fringe_error_um": {"as_sent": 1e3 * bare, "corrected": 1e3 * corrected},
+    }
+
+
+def lines_of(report: dict[str, object]) -> list[str]:
+    """For a person, with the lines for the configuration."""
+    error = report["fringe_error_um"]
+    assert isinstance(error, dict)
+    return [
+        f"settles in {report['settle_ms']:.0f} ms, gamma {report['gamma']:.2f}",
+        f"its fringes would be off by {error['as_sent']:.1f} um RMS on the screen, "
+        f"corrected by {error['corrected']:.1f} um, which is the rounding of its levels",
+        "for the configuration (without them both are measured at each start):",
+        "[devices.screen]",
+        f"settle_ms = {report['settle_ms']:.0f}",
+        "linearise = true",
+    ]
+
+
+def fringe_error_mm(response: DisplayResponse, pattern: PatternConfig, corrected: bool) -> float:
+    """RMS error of a screen coordinate that this display makes in sinusoids: harmonics taken for phase."""
+    phase = 2 * np.pi * np.arange(_PHASES) / _PHASES
+    shifts = 2 * np.pi * np.arange(pattern.steps) / pattern.steps
+    wanted = (1 + np.cos(phase + shifts[:, None])) / 2
+    levels = response.levels_of(wanted) if corrected else np.rint(255 * wanted)
+    light = np.interp(levels, response.levels, response.light)
+    seen = np.arctan2(-np.sin(shifts) @ light, np.cos(shifts) @ light)
+    error = np.angle(np.exp(1j * (seen - phase)))
+    return float(mm_per_rad(pattern) * np.std(error))

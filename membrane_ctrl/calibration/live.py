@@ -1,0 +1,238 @@
+"""`calibrate --live`: plan, ask, take the sets, come back, solve, show, ask, adopt."""
+
+import contextlib
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from membrane_ctrl.calibration import session as sessions
+from membrane_ctrl.calibration.plan import Held, reach_of, setpoints_um
+from membrane_ctrl.calibration.session import Head, Session, adopt, compared
+from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command, freed, stated_sigmas
+from membrane_ctrl.calibration.sweep import CaptureLink, Procedure, Sweep
+from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
+from membrane_ctrl.control_port.client import PortClient
+from membrane_ctrl.control_port.ctl import Where, socket_path
+from membrane_ctrl.geometry.file import GeometryOrigin, geometry_of_run, origin_of, read_geometry
+from membrane_ctrl.geometry.prior_file import read_prior
+from membrane_ctrl.measure.capture_set import read_head
+from membrane_ctrl.metrology.calibrate import parameters, propagate
+from membrane_ctrl.metrology.calibrate.verdict import GOOD_SPREAD_UM
+from membrane_ctrl.model.errors import DeviceError, Exit, InputError
+from membrane_ctrl.sessions.live_hold import HoldError, LiveHold
+from membrane_ctrl.sessions.progress import Progress
+
+USUAL_SETS = 5
+_NEARLY_ALL = 0.9  # of the good range: more would hardly be better
+
+
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """What the command line asked for; from `geometry` on as for `calibrate`."""
+
+    where: Where
+    logs: Path
+    session: Path | None
+    name: str
+    range_um: float | None
+    sets: int | None
+    yes: bool
+    take_over: bool
+    geometry: Path | None
+    free: tuple[str, ...]
+    laser_sigma_um: float
+    json: bool
+    pictures: bool = True
+    priors: tuple[Path, ...] = ()
+
+
+def calibrate_live(options: LiveOptions) -> int:
+    """Take what is missing of a session's sets, solve, and adopt if a person agrees. Returns the exit code."""
+    freed(options.free)  # what is wrong with these is better known before the mirror moves
+    for path in options.priors:
+        read_prior(path)
+    session = None
+    if options.session is not None:
+        if options.range_um is not None or options.sets is not None:
+            raise InputError("--session has its own setpoints: leave out --range-um and --sets")
+        session = sessions.resume(options.session)
+    if session is None or session.missing:
+        with _link(options) as link:
+            session = take_sets(link, session, options)
+    return solve_and_adopt(session, options)
+
+
+def take_sets(link: CaptureLink, session: Session | None, options: LiveOptions) -> Session:
+    """All sets that are missing, if a person agrees; the mirror comes back to where it was.
+
+    Raises
+    ------
+    InputError, DeviceError, RejectedError, KeyboardInterrupt
+        The sets so far stay in the session's folder then.
+    """
+    progress = Progress()
+    sweep = Sweep(link, link.config.limits, progress)
+    try:
+        held = sweep.look()
+        procedure = Procedure(link, sweep, held, progress)
+        head = session.head if session is not None else _planned(link, held, options)
+        missing = session.missing if session is not None else tuple(range(len(head.setpoints_um)))
+        if session is not None:
+            _same_bench(link, session)
+        procedure.check(head)
+        minutes = sum(procedure.times_s(head, missing)) / 60
+        progress.say(_plan(head, len(missing), held, minutes))
+        progress.say(_worth(link, head, held, options))
+        _agree(f"move the mirror through {len(missing)} setpoints?", options.yes)
+        sweep.claim(held.setpoint_um)
+        session = session or sessions.begin(options.logs, options.name, head, link.config)
+        progress.say(f"session: {session.path}")
+        procedure.take(session)
+    except HoldError as error:
+        raise DeviceError(str(error)) from None
+    return session
+
+
+def solve_and_adopt(session: Session, options: LiveOptions) -> int:
+    """Solve a session's sets, show old and new, put the new geometry in place if that is agreed."""
+    solving = CalibrateOptions(
+        session.sets,
+        options.geometry,
+        session.geometry,
+        options.free,
+        options.laser_sigma_um,
+        options.json,
+        options.pictures,
+        session.head.start_um,
+        priors=options.priors,
+    )
+    code = calibrate_command(solving)
+    if code != Exit.DONE:
+        return code
+    optics, place = read_head(session.sets[0]).optics, session.config.optics.geometry_file
+    for line in compared(optics, _origin(session, place), read_geometry(session.geometry)):
+        _say(line)
+    if place is None:
+        _say(f"not adopted: the configuration names no optics.geometry_file; the geometry is {session.geometry}")
+    elif not _asked(f"adopt it as {place}?", options.yes):
+        _say(f"not adopted; `membrane-ctrl calibrate --live --session {session.path} --yes` does it")
+    else:
+        kept = adopt(session.geometry, place)
+        before = f"; the one before it is {kept}" if kept else ""
+        _say(f"adopted: {place}{before}; the next hold measures with it")
+    return code
+
+
+def _planned(link: CaptureLink, held: Held, options: LiveOptions) -> Head:
+    wanted = setpoints_um(held, reach_of(held, link.config), options.range_um, options.sets or USUAL_SETS)
+    return sessions.head_of(link.name, held.setpoint_um, held.shape_on, wanted)
+
+
+def _same_bench(link: CaptureLink, session: Session) -> None:
+    """Raises InputError if the hold measures with another geometry than the sets so far were taken with."""
+    now = geometry_of_run(link.run_dir, link.config).optics
+    for folder in session.sets:
+        if not folder.exists():
+            continue
+        then = read_head(folder).optics
+        if _written_out(then) != _written_out(now):
+            raise InputError(f"{folder}: of another camera or geometry than {link.name} has; begin a new session")
+
+
+def _written_out(optics: OpticsConfig) -> tuple[GeometryConfig, CameraConfig]:
+    """What may be left out in one place and stand in another: the reference is not compared, the pixel's place is."""
+    camera = optics.camera.model_copy(update={"principal_px": optics.camera.principal})
+    return optics.geometry.model_copy(update={"reference_displacement_um": None}), camera
+
+
+def _plan(head: Head, missing: int, held: Held, minutes: float) -> str:
+    low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
+    return (
+        f"{missing} of {len(head.setpoints_um)} sets from {low_um:g} to {high_um:g} um "
+        f"(sag {held.sag_at_mm(low_um):.1f} to {held.sag_at_mm(high_um):.1f} mm; now {held.setpoint_um:g} um, "
+        f"{held.pressure_pa:.0f} Pa, leak {held.leak_um_per_s:.1f} um/s), then back to {head.start_um:g} um: "
+        f"about {minutes:.0f} min"
+    )
+
+
+def _worth(link: CaptureLink, head: Head, held: Held, options: LiveOptions) -> str:
+    """How well the geometry will be determined, and by how much better if there were more room."""
+    here = _foreseen(link, held, head.setpoints_um, options)
+    line = f"such sets leave of a figure: sag +- {here.sag_um:.1f} um, figure +- {here.figure_rms_um:.1f} um RMS"
+    low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
+    if high_um - low_um >= _NEARLY_ALL * GOOD_SPREAD_UM:
+        return line
+    ends = (low_um + high_um - GOOD_SPREAD_UM) / 2, (low_um + high_um + GOOD_SPREAD_UM) / 2
+    best = _foreseen(link, held, np.linspace(*ends, len(head.setpoints_um)).tolist(), options)
+    reach = reach_of(held, link.config)
+    return (
+        f"{line}; {GOOD_SPREAD_UM:.0f} um from first to last would leave {best.sag_um:.1f} and "
+        f"{best.figure_rms_um:.1f} ({reach.low_why} and {reach.high_why} have room for "
+        f"{reach.high_um - reach.low_um:.0f})"
+    )
+
+
+def _foreseen(
+    link: CaptureLink, held: Held, setpoints: Sequence[float], options: LiveOptions
+) -> propagate.Propagated:
+    optics = geometry_of_run(link.run_dir, link.config).optics
+    if options.geometry is not None:
+        optics = read_geometry(options.geometry).over(optics)
+    known = parameters.sigmas({**stated_sigmas(optics.geometry), **freed(options.free)})
+    sags_mm = [held.sag_at_mm(each) for each in sorted(setpoints)]
+    try:
+        return propagate.foresee(optics, known, sags_mm, held.swing_adu, options.laser_sigma_um)
+    except ValueError as error:
+        raise InputError(f"{link.name}: {error}; does [optics] state this bench?") from None
+
+
+def _origin(session: Session, place: Path | None) -> GeometryOrigin:
+    """Of the geometry that the sets were taken with: the file's if it is still the same, else by its numbers."""
+    optics = read_head(session.sets[0]).optics
+    if place is not None and place.exists():
+        with contextlib.suppress(InputError):  # a file that is spoilt is in nobody's way
+            file = read_geometry(place)
+            if file.geometry == optics.geometry:
+                return file.origin
+    return origin_of(optics)
+
+
+@contextmanager
+def _link(options: LiveOptions) -> Iterator[LiveHold]:
+    socket = socket_path(options.where)
+    client = PortClient.unix(socket, lambda text: _say(f"notice: {text}"))
+    try:
+        if client.greeting["role"] == "read":
+            raise InputError(f"calibrate --live takes the role operate; {client.greeting['you']} has read")
+        run_dir = options.where.run or socket.parent / str(client.greeting["run"])
+        link = LiveHold(client, run_dir, options.take_over)
+    except BaseException:
+        client.close()
+        raise
+    with contextlib.closing(link):
+        yield link
+
+
+def _agree(question: str, yes: bool) -> None:
+    """Raises InputError unless somebody says yes."""
+    if not yes and not sys.stdin.isatty():
+        raise InputError(f"{question} There is nobody to ask here: say --yes")
+    if not _asked(question, yes):
+        raise InputError("nothing was moved")
+
+
+def _asked(question: str, yes: bool) -> bool:
+    if yes:
+        return True
+    if not sys.stdin.isatty():
+        return False
+    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr)

@@ -1,0 +1,284 @@
+"""The `calibrate` command: one geometry, with its covariance, from capture sets at several pressures."""
+
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from membrane_ctrl.calibration.report import lines_of, report_of
+from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
+from membrane_ctrl.geometry import file, prior_file
+from membrane_ctrl.measure.measurement import Figures
+from membrane_ctrl.metrology.bins import BinGrid, pixel_sigma_adu
+from membrane_ctrl.metrology.calibrate import artefact, drift, propagate, residuals, separable, verdict
+from membrane_ctrl.metrology.calibrate.parameters import LASER, NAMES, sigmas, usual_sigma
+from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, slope_residual, solve
+from membrane_ctrl.metrology.checked import Checked
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.phase import mm_per_rad, phase_sigma_rad
+from membrane_ctrl.model.errors import Exit, InputError
+from membrane_ctrl.model.files import users, write_text_atomic
+
+# A capture set's bins as screen points with their noise, for the calibration.
+
+
+def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.SetPhases:
+    """The bins inside the analysis radius that the set's own fit kept.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        Of the set: camera, pattern, and the stated geometry, which only chooses the bins and tells what averaging
+        over a bin adds to a curved phase (some 1e-3 mm: no calibration changes it).
+    """
+    state, bin_px = checked.state, checked.binned.bin_px
+    grid = BinGrid(checked.tracer.geometry, optics.camera, bin_px)
+    scale = mm_per_rad(optics.pattern)
+    phase = checked.phase_rad.reshape(2, -1)[:, state.index]
+    swing = checked.view.swing_adu.reshape(2, -1)[:, state.index]
+    pixel = pixel_sigma_adu(optics.camera.noise_adu)
+    per_adu = [phase_sigma_rad(checked.stack.shifts_rad(used), pixel, 1.0) for used in checked.view.used]
+    variance = np.mean(np.square(np.array(per_adu)[:, None] / swing), axis=0)
+    return residuals.SetPhases(
+        name=name,
+        column_px=grid.column_px[state.index],
+        row_px=grid.row_px[state.index],
+        screen_mm=phase * scale - state.offset_mm,
+        sigma_mm=np.sqrt(variance) * scale / bin_px,
+        displacement_um=checked.stack.mean_reading_um,
+    )
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """What the command was asked for.
+
+    Attributes
+    ----------
+    folders : sequence of Path
+        Capture sets.
+    geometry : Path or None
+        What was measured by hand, instead of what the sets say.
+    out : Path
+        The new `geometry.toml`.
+    free : sequence of str
+        NAME or NAME=SIGMA; a sigma of 0 holds a parameter.
+    laser_sigma_um : float
+        Of a set's mean reading.
+    as_json : bool
+        Report as JSON.
+    pictures : bool
+        Draw what is left of the screen points, beside the geometry.
+    reference_um : float or None
+        Laser reading for which the hand's measurements hold, if the sets do not say; None: the first set's.
+    priors : sequence of Path
+        What auxiliary calibrations have found; the last one counts.
+    """
+
+    folders: Sequence[Path]
+    geometry: Path | None
+    out: Path
+    free: Sequence[str]
+    laser_sigma_um: float
+    as_json: bool
+    pictures: bool = True
+    reference_um: float | None = None
+    priors: Sequence[Path] = ()
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Sets that were read: their phases, the bench that all of them state, and what is wrong with single frames."""
+
+    sets: tuple[residuals.SetPhases, ...]
+    optics: OpticsConfig
+    reference_um: float
+    notes: tuple[str, ...] = ()
+
+
+def calibrate_command(options: CalibrateOptions) -> int:
+    """Read, solve, judge, write. Returns the exit code; raises CommandError for sets that are none."""
+    priors = [prior_file.read_prior(path) for path in options.priors]
+    free = {name: sigma for prior in priors for name, sigma in prior.content.sigmas.items()} | freed(options.free)
+    begin = time.perf_counter()
+    bundle = with_priors(read_sets(options.folders, options.geometry, options.reference_um), priors)
+    read = time.perf_counter()
+    problem = problem_of(bundle, free, options.laser_sigma_um)
+    findings, solution = verdict.before(problem), None
+    if not findings:
+        try:
+            solution = solve(problem, _progress())
+            findings = (*verdict.after(solution), *(verdict.Finding(False, note) for note in bundle.notes))
+        except ValueError as error:
+            findings = (verdict.Finding(True, str(error)),)
+    timing = {"read": read - begin, "solve": time.perf_counter() - read}
+    usable = solution is not None and not any(finding.fatal for finding in findings)
+    written = _write(options.out, solution, problem, bundle, findings) if usable and solution is not None else ""
+    if solution is not None and options.pictures:
+        _draw(options.out.with_name(f"{options.out.stem}-residuals.png"), solution)
+    report = report_of(solution, findings, bundle.optics.mirror.analysis_radius_mm)
+    report |= {"out": str(options.out) if usable else None, "hash": written or None, "timing_s": timing}
+    print(json.dumps(report) if options.as_json else "\n".join(lines_of(report)))
+    if not usable:
+        print(f"calibrate: rejected; {options.out} is not written, the old geometry stays in force", file=sys.stderr)
+    return Exit.DONE if usable else Exit.REJECTED
+
+
+def freed(texts: Sequence[str]) -> dict[str, float]:
+    """`--free NAME[=SIGMA]` as sigmas. Raises InputError."""
+    out = {}
+    for text in texts:
+        name, _, amount = text.partition("=")
+        if name not in NAMES:
+            raise InputError(f"--free {text}: {name} is not a parameter; known are {', '.join(NAMES)}")
+        try:
+            out[name] = float(amount) if amount else usual_sigma(name)
+        except ValueError:
+            raise InputError(f"--free {text}: {amount} is not a number") from None
+        if not (math.isfinite(out[name]) and out[name] >= 0):
+            raise InputError(f"--free {text}: a sigma is 0 (hold it) or more")
+    return out
+
+
+def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: float | None = None) -> Bundle:
+    """Read capture sets and their phases.
+
+    Raises
+    ------
+    InputError
+        For a set that is none, or that says it is of another rig than the first.
+    RejectedError
+        For a set that gives no figure.
+    """
+    figures = Figures(None if geometry is None else file.read_geometry(geometry))
+    if len(set(folders)) < len(folders):
+        raise InputError(f"{next(f for f in folders if list(folders).count(f) > 1)}: given twice")
+    sets: list[residuals.SetPhases] = []
+    benches: list[OpticsConfig] = []
+    notes: list[str] = []
+    for folder in folders:
+        figure = figures.of(folder)
+        benches.append(figure.head.optics)
+        _same_rig(folders[0], benches[0], folder, benches[-1])
+        sets.append(phases_of(folder.name, figure.checked, figure.head.optics))
+        files = figure.head.files
+        notes += [f"{folder.name}: {files[flag.frame]} left out: {flag.reason}" for flag in figure.checked.flags]
+        if sys.stderr.isatty():
+            print(f"\r{len(sets)} of {len(folders)} sets read", end="", file=sys.stderr)
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    reference_um = _reference_um(sets, benches, reference_um)
+    if not any(math.isfinite(phases.displacement_um) for phases in sets):
+        # no laser: the world's origin is the vertex of the first set
+        sets[0] = replace(sets[0], displacement_um=reference_um)
+    return Bundle(tuple(sets), benches[0], reference_um, tuple(notes))
+
+
+def with_priors(bundle: Bundle, priors: Sequence[prior_file.Prior]) -> Bundle:
+    """The sets with the bench as auxiliary calibrations have it. Raises InputError for another camera's."""
+    optics = bundle.optics
+    for prior in priors:
+        optics = prior.over(optics)
+    return replace(bundle, optics=optics)
+
+
+def _reference_um(
+    sets: Sequence[residuals.SetPhases], benches: Sequence[OpticsConfig], known_um: float | None
+) -> float:
+    """Reading at which the vertex is the world's origin: what all sets state, else as known, else the first there is.
+
+    A set that states none has its own first reading there: then the sets differ.
+    """
+    stated = {bench.geometry.reference_displacement_um for bench in benches}
+    if len(stated) == 1 and (reference_um := stated.pop()) is not None:
+        return reference_um
+    if known_um is not None:
+        return known_um
+    return next((phases.displacement_um for phases in sets if math.isfinite(phases.displacement_um)), 0.0)
+
+
+def _same_rig(first: Path, optics: OpticsConfig, folder: Path, other: OpticsConfig) -> None:
+    for section in ("camera", "mirror", "pattern", "geometry"):
+        ours, theirs = getattr(optics, section), getattr(other, section)
+        for field in type(ours).model_fields:
+            if field in ("reference_displacement_um", "steps", "noise_adu"):
+                continue
+            if getattr(ours, field) != getattr(theirs, field):
+                raise InputError(
+                    f"{folder / 'capture.toml'}: {section}.{field}: not that of {first}; "
+                    "sets of one calibration are of one rig"
+                )
+
+
+def stated_sigmas(stated: GeometryConfig) -> dict[str, float]:
+    """Those of the hand's measurements that are stated."""
+    given = {"a_mm": stated.a_sigma_mm, "b_mm": stated.b_sigma_mm, "alpha_deg": stated.alpha_sigma_deg}
+    return {name: sigma for name, sigma in given.items() if sigma is not None}
+
+
+def problem_of(bundle: Bundle, free: dict[str, float], laser_sigma_um: float) -> Problem:
+    """The stated bench with its sigmas. Raises InputError for a geometry that cannot be calibrated."""
+    own = stated_sigmas(bundle.optics.geometry)
+    try:
+        geometry = Geometry.from_config(bundle.optics)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    witness = separable.Witness(bundle.reference_um, laser_sigma_um)
+    if sum(math.isfinite(phases.displacement_um) for phases in bundle.sets) < 2:
+        own[LASER.name] = 0.0  # a scale of nothing
+    return Problem(geometry, bundle.sets, sigmas({**own, **free}), witness, bundle.optics.mirror.radius_mm)
+
+
+def _write(
+    path: Path, solution: Solution, problem: Problem, bundle: Bundle, findings: Sequence[verdict.Finding]
+) -> str:
+    """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
+    slopes = [slope_residual(solution, phases, k) for k, phases in enumerate(problem.sets)]
+    noises = [_noise_urad(solution, phases, k) for k, phases in enumerate(problem.sets)]
+    origin = artefact.Origin(
+        date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        sets=tuple(phases.name for phases in problem.sets),
+        screen_residual_um=1e3 * float(np.median([each.residual_rms_mm for each in solution.equations])),
+        slope_residual_urad=1e6 * float(np.median(slopes)),
+        slope_noise_urad=float(np.median(noises)),
+        condition=propagate.condition_number(solution),
+        notes=tuple(finding.says for finding in findings),
+    )
+    tables = artefact.tables_of(solution, bundle.optics, origin)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text_atomic(users(path), tomli_w.dumps(tables))  # never half a geometry
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+    return str(tables["calibration"]["hash"])
+
+
+def _noise_urad(solution: Solution, phases: residuals.SetPhases, index: int) -> float:
+    sigma_mm = float(np.sqrt(np.mean(phases.sigma_mm**2)))
+    return drift.noise_urad(solution.bench.geometry, solution.states[index].surface, sigma_mm)
+
+
+def _draw(path: Path, solution: Solution) -> None:
+    """The residuals' maps, also of a solution that is refused: there they are wanted most."""
+    from membrane_ctrl.calibration.report import draw_residuals
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draw_residuals(path, solution)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def _progress() -> Any:
+    """A line that counts, on a terminal only."""
+    if not sys.stderr.isatty():
+        return None
+    return lambda count, change: print(f"step {count}: {change:.2g} sigma", file=sys.stderr)

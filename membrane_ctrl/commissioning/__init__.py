@@ -1,0 +1,1 @@
+"""Commands about devices: check, devices, conformance, safe."""

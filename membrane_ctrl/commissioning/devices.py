@@ -1,0 +1,121 @@
+"""`devices`: what is plugged into this machine, with the text to paste into a configuration."""
+
+import asyncio
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from rich.markup import escape
+from rich.table import Table
+
+from firmware_iface import conformance, roles
+from firmware_iface.links import aravis
+from firmware_iface.links.usb_ports import serial_ports
+from membrane_ctrl.instruments.device_lock import locked, modbus_names
+from membrane_ctrl.model import errors, terminal
+
+_DRM = Path("/sys/class/drm")
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """One thing that is there.
+
+    Attributes
+    ----------
+    kind : str
+        "port", "camera" or "display".
+    name : str
+        What it says it is.
+    paste : str
+        The line of a configuration that names it; empty when none does.
+    """
+
+    kind: str
+    name: str
+    paste: str = ""
+
+
+def list_devices(as_json: bool) -> int:
+    """Print everything that was found, and what could not be looked for."""
+    cameras, missing = find_cameras()
+    found = [*find_ports(), *cameras, *find_displays()]
+    if as_json:
+        listed = [asdict(device) for device in found]
+        print(json.dumps({"schema": "membrane-devices/1", "devices": listed, "notes": missing}))
+        return errors.Exit.DONE
+    table = Table("kind", "name", "to paste")
+    for device in found:
+        table.add_row(device.kind, escape(device.name), escape(device.paste))
+    console = terminal.table_console()
+    console.print(table if found else "nothing found: no serial port, camera or display")
+    for note in missing:
+        console.print(escape(note))
+    return errors.Exit.DONE
+
+
+def find_ports() -> list[Found]:
+    """Serial ports; by their USB identity where they have one, since that survives a replug."""
+    return [
+        Found("port", f"{port.path}: {port.description}", f'port = "{port.usb_name or port.path}"')
+        for port in serial_ports()
+    ]
+
+
+def find_cameras() -> tuple[list[Found], list[str]]:
+    """GenICam cameras, and a note when they cannot be looked for."""
+    try:
+        cameras = list(aravis.find_cameras())
+    except roles.LinkError as error:
+        return [], [str(error)]
+    return [
+        Found("camera", f"{camera.vendor} {camera.model}", f'camera = "{camera.camera_id}"') for camera in cameras
+    ], []
+
+
+def find_displays(root: Path = _DRM) -> list[Found]:
+    """Connected displays, as the kernel knows them: works without a running desktop."""
+    found = []
+    for status in sorted(root.glob("card*-*/status")):
+        if status.read_text(encoding="ascii").strip() != "connected":
+            continue
+        connector = status.parent.name.split("-", 1)[1]
+        modes = (status.parent / "modes").read_text(encoding="ascii").split()
+        size = modes[0] if modes else "size unknown"
+        width, _, height = size.partition("x")
+        paste = f"width_px = {width}\nheight_px = {height}" if width.isdigit() and height.isdigit() else ""
+        found.append(Found("display", f"{connector}, {size}", paste))
+    return found
+
+
+# `conformance`: whether a board may be trusted with the pump.
+
+
+def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
+    """Test and report; the exit code is that of a rejected measurement when the board fails.
+
+    Raises
+    ------
+    InputError
+        The URL is none.
+    DeviceError
+        The board is not there, went away, or is another program's.
+    """
+    try:
+        with locked(modbus_names(url, unit_id)):
+            findings = asyncio.run(conformance.examine(url, unit_id))
+    except ValueError as error:
+        raise errors.InputError(str(error)) from None
+    except roles.LinkError as error:
+        raise errors.DeviceError(str(error)) from None
+    passed = not any(finding.problem for finding in findings)
+    if as_json:
+        checks = [asdict(finding) for finding in findings]
+        print(json.dumps({"schema": "membrane-conformance/1", "board": url, "passed": passed, "checks": checks}))
+    else:
+        table = Table("check", "result", "docs/firmware.md")
+        for finding in findings:
+            table.add_row(finding.check, escape(finding.problem) or "passed", finding.section)
+        terminal.table_console().print(table)
+        terminal.table_console().print("conforms" if passed else "does not conform: do not let it run a pump")
+    return errors.Exit.DONE if passed else errors.Exit.REJECTED

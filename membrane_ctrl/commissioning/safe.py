@@ -1,0 +1,179 @@
+"""`safe`: stops the pump, whoever runs it, and keeps it stopped until a person says otherwise.
+
+For a person in doubt, and for `ExecStopPost`. It works when the control process is long dead or hangs, and takes
+nothing away from who holds the devices: it neither claims them, nor arms a watchdog, nor opens a sensor.
+"""
+
+import asyncio
+import getpass
+import math
+import sys
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from firmware_iface.drivers.pump_board import PumpBoard
+from firmware_iface.roles import BenchReading, LinkError
+from membrane_ctrl.config.devices import DevicesConfig
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.control_port import client, unix
+from membrane_ctrl.instruments import bench, device_lock
+from membrane_ctrl.model.errors import DeviceError, Exit, InputError
+from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile
+
+_CAUSE = "made safe by hand"
+_REMEDY = "see with whoever made it safe that the mirror may move"
+_LOOK_S = 0.1
+_LAPSE_S = 1.0  # after a watchdog period: a pump that still runs is not going to be stopped by the board
+
+
+def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: bool = True) -> int:
+    """Stop the pump; the vent stays as it is.
+
+    Parameters
+    ----------
+    config : Config
+        Whose devices are stopped.
+    source : str
+        Where it came from, for messages.
+    logs_dir : Path, optional
+        The folder of the runs, if it is not the configuration's.
+    latch : bool
+        Keep everybody from running the pump again until a person clears it: at the board, at a running hold and for
+        the next one. Without, a program that has the devices is left alone.
+
+    Raises
+    ------
+    InputError
+        The configuration names no devices.
+    DeviceError
+        The pump could not be stopped, or not be kept so.
+    """
+    if config.devices is None:
+        raise InputError(f"{source}: devices: missing; there is nothing to make safe")
+    if not latch:
+        with device_lock.locked(device_lock.device_names(config.devices)):
+            print(asyncio.run(_after_a_run(config.devices)), file=sys.stderr)
+        return Exit.DONE
+    folder = logs_dir or Path(config.recording.logs_dir)
+    stopped = _tried(config.devices)
+    told = _hold_told(config, folder)
+    if not stopped.lasts:  # the hold may have commanded it again before it was told
+        stopped = _tried(config.devices)
+    if stopped.problem and not told:
+        raise DeviceError(f"{stopped.problem}; cut the pump's power if it runs")
+    for line in (stopped.words, told):
+        if line:
+            print(line, file=sys.stderr)
+    _keep(LatchedFile(folder))
+    return Exit.DONE
+
+
+@dataclass(frozen=True, slots=True)
+class _Stopped:
+    """What became of the pump; `lasts` if the board itself keeps it stopped."""
+
+    words: str = ""
+    problem: str = ""
+    lasts: bool = False
+
+
+def _tried(devices: DevicesConfig) -> _Stopped:
+    try:
+        return asyncio.run(_stop(devices))
+    except DeviceError as error:
+        return _Stopped(problem=str(error))
+
+
+async def _stop(devices: DevicesConfig) -> _Stopped:
+    """Stop the pump at the device. Raises DeviceError."""
+    if devices.board is None:
+        return await _stop_instrument(devices)
+    board = bench.pump_board(devices, devices.board)
+    try:
+        identity = await bench.patiently(board.identify, devices.board)
+        await board.stop()
+        reading = await board.read()
+    except LinkError as error:
+        raise DeviceError(str(error)) from None
+    finally:
+        await board.close()
+    return _Stopped(_words(devices, reading), lasts=identity.map_version > 1)
+
+
+async def _stop_instrument(devices: DevicesConfig) -> _Stopped:
+    """The pump alone: a laser that is unplugged must not keep it running."""
+    pump = bench.role_devices(devices).pump
+    try:
+        await bench.patiently(pump.open, "pump")
+        await pump.set_pump(0.0)
+        fraction = await pump.pump_fraction()
+    except LinkError as error:
+        raise DeviceError(f"pump: {error}") from None
+    finally:
+        await pump.close()
+    return _Stopped(f"{devices.name}: pump {fraction:g}")
+
+
+def _words(devices: DevicesConfig, reading: BenchReading) -> str:
+    latched = f", faults latched {reading.latched_faults:#x}" if reading.latched_faults else ""
+    return f"{devices.name}: pump {reading.pump_fraction:g}, vent {reading.vent_fraction:.2f}{latched}"
+
+
+async def _after_a_run(devices: DevicesConfig) -> str:
+    """See to it that the pump stands after a hold has ended, without a latch that would keep the next one down.
+
+    A hold that was killed leaves the pump to the board's watchdog, which is waited for. Raises DeviceError.
+    """
+    if devices.board is None:
+        return (await _stop_instrument(devices)).words
+    board = bench.pump_board(devices, devices.board)
+    try:
+        identity = await bench.patiently(board.identify, devices.board)
+        if identity.map_version == 1:
+            await board.stop()
+        return _words(devices, await _standing(board, devices.watchdog_s))
+    except LinkError as error:
+        raise DeviceError(f"{error}; the board's watchdog stops the pump by itself") from None
+    finally:
+        await board.close()
+
+
+async def _standing(board: PumpBoard, watchdog_s: float) -> BenchReading:
+    """The reading of a pump that stands; one that runs on beyond the watchdog is stopped, which latches."""
+    for _ in range(math.ceil((watchdog_s + _LAPSE_S) / _LOOK_S)):
+        if (reading := await board.read()).pump_fraction == 0.0:
+            return reading
+        await asyncio.sleep(_LOOK_S)
+    await board.stop()
+    return await board.read()
+
+
+def _hold_told(config: Config, folder: Path) -> str:
+    """Have a running hold latch; what came of it, empty if none answers."""
+    path = Path(config.port.socket) if config.port.socket else folder / unix.SOCKET_NAME
+    if not config.port.enabled or not path.exists():
+        return ""
+    try:
+        with client.PortClient.unix(path, notice=lambda _: None) as hold:
+            answer = hold.ask(do="latch", text=_CAUSE, why="membrane-ctrl safe")
+            run = str(hold.greeting.get("run", ""))
+    except DeviceError as error:
+        print(f"the running hold was not told: {error}", file=sys.stderr)
+        return ""
+    if not answer.get("ok"):
+        print(f"the running hold refused to latch: {answer.get('refused', '')}", file=sys.stderr)
+        return ""
+    return f"run {run}: latched, until `membrane-ctrl ctl ack`"
+
+
+def _keep(file: LatchedFile) -> None:
+    """No hold before a person clears it. Raises DeviceError."""
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    try:
+        file.path.parent.mkdir(parents=True, exist_ok=True)
+        file.add(LatchedFault("locked", _CAUSE, f"by {getpass.getuser()}", _REMEDY, now, "none"))
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise DeviceError(f"{file.path}: the pump is stopped, but this could not be written ({reason})") from None
+    print(f"{file.path}: no hold before `membrane-ctrl hold --clear-faults` or `ctl ack`", file=sys.stderr)

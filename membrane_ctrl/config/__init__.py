@@ -1,0 +1,1 @@
+"""The configuration: its tables, and the TOML file it comes from."""

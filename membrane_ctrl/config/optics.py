@@ -1,0 +1,139 @@
+"""The tables `[devices.camera]` and `[devices.screen]` of the configuration."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from membrane_ctrl.config.section import Section
+
+
+class AravisCamera(Section):
+    """A GenICam camera (USB3 Vision or GigE Vision)."""
+
+    driver: Literal["aravis"]
+    camera: str = ""  # as `devices` lists it, or its address; empty: the first that is found
+    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16", "BayerRG8", "BayerGR8", "BayerGB8", "BayerBG8"] = (
+        "Mono8"
+    )
+    exposure_ms: Annotated[float, Field(gt=0, le=10_000)] = 20.0
+    gain_db: Annotated[float, Field(ge=0, le=48)] = 0.0
+    packet_bytes: Annotated[int, Field(ge=0, le=65_000)] = 0  # GigE Vision; 0: as the camera and the network agree
+    timeout_s: Annotated[float, Field(gt=0, le=60)] = 1.0
+
+    @property
+    def bits(self) -> int:
+        """Depth of a pixel."""
+        return int(self.pixel_format[-2:]) if self.pixel_format[-2:].isdigit() else 8
+
+
+class UvcCamera(Section):
+    """A USB camera without GenICam."""
+
+    driver: Literal["uvc"]
+    port: str = "0"
+    exposure: Annotated[float, Field(ge=0)] = 0.0  # in the camera's own unit; 0 leaves it
+    gain: Annotated[float, Field(ge=0)] = 0.0
+    bits: Literal[8] = 8
+
+
+class FolderCamera(Section):
+    """Pictures from a folder instead of a camera and a screen."""
+
+    driver: Literal["folder"]
+    folder: Annotated[str, Field(min_length=1)]
+
+
+class PygameScreen(Section):
+    """The display with the fringes."""
+
+    driver: Literal["pygame"] = "pygame"
+    display: Annotated[int, Field(ge=0, le=15)] = 0
+    width_px: Annotated[int, Field(ge=16, le=16_384)]
+    height_px: Annotated[int, Field(ge=16, le=16_384)]
+    pixel_mm: Annotated[float, Field(gt=0.01, le=10)]
+    centre_px: tuple[float, float] | None = None  # (column, row) of O'; the screen's middle when absent
+    settle_ms: Annotated[float, Field(ge=0, le=5000)] | None = None  # measured at the start when absent
+    linearise: bool = True  # measure the display's response at the start and correct it
+    self_test: bool = True  # exposure and checkerboard at the start
+
+
+CameraTable = Annotated[AravisCamera | UvcCamera | FolderCamera, Field(discriminator="driver")]
+ScreenTable = PygameScreen
+
+
+# The screen in the configuration: its pose, and how its face stands off a plane.
+
+
+Vector3 = tuple[float, float, float]
+Axis = Annotated[tuple[float, ...], Field(min_length=2, max_length=500)]
+
+_EVEN = 1e-6  # of the distance of two nodes: rounding of written decimals
+_SQUARE = 1e-6  # of two unit vectors: what rounding to seven digits leaves
+
+
+class HeightMapConfig(Section):
+    """Heights of the face at the nodes of an even grid, towards the mirror; between them a bicubic spline.
+
+    `heights_mm[r][c]` belongs to `s_y_mm[r]` and `s_x_mm[c]`. With three nodes along an axis the spline is quadratic
+    there, with two linear. In a file, `file` may stand for `heights_mm`: a text of numbers, a row a line.
+    """
+
+    s_x_mm: Axis
+    s_y_mm: Axis
+    heights_mm: tuple[Axis, ...]
+
+    @model_validator(mode="after")
+    def _grid(self) -> HeightMapConfig:
+        for name, axis in (("s_x_mm", self.s_x_mm), ("s_y_mm", self.s_y_mm)):
+            steps = np.diff(axis)
+            if not (steps[0] > 0 and np.ptp(steps) <= _EVEN * steps[0]):
+                raise ValueError(f"{name} must rise in even steps")
+        rows, columns = len(self.s_y_mm), len(self.s_x_mm)
+        if len(self.heights_mm) != rows or any(len(row) != columns for row in self.heights_mm):
+            shape = f"{len(self.heights_mm)} rows of {', '.join(sorted({str(len(row)) for row in self.heights_mm}))}"
+            raise ValueError(f"heights_mm has {shape} numbers, s_y_mm and s_x_mm ask for {rows} rows of {columns}")
+        if np.abs(self.heights_mm).max() > 100:  # a screen is not that crooked: micrometres taken for millimetres?
+            raise ValueError("heights_mm has a height beyond 100 mm")
+        return self
+
+
+class ScreenPoseConfig(Section):
+    """Any screen pose, O' in world and the unit vectors of `s_x` and `s_y`, and its face; both may be left out.
+
+    The face stands off the plane, along s_x x s_y, which points at the mirror, by the bow, a paraboloid given by its
+    height 200 mm from O', plus the height map.
+    """
+
+    origin_mm: Vector3 | None = None
+    s_x: Vector3 | None = None
+    s_y: Vector3 | None = None
+    bow_mm: Annotated[float, Field(ge=-100, le=100)] = 0.0
+    height_map: HeightMapConfig | None = None
+
+    @property
+    def pose(self) -> tuple[Vector3, Vector3, Vector3] | None:
+        """Origin, s_x and s_y; None if the short form gives them."""
+        if self.origin_mm is None or self.s_x is None or self.s_y is None:
+            return None
+        return self.origin_mm, self.s_x, self.s_y
+
+    @model_validator(mode="after")
+    def _whole(self) -> ScreenPoseConfig:
+        given = [value is not None for value in (self.origin_mm, self.s_x, self.s_y)]
+        if any(given) and not all(given):
+            raise ValueError("origin_mm, s_x and s_y belong together: give all or none")
+        if self.s_x is not None and self.s_y is not None:
+            axes = np.array([self.s_x, self.s_y])
+            if not np.allclose(axes @ axes.T, np.eye(2), atol=_SQUARE):
+                raise ValueError("s_x and s_y are not two unit vectors at a right angle")
+        return self
+
+    def covers(self, half_side_mm: float) -> bool:
+        """Whether the height map, if there is one, reaches over the pattern."""
+        if self.height_map is None:
+            return True
+        axes = (self.height_map.s_x_mm, self.height_map.s_y_mm)
+        return all(axis[0] <= -half_side_mm and axis[-1] >= half_side_mm for axis in axes)

@@ -1,0 +1,298 @@
+"""The whole configuration: frozen, validated, unit-suffixed, one TOML file.
+
+Every field that holds a quantity ends in its unit. Values outside the range a real bench could have are
+refused, so that a wrong unit (metres for millimetres) is seen when the file is read and not at the mirror.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from membrane_ctrl.config.devices import DevicesConfig
+from membrane_ctrl.config.optics import AravisCamera, ScreenPoseConfig, UvcCamera
+from membrane_ctrl.config.port import AlarmsConfig, PortConfig
+from membrane_ctrl.config.section import Section
+
+Positive = Annotated[float, Field(gt=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Vector3 = tuple[float, float, float]
+
+
+class LoopConfig(Section):
+    """The inner loop. The manipulated value is the pump's flow as a speed of the mirror's centre."""
+
+    rate_hz: Annotated[float, Field(ge=1, le=200)] = 50.0
+    setpoint_um: float = 0.0
+    # SIMC PI with the closed-loop time constant chosen for least predicted variance (PHYSICS, inner loop)
+    kp_per_s: Annotated[float, Field(ge=0, le=20)] = 0.61
+    ti_s: Annotated[float, Field(gt=0.05, le=3600)] = 6.5
+    td_s: Annotated[float, Field(ge=0, le=10)] = 0.0
+    setpoint_weight: Fraction = 1.0  # the setpoint only ever ramps, with its speed fed forward
+    measurement_filter_s: Annotated[float, Field(ge=0, le=10)] = 0.2
+    flow_max_um_per_s: Annotated[float, Field(gt=0, le=100)] = 5.3
+    flow_rate_limit_um_per_s2: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    setpoint_ramp_um_per_s: Annotated[float, Field(gt=0, le=100)] = 3.5
+    feedforward_barometer: bool = True
+    feedforward_temperature: bool = True
+    barometer_gain_um_per_pa: Annotated[float, Field(ge=-10, le=10)] = -0.358
+    temperature_gain_um_per_k: Annotated[float, Field(ge=-2000, le=2000)] = 123.0
+    gas_follows_air_s: Annotated[float, Field(ge=0, le=3600)] = 12.0
+    feedforward_filter_s: Annotated[float, Field(ge=0, le=60)] = 0.2
+    bleed_fraction: Fraction = 0.0  # vent held this far open during hold, for a mirror that is too tight
+
+    @model_validator(mode="after")
+    def _filter_slower_than_tick(self) -> LoopConfig:
+        if 0 < self.measurement_filter_s < 0.5 / self.rate_hz:
+            raise ValueError("measurement_filter_s is shorter than half a tick: use 0 to switch it off")
+        return self
+
+
+class PumpConfig(Section):
+    """Flow of the pump against its command (PHYSICS: film and gas)."""
+
+    flow_full_um_per_s: Annotated[float, Field(gt=0, le=100)] = 5.3
+    dead_fraction: Fraction = 0.10
+    start_fraction: Fraction = 0.22
+    stall_fraction: Fraction = 0.15
+
+
+class LimitsConfig(Section):
+    """What the mirror must never leave."""
+
+    displacement_min_um: float = -2000.0
+    displacement_max_um: float = 500.0
+    gauge_pressure_max_pa: Annotated[float, Field(gt=0, le=5000)] = 750.0
+    stale_s: Annotated[float, Field(gt=0, le=10)] = 0.3
+    # a film is never still: a reading equal to the last bit for so long comes from a sensor that has stopped
+    stuck_s: Annotated[float, Field(gt=0, le=600)] = 5.0
+    lateness_max_ms: Annotated[float, Field(gt=0, le=10000)] = 100.0
+    step_max_um: Annotated[float, Field(gt=0, le=10000)] = 50.0  # a jump between two ticks that no film makes
+    # noise of 0.5 Pa on steps of 0.001 Pa never repeats so long, nor does a slow gauge that answers once a second; a
+    # gauge that filters its noise below its own resolution repeats itself on a held mirror, and needs more
+    gauge_stuck_s: Annotated[float, Field(gt=0, le=1e5)] = 20.0
+    # a slammed door (100 Pa) moves the film by 36 um, 2 Pa; a storm of 250 Pa by 5 Pa
+    gauge_step_max_pa: Annotated[float, Field(gt=0, le=5000)] = 30.0
+    # 20 um are 1 Pa: 30 sigma of a gauge's ten-second mean, 5 times what a mount at 2 um/min has in two minutes
+    laser_gauge_apart_max_um: Annotated[float, Field(gt=0, le=10000)] = 20.0
+    # over hours: a gauge's zero drifts by 1 Pa/K (20 um/K), a fresh film's creep is 31 um (control/film.py)
+    laser_gauge_drift_max_um: Annotated[float, Field(gt=0, le=10000)] = 100.0
+    # a leak that doubles is a leak; a film that takes more than this, seen by no camera, may be running away
+    leak_growth_max: Annotated[float, Field(gt=1, le=1000)] = 2.2
+    following_error_max_um: Annotated[float, Field(gt=0, le=10000)] = 60.0
+    band_um: Positive = 2.0
+
+
+class StatesConfig(Section):
+    """How long states and rungs may last."""
+
+    check_s: Annotated[float, Field(ge=0.1, le=600)] = 2.0  # of good readings before the pump may run
+    check_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
+    actuator_test: bool = True  # pump up, pump off, vent, before a hold: does the film answer?
+    inflate_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 14_400.0  # a fill from flat takes two hours
+    inflate_pause_um: Annotated[float, Field(gt=0, le=1e4)] = 10.0  # behind the ramp by this much: the ramp waits
+    settle_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.5  # inside the band before the state is `hold`
+    settle_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 600.0
+    # 10 s of laser loss cost 1.6 um on average (PHYSICS, inner loop); longer is no glitch
+    hold_flow_max_s: Annotated[float, Field(gt=0, le=600)] = 12.0
+    ramp_down_s: Annotated[float, Field(gt=0, le=600)] = 10.0
+    pump_off_max_s: Annotated[float, Field(gt=0, le=1e6)] = 3600.0
+    lower_timeout_s: Annotated[float, Field(gt=0, le=600)] = 3.0  # a pump commanded off is seen to stand by then
+    pause_max_s: Annotated[float, Field(gt=0, le=1e5)] = 600.0
+    manual_max_s: Annotated[float, Field(gt=0, le=1e5)] = 600.0  # since the last `manual`; then it is held again
+    manual_range_um: Annotated[float, Field(gt=0, le=1e4)] = 50.0  # and so it is further from the setpoint
+    vented_pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 100.0  # `vent` is done below this
+    latch_twin_faults: bool = False  # a trip of the simulated mirror keeps the next run down, as a real one does
+    stay_after_trip: bool = False  # wait in `fault` for `ctl ack` instead of ending the run
+
+
+class ResumeConfig(Section):
+    """Which latched faults may clear by themselves once their cause has gone."""
+
+    faults: tuple[str, ...] = ()
+    wait_s: Annotated[float, Field(ge=1, le=1e5)] = 30.0
+    most_per_day: Annotated[int, Field(ge=0, le=1000)] = 3
+
+
+class ShapeConfig(Section):
+    """The measurement cycle and the outer loop."""
+
+    enabled: bool = True
+    period_s: Annotated[float, Field(ge=0.2, le=3600)] = 2.0
+    frame_interval_s: Annotated[float, Field(ge=0.0, le=10)] = 0.1
+    bin_px: Annotated[int, Field(ge=1, le=16)] = 4
+    # a laser mount that sets off at 2 um/min is then followed within 0.5 um (control/filters.py)
+    time_constant_s: Annotated[float, Field(ge=1, le=1e5)] = 40.0
+    trim_rate_max_um_per_s: Annotated[float, Field(gt=0, le=10)] = 0.1
+    trim_max_um: Annotated[float, Field(gt=0, le=1000)] = 100.0
+    fresh_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
+    disagreement_max_um: Annotated[float, Field(gt=0, le=1000)] = 10.0
+
+
+class PatternConfig(Section):
+    """Fringes on the screen (INTERFACES section 2)."""
+
+    steps: Annotated[int, Field(ge=3, le=64)] = 4
+    periods: Annotated[int, Field(ge=1, le=8)] = 8
+    period_mm: Annotated[float, Field(ge=1, le=2000)] = 49.82
+
+
+class CameraPoseConfig(Section):
+    """Any camera pose: pinhole in world; rotation rows are the camera's x right, y down, z forward in world."""
+
+    position_mm: Vector3
+    rotation: tuple[Vector3, Vector3, Vector3]
+
+    @model_validator(mode="after")
+    def _is_rotation(self) -> CameraPoseConfig:
+        rows = np.array(self.rotation)
+        # 1e-6: what rounding to seven digits leaves
+        if not np.allclose(rows @ rows.T, np.eye(3), atol=1e-6) or np.linalg.det(rows) < 0:
+            raise ValueError("rotation is not a rotation (rows: right, down, forward in world)")
+        return self
+
+
+class GeometryConfig(Section):
+    """Camera and screen: the paper's a, b, alpha, or two general poses (INTERFACES section 1).
+
+    Either form may say in `screen` how the screen's face stands off its plane.
+    """
+
+    a_mm: Annotated[float, Field(ge=100, le=100_000)] | None = None
+    b_mm: Annotated[float, Field(ge=100, le=100_000)] | None = None
+    alpha_deg: Annotated[float, Field(gt=0, lt=180)] | None = None
+    a_sigma_mm: Annotated[float, Field(ge=0)] | None = None
+    b_sigma_mm: Annotated[float, Field(ge=0)] | None = None
+    alpha_sigma_deg: Annotated[float, Field(ge=0)] | None = None
+    reference_displacement_um: float | None = None
+    camera: CameraPoseConfig | None = None
+    screen: ScreenPoseConfig | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> GeometryConfig:
+        short = (self.a_mm, self.b_mm, self.alpha_deg)
+        general = (self.camera, None if self.screen is None else self.screen.pose)
+        if all(v is not None for v in short) and all(v is None for v in general):
+            return self
+        if all(v is None for v in short) and all(v is not None for v in general):
+            return self
+        raise ValueError("give either a_mm, b_mm and alpha_deg, or both [camera] and [screen] poses")
+
+
+class CameraConfig(Section):
+    """Sensor and lens."""
+
+    width_px: Annotated[int, Field(ge=8, le=20_000)] = 2448
+    height_px: Annotated[int, Field(ge=8, le=20_000)] = 2048
+    focal_mm: Annotated[float, Field(ge=1, le=1000)] = 16.0
+    pixel_um: Annotated[float, Field(ge=0.5, le=500)] = 3.45
+    principal_px: tuple[float, float] | None = None  # (column, row); the sensor's middle when absent
+    distortion: tuple[float, ...] = ()  # OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]
+    noise_adu: Annotated[float, Field(ge=0)] = 0.4
+    bits: Annotated[int, Field(ge=8, le=16)] = 8
+
+    @property
+    def principal(self) -> tuple[float, float]:
+        """Principal point as (column, row) in pixels."""
+        return self.principal_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
+
+
+class MirrorConfig(Section):
+    """The film's rim and the part of it that is measured."""
+
+    radius_mm: Annotated[float, Field(ge=10, le=50_000)] = 500.0
+    analysis_radius_mm: Annotated[float, Field(ge=10, le=50_000)] = 475.0
+    sag_mm: Annotated[float, Field(ge=0.1, le=10_000)] = 37.1  # depth of the bowl at displacement 0
+    pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 600.0  # and the gauge's reading there; 0: not known
+
+    @model_validator(mode="after")
+    def _inside(self) -> MirrorConfig:
+        if self.analysis_radius_mm > self.radius_mm:
+            raise ValueError("analysis_radius_mm is larger than radius_mm")
+        return self
+
+
+class OpticsConfig(Section):
+    """Everything the deflectometry must know of the bench."""
+
+    geometry: GeometryConfig = GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9)
+    camera: CameraConfig = CameraConfig()
+    pattern: PatternConfig = PatternConfig()
+    mirror: MirrorConfig = MirrorConfig()
+    geometry_file: Path | None = None  # of `calibrate`: used instead of `geometry` (a path from the file's folder)
+
+    @model_validator(mode="after")
+    def _map_covers_pattern(self) -> OpticsConfig:
+        half_mm = self.pattern.periods * self.pattern.period_mm / 2
+        if self.geometry.screen is not None and not self.geometry.screen.covers(half_mm):
+            raise ValueError(
+                f"geometry.screen.height_map must reach over the pattern, {half_mm:g} mm from O' each way"
+            )
+        return self
+
+
+class TwinConfig(Section):
+    """The simulated bench. Numbers are PHYSICS' (assumed) ones unless the file says otherwise."""
+
+    port: Annotated[int, Field(ge=0, le=65535)] = 5020  # 0: any free one
+    scenario: Literal["calm", "quiet", "typical", "gusty"] = "typical"
+    seed: Annotated[int, Field(ge=0)] = 1
+    from_flat: bool = False
+    start_error_um: Annotated[float, Field(ge=-500, le=500)] = -25.0
+    laser_noise_um: Annotated[float, Field(ge=0, le=100)] = 1.0
+    laser_resolution_um: Annotated[float, Field(ge=0, le=100)] = 0.1
+    laser_drift_um_per_min: Annotated[float, Field(ge=-1000, le=1000)] = 0.0
+    leak_time_constant_s: Annotated[float, Field(ge=10, le=1e8)] = 1.0e4
+    barometer_noise_pa: Annotated[float, Field(ge=0, le=100)] = 0.05
+    thermometer_noise_k: Annotated[float, Field(ge=0, le=10)] = 0.002
+    geometry: GeometryConfig | None = None  # where camera and screen really stand; none: as [optics.geometry] states
+
+
+class RecordingConfig(Section):
+    """Where runs go and what they hold."""
+
+    logs_dir: str = "logs"
+    min_free_mb: Annotated[float, Field(ge=1)] = 500.0
+    thumbnails: bool = True
+    raw_every_cycles: Annotated[int, Field(ge=0, le=1_000_000)] = 0  # keep the frames of every n-th cycle; 0: of none
+    raw_before_fault_cycles: Annotated[int, Field(ge=0, le=20)] = 2  # and always of the last before a fault
+    segment_s: Annotated[float, Field(ge=10, le=86_400)] = 3600.0  # a crash leaves at most this much unoptimised
+    quiet_hz: Annotated[float, Field(ge=0.1, le=200)] = 2.0  # rows for the viewer while nothing happens
+    keep_gb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None  # old runs beyond this are deleted; none: never
+    keep_days: Annotated[float, Field(ge=0.1, le=1e5)] | None = None
+
+
+class Config(Section):
+    """The whole configuration of a run."""
+
+    loop: LoopConfig = LoopConfig()
+    pump: PumpConfig = PumpConfig()
+    limits: LimitsConfig = LimitsConfig()
+    states: StatesConfig = StatesConfig()
+    resume: ResumeConfig = ResumeConfig()
+    shape: ShapeConfig = ShapeConfig()
+    optics: OpticsConfig = OpticsConfig()
+    devices: DevicesConfig | None = None
+    twin: TwinConfig = TwinConfig()
+    recording: RecordingConfig = RecordingConfig()
+    port: PortConfig = PortConfig()
+    alarms: AlarmsConfig = AlarmsConfig()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Config:
+        limits = self.limits
+        if limits.displacement_min_um >= limits.displacement_max_um:
+            raise ValueError("limits.displacement_min_um must be below limits.displacement_max_um")
+        if not limits.displacement_min_um < self.loop.setpoint_um < limits.displacement_max_um:
+            raise ValueError(
+                f"loop.setpoint_um = {self.loop.setpoint_um:g} is outside the limits "
+                f"({limits.displacement_min_um:g} .. {limits.displacement_max_um:g} um)"
+            )
+        if self.devices is not None and isinstance(self.devices.camera, AravisCamera | UvcCamera):
+            bits = self.devices.camera.bits
+            if bits != self.optics.camera.bits:
+                raise ValueError(f"optics.camera.bits = {self.optics.camera.bits}, but devices.camera gives {bits}")
+        return self

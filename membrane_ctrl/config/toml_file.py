@@ -1,0 +1,201 @@
+"""The configuration's TOML file: read with errors a person can act on, written with every default spelled out."""
+
+import difflib
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import tomli_w
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.files import read_text
+
+Model = TypeVar("Model", bound=BaseModel)
+# A configuration with every default is 10 kB, a height map of 100 x 100 nodes 80 kB.
+_BYTES_MAX = 1_000_000
+# The parser takes time and memory by the square of the parts of a dotted key. No key of ours has more than four.
+_PARTS_MAX = 50
+_QUOTED_PART = re.compile(r"""["']\s*\.""")
+
+
+def load(path: Path, model: type[Model], follow: bool = True) -> Model:
+    """Read and validate a TOML file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    model : type
+        What it must hold (`config.Config` for a run).
+    follow : bool
+        The file is the user's own; False for one in a folder that may come from anywhere (`recording.atomic`).
+
+    Raises
+    ------
+    InputError
+        One line that names the file, the field and what would be right.
+    """
+    tables = read_toml(path, follow)
+    optics = tables.get("optics")
+    if isinstance(optics, dict):
+        with_height_map(optics.get("geometry"), path, follow)
+    return parse(tables, model, str(path))
+
+
+def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
+    """The tables of a TOML file. Raises InputError naming the file (and the line, if it is not TOML)."""
+    try:
+        text = read_text(path, _BYTES_MAX, follow=follow)
+        if any(map(_too_many_parts, text.splitlines())):
+            raise InputError(f"{path}: not valid TOML: a key of more than {_PARTS_MAX} parts")
+        return tomllib.loads(text)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder, a TOML file is needed") from None
+    except PermissionError:
+        raise InputError(f"{path}: no permission to read it") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({_small(error.strerror or str(error))})") from None
+    except RecursionError:
+        raise InputError(f"{path}: not valid TOML: nested too deep") from None
+    except ValueError as error:  # of TOML, of UTF-8, of a number with thousands of digits
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+
+
+def _small(text: str) -> str:
+    """The text within a sentence."""
+    return text[:1].lower() + text[1:]
+
+
+def _too_many_parts(line: str) -> bool:
+    """Whether a line may hold such a key: too many dots between commas, which stand in a key only if it is quoted."""
+    if line.count(".") <= _PARTS_MAX or line.lstrip().startswith("#"):
+        return False
+    dots = max(piece.count(".") for piece in line.split(","))
+    return dots > _PARTS_MAX or len(_QUOTED_PART.findall(line)) > _PARTS_MAX
+
+
+def with_height_map(geometry: Any, where: Path, follow: bool = True) -> None:
+    """Put the numbers of `screen.height_map.file` in its place, in the tables of a geometry that came from `where`.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or if it holds anything but rows of numbers.
+    """
+    screen = geometry.get("screen") if isinstance(geometry, dict) else None
+    table = screen.get("height_map") if isinstance(screen, dict) else None
+    if not isinstance(table, dict) or "file" not in table:
+        return
+    field = f"{where}: geometry.screen.height_map.file"
+    if "heights_mm" in table:
+        raise InputError(f"{field}: give either the file or heights_mm")
+    path = where.parent / str(table.pop("file"))
+    if not follow and path.parent != where.parent:
+        raise InputError(f"{field}: {path}: not beside {where.name}")
+    try:
+        lines = read_text(path, follow=follow).replace(",", " ").splitlines()
+        rows = [[float(word) for word in line.split("#")[0].split()] for line in lines]
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise InputError(f"{field}: {path}: {reason}") from None
+    table["heights_mm"] = [row for row in rows if row]
+
+
+def parse(tables: dict[str, Any], model: type[Model], where: str) -> Model:
+    """Validate tables that came from `where`. Raises InputError like `load`."""
+    try:
+        return model.model_validate(tables)
+    except ValidationError as error:
+        raise InputError(f"{where}: {describe(_telling(error.errors()), model)}") from None
+
+
+def prune(table: dict[str, Any], model: type[BaseModel], prefix: str = "") -> tuple[str, ...]:
+    """Take out keys that are not known, so that a newer writer's sets are read; returns their names."""
+    ignored: list[str] = []
+    known = {(field.alias or name): field.annotation for name, field in model.model_fields.items()}
+    for key in list(table):
+        if key not in known:
+            del table[key]
+            ignored.append(prefix + key)
+            continue
+        nested = [t for t in (known[key], *get_args(known[key])) if isinstance(t, type) and issubclass(t, BaseModel)]
+        inner = table[key] if isinstance(table[key], list) else [table[key]]
+        for item in inner:
+            if nested and isinstance(item, dict):
+                ignored += prune(item, nested[0], f"{prefix}{key}.")
+    return tuple(dict.fromkeys(ignored))
+
+
+def dump(config: BaseModel) -> str:
+    """TOML text of a configuration, every default written out; fields that are None are left out."""
+    return tomli_w.dumps(config.model_dump(mode="json", exclude_none=True))
+
+
+def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
+    """One line for a validation error: the field, what is wrong with it, and what would be right."""
+    path, parent = _walk(model, error["loc"])
+    field = ".".join(str(part) for part in path)
+    if error["type"] == "extra_forbidden":
+        return (
+            f"{field}: unknown key; {_hint(str(error['loc'][-1]), [] if parent is None else [*parent.model_fields])}"
+        )
+    if error["type"] == "union_tag_invalid":
+        tag, known = str(error["ctx"]["tag"]), re.findall(r"'([^']*)'", error["ctx"]["expected_tags"])
+        return f"{field}.driver: {tag!r} is not known here; {_hint(tag, known)}"
+    message = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "value_error":
+        return f"{field}: {message}" if field else message
+    value = error["input"]
+    shown = f" (it is {value!r})" if isinstance(value, (int, float, str, bool)) else ""
+    return f"{field}: {message[:1].lower()}{message[1:]}{shown}"
+
+
+def _hint(word: str, known: list[str]) -> str:
+    near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    return f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}" if known else "remove it"
+
+
+def _telling(errors: list[ErrorDetails]) -> ErrorDetails:
+    """The error that says most: a key that is not known is often the misspelt one that another error misses."""
+    misspelt = [error for error in errors if error["type"] == "extra_forbidden"]
+    return misspelt[0] if misspelt and errors[0]["type"] == "missing" else errors[0]
+
+
+def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[int | str], type[BaseModel] | None]:
+    """The path of a key as in the file, and the section that it is in; None if that is not known.
+
+    In a location, the tag of a union's member (`driver = "ventus"`) stands between the table and its key.
+    """
+    path: list[int | str] = []
+    inside: type[BaseModel] | None = model
+    members: list[type[BaseModel]] = []
+    for place, part in enumerate(location):
+        last = place + 1 == len(location)
+        if tagged := [m for m in members if part in _tags(m)]:
+            inside, members = tagged[0], []
+            continue
+        path.append(part)
+        if last or isinstance(part, int):
+            continue
+        field = None if inside is None else inside.model_fields.get(part)
+        members = [] if field is None else _sections(field.annotation)
+        inside = members[0] if members else None
+    return path, inside
+
+
+def _sections(annotation: Any) -> list[type[BaseModel]]:
+    """All sections that a field may hold."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [section for inner in get_args(annotation) for section in _sections(inner)]
+
+
+def _tags(section: type[BaseModel]) -> tuple[Any, ...]:
+    """Values of `driver` that mean this section."""
+    driver = section.model_fields.get("driver")
+    return () if driver is None else get_args(driver.annotation)

@@ -1,0 +1,229 @@
+"""The process that draws, so that the tick never waits for a terminal."""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+import os
+import signal
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import FrameType
+
+from rich.console import Console
+from rich.live import Live
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.console.model import Event, ScreenModel, View, text
+from membrane_ctrl.console.view import screen
+from membrane_ctrl.console.why import duration, number, percent
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.shape_estimate import unpack_estimate
+from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
+from membrane_ctrl.model.terminal import Plain
+from membrane_ctrl.processes import child, ring
+
+# The same for a log file: a line a second, and faults at once.
+
+
+_AT_ONCE = frozenset(
+    {"fault", "cleared", "state", "link", "child_ended", "child_silent", "child_restarted", "child_given_up", "end"}
+    | {"recorder_error", "disk_low", "recorder_recovered"}  # a disk that takes nothing does not take the event either
+)
+
+
+def line(view: View) -> str:
+    """The second in one line."""
+    row = view.row
+    if view.silent_s or row is None:
+        silent = f"control loop silent for {view.silent_s:.1f} s" if row else view.why
+        return f"{view.elapsed_s:9.1f} s  {silent}"
+    shape = view.shape
+    parts = [
+        f"{view.elapsed_s:9.1f} s  {view.state.name.lower():7}",
+        f"error {number(row.error_um, 2, sign=True):>7} um",
+        f"pump {percent(row.pump_fraction):>5}",
+        f"leak {number(row.leak_um_per_s, 2)} um/s" + (" TOO TIGHT" if view.too_tight else ""),
+        f"shape {_shape_words(view)} trim {number(shape.trim_um, 2, sign=True)} um",
+        f"late {number(row.lateness_ms, 1)} ms",
+        view.why,
+    ]
+    if view.recording:
+        parts.append(f"RECORDING {view.recording}")
+    if math.isfinite(view.left_s):
+        parts.append(f"{duration(view.left_s)} left")
+    return "  ".join(parts)
+
+
+def at_once(event: Event) -> bool:
+    """Whether nobody should have to wait a second for the event."""
+    kind = event.get("kind")
+    return kind in _AT_ONCE or (kind == "acquisition" and event.get("state") != "running")
+
+
+def event_line(event: Event) -> str:
+    """An event in one line."""
+    mono_s = event.get("mono_s", math.nan)
+    what = " ".join(str(event[key]) for key in ("state", "child", "exit") if key in event)
+    words = " ".join(f"{what} {text(event)}".split())  # one line, whatever an error said
+    remedy = f"; {event['remedy']}" if event.get("remedy") else ""
+    return f"{number(mono_s, 1):>9} s  {str(event.get('kind', '?')).upper()} {words}{remedy}".rstrip()
+
+
+def _shape_words(view: View) -> str:
+    shape = view.shape
+    if shape.estimate is None:
+        return shape.note or shape.state.name.lower()
+    return f"{shape.state.name.lower()} {shape.estimate.verdict} {duration(shape.age_s)}"
+
+
+_LOOK_S = 0.2  # as fast as a person reads changing figures
+_PLAIN_S = 1.0
+# A round takes some ms; a terminal that is stopped (Ctrl-S, a dead ssh) takes what is written to it for a while
+_HANGS_S = 15.0
+_ROW = struct.Struct(f"<{len(FIELDS)}d")
+
+
+@dataclass(frozen=True, slots=True)
+class ScreenSpec:
+    """What the screen needs to know of the run.
+
+    Attributes
+    ----------
+    clock : RunClock
+        The run's clock.
+    telemetry, events, shapes : RingAddress
+        What to show; `shapes` is None for a run without a camera.
+    run_dir : Path
+        Where the recording goes, for the person to find.
+    config : Config
+        The run's configuration.
+    duration_s : float or None
+        How long the run shall take.
+    since_s : float
+        What was told before this is not told again: there was another screen then.
+    """
+
+    clock: RunClock
+    telemetry: ring.RingAddress
+    events: ring.RingAddress
+    shapes: ring.RingAddress | None
+    run_dir: Path
+    config: Config
+    duration_s: float | None = None
+    since_s: float = -math.inf
+
+
+def screen_main(spec: ScreenSpec, status: Connection | None = None) -> None:
+    """Show the run on stderr until its "end" event, `processes.STOP`, or the death of the parent.
+
+    Target of a `spawn`ed process; over `status` it says that it is alive. SIGINT is left to the control process; the
+    terminal is given back in any case.
+    """
+    parent = multiprocessing.parent_process()  # who started it, even if that is gone by now
+    parent_pid = os.getppid() if parent is None or parent.pid is None else parent.pid
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(child.STOP, _leave)
+    report = child.reporter(status)
+    with closing(_Feed(spec)) as feed:
+
+        def rounds(show: Callable[[], object]) -> None:
+            while not feed.model.ended and os.getppid() == parent_pid:
+                show()
+                report(child.alive(_HANGS_S))
+                time.sleep(_LOOK_S)
+
+        try:
+            _draw(spec, feed, rounds)
+        except OSError:  # nobody reads any more: `2>&1 | head`, a terminal that was closed; another would see no more
+            rounds(feed.update)
+
+
+def _draw(spec: ScreenSpec, feed: _Feed, rounds: Callable[[Callable[[], object]], None]) -> None:
+    """Go on drawing as what stderr is can be drawn on. Raises OSError when it is closed."""
+    console = Console(stderr=True)
+    drawable = console.is_terminal and not console.is_dumb_terminal
+    with _live(console, spec, feed) if drawable else _plain(spec, feed) as show:
+        rounds(show)
+
+
+def give_back_terminal() -> None:
+    """For a screen that was killed: the first page of the terminal, and its cursor. Nothing without a terminal."""
+    with suppress(OSError):
+        terminal = getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # this once, control bytes are ours
+        if terminal.isatty():
+            terminal.write("\x1b[?1049l\x1b[?25h")
+            terminal.flush()
+
+
+class _Feed:
+    """The rings, poured into the model."""
+
+    def __init__(self, spec: ScreenSpec) -> None:
+        self.model = ScreenModel(spec.config, spec.duration_s)
+        self._telemetry = ring.RingReader(spec.telemetry)
+        self._events = ring.RingReader(spec.events)
+        self._shapes = ring.RingReader(spec.shapes) if spec.shapes else None
+
+    def update(self) -> list[Event]:
+        """Take what has come; returns the events among it."""
+        for message in self._telemetry.drain():
+            self.model.take_row(TelemetryRow(*_ROW.unpack(message)))
+        for message in self._shapes.drain() if self._shapes else ():
+            self.model.take_shape(unpack_estimate(message))
+        events: list[Event] = [json.loads(message) for message in self._events.drain()]
+        for event in events:
+            self.model.take_event(event)
+        return events
+
+    def close(self) -> None:
+        for reader in (self._telemetry, self._events, self._shapes):
+            if reader is not None:
+                reader.close()
+
+
+@contextmanager
+def _live(console: Console, spec: ScreenSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
+    """The screen on a terminal's other page; what was on the terminal is there again afterwards."""
+    run = str(spec.run_dir)
+
+    def show() -> None:
+        feed.update()
+        live.update(Plain(screen(feed.model.view(spec.clock.now()), spec.config, run)), refresh=True)
+
+    with Live(console=console, screen=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False) as live:
+        yield show
+    print(line(feed.model.view(spec.clock.now())), file=sys.stderr)  # the other page is gone: leave the last word
+
+
+@contextmanager
+def _plain(spec: ScreenSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
+    """A line a second; important events at once."""
+    due_s = spec.clock.now()
+
+    def show() -> None:
+        nonlocal due_s
+        lines = [
+            event_line(event)
+            for event in feed.update()
+            if at_once(event) and event.get("mono_s", math.inf) >= spec.since_s
+        ]
+        now_s = spec.clock.now()
+        if now_s >= due_s:
+            lines.append(line(feed.model.view(now_s)))
+            due_s = now_s - (now_s - due_s) % _PLAIN_S + _PLAIN_S
+        for each in lines:
+            print(each, file=sys.stderr, flush=True)
+
+    yield show
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    raise SystemExit(0)

@@ -1,0 +1,114 @@
+"""One line that answers "why is the pump where it is" and "why is it not holding"."""
+
+import math
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.telemetry import TelemetryRow
+
+_RUNGS = {
+    Rung.HOLD_FLOW: "pump keeps its last mean flow",
+    Rung.RAMP_DOWN: "pump is ramped down",
+    Rung.PUMP_OFF: "pump is off",
+    Rung.VENT: "pump is off and the vent is open",
+}
+_STATES = {
+    State.STANDBY: "pump is off: nobody has asked to hold the mirror",
+    State.CHECK: "pump is off until every sensor has been good for a while",
+    State.MANUAL: "pump is where a person has put it",
+    State.TUNE: "pump is driven by a tuning session",
+    State.LOWER: "pump is being stopped: the run is ending",
+    State.FAULT: "pump is off: a fault is latched until a person clears it",
+}
+# Below this share of the flow that holds the mirror a contribution is not worth naming.
+_WORTH_NAMING = 0.03
+
+
+def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
+    """The line.
+
+    Parameters
+    ----------
+    row : TelemetryRow
+        The newest tick.
+    told : str
+        What the controller itself last gave as its reason in this state; empty if nothing.
+    fault : str
+        The fault that stands, in words; empty if none.
+    config : Config
+        For band, flow limit and target.
+    """
+    state, rung = State(int(row.state)), Rung(int(row.rung))
+    if rung != Rung.NONE:
+        return f"{_RUNGS[rung]}: {fault or told or 'a fault is not named'}"
+    if state in _STATES:
+        return told or _STATES[state]
+    if not (math.isfinite(row.displacement_um) and math.isfinite(row.filtered_um)):
+        return f"{_RUNGS[Rung.HOLD_FLOW]}: {told or fault or 'there is no valid laser reading'}"
+    if state == State.INFLATE:
+        to_go_um = row.target_um - row.filtered_um
+        return f"{_flow(row)}: {'filling' if to_go_um > 0 else 'waiting for the leak'}, {abs(to_go_um):.1f} um to go"
+    if abs(row.error_um) > config.limits.band_um:
+        return f"outside the band: {_outside(row)}"
+    return _balance(row) if state == State.HOLD else f"settling: {_balance(row)}"
+
+
+def _outside(row: TelemetryRow) -> str:
+    """Which way the mirror is off and what the pump does about it (error = setpoint - reading)."""
+    if row.error_um > 0:
+        at_limit = row.flow_wanted_um_per_s > row.flow_um_per_s + 1e-6
+        return f"bowl {row.error_um:.1f} um too shallow, {_flow(row)}{', all it may give' if at_limit else ''}"
+    waits = row.flow_um_per_s <= 0
+    return f"bowl {-row.error_um:.1f} um too deep, {_flow(row)}{', only the leak lets it down' if waits else ''}"
+
+
+def _balance(row: TelemetryRow) -> str:
+    """What the flow is made of, the largest first."""
+    parts = {
+        "leak": row.i_um_per_s,  # in the mean the integrator's part is what leaks
+        "error": row.p_um_per_s,
+        "its speed": row.d_um_per_s,
+        "feed-forward": row.feedforward_um_per_s,
+    }
+    least = _WORTH_NAMING * max(abs(row.flow_um_per_s), abs(row.i_um_per_s))
+    named = sorted(((v, k) for k, v in parts.items() if abs(v) > least), key=lambda part: -abs(part[0]))
+    return f"{_flow(row)}: " + ", ".join(f"{value:+.2f} {name}" for value, name in named)
+
+
+def _flow(row: TelemetryRow) -> str:
+    if row.flow_um_per_s <= 0:
+        return "pump is at 0"
+    return f"pump gives {row.flow_um_per_s:.2f} um/s"
+
+
+# Numbers and times as a person reads them; a dash where there is none.
+
+
+NONE = "–"
+
+
+def number(value: float, digits: int, unit: str = "", sign: bool = False) -> str:
+    """`value` with its unit."""
+    if not math.isfinite(value):
+        return NONE
+    figure = f"{value:{'+' if sign else ''}.{digits}f}"
+    return f"{figure} {unit}" if unit else figure
+
+
+def percent(fraction: float, digits: int = 0) -> str:
+    """A fraction as a percentage."""
+    return number(100.0 * fraction, digits, "%")
+
+
+def duration(seconds_s: float) -> str:
+    """A time span: 7 s, 2:05, 3:02:05, 4 d 03:02:05."""
+    if not math.isfinite(seconds_s):
+        return NONE
+    minutes, seconds = divmod(int(seconds_s), 60)
+    hours, minutes = divmod(minutes, 60)
+    days, hours = divmod(hours, 24)
+    if days:
+        return f"{days} d {hours:02}:{minutes:02}:{seconds:02}"
+    if hours:
+        return f"{hours}:{minutes:02}:{seconds:02}"
+    return f"{minutes}:{seconds:02}" if minutes else f"{seconds} s"

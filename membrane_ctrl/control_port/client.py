@@ -1,0 +1,152 @@
+"""The other end of the port: plain blocking sockets, for the command line and for programs."""
+
+from __future__ import annotations
+
+import errno
+import json
+import socket
+import ssl
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl.control_port.protocol import encode
+from membrane_ctrl.control_port.unix import short
+from membrane_ctrl.model.errors import DeviceError
+
+Message = dict[str, Any]
+_ANSWER_S = 10.0
+_TURN = struct.pack("ll", 10, 0)  # to wait at the door: s and us, as the kernel takes a time-out
+
+
+class PortClient:
+    """A connection to a running hold.
+
+    Parameters
+    ----------
+    connection : socket
+        Connected, its handshake done.
+    where : str
+        For messages.
+    notice : callable
+        Gets what the hold says without being asked.
+
+    Attributes
+    ----------
+    greeting : dict
+        Who we are to the hold: `run`, `you`, `role`, `commander`.
+
+    Raises
+    ------
+    DeviceError
+        One line: nobody there, or not a hold.
+    """
+
+    def __init__(self, connection: socket.socket, where: str, notice: Callable[[str], None]) -> None:
+        self._connection, self._where, self._notice = connection, where, notice
+        self._lines = connection.makefile("rb")
+        self._number = 0
+        greeting = self._next()
+        if greeting is None:  # the hold says why in its record; a refused certificate is the usual reason by TLS
+            self.close()
+            raise DeviceError(f"{where}: hung up without a greeting; by TLS: is the certificate valid for this hold?")
+        if "membrane_ctrl" not in greeting:
+            self.close()
+            raise DeviceError(f"{where}: this is no control port of membrane-ctrl")
+        self.greeting = greeting
+
+    @classmethod
+    def unix(cls, path: Path, notice: Callable[[str], None]) -> PortClient:
+        """Connect to a socket file."""
+        connection = socket.socket(socket.AF_UNIX)
+        # While others crowd the door, connecting waits its turn only if it blocks; with Python's own time-out it
+        # would be refused at once.
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TURN)
+        try:
+            with short(path) as address:
+                connection.connect(address)
+            connection.getpeername()  # a signal ends the wait for one's turn, which Python takes for connected
+            connection.settimeout(_ANSWER_S)
+        except (FileNotFoundError, ConnectionRefusedError):
+            connection.close()
+            raise DeviceError(f"{path}: no hold is listening there; name its run with --run or --socket") from None
+        except BlockingIOError:
+            connection.close()
+            raise DeviceError(f"{path}: too many wait there to be let in; try again") from None
+        except OSError as error:
+            connection.close()
+            if error.errno == errno.ENOTCONN:
+                return cls.unix(path, notice)
+            raise DeviceError(f"{path}: {(error.strerror or str(error)).lower()}") from None
+        return cls(connection, str(path), notice)
+
+    @classmethod
+    def tls(cls, host: str, port: int, context: ssl.SSLContext, notice: Callable[[str], None]) -> PortClient:
+        """Connect by TCP; the context holds the own certificate (`tls.client_context`)."""
+        where = f"{host}:{port}"
+        try:
+            plain = socket.create_connection((host, port), _ANSWER_S)
+        except OSError as error:
+            raise DeviceError(f"{where}: {(error.strerror or str(error)).lower()}") from None
+        try:
+            secured = context.wrap_socket(plain, server_hostname=host)
+        except OSError as error:
+            plain.close()
+            raise DeviceError(f"{where}: {error}") from None
+        return cls(secured, where, notice)
+
+    def ask(self, **request: Any) -> Message:
+        """Send a request (`protocol.Request`) and wait for its answer. Raises DeviceError if none comes."""
+        self._number += 1
+        try:
+            self._connection.sendall(encode({**request, "number": self._number}))
+        except OSError as error:
+            raise DeviceError(f"{self._where}: {(error.strerror or str(error)).lower()}") from None
+        for message in self.messages():
+            if message.get("number") in (self._number, 0):  # 0: it could not be read far enough to find its number
+                return message
+        raise DeviceError(f"{self._where}: the hold closed the connection without an answer")
+
+    def messages(self) -> Iterator[Message]:
+        """What comes, until the hold ends; notices are handed on."""
+        while (message := self._next()) is not None:
+            if "notice" in message:
+                self._notice(str(message["notice"]))
+            else:
+                yield message
+
+    def patience(self, seconds: float) -> None:
+        """How long the next message may take."""
+        self._connection.settimeout(seconds)
+
+    def close(self) -> None:
+        """Hang up."""
+        self._lines.close()
+        self._connection.close()
+
+    def __enter__(self) -> PortClient:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _next(self) -> Message | None:
+        try:
+            line = self._lines.readline()
+        except ConnectionResetError:
+            return None
+        except TimeoutError:
+            raise DeviceError(f"{self._where}: the hold does not answer; is it stopped or overloaded?") from None
+        except OSError as error:  # TLS: a refused certificate shows with the first byte that is read
+            self.close()
+            raise DeviceError(f"{self._where}: {error}") from None
+        if not line.endswith(b"\n"):
+            return None
+        try:
+            message = json.loads(line)
+        except ValueError:
+            message = None
+        if not isinstance(message, dict):
+            raise DeviceError(f"{self._where}: an answer that is no JSON object")
+        return message

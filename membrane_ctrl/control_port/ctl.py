@@ -1,0 +1,229 @@
+"""`ctl`: one request to a running hold, and its answer."""
+
+import json
+import math
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl.config.toml_file import read_toml
+from membrane_ctrl.control_port import protocol, unix
+from membrane_ctrl.control_port.client import PortClient
+from membrane_ctrl.model import clock, errors
+
+_SHAPE = {"on": "shape_on", "off": "shape_off"}
+_NUMBERS = {"setpoint": "um", "manual": "um/s of the centre"}
+# `tune` takes more than a word: `membrane-ctrl tune` asks for it
+_PLAIN = (
+    "status",
+    "watch",
+    "release",
+    "quiet",
+    *(k for k in protocol.KINDS if not k.startswith("shape_") and k != "tune"),
+)
+ACTIONS = (*_PLAIN, "shape")
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """Which hold is meant, and as whom."""
+
+    socket: Path | None = None
+    run: Path | None = None
+    tls: str = ""  # HOST:PORT
+    certificate: Path | None = None
+    key: Path | None = None
+    authority: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CtlOptions:
+    """What the command line asked for."""
+
+    action: str
+    argument: str | None
+    why: str
+    take_over: bool
+    every: str
+    trial: str
+    json: bool
+    where: Where
+
+
+def ctl(options: CtlOptions) -> int:
+    """Ask a running hold. Raises InputError for a refusal, DeviceError if nobody answers."""
+    request = request_for(options)
+    with _connect(options.where) as client:
+        answer = client.ask(**request)
+        if not answer.get("ok"):
+            if options.json:
+                print(json.dumps(answer))
+            raise errors.InputError(f"refused: {answer.get('refused')}")
+        if options.action == "watch":
+            return _watch(client, answer["status"], options)
+        if options.json:
+            print(json.dumps(answer))
+        elif options.action == "status":
+            print("\n".join(status_lines(answer["status"])))
+        else:
+            state = f"; the state was {answer['state']}" if "state" in answer else ""
+            print(f"{options.action}: done{state}", file=sys.stderr)
+    return errors.Exit.DONE
+
+
+def request_for(options: CtlOptions) -> dict[str, Any]:
+    """The request a command line means. Raises InputError."""
+    action, argument = options.action, options.argument
+    request: dict[str, Any] = {"do": action, "why": options.why, "take_over": options.take_over}
+    if action not in ACTIONS:
+        raise errors.InputError(f"ctl {action}: unknown; known are {', '.join(ACTIONS)}")
+    if action == "watch":
+        request["period_s"] = clock.parse_duration_s(options.every)
+    if action in _NUMBERS:
+        request["value"] = _number(action, argument)
+    elif action == "shape":
+        if argument not in _SHAPE:
+            raise errors.InputError("ctl shape: on or off?")
+        request["do"] = _SHAPE[argument]
+    elif action == "mark":
+        if not argument:
+            raise errors.InputError('ctl mark: what? ctl mark "door opened"')
+        request["text"] = argument
+    elif action == "latch":
+        request["text"] = argument or ""
+    elif action == "gains":
+        request["loop"] = _gains(argument)
+        if options.trial:
+            request["value"] = clock.parse_duration_s(options.trial)
+    elif argument is not None:
+        raise errors.InputError(f"ctl {action} takes no argument (it is {argument!r})")
+    return request
+
+
+def status_lines(status: dict[str, Any]) -> list[str]:
+    """The status for a person."""
+    row, fault = status.get("row") or {}, status.get("fault")
+    lines = [f"{status.get('run', '?')}: {status['state']} - {status['why'] or 'as it should be'}"]
+    if fault:
+        lines.append(f"FAULT {fault['code']} {fault['name']}: {fault['cause']}; {fault['remedy']}")
+    if row:
+        shown = {
+            "setpoint": ("setpoint_um", "um"),
+            "reading": ("displacement_um", "um"),
+            "error": ("error_um", "um"),
+            "flow": ("flow_um_per_s", "um/s"),
+            "leak": ("leak_um_per_s", "um/s"),
+            "gauge pressure": ("gauge_pressure_pa", "Pa"),
+            "trim": ("trim_um", "um"),
+            "late": ("lateness_ms", "ms"),
+        }
+        lines += [f"  {name:15}{_shown(row.get(field))} {unit}" for name, (field, unit) in shown.items()]
+        lines.append(f"  {'shape loop':15}{status['shape']} {status['shape_reason']}".rstrip())
+        lines.append(f"  {'geometry':15}{_geometry(status.get('geometry'))}")
+    lines += [f"  {'maintenance':15}{message}" for message in status.get("maintenance", {}).values()]
+    lines += [f"  {'recording':15}{message}" for message in status.get("recording", {}).values()]
+    lines.append(f"  {'commander':15}{status.get('commander') or 'nobody'}")
+    return lines
+
+
+def _geometry(geometry: dict[str, Any] | None) -> str:
+    if geometry is None:
+        return "nothing measures with one yet"
+    made = f"{geometry['file']}, calibrated {geometry['calibrated_utc']}" if geometry["file"] else "as configured"
+    return geometry["message"] or f"{made} (hash {geometry['hash']})"
+
+
+def _watch(client: PortClient, first: dict[str, Any], options: CtlOptions) -> int:
+    client.patience(clock.parse_duration_s(options.every) + 10.0)
+    _print_watched(first, options.json)
+    for message in client.messages():
+        if "status" in message:
+            _print_watched(message["status"], options.json)
+    print("the run is over", file=sys.stderr)
+    return errors.Exit.DONE
+
+
+def _print_watched(status: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(status), flush=True)
+        return
+    row = status.get("row") or {}
+    print(
+        f"{_shown(row.get('mono_s'))} s  {status['state']:8} error {_shown(row.get('error_um'))} um  "
+        f"pump {_shown(row.get('pump_fraction'))}  {status['why']}",
+        flush=True,
+    )
+
+
+def _shown(value: float | None) -> str:
+    return f"{value:10.3f}" if value is not None else f"{'-':>10}"
+
+
+def _number(action: str, argument: str | None) -> float:
+    try:
+        value = float(argument or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise errors.InputError(f"ctl {action}: a number in {_NUMBERS[action]} is needed")
+    return value
+
+
+def _gains(argument: str | None) -> dict[str, Any]:
+    """Loop keys of a TOML or JSON file, or of the text itself; a [loop] table is looked into."""
+    if not argument:
+        raise errors.InputError("ctl gains: give a TOML or JSON file with loop keys, or the keys: 'kp_per_s = 0.5'")
+    path = Path(argument)
+    if path.suffix == ".json":
+        try:
+            tables = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise errors.InputError(f"{path}: {error}") from None
+    elif path.suffix == ".toml":
+        tables = read_toml(path)
+    else:
+        try:
+            tables = tomllib.loads(argument)
+        except tomllib.TOMLDecodeError as error:
+            raise errors.InputError(f"ctl gains: neither a .toml or .json file nor keys: {error}") from None
+    if isinstance(tables, dict) and isinstance(tables.get("loop"), dict):
+        tables = tables["loop"]
+    if not isinstance(tables, dict) or not all(isinstance(value, (bool, int, float)) for value in tables.values()):
+        raise errors.InputError(f"{argument}: loop keys with numbers are needed")
+    return tables
+
+
+def _connect(where: Where) -> PortClient:
+    def notice(text: str) -> None:
+        print(f"notice: {text}", file=sys.stderr)
+
+    if where.tls:
+        return _connect_tls(where, notice)
+    client = PortClient.unix(socket_path(where), notice)
+    if where.run is not None and client.greeting["run"] != where.run.resolve().name:
+        client.close()
+        raise errors.InputError(f"{where.run}: is not running; {client.greeting['run']} is")
+    return client
+
+
+def _connect_tls(where: Where, notice: Any) -> PortClient:
+    from membrane_ctrl.control_port.tls import client_context
+
+    host, _, port = where.tls.rpartition(":")
+    if not host or not port.isdigit():
+        raise errors.InputError(f"--tls {where.tls}: HOST:PORT is needed")
+    if where.certificate is None or where.key is None or where.authority is None:
+        raise errors.InputError("--tls needs --certificate, --key and --authority")
+    return PortClient.tls(host, int(port), client_context(where.certificate, where.key, where.authority), notice)
+
+
+def socket_path(where: Where) -> Path:
+    """The socket file: as told, of the run's own configuration, beside the run's folder, or in `logs`."""
+    if where.socket is not None:
+        return where.socket
+    if where.run is None:
+        return Path("logs") / unix.SOCKET_NAME
+    configured = read_toml(where.run / "config.toml").get("port", {}).get("socket")
+    return Path(configured) if configured else where.run.resolve().parent / unix.SOCKET_NAME

@@ -1,0 +1,217 @@
+"""A listening socket in the control process: lets in few at a time, and opens again by itself after a failure.
+
+`asyncio.start_server` would accept, and shake hands with, whoever comes in one go; here every newcomer waits for the
+one before. A flood of connections so costs the tick no more than twenty handshakes a second.
+
+Who has not shown yet who it is (no handshake, no request) is a stranger. Strangers are few, and of one address fewer:
+for a newcomer the one that has dawdled longest goes, so that nobody keeps the door shut by standing in it. An
+address that comes too often is turned away unheard, which makes room in the queue for the others.
+"""
+
+import asyncio
+import socket
+import struct
+from collections import Counter, OrderedDict
+from collections.abc import Awaitable, Callable
+
+from membrane_ctrl.model.events import Event
+
+BACKLOG = 64  # who waits at the door while another comes in; the kernel turns away the rest
+_INSIDE_MOST = 32
+_STRANGERS_MOST, _STRANGERS_EACH = 16, 4
+_PAUSE_S = 0.05
+# Of one address: a person's terminal and a script or two; a flood gets the tenth of the door that is left
+_BURST, _PER_S = 10.0, 2.0
+_TURN_AWAY_S = 0.005  # costs 50 us: a hundredth of a processor
+_ADDRESSES_MOST = 1024  # remembered
+_LEAVE_S = 2.0  # then the run ends without them
+_AGAIN_S, _AGAIN_MOST_S = 1.0, 60.0
+_RESET = struct.pack("ii", 1, 0)  # SO_LINGER: what is turned away leaves nothing behind in the kernel
+
+LetIn = Callable[[], object]
+Welcome = Callable[[socket.socket, LetIn], Awaitable[None]]
+
+
+class Turns:
+    """How often an address may come: a bucket each, the address that has been away longest is forgotten first.
+
+    Parameters
+    ----------
+    now : callable
+        A clock in s.
+    """
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._now = now
+        self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    def take(self, address: str) -> bool:
+        """Whether it may come in now; then it has come."""
+        now_s = self._now()
+        left, since_s = self._left.pop(address, (_BURST, now_s))
+        left = min(_BURST, left + _PER_S * (now_s - since_s))
+        may = left >= 1.0
+        self._left[address] = (left - may, now_s)
+        if len(self._left) > _ADDRESSES_MOST:
+            self._left.popitem(last=False)
+        return may
+
+
+class Door:
+    """Accepts connections and welcomes each in a task of its own.
+
+    Parameters
+    ----------
+    name : str
+        For messages.
+    listener : socket
+        Bound, listening, not blocking; the door closes it.
+    welcome : callable
+        Looks after one connection to its end; calls its second argument when it knows who has come.
+    tell : callable
+        Puts an event on record.
+    refused : callable
+        Gets who was not let in, and why.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        listener: socket.socket,
+        welcome: Welcome,
+        tell: Callable[[Event], None],
+        refused: Callable[[str, str], None],
+    ) -> None:
+        self._name = name
+        self._listener = listener
+        self._welcome = welcome
+        self._tell = tell
+        self._refused = refused
+        self._inside: set[asyncio.Task[None]] = set()
+        self._strangers: dict[asyncio.Task[None], str] = {}  # and their addresses, in the order they came
+        self._task: asyncio.Task[None] | None = None
+
+    def open(self) -> None:
+        """Begin to accept."""
+        self._task = asyncio.create_task(self._keep(), name=f"port {self._name}")
+
+    async def close(self) -> None:
+        """End everything behind the door."""
+        tasks = [*self._inside, *([self._task] if self._task else [])]
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks, timeout=_LEAVE_S)
+        self._listener.close()
+
+    async def _keep(self) -> None:
+        """Accept for ever; what fails is said, and tried again."""
+        again_s = 0.0
+        turns = Turns(asyncio.get_running_loop().time)
+        while True:
+            try:
+                came_in = await self._accept(turns)
+            except Exception as error:
+                again_s = min(max(2.0 * again_s, _AGAIN_S), _AGAIN_MOST_S)
+                self._tell({"kind": "port_failed", "port": self._name, "message": str(error), "again_s": again_s})
+                await asyncio.sleep(again_s)
+                continue
+            if again_s:
+                again_s = 0.0
+                self._tell({"kind": "port_open", "port": self._name})
+            await asyncio.sleep(_PAUSE_S if came_in else _TURN_AWAY_S)
+
+    async def _accept(self, turns: Turns) -> bool:
+        connection, peer = await asyncio.get_running_loop().sock_accept(self._listener)
+        address = str(peer[0]) if isinstance(peer, tuple) else ""  # who comes by a socket file has none
+        if address and not turns.take(address):
+            self._turn_away(connection, address, "comes too often")
+            return False
+        if not self._room_for(address):
+            self._turn_away(connection, address, "too many are inside")
+            return True
+        task = asyncio.create_task(self._look_after(connection), name=f"port {self._name} client")
+        self._inside.add(task)
+        if address:  # the kernel names the others
+            self._strangers[task] = address
+        task.add_done_callback(self._gone)
+        return True
+
+    def _turn_away(self, connection: socket.socket, address: str, reason: str) -> None:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+        connection.close()
+        self._refused(f"{self._name}:{address}", reason)
+
+    def _room_for(self, address: str) -> bool:
+        """Whether a newcomer may come in; the longest waiting stranger of a crowded address goes for it."""
+        each = Counter(self._strangers.values())
+        crowded = each[address] >= _STRANGERS_EACH
+        if not crowded and len(self._strangers) < _STRANGERS_MOST:
+            return len(self._inside) < _INSIDE_MOST
+        most = address if crowded else each.most_common(1)[0][0]
+        task = next(task for task, other in self._strangers.items() if other == most)
+        del self._strangers[task]
+        task.cancel()
+        self._refused(f"{self._name}:{most}", "did not say who it is, and others wait")
+        return len(self._inside) <= _INSIDE_MOST
+
+    def _gone(self, task: asyncio.Task[None]) -> None:
+        self._inside.discard(task)
+        self._strangers.pop(task, None)
+
+    async def _look_after(self, connection: socket.socket) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        try:
+            await self._welcome(connection, lambda: self._strangers.pop(task, None))
+        except Exception as error:  # one client's trouble is nobody else's
+            self._tell({"kind": "port_failed", "port": self._name, "message": f"{type(error).__name__}: {error}"})
+        finally:
+            connection.close()
+
+
+# What was refused goes on record, but nobody can fill the record with it.
+
+
+# An honest mistake or ten are all there; of a flood one in ten seconds, with the count of the others
+_REFUSAL_BURST = 10.0
+_REFUSALS_PER_S = 0.1
+
+
+class Refusals:
+    """Records refusals, a bucket of them at a time.
+
+    Parameters
+    ----------
+    tell : callable
+        Puts an event on record.
+    now : callable
+        The run's clock.
+
+    Attributes
+    ----------
+    count : int
+        All of them.
+    """
+
+    def __init__(self, tell: Callable[[Event], None], now: Callable[[], float]) -> None:
+        self._tell, self._now = tell, now
+        self._left, self._since_s = _REFUSAL_BURST, now()
+        self._unsaid = 0
+        self.count = 0
+
+    def record(self, who: str, command: str, reason: str, why: str = "") -> None:
+        """Count a refusal, and record it if the bucket allows."""
+        self.count += 1
+        now_s = self._now()
+        self._left = min(_REFUSAL_BURST, self._left + _REFUSALS_PER_S * (now_s - self._since_s))
+        self._since_s = now_s
+        if self._left < 1.0:
+            self._unsaid += 1
+            return
+        self._left -= 1.0
+        event: Event = {"kind": "refused", "who": who, "command": command, "why": why, "reason": reason}
+        if self._unsaid:
+            event["and_unrecorded"] = self._unsaid
+        self._tell(event)
+        self._unsaid = 0

@@ -1,0 +1,229 @@
+"""One JSON object a line in either direction, and the limits that keep a message from costing a tick.
+
+A request carries a number; its answer carries the same. What comes without a number was not asked for: the greeting,
+notices, and what `watch` streams.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import ssl
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import AfterValidator, Field, ValidationError, model_validator
+
+from membrane_ctrl.config.section import Section
+from membrane_ctrl.config.toml_file import describe
+from membrane_ctrl.controller.commands import Kind
+
+VERSION = 1
+
+# The longest honest message is `gains` with every key of the loop: 900 bytes. 8 kB are parsed in 0.1 ms.
+MESSAGE_BYTES = 8192
+
+# who, why and text go into one event, and JSON makes up to 3 bytes of one in UTF-8: together they fit its slot
+WHO_BYTES, WHY_BYTES, TEXT_BYTES = 64, 300, 500
+
+Errand = Literal["status", "watch", "release", "quiet"]
+Action = Literal[Kind, Errand]
+
+KINDS: tuple[Kind, ...] = get_args(Kind)
+ACTIONS: tuple[str, ...] = (*KINDS, *get_args(Errand))
+
+
+_NEEDED = {"value": ("setpoint", "manual"), "text": ("mark",), "loop": ("gains",), "experiment": ("tune",)}
+_OPTIONAL = {"value": ("gains",), "text": ("latch",)}
+
+
+class RequestError(ValueError):
+    """A message that is no request; the text is the answer."""
+
+    def __init__(self, reason: str, number: int = 0) -> None:
+        super().__init__(reason)
+        self.number = number
+
+
+def _words(most_bytes: int) -> AfterValidator:
+    def check(text: str) -> str:
+        if not text.isprintable():
+            raise ValueError("only printable characters, in one line")
+        if len(text.encode()) > most_bytes:
+            raise ValueError(f"longer than {most_bytes} bytes")
+        return text
+
+    return AfterValidator(check)
+
+
+class Request(Section):
+    """What a client sends.
+
+    Attributes
+    ----------
+    number : int
+        Chosen by the client, returned with the answer.
+    do : str
+        A command of `commands.TABLE`, or an errand: `status` once, `watch` (the status again and again), `release`
+        (give the command back), `quiet` (acknowledge the alarms).
+    why : str
+        Recorded with the command.
+    value : float or None
+        `setpoint`: um. `manual`: um/s. `gains`: s on trial, until they are kept or go back.
+    text : str
+        `mark`: what to write. `latch`: why nobody may hold the mirror.
+    loop : dict or None
+        `gains`: the keys of `[loop]` that change.
+    experiment : dict or None
+        `tune`: an `ExperimentSpec`.
+    take_over : bool
+        Take the command from whoever has it.
+    period_s : float
+        `watch`: from status to status.
+    """
+
+    number: Annotated[int, Field(ge=0, lt=2**53)] = 0
+    do: Action
+    why: Annotated[str, _words(WHY_BYTES)] = ""
+    value: float | None = None
+    text: Annotated[str, _words(TEXT_BYTES)] = ""
+    loop: dict[str, bool | float] | None = None
+    experiment: dict[str, str | int | float] | None = None
+    take_over: bool = False
+    period_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.0
+
+    @model_validator(mode="after")
+    def _complete(self) -> Request:
+        for name, kinds in _NEEDED.items():
+            given = getattr(self, name) not in (None, "")
+            if given and self.do not in (*kinds, *_OPTIONAL.get(name, ())):
+                raise ValueError(f"{self.do} takes no {name}")
+            if not given and self.do in kinds:
+                raise ValueError(f"{self.do}: {name} missing")
+        return self
+
+
+def parse(line: bytes) -> Request:
+    """The request in a line. Raises RequestError with one line that says what is wrong."""
+    try:
+        return Request.model_validate_json(line, strict=True)
+    except ValidationError as error:
+        reason = describe(error.errors(include_url=False)[0], Request).removeprefix(": ")
+        raise RequestError(_short(reason), _number_in(line)) from None
+
+
+def encode(message: dict[str, Any]) -> bytes:
+    """A message as a line."""
+    return json.dumps(message, allow_nan=False, default=str).encode() + b"\n"
+
+
+def _number_in(line: bytes) -> int:
+    """The number of a request that is wrong in another place, so that its sender knows which one was meant."""
+    try:
+        number = json.loads(line)["number"]
+    except (ValueError, TypeError, LookupError, RecursionError):
+        return 0
+    return number if type(number) is int and 0 <= number < 2**53 else 0
+
+
+def _short(reason: str, most: int = 300) -> str:
+    """One printable line; what a client sent may be quoted in it."""
+    clean = "".join(c if c.isprintable() else "?" for c in reason)
+    return clean if len(clean) <= most else clean[: most - 3] + "..."
+
+
+# One connection as lines: bounded, and never waited for.
+
+
+# Who has begun a line ends it in this time
+_LINE_S = 5.0
+# Who does not read gets this much behind, and is then dropped: a watcher of 10 Hz for a minute
+_UNREAD_BYTES = 1 << 20
+_HANDSHAKE_S = 3.0
+
+
+class SlowReaderError(ConnectionError):
+    """The peer has not read for too long."""
+
+
+class Wire:
+    """Lines in, lines out.
+
+    Parameters
+    ----------
+    reader, writer
+        Of the connection.
+    """
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._reader, self._writer = reader, writer
+
+    @classmethod
+    async def on(cls, connection: socket.socket, context: ssl.SSLContext | None = None) -> Wire:
+        """Take over an accepted connection. Raises OSError (ssl.SSLError among them) if the handshake fails."""
+        loop = asyncio.get_running_loop()
+        reader = asyncio.StreamReader(limit=MESSAGE_BYTES, loop=loop)
+        protocol = asyncio.StreamReaderProtocol(reader, loop=loop)
+        secured = {"ssl": context, "ssl_handshake_timeout": _HANDSHAKE_S} if context else {}
+        transport, _ = await loop.connect_accepted_socket(lambda: protocol, connection, **secured)  # type: ignore[arg-type]
+        return cls(reader, asyncio.StreamWriter(transport, protocol, reader, loop))
+
+    @property
+    def certificate(self) -> dict[str, Any]:
+        """What the peer's certificate says, as `ssl.SSLSocket.getpeercert`."""
+        found: dict[str, Any] | None = self._writer.get_extra_info("peercert")
+        return found or {}
+
+    async def line(self) -> bytes | None:
+        """The next line; None when the peer has gone.
+
+        Raises
+        ------
+        RequestError
+            The line is too long or too slow; there is no way to find the next one.
+        """
+        try:
+            first = await self._reader.read(1)  # a peer may think for hours between two lines
+            if first in (b"", b"\n"):
+                return first or None
+            # not `wait_for`, which forgets a cancellation that comes together with its result
+            async with asyncio.timeout(_LINE_S):
+                rest = await self._reader.readuntil(b"\n")
+        except asyncio.LimitOverrunError:
+            raise RequestError(f"a message may have {MESSAGE_BYTES} bytes") from None
+        except TimeoutError:
+            raise RequestError(f"a message must be complete within {_LINE_S:g} s") from None
+        except (asyncio.IncompleteReadError, OSError):
+            return None
+        return first + rest
+
+    def send(self, message: dict[str, Any]) -> None:
+        """Send without waiting. Raises SlowReaderError (and ends the connection) when too much is unread."""
+        transport = self._writer.transport
+        if transport.is_closing():
+            return
+        if transport.get_write_buffer_size() > _UNREAD_BYTES:
+            transport.abort()
+            raise SlowReaderError("does not read")
+        self._writer.write(encode(message))
+
+    async def until(self, end: bytes) -> bytes:
+        """What comes up to `end`. Raises asyncio's LimitOverrunError or IncompleteReadError."""
+        return await self._reader.readuntil(end)
+
+    def send_bytes(self, data: bytes) -> None:
+        """Send an answer that is no line."""
+        self._writer.write(data)
+
+    async def close(self) -> None:
+        """Send what is left, if that goes at once, and end."""
+        self._writer.close()
+        try:
+            async with asyncio.timeout(1.0):
+                await self._writer.wait_closed()
+        except (TimeoutError, OSError):
+            self._writer.transport.abort()
+
+    def abort(self) -> None:
+        """End now."""
+        self._writer.transport.abort()

@@ -1,0 +1,268 @@
+"""The port as the run sees it: hears what every tick decided, asks the next one.
+
+The control process has one thread and one loop: what is done here is done between two ticks, and all of it is
+bounded: connections, messages, their rate, what waits to be sent. A door that fails opens again by itself
+(`door.Door`): a hold that cannot be asked is no reason to let the mirror down, and signals still stop it.
+"""
+
+import asyncio
+import contextlib
+import itertools
+import math
+import socket
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from typing import Any
+
+from membrane_ctrl.config.port import PortConfig
+from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.config.toml_file import parse
+from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.control_port.door import Door, LetIn, Refusals, Welcome
+from membrane_ctrl.control_port.protocol import KINDS, VERSION, Request, Wire
+from membrane_ctrl.control_port.session import FREE, Helm, Peer, Session, may_not
+from membrane_ctrl.control_port.status import Picture, metrics_text, serve_metrics
+from membrane_ctrl.control_port.tls import Listeners
+from membrane_ctrl.controller import commands, tick
+from membrane_ctrl.model import errors, events
+
+# Beyond these the connection that has been silent longest goes: one person's terminals cannot lock out another's stop
+_SESSIONS_MOST, _SESSIONS_EACH = 16, 4
+# A tick takes a command up within its period; a loop that does not in so long has other troubles, and says so
+_ANSWER_S = 5.0
+_EXPIRED = "the certificate has expired"
+_OVER = "the run is over"
+
+
+@dataclass(frozen=True, slots=True)
+class RunHooks:
+    """What the port needs of the run.
+
+    Attributes
+    ----------
+    ask : callable
+        Hands a command to the next tick.
+    tell : callable
+        Puts an event on record.
+    now : callable
+        The run's clock.
+    loop : callable
+        The loop's settings as they are now.
+    """
+
+    ask: Callable[[commands.Command], None]
+    tell: Callable[[events.Event], None]
+    now: Callable[[], float]
+    loop: Callable[[], LoopConfig]
+
+
+class Port:
+    """Commands in, answers and status out.
+
+    Parameters
+    ----------
+    config : PortConfig
+        The run's.
+    listeners : Listeners
+        Bound sockets.
+    run : str
+        Name of the run folder.
+    hooks : RunHooks
+        What it needs of the run.
+    """
+
+    def __init__(self, config: PortConfig, listeners: Listeners, run: str, hooks: RunHooks) -> None:
+        self._listeners, self._run, self._hooks = listeners, run, hooks
+        self._tell, self._now = hooks.tell, hooks.now
+        self._helm = Helm(config.commander_lapses_s)
+        self._refusals = Refusals(hooks.tell, hooks.now)
+        self._picture = Picture()
+        self._numbers = itertools.count(1)
+        self._waiting: dict[int, asyncio.Future[str]] = {}
+        self._sessions: list[Session] = []
+        self._over = False
+
+    def heard(self, outputs: tick.TickOutputs) -> None:
+        """Take in what a tick decided; those who asked for it get their answer."""
+        self._picture.take(outputs)
+        for event in outputs.events:
+            for session in self._sessions:
+                session.event(event)
+        for number, refusal in outputs.answers:
+            future = self._waiting.get(number)
+            if future is not None and not future.done():
+                future.set_result(refusal)
+
+    def told(self, event: events.Event) -> None:
+        """Take in what a child process reports."""
+        self._picture.note(event)
+        for session in self._sessions:
+            session.event(event)
+
+    @contextlib.asynccontextmanager
+    async def open(self) -> AsyncIterator[None]:
+        """Let clients in for the length of a `with` block."""
+        listeners = self._listeners
+        asked: list[tuple[str, socket.socket, Welcome]] = []
+        if listeners.unix is not None:
+            asked.append(("unix", listeners.unix.socket, self._welcome_unix))
+        if listeners.tls is not None:
+            asked.append(("tls", listeners.tls.socket, self._welcome_tls))
+        if listeners.metrics is not None:
+            asked.append(("metrics", listeners.metrics, self._welcome_metrics))
+        doors = [Door(*each, self._tell, self._turned_away) for each in asked]
+        for door in doors:
+            door.open()
+        if doors:
+            self._tell({"kind": "port", **listeners.addresses})
+        try:
+            yield
+        finally:
+            self._over = True
+            for future in self._waiting.values():
+                if not future.done():
+                    future.set_result(_OVER)
+            while self._waiting:  # noqa: ASYNC110  an answer is sent in the same step that takes it from here
+                await asyncio.sleep(0.0)
+            for door in doors:
+                await door.close()
+
+    def status(self) -> dict[str, Any]:
+        """What `status` answers and `watch` streams."""
+        return {
+            "run": self._run,
+            **self._picture.status(),
+            "commander": self._helm.holder(self._now()) or None,
+            "clients": len(self._sessions),
+        }
+
+    def metrics(self) -> str:
+        """The same for Prometheus."""
+        recording_ok = not self._picture.recorder.standing
+        return metrics_text(self._picture.row, len(self._sessions), self._refusals.count, recording_ok)
+
+    def _turned_away(self, who: str, reason: str) -> None:
+        self._refusals.record(who, "", reason)
+
+    async def _welcome_metrics(self, connection: socket.socket, let_in: LetIn) -> None:
+        await serve_metrics(connection, self.metrics)
+
+    async def _welcome_unix(self, connection: socket.socket, let_in: LetIn) -> None:
+        assert self._listeners.unix is not None
+        peer = self._listeners.unix.peer(connection)
+        await self._serve(await Wire.on(connection), peer)
+
+    async def _welcome_tls(self, connection: socket.socket, let_in: LetIn) -> None:
+        assert self._listeners.tls is not None
+        try:
+            wire = await Wire.on(connection, self._listeners.tls.context)
+        except OSError as error:  # no certificate, an expired one, one of a stranger, no TLS at all, too slow
+            self._refusals.record("tls:unknown", "", f"handshake: {error}")
+            return
+        let_in()
+        tls, certificate = self._listeners.tls, wire.certificate
+        await self._serve(wire, tls.peer(certificate), tls.lasts_s(certificate))
+
+    async def _serve(self, wire: Wire, peer: Peer, lasts_s: float | None = None) -> None:
+        self._make_room(peer)
+        session = Session(wire, peer, self.status)
+        self._sessions.append(session)
+        loop = asyncio.get_running_loop()
+        expiry = None if lasts_s is None else loop.call_later(lasts_s, self._turn_out, session, _EXPIRED)
+        greeting = {
+            "membrane_ctrl": VERSION,
+            "run": self._run,
+            "you": peer.who,
+            "role": peer.role,
+            "commander": self._helm.holder(self._now()) or None,
+        }
+        try:
+            await session.run(greeting, self._answer, self._refusals.record)
+        finally:
+            self._sessions.remove(session)
+            if expiry is not None:
+                expiry.cancel()
+
+    def _turn_out(self, session: Session, reason: str) -> None:
+        self._refusals.record(session.peer.who, "", reason)
+        session.drop(reason)
+
+    def _make_room(self, peer: Peer) -> None:
+        own = [session for session in self._sessions if session.peer.who == peer.who]
+        crowd = own if len(own) >= _SESSIONS_EACH else self._sessions if len(self._sessions) >= _SESSIONS_MOST else []
+        if crowd:
+            self._turn_out(min(crowd, key=lambda session: session.heard_s), "too many connections: silent longest")
+
+    async def _answer(self, session: Session, request: Request) -> dict[str, Any]:
+        """Do what is asked, or say why not. What the controller refuses, it records itself."""
+        peer = session.peer
+        refusal = may_not(peer, request.do) or self._take_helm(peer, request)
+        if not refusal and request.do not in commands.TABLE:
+            return self._run_errand(session, request)
+        try:
+            command = self._command(peer, request) if not refusal else None
+        except errors.InputError as error:
+            refusal, command = str(error), None
+        if command is None:
+            self._refusals.record(peer.who, request.do, refusal, request.why)
+            return {"ok": False, "refused": refusal}
+        refusal = await self._obeyed(command)
+        if refusal:
+            return {"ok": False, "refused": refusal}
+        return {"ok": True, "state": self._picture.status()["state"]}
+
+    def _take_helm(self, peer: Peer, request: Request) -> str:
+        if request.do in FREE:
+            return ""
+        former = self._helm.holder(self._now())
+        refusal = self._helm.claim(peer.who, request.take_over, self._now())
+        if not refusal and former != peer.who:
+            self._tell({"kind": "commander", "who": peer.who, "former": former or None, "why": request.why})
+            for session in self._sessions:
+                if session.peer.who == former:
+                    session.notice(
+                        f"{peer.who} has taken over the command" + (f": {request.why}" * bool(request.why))
+                    )
+        return refusal
+
+    def _run_errand(self, session: Session, request: Request) -> dict[str, Any]:
+        who = session.peer.who
+        match request.do:
+            case "watch":
+                session.watch(request.period_s)
+            case "release":
+                self._helm.release(who)
+                self._tell({"kind": "commander", "who": None, "former": who, "why": request.why})
+            case "quiet":
+                self._tell({"kind": "alarms_acknowledged", "who": who, "why": request.why})
+        return {"ok": True, "status": self.status(), "loop": self._hooks.loop().model_dump()}
+
+    def _command(self, peer: Peer, request: Request) -> commands.Command:
+        """The command of a request. Raises InputError for gains or an experiment that are none."""
+        kind = next(kind for kind in KINDS if kind == request.do)
+        loop = None if request.loop is None else self._new_loop(request.loop)
+        experiment = None if request.experiment is None else parse(request.experiment, ExperimentSpec, "tune")
+        value = math.nan if request.value is None else request.value
+        return commands.Command(
+            kind, peer.who, request.why, value, request.text, loop, experiment, next(self._numbers)
+        )
+
+    def _new_loop(self, changes: dict[str, bool | float]) -> LoopConfig:
+        if "setpoint_um" in changes:
+            raise errors.InputError("gains: setpoint_um: use the command setpoint")
+        return parse({**self._hooks.loop().model_dump(), **changes}, LoopConfig, "gains")
+
+    async def _obeyed(self, command: commands.Command) -> str:
+        """Why the tick that took the command up refused it; empty if it obeyed."""
+        if self._over:
+            return _OVER
+        future: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._waiting[command.number] = future
+        self._hooks.ask(command)
+        try:
+            async with asyncio.timeout(_ANSWER_S):
+                return await future
+        except TimeoutError:
+            return f"no tick took it up within {_ANSWER_S:g} s; it may still be obeyed"
+        finally:
+            self._waiting.pop(command.number, None)

@@ -1,0 +1,168 @@
+"""The port on TCP: nobody without a certificate that the configured authority has signed.
+
+The name is the certificate's common name (CN), the role its organisational unit (OU: read, operate or tune); without
+one of these it is `read`.
+"""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from membrane_ctrl.config.port import PortConfig, TlsConfig
+from membrane_ctrl.control_port import door, protocol, session
+from membrane_ctrl.control_port.unix import SOCKET_NAME, UnixListener
+from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.model.errors import DeviceError, InputError
+
+if TYPE_CHECKING:
+    pass
+
+
+_ROLES: dict[str, Role] = {"read": "read", "operate": "operate", "tune": "tune"}
+
+
+class TlsListener:
+    """A listening TCP socket and what its handshakes need.
+
+    Parameters
+    ----------
+    config : TlsConfig
+        Address and certificates.
+
+    Raises
+    ------
+    InputError, DeviceError
+        One line: a file that is no certificate or key, an address that cannot be had.
+    """
+
+    def __init__(self, config: TlsConfig) -> None:
+        self.context = server_context(config)
+        self.socket = listen_tcp(config.host, config.port, "port.tls")
+
+    def peer(self, certificate: dict[str, Any]) -> session.Peer:
+        """Who the certificate (as of `getpeercert`) names, and as what; who has no name may only read.
+
+        All the nameless would be one commander, and the record could not say who it was.
+        """
+        subject = {key: value for part in certificate.get("subject", ()) for key, value in part}
+        name = "".join(c for c in subject.get("commonName", "") if c.isprintable()).strip()
+        if not name:
+            return session.Peer("tls:nameless", "read")
+        who = f"tls:{name}".encode()[: protocol.WHO_BYTES].decode(errors="ignore")
+        return session.Peer(who, _ROLES.get(subject.get("organizationalUnitName", ""), "read"))
+
+    def lasts_s(self, certificate: dict[str, Any]) -> float:
+        """How long the certificate is valid from now on: a connection must not outlive it."""
+        return ssl.cert_time_to_seconds(certificate["notAfter"]) - time.time()
+
+    def close(self) -> None:
+        """Close the socket."""
+        self.socket.close()
+
+
+def server_context(config: TlsConfig) -> ssl.SSLContext:
+    """TLS 1.3, and a client certificate or nothing. Raises InputError naming the file."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.verify_mode = ssl.CERT_REQUIRED
+    context.num_tickets = 0  # a resumed session would not look at the certificate's date again
+    load_pair(context, Path(config.certificate_file), Path(config.key_file))
+    load_authority(context, Path(config.client_ca_file))
+    return context
+
+
+def client_context(certificate: Path, key: Path, authority: Path) -> ssl.SSLContext:
+    """The other side of `server_context`. Raises InputError naming the file."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    load_pair(context, certificate, key)
+    load_authority(context, authority)
+    return context
+
+
+def load_pair(context: ssl.SSLContext, certificate: Path, key: Path) -> None:
+    """The own certificate and its key, which must not ask for a password. Raises InputError."""
+    for path in (certificate, key):
+        _require_readable(path)
+    try:
+        context.load_cert_chain(certificate, key, password=lambda: "")
+    except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
+        raise InputError(f"{certificate}, {key}: no certificate with its unencrypted key ({error})") from None
+
+
+def load_authority(context: ssl.SSLContext, authority: Path) -> None:
+    """Whose signature counts. Raises InputError."""
+    _require_readable(authority)
+    try:
+        context.load_verify_locations(authority)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{authority}: no certificate of an authority ({error})") from None
+
+
+def listen_tcp(host: str, port: int, field: str) -> socket.socket:
+    """A listening socket. Raises DeviceError naming the configuration's field."""
+    try:
+        listener = socket.create_server((host, port), backlog=door.BACKLOG)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise DeviceError(f"{field}: cannot listen on {host}:{port} ({reason})") from None
+    listener.setblocking(False)
+    return listener
+
+
+def _require_readable(path: Path) -> None:
+    try:
+        path.open("rb").close()
+    except OSError as error:
+        raise InputError(f"{path}: {(error.strerror or str(error)).lower()}") from None
+
+
+# All sockets of the port, bound before anything else of the run exists: an address in use is refused in one line.
+
+
+@dataclass(frozen=True, slots=True)
+class Listeners:
+    """Bound and listening; None for what is not wanted."""
+
+    unix: UnixListener | None = None
+    tls: TlsListener | None = None
+    metrics: socket.socket | None = None
+    path: Path | None = None
+
+    @property
+    def addresses(self) -> dict[str, str]:
+        """Where they are, for people."""
+        found = {"socket": str(self.path)} if self.unix else {}
+        tcp = {"tls": self.tls.socket if self.tls else None, "metrics": self.metrics}
+        for name, listener in tcp.items():
+            if listener is not None:
+                host, port = listener.getsockname()[:2]
+                found[name] = f"{host}:{port}"
+        return found
+
+
+def listeners_for(config: PortConfig, logs_dir: Path, stack: ExitStack) -> Listeners:
+    """Bind what the configuration asks for; the stack closes it. Raises InputError or DeviceError."""
+    if not config.enabled:
+        return Listeners()
+    path = Path(config.socket) if config.socket else logs_dir / SOCKET_NAME
+    unix = UnixListener(path, config.group, config.group_role)
+    stack.callback(unix.close)
+    tls = metrics = None
+    if config.tls is not None:
+        pass
+
+        tls = TlsListener(config.tls)
+        stack.callback(tls.close)
+    if config.metrics_port is not None:
+        pass
+
+        metrics = listen_tcp("127.0.0.1", config.metrics_port, "port.metrics_port")
+        stack.callback(metrics.close)
+    return Listeners(unix, tls, metrics, path)

@@ -1,0 +1,1 @@
+"""The tick: states, safety, commands, and what a controller remembers. Pure."""

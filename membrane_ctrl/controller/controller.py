@@ -1,0 +1,418 @@
+"""One tick of control: observe, judge, act. Pure of I/O and clock, so that a run, a replay and a test are the same.
+
+The order is fixed: what the bench shows becomes an observation; the safety table judges it; only then the state's
+handler runs, and what it wants is overruled wherever the ladder says so. Every path through a tick ends here.
+"""
+
+import math
+from collections.abc import Collection
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.roles import ALL_FAULTS, BenchCommand, BenchReading
+from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.control import inner_loop, shape_loop
+from membrane_ctrl.control.experiments.machine import Finished
+from membrane_ctrl.control.experiments.trial import Trial
+from membrane_ctrl.controller import commands, pump_obeys, safe_levels, safety, sensor_consistency, states
+from membrane_ctrl.controller.observer import Observer
+from membrane_ctrl.controller.tick import TickInputs, TickOutputs
+from membrane_ctrl.model import errors, telemetry
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.states import Rung, State
+
+# dt outside this range of the nominal one is no time step a loop was designed for; what is beyond is a missed
+# tick, which safety sees by its lateness
+_DT_RANGE = (0.2, 5.0)
+
+# a reason that comes and goes faster (a pump that touches its limit) tells nobody anything
+_WHY_STANDS_S = 1.0
+# who asked for one of these is named in the line that says why
+_MOVES = frozenset({"hold", "stop", "pause", "manual", "tune", "ack", "lower", "vent"})
+_NO_DIGITS = str.maketrans("", "", "0123456789")
+# for the record of a tick without an answer; its whole numbers, which have no NaN, are not used
+_NO_READING = BenchReading(
+    displacement_um=math.nan,
+    displacement_quality=0,
+    gauge_pressure_pa=math.nan,
+    ambient_pressure_pa=math.nan,
+    air_temperature_c=math.nan,
+    gas_temperature_c=math.nan,
+    pump_fraction=math.nan,
+    vent_fraction=math.nan,
+    sample_counter=0,
+    device_time_s=math.nan,
+    watchdog_tripped=False,
+    latched_faults=0,
+)
+
+
+class Controller:
+    """Owns the state machine, the safety table and both loops.
+
+    Parameters
+    ----------
+    config : Config
+        The run's configuration.
+    sag_sensitivity : (36,) array
+        Zernike coefficients of a Hencky bowl per sag, in um per um, for the outer loop.
+    """
+
+    def __init__(self, config: Config, sag_sensitivity: NDArray[np.float64]) -> None:
+        self._config = config
+        self._safety = safety.SafetyTable(config.limits)
+        self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity)
+        observer = Observer(config.limits)
+        loop = inner_loop.InnerLoop(config.loop, config.pump)
+        ladder, standstill = safe_levels.Ladder(config.states), pump_obeys.Standstill(config.loop, config.states)
+        self._scene = states.Scene(config, config.loop, loop, observer, ladder, standstill, config.loop.setpoint_um)
+        self._resume = safe_levels.ResumeRule(config.resume, config.limits)
+        self._gains = commands.GainsTrial(config.loop)
+        self._witnesses = sensor_consistency.Witnesses(config)
+        self._answers: list[tuple[int, str]] = []
+        self._clear_mask = 0
+        self._tick_error = ""
+        self._ticks = 0
+        self._state_since_s = math.nan
+        self._said_why = self._why_words = ""
+        self._why_since_s = 0.0
+        self._shape_was: tuple[int, str] = (-1, "")
+        self.state = State.STANDBY
+        self.fault: safety.Rule | None = None
+
+    @property
+    def loop_config(self) -> LoopConfig:
+        """The loop's settings as they are now."""
+        return self._scene.loop_config
+
+    def tick(self, inputs: TickInputs) -> TickOutputs:
+        """Run one tick. Never raises: what a handler raises is a fault of the next judgement."""
+        scene = self._scene
+        events: list[Event] = []
+        self._begin(inputs, events)
+        last = scene.output or inner_loop.NO_OUTPUT
+        error_um = last.error_um if self.state in safety.MOVING else math.nan
+        left_um = scene.setpoint_um + scene.trim_um - last.setpoint_um
+        scene.observer.look(inputs)
+        held = sensor_consistency.Held(
+            laser_um=scene.observer.displacement_um,
+            gauge_pressure_pa=scene.observer.gauge_pressure_pa,
+            setpoint_um=scene.setpoint_um,
+            trim_um=scene.trim_um,
+            ramp_left_um=left_um,
+            leak_um_per_s=last.leak_um_per_s,
+            flow_um_per_s=last.flow_um_per_s,
+            bleed_fraction=scene.loop_config.bleed_fraction,
+        )
+        witnesses = self._witnesses
+        events += witnesses.ask(inputs, self.state, scene.dt_s, held)
+        stand = scene.standstill
+        stand.look(inputs.now_s, inputs.reading, scene.observer.commanded, inputs.link_up)
+        observation = scene.observer.observe(
+            inputs,
+            error_um,
+            self._tick_error,
+            scene.overdue,
+            scene.unfit,
+            witnesses.laser_lies,
+            runs_on=stand.runs_on,
+            inflow=stand.inflow,
+            locked=scene.latched,
+            laser_gauge_apart=witnesses.laser_gauge_apart,
+            gas_excess=witnesses.gas_excess,
+        )
+        verdict = self._safety.judge(self.state, observation)
+        self._apply(verdict, events)
+        self._consider_resuming(observation)
+        shape = self._step_shape(inputs, events)
+        if math.isnan(self._state_since_s):  # the verdict has just changed the state
+            self._state_since_s, scene.state_age_s = inputs.now_s, 0.0
+        self._act(events)
+        command = BenchCommand(scene.pump_fraction, scene.vent_fraction)
+        scene.observer.wrote(command)
+        scene.last_pump_fraction = scene.pump_fraction
+        self._tell_why(events)
+        return TickOutputs(
+            command=command,
+            row=self._row(inputs, observation, shape),
+            events=tuple(events),
+            finished=scene.finished,
+            answers=tuple(self._answers),
+            clear_mask=self._clear_mask,
+        )
+
+    def _begin(self, inputs: TickInputs, events: list[Event]) -> None:
+        scene = self._scene
+        self._ticks += 1
+        nominal_s = 1.0 / self._config.loop.rate_hz
+        scene.now_s = inputs.now_s
+        scene.dt_s = min(max(inputs.dt_s, _DT_RANGE[0] * nominal_s), _DT_RANGE[1] * nominal_s)
+        if self._ticks == 1:
+            self._shape.switch(self._config.shape.enabled, inputs.now_s)
+        if math.isnan(self._state_since_s):  # the state's first tick
+            self._state_since_s = inputs.now_s
+        scene.state_age_s = inputs.now_s - self._state_since_s
+        self._answers, self._clear_mask = [], 0
+        obeyed: set[str] = set()
+        for command in commands.in_order(inputs.commands):
+            if self._obey(command, obeyed, events):
+                obeyed.add(command.kind)
+        if self._gains.overdue(scene.now_s):
+            self._revert_gains("nobody has kept them in time", events)
+
+    def _obey(self, command: commands.Command, obeyed: Collection[str], events: list[Event]) -> bool:
+        """Do what a command asks, or say why not; either is recorded with who asked and why."""
+        refused = (
+            commands.refusal(command, self.state, self._config)
+            or commands.overruled(command, obeyed)
+            or self._prepare(command)
+        )
+        self._answers.append((command.number, refused))
+        event: Event = {"kind": "command", "command": command.kind, "who": command.who, "why": command.why}
+        if math.isfinite(command.value):
+            event["value"] = command.value
+        if command.text:
+            event["text"] = command.text
+        if command.loop is not None:
+            event["loop"] = command.loop.model_dump()
+        if command.experiment is not None:
+            event["experiment"] = command.experiment.model_dump()
+        events.append({**event, "refused": refused} if refused else event)
+        if not refused:
+            self._do(command)
+        return not refused
+
+    def _do(self, command: commands.Command) -> None:
+        scene = self._scene
+        match command.kind:
+            case "hold":
+                scene.hold_wanted = True
+            case "manual":
+                scene.manual_wanted, scene.manual_um_per_s = True, command.value
+                scene.manual_since_s = scene.now_s
+            case "pause" | "resume":
+                scene.paused = command.kind == "pause"
+            case "setpoint":
+                scene.setpoint_um = command.value
+            case "gains":
+                assert command.loop is not None  # `refusal` has looked
+                self._gains.begin(command.loop, scene.now_s, command.value)
+                self._set_gains(command.loop)
+            case "keep":
+                self._gains.keep()
+            case "shape_on" | "shape_off":
+                self._shape.switch(command.kind == "shape_on", scene.now_s)
+            case "latch":
+                scene.latched = scene.latched or command.text or f"locked by {command.who}"
+                scene.hold_wanted = scene.acknowledged = False
+            case "resumed":
+                self._resume.resumed(scene.now_s - command.value)
+            case "ack":
+                scene.latched = ""
+                scene.acknowledged = self.state == State.FAULT
+                self._clear_mask = ALL_FAULTS
+            case "stop":
+                scene.way_down = "stop"
+                scene.stop_exit = errors.Exit.DONE if command.who == "duration" else errors.Exit.INTERRUPTED
+            case "vent" if self.state == State.FAULT:
+                scene.ladder.enter(Rung.VENT, scene.now_s)
+            case "lower" | "vent":
+                scene.way_down = scene.way_down or "lower"
+                scene.venting |= command.kind == "vent"
+        if command.kind in _MOVES:
+            scene.asked_by = command.who
+
+    def _prepare(self, command: commands.Command) -> str:
+        """Make the experiment that is asked for; why it cannot be, or may not begin, if so."""
+        scene, spec = self._scene, command.experiment
+        if command.kind == "hold" and scene.latched:
+            return f"a fault is latched: {scene.latched}; acknowledge it first"
+        if command.kind in ("manual", "tune") and scene.ladder.rung != Rung.NONE:
+            return "the safety table holds the mean flow"
+        if command.kind != "tune" or spec is None:
+            return ""
+        centre_um = scene.setpoint_um + scene.trim_um
+        try:
+            scene.trial = Trial(spec, scene.loop_config, self._config.pump, centre_um)
+        except ValueError as error:
+            return str(error)
+        scene.hold_wanted = False
+        return ""
+
+    def _set_gains(self, loop: LoopConfig) -> None:
+        self._scene.loop_config = loop
+        self._scene.loop.set_gains(loop)
+
+    def _revert_gains(self, why: str, events: list[Event]) -> None:
+        self._set_gains(self._gains.revert())
+        events.append({"kind": "gains_reverted", "why": why})
+
+    def _consider_resuming(self, observation: safety.Observation) -> None:
+        """A latched fault on the list may go, once its cause has stayed away (`resume`)."""
+        scene, resume = self._scene, self._resume
+        if self.state != State.FAULT or self.fault is None:
+            resume.forget()
+            scene.may_resume = scene.resume_possible = False
+            return
+        scene.may_resume = resume.due(self.fault, scene.ladder, observation, scene.now_s)
+        scene.resume_possible = resume.possible
+        self._clear_mask |= resume.clear_mask
+
+    def _apply(self, verdict: safety.Verdict, events: list[Event]) -> None:
+        """Put the verdict on the ladder; whatever goes below HOLD_FLOW latches as the run's fault."""
+        scene, ladder = self._scene, self._scene.ladder
+        rule = verdict.rule
+        if rule is None:
+            if ladder.rung == Rung.HOLD_FLOW:
+                ladder.clear(scene.now_s)
+                events.append({"kind": "cleared", "name": self.fault.name if self.fault else ""})
+                self.fault = None
+            return
+        if self.fault is None or (rule.rung > Rung.HOLD_FLOW >= ladder.rung):
+            self.fault = rule
+            events.append(_fault_event(verdict))
+        ladder.enter(rule.rung, scene.now_s)
+        if ladder.step(scene.now_s) > Rung.HOLD_FLOW and self.state != State.FAULT:
+            self._go(State.FAULT, f"{self.fault.name}: {self.fault.cause}", events)
+
+    def _step_shape(self, inputs: TickInputs, events: list[Event]) -> shape_loop.ShapeOutput:
+        scene = self._scene
+        settled = self.state == State.HOLD and scene.ladder.rung == Rung.NONE
+        shape = self._shape.step(
+            inputs.now_s,
+            scene.dt_s,
+            inputs.estimate,
+            scene.observer.displacement_um,
+            settled,
+            self._witnesses.camera_lies,
+        )
+        scene.trim_um = shape.trim_um if self.state in safety.MOVING else 0.0
+        words = shape.reason.translate(_NO_DIGITS)  # numbers that change are no news
+        if (shape.state, words) != self._shape_was:
+            self._shape_was = (shape.state, words)
+            events.append({"kind": "shape", "state": shape.state.name.lower(), "reason": shape.reason})
+        return shape
+
+    def _act(self, events: list[Event]) -> None:
+        """Run the state's handler with everything off unless it says otherwise."""
+        scene = self._scene
+        scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, 0.0
+        try:
+            wanted = states.HANDLERS[self.state](scene)
+        except Exception as error:
+            self._tick_error = f"{type(error).__name__}: {error}"
+            # a mirror that is being vented is not shut up by an error
+            vents = scene.venting or scene.ladder.rung == Rung.VENT
+            scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, float(vents)
+            if self.state == State.FAULT:  # nothing is left that could judge it
+                scene.finished = errors.Exit.SAFETY_TRIP
+            return
+        for name, fraction in (("pump", scene.pump_fraction), ("vent", scene.vent_fraction)):
+            if not 0.0 <= fraction <= 1.0:
+                self._tick_error = f"{name} command {fraction} from state {self.state.name.lower()}"
+                scene.pump_fraction, scene.vent_fraction = 0.0, 0.0
+        if wanted != self.state:
+            self._go(wanted, scene.why, events)
+
+    def _go(self, state: State, why: str, events: list[Event]) -> None:
+        scene = self._scene
+        events.append({"kind": "state", "state": state.name.lower(), "from": self.state.name.lower(), "why": why})
+        if self.state == State.TUNE:
+            self._tell_trial(why, events)
+        if state != State.TUNE:
+            scene.trial = scene.trial_ended = None
+        if state == State.FAULT and self._gains.on_trial:
+            self._revert_gains("a fault came while they were on trial", events)
+        if self.state == State.FAULT:  # it was acknowledged, or may resume
+            if not scene.acknowledged and self.fault is not None:
+                self._resume.resumed(scene.now_s)
+                events.append({"kind": "resumed", "name": self.fault.name})
+            self.fault, self._tick_error = None, ""
+            scene.ladder.leave()
+            scene.acknowledged = False
+        if state == State.STANDBY:
+            scene.venting = False
+        scene.manual_wanted = scene.paused = False  # asked of the hold that was, not of the next one
+        self.state = state
+        self._state_since_s = math.nan
+        scene.good_since_s = scene.last_good_s = math.nan
+        scene.overdue = scene.unfit = ""
+        scene.test = None
+
+    def _tell_trial(self, why: str, events: list[Event]) -> None:
+        """How the experiment ended: by itself, or because the state was left."""
+        trial = self._scene.trial
+        assert trial is not None
+        ended = self._scene.trial_ended or Finished(False, why)
+        told = {"kind": "experiment", "experiment": trial.spec.kind, "completed": ended.completed}
+        events.append({**told, "reason": ended.reason, **trial.result()})
+
+    def _tell_why(self, events: list[Event]) -> None:
+        """The one line of the operator, as an event when its words (not its numbers) have changed for good."""
+        scene = self._scene
+        words = scene.why.translate(_NO_DIGITS)
+        if words != self._why_words:
+            self._why_words, self._why_since_s = words, scene.now_s
+        if words != self._said_why and scene.now_s - self._why_since_s >= _WHY_STANDS_S:
+            self._said_why = words
+            events.append({"kind": "why", "why": scene.why})
+
+    def _row(
+        self, inputs: TickInputs, observation: safety.Observation, shape: shape_loop.ShapeOutput
+    ) -> telemetry.TelemetryRow:
+        scene, reading = self._scene, inputs.reading or _NO_READING
+        out = scene.output or inner_loop.NO_OUTPUT
+        return telemetry.TelemetryRow(
+            mono_s=inputs.now_s,
+            tick=self._ticks,
+            dt_s=scene.dt_s,
+            lateness_ms=inputs.lateness_ms,
+            missed_ticks=inputs.missed_ticks,
+            state=self.state,
+            shape_state=shape.state,
+            rung=scene.ladder.rung,
+            fault=self.fault.code if self.fault else 0,
+            target_um=scene.setpoint_um,
+            setpoint_um=out.setpoint_um,
+            displacement_um=observation.displacement_um,
+            filtered_um=out.filtered_um,
+            error_um=out.error_um,
+            p_um_per_s=out.p_um_per_s,
+            i_um_per_s=out.i_um_per_s,
+            d_um_per_s=out.d_um_per_s,
+            feedforward_um_per_s=out.feedforward_um_per_s,
+            flow_wanted_um_per_s=out.flow_wanted_um_per_s,
+            flow_um_per_s=out.flow_um_per_s,
+            pump_fraction=scene.pump_fraction,
+            vent_fraction=scene.vent_fraction,
+            pump_readback_fraction=reading.pump_fraction,
+            vent_readback_fraction=reading.vent_fraction,
+            gauge_pressure_pa=observation.gauge_pressure_pa,
+            ambient_pressure_pa=reading.ambient_pressure_pa,
+            air_temperature_c=reading.air_temperature_c,
+            gas_temperature_c=reading.gas_temperature_c,
+            displacement_quality=reading.displacement_quality if inputs.reading else math.nan,
+            sample_counter=reading.sample_counter if inputs.reading else math.nan,
+            device_time_s=reading.device_time_s,
+            leak_um_per_s=out.leak_um_per_s,
+            trim_um=shape.trim_um,
+            truth_displacement_um=inputs.truth_displacement_um,
+            truth_laser_bias_um=inputs.truth_laser_bias_um,
+        )
+
+
+def _fault_event(verdict: safety.Verdict) -> Event:
+    rule = verdict.rule
+    assert rule is not None
+    return {
+        "kind": "fault",
+        "code": rule.code,
+        "name": rule.name,
+        "cause": rule.cause,
+        "seen": verdict.seen,
+        "limit": rule.limit,
+        "rung": rule.rung.name.lower(),
+        "latching": rule.latching,
+        "remedy": rule.remedy,
+    }

@@ -1,0 +1,325 @@
+"""The whole configuration against itself and against what the board says. Pure; `check` and `hold` refuse by it.
+
+The range of a field (`config`) catches a wrong unit. What stands here are combinations: settings that let the pump
+run when it must not, guards that can never trip or always do, and numbers that contradict each other.
+"""
+
+import difflib
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from pydantic import BaseModel
+
+from firmware_iface.roles import BenchIdentity
+from membrane_ctrl.config.devices import DevicesConfig, VaisalaPtb330
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller import cross_check_plant, pump_obeys, safety
+from membrane_ctrl.model.errors import FindingsError
+
+_RESUMES_MOST = 24  # a day: what comes back more often than once an hour has a cause that is not passing
+# How long the pump may run with nobody in control, and give a flow that nobody corrects. At 5 um/s and at the
+# 1.2 um/s of a doubled leak that is 10 um and 70 um, well inside what the default limits leave.
+_UNATTENDED_S, _BLIND_S = 2.0, 60.0
+_PAUSE_S = 3600.0  # the laser still guards the limits, but nobody holds the mirror
+_PUMP_STANDS_S = 0.5  # lag and transport
+_GAUGE_NOISE_PA = 1.0
+_UNKNOWN = BenchIdentity("", 0, "", math.nan)
+_TWIN_BOARD = DevicesConfig(board="tcp://twin")  # what `--twin` makes when no devices are named
+
+
+def cross_check(config: Config, board: BenchIdentity | None = None) -> tuple[cross_check_plant.Finding, ...]:
+    """Judge a configuration.
+
+    Parameters
+    ----------
+    config : Config
+    board : BenchIdentity, optional
+        What answered, with the limits it keeps; without it only the file is judged.
+
+    Returns
+    -------
+    tuple of Finding
+        Errors first; empty for a sound configuration.
+    """
+    say = cross_check_plant.Findings(config)
+    _finite(config, say)
+    if not say.found:  # the others compute
+        for judge in _RULES:
+            judge(config, say)
+        for judge_board in (cross_check_plant.judge_ranges, _board):
+            judge_board(config, board or _UNKNOWN, say)
+    return tuple(sorted(say.found, key=lambda finding: finding.severity))
+
+
+def require_sound(
+    config: Config, source: str, board: BenchIdentity | None = None
+) -> tuple[cross_check_plant.Finding, ...]:
+    """Refuse a configuration with errors; return the warnings of one without.
+
+    Raises
+    ------
+    InputError
+        A line for each finding.
+    """
+    findings = cross_check(config, board)
+    if any(finding.severity == "error" for finding in findings):
+        raise FindingsError([finding.line(source) for finding in findings])
+    return findings
+
+
+def _finite(config: Config, say: cross_check_plant.Findings) -> None:
+    """Not a number is refused where a file is read; a program may have put one in since."""
+    for field, value in _numbers(config, ""):
+        say.error(not math.isfinite(value), field, "is no number", "give a finite one")
+
+
+def _numbers(value: Any, field: str) -> Iterator[tuple[str, float]]:
+    if isinstance(value, BaseModel):
+        inner: Iterable[tuple[Any, Any]] = ((name, getattr(value, name)) for name in type(value).model_fields)
+    elif isinstance(value, tuple | list):
+        inner = enumerate(value)
+    else:
+        if isinstance(value, float):
+            yield field, value
+        return
+    for name, part in inner:
+        yield from _numbers(part, f"{field}.{name}".lstrip("."))
+
+
+def _resume(config: Config, say: cross_check_plant.Findings) -> None:
+    resume = config.resume
+    known = [rule.name for rule in safety.TABLE]
+    may = sorted(rule.name for rule in safety.TABLE if rule.may_resume)
+    for index, name in enumerate(resume.faults):
+        field = f"resume.faults.{index}"
+        near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]}?" if near else f"may resume: {', '.join(may)}"
+        say.error(name not in known, field, "no fault has this name, so nothing would resume", hint)
+        say.error(
+            name in known and name not in may,
+            field,
+            "this fault needs a person before gas flows again",
+            f"take it out; may resume: {', '.join(may)}",
+        )
+    say.error(
+        resume.most_per_day > _RESUMES_MOST,
+        "resume.most_per_day",
+        "a fault that comes back so often is not passing",
+        f"give at most {_RESUMES_MOST}",
+    )
+    if resume.faults:
+        never = "the rule can never act"
+        say.warn(resume.most_per_day == 0, "resume.most_per_day", never, "give at least 1, or empty resume.faults")
+        waits = resume.wait_s >= config.states.pump_off_max_s
+        why = f"the mirror is vented before: {never}"
+        say.warn(waits, "resume.wait_s", why, "keep it below states.pump_off_max_s")
+
+
+def _watchdog(config: Config, say: cross_check_plant.Findings) -> None:
+    devices, limits = config.devices or _TWIN_BOARD, config.limits
+    tick_s, watchdog_s = 1.0 / config.loop.rate_hz, devices.watchdog_s
+    if config.devices is not None:
+        say.error(
+            watchdog_s > _UNATTENDED_S,
+            "devices.watchdog_s",
+            "the pump runs on for so long after the control process has died",
+            f"give at most {_UNATTENDED_S:g} s",
+        )
+        for field, timeout_s in _slowest_answers(devices):
+            say.error(
+                timeout_s + tick_s >= watchdog_s,
+                field,
+                f"with a tick of {tick_s:g} s, one lost answer ({timeout_s:g} s on its line) lasts longer than the "
+                f"watchdog ({watchdog_s:g} s)",
+                "shorten the time-out, or lengthen devices.watchdog_s",
+            )
+            say.warn(
+                timeout_s + tick_s >= limits.stale_s and len(devices.roles()) == 0,
+                "limits.stale_s",
+                "one lost answer ends the run",
+                f"give more than {timeout_s + tick_s:g} s",
+            )
+    say.error(
+        2.0 * tick_s > watchdog_s,
+        "loop.rate_hz",
+        f"the watchdog ({watchdog_s:g} s) trips between two ticks of {tick_s:g} s, or at the first late one",
+        f"give at least {2.0 / watchdog_s:g} Hz, or a longer devices.watchdog_s",
+    )
+    say.error(
+        1e-3 * limits.lateness_max_ms >= watchdog_s,
+        "limits.lateness_max_ms",
+        f"can never trip: the watchdog ({watchdog_s:g} s) trips first",
+        "keep it below devices.watchdog_s",
+    )
+    say.warn(limits.lateness_max_ms < 5.0, "limits.lateness_max_ms", "a healthy machine is that late", "give 100 ms")
+
+
+def _stale(config: Config, say: cross_check_plant.Findings) -> None:
+    limits, rate_hz = config.limits, config.loop.rate_hz
+    tick_s = 1.0 / rate_hz
+    say.error(
+        limits.stale_s * rate_hz < 1.5 - 1e-9,
+        "limits.stale_s",
+        f"shorter than 1.5 ticks of {tick_s:g} s: every late tick is a fault",
+        f"give at least {1.5 * tick_s:g} s",
+    )
+    blind = "the pump runs on without a reading for so long"
+    say.error(limits.stale_s > _UNATTENDED_S, "limits.stale_s", blind, f"give at most {_UNATTENDED_S:g} s")
+    say.error(
+        limits.stuck_s < 3.0 * tick_s,
+        "limits.stuck_s",
+        "two equal readings by chance are a fault",
+        f"give at least {3.0 * tick_s:g} s",
+    )
+    say.error(
+        limits.stuck_s > _BLIND_S,
+        "limits.stuck_s",
+        "the loop follows a laser that has stopped for so long",
+        f"give at most {_BLIND_S:g} s",
+    )
+
+
+def _slowest_answers(devices: DevicesConfig) -> Iterator[tuple[str, float]]:
+    """The longest time that a tick waits for answers: those on one line wait for each other, the lines do not."""
+    if devices.board is not None:
+        yield "devices.timeout_s", devices.timeout_s
+        return
+    lines: dict[str, list[tuple[str, float]]] = defaultdict(list)
+    for role, section in devices.roles().items():
+        if not isinstance(section, VaisalaPtb330):  # read in the background
+            line = str(getattr(section, "link", None) or getattr(section, "port", ""))
+            lines[line].append((f"devices.{role}.timeout_s", section.timeout_s))
+    slowest = max(lines.values(), key=lambda line: sum(timeout_s for _, timeout_s in line))
+    yield slowest[0][0], sum(timeout_s for _, timeout_s in slowest)
+
+
+def _states(config: Config, say: cross_check_plant.Findings) -> None:
+    states, limits = config.states, config.limits
+    blind = "the pump gives a flow for so long that nobody corrects"
+    for name, most_s in (("hold_flow_max_s", _BLIND_S), ("ramp_down_s", _BLIND_S), ("pause_max_s", _PAUSE_S)):
+        say.error(getattr(states, name) > most_s, f"states.{name}", blind, f"give at most {most_s:g} s")
+    always = "over before it can have been met"
+    needed_s = states.check_s
+    if states.actuator_test:
+        needed_s = pump_obeys.ActuatorTest(config.pump, True, config.loop.rate_hz).duration_s
+    say.error(
+        states.check_timeout_s <= needed_s,
+        "states.check_timeout_s",
+        f"{always}: the check takes {needed_s:.1f} s",
+        f"give at least {2.0 * needed_s:.0f} s",
+    )
+    say.error(
+        states.settle_timeout_s <= states.settle_s,
+        "states.settle_timeout_s",
+        f"{always}: states.settle_s is {states.settle_s:g} s",
+        "give some minutes",
+    )
+    say.error(
+        states.lower_timeout_s < _PUMP_STANDS_S + 2.0 / config.loop.rate_hz,
+        "states.lower_timeout_s",
+        f"{always}: a pump stands {_PUMP_STANDS_S:g} s after its command, seen a tick later",
+        "give 3 s",
+    )
+    way_um = config.loop.setpoint_um - limits.displacement_min_um
+    speed_um_per_s = min(config.loop.setpoint_ramp_um_per_s, cross_check_plant.flow_um_per_s(config))
+    say.warn(
+        states.inflate_timeout_s < way_um / speed_um_per_s,
+        "states.inflate_timeout_s",
+        f"{always}: the way up from limits.displacement_min_um takes {way_um / speed_um_per_s:.0f} s at least",
+        "give it more time",
+    )
+    say.error(
+        states.vented_pressure_pa > 0.5 * limits.gauge_pressure_max_pa,
+        "states.vented_pressure_pa",
+        "a mirror at this pressure is not vented",
+        "give less than half of limits.gauge_pressure_max_pa",
+    )
+    say.error(
+        states.vented_pressure_pa < _GAUGE_NOISE_PA,
+        "states.vented_pressure_pa",
+        "within the noise of a gauge at zero: venting would never end",
+        f"give at least {_GAUGE_NOISE_PA:g} Pa",
+    )
+
+
+def _limits(config: Config, say: cross_check_plant.Findings) -> None:
+    limits, setpoint_um = config.limits, config.loop.setpoint_um
+    trim_um = config.shape.trim_max_um if config.shape.enabled else 0.0
+    above_um, below_um = limits.displacement_max_um - setpoint_um, setpoint_um - limits.displacement_min_um
+    for room_um, side in ((above_um, "above"), (below_um, "below")):
+        say.error(
+            trim_um + limits.band_um >= room_um,
+            "shape.trim_max_um" if trim_um >= limits.band_um else "limits.band_um",
+            f"the setpoint ({setpoint_um:g} um) has {room_um:g} um {side} it; trim and band reach the limit",
+            "give less, or move the setpoint or the limits",
+        )
+    say.warn(
+        limits.following_error_max_um >= min(above_um, below_um),
+        "limits.following_error_max_um",
+        "can never trip: a displacement limit trips first",
+        f"give less than {min(above_um, below_um):g} um",
+    )
+    say.error(
+        limits.band_um >= limits.following_error_max_um,
+        "limits.band_um",
+        f"a mirror inside the band would be a following error ({limits.following_error_max_um:g} um)",
+        "keep it below limits.following_error_max_um",
+    )
+    step_um = cross_check_plant.flow_um_per_s(config) / config.loop.rate_hz
+    say.error(
+        limits.step_max_um < 4.0 + step_um,
+        "limits.step_max_um",
+        f"a moving film ({step_um:.2f} um a tick) and the laser's noise (1 um) already jump so far",
+        f"give at least {4.0 + step_um:.0f} um",
+    )
+    say.error(
+        limits.step_max_um >= above_um,
+        "limits.step_max_um",
+        f"can never trip: the limit is {above_um:g} um above the setpoint",
+        "give less",
+    )
+
+
+def _board(config: Config, board: BenchIdentity, say: cross_check_plant.Findings) -> None:
+    """The limits that the board keeps by itself."""
+    say.error(
+        config.limits.gauge_pressure_max_pa > board.gauge_pressure_limit_pa,
+        "limits.gauge_pressure_max_pa",
+        f"the board vents at {board.gauge_pressure_limit_pa:g} Pa by itself",
+        "give at most that",
+    )
+    pump, limit = config.pump, board.pump_limit_fraction
+    share = cross_check_plant.flow_um_per_s(config) / pump.flow_full_um_per_s
+    needed = pump.dead_fraction + (1.0 - pump.dead_fraction) * share
+    most = f"and the board gives the pump {limit:g} at most"
+    say.error(
+        needed > limit + 1e-9,
+        "loop.flow_max_um_per_s",
+        f"takes a command of {needed:.2f}, {most}",
+        "lower it, or raise the limit of the board",
+    )
+    test = max(part.pump_fraction for part in pump_obeys.PARTS)
+    say.error(
+        config.states.actuator_test and test > limit + 1e-9,
+        "states.actuator_test",
+        f"commands {test:g}, {most}",
+        "raise the limit of the board, or leave the test out",
+    )
+
+
+_RULES = (
+    _resume,
+    _watchdog,
+    _stale,
+    _states,
+    _limits,
+    cross_check_plant.judge_gauge,
+    cross_check_plant.judge_film,
+    cross_check_plant.judge_alarms,
+    cross_check_plant.judge_pump,
+    cross_check_plant.judge_loop,
+    cross_check_plant.judge_shape,
+    cross_check_plant.judge_optics,
+)

@@ -1,0 +1,322 @@
+"""Findings, and those about pump, sensors, loops, optics and alarms. Guards and limits are in `cross_check`."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from firmware_iface.roles import BenchIdentity
+from membrane_ctrl.config.devices import ModbusMap, Optoncdt1420
+from membrane_ctrl.config.schema import Config, GeometryConfig
+from membrane_ctrl.control import gas, inner_loop
+from membrane_ctrl.control.film import CONTRADICTED_MOST, LEAK_LEAST_UM_PER_S, TAUT_PA
+from membrane_ctrl.controller import pump_obeys, safety
+
+Severity = Literal["error", "warning"]
+
+_MS_MOST, _MS_WARN = 3.0, 1.8  # peak sensitivity: 3 leaves a phase margin of 19 deg
+_BAROMETER_UM_PER_PA, _TEMPERATURE_UM_PER_K = -0.358, 123.0  # docs/physics.md
+_FEEDFORWARD_MOST = 2.0  # times the physical gain: from there on it does more harm than none
+_VENT_FULL_UM_PER_S = 100.0  # of an open vent at the nominal pressure
+_GRAZING_DEG = 10.0
+_GAUGE_BLIND_S = 600.0  # a slow, filtered gauge of a calm mirror repeats itself for minutes
+_STORM_PA = 5.0  # what 250 Pa of weather at once move the gauge by
+# What parts laser and gauge although none of them lies: the gauge's noise at 1 Hz and a mount that warms up; a fresh
+# film's creep (control/film.py)
+_APART_UM, _CREEP_UM = 7.0, 31.0
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One setting that is wrong: `error` refuses, `warning` only says."""
+
+    severity: Severity
+    field: str
+    value: str
+    why: str
+    remedy: str
+
+    def line(self, source: str) -> str:
+        """For people, with the file's name."""
+        mark = "warning: " if self.severity == "warning" else ""
+        return f"{source}: {mark}{self.field} = {self.value}: {self.why}; {self.remedy}"
+
+
+class Findings:
+    """Collects findings; the value is looked up by the field's name, so that a name cannot be wrong."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self.found: list[Finding] = []
+
+    def error(self, wrong: bool, field: str, why: str, remedy: str) -> None:
+        """Note that the field must not be so, if it is wrong."""
+        if wrong:
+            self.found.append(Finding("error", field, self._value(field), why, remedy))
+
+    def warn(self, wrong: bool, field: str, why: str, remedy: str) -> None:
+        """Note that the field should not be so."""
+        if wrong:
+            self.found.append(Finding("warning", field, self._value(field), why, remedy))
+
+    def _value(self, field: str) -> str:
+        value: Any = self._config
+        for name in field.split("."):
+            value = value[int(name)] if name.isdigit() else getattr(value, name)
+        return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def flow_um_per_s(config: Config) -> float:
+    return min(config.loop.flow_max_um_per_s, config.pump.flow_full_um_per_s)
+
+
+def judge_pump(config: Config, say: Findings) -> None:
+    pump, loop = config.pump, config.loop
+    say.error(
+        not pump.dead_fraction <= pump.stall_fraction <= pump.start_fraction,
+        "pump.stall_fraction",
+        "a pump gives nothing below dead_fraction, stalls above it, and starts above that",
+        f"order them: dead ({pump.dead_fraction:g}) <= stall ({pump.stall_fraction:g}) <= start "
+        f"({pump.start_fraction:g})",
+    )
+    test_fraction = max(part.pump_fraction for part in pump_obeys.PARTS)
+    if pump.start_fraction >= test_fraction:
+        why = f"the actuator test commands {test_fraction:g}, and that would not start it"
+        say.error(config.states.actuator_test, "pump.start_fraction", why, "measure it; no pump starts so late")
+        say.warn(not config.states.actuator_test, "pump.start_fraction", "no pump starts so late", "measure it")
+    else:
+        least_um_per_s = gas.PumpCurve(pump).least_flow_um_per_s
+        why = f"the least flow of a running pump is {least_um_per_s:.2f} um/s: it would only ever start and stop"
+        say.error(
+            loop.flow_max_um_per_s <= 2.0 * least_um_per_s,
+            "loop.flow_max_um_per_s",
+            why,
+            "give several times as much, or measure pump.stall_fraction",
+        )
+    say.warn(
+        loop.flow_max_um_per_s > pump.flow_full_um_per_s + 1e-9,
+        "loop.flow_max_um_per_s",
+        f"the pump has {pump.flow_full_um_per_s:g} um/s (pump.flow_full_um_per_s)",
+        "measure the pump, or lower it",
+    )
+    if config.devices is None:
+        return
+    for role in ("pump", "vent"):
+        section = getattr(config.devices, role)
+        if isinstance(section, ModbusMap):
+            name = "limits" if section.limits is not None else "value"
+            low, high = min(section.limits or section.value), max(section.limits or section.value)
+            never = "0 is not in it, so it can never be shut" if role == "pump" else "0 is not in it"
+            say.error(low > 0.0, f"devices.{role}.{name}", never, "begin at 0")
+            say.error(high < 1.0, f"devices.{role}.{name}", "a command of 1 would be refused", "end at 1")
+
+
+def judge_loop(config: Config, say: Findings) -> None:
+    loop = config.loop
+    full_um_per_s = flow_um_per_s(config)
+    sensitivity = inner_loop.peak_sensitivity(loop)
+    gains = f"with Ti {loop.ti_s:g} s, Td {loop.td_s:g} s, a filter of {loop.measurement_filter_s:g} s"
+    measure = "use `tune`, or the default gains"
+    say.error(loop.kp_per_s == 0.0, "loop.kp_per_s", "nobody would hold the mirror", measure)
+    say.error(math.isinf(sensitivity), "loop.kp_per_s", f"{gains} the loop is unstable on the nominal pump", measure)
+    close = f"{gains} the loop is close to unstable (peak sensitivity {sensitivity:.1f}, the defaults have 1.3)"
+    say.error(_MS_MOST < sensitivity < math.inf, "loop.kp_per_s", close, measure)
+    say.warn(_MS_WARN < sensitivity <= _MS_MOST, "loop.kp_per_s", close, measure)
+    for on, field, gain, nominal in (
+        (loop.feedforward_barometer, "barometer_gain_um_per_pa", loop.barometer_gain_um_per_pa, _BAROMETER_UM_PER_PA),
+        (loop.feedforward_temperature, "temperature_gain_um_per_k", loop.temperature_gain_um_per_k,
+         _TEMPERATURE_UM_PER_K),
+    ):  # fmt: skip
+        share = gain / nominal
+        remedy = f"physics gives {nominal:g}, see docs/physics.md"
+        say.error(on and share < 0.0, f"loop.{field}", "the sign is wrong: it would double the weather", remedy)
+        why = "more than twice the physical value: it does more harm than none"
+        say.error(on and share > _FEEDFORWARD_MOST, f"loop.{field}", why, remedy)
+    say.warn(
+        loop.setpoint_ramp_um_per_s > full_um_per_s,
+        "loop.setpoint_ramp_um_per_s",
+        f"faster than the pump's {full_um_per_s:g} um/s",
+        "give less",
+    )
+    say.error(
+        loop.bleed_fraction * _VENT_FULL_UM_PER_S > 0.5 * full_um_per_s,
+        "loop.bleed_fraction",
+        f"the vent would take about {loop.bleed_fraction * _VENT_FULL_UM_PER_S:.0f} um/s, half of what the pump has "
+        "or more",
+        f"give less than {0.5 * full_um_per_s / _VENT_FULL_UM_PER_S:.3f}",
+    )
+    swing_s = full_um_per_s / loop.flow_rate_limit_um_per_s2
+    say.error(
+        swing_s > 2.0,
+        "loop.flow_rate_limit_um_per_s2",
+        f"the pump needs {swing_s:.0f} s from none to full: the loop would swing",
+        f"give at least {0.5 * full_um_per_s:.1f} um/s2",
+    )
+
+
+def judge_shape(config: Config, say: Findings) -> None:
+    shape = config.shape
+    if not shape.enabled:
+        return
+    say.error(
+        shape.fresh_s < shape.period_s,
+        "shape.fresh_s",
+        f"a shape comes every {shape.period_s:g} s: the last one is never fresh",
+        "give several periods",
+    )
+    say.error(
+        shape.time_constant_s < 2.0 * shape.period_s,
+        "shape.time_constant_s",
+        f"shorter than two shapes ({shape.period_s:g} s each): the trim would follow their noise",
+        "give 20 periods",
+    )
+    say.error(
+        shape.trim_rate_max_um_per_s > 0.5 * config.loop.setpoint_ramp_um_per_s,
+        "shape.trim_rate_max_um_per_s",
+        "the trim may outrun the setpoint's ramp (loop.setpoint_ramp_um_per_s)",
+        "give 0.1 um/s",
+    )
+    say.error(
+        shape.disagreement_max_um >= config.limits.displacement_max_um - config.loop.setpoint_um,
+        "shape.disagreement_max_um",
+        "can never trip: limits.displacement_max_um trips first",
+        "give 10 um",
+    )
+    say.warn(
+        8.0 * shape.frame_interval_s > shape.period_s,
+        "shape.frame_interval_s",
+        f"a cycle of 8 frames does not fit shape.period_s ({shape.period_s:g} s)",
+        "shorten it",
+    )
+
+
+def judge_optics(config: Config, say: Findings) -> None:
+    _geometry("optics.geometry", config.optics.geometry, config.optics.mirror.radius_mm, say)
+    if config.twin.geometry is not None:
+        _geometry("twin.geometry", config.twin.geometry, config.optics.mirror.radius_mm, say)
+
+
+def _geometry(field: str, geometry: GeometryConfig, radius_mm: float, say: Findings) -> None:
+    if geometry.alpha_deg is not None:
+        grazing = min(geometry.alpha_deg, 180.0 - geometry.alpha_deg) < _GRAZING_DEG
+        as_degrees = math.degrees(geometry.alpha_deg)
+        hint = (
+            f"as radians it is {as_degrees:.1f} deg" if as_degrees < 180.0 else "measure it from the mirror's plane"
+        )
+        say.error(grazing, f"{field}.alpha_deg", "camera and screen would look along the mirror", hint)
+        for name in ("a", "b"):
+            length_mm, sigma_mm = getattr(geometry, f"{name}_mm"), getattr(geometry, f"{name}_sigma_mm")
+            say.warn(length_mm < radius_mm, f"{field}.{name}_mm", "nearer than the mirror is wide", "in mm?")
+            wide = sigma_mm is not None and sigma_mm > 0.1 * length_mm
+            say.warn(wide, f"{field}.{name}_sigma_mm", "a tenth of the length or more", "measure again")
+    if geometry.camera is not None:
+        behind = geometry.camera.position_mm[2] <= 0.0
+        say.error(
+            behind, f"{field}.camera.position_mm", "the camera is behind the mirror", "z points out of the mirror"
+        )
+
+
+def judge_alarms(config: Config, say: Findings) -> None:
+    alarms, tick_s = config.alarms, 1.0 / config.loop.rate_hz
+    say.error(alarms.silent_s < 2.0 * tick_s, "alarms.silent_s", "a tick takes as long", f"give {4.0 * tick_s:g} s")
+    most = {
+        "fault": max(rule.code for rule in safety.TABLE),
+        "pump_fraction": 1.0,
+        "vent_fraction": 1.0,
+        "flow_um_per_s": flow_um_per_s(config),
+        "gauge_pressure_pa": config.limits.gauge_pressure_max_pa,
+        "displacement_um": config.limits.displacement_max_um,
+    }
+    for index, rule in enumerate(alarms.rules):
+        if rule.raise_at > rule.clear_at and rule.field in most:
+            why = f"{rule.name} can never be raised: {rule.field} is {most[rule.field]:g} at most"
+            say.error(rule.raise_at >= most[rule.field], f"alarms.rules.{index}.raise_at", why, "give less")
+    port = config.port
+    if port.tls is not None and port.metrics_port is not None:
+        why = "port.tls.port is the same"
+        say.error(port.metrics_port == port.tls.port, "port.metrics_port", why, "give another")
+
+
+def judge_gauge(config: Config, say: Findings) -> None:
+    """The gauge as a guard, and as a witness against the laser."""
+    limits, pressure_pa = config.limits, config.optics.mirror.pressure_pa
+    above_um = limits.displacement_max_um - config.loop.setpoint_um
+    room_pa = limits.gauge_pressure_max_pa - pressure_pa
+    say.error(
+        room_pa <= 0.0,
+        "limits.gauge_pressure_max_pa",
+        f"the mirror has {pressure_pa:g} Pa at displacement 0 (optics.mirror.pressure_pa)",
+        "measure that, or raise the limit",
+    )
+    never = "can never trip: the pressure limit trips first"
+    say.error(
+        0.0 < room_pa <= limits.gauge_step_max_pa, "limits.gauge_step_max_pa", never, f"less than {room_pa:g} Pa"
+    )
+    why = "a gauge that has stopped guards nothing for so long"
+    say.error(
+        limits.gauge_stuck_s > _GAUGE_BLIND_S, "limits.gauge_stuck_s", why, f"give at most {_GAUGE_BLIND_S:g} s"
+    )
+    tick_s = 1.0 / config.loop.rate_hz
+    why = "two equal readings by chance are a fault"
+    say.error(limits.gauge_stuck_s < 3.0 * tick_s, "limits.gauge_stuck_s", why, f"give at least {3.0 * tick_s:g} s")
+    why = "a storm alone moves the gauge so far"
+    say.error(
+        limits.gauge_step_max_pa < _STORM_PA, "limits.gauge_step_max_pa", why, f"give at least {_STORM_PA:g} Pa"
+    )
+    for name, least_um, by in (
+        ("laser_gauge_apart_max_um", _APART_UM, "the gauge's noise and a mount that warms up"),
+        ("laser_gauge_drift_max_um", _CREEP_UM, "the creep of a fresh film"),
+    ):
+        why = f"can never trip: limits.displacement_max_um is {above_um:g} um above the setpoint"
+        say.error(getattr(limits, name) >= above_um, f"limits.{name}", why, "give less")
+        why = f"{by} alone reach it"
+        say.error(getattr(limits, name) < least_um, f"limits.{name}", why, f"give at least {least_um:g} um")
+
+
+def judge_film(config: Config, say: Findings) -> None:
+    """What is said of the film, which gas, laser and gauge are judged by."""
+    limits, mirror = config.limits, config.optics.mirror
+    most = 1.0 + flow_um_per_s(config) / LEAK_LEAST_UM_PER_S
+    why = f"can never trip: the pump gives {flow_um_per_s(config):g} um/s"
+    say.error(limits.leak_growth_max >= most, "limits.leak_growth_max", why, f"give less than {most:.1f}")
+    why = "what the weather moves a leak by trips it"
+    least = CONTRADICTED_MOST
+    say.error(limits.leak_growth_max < least, "limits.leak_growth_max", why, f"give at least {least:g}")
+    why = f"no film is so deep for its radius ({mirror.radius_mm:g} mm)"
+    say.error(mirror.sag_mm >= 0.5 * mirror.radius_mm, "optics.mirror.sag_mm", why, "give the bowl's depth in mm")
+    why = f"the bowl is only {mirror.sag_mm:g} mm deep (optics.mirror.sag_mm): it can never trip"
+    say.error(limits.displacement_min_um <= -1e3 * mirror.sag_mm, "limits.displacement_min_um", why, "give more")
+    why = f"below {TAUT_PA:g} Pa laser and gauge are not held against each other"
+    slack = 0.0 < mirror.pressure_pa <= TAUT_PA
+    say.warn(slack, "optics.mirror.pressure_pa", why, "measure it with the film taut")
+    why = "not known: a gauge in a wrong unit is not noticed"
+    say.warn(
+        mirror.pressure_pa == 0.0, "optics.mirror.pressure_pa", why, "give the gauge's reading at displacement 0"
+    )
+
+
+def judge_ranges(config: Config, board: BenchIdentity, say: Findings) -> None:
+    """A limit that its sensor cannot show never trips."""
+    limits, devices = config.limits, config.devices
+    laser = devices.displacement if devices is not None else None
+    gauge = devices.gauge_pressure if devices is not None else None
+    stated_um = stated_pa = (-math.inf, math.inf)
+    if isinstance(laser, ModbusMap):
+        stated_um = laser.limits or laser.value
+    elif isinstance(laser, Optoncdt1420) and laser.range_mm is not None:
+        zero_mm = laser.range_mm / 2 if laser.zero_mm is None else laser.zero_mm
+        stated_um = (-1e3 * laser.direction * zero_mm, 1e3 * laser.direction * (laser.range_mm - zero_mm))
+    if isinstance(gauge, ModbusMap):
+        stated_pa = gauge.limits or gauge.value
+    low_um = max(min(stated_um), board.displacement_range_um[0])
+    high_um = min(max(stated_um), board.displacement_range_um[1])
+    full_pa = min(max(stated_pa), board.gauge_range_pa[1])
+    shows = f"the laser shows {low_um:g} .. {high_um:g} um: nobody would see it"
+    change = "change it, or move the laser"
+    say.error(limits.displacement_max_um > high_um, "limits.displacement_max_um", shows, change)
+    say.error(limits.displacement_min_um < low_um, "limits.displacement_min_um", shows, change)
+    say.error(
+        limits.gauge_pressure_max_pa >= full_pa,
+        "limits.gauge_pressure_max_pa",
+        f"the gauge shows {full_pa:g} Pa at most: nobody would see it",
+        "give less, or another gauge",
+    )

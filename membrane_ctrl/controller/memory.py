@@ -1,0 +1,107 @@
+"""All that a controller remembers, as bytes: a replay can begin in the middle of a run, to the last bit.
+
+JSON of plain data (`object_codec`), compressed. A run folder may come from anywhere: what is read back is checked,
+attribute by attribute, against today's code, and memory of another layout is refused. The run's configuration is not
+in it (the folder has it), and rules of the safety table go by their code.
+"""
+
+import json
+import zlib
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.control.experiments.trial import Trial
+from membrane_ctrl.controller import pump_obeys, safety
+from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.model import object_codec, shape_estimate
+
+_RULES = {rule.code: rule for rule in safety.TABLE}
+_BYTES_MAX = 1 << 20  # a memory takes some 30 kB, decompressed
+
+
+class UnknownMemoryError(ValueError):
+    """Damaged, or of another layout; the message says what."""
+
+
+def remember(controller: Controller) -> bytes:
+    """The controller's memory; empty while something is under way that cannot be written down (an experiment)."""
+    try:
+        plain = object_codec.encode(controller, _specials(controller._config))
+    except TypeError:
+        return b""
+    return zlib.compress(json.dumps(plain, separators=(",", ":")).encode(), 1)
+
+
+def recall(memory: bytes, fresh: Controller) -> Controller:
+    """The controller as it was.
+
+    Parameters
+    ----------
+    memory : bytes
+        Of `remember`.
+    fresh : Controller
+        A new one of the same configuration: how today's code is laid out.
+
+    Raises
+    ------
+    UnknownMemoryError
+    """
+    config = fresh._config
+    examples = (fresh, pump_obeys.ActuatorTest(config.pump, test_vent=True, rate_hz=config.loop.rate_hz))
+    decoder = object_codec.Decoder(examples, _specials(config))
+    try:
+        expander = zlib.decompressobj()
+        text = expander.decompress(memory, _BYTES_MAX)
+        if not expander.eof:
+            raise object_codec.CodecError("it ends early, or is too long")
+        controller = decoder.decode(json.loads(text), Controller)
+    except (zlib.error, ValueError, RecursionError) as error:
+        raise UnknownMemoryError(f"the recorded memory cannot be used: {error}") from None
+    assert isinstance(controller, Controller)
+    return controller
+
+
+def _specials(config: Config) -> object_codec.Specials:
+    """What a memory holds that is not written attribute by attribute."""
+    sections = {"": config} | {name: getattr(config, name) for name in Config.model_fields}
+    names = {id(section): name for name, section in sections.items()}
+
+    def model(value: BaseModel) -> Any:
+        name = names.get(id(value))
+        return value.model_dump(mode="json") if name is None else name
+
+    def model_again(data: Any, kind: type) -> Any:
+        if isinstance(data, str):
+            found = sections.get(data)
+        else:
+            assert issubclass(kind, BaseModel)
+            try:
+                found = kind.model_validate(data)
+            except ValidationError as error:
+                raise object_codec.CodecError(f"{kind.__name__}: {error.errors()[0]['msg']}") from None
+        if not isinstance(found, kind):
+            raise object_codec.CodecError(f"the configuration has no {kind.__name__} {str(data)[:40]!r}")
+        return found
+
+    return {
+        BaseModel: object_codec.Special(model, model_again),
+        safety.Rule: object_codec.Special(lambda rule: rule.code, _rule),
+        shape_estimate.ShapeEstimate: object_codec.ESTIMATE,
+        Trial: object_codec.Special(_no_trial, _no_trial_again),
+    }
+
+
+def _rule(data: Any, _: type) -> safety.Rule:
+    if type(data) is not int or data not in _RULES:
+        raise object_codec.CodecError(f"the safety table has no rule {str(data)[:40]!r}")
+    return _RULES[data]
+
+
+def _no_trial(_: Trial) -> Any:
+    raise TypeError("an experiment cannot be written down")
+
+
+def _no_trial_again(_: Any, __: type) -> Any:
+    raise object_codec.CodecError("an experiment is not taken up again")

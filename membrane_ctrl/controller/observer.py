@@ -1,0 +1,165 @@
+"""From a tick's raw inputs to the observation that safety judges and the reading that the loop may use."""
+
+import math
+
+from firmware_iface.roles import BenchCommand, BenchReading
+from membrane_ctrl.config.schema import LimitsConfig
+from membrane_ctrl.controller import safety, tick
+
+# Of a slack film the gauge may read nothing but its own zero, and that for hours.
+_SLACK_PA = 20.0
+
+
+class _Repeats:
+    """How long a value has come again and again, equal to the last bit."""
+
+    def __init__(self) -> None:
+        self._value = self._since_s = math.nan
+
+    def same_s(self, value: float, now_s: float) -> float:
+        """In seconds; a value that is absent (NaN) changes nothing."""
+        if math.isfinite(value) and value != self._value:
+            self._value, self._since_s = value, now_s
+        return 0.0 if math.isnan(self._since_s) else now_s - self._since_s
+
+
+class _Jumps:
+    """Refuses values further from the last good one than they can be; believes the new place after ten in a row.
+
+    The safety table has spoken by then, and what is measured may really have moved while nothing was seen.
+    """
+
+    def __init__(self, step_max: float) -> None:
+        self._step_max = step_max
+        self._good = math.nan
+        self.count = 0
+
+    def refuse(self, value: float) -> bool:
+        """Whether a value is a jump; one that is absent (NaN) is none."""
+        if not math.isfinite(value):
+            return False
+        if abs(value - self._good) > self._step_max and self.count < 10:
+            self.count += 1
+            return True
+        self.count = 0
+        self._good = value
+        return False
+
+
+class Observer:
+    """Remembers what is needed to see stale, frozen and jumping input.
+
+    Attributes
+    ----------
+    reading : BenchReading or None
+        This tick's reading.
+    displacement_um : float
+        The laser reading that the loop may use; NaN if there is none in this tick.
+    gauge_pressure_pa : float
+        The gauge's reading if it is no jump; NaN if there is none. Limits are judged on what it says in any case.
+    commanded : tuple of float
+        The last two pump commands, newest first.
+    """
+
+    def __init__(self, limits: LimitsConfig) -> None:
+        self._last_read_s = math.nan
+        self._last_advance_s = math.nan
+        self._stamp: tuple[int, float] | None = None
+        self._laser_jumps, self._gauge_jumps = _Jumps(limits.step_max_um), _Jumps(limits.gauge_step_max_pa)
+        self._laser_repeats, self._gauge_repeats = _Repeats(), _Repeats()
+        self.commanded = (0.0, 0.0)
+        self.reading: BenchReading | None = None
+        self.displacement_um = self.gauge_pressure_pa = math.nan
+
+    def wrote(self, command: BenchCommand) -> None:
+        """Note the command of the tick that just ended, to compare it with its read-back."""
+        self.commanded = (command.pump_fraction, self.commanded[0])
+
+    def look(self, inputs: tick.TickInputs) -> None:
+        """Take the tick's reading: what of it is new, and what is no jump."""
+        reading = self.reading = inputs.reading
+        now_s = inputs.now_s
+        if math.isnan(self._last_read_s):  # ages count from the first tick
+            self._last_read_s = self._last_advance_s = now_s
+        if reading is not None:
+            self._last_read_s = now_s
+            stamp = (reading.sample_counter, reading.device_time_s)
+            if self._stamp is None or (stamp[0] != self._stamp[0] and stamp[1] != self._stamp[1]):
+                self._last_advance_s = now_s
+                self._stamp = stamp
+        self.displacement_um = self._gate(reading, fresh=self._last_advance_s == now_s)
+        gauge_pa = reading.gauge_pressure_pa if reading else math.nan
+        self.gauge_pressure_pa = math.nan if self._gauge_jumps.refuse(gauge_pa) else gauge_pa
+
+    def observe(
+        self,
+        inputs: tick.TickInputs,
+        error_um: float,
+        tick_error: str,
+        overdue: str,
+        unfit: str,
+        laser_lies: str,
+        runs_on: str = "",
+        inflow: str = "",
+        locked: str = "",
+        laser_gauge_apart: str = "",
+        gas_excess: str = "",
+    ) -> safety.Observation:
+        """One tick's observation, after `look`."""
+        reading, now_s = self.reading, inputs.now_s
+        gauge_pa = reading.gauge_pressure_pa if reading else math.nan
+        return safety.Observation(
+            link_up=inputs.link_up,
+            reading_age_s=now_s - self._last_read_s,
+            advance_age_s=now_s - self._last_advance_s,
+            same_s=self._laser_repeats.same_s(self.displacement_um, now_s),
+            displacement_um=_good_quality_um(reading),
+            displacement_valid=math.isfinite(self.displacement_um),
+            jumps=self._laser_jumps.count,
+            error_um=error_um,
+            gauge_pressure_pa=gauge_pa,
+            gauge_same_s=self._gauge_same_s(gauge_pa, now_s),
+            gauge_jumps=self._gauge_jumps.count,
+            pump_mismatch=self._mismatch(reading),
+            watchdog_tripped=reading.watchdog_tripped if reading else False,
+            board_faults=reading.latched_faults if reading else 0,
+            foreign=reading.foreign if reading else 0,
+            lateness_ms=inputs.lateness_ms,
+            dead_tasks=inputs.dead_tasks,
+            tick_error=tick_error,
+            overdue=overdue,
+            unfit=unfit,
+            laser_lies=laser_lies,
+            runs_on=runs_on,
+            inflow=inflow,
+            locked=locked,
+            vent_fraction=reading.vent_fraction if reading else math.nan,
+            laser_gauge_apart=laser_gauge_apart,
+            gas_excess=gas_excess,
+        )
+
+    def _gate(self, reading: BenchReading | None, fresh: bool) -> float:
+        """The displacement if it is finite, good, new, and within reach of the last good one; else NaN."""
+        value_um = _good_quality_um(reading)
+        if not fresh or not math.isfinite(value_um) or self._laser_jumps.refuse(value_um):
+            return math.nan
+        return value_um
+
+    def _gauge_same_s(self, gauge_pa: float, now_s: float) -> float:
+        """How long the gauge of a taut film has repeated one value; 0 in a tick without one."""
+        same_s = self._gauge_repeats.same_s(gauge_pa, now_s)
+        return same_s if abs(gauge_pa) > _SLACK_PA else 0.0
+
+    def _mismatch(self, reading: BenchReading | None) -> float:
+        """How far the read-back is from both of the last two commands: one tick of transport is no mismatch."""
+        if reading is None:
+            return 0.0  # no reading has its own rules
+        if not math.isfinite(reading.pump_fraction):
+            return math.inf  # nobody knows what the pump does
+        return min(abs(reading.pump_fraction - command) for command in self.commanded)
+
+
+def _good_quality_um(reading: BenchReading | None) -> float:
+    if reading is None or reading.displacement_quality != 0:
+        return math.nan
+    return reading.displacement_um

@@ -1,0 +1,134 @@
+"""The ladder of safe actions: hold the last mean flow -> ramp down -> pump off -> vent.
+
+A fault chooses the rung to enter at; each rung times out into the next; nothing but a clear observation on the
+first rung leads back up. The time that the first rung lasts is a store that fills again only as fast as it is used:
+a cause that comes and goes, and is there more than half of the time, times out as one that stays.
+"""
+
+import math
+from collections import deque
+
+from firmware_iface.register_map import default_map
+from membrane_ctrl.config.schema import LimitsConfig, ResumeConfig, StatesConfig
+from membrane_ctrl.controller.safety import Observation, Rule
+from membrane_ctrl.model.states import Rung
+
+
+class Ladder:
+    """Which safe action is in force, and since when."""
+
+    def __init__(self, config: StatesConfig) -> None:
+        self._limit_s = {
+            Rung.HOLD_FLOW: config.hold_flow_max_s,
+            Rung.RAMP_DOWN: config.ramp_down_s,
+            Rung.PUMP_OFF: config.pump_off_max_s,
+        }
+        self.rung = Rung.NONE
+        self._since_s = 0.0
+        self._used_s = self._cleared_s = 0.0  # of HOLD_FLOW's time, when it was last left, and when that was
+
+    def enter(self, rung: Rung, now_s: float) -> None:
+        """Go to a rung, if it is further down than the present one."""
+        if rung > self.rung:
+            used_s = max(0.0, self._used_s - (now_s - self._cleared_s)) if rung == Rung.HOLD_FLOW else 0.0
+            self.rung = rung
+            self._since_s = now_s - used_s
+
+    def clear(self, now_s: float) -> None:
+        """Leave the ladder; only from HOLD_FLOW, as everything below is latched."""
+        assert self.rung == Rung.HOLD_FLOW, self.rung
+        self._used_s, self._cleared_s = self.age_s(now_s), now_s
+        self.rung = Rung.NONE
+
+    def leave(self) -> None:
+        """Leave the ladder from wherever it is: a person has acknowledged, or the resume rule allows it."""
+        self.rung, self._used_s = Rung.NONE, 0.0
+
+    def age_s(self, now_s: float) -> float:
+        """Time on the present rung; on HOLD_FLOW with what was left of earlier times there."""
+        return now_s - self._since_s
+
+    def step(self, now_s: float) -> Rung:
+        """The rung in force now: a rung whose time is over gives way to the next."""
+        limit_s = self._limit_s.get(self.rung)
+        if limit_s is not None and self.age_s(now_s) > limit_s:
+            self.enter(Rung(self.rung + 1), now_s)
+        return self.rung
+
+
+# May a latched fault clear by itself? Only listed ones, only when their cause has stayed away, only so often.
+#
+# Never what has vented, never what the board has latched beyond its watchdog's own trip, never a board that another
+# program has taken, and nothing that a person has latched: one sign of these at any moment of the fault decides,
+# whatever its first cause was.
+
+
+DAY_S = 86_400.0
+WATCHDOG_MASK = default_map().fault_mask("watchdog")
+# A bleed, the actuator test and a controller's way down leave the vent at most this far open; a board that vents by
+# itself opens it fully
+VENTED_FRACTION = 0.5
+
+
+class ResumeRule:
+    """Counts the resumes of the last day and how long the present cause has been away."""
+
+    def __init__(self, config: ResumeConfig, limits: LimitsConfig) -> None:
+        self._config, self._limits = config, limits
+        self._resumed_s: deque[float] = deque()
+        self._clear_since_s = math.nan
+        self._never = False
+        self.possible = False
+        self.clear_mask = 0
+
+    def resumed(self, at_s: float) -> None:
+        """Count a resume; one before this run has a negative time."""
+        self._resumed_s.append(at_s)
+
+    def forget(self) -> None:
+        """There is no fault: what was seen in an earlier one does not count in the next."""
+        self._clear_since_s, self._never, self.possible, self.clear_mask = math.nan, False, False, 0
+
+    def due(self, fault: Rule, ladder: Ladder, observation: Observation, now_s: float) -> bool:
+        """Look at a tick of a fault; True once the cause has stayed away for long enough.
+
+        Afterwards `possible` says whether the fault may still clear by itself, and `clear_mask` which of the board's
+        latches have to be cleared for it: the watchdog's own, or none.
+        """
+        self._never |= _decides(ladder, observation)
+        listed = fault.may_resume and fault.name in self._config.faults
+        self.possible = listed and not self._never and self._left(now_s)
+        self.clear_mask = observation.board_faults if self.possible else 0
+        if not self.possible:
+            self._clear_since_s = math.nan
+            return False
+        silent = not observation.link_up or observation.reading_age_s > self._limits.stale_s
+        gone = not (silent or self.clear_mask or fault.broken(observation, self._limits))
+        if gone and observation.reading_age_s > 0.0:
+            return False  # an answer that is lost now and then says nothing
+        return self._waited(gone, now_s)
+
+    def _left(self, now_s: float) -> bool:
+        """The day's number is not used up."""
+        while self._resumed_s and now_s - self._resumed_s[0] > DAY_S:
+            self._resumed_s.popleft()
+        return len(self._resumed_s) < self._config.most_per_day
+
+    def _waited(self, gone: bool, now_s: float) -> bool:
+        if not gone:
+            self._clear_since_s = math.nan
+            return False
+        if math.isnan(self._clear_since_s):
+            self._clear_since_s = now_s
+        return now_s - self._clear_since_s >= self._config.wait_s
+
+
+def _decides(ladder: Ladder, observation: Observation) -> bool:
+    """Something that only a person may clear."""
+    return (
+        ladder.rung == Rung.VENT
+        or bool(observation.board_faults & ~WATCHDOG_MASK)
+        or observation.vent_fraction > VENTED_FRACTION
+        or bool(observation.locked)
+        or bool(observation.foreign)
+    )

@@ -1,0 +1,168 @@
+"""What a held mirror's sensors say about each other and about the film: who lies, and what wears out."""
+
+import math
+from dataclasses import dataclass
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.control import film, film_health, gas, plausibility
+from membrane_ctrl.controller import safety, tick
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.states import State
+
+# A single bad answer is nobody's business.
+_WEATHER_STANDS_S = 10.0
+# No two cycles have the same noise; one that comes twice may be the same message.
+_REPEATS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """How the mirror is held.
+
+    Attributes
+    ----------
+    laser_um, gauge_pressure_pa : float
+        Readings that are new, good and no jump, else NaN: a mean over ten seconds must not take in a bit error.
+    setpoint_um, trim_um : float
+        What a person has asked for, and what the shape loop adds.
+    ramp_left_um : float
+        How far the setpoint's ramp has still to go. A camera sees the film of a cycle ago, and the gauge is linear
+        only about its reference: on a long way they would contradict a laser that is right.
+    leak_um_per_s, flow_um_per_s : float
+        As the inner loop estimates it, and what the pump gives; NaN without.
+    bleed_fraction : float
+        The vent that is held open on purpose.
+    """
+
+    laser_um: float
+    gauge_pressure_pa: float
+    setpoint_um: float
+    trim_um: float
+    ramp_left_um: float
+    leak_um_per_s: float
+    flow_um_per_s: float
+    bleed_fraction: float
+
+
+class Witnesses:
+    """Asked on every tick, before safety judges.
+
+    Attributes
+    ----------
+    laser_lies : str
+        What the three witnesses of the sag have seen, if it is the laser that does not fit.
+    camera_lies : str
+        The same of the camera, as a reason for the shape loop.
+    laser_gauge_apart : str
+        What laser and gauge have seen, if both cannot be true.
+    gas_excess : str
+        How much more gas the film takes than it used to, if no camera sees it.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._plausibility = plausibility.Plausibility(config.shape.disagreement_max_um)
+        self._far_um = config.shape.disagreement_max_um
+        self._health = film_health.FilmHealth(min(config.loop.flow_max_um_per_s, config.pump.flow_full_um_per_s))
+        self._film = film.FilmWitness(config.limits, config.optics.mirror)
+        self._growth = film.LeakGrowth()
+        self._leak_growth_max = config.limits.leak_growth_max
+        self._fresh_s = config.shape.fresh_s
+        self._camera_s = -math.inf
+        self._sag_um, self._repeats = math.nan, 0
+        self._setpoint_um, self._bleed_fraction = config.loop.setpoint_um, config.loop.bleed_fraction
+        self._liar = plausibility.Liar.NOBODY
+        self._weather_s = 0.0
+        self._weather_told = False
+        self.laser_lies = self.camera_lies = self.laser_gauge_apart = self.gas_excess = ""
+
+    def ask(self, inputs: tick.TickInputs, state: State, dt_s: float, held: Held) -> list[Event]:
+        """One tick.
+
+        Parameters
+        ----------
+        inputs : TickInputs
+        state : State
+            Only a held mirror is judged.
+        dt_s : float
+        held : Held
+
+        Returns
+        -------
+        list of Event
+            What is new.
+        """
+        laser_um, gauge_pa = held.laser_um, held.gauge_pressure_pa
+        if held.setpoint_um != self._setpoint_um:
+            self._setpoint_um = held.setpoint_um
+            self._health.setpoint_moved()
+        if state != State.HOLD or held.bleed_fraction != self._bleed_fraction:
+            self._bleed_fraction = held.bleed_fraction
+            self._growth.reset()
+        if state in safety.CONNECTED:
+            self.laser_gauge_apart = self._film.step(dt_s, laser_um, held.trim_um, gauge_pa)
+        elif self._film.watching:
+            self._film.reset()
+            self.laser_gauge_apart = ""
+        if state != State.HOLD or abs(held.ramp_left_um) > self._far_um:
+            return self._rest()
+        self._look_at_camera(inputs)
+        events = self._judge_weather(inputs, dt_s)
+        events += self._judge(self._plausibility.step(dt_s, laser_um, gauge_pa, inputs.estimate))
+        self.gas_excess = self._growth.step(held.leak_um_per_s, held.flow_um_per_s, self._most_growth(inputs), dt_s)
+        for warning in self._health.step(dt_s, held.leak_um_per_s, gauge_pa):
+            kind = "maintenance" if warning.bad else "maintenance_over"
+            events.append({"kind": kind, "name": warning.name, "message": warning.message})
+        return events
+
+    def _rest(self) -> list[Event]:
+        """Nothing is held, or not yet where it is to be."""
+        self._growth.moves()
+        self.gas_excess = ""
+        if self._plausibility.watching:
+            self._plausibility.reset()
+        return self._judge(plausibility.Liar.NOBODY)
+
+    def _look_at_camera(self, inputs: tick.TickInputs) -> None:
+        """Note when it has last seen the film, and how often the same to the last bit."""
+        estimate = inputs.estimate
+        if estimate is None or estimate.verdict == "rejected":
+            return
+        self._camera_s = estimate.time_s
+        self._repeats = self._repeats + 1 if estimate.sag_um == self._sag_um else 0
+        self._sag_um = estimate.sag_um
+
+    def _most_growth(self, inputs: tick.TickInputs) -> float:
+        """How far the leak may grow: as it likes, while a camera sees the film where the laser does."""
+        if self._repeats >= _REPEATS:
+            return self._leak_growth_max
+        if not inputs.now_s - self._camera_s <= self._fresh_s:
+            return self._leak_growth_max
+        return math.inf if self._liar == plausibility.Liar.NOBODY else film.CONTRADICTED_MOST
+
+    def _judge_weather(self, inputs: tick.TickInputs, dt_s: float) -> list[Event]:
+        """A barometer or thermometer that cannot be right is left out, and that is told once."""
+        reading = inputs.reading
+        if reading is None:
+            return []
+        complaint = gas.weather_complaint(reading.ambient_pressure_pa, reading.air_temperature_c)
+        self._weather_s = self._weather_s + dt_s if bool(complaint) != self._weather_told else 0.0
+        if self._weather_s < _WEATHER_STANDS_S:
+            return []
+        self._weather_told, self._weather_s = bool(complaint), 0.0
+        kind = "maintenance" if complaint else "maintenance_over"
+        return [{"kind": kind, "name": "weather_sensor", "message": complaint or "no longer so"}]
+
+    def _judge(self, liar: plausibility.Liar) -> list[Event]:
+        repeats = self._repeats >= _REPEATS
+        seen = str(self._plausibility.changes) if liar in (plausibility.Liar.LASER, plausibility.Liar.OPTICS) else ""
+        self.laser_lies = seen if liar == plausibility.Liar.LASER else ""
+        if repeats:
+            self.camera_lies = "the camera repeats one shape to the last bit: restart it"
+        elif liar != plausibility.Liar.OPTICS:
+            self.camera_lies = ""
+        elif not self.camera_lies:  # the words stay: a reason whose numbers change is no new one
+            self.camera_lies = f"laser and gauge agree that the camera is wrong: {seen}"
+        if liar == self._liar:
+            return []
+        self._liar = liar
+        return [{"kind": "plausibility", "liar": liar.name.lower(), "seen": str(self._plausibility.changes)}]

@@ -1,0 +1,437 @@
+"""States as small functions: each looks at the tick, sets what the pump shall do, and returns the next state.
+
+They decide only what is wanted when all is well. Safety is judged around them on every tick
+(`controller.Controller.tick`): no handler can go past it.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.control import filters, inner_loop
+from membrane_ctrl.control.experiments.machine import Finished, Measurement
+from membrane_ctrl.control.experiments.trial import Trial
+from membrane_ctrl.controller import pump_obeys, safe_levels
+from membrane_ctrl.controller.observer import Observer
+from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.model.states import Rung, State
+
+# a pump that someone left running has run down by then: lag 0.15 s, transport 0.1 s (docs/physics.md, inner loop)
+_PUMP_STANDS_S = 0.5
+_VENTED_S = 900.0  # twice what the twin's valve takes from 600 Pa; longer means a shut vent or a wrong gauge
+# A `stop` of a pump that does not obey: the vent has been open and the pump commanded off for so long, and whoever
+# waits is told that it runs on. Shorter than the 30 s that the service manager gives a stop.
+_STOP_GIVES_UP_S = 10.0
+
+
+@dataclass(slots=True)
+class Scene:
+    """What the handlers share: the loop, this tick's facts, and what they decide."""
+
+    config: Config
+    loop_config: LoopConfig  # as it is now, after `gains`
+    loop: inner_loop.InnerLoop
+    observer: Observer
+    ladder: safe_levels.Ladder
+    standstill: pump_obeys.Standstill
+    setpoint_um: float
+    # this tick
+    now_s: float = 0.0
+    dt_s: float = 0.02
+    state_age_s: float = 0.0  # 0 exactly in the first tick of a state
+    trim_um: float = 0.0
+    # what was asked for
+    hold_wanted: bool = False
+    manual_wanted: bool = False
+    manual_um_per_s: float = 0.0
+    manual_since_s: float = math.nan  # the last `manual` command
+    mean_flow_um_per_s: float = 0.0  # the pump's when a person took it
+    paused: bool = False
+    trial: Trial | None = None  # an experiment, until its end has been told
+    way_down: Literal["stop", "lower"] | None = None
+    venting: bool = False  # on the way down, and after a `stop` as well
+    asked_by: str = ""
+    stop_exit: Exit = Exit.DONE
+    acknowledged: bool = False
+    latched: str = ""  # a fault of an earlier run: no hold before a person has acknowledged it
+    may_resume: bool = False  # the resume rule lets a latched fault go
+    resume_possible: bool = False  # it may yet
+    # memory of the states
+    good_since_s: float = math.nan
+    last_good_s: float = math.nan  # in `check`
+    sinking: filters.Slope = field(default_factory=filters.Slope)  # of the mirror with the pump off, seen in `check`
+    test: pump_obeys.ActuatorTest | None = None
+    ramp_from_fraction: float = 0.0
+    last_pump_fraction: float = 0.0
+    # decisions of this tick
+    output: inner_loop.LoopOutput | None = None
+    pump_fraction: float = 0.0
+    vent_fraction: float = 0.0
+    why: str = ""
+    overdue: str = ""
+    unfit: str = ""
+    finished: Exit | None = None
+    trial_ended: Finished | None = None
+
+    def stay_good(self, good: bool) -> float:
+        """How long `good` has been true without a break, in seconds."""
+        if not good:
+            self.good_since_s = math.nan
+            return 0.0
+        if math.isnan(self.good_since_s):
+            self.good_since_s = self.now_s
+        return self.now_s - self.good_since_s
+
+
+def standby(scene: Scene) -> State:
+    """Pump off until someone wants the mirror held."""
+    if scene.way_down is not None:
+        return _go_down(scene)
+    if scene.hold_wanted:
+        scene.why = "asked to hold the mirror"
+        return State.CHECK
+    scene.why = f"standby: latched: {scene.latched}" if scene.latched else "standby: nobody has asked for a hold"
+    return State.STANDBY
+
+
+def check(scene: Scene) -> State:
+    """Every sensor must have been good for a while, and the film must answer, before the pump may run for good."""
+    if scene.way_down is not None:
+        return _go_down(scene)
+    missing = _missing(scene)
+    if not missing:
+        scene.last_good_s = scene.now_s
+    # an answer that is lost now and then is no sensor that is bad
+    gone = not scene.now_s - scene.last_good_s <= scene.config.limits.stale_s
+    good_s = scene.stay_good(not gone)
+    if scene.state_age_s > scene.config.states.check_timeout_s:
+        scene.overdue = f"sensors not good after {scene.config.states.check_timeout_s:g} s: {missing}"
+    if gone:
+        scene.test = None  # what was measured with a hole in it is measured again
+        scene.why = f"checking the sensors: {missing}"
+        return State.CHECK
+    if scene.config.states.actuator_test:
+        return _test_actuators(scene)
+    scene.why = "checking the sensors: all good so far"
+    if scene.state_age_s > _PUMP_STANDS_S:
+        scene.sinking.add(scene.now_s, scene.observer.displacement_um)
+    if good_s < scene.config.states.check_s or missing:
+        return State.CHECK
+    return _begin(scene, max(0.0, -scene.sinking.per_s))
+
+
+def inflate(scene: Scene) -> State:
+    """Ramp from where the mirror is to the setpoint; the ramp waits for a mirror that lags behind."""
+    if (elsewhere := _asked_elsewhere(scene)) is not None:
+        return elsewhere
+    lags = scene.output is not None and abs(scene.output.error_um) > scene.config.states.inflate_pause_um
+    target_um = scene.output.setpoint_um - scene.trim_um if scene.output is not None and lags else scene.setpoint_um
+    output = _drive(scene, target_um)
+    to_go_um = scene.setpoint_um - output.filtered_um
+    scene.why = f"inflating: {to_go_um:.1f} um to go" + (", the ramp waits for the mirror" if lags else "")
+    ramp_left_um = scene.setpoint_um + scene.trim_um - output.setpoint_um
+    if max(abs(ramp_left_um), abs(to_go_um)) < scene.config.limits.band_um:
+        return State.SETTLE
+    if scene.state_age_s > scene.config.states.inflate_timeout_s:
+        scene.overdue = f"still {to_go_um:.0f} um from the setpoint"
+    return State.INFLATE
+
+
+def settle(scene: Scene) -> State:
+    """Stay inside the band for a while before the state is called hold."""
+    if (elsewhere := _asked_elsewhere(scene)) is not None:
+        return elsewhere
+    output = _drive(scene, scene.setpoint_um)
+    band_um = scene.config.limits.band_um
+    settled_s = scene.stay_good(abs(output.error_um) < band_um)
+    scene.why = f"settling: inside the band for {settled_s:.0f} s"
+    if settled_s >= scene.config.states.settle_s:
+        scene.why = f"inside +-{band_um:g} um for {settled_s:.1f} s"
+        return State.HOLD
+    if scene.state_age_s > scene.config.states.settle_timeout_s:
+        scene.overdue = f"not inside +-{band_um:g} um for {scene.config.states.settle_s:g} s"
+    return State.SETTLE
+
+
+def hold(scene: Scene) -> State:
+    """The main job."""
+    if (elsewhere := _asked_elsewhere(scene)) is not None:
+        return elsewhere
+    if scene.paused:
+        scene.output = scene.loop.stale(scene.dt_s)
+        scene.pump_fraction = scene.output.pump_fraction
+        scene.vent_fraction = scene.loop_config.bleed_fraction
+        scene.why = f"paused by {scene.asked_by}: the pump gives its mean flow"
+        if scene.stay_good(True) > scene.config.states.pause_max_s or _strayed(scene):
+            scene.paused = False
+        return State.HOLD
+    scene.good_since_s = math.nan
+    scene.why = _why_hold(scene, _drive(scene, scene.setpoint_um))
+    return State.HOLD
+
+
+def manual(scene: Scene) -> State:
+    """The flow that a person has asked for; the loop follows, so that `hold` takes over without a bump."""
+    if scene.way_down is not None:
+        return _go_down(scene)
+    if scene.hold_wanted:
+        scene.why = f"{scene.asked_by} asked to hold the mirror again"
+        _keep_flowing(scene)
+        return State.INFLATE
+    if over := _manual_over(scene):
+        scene.output = scene.loop.follow(_given(scene, scene.setpoint_um), scene.mean_flow_um_per_s, scene.dt_s)
+        scene.pump_fraction = scene.output.pump_fraction
+        scene.vent_fraction = scene.loop_config.bleed_fraction
+        scene.why = f"manual is over: {over}"
+        return State.INFLATE
+    output = scene.output = scene.loop.follow(_given(scene, scene.setpoint_um), scene.manual_um_per_s, scene.dt_s)
+    scene.pump_fraction = output.pump_fraction
+    scene.vent_fraction = scene.loop_config.bleed_fraction
+    scene.why = f"manual: {scene.asked_by} has set the flow to {scene.manual_um_per_s:.2f} um/s"
+    return State.MANUAL
+
+
+def tune(scene: Scene) -> State:
+    """An experiment, inside its guard; whatever ends it, the loop takes the mirror back at the holding flow."""
+    trial = scene.trial
+    assert trial is not None  # the command that leads here has made it
+    if scene.way_down is not None:
+        return _go_down(scene)
+    given = _given(scene, scene.setpoint_um)
+    measurement = Measurement(given.displacement_um, given.ambient_pressure_pa, given.air_temperature_c)
+    wanted: float | Finished
+    if scene.hold_wanted:
+        wanted = Finished(False, f"ended by {scene.asked_by}")
+    elif scene.ladder.rung != Rung.NONE:
+        wanted = Finished(False, "the safety table holds the mean flow")
+    else:
+        wanted = trial.step(measurement, scene.dt_s)
+    scene.vent_fraction = scene.loop_config.bleed_fraction
+    if isinstance(wanted, Finished):
+        scene.output = scene.loop.follow(given, trial.spec.holding_flow_um_per_s, scene.dt_s)
+        scene.trial_ended = wanted
+        scene.why = f"{trial.spec.kind} {'done' if wanted.completed else 'stopped'}: {wanted.reason}"
+    elif trial.raw:
+        scene.output = scene.loop.follow_raw(given, wanted, scene.dt_s)
+    else:
+        scene.output = scene.loop.follow(given, wanted, scene.dt_s)
+    scene.pump_fraction = scene.output.pump_fraction
+    if scene.trial_ended is not None:
+        return State.HOLD
+    scene.why = f"tuning: {trial.spec.kind} asked for by {scene.asked_by}"
+    return State.TUNE
+
+
+def lower(scene: Scene) -> State:
+    """The way down: pump off, and seen to be off; the leak lets the mirror down by itself, or the vent does.
+
+    What ends it is read-back and pressure, never a time-out: a pump that runs on is a fault (`pump_runs_on`).
+    """
+    scene.hold_wanted = False
+    scene.vent_fraction = float(scene.venting)
+    stand = scene.standstill
+    scene.why = f"{_way(scene)} asked for by {scene.asked_by}: pump off"
+    if scene.way_down == "stop":
+        if stand.silent_s > scene.config.states.lower_timeout_s:
+            scene.finished = Exit.DEVICE_FAILED  # nobody can see whether the pump stands
+        elif stand.at_rest:
+            scene.finished = scene.stop_exit
+        return State.LOWER
+    if scene.venting:
+        reading = scene.observer.reading
+        pressure_pa = reading.gauge_pressure_pa if reading else math.nan
+        scene.why = f"venting: {pressure_pa:.0f} Pa left"
+        if scene.state_age_s > _VENTED_S:
+            scene.why += f" after {scene.state_age_s / 60:.0f} min: see whether the vent opens and the gauge reads"
+        if not pressure_pa < scene.config.states.vented_pressure_pa:
+            return State.LOWER
+    if not stand.seen_off:
+        return State.LOWER
+    scene.way_down = None
+    return State.STANDBY
+
+
+def fault(scene: Scene) -> State:
+    """Down the ladder, latched; a person clears it, or the resume rule does for a cause that has gone."""
+    rung = scene.ladder.step(scene.now_s)
+    scene.why = f"fault: {rung.name.lower().replace('_', ' ')}"
+    scene.hold_wanted = False
+    scene.vent_fraction = float(scene.venting or rung == Rung.VENT)
+    if rung == Rung.RAMP_DOWN:
+        if scene.state_age_s == 0:
+            scene.ramp_from_fraction = scene.last_pump_fraction
+        left = max(0.0, 1.0 - scene.ladder.age_s(scene.now_s) / scene.config.states.ramp_down_s)
+        scene.pump_fraction = left * scene.ramp_from_fraction
+        return State.FAULT
+    stops = scene.way_down == "stop"
+    stand = scene.standstill
+    silent = stand.silent_s > scene.config.states.lower_timeout_s
+    if scene.acknowledged and (stand.seen_off or silent):
+        scene.why = f"fault acknowledged by {scene.asked_by}"
+        return State.STANDBY
+    if scene.may_resume and stand.seen_off and not stops:
+        scene.hold_wanted = True
+        scene.why = "the cause has gone and may resume by itself"
+        return State.STANDBY
+    may_end = stops or not (scene.config.states.stay_after_trip or scene.resume_possible)
+    if may_end and (stand.at_rest or silent or _nothing_left_to_do(scene, rung)):
+        scene.finished = Exit.SAFETY_TRIP
+    return State.FAULT
+
+
+def _nothing_left_to_do(scene: Scene, rung: Rung) -> bool:
+    """A pump that does not obey: the vent is open, and the mirror is empty or has been given the time to get so.
+
+    Until then the run goes on, for its last command is then not the only one that tells the pump to stop.
+    """
+    if rung != Rung.VENT:
+        return False
+    reading, vented_s = scene.observer.reading, scene.ladder.age_s(scene.now_s)
+    empty = reading is not None and reading.gauge_pressure_pa < scene.config.states.vented_pressure_pa
+    return vented_s > (_STOP_GIVES_UP_S if empty or scene.way_down == "stop" else _VENTED_S)
+
+
+HANDLERS: dict[State, Callable[[Scene], State]] = {
+    State.STANDBY: standby,
+    State.CHECK: check,
+    State.INFLATE: inflate,
+    State.SETTLE: settle,
+    State.HOLD: hold,
+    State.MANUAL: manual,
+    State.TUNE: tune,
+    State.LOWER: lower,
+    State.FAULT: fault,
+}
+
+
+def _go_down(scene: Scene) -> State:
+    scene.why = f"{_way(scene)} asked for by {scene.asked_by}"
+    return State.LOWER
+
+
+def _way(scene: Scene) -> str:
+    return "vent" if scene.venting and scene.way_down == "lower" else str(scene.way_down)
+
+
+def _strayed(scene: Scene) -> bool:
+    """The mirror is further from its setpoint than it may get while no loop holds it."""
+    away_um = abs(scene.observer.displacement_um - scene.setpoint_um - scene.trim_um)
+    return away_um > scene.config.states.manual_range_um
+
+
+def _manual_over(scene: Scene) -> str:
+    """Why the loop takes the mirror back from whoever set the flow; empty if it does not."""
+    states = scene.config.states
+    if scene.ladder.rung != Rung.NONE:
+        return "the safety table holds the mean flow"
+    if _strayed(scene):
+        return f"more than {states.manual_range_um:g} um from the setpoint"
+    if scene.now_s - scene.manual_since_s > states.manual_max_s:
+        return f"no flow was set for {states.manual_max_s:g} s"
+    return ""
+
+
+def _keep_flowing(scene: Scene) -> None:
+    """Go on as in the last tick: the state that was just chosen takes over in the next one."""
+    scene.pump_fraction = scene.last_pump_fraction
+    scene.vent_fraction = scene.loop_config.bleed_fraction
+
+
+def _asked_elsewhere(scene: Scene) -> State | None:
+    """The state that somebody has asked for, if it is another one than a hold."""
+    if scene.way_down is not None:
+        return _go_down(scene)
+    if scene.trial is not None:
+        _drive(scene, scene.setpoint_um)  # the loop has this tick: without it the pump would be off for 20 ms
+        scene.why = f"{scene.asked_by} asked for the experiment {scene.trial.spec.kind}"
+        return State.TUNE
+    if scene.manual_wanted:
+        scene.hold_wanted = False
+        scene.why = f"{scene.asked_by} has taken the pump"
+        scene.mean_flow_um_per_s = scene.loop.mean_flow_um_per_s
+        _keep_flowing(scene)
+        return State.MANUAL
+    return None
+
+
+def _test_actuators(scene: Scene) -> State:
+    reading = scene.observer.reading
+    if scene.test is None:
+        vents = reading is not None and math.isfinite(reading.vent_fraction)
+        tense = reading is not None and reading.gauge_pressure_pa > scene.config.states.vented_pressure_pa
+        scene.test = pump_obeys.ActuatorTest(scene.config.pump, vents and tense, scene.config.loop.rate_hz)
+    scene.test.step(scene.observer.displacement_um, scene.dt_s)
+    part = scene.test.part
+    if part is not None:
+        scene.pump_fraction, scene.vent_fraction = part.pump_fraction, part.vent_fraction
+        scene.why = f"checking that the film answers: {part.name}"
+        return State.CHECK
+    if _missing(scene):
+        return State.CHECK  # the loop begins at a reading
+    complaint = scene.test.complaint()
+    if complaint:
+        if scene.test.is_second:
+            scene.unfit = complaint
+        scene.why = f"the film does not answer{'' if scene.unfit else ' clearly'}: {complaint}"
+        scene.test.again()
+        return State.CHECK
+    return _begin(scene, scene.test.leak_um_per_s)
+
+
+def _begin(scene: Scene, leak_um_per_s: float) -> State:
+    """Hand over to the loop, with the flow that balances the leak: the integrator need not find it first."""
+    scene.loop.start(scene.observer.displacement_um, leak_um_per_s)
+    scene.why = f"all sensors good, the film answers; it sinks by {leak_um_per_s:.2f} um/s"
+    scene.pump_fraction = scene.last_pump_fraction
+    return State.INFLATE
+
+
+def _drive(scene: Scene, target_um: float) -> inner_loop.LoopOutput:
+    """Let the loop drive the pump: automatic with a reading to trust, the held mean flow without one."""
+    if math.isfinite(scene.observer.displacement_um) and scene.ladder.rung == Rung.NONE:
+        output = scene.loop.step(_given(scene, target_um), scene.dt_s)
+    else:
+        output = scene.loop.stale(scene.dt_s)
+    scene.output = output
+    scene.pump_fraction = output.pump_fraction
+    scene.vent_fraction = scene.loop_config.bleed_fraction
+    return output
+
+
+def _given(scene: Scene, target_um: float) -> inner_loop.LoopInput:
+    reading = scene.observer.reading
+    return inner_loop.LoopInput(
+        target_um=target_um,
+        trim_um=scene.trim_um,
+        displacement_um=scene.observer.displacement_um,
+        ambient_pressure_pa=reading.ambient_pressure_pa if reading else math.nan,
+        air_temperature_c=reading.air_temperature_c if reading else math.nan,
+    )
+
+
+def _missing(scene: Scene) -> str:
+    reading = scene.observer.reading
+    if reading is None:
+        return "no answer from the device"
+    if not math.isfinite(scene.observer.displacement_um):
+        return f"no valid laser reading (quality {reading.displacement_quality})"
+    if not math.isfinite(reading.gauge_pressure_pa):
+        return "no gauge pressure"
+    if reading.latched_faults:
+        return f"the board has latched faults {reading.latched_faults:#x}"
+    return ""
+
+
+def _why_hold(scene: Scene, output: inner_loop.LoopOutput) -> str:
+    if scene.ladder.rung == Rung.HOLD_FLOW:
+        return "holding the last mean flow until the laser is back"
+    if output.too_tight:
+        return "holding, but the mirror is too tight: open a bleed (loop.bleed_fraction)"
+    if output.saturated:
+        side = (
+            "more gas than the pump has" if output.flow_wanted_um_per_s > output.flow_um_per_s else "less than none"
+        )
+        return f"holding, pump at its limit: the loop wants {side}"
+    return "holding: the pump replaces what leaks"

@@ -1,0 +1,232 @@
+"""A geometry in a file: by hand, of another set, or the `geometry.toml` that `calibrate` writes.
+
+Of the last also the lens and the screen's pitch count, if they were calibrated. Its `[calibration]` carries a hash of
+its numbers, which results and runs name; a file whose numbers are no longer those is refused.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import tomli_w
+
+from membrane_ctrl.config.schema import CameraConfig, Config, GeometryConfig, OpticsConfig
+from membrane_ctrl.config.section import Section
+from membrane_ctrl.config.toml_file import parse, prune, read_toml, with_height_map
+from membrane_ctrl.model import errors, files, plain_json
+
+Table = TypeVar("Table", bound=Section)
+
+
+class LensTable(Section):
+    """`[camera]` of a calibrated geometry: the lens, and the camera that it belongs to."""
+
+    width_px: int
+    height_px: int
+    pixel_um: float
+    focal_mm: float
+    principal_px: tuple[float, float]
+    distortion: tuple[float, ...] = ()
+
+    def over(self, camera: CameraConfig, where: Path) -> CameraConfig:
+        """The camera with this lens; raises InputError, naming the file, if it is another camera."""
+        for key in ("width_px", "height_px", "pixel_um"):
+            if getattr(self, key) != getattr(camera, key):
+                raise errors.InputError(
+                    f"{where}: camera.{key} = {getattr(self, key):g}, the frames' camera has "
+                    f"{getattr(camera, key):g}; a calibrated lens is good for its own camera alone"
+                )
+        return camera.model_copy(update=self.model_dump())
+
+
+class PitchTable(Section):
+    """`[pattern]` of a calibrated geometry."""
+
+    period_mm: float
+
+
+class CalibrationTable(Section):
+    """What is read of `[calibration]`."""
+
+    date_utc: str
+    hash: str
+    slope_residual_urad: float
+    slope_noise_urad: float
+    ring_um: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class GeometryOrigin:
+    """Which geometry a result was made with.
+
+    Attributes
+    ----------
+    hash : str
+        Of its numbers: that of the file, or of what the set itself states.
+    file : str
+        Where it was read; empty for the set's own.
+    calibrated_utc : str
+        When; empty if it is not a calibrated one.
+    """
+
+    hash: str
+    file: str = ""
+    calibrated_utc: str = ""
+
+    def table(self) -> dict[str, str | None]:
+        """For JSON."""
+        return {"hash": self.hash, "file": self.file or None, "calibrated_utc": self.calibrated_utc or None}
+
+
+@dataclass(frozen=True)
+class GeometryFile:
+    """A geometry that was read.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    geometry : GeometryConfig
+        Poses.
+    lens, pitch : LensTable, PitchTable or None
+        If they were calibrated.
+    calibration : CalibrationTable or None
+        None for what was written by hand.
+    text : str
+        All that the file says, the screen's height map in it and not beside it.
+    """
+
+    path: Path
+    geometry: GeometryConfig
+    lens: LensTable | None
+    pitch: PitchTable | None
+    calibration: CalibrationTable | None
+    origin: GeometryOrigin
+    text: str
+
+    def over(self, optics: OpticsConfig) -> OpticsConfig:
+        """The bench with this geometry instead of its own. Raises InputError if it is of another camera."""
+        camera, pattern = optics.camera, optics.pattern
+        if self.lens is not None:
+            camera = self.lens.over(camera, self.path)
+        if self.pitch is not None:
+            pattern = pattern.model_copy(update=self.pitch.model_dump())
+        parts = {"geometry": self.geometry, "camera": camera, "pattern": pattern}
+        return parse({**dict(optics), **parts}, OpticsConfig, str(self.path))
+
+
+def read_geometry(path: Path) -> GeometryFile:
+    """A geometry file: a `[geometry]` table as in `capture.toml`, its keys alone, or what `calibrate` wrote.
+
+    Raises
+    ------
+    InputError
+        One line with the file and the field; also for calibrated numbers that were changed by hand.
+    """
+    tables = read_toml(path)
+    calibrated = tables.get("schema") == plain_json.SCHEMA
+    table = tables.get("geometry", tables)
+    with_height_map(table, path)
+    hashed = plain_json.content_hash(tables if "geometry" in tables else {"geometry": tables})
+    text = tomli_w.dumps(tables)
+    if isinstance(table, dict):
+        prune(table, GeometryConfig)
+    geometry = parse(table, GeometryConfig, str(path))
+    if not calibrated:
+        return GeometryFile(path, geometry, None, None, None, GeometryOrigin(hashed, str(path)), text)
+    calibration = _part(tables, "calibration", CalibrationTable, path)
+    if calibration is not None and calibration.hash != hashed:
+        raise errors.InputError(
+            f"{path}: calibration.hash = {calibration.hash}, but that of the numbers is {hashed}: they were changed "
+            "after the calibration; calibrate again, or take [calibration] and schema out to use them as they are"
+        )
+    origin = GeometryOrigin(hashed, str(path), "" if calibration is None else calibration.date_utc)
+    lens, pitch = _part(tables, "camera", LensTable, path), _part(tables, "pattern", PitchTable, path)
+    return GeometryFile(path, geometry, lens, pitch, calibration, origin, text)
+
+
+def origin_of(optics: OpticsConfig) -> GeometryOrigin:
+    """Of a bench that states its own geometry."""
+    lens = {key: getattr(optics.camera, key) for key in ("focal_mm", "distortion")}
+    tables = {
+        "geometry": optics.geometry.model_dump(exclude_none=True, exclude={"reference_displacement_um"}),
+        "camera": {**lens, "principal_px": optics.camera.principal},
+        "pattern": {"period_mm": optics.pattern.period_mm},
+    }
+    return GeometryOrigin(plain_json.content_hash(tables))
+
+
+def _part(tables: dict[str, Any], name: str, model: type[Table], path: Path) -> Table | None:
+    table = tables.get(name)
+    if isinstance(table, dict):
+        prune(table, model)
+    return None if table is None else parse(table, model, f"{path}: {name}")
+
+
+# The geometry that a run measures with: that of `optics.geometry_file`, kept in the run's folder as it was.
+
+
+KEPT = "geometry.toml"  # in the run's folder
+
+
+@dataclass(frozen=True)
+class InForce:
+    """What the cycles of a run measure with.
+
+    Attributes
+    ----------
+    optics : OpticsConfig
+        The configuration's, with the calibrated geometry if there is one.
+    origin : GeometryOrigin
+        Its name.
+    calibration : CalibrationTable or None
+        What a drift is seen against.
+    text : str
+        What the file says; empty without one.
+    note : str
+        Why what the configuration states by hand is used although it names a file.
+    """
+
+    optics: OpticsConfig
+    origin: GeometryOrigin
+    calibration: CalibrationTable | None = None
+    text: str = ""
+    note: str = ""
+
+    def keep(self, run_dir: Path) -> None:
+        """Leave a copy in the run's folder: whoever measures or looks back takes that. Raises InputError."""
+        if not self.text:
+            return
+        try:
+            files.write_text_atomic(run_dir / KEPT, self.text)
+        except OSError as error:
+            raise errors.InputError(f"{run_dir / KEPT}: cannot be written: {error.strerror or error}") from None
+
+
+def geometry_in_force(config: Config) -> InForce:
+    """Read the file that the configuration names.
+
+    A file that is not there yet is no error: the first calibration of a bench has to be taken with what was measured
+    by hand. The note says so.
+
+    Raises
+    ------
+    InputError
+        If the file is there and cannot be used.
+    """
+    return _read(config.optics.geometry_file, config)
+
+
+def geometry_of_run(run_dir: Path | None, config: Config) -> InForce:
+    """The same of a run that has begun, from its folder."""
+    return _read(None if run_dir is None else run_dir / KEPT, config)
+
+
+def _read(path: Path | None, config: Config) -> InForce:
+    optics = config.optics
+    if path is None or not path.exists():
+        wanted = optics.geometry_file
+        note = f"{wanted} is not there yet: [optics.geometry] is used, as measured by hand" if wanted else ""
+        return InForce(optics, origin_of(optics), note=note)
+    file = read_geometry(path)
+    return InForce(file.over(optics), file.origin, file.calibration, file.text)

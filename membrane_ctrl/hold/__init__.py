@@ -1,0 +1,1 @@
+"""`hold`: start, supervise, take down."""

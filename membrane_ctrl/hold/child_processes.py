@@ -1,0 +1,305 @@
+"""The processes beside the control process, and the rings between them."""
+
+import math
+import select
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller.tick import MESSAGE_BYTES
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.telemetry import ROW_BYTES
+from membrane_ctrl.processes.child import ALIVE, Child, pipe
+from membrane_ctrl.processes.ring import FrameAddress, RingAddress, ring
+
+# A post that is kept filled: a child process that ends or falls silent is replaced, but not for ever.
+#
+# A child says each second or so that it is alive, and for how long it may now be silent (`child_report.alive`). A
+# process that was stopped, or that hangs, is still there but does not keep its word: it is killed, and the next one
+# takes its place.
+
+
+# The first replacement comes at once, the next ones later and later: what dies at its start must not keep the
+# machine busy with starting it.
+_LONGEST_WAIT_S = 60.0
+# A day has room for many; what ends more often in an hour will not be mended by starting it again.
+_MOST_PER_HOUR = 10
+_HOUR_S = 3600.0
+# Until its first word: an interpreter that starts on a busy machine. What takes longer is said in that word.
+_STARTS_S = 60.0
+
+Make = Callable[[int], tuple[Child, Connection]]
+
+
+class Post:
+    """One such post.
+
+    Parameters
+    ----------
+    make : callable
+        Makes the child that comes after so many others, not started yet, and the end of the pipe it reports by.
+
+    Attributes
+    ----------
+    child : Child
+        Who fills it now, or did last.
+    """
+
+    def __init__(self, make: Make) -> None:
+        self._make = make
+        self._replaced_s: deque[float] = deque()
+        self._count = 0
+        self._ended_s: float | None = None
+        self._given_up = False
+        self._expected_s = math.inf  # the child's next word
+        self._silent = False
+        self.child, self._line = make(0)
+
+    def start(self, now_s: float) -> None:
+        """Start the first child."""
+        self._expected_s = now_s + _STARTS_S
+        self.child.start()
+
+    def send(self, word: str) -> bool:
+        """Hand a word to the child; False if nobody takes it now. Never waits."""
+        try:
+            if not (self.child.alive and select.select([], [self._line.fileno()], [], 0)[1]):
+                return False
+            self._line.send(word)
+        except OSError:
+            return False
+        return True
+
+    def look(self, now_s: float) -> list[Event]:
+        """What it has said since the last call, and what became of it; starts another when that is due.
+
+        Never waits, but for starting a process (some ms, less than a tick).
+        """
+        said = self._said(now_s)
+        if self.child.alive:
+            if now_s > self._expected_s and not self._silent:
+                said.append(self._fell_silent(now_s))
+            return said
+        name = self.child.name
+        if self._ended_s is None:
+            self._ended_s = now_s
+            said.append({"kind": "child_ended", "child": name, "exit_code": self.child.exit_code})
+        if self._used_up(now_s):
+            if not self._given_up:
+                self._given_up = True
+                said.append({"kind": "child_given_up", "child": name, "restarts": len(self._replaced_s)})
+            return said
+        if now_s - self._ended_s >= self._wait_s():
+            self.replace(now_s)
+            said.append({"kind": "child_restarted", "child": name, "restarts": self._count})
+        return said
+
+    def replace(self, now_s: float) -> None:
+        """Start another child in the place of the one that ended."""
+        self._line.close()
+        self._count += 1
+        self._replaced_s.append(now_s)
+        self._ended_s, self._given_up, self._silent = None, False, False
+        self._expected_s = now_s + _STARTS_S
+        self.child, self._line = self._make(self._count)
+        self.child.start()
+
+    def _fell_silent(self, now_s: float) -> Event:
+        """Kill who keeps still, unless nobody may take the place: half a recorder is better than none."""
+        self._silent = True
+        late_s = round(now_s - self._expected_s, 1)
+        killed = not self._used_up(now_s)
+        if killed:
+            self.child.kill()
+        return {"kind": "child_silent", "child": self.child.name, "overdue_s": late_s, "killed": killed}
+
+    def _used_up(self, now_s: float) -> bool:
+        """Whether this hour's replacements are spent."""
+        while self._replaced_s and now_s - self._replaced_s[0] > _HOUR_S:
+            self._replaced_s.popleft()
+        return len(self._replaced_s) >= _MOST_PER_HOUR
+
+    def _wait_s(self) -> float:
+        return min(_LONGEST_WAIT_S, 2.0 ** (len(self._replaced_s) - 1)) if self._replaced_s else 0.0
+
+    def _said(self, now_s: float) -> list[Event]:
+        said: list[Event] = []
+        try:
+            while self._line.poll():
+                event = self._line.recv()
+                if event["kind"] == ALIVE:
+                    self._expected_s, self._silent = now_s + event["for_s"], False
+                else:
+                    said.append(event)
+        except (EOFError, OSError):  # it has ended
+            pass
+        return said
+
+
+# A recorder that is busy for a minute (a slow disk, a big flush) loses nothing
+_TELEMETRY_KEPT_S = 60.0
+_EVENTS_KEPT, _EVENT_BYTES = 1024, 4096
+_SHAPES_KEPT, _SHAPE_BYTES = 64, 1 << 16  # a 36 x 36 covariance is 10 kB
+_RECORDER_CLOSES_S = 30.0
+_CHILD_STOPS_S = 3.0
+_ALARMS_LEAVE_S = 10.0  # it gives itself 8 s for the last notices
+
+
+@dataclass(frozen=True, slots=True)
+class Rings:
+    """The shared memory of a run (docs/architecture.md)."""
+
+    telemetry: RingAddress
+    events: RingAddress
+    inputs: RingAddress
+    shapes: RingAddress | None
+    frames: FrameAddress | None
+    truth: RingAddress | None
+
+
+def rings_for(config: Config, truth: RingAddress | None, stack: ExitStack) -> Rings:
+    """Make the rings; the stack gives their memory back."""
+    kept = round(_TELEMETRY_KEPT_S * config.loop.rate_hz)
+    telemetry = stack.enter_context(ring(kept, ROW_BYTES))
+    events = stack.enter_context(ring(_EVENTS_KEPT, _EVENT_BYTES))
+    inputs = stack.enter_context(ring(kept, MESSAGE_BYTES))
+    camera = truth is not None or (config.devices is not None and config.devices.camera is not None)
+    if not camera or not config.shape.enabled:
+        return Rings(telemetry, events, inputs, None, None, truth)
+    shapes = stack.enter_context(ring(_SHAPES_KEPT, _SHAPE_BYTES))
+    return Rings(telemetry, events, inputs, shapes, _frames(config, stack), truth)
+
+
+def _frames(config: Config, stack: ExitStack) -> FrameAddress:
+    from membrane_ctrl.processes.frames import FrameRing
+
+    owner = FrameRing.for_optics(config.optics, config.recording.raw_before_fault_cycles)
+    stack.callback(owner.close)
+    return owner.address
+
+
+class Crew:
+    """Recorder, live screen, acquisition and alarms of one run. The hold goes on without any of them, and says so."""
+
+    def __init__(
+        self, config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str, duration_s: float | None
+    ) -> None:
+        self._clock = clock
+        self._summary = run_dir / "summary.json"
+        self._screen = Post(_screen(config, clock, rings, run_dir, duration_s))
+        self._recorder = Post(_recorder(config, clock, rings, run_dir, name))
+        self._acquisition = None
+        if rings.shapes is not None and rings.frames is not None:
+            self._acquisition = Post(_acquisition(config, clock, rings, rings.shapes, rings.frames, run_dir))
+        self._alarms = Post(_alarms(config, clock, rings, run_dir.name)) if config.alarms.urls_file else None
+
+    @property
+    def _posts(self) -> list[Post]:
+        return [post for post in (self._recorder, self._acquisition, self._alarms, self._screen) if post is not None]
+
+    def start(self, stack: ExitStack) -> None:
+        """Start all; the stack ends whatever `take_down` has not."""
+        stack.callback(self._stop)
+        for post in self._posts:
+            post.start(self._clock.now())
+
+    def _stop(self) -> None:
+        for post in self._posts:
+            post.child.stop(_CHILD_STOPS_S)
+
+    def reports(self) -> list[Event]:
+        """What the children have said since the last call, and who was replaced; never waits."""
+        return [event for post in self._posts for event in post.look(self._clock.now())]
+
+    def capture(self) -> Event | None:
+        """Have the acquisition take a full set to disk, which its own event names; an event if that cannot be."""
+        if self._acquisition is None:
+            return {"kind": "capture", "failed": "no camera measures in this run"}
+        if not self._acquisition.send("capture"):
+            return {"kind": "capture", "failed": "the acquisition does not answer; is it being replaced?"}
+        return None
+
+    def take_down(self) -> None:
+        """Stop the acquisition, then let recorder and screen finish by themselves: the "end" event is their sign."""
+        if self._acquisition is not None:
+            self._acquisition.child.stop(_CHILD_STOPS_S)
+        recorder = self._recorder.child
+        if not recorder.join(_RECORDER_CLOSES_S):
+            recorder.stop(0.0)  # stopped, or its disk takes nothing any more
+        if recorder.exit_code != 0 and not self._summary.exists():  # another writes the end down
+            self._recorder.replace(self._clock.now())
+            self._recorder.child.join(_RECORDER_CLOSES_S)
+        self._end_screen()
+        if self._alarms is not None:
+            self._alarms.child.join(_ALARMS_LEAVE_S)
+
+    def _end_screen(self) -> None:
+        """The terminal is a person's again, whatever has become of who drew on it."""
+        from membrane_ctrl.console.process import give_back_terminal
+
+        screen = self._screen.child
+        if not screen.join(_CHILD_STOPS_S):
+            screen.stop(0.0)
+        if screen.exit_code != 0:
+            give_back_terminal()
+
+
+def _screen(config: Config, clock: RunClock, rings: Rings, run_dir: Path, duration_s: float | None) -> Make:
+    from membrane_ctrl.console.process import ScreenSpec
+
+    spec = ScreenSpec(clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s)
+
+    def make(count: int) -> tuple[Child, Connection]:
+        ours, theirs = pipe()
+        arguments = (replace(spec, since_s=clock.now()) if count else spec, theirs)
+        return Child("screen", "membrane_ctrl.console.process:screen_main", arguments, nice=5), ours
+
+    return make
+
+
+def _recorder(config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str) -> Make:
+    from membrane_ctrl.recorder.process import RecorderSpec
+
+    spec = RecorderSpec(
+        run_dir, name, clock, config, rings.telemetry, rings.events, rings.shapes, rings.frames, rings.inputs
+    )
+
+    def make(resumes: int) -> tuple[Child, Connection]:
+        ours, theirs = pipe()
+        arguments = (replace(spec, resumes=resumes), theirs)
+        return Child("recorder", "membrane_ctrl.recorder.process:recorder_main", arguments, nice=5), ours
+
+    return make
+
+
+def _acquisition(
+    config: Config, clock: RunClock, rings: Rings, shapes: RingAddress, frames: FrameAddress, run_dir: Path
+) -> Make:
+    from membrane_ctrl.acquisition.process import AcquisitionSpec
+
+    spec = AcquisitionSpec(config, clock, rings.telemetry, shapes, rings.truth, frames, run_dir)
+
+    def make(_: int) -> tuple[Child, Connection]:
+        ours, theirs = pipe()
+        return Child(
+            "acquisition", "membrane_ctrl.acquisition.process:acquisition_main", (spec, theirs), nice=10
+        ), ours
+
+    return make
+
+
+def _alarms(config: Config, clock: RunClock, rings: Rings, run: str) -> Make:
+    from membrane_ctrl.alarms.process import AlarmsSpec
+
+    spec = AlarmsSpec(clock, rings.telemetry, rings.events, config.alarms, run)
+
+    def make(_: int) -> tuple[Child, Connection]:
+        ours, theirs = pipe()
+        return Child("alarms", "membrane_ctrl.alarms.process:alarms_main", (spec, theirs), nice=5), ours
+
+    return make

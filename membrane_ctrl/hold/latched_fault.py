@@ -1,0 +1,137 @@
+"""Keeps the latched-fault file in step with the controller, without a tick waiting for a disk."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
+from functools import partial
+from types import TracebackType
+
+from membrane_ctrl.controller import commands, tick
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile, ResumeLog
+
+
+class Latcher:
+    """A listener to ticks; a context manager that waits for the disk at the end, when the pump is off.
+
+    Parameters
+    ----------
+    file : LatchedFile or None
+        None: nothing is latched beyond the run (the twin's default).
+    resumes : ResumeLog or None
+        Where resumes are counted beyond the run.
+    run : str
+        Name of the run folder.
+    utc : callable
+        UTC of a moment on the run's clock.
+    tell : callable
+        Takes an event, for a file that could not be written, or can again.
+    """
+
+    def __init__(
+        self,
+        file: LatchedFile | None,
+        resumes: ResumeLog | None,
+        run: str,
+        utc: Callable[[float], datetime],
+        tell: Callable[[Event], None],
+    ) -> None:
+        self._file, self._resumes, self._run, self._utc, self._tell = file, resumes, run, utc, tell
+        # one thread, so that a fault and its acknowledgement stay in order; it exists only once there is a fault
+        self._disk = ThreadPoolExecutor(1, thread_name_prefix="latched-fault")
+        self._news: deque[Event] = deque()  # from the disk's thread
+        self._failing = False
+        self._last: Callable[[], None] = lambda: None
+        self._fault: Event = {}
+
+    @property
+    def latched(self) -> str:
+        """What is latched now, in one line; empty for nothing."""
+        fault = None if self._file is None else self._file.read()
+        return "" if fault is None else str(fault)
+
+    @property
+    def resumes_s(self) -> tuple[float, ...]:
+        """How long ago the resumes of the last day were, oldest first."""
+        return () if self._resumes is None else self._resumes.ages_s(datetime.now(UTC))
+
+    def __enter__(self) -> Latcher:
+        if self._file is not None:
+            with contextlib.suppress(OSError):  # then it is tried without when it matters, and a failure is told
+                self._file.reserve()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._file is not None:
+            self._disk.submit(self._settle, self._file)
+        self._disk.shutdown()
+        self._report()
+
+    def heard(self, outputs: tick.TickOutputs) -> None:
+        """A tick has ended: latch a fault or a person's lock, clear what was left or acknowledged."""
+        self._report()
+        for event in outputs.events:
+            match event:
+                case {"kind": "fault"}:
+                    self._fault = event
+                case {"kind": "state", "state": "fault"}:
+                    self._latch(outputs.row.mono_s)
+                case {"kind": "command", "command": "latch", "who": who} if (
+                    "refused" not in event
+                    and who != commands.AT_START  # what is latched at the start is where it belongs
+                ):
+                    self._lock(who, event.get("text", ""), outputs.row.mono_s)
+                case {"kind": "resumed"} if self._resumes is not None:
+                    self._disk.submit(self._try, partial(self._resumes.add, self._utc(outputs.row.mono_s)))
+                case {"kind": "state", "from": "fault"} | {"kind": "command", "command": "ack"} if (
+                    "refused" not in event and self._file is not None
+                ):
+                    self._disk.submit(self._try, self._file.clear)
+
+    def _latch(self, now_s: float) -> None:
+        words = {key: str(self._fault.get(key, "")) for key in ("name", "cause", "seen", "remedy")}
+        if self._file is not None:
+            self._write(partial(self._file.write, self._dated(words, now_s)))
+
+    def _lock(self, who: str, text: str, now_s: float) -> None:
+        remedy = "see with whoever locked it that the mirror may move"
+        words = {"name": "locked", "cause": text or "by hand", "seen": f"by {who}", "remedy": remedy}
+        if self._file is not None:
+            self._write(partial(self._file.add, self._dated(words, now_s)))
+
+    def _dated(self, words: dict[str, str], now_s: float) -> LatchedFault:
+        return LatchedFault(**words, time_utc=self._utc(now_s).isoformat(timespec="seconds"), run=self._run)
+
+    def _write(self, act: Callable[[], None]) -> None:
+        self._last = act
+        self._disk.submit(self._try, act)
+
+    def _settle(self, file: LatchedFile) -> None:
+        """The run is over: what the disk did not take is tried once more, and the disk is waited for."""
+        if self._failing:
+            self._try(self._last)
+        if not self._failing:
+            self._try(file.sync)
+        file.release()
+
+    def _try(self, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except Exception as error:  # nobody looks at what a thread raises
+            if not self._failing:
+                self._news.append({"kind": "latch_failed", "message": str(error)})
+            self._failing = True
+        else:
+            if self._failing:
+                self._news.append({"kind": "latch_written"})
+                self._failing = False
+
+    def _report(self) -> None:
+        while self._news:
+            self._tell(self._news.popleft())

@@ -1,0 +1,310 @@
+"""`hold`: everything around the ticks. Starts the processes, wires them, and takes them down in the right order.
+
+On the way in, what can be refused is refused before anything exists: configuration, port, devices, folder. On the
+way out: the safe state first, then the recording, then the rest.
+"""
+
+import asyncio
+import contextlib
+import gc
+import json
+import math
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+from firmware_iface.drivers.pump_board import NO_CLAIM
+from firmware_iface.roles import ALL_FAULTS, Bench, LinkError
+from membrane_ctrl.alarms.senders import require_sendable
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.control_port import server, tls
+from membrane_ctrl.controller import commands, cross_check, safe_levels, tick
+from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.geometry.file import geometry_in_force
+from membrane_ctrl.hold import child_processes, latched_fault
+from membrane_ctrl.hold.supervisor import Supervisor, Wiring
+from membrane_ctrl.hold.systemd import SystemdNotify
+from membrane_ctrl.instruments.bench import connect, open_bench
+from membrane_ctrl.instruments.device_lock import device_names, locked
+from membrane_ctrl.model import errors, terminal
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.processes.child import raise_priority
+from membrane_ctrl.processes.ring import RingReader, RingWriter, publish
+from membrane_ctrl.run_files.latched_fault import LatchedFile, ResumeLog
+from membrane_ctrl.run_files.run_folder import create_run_folder
+from membrane_ctrl.sim.bench import TwinProcess
+
+
+@dataclass(frozen=True, slots=True)
+class HoldOptions:
+    """What the command line asked for."""
+
+    config: Config
+    source: str  # where the configuration came from, for messages
+    twin: bool
+    duration_s: float | None
+    name: str
+    logs_dir: Path | None
+    clear_faults: bool
+    json: bool
+    standby: bool = False  # wait for `ctl hold`
+    lab: bool = False  # the twin answers as the instruments of the configuration, not as the pump board
+
+
+def hold_mirror(options: HoldOptions) -> int:
+    """Hold the mirror until the duration is over, a signal comes, or a safety trip ends it.
+
+    Returns the exit code. Raises InputError or DeviceError (one line) for what fails before the first tick.
+    """
+    if options.config.devices is None and not options.twin:
+        raise errors.InputError(
+            f"{options.source}: devices: missing; name the pump board in [devices], or use --twin"
+        )
+    for warning in cross_check.require_sound(options.config, options.source):
+        print(warning.line(options.source), file=sys.stderr)
+    require_sendable(options.config.alarms)
+    geometry = geometry_in_force(options.config)
+    clock = RunClock.start()
+    with terminal.ends_as_by_ctrl_c(), ExitStack() as stack:  # SIGTERM before and after the ticks cleans up as well
+        twin = TwinProcess.started(options.config, clock, stack, options.lab) if options.twin else None
+        config = twin.config if twin else options.config
+        assert config.devices is not None
+        logs_dir = options.logs_dir or Path(config.recording.logs_dir)
+        listeners = tls.listeners_for(config.port, logs_dir, stack)  # a second hold ends here, no device touched
+        stack.enter_context(locked(device_names(config.devices)))  # and here one with other folders
+        latched = _latched(config, logs_dir, options)
+        resumes = None if latched is None else ResumeLog(logs_dir)
+        board = asyncio.run(_identify(open_bench(config.devices), config, options, resumes))
+        run_dir = create_run_folder(logs_dir, options.name, clock.origin_utc, config)
+        geometry.keep(run_dir)
+        rings = child_processes.rings_for(config, twin.truth if twin else None, stack)
+        publish(run_dir, {"telemetry": rings.telemetry, "events": rings.events, "shapes": rings.shapes})
+        crew = child_processes.Crew(config, clock, rings, run_dir, options.name, options.duration_s)
+        crew.start(stack)
+        bench = open_bench(config.devices)  # a link belongs to the event loop that opened it
+        port = partial(server.Port, config.port, listeners, run_dir.name)
+        latcher = partial(latched_fault.Latcher, latched, resumes, run_dir.name, clock.utc)
+        exit_code = asyncio.run(_run(bench, config, options, clock, rings, crew, twin, port, latcher, board))
+        crew.take_down()
+    with contextlib.suppress(OSError):  # the terminal was closed, or nobody reads any more
+        _report(run_dir, options.json)
+    return exit_code
+
+
+def _latched(config: Config, logs_dir: Path, options: HoldOptions) -> LatchedFile | None:
+    """The file of the fault that outlives a run; the twin has one only if its configuration says so.
+
+    Raises DeviceError if a fault is latched, unless it is to be cleared, or nobody asks to hold the mirror yet.
+    """
+    if options.twin and not config.states.latch_twin_faults:
+        return None
+    file = LatchedFile(logs_dir)
+    fault = file.read()
+    if fault is not None and options.clear_faults:
+        try:
+            file.clear()
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            raise errors.DeviceError(f"{file.path}: cannot be cleared ({reason}); remove it by hand") from None
+    elif fault is not None and not options.standby:
+        raise errors.DeviceError(f"a fault is latched: {fault}; {fault.remedy}, then start with --clear-faults")
+    return file
+
+
+@dataclass(frozen=True, slots=True)
+class BoardAtStart:
+    """What the board itself had latched before this run."""
+
+    latched: str = ""  # and has still: nobody asks to hold the mirror yet
+    cleared: str = ""  # as the resume rule allows
+
+
+async def _identify(
+    bench: Bench, config: Config, options: HoldOptions, resumes: ResumeLog | None = None
+) -> BoardAtStart:
+    """Who is there, and is it fit to run, before a run folder exists. Raises DeviceError or InputError."""
+    devices = config.devices
+    assert devices is not None
+    try:
+        identity = await connect(bench, devices)
+        cross_check.require_sound(config, options.source, identity)
+        if options.clear_faults:
+            await bench.clear_faults(ALL_FAULTS)
+        reading = await bench.read()
+        faults = reading.latched_faults
+        if not faults:
+            return BoardAtStart()
+        what = f"{devices.name}: the board has latched faults {faults:#x} (docs/registers.md)"
+        # the controller before this one was killed: no more than that, if nothing else is latched and none vented
+        vented = reading.vent_fraction > safe_levels.VENTED_FRACTION
+        if faults == safe_levels.WATCHDOG_MASK and not vented and _may_resume("watchdog_tripped", config, resumes):
+            await bench.clear_faults(safe_levels.WATCHDOG_MASK)
+            return BoardAtStart(cleared="its watchdog had stopped the pump; cleared, as resume.faults allows")
+    except LinkError as error:
+        raise errors.DeviceError(f"{devices.name}: {error}") from None
+    finally:
+        await bench.close()
+    if not options.standby:
+        raise errors.DeviceError(f"{what}; find out why, then start with --clear-faults")
+    return BoardAtStart(latched=what)
+
+
+def _may_resume(name: str, config: Config, resumes: ResumeLog | None) -> bool:
+    """The resume rule at a start; what it allows is counted, or it is not allowed."""
+    if name not in config.resume.faults:
+        return False
+    if resumes is None:
+        return True  # the twin, of which nothing is kept
+    now = datetime.now(UTC)
+    if len(resumes.ages_s(now)) >= config.resume.most_per_day:
+        return False
+    try:
+        resumes.add(now)
+    except OSError:
+        return False
+    return True
+
+
+async def _run(
+    bench: Bench,
+    config: Config,
+    options: HoldOptions,
+    clock: RunClock,
+    rings: child_processes.Rings,
+    crew: child_processes.Crew,
+    twin: TwinProcess | None,
+    port_for: Callable[[server.RunHooks], server.Port],
+    latcher_for: Callable[[Callable[[Event], None]], latched_fault.Latcher],
+    board: BoardAtStart,
+) -> errors.Exit:
+    from membrane_ctrl.metrology.optics.hencky import zernike_projection
+
+    with _open(rings) as (telemetry, events, inputs, shapes):
+        truth = twin.truth_reader() if twin else None
+        wiring = Wiring(bench, telemetry, events, inputs, shapes, truth, crew.reports)
+        controller = Controller(config, zernike_projection())
+        supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
+        port = port_for(server.RunHooks(supervisor.ask, supervisor.tell, clock.now, lambda: controller.loop_config))
+        latcher, systemd = latcher_for(supervisor.tell), SystemdNotify()
+        wiring.heard = {
+            "control port": port.heard,
+            "latched-fault file": latcher.heard,
+            "systemd": systemd.heard,
+            "capture": partial(_capture, crew, supervisor.tell),
+        }
+        wiring.told = {"control port": port.told, "systemd": systemd.told}
+        devices = config.devices.name if config.devices else ""
+        supervisor.tell({"kind": "start", "devices": devices, "priority": raise_priority(), "message": board.cleared})
+        exit_code = errors.Exit.DEVICE_FAILED
+        try:
+            if not options.standby:
+                supervisor.ask(commands.Command("hold", commands.AT_START))
+            elif latched := "; ".join(part for part in (latcher.latched, board.latched) if part):
+                supervisor.ask(commands.Command("latch", commands.AT_START, text=latched))
+            for age_s in latcher.resumes_s:
+                supervisor.ask(commands.Command("resumed", commands.AT_START, value=age_s))
+            gc.collect()
+            gc.freeze()  # what lives for the whole run need not be looked at again between two ticks
+            async with port.open():
+                with _signals(supervisor), latcher, systemd:
+                    assert config.devices is not None
+                    # last: the board's watchdog runs from here on
+                    if (await connect(bench, config.devices)).map_version == 1:
+                        supervisor.tell({"kind": "no_claim", "message": NO_CLAIM})
+                    exit_code = await supervisor.run(options.duration_s)
+        except LinkError as error:
+            supervisor.tell({"kind": "link", "message": str(error)})
+            raise errors.DeviceError(str(error)) from None
+        finally:
+            await bench.close()
+            supervisor.tell(
+                {
+                    "kind": "end",
+                    "exit": exit_code.name.lower(),
+                    "exit_code": int(exit_code),
+                    "ticks": supervisor.ticks,
+                    "missed_ticks": supervisor.missed_ticks,
+                }
+            )
+    return exit_code
+
+
+def _capture(crew: child_processes.Crew, tell: Callable[[Event], None], outputs: tick.TickOutputs) -> None:
+    """A set that was asked for, and not refused, is the acquisition's to take."""
+    for event in outputs.events:
+        asked = event["kind"] == "command" and event["command"] == "capture" and "refused" not in event
+        if asked and (failed := crew.capture()) is not None:
+            tell(failed)
+
+
+@contextlib.contextmanager
+def _open(rings: child_processes.Rings) -> Iterator[tuple[RingWriter, RingWriter, RingWriter, RingReader | None]]:
+    telemetry, events, inputs = RingWriter(rings.telemetry), RingWriter(rings.events), RingWriter(rings.inputs)
+    shapes = RingReader(rings.shapes) if rings.shapes else None
+    try:
+        yield telemetry, events, inputs, shapes
+    finally:
+        for ring in (telemetry, events, inputs, shapes):
+            if ring is not None:
+                ring.close()
+
+
+@contextlib.contextmanager
+def _signals(supervisor: Supervisor) -> Iterator[None]:
+    """SIGINT, SIGTERM and a closed terminal ask for a clean stop; the safe state comes before anything else."""
+    loop = asyncio.get_running_loop()
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # `nohup` asks to go on without the terminal
+        numbers.append(signal.SIGHUP)
+    before = {number: signal.getsignal(number) for number in numbers}
+    for number in numbers:
+        loop.add_signal_handler(number, supervisor.ask, commands.Command("stop", number.name))
+    try:
+        yield
+    finally:
+        for number in numbers:
+            loop.remove_signal_handler(number)
+            signal.signal(number, before[number])  # asyncio leaves the default: an end without clean-up
+
+
+def _report(run_dir: Path, as_json: bool) -> None:
+    """What the run was, and where it is."""
+    summary_path = run_dir / "summary.json"
+    if as_json:
+        print(summary_path.read_text(encoding="utf-8") if summary_path.exists() else "{}")
+        return
+    if not run_dir.exists():
+        print(f"{run_dir}: removed or moved during the run; nothing of the run is there", file=sys.stderr)
+        return
+    if summary_path.exists():
+        summary = json.loads(summary_path.read_text(encoding="utf-8"))
+        for line in _headline(summary):
+            print(line, file=sys.stderr)
+        anew_s = summary["recorder"].get("folder_anew_s")
+        if anew_s is not None:
+            print(f"the run folder was removed or moved; this one begins at {anew_s:.1f} s", file=sys.stderr)
+    else:
+        print("the recorder left no summary.json; what it had recorded is still readable", file=sys.stderr)
+    print(f"run folder: {run_dir}", file=sys.stderr)
+    if any(run_dir.glob("*.rrd")):
+        print(f"open it:    rerun {run_dir}/*.rrd", file=sys.stderr)
+
+
+def _headline(summary: dict[str, object]) -> Iterator[str]:
+    labels: dict[str, tuple[str, Callable[[float], str]]] = {
+        "true_std_um": ("true centre, standard deviation", lambda v: f"{v:.3f} um"),
+        "true_bias_um": ("true centre, bias", lambda v: f"{v:+.3f} um"),
+        "in_band_1s_fraction": ("1 s means inside the band", lambda v: f"{100 * v:.1f} %"),
+        "cycles": ("shape cycles", lambda v: f"{v:.0f}"),
+        "missed_ticks": ("missed ticks", lambda v: f"{v:.0f}"),
+    }
+    for key, (label, show) in labels.items():
+        value = summary.get(key)
+        if isinstance(value, (int, float)) and math.isfinite(value):
+            yield f"{label + ':':34}{show(value)}"

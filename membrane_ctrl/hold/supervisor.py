@@ -1,0 +1,254 @@
+"""The tick: asyncio, absolute deadlines, one device exchange, one pure function, one write.
+
+Nothing here may take longer than a tick: no image, no Rerun, no file. What is recorded goes into shared-memory
+rings, which never wait. A missed deadline is skipped and counted, never made up in a burst.
+"""
+
+import asyncio
+import json
+import math
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+
+from firmware_iface.roles import Bench, BenchCommand, BenchReading, LinkDownError, LinkError, LinkWaitsError
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.controller.memory import remember
+from membrane_ctrl.controller.tick import TickInputs, TickOutputs, pack_tick
+from membrane_ctrl.model import errors, shape_estimate
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.processes.ring import RingReader, RingWriter
+
+# Looking after a child costs a system call; half a second late is soon enough, the loop does not need them
+_CHILD_WATCH_S = 0.5
+# A replay has to run through half of this on the way to its part, in some seconds; a memory takes 0.6 ms of a
+# tick and 7 kB
+MEMORY_EVERY_S = 600.0
+# of a text in an event that is longer than a slot of the ring; a letter takes up to 12 bytes in JSON
+_TEXT_CUTS = (200, 20)
+
+
+@dataclass(slots=True)
+class Wiring:
+    """Everything the tick is connected to."""
+
+    bench: Bench
+    telemetry: RingWriter
+    events: RingWriter
+    inputs: RingWriter | None = None  # what the ticks were given, for a replay
+    shapes: RingReader | None = None
+    truth: Callable[[], tuple[float, float]] | None = None  # (displacement_um, laser_bias_um) of the twin
+    reports: Callable[[], list[Event]] = list  # what the children have said since the last call
+    # who wants to know what each tick decided, and what the children report; one that raises is a fault
+    heard: Mapping[str, Callable[[TickOutputs], None]] = field(default_factory=dict)
+    told: Mapping[str, Callable[[Event], None]] = field(default_factory=dict)
+
+
+class Supervisor:
+    """Runs the ticks of one run, from the first one to the exit code.
+
+    Parameters
+    ----------
+    controller : Controller
+        The pure tick.
+    wiring : Wiring
+        Devices, rings and children.
+    clock : RunClock
+        The run's clock.
+    rate_hz : float
+        Tick rate.
+    """
+
+    def __init__(self, controller: Controller, wiring: Wiring, clock: RunClock, rate_hz: float) -> None:
+        self._controller = controller
+        self._wiring = wiring
+        self._clock = clock
+        self._period_s = 1.0 / rate_hz
+        self._pending: list[Command] = []
+        self._link_up = True
+        self._link_error = ""
+        self._inputs_error = self._shape_error = ""
+        self._next_watch_s = 0.0
+        self._next_memory_s = MEMORY_EVERY_S
+        self._vent_fraction = 0.0
+        self._broken: dict[str, str] = {}  # parts of the program that raised, with what
+        self.ticks = 0
+        self.missed_ticks = 0
+
+    def ask(self, command: Command) -> None:
+        """Hand a command to the next tick."""
+        self._pending.append(command)
+
+    def tell(self, event: Event) -> None:
+        """Put an event on record, now."""
+        now_s = self._clock.now()
+        stamped = {"time_utc": self._clock.utc(now_s).isoformat(), "mono_s": round(now_s, 6), **event}
+        self._wiring.events.put(_line(stamped, self._wiring.events.slot_bytes))
+
+    async def run(self, duration_s: float | None) -> errors.Exit:
+        """Tick until a tick says that the run is over; the pump is off by then, or cannot be reached."""
+        deadline_s = last_s = self._clock.now()
+        ends_s = math.inf if duration_s is None else deadline_s + duration_s
+        try:
+            while True:
+                deadline_s += self._period_s
+                await asyncio.sleep(max(0.0, deadline_s - self._clock.now()))
+                now_s = self._clock.now()
+                late_s = now_s - deadline_s
+                skipped = max(0, int(late_s / self._period_s))
+                self.missed_ticks += skipped
+                deadline_s += skipped * self._period_s
+                if now_s >= ends_s:
+                    self.ask(Command("stop", "duration"))
+                    ends_s = math.inf
+                finished = await self._tick(now_s, now_s - last_s, late_s)
+                last_s = now_s
+                if finished is not None:
+                    return finished
+        finally:
+            # the vent stays as it is: a mirror that is being vented must not be shut by the end of the program
+            await self._write(BenchCommand(0.0, self._vent_fraction))
+
+    async def _tick(self, now_s: float, dt_s: float, late_s: float) -> errors.Exit | None:
+        wiring = self._wiring
+        self.ticks += 1
+        if not self._link_up:
+            await self._reconnect()
+        reading = await self._read() if self._link_up else None
+        if now_s >= self._next_watch_s:
+            self._next_watch_s = now_s + _CHILD_WATCH_S
+            self._guarded("children", self._watch)
+        truth_um, bias_um = wiring.truth() if wiring.truth else (math.nan, math.nan)
+        commands, self._pending = tuple(self._pending), []
+        inputs = TickInputs(
+            now_s=now_s,
+            dt_s=dt_s,
+            reading=reading,
+            lateness_ms=1e3 * late_s,
+            missed_ticks=self.missed_ticks,
+            link_up=self._link_up,
+            estimate=self._newest_shape(),
+            commands=commands,
+            dead_tasks=(*wiring.bench.dead_guards(), *self._broken.values()),
+            truth_displacement_um=truth_um,
+            truth_laser_bias_um=bias_um,
+        )
+        memory = self._remember(now_s)
+        outputs = self._controller.tick(inputs)
+        self._vent_fraction = outputs.command.vent_fraction
+        if outputs.clear_mask:
+            await self._clear_board(outputs.clear_mask)
+        await self._write(outputs.command)
+        self._record(inputs, outputs, memory)
+        for event in outputs.events:
+            self.tell(event)
+        for name, hear in wiring.heard.items():
+            self._guarded(name, partial(hear, outputs))
+        return outputs.finished
+
+    def _remember(self, now_s: float) -> bytes:
+        """Now and then the controller's memory, so that a replay need not begin with the run."""
+        if self._wiring.inputs is None or now_s < self._next_memory_s:
+            return b""
+        self._next_memory_s = now_s + MEMORY_EVERY_S
+        return remember(self._controller)
+
+    def _record(self, inputs: TickInputs, outputs: TickOutputs, memory: bytes) -> None:
+        """The row for people, the inputs for a replay; a value of a wrong kind costs the replay, not the run."""
+        row = outputs.row.pack()
+        self._wiring.telemetry.put(row)
+        if self._wiring.inputs is None:
+            return
+        try:
+            messages = pack_tick(self.ticks, inputs, outputs, row, memory)
+        except (struct.error, TypeError, ValueError) as error:
+            if not self._inputs_error:
+                self._inputs_error = str(error)
+                self.tell({"kind": "inputs_not_recorded", "message": self._inputs_error})
+            return
+        for message in messages:
+            self._wiring.inputs.put(message)
+
+    async def _read(self) -> BenchReading | None:
+        try:
+            reading = await self._wiring.bench.read()
+        except LinkError as error:
+            self._link_failed(error)
+            return None
+        return reading
+
+    async def _reconnect(self) -> None:
+        """Try the lost link again; the link backs off by itself, and there is nothing to be late for meanwhile."""
+        try:
+            await self._wiring.bench.open()
+        except LinkWaitsError:
+            return
+        except LinkError as error:  # another one than that which broke it: it answers, and another program holds it
+            self._link_failed(error)
+            return
+        self._link_up, self._link_error = True, ""
+        self.tell({"kind": "link", "message": "connected again"})
+
+    async def _clear_board(self, mask: int) -> None:
+        try:
+            await self._wiring.bench.clear_faults(mask)
+        except LinkError as error:
+            self._link_failed(error)
+
+    async def _write(self, command: BenchCommand) -> None:
+        """The write that ends a tick and feeds the board's watchdog."""
+        if not self._link_up:
+            return
+        try:
+            await self._wiring.bench.write(command)
+        except LinkError as error:
+            self._link_failed(error)
+
+    def _link_failed(self, error: LinkError) -> None:
+        if isinstance(error, LinkDownError):
+            self._link_up = False
+        if str(error) != self._link_error:
+            self._link_error = str(error)
+            self.tell({"kind": "link", "message": str(error)})
+
+    def _newest_shape(self) -> shape_estimate.ShapeEstimate | None:
+        if self._wiring.shapes is None:
+            return None
+        messages = self._wiring.shapes.drain()
+        if not messages:
+            return None
+        try:
+            return shape_estimate.unpack_estimate(messages[-1])
+        except ValueError as error:  # as good as no shape, which the shape loop bears
+            if str(error) != self._shape_error:
+                self._shape_error = str(error)
+                self.tell({"kind": "shape_unreadable", "message": str(error)})
+            return None
+
+    def _watch(self) -> None:
+        """The hold goes on without its children, and says so."""
+        for report in self._wiring.reports():
+            self.tell(report)
+            for name, told in self._wiring.told.items():
+                self._guarded(name, partial(told, report))
+
+    def _guarded(self, name: str, act: Callable[[], None]) -> None:
+        """Let a part of the program act. If it raises, the next tick sees it (`dead_task`) and goes down in order."""
+        try:
+            act()
+        except Exception as error:
+            self._broken.setdefault(name, f"{name} ({type(error).__name__}: {error})")
+
+
+def _line(event: Event, most_bytes: int) -> bytes:
+    """An event for the ring: the texts of one that is too long are cut, as no message is worth the hold."""
+    line = json.dumps(event, allow_nan=False, default=str).encode()
+    for most in _TEXT_CUTS:
+        if len(line) <= most_bytes:
+            break
+        cut = {key: value[:most] if isinstance(value, str) else value for key, value in event.items()}
+        line = json.dumps(cut, allow_nan=False, default=str).encode()
+    return line

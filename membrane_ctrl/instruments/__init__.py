@@ -1,0 +1,1 @@
+"""From the configuration to devices, one program a device."""

@@ -1,1 +1,0 @@
-"""What crosses between processes: shared-memory rings and frames that a slow or dead reader cannot block."""

@@ -1,0 +1,1 @@
+"""Capture sets and their results."""

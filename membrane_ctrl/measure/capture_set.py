@@ -1,0 +1,333 @@
+"""Capture sets on disk (INTERFACES section 3): `capture.toml` and one image a frame, read and checked.
+
+What is wrong with the description of a set is an InputError. What is wrong with single frames (missing, unreadable,
+of another size or depth than the rest) is kept beside the frames: the measurement decides whether it can do without.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from firmware_iface.roles import Pattern
+from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig, PatternConfig
+from membrane_ctrl.config.section import Section
+from membrane_ctrl.config.toml_file import parse, prune, read_toml, with_height_map
+from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, origin_of
+from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
+from membrane_ctrl.metrology.phase import AXES, GRAY_BITS
+from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.files import read_bytes
+
+FloatArray = NDArray[np.float64]
+Frames = NDArray[np.uint8] | NDArray[np.uint16]
+
+_DEPTHS = (10, 12, 14, 16)  # bits of a sensor in 16-bit files, when the set does not say
+_READERS = 2
+# All frames of a set are in memory at once: 18 of a camera of 16 megapixels.
+_PIXELS_MAX = 300_000_000
+
+
+class FrameRow(Section):
+    """One `[[frames]]` table."""
+
+    file: str
+    role: Literal["sin", "gray", "white", "black"]
+    axis: Literal["x", "y"] | None = None
+    index: Annotated[int, Field(ge=0, le=1023)] = 0
+    shift_rad: float | None = None
+    time_s: float | None = None
+    displacement_um: float | None = None
+
+
+class CaptureFile(Section):
+    """The content of `capture.toml`."""
+
+    schema_: Annotated[Literal["membrane-capture/1"], Field(alias="schema")]
+    kind: Literal["full", "fringes"]
+    reference: str | None = None
+    pattern: PatternConfig
+    geometry: GeometryConfig
+    camera: CameraConfig
+    mirror: MirrorConfig
+    frames: tuple[FrameRow, ...]
+
+
+@dataclass(frozen=True)
+class CaptureHead:
+    """What `capture.toml` says, checked and in order.
+
+    Attributes
+    ----------
+    folder : Path
+        Of the set.
+    kind : "full" or "fringes"
+        See INTERFACES section 3.
+    reference : Path or None
+        Of a fringes set: the full set that anchors it.
+    optics : OpticsConfig
+        Geometry, camera, pattern and mirror; `camera.bits` is to be trusted only if `bits_stated`.
+    bits_stated : bool
+        Whether the set says how deep its frames are.
+    files : tuple of str
+        In the order of the patterns.
+    patterns : tuple of Pattern
+        x sinusoids, x Gray bits, y sinusoids, y Gray bits, white, black (of a full set).
+    time_s, displacement_um : (frames,) arrays
+        NaN where the set says nothing.
+    ignored : tuple of str
+        Keys of the file that are not known.
+    geometry : GeometryOrigin
+        Which geometry is in `optics`.
+    """
+
+    folder: Path
+    kind: Literal["full", "fringes"]
+    reference: Path | None
+    optics: OpticsConfig
+    bits_stated: bool
+    files: tuple[str, ...]
+    patterns: tuple[Pattern, ...]
+    time_s: FloatArray
+    displacement_um: FloatArray
+    ignored: tuple[str, ...]
+    geometry: GeometryOrigin
+
+
+@dataclass(frozen=True)
+class CaptureSet:
+    """A set with its frames.
+
+    Attributes
+    ----------
+    head : CaptureHead
+        Its `optics.camera.bits` is now the true depth.
+    frames : (frames, height, width) array
+        uint8 or uint16; zeros where a frame is in `unusable`.
+    unusable : dict from frame to reason
+        Frames that could not be read as the others.
+    lost : tuple of int
+        Those of them of which there is no picture at all.
+    """
+
+    head: CaptureHead
+    frames: Frames
+    unusable: dict[int, str]
+    lost: tuple[int, ...] = ()
+
+
+def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead:
+    """Read `capture.toml`.
+
+    Parameters
+    ----------
+    folder : Path
+        The set.
+    geometry : GeometryFile, optional
+        Used instead of the set's own, with the lens and the pitch that were calibrated with it.
+
+    Raises
+    ------
+    InputError
+        One line with the file and the field.
+    """
+    path = folder / "capture.toml"
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such capture set")
+    tables = read_toml(path, follow=False)
+    with_height_map(tables.get("geometry"), path, follow=False)
+    ignored = prune(tables, CaptureFile)
+    if geometry is not None:
+        tables["geometry"] = geometry.geometry.model_dump(exclude_none=True)
+    bits_stated = isinstance(tables.get("camera"), dict) and "bits" in tables["camera"]
+    content = parse(tables, CaptureFile, str(path))
+    rows = _ordered(content, path)
+    reference = None
+    for row in content.frames:
+        _require_inside(row.file, folder, path)
+    if content.kind == "fringes":
+        if content.reference is None:
+            raise InputError(f"{path}: reference: a fringes set names the full set that anchors it")
+        reference = (folder / content.reference).resolve()
+    sections = ("geometry", "camera", "pattern", "mirror")
+    blamed = path if geometry is None else geometry.path  # what may not fit together is the screen and the pattern
+    optics = parse({name: getattr(content, name) for name in sections}, OpticsConfig, str(blamed))
+    if geometry is not None:
+        optics = geometry.over(optics)
+    return CaptureHead(
+        folder=folder,
+        kind=content.kind,
+        reference=reference,
+        optics=_with_reference_displacement(optics, content.frames[0].displacement_um if reference is None else None),
+        bits_stated=bits_stated,
+        files=tuple(row.file for row, _ in rows),
+        patterns=tuple(pattern for _, pattern in rows),
+        time_s=_column([row.time_s for row, _ in rows]),
+        displacement_um=_column([row.displacement_um for row, _ in rows]),
+        ignored=ignored,
+        geometry=origin_of(optics) if geometry is None else geometry.origin,
+    )
+
+
+def read_set(folder: Path, geometry: GeometryFile | None = None) -> CaptureSet:
+    """Read a capture set with its images. Raises InputError as `read_head`, and if no frame is usable."""
+    head = read_head(folder, geometry)
+    camera = head.optics.camera
+    if len(head.files) * camera.width_px * camera.height_px > _PIXELS_MAX:
+        raise InputError(
+            f"{folder / 'capture.toml'}: camera.width_px, height_px: {len(head.files)} frames of {camera.width_px} x "
+            f"{camera.height_px} pixels are more than the {_PIXELS_MAX / 1e6:.0f} million that a set may have"
+        )
+    with ThreadPoolExecutor(_READERS) as pool:
+        images = list(pool.map(_read_image, [folder / name for name in head.files]))
+    return assemble(head, images)
+
+
+def assemble(head: CaptureHead, images: Sequence[Frames | str]) -> CaptureSet:
+    """Frames of one size and depth in one array; an image that is a text is the reason why there is none.
+
+    Raises
+    ------
+    InputError
+        If no frame is readable, or if most contradict the file's own camera.
+    """
+    path = head.folder / "capture.toml"
+    good = [image for image in images if not isinstance(image, str)]
+    if not good:
+        raise InputError(f"{path}: frames: none of the {len(images)} images is readable ({images[0]})")
+    camera = head.optics.camera
+    size, depth = (camera.height_px, camera.width_px), _most([image.dtype for image in good])
+    seen = _most([image.shape for image in good])
+    if seen != size:
+        raise InputError(
+            f"{path}: camera.width_px, height_px: {size[1]} x {size[0]}, but the images are {seen[1]} x {seen[0]}"
+        )
+    frames: Frames = np.zeros((len(images), *size), depth)
+    unusable: dict[int, str] = {}
+    for k, image in enumerate(images):
+        if isinstance(image, str):
+            unusable[k] = image
+        elif image.shape != size:
+            unusable[k] = f"wrong size: {image.shape[1]} x {image.shape[0]} pixels, the others {size[1]} x {size[0]}"
+        elif image.dtype != depth:
+            unusable[k] = f"wrong bit depth: {8 * image.itemsize} bit, the others {8 * depth.itemsize} bit"
+        else:
+            frames[k] = image
+    bits = _depth(head, frames, path)
+    optics = head.optics.model_copy(update={"camera": camera.model_copy(update={"bits": bits})})
+    lost = tuple(k for k, image in enumerate(images) if isinstance(image, str))
+    return CaptureSet(replace(head, optics=optics), frames, unusable, lost)
+
+
+def anchored(head: CaptureHead, reference: CaptureHead) -> CaptureHead:
+    """A fringes set's head; the displacement for which its geometry holds is, unless stated, its reference's.
+
+    Raises InputError if the two cannot belong together.
+    """
+    ours, theirs = head.optics, reference.optics
+    where = head.folder / "capture.toml"
+    if reference.kind != "full":
+        raise InputError(f"{where}: reference: {reference.folder} is not a full set")
+    for section in ("camera", "pattern"):
+        a, b = getattr(ours, section), getattr(theirs, section)
+        for key in ("width_px", "height_px", "periods", "period_mm"):
+            if getattr(a, key, None) != getattr(b, key, None):
+                raise InputError(f"{where}: {section}.{key} = {getattr(a, key)}, in the reference {getattr(b, key)}")
+    return replace(head, optics=_with_reference_displacement(ours, theirs.geometry.reference_displacement_um))
+
+
+def _with_reference_displacement(optics: OpticsConfig, displacement_um: float | None) -> OpticsConfig:
+    """The same with the displacement for which the geometry holds, unless it states one."""
+    geometry = optics.geometry
+    if geometry.reference_displacement_um is not None or displacement_um is None:
+        return optics
+    update = {"reference_displacement_um": displacement_um}
+    return optics.model_copy(update={"geometry": geometry.model_copy(update=update)})
+
+
+def _read_image(path: Path) -> Frames | str:
+    """The image, or why there is none."""
+    try:
+        image = decoded_image(read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_UNCHANGED)
+    except FileNotFoundError:
+        return "missing: no such file"
+    except (OSError, ValueError) as error:
+        return f"unreadable: {(error.strerror if isinstance(error, OSError) else None) or error}"
+    if image.ndim != 2:
+        return f"unreadable: {image.shape[2]} colour channels instead of one"
+    if image.dtype not in (np.uint8, np.uint16):
+        return f"wrong bit depth: {image.dtype} pixels"
+    return image  # type: ignore[return-value]  # checked above
+
+
+def _depth(head: CaptureHead, frames: Frames, path: Path) -> int:
+    """Bits of the sensor: as stated, else the least of the usual ones that holds the brightest pixel."""
+    bits = head.optics.camera.bits
+    if not head.bits_stated:
+        return 8 if frames.dtype == np.uint8 else next(b for b in _DEPTHS if int(frames.max()) < 2**b)
+    if (bits == 8) != (frames.dtype == np.uint8):
+        raise InputError(f"{path}: camera.bits = {bits}, but the images have {8 * frames.itemsize} bit pixels")
+    if int(frames.max()) >= 2**bits:
+        raise InputError(f"{path}: camera.bits = {bits}, but pixels reach {int(frames.max())}")
+    return bits
+
+
+def _require_inside(name: str, folder: Path, path: Path) -> None:
+    """Raise InputError for a frame that is not the set's own: a set may come from anywhere."""
+    try:
+        inside = bool(name) and (folder / name).resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):  # a NUL, a name too long, links in a ring
+        inside = False
+    if not inside or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise InputError(f"{path}: frames: {name!r} is outside the set's folder")
+
+
+def _ordered(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]:
+    """Rows with their patterns in the order of the sequence. Raises InputError if one is missing or twice."""
+    found: dict[str, tuple[FrameRow, Pattern]] = {}
+    for row in content.frames:
+        if row.role in ("sin", "gray") and row.axis is None:
+            raise InputError(f"{path}: frames: {row.file} has role {row.role} and no axis")
+        pattern = Pattern(row.role, row.axis or "", row.index if row.axis else 0)
+        if row.role == "sin":
+            shift = 2 * math.pi * row.index / content.pattern.steps if row.shift_rad is None else row.shift_rad
+            pattern = Pattern(row.role, row.axis or "", row.index, shift)
+        if pattern.name in found:
+            raise InputError(
+                f"{path}: frames: {pattern.name} is there twice ({found[pattern.name][0].file}, {row.file})"
+            )
+        found[pattern.name] = (row, pattern)
+    names = _sequence_names(content)
+    if missing := [name for name in names if name not in found]:
+        raise InputError(f"{path}: frames: a {content.kind} set of {content.pattern.steps} steps needs {missing[0]}")
+    if extra := [name for name in found if name not in names]:
+        raise InputError(f"{path}: frames: {extra[0]} does not belong to a {content.kind} set")
+    for name, times in Counter(row.file for row in content.frames).items():
+        if times > 1:
+            raise InputError(f"{path}: frames: {name} is given for {times} frames")
+    return [found[name] for name in names]
+
+
+def _sequence_names(content: CaptureFile) -> list[str]:
+    names: list[str] = []
+    for axis in AXES:
+        names += [Pattern("sin", axis, k).name for k in range(content.pattern.steps)]
+        if content.kind == "full":
+            names += [Pattern("gray", axis, bit).name for bit in range(1, GRAY_BITS + 1)]
+    return names + (["white", "black"] if content.kind == "full" else [])
+
+
+def _column(values: list[float | None]) -> FloatArray:
+    return np.array([math.nan if value is None else value for value in values])
+
+
+def _most(values: list[Any]) -> Any:
+    return Counter(values).most_common(1)[0][0]

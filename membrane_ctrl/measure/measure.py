@@ -1,0 +1,147 @@
+"""The `measure` command: one capture set to height, Zernike coefficients and quality."""
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.geometry.file import read_geometry
+from membrane_ctrl.measure.measurement import Measurement, measure_set
+from membrane_ctrl.measure.results import ErrorBars, details_table, error_bars, result_table, write_result
+from membrane_ctrl.metrology.facet.sofast import SofastMeasurement, lit_pixels, read_measurement, series_of
+from membrane_ctrl.metrology.frames.series_integrity import SeriesFlag, check_series
+from membrane_ctrl.metrology.optics.geometry import Outline, find_outline
+from membrane_ctrl.metrology.optics.surface import RadialProfile, radial_profile
+from membrane_ctrl.model.errors import Exit, InputError
+
+FloatArray = NDArray[np.float64]
+
+# A good pose leaves 0.4 mm and 0.0007 (simulated, a fifth of the sensor's pixels); a ring is round to 1 mm or so.
+_RIM_OFF_MM, _RIM_SIZE = 3.0, 0.005
+
+
+def measure_command(
+    folder: Path, geometry: Path | None, out: Path | None, as_json: bool, pictures: bool, rerun: bool
+) -> int:
+    """Measure one set, write the result, say what came out. Returns the exit code; raises InputError."""
+    if folder.suffix == ".h5":
+        pass
+
+        return facet_command(folder, as_json)
+    measurement = measure_set(folder, None if geometry is None else read_geometry(geometry))
+    for key in measurement.head.ignored:
+        print(f"{folder / 'capture.toml'}: {key}: not known, ignored", file=sys.stderr)
+    target = out.resolve() if out else folder / "result"  # a link that a person names is meant
+    light, outline = _outline(measurement)
+    profile = _profile(measurement)
+    bars = error_bars(measurement, geometry)
+    begin = time.perf_counter()
+    try:
+        write_result(target, measurement, details_table(measurement, profile, outline, bars), bars)
+        drawn: list[Path] = []
+        if pictures:
+            from membrane_ctrl.measure.pictures import draw_all
+
+            drawn = draw_all(target, measurement, light, profile, outline, bars)
+        if rerun:
+            from membrane_ctrl.measure.pictures import log_measurement
+
+            log_measurement(target / "measurement.rrd", measurement, drawn)
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written: {error.strerror or error}") from None
+    print(f"written to {target} in {time.perf_counter() - begin:.1f} s", file=sys.stderr)
+    if as_json:
+        print(json.dumps(result_table(measurement)))
+    else:
+        print("\n".join(_lines(measurement, profile, outline, bars)))
+    return int(Exit.REJECTED if measurement.verdict == "rejected" else Exit.DONE)
+
+
+def _outline(measurement: Measurement) -> tuple[FloatArray, Outline | None]:
+    """The light in the picture, in bins, and the rim found in it."""
+    checked, optics = measurement.checked, measurement.head.optics
+    if checked is None or measurement.full is None:
+        return np.zeros((2, 2)), None
+    light = checked.binned.means[[k for used in checked.view.used for k in used]].mean(axis=0).astype(float)
+    bin_px = checked.binned.bin_px
+    fine = np.repeat(np.repeat(light, bin_px, axis=0), bin_px, axis=1)
+    rim_z = checked.tracer.vertex_z_mm + measurement.full.surface.sag_mm
+    return light, find_outline(fine, checked.tracer.geometry, optics.mirror.radius_mm, rim_z)
+
+
+def _profile(measurement: Measurement) -> RadialProfile | None:
+    full = measurement.full
+    if full is None:
+        return None
+    return radial_profile(full.grid.axis_mm, full.height_mm(), measurement.head.optics.mirror.radius_mm)
+
+
+def _lines(
+    measurement: Measurement, profile: RadialProfile | None, outline: Outline | None, bars: ErrorBars | None
+) -> list[str]:
+    """What a person wants to read."""
+    full = measurement.full
+    lines = [f"verdict   {measurement.verdict}{': ' + measurement.reason if measurement.reason else ''}"]
+    lines += [f"flagged   {item['file']}: {item['reason']}" for item in measurement.flagged_files()]
+    if full is None or profile is None or bars is None:
+        return lines
+    of_noise, of_geometry = bars.sag_um
+    residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
+    coeffs = 1e3 * full.surface.coeffs_mm
+    lines += [
+        f"sag       {full.surface.sag_mm:.4f} mm, 1 sigma {of_noise:.2g} um of noise"
+        + (f", {of_geometry:.3g} um of the geometry" if of_geometry > 0 else ""),
+        f"geometry  its spread: {bars.source}",
+        f"Hencky    {profile.sag_mm:.4f} mm, {profile.pressure_pa:.0f} Pa under the paper's film",
+        f"figure    astigmatism {np.hypot(*coeffs[4:6]):.2f} um, coma {np.hypot(*coeffs[6:8]):.2f} um, "
+        f"trefoil {np.hypot(*coeffs[8:10]):.2f} um (RMS)",
+        f"residual  {full.quality.residual_urad:.2f} urad of slope, {residual_um.std():.3f} um RMS of height",
+        f"fit       {len(full.fit.changes_mm)} iterations, last change {full.fit.changes_mm[-1]:.1e} mm, "
+        f"{np.count_nonzero(full.weights)} pixels",
+    ]
+    if outline is not None:
+        off = abs(outline.offset_mm) > _RIM_OFF_MM or abs(outline.size_ratio - 1) > _RIM_SIZE
+        lines.append(
+            f"rim       {outline.offset_mm:.1f} mm from where the pose puts it, {outline.size_ratio:.4f} of its size"
+            + (": is the camera's pose right, and mirror.radius_mm?" if off else "")
+        )
+    return lines
+
+
+# `measure` of a SOFAST file: are its frames what they should be? Slopes need the poses that its own tool finds.
+
+
+_LEAST_PIXELS = 200  # fewer tell nothing of a frame
+
+
+def facet_command(path: Path, as_json: bool) -> int:
+    """Check the frames and say what was found. Returns the exit code; raises InputError for what is no such file."""
+    try:
+        measurement = read_measurement(path)
+    except (ValueError, OSError, ImportError) as error:
+        raise InputError(str(error)) from None
+    mask = lit_pixels(measurement)
+    if np.count_nonzero(mask) < _LEAST_PIXELS:
+        raise InputError(f"{path}: only {np.count_nonzero(mask)} pixels see fringes")
+    found = check_series(series_of(measurement, mask), measurement.black[mask], measurement.white[mask])
+    flagged = [{"file": _name(measurement, flag), "reason": flag.reason} for flag in found.flags]
+    table = {
+        "schema": "membrane-frames/1",
+        "quality": {"verdict": found.verdict, "reason": found.reason, "flagged_frames": flagged},
+        "pixels": int(np.count_nonzero(mask)),
+    }
+    lines = [f"verdict   {found.verdict}{': ' + found.reason if found.reason else ''}"]
+    lines += [f"flagged   {item['file']}: {item['reason']}" for item in flagged]
+    print(json.dumps(table) if as_json else "\n".join(lines))
+    return int(Exit.REJECTED if found.verdict == "rejected" else Exit.DONE)
+
+
+def _name(measurement: SofastMeasurement, flag: SeriesFlag) -> str:
+    """For a person: axis, periods a screen, step from 0."""
+    if flag.axis in ("white", "black"):
+        return flag.axis
+    periods = measurement.periods_x if flag.axis == "x" else measurement.periods_y
+    return f"{flag.axis}, {periods[flag.index]:g} periods, step {flag.step}"

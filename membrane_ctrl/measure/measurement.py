@@ -1,0 +1,241 @@
+"""One capture set on disk to its full result: what `measure` and every analysis of many sets call."""
+
+import math
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from membrane_ctrl.geometry.file import GeometryFile
+from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet, anchored, read_set
+from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, check
+from membrane_ctrl.metrology.frames import frame_stack, integrity
+from membrane_ctrl.metrology.full import BinFigure, FullResult, bin_figure, measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.reconstruct import HeightFunction
+from membrane_ctrl.metrology.uncertainty.monte_carlo import TrialBench
+from membrane_ctrl.model import errors, shape_estimate
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What became of a set.
+
+    Attributes
+    ----------
+    head : CaptureHead
+        The set.
+    verdict : "ok", "degraded" or "rejected"
+        The worst that was found; `reason` says it.
+    flags : tuple of Flag
+        Frames that do not belong to the set.
+    checked, full : Checked, FullResult or None
+        None where the frames gave no figure.
+    displacement_um : float
+        Mean laser reading of the sinusoids: the moment that the figure belongs to; NaN without.
+    timing_s : dict
+        Seconds for "load", "phase" and "reconstruct".
+    """
+
+    head: CaptureHead
+    verdict: shape_estimate.Verdict
+    reason: str
+    flags: tuple[integrity.Flag, ...]
+    checked: Checked | None
+    full: FullResult | None
+    displacement_um: float
+    timing_s: dict[str, float]
+
+    def flagged_files(self) -> list[dict[str, str]]:
+        """The flags as files."""
+        return [{"file": self.head.files[flag.frame], "reason": flag.reason} for flag in self.flags]
+
+
+def measure_set(
+    folder: Path,
+    geometry: GeometryFile | None = None,
+    anchor: Anchor | None = None,
+    start: HeightFunction | None = None,
+) -> Measurement:
+    """Measure one set.
+
+    Parameters
+    ----------
+    folder : Path
+        The set.
+    geometry : GeometryFile, optional
+        Instead of the set's own.
+    anchor : Anchor, optional
+        For a fringes set: its reference, if it has been read already (see `read_anchor`).
+    start : height function, optional
+        Starting shape of the fit.
+
+    Raises
+    ------
+    InputError
+        If the set or its reference is not one.
+    """
+    begin = time.perf_counter()
+    capture = read_set(folder, geometry)
+    if capture.head.reference is not None:
+        reference, own = read_anchor(capture.head.reference, geometry)
+        anchor = anchor or own
+        capture = replace(capture, head=anchored(capture.head, reference))
+    return measure_capture(capture, anchor, start, load_s=time.perf_counter() - begin)
+
+
+def read_anchor(folder: Path, geometry: GeometryFile | None = None) -> tuple[CaptureHead, Anchor]:
+    """The reference of fringes sets. Raises InputError if it gives no figure."""
+    capture = read_set(folder, geometry)
+    if capture.head.kind != "full":
+        raise errors.InputError(f"{folder / 'capture.toml'}: kind: a reference must be a full set")
+    try:
+        return capture.head, check(stack_of(capture), capture.head.optics).anchor()
+    except RejectedSetError as error:
+        raise errors.InputError(f"{folder}: cannot be a reference: {error}") from None
+
+
+def stack_of(capture: CaptureSet) -> frame_stack.FrameStack:
+    """The frames for the metrology.
+
+    Raises
+    ------
+    RejectedSetError
+        If a picture is missing or unreadable. It could often be done without, but a set that was not written whole is
+        not to be trusted for the rest of it either.
+    """
+    if capture.lost:
+        flags = tuple(integrity.Flag(k, capture.unusable[k], math.inf) for k in capture.lost)
+        first = capture.lost[0]
+        raise RejectedSetError(f"{capture.head.files[first]} is {capture.unusable[first]}", flags)
+    return frame_stack.FrameStack(
+        capture.frames, capture.head.patterns, capture.head.displacement_um, capture.unusable
+    )
+
+
+def measure_capture(
+    capture: CaptureSet, anchor: Anchor | None = None, start: HeightFunction | None = None, load_s: float = 0.0
+) -> Measurement:
+    """Measure frames that are in memory; never raises for what they show."""
+    optics = capture.head.optics
+    mean_um = float("nan")
+    begin = time.perf_counter()
+    try:
+        stack = stack_of(capture)
+        mean_um = stack.mean_reading_um
+        checked = check(stack, optics, anchor)
+    except RejectedSetError as error:
+        timing = {"load": load_s, "phase": time.perf_counter() - begin, "reconstruct": 0.0}
+        return Measurement(capture.head, "rejected", str(error), error.flags, None, None, mean_um, timing)
+    pixels = measure_pixels(optics, checked)
+    middle = time.perf_counter()
+    full = reconstruct_full(optics, checked, pixels, start)
+    end = time.perf_counter()
+    verdict, reason = shape_estimate.judge(full.quality)
+    if verdict == "ok":
+        verdict, reason = checked.verdict
+    timing = {"load": load_s, "phase": middle - begin, "reconstruct": end - middle}
+    return Measurement(capture.head, verdict, reason, checked.flags, checked, full, mean_um, timing)
+
+
+def noise_seen_adu(measurement: Measurement) -> float:
+    """Noise of a pixel as the phase steps show it; NaN for three steps, which always agree."""
+    if measurement.checked is None or measurement.full is None:
+        return float("nan")
+    free = sum(len(used) - 3 for used in measurement.checked.view.used)
+    return float(np.sqrt(np.median(np.square(measurement.full.rest_adu)) / free)) if free else float("nan")
+
+
+# The figure of one capture set on disk from its bins: what the analyses of many sets call.
+
+
+@dataclass(frozen=True)
+class SetFigure:
+    """A set that gave a figure.
+
+    Attributes
+    ----------
+    head : CaptureHead
+        What the set says of itself.
+    checked, figure : Checked, BinFigure
+        Its frames and its surface.
+    verdict : "ok" or "degraded"
+        With its reason.
+    time_s, displacement_um : float
+        Means over the sinusoids; NaN where the set says nothing.
+    """
+
+    head: CaptureHead
+    checked: Checked
+    figure: BinFigure
+    verdict: shape_estimate.Verdict
+    reason: str
+    time_s: float
+    displacement_um: float
+
+    def bench(self) -> TrialBench:
+        """For Monte Carlo trials."""
+        return TrialBench.of(self.head.optics, self.checked, self.figure)
+
+
+class Figures:
+    """Figures of sets, one after the other; remembers the last reference, which most sets of a run share.
+
+    Parameters
+    ----------
+    geometry : GeometryFile, optional
+        Used instead of the sets' own.
+    """
+
+    def __init__(self, geometry: GeometryFile | None = None) -> None:
+        self._geometry = geometry
+        self._reference: Path | None = None
+        self._anchor: tuple[CaptureHead, Anchor] | errors.CommandError = errors.CommandError("no reference read yet")
+
+    def of(self, folder: Path) -> SetFigure:
+        """Read and measure a set.
+
+        Raises
+        ------
+        InputError
+            If the set or its reference is not one.
+        RejectedError
+            If its frames give no figure that may be used.
+        """
+        capture = read_set(folder, self._geometry)
+        anchor = None
+        if capture.head.reference is not None:
+            reference, anchor = self._anchored_by(capture.head.reference)
+            capture = replace(capture, head=anchored(capture.head, reference))
+        optics = capture.head.optics
+        try:
+            stack = stack_of(capture)
+            checked = check(stack, optics, anchor)
+        except RejectedSetError as error:
+            raise errors.RejectedError(f"{folder}: rejected: {error}") from None
+        figure = bin_figure(optics, checked)
+        verdict, reason = shape_estimate.judge(figure.quality)
+        if verdict == "rejected":
+            raise errors.RejectedError(f"{folder}: rejected: {reason}")
+        if verdict == "ok":
+            verdict, reason = checked.verdict
+        return SetFigure(
+            capture.head, checked, figure, verdict, reason, _middle_s(capture.head), stack.mean_reading_um
+        )
+
+    def _anchored_by(self, reference: Path) -> tuple[CaptureHead, Anchor]:
+        if reference != self._reference:
+            self._reference = reference
+            try:
+                self._anchor = read_anchor(reference, self._geometry)
+            except errors.CommandError as error:
+                self._anchor = error
+        if isinstance(self._anchor, errors.CommandError):
+            raise self._anchor
+        return self._anchor
+
+
+def _middle_s(head: CaptureHead) -> float:
+    """Mean start of exposure of the sinusoids."""
+    times = np.array([t for t, pattern in zip(head.time_s, head.patterns, strict=True) if pattern.role == "sin"])
+    return float(times.mean()) if times.size else math.nan

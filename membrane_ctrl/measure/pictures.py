@@ -1,0 +1,214 @@
+"""Pictures of a measurement, as PNG files beside the result."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from membrane_ctrl.measure.measurement import Measurement
+from membrane_ctrl.measure.results import ErrorBars, write_figure
+from membrane_ctrl.metrology.full import FullResult
+from membrane_ctrl.metrology.optics import geometry, surface
+from membrane_ctrl.model.files import move, scratch_folder
+from membrane_ctrl.model.terminal import plain
+
+FloatArray = NDArray[np.float64]
+
+_SHOWN_PX = 600  # a side, of maps of pixels
+
+
+def draw_all(
+    out: Path,
+    measurement: Measurement,
+    light: FloatArray,
+    profile: surface.RadialProfile | None,
+    outline: geometry.Outline | None,
+    bars: ErrorBars | None,
+) -> list[Path]:
+    """Draw everything there is to draw; returns the files.
+
+    Parameters
+    ----------
+    light : (H, W) array
+        The scene, of any size: white, or the mean of the fringes.
+    """
+    files = [write_figure(out / "frames.png", _frames(measurement))]
+    full = measurement.full
+    if full is None or profile is None:
+        return files
+    axis, height = full.grid.axis_mm, full.height_mm()
+    residual_um = 1e3 * full.residual_mm
+    files += [
+        write_figure(out / "sag.png", _map("height (mm)", axis, height, "viridis")),
+        write_figure(out / "residual.png", _map("height over the fit (um)", axis, residual_um, "RdBu_r", even=True)),
+        write_figure(out / "slopes.png", _slopes(full)),
+        write_figure(out / "modulation.png", _modulation(measurement, full, light, outline)),
+        write_figure(out / "profile.png", _profile(profile)),
+        write_figure(out / "convergence.png", _convergence(full)),
+    ]
+    return files if bars is None else [*files, write_figure(out / "uncertainty.png", _uncertainty(bars))]
+
+
+def _uncertainty(bars: ErrorBars) -> Figure:
+    """1 sigma from noise and, if its spread is one, from the geometry."""
+    figure = Figure(figsize=(12, 4.8), layout="constrained")
+    of_noise, of_geometry = bars.maps_um()
+    left, right = figure.subplots(1, 2)
+    _image(left, "1 sigma of pixel noise (nm)", bars.grid.axis_mm, 1e3 * of_noise, "magma")
+    if np.isfinite(of_geometry).any():
+        _image(right, "1 sigma of the geometry (um)", bars.grid.axis_mm, of_geometry, "magma")
+    return figure
+
+
+def _map(title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False) -> Figure:
+    figure = Figure(figsize=(6.4, 5.4), layout="constrained")
+    _image(figure.subplots(), title, axis, values, colours, even)
+    return figure
+
+
+def _image(axes: Any, title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False) -> None:
+    low, high = np.nanpercentile(values, [0.5, 99.5])
+    if even:
+        high = max(abs(low), abs(high))
+        low = -high
+    extent = (axis[0], axis[-1], axis[0], axis[-1])
+    shown = axes.imshow(values, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high)
+    axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)")
+    axes.figure.colorbar(shown, ax=axes, shrink=0.85)
+
+
+def _slopes(full: FullResult) -> Figure:
+    """Slopes as measured, and what the fit leaves of them."""
+    figure = Figure(figsize=(11, 9), layout="constrained")
+    axes = figure.subplots(2, 2)
+    grid = full.grid
+    every = max(1, full.index.size // _SHOWN_PX**2)
+    x, y, gx, gy = full.field[:4, ::every]
+    for place, slope, name in ((axes[0, 0], gx, "dh/dx"), (axes[0, 1], gy, "dh/dy")):
+        points = place.scatter(x, y, c=1e3 * slope, s=1, cmap="RdBu_r", rasterized=True)
+        place.set(title=f"{name} measured (mrad)", xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
+        figure.colorbar(points, ax=place, shrink=0.85)
+    for place, slope, name in ((axes[1, 0], grid.slope_x, "dh/dx"), (axes[1, 1], grid.slope_y, "dh/dy")):
+        left = np.where(grid.count > 0, 1e6 * slope, np.nan)
+        _image(place, f"{name} less the fit (urad)", grid.axis_mm, left, "RdBu_r", even=True)
+    return figure
+
+
+def _modulation(
+    measurement: Measurement, full: FullResult, light: FloatArray, outline: geometry.Outline | None
+) -> Figure:
+    """Fringe amplitude in the camera's picture, beside the light with the rim found in it."""
+    camera = measurement.head.optics.camera
+    swing = np.full(camera.width_px * camera.height_px, np.nan, np.float32)
+    swing[full.index] = full.swing_adu
+    step = max(1, camera.height_px // _SHOWN_PX)
+    figure = Figure(figsize=(12, 5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    extent = (-0.5, camera.width_px - 0.5, camera.height_px - 0.5, -0.5)
+    picture = swing.reshape(camera.height_px, camera.width_px)[::step, ::step]
+    figure.colorbar(left.imshow(picture, extent=extent), ax=left, shrink=0.85)
+    left.set(title="fringe amplitude (ADU)", xlabel="column", ylabel="row")
+    right.imshow(light, extent=extent, cmap="gray")
+    right.set(title="light and rim", xlabel="column", ylabel="row")
+    if outline is not None:
+        right.plot(*outline.rim_px, ".", markersize=2, color="tab:orange")
+    return figure
+
+
+def _frames(measurement: Measurement) -> Figure:
+    """One tile a frame, the flagged ones with their reason."""
+    names = [pattern.name for pattern in measurement.head.patterns]
+    reasons = {flag.frame: plain(flag.reason) for flag in measurement.flags}
+    figure = Figure(figsize=(9, 0.28 * len(names) + 1.2), layout="constrained")
+    axes = figure.subplots()
+    colours = ["tab:red" if k in reasons else "tab:green" for k in range(len(names))]
+    axes.barh(range(len(names)), 1.0, color=colours, alpha=0.5)
+    for k in range(len(names)):
+        axes.text(0.02, k, reasons.get(k, "as predicted"), va="center", fontsize=8, parse_math=False)
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()
+    axes.set(xticks=[], xlim=(0, 1))
+    axes.set_title(plain(f"{measurement.verdict} {measurement.reason}")[:110], parse_math=False)
+    return figure
+
+
+def _profile(profile: surface.RadialProfile) -> Figure:
+    figure = Figure(figsize=(7, 6), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    upper.fill_between(profile.radius_mm, profile.low_mm, profile.high_mm, alpha=0.4, label="95 % of the ring")
+    upper.plot(profile.radius_mm, profile.mean_mm, label="measured, mean over azimuth")
+    upper.plot(profile.radius_mm, profile.hencky_mm, "--", label=f"Hencky, sag {profile.sag_mm:.3f} mm")
+    upper.set(ylabel="height (mm)", title=f"radial profile; pressure equivalent {profile.pressure_pa:.0f} Pa")
+    upper.legend()
+    low, mean, high = (1e3 * (row - profile.hencky_mm) for row in (profile.low_mm, profile.mean_mm, profile.high_mm))
+    lower.fill_between(profile.radius_mm, low, high, alpha=0.4)
+    lower.plot(profile.radius_mm, mean)
+    lower.set(xlabel="radius (mm)", ylabel="less Hencky (um)")
+    return figure
+
+
+def _convergence(full: FullResult) -> Figure:
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    changes = full.fit.changes_mm
+    axes.semilogy(range(1, len(changes) + 1), np.maximum(changes, 1e-16), "o-")
+    axes.axhline(1e-6, linestyle="--", color="tab:red")
+    axes.set(xlabel="iteration", ylabel="largest change of height (mm)", title="bins first, then every pixel")
+    return figure
+
+
+# A result's own Rerun recording: opened, and closed with a look at whether it reached the disk.
+
+
+@contextmanager
+def result_recording(
+    path: Path, application: str, blueprint: rrb.Blueprint | None = None
+) -> Iterator[rr.RecordingStream]:
+    """A recording in a file `path` (.rrd), overwritten. Raises OSError if it cannot be written."""
+    recording = rr.RecordingStream(application)
+    with scratch_folder(path.parent, ".recording-") as folder:
+        try:
+            recording.save(folder / path.name, default_blueprint=blueprint)
+            yield recording
+            recording.flush()  # logging never says that a disk is full, this does
+        except RuntimeError as error:
+            raise OSError(f"{path.name}: {error}") from None
+        finally:
+            recording.disconnect()
+        try:
+            move(folder / path.name, path)
+        except OSError as error:
+            raise OSError(f"{path.name}: {error.strerror}") from None
+
+
+def log_pictures(recording: rr.RecordingStream, entity: str, pictures: Sequence[Path]) -> None:
+    """Every picture below an entity, by its file's name."""
+    for picture in pictures:
+        recording.log(f"{entity}/{picture.stem}", rr.EncodedImage(path=picture), static=True)
+
+
+# A measurement as a Rerun recording: maps, coefficients, verdict, and the pictures.
+
+
+def log_measurement(path: Path, measurement: Measurement, pictures: Sequence[Path]) -> None:
+    """Write a recording `path` (.rrd). Raises OSError if it cannot be written."""
+    words = [f"verdict: {measurement.verdict} {measurement.reason}"]
+    words += [f"{item['file']}: {item['reason']}" for item in measurement.flagged_files()]
+    full = measurement.full
+    with result_recording(path, "membrane_ctrl_measure") as recording:
+        recording.log("measure/verdict", rr.TextDocument("\n".join(words)), static=True)
+        if full is not None:
+            coeffs_um = 1e3 * full.surface.coeffs_mm
+            recording.log("measure/zernike_um", rr.BarChart(coeffs_um[1:], abscissa=np.arange(2, 37)), static=True)
+            # row 0 of a picture is on top, that is at +y
+            height = full.height_mm()[::-1].astype(np.float32)
+            residual = (1e3 * full.residual_mm)[::-1].astype(np.float32)
+            recording.log("measure/height_mm", rr.Tensor(height, dim_names=["y", "x"]), static=True)
+            recording.log("measure/residual_um", rr.Tensor(residual, dim_names=["y", "x"]), static=True)
+        log_pictures(recording, "measure/pictures", pictures)

@@ -1,0 +1,236 @@
+"""What `measure` leaves in a folder: `result.json` and `height.npz` (INTERFACES section 5), and `details.json`."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.geometry.spread_file import spread_of
+from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
+from membrane_ctrl.metrology import bins, phase
+from membrane_ctrl.metrology.full import FullResult
+from membrane_ctrl.metrology.optics.geometry import Outline
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, RadialProfile, sag_gradient
+from membrane_ctrl.metrology.uncertainty import monte_carlo
+from membrane_ctrl.model.files import make_folder, write_bytes_atomic, write_text_atomic
+
+if TYPE_CHECKING:  # matplotlib takes a second to load
+    from matplotlib.figure import Figure
+
+
+# How well a measured height is known: noise of the pixels, and what is known of the geometry, without any trials.
+#
+# Both are linear (`metrology.uncertainty`): a few dozen solutions of thinned points, 50 ms. The Monte Carlo of the
+# `uncertainty` command agrees within 10 %.
+
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ErrorBars:
+    """Covariances (36, 36) in mm^2 of the fit's parameters.
+
+    Attributes
+    ----------
+    noise : array
+        From the pixels' noise, or the scatter of the slopes if that is larger.
+    geometry : array
+        From the geometry's spread; zeros if the poses are taken as exact.
+    source : str
+        Where that spread is stated.
+    grid : HeightMap
+        Where `maps_um` has its points.
+    """
+
+    noise: FloatArray
+    geometry: FloatArray
+    source: str
+    grid: monte_carlo.HeightMap
+
+    @property
+    def sag_um(self) -> tuple[float, float]:
+        """1 sigma of the sag: noise, geometry."""
+        gradient = sag_gradient()
+        of_noise, of_geometry = (1e3 * float(np.sqrt(gradient @ c @ gradient)) for c in (self.noise, self.geometry))
+        return of_noise, of_geometry
+
+    def maps_um(self) -> tuple[FloatArray, FloatArray]:
+        """1 sigma (n, n) of the height on `grid.axis_mm`: noise, geometry; NaN outside the analysis radius."""
+        of_noise, of_geometry = (self.grid.picture(1e3 * self.grid.sigma(c)) for c in (self.noise, self.geometry))
+        return of_noise, of_geometry
+
+
+def error_bars(measurement: Measurement, geometry: Path | None) -> ErrorBars | None:
+    """Error bars of a measurement; None if it has no figure.
+
+    Parameters
+    ----------
+    geometry : Path, optional
+        The file that the geometry is from, with its covariance.
+
+    Raises
+    ------
+    InputError
+        If that covariance is none, or of the other form of geometry.
+    """
+    full, checked, optics = measurement.full, measurement.checked, measurement.head.optics
+    if full is None or checked is None:
+        return None
+    swing = full.quality.modulation_share * (2**optics.camera.bits - 1)
+    pixel = bins.pixel_sigma_adu(optics.camera.noise_adu)
+    shifts = [checked.stack.shifts_rad(used) for used in checked.view.used]
+    sigma_mm = phase.mm_per_rad(optics.pattern) * np.array([phase.phase_sigma_rad(d, pixel, swing) for d in shifts])
+    gain = bins.slope_per_screen(checked.tracer.geometry, full.surface.radius_mm, full.surface.sag_mm)
+    spread, source = spread_of(optics.geometry, geometry)
+    try:
+        of_geometry = monte_carlo.geometry_covariance(
+            monte_carlo.geometry_jacobian(_bench(measurement), spread), spread
+        )
+    except ArithmeticError:
+        of_geometry, source = np.full((PARAMETERS, PARAMETERS), np.nan), f"{source}: too wide to be a spread"
+    grid = monte_carlo.HeightMap.over(optics.mirror.analysis_radius_mm, optics.mirror.radius_mm)
+    return ErrorBars(bins.parameter_covariance(full.fit, gain @ sigma_mm**2), of_geometry, source, grid)
+
+
+def _bench(measurement: Measurement) -> monte_carlo.TrialBench:
+    """The bins' points on their surface."""
+    checked = measurement.checked
+    if checked is None:
+        raise ValueError("a set without a figure has no error bars")
+    row, column = np.divmod(checked.state.index, checked.phase_rad.shape[2])
+    side, exact = checked.binned.bin_px, np.zeros((2, row.size))
+    place_px = side * np.stack([column, row]) + (side - 1) / 2
+    surface, points = checked.state.surface, checked.state.points
+    return monte_carlo.TrialBench.of_points(
+        measurement.head.optics, checked.tracer, surface, points, place_px, exact, monte_carlo.TRIAL_POINTS
+    )
+
+
+def result_table(measurement: Measurement) -> dict[str, Any]:
+    """The content of `result.json` (schema membrane-result/1); numbers that do not exist are null."""
+    full = measurement.full
+    radius_mm = measurement.head.optics.mirror.radius_mm
+    coeffs = [None] * 36 if full is None else (1e3 * full.surface.coeffs_mm).tolist()
+    full_scale = 2**measurement.head.optics.camera.bits - 1
+    quality: dict[str, Any] = {
+        "verdict": measurement.verdict,
+        "reason": measurement.reason,
+        "valid_fraction": 0.0 if full is None else full.quality.valid_fraction,
+        "modulation_median_adu": None if full is None else full.quality.modulation_share * full_scale,
+        "saturated_fraction": None if full is None else full.quality.saturated_fraction,
+        "flagged_frames": measurement.flagged_files(),
+    }
+    return {
+        "schema": "membrane-result/1",
+        "zernike": {
+            "index": "noll",
+            "first": 1,
+            "normalisation": "rms",
+            "radius_mm": radius_mm,
+            "coeffs_um": coeffs,
+        },
+        "fit": _fit_table(full),
+        "quality": quality,
+        "geometry": measurement.head.geometry.table(),
+        "timing_s": measurement.timing_s,
+    }
+
+
+def _fit_table(full: FullResult | None) -> dict[str, Any]:
+    if full is None:
+        return {"iterations": 0, "converged": False, "last_change_mm": None, "slope_residual_urad": None, "points": 0}
+    return {
+        "iterations": len(full.fit.changes_mm),
+        "converged": full.fit.converged,
+        "last_change_mm": full.fit.changes_mm[-1],
+        "slope_residual_urad": full.quality.residual_urad,
+        "points": int(np.count_nonzero(full.weights)),
+    }
+
+
+def details_table(
+    measurement: Measurement, profile: RadialProfile | None, outline: Outline | None, bars: ErrorBars | None
+) -> dict[str, Any]:
+    """What a person also asks for: sag, pressure, zonal residual, noise, the rim in the picture."""
+    full = measurement.full
+    table: dict[str, Any] = {
+        "set": str(measurement.head.folder),
+        "displacement_um": _number(measurement.displacement_um),
+        "ignored_keys": list(measurement.head.ignored),
+        "noise_seen_adu": _number(noise_seen_adu(measurement)),
+    }
+    if full is not None:
+        residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
+        table |= {
+            "sag_mm": full.surface.sag_mm,
+            "hencky_excess_sag_mm": full.surface.hencky_mm,
+            "changes_mm": list(full.fit.changes_mm),
+            "zonal_residual_rms_um": float(residual_um.std()),
+            "zonal_residual_max_um": float(np.max(np.abs(residual_um - residual_um.mean()))),
+            "motion_taken_out": full.moved,
+        }
+    if profile is not None:
+        table |= {"hencky_sag_mm": profile.sag_mm, "pressure_equivalent_pa": profile.pressure_pa}
+    if bars is not None:
+        of_noise, of_geometry = bars.sag_um
+        table["sag_sigma_um"] = {
+            "noise": _number(of_noise),
+            "geometry": _number(of_geometry),
+            "geometry_spread": bars.source,
+        }
+    if outline is not None:
+        table["rim"] = {
+            "centre_px": list(outline.centre_px),
+            "expected_centre_px": list(outline.expected_px),
+            "offset_mm": outline.offset_mm,
+            "size_ratio": outline.size_ratio,
+        }
+    return table
+
+
+def write_result(out: Path, measurement: Measurement, details: dict[str, Any], bars: ErrorBars | None) -> None:
+    """Write `result.json`, `details.json` and, if there is a figure to be used, two maps. Raises OSError."""
+    make_folder(out)
+    write_json(out / "result.json", result_table(measurement))
+    write_json(out / "details.json", details)
+    if measurement.full is not None and measurement.verdict != "rejected":
+        axis = measurement.full.grid.axis_mm
+        write_arrays(out / "height.npz", x_mm=axis, y_mm=axis, h_mm=measurement.full.height_mm())
+        if bars is not None:
+            axis, (of_noise, of_geometry) = bars.grid.axis_mm, bars.maps_um()
+            file = out / "sigma.npz"
+            write_arrays(file, x_mm=axis, y_mm=axis, sigma_noise_um=of_noise, sigma_geometry_um=of_geometry)
+
+
+def write_json(path: Path, table: dict[str, Any]) -> None:
+    """Write strict JSON: no NaN."""
+    write_text_atomic(path, json.dumps(table, indent=1, allow_nan=False) + "\n")
+
+
+def write_arrays(path: Path, **arrays: NDArray[np.float64]) -> None:
+    """Write an `.npz`. Raises OSError."""
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **arrays)
+    write_bytes_atomic(path, file.getvalue())
+
+
+def write_figure(path: Path, figure: Figure, dpi: int = 110) -> Path:
+    """Write a figure as PNG; returns its path. Raises OSError."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    picture = io.BytesIO()
+    FigureCanvasAgg(figure).print_figure(picture, format="png", dpi=dpi)
+    write_bytes_atomic(path, picture.getvalue())
+    return path
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None

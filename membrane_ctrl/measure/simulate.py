@@ -1,0 +1,104 @@
+"""The `simulate` command: capture sets with known truth, from the twin's optics."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from membrane_ctrl.config.schema import Config, OpticsConfig
+from membrane_ctrl.geometry.file import read_geometry
+from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.sim.optics import film_shape, shade, simulate, simulation_spec
+
+
+@dataclass(frozen=True)
+class SimulateOptions:
+    """What the command was asked for; quantities as in `SimulationSpec`."""
+
+    folder: Path
+    config: Config
+    sag_mm: float
+    figure: bool
+    steps: int | None
+    bits: int | None
+    noise_adu: float | None
+    shrink: int
+    gamma: float
+    motion: simulation_spec.Motion
+    laser_noise_um: float
+    stated: Path | None
+    exact: bool
+    seed: int
+    faults: tuple[str, ...]
+    sets: int
+    interval_s: float
+
+
+def simulate_command(options: SimulateOptions) -> int:
+    """Write a set, or a run of sets. Raises InputError."""
+    if options.folder.exists() and any(options.folder.iterdir()):
+        raise InputError(f"{options.folder}: is not empty; simulate writes into a new or empty folder")
+    try:
+        spec = specification(options)
+        if options.sets == 1:
+            simulate.simulate_set(options.folder, spec)
+        else:
+            simulate.simulate_run(options.folder, spec, options.sets, options.interval_s, _progress(options.sets))
+    except ValueError as error:
+        raise InputError(f"simulate: {error}") from None
+    except OSError as error:
+        raise InputError(f"{options.folder}: cannot be written: {error.strerror or error}") from None
+    print(f"{options.sets} set(s) written to {options.folder}", file=sys.stderr)
+    return 0
+
+
+def specification(options: SimulateOptions) -> simulation_spec.SimulationSpec:
+    """The set that the options describe. Raises ValueError naming what cannot be."""
+    optics = _optics(options)
+    radius_mm = optics.mirror.radius_mm
+    mounted = film_shape.typical_film(options.sag_mm, radius_mm, options.seed)
+    return simulation_spec.SimulationSpec(
+        optics,
+        mounted if options.figure else film_shape.FilmShape(options.sag_mm, radius_mm),
+        motion=options.motion,
+        laser_noise_um=options.laser_noise_um,
+        stated_geometry=None if options.stated is None else read_geometry(options.stated).geometry,
+        light=shade.Light(gamma=options.gamma),
+        exact=options.exact,
+        seed=options.seed,
+        faults=tuple(simulation_spec.FrameFault.parse(text) for text in options.faults),
+    )
+
+
+def _optics(options: SimulateOptions) -> OpticsConfig:
+    """The configuration's optics with the options' depth, noise, steps and size."""
+    optics = options.config.optics
+    camera, pattern = optics.camera, optics.pattern
+    changes: dict[str, object] = {}
+    if options.shrink > 1:
+        column, row = camera.principal
+        changes = {
+            "width_px": camera.width_px // options.shrink,
+            "height_px": camera.height_px // options.shrink,
+            "pixel_um": camera.pixel_um * options.shrink,
+            # pixel centres are integers: the middle of the first large pixel is (shrink - 1) / 2
+            "principal_px": tuple((p - (options.shrink - 1) / 2) / options.shrink for p in (column, row)),
+        }
+    if options.bits is not None:
+        changes["bits"] = options.bits
+    if options.noise_adu is not None:
+        changes["noise_adu"] = options.noise_adu
+    steps = {} if options.steps is None else {"steps": options.steps}
+    return OpticsConfig(
+        geometry=optics.geometry,
+        camera=type(camera)(**{**camera.model_dump(exclude_none=True), **changes}),
+        pattern=type(pattern)(**{**pattern.model_dump(), **steps}),
+        mirror=optics.mirror,
+    )
+
+
+def _progress(sets: int) -> Callable[[int], None] | None:
+    """A line that counts, on a terminal only."""
+    if not sys.stderr.isatty():
+        return None
+    return lambda done: print(f"\r{done} of {sets} sets", end="" if done < sets else "\n", file=sys.stderr)

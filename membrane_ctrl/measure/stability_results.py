@@ -1,0 +1,218 @@
+"""The table of a stability run, one line a set, written as the sets pass by and read back thinned for pictures."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from membrane_ctrl.measure.pictures import log_pictures, result_recording
+from membrane_ctrl.measure.results import write_figure
+from membrane_ctrl.model.files import fresh_text
+
+FloatArray = NDArray[np.float64]
+
+_HEAD = ("set", "verdict", "reason")
+_NUMBERS = ("time_s", "displacement_um", "sag_um", "slope_residual_urad", "rmse_mean_um")
+_ZERNIKE = tuple(f"z{j}_um" for j in range(1, 37))
+
+
+class SeriesFile:
+    """Writes `series.csv`; a set that gave no figure has a line without numbers.
+
+    Parameters
+    ----------
+    path : Path
+        Overwritten.
+    points : sequence of str
+        Names of the points whose height is followed.
+    """
+
+    def __init__(self, path: Path, points: Sequence[str]) -> None:
+        self._file = fresh_text(path)
+        self._writer = csv.writer(self._file, lineterminator="\n")
+        self._writer.writerow((*_HEAD, *_NUMBERS, *(f"{name}_um" for name in points), *_ZERNIKE))
+
+    def __enter__(self) -> SeriesFile:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def add(
+        self,
+        name: str,
+        verdict: str,
+        reason: str,
+        numbers: Sequence[float] = (),
+        points_um: Sequence[float] = (),
+        coeffs_um: Sequence[float] = (),
+    ) -> None:
+        """One line; `numbers` are time_s, displacement_um, sag_um, slope_residual_urad, rmse_mean_um."""
+        cells = [f"{value:.12g}" for value in (*numbers, *points_um, *coeffs_um)]
+        self._writer.writerow((name, verdict, reason, *cells))
+
+
+def read_series(path: Path, points: int, most: int = 4000) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times (n,), heights of the points (n, points) and coefficients (n, 36) of the sets that gave a figure.
+
+    At most about `most` of them, evenly chosen, however long the run.
+    """
+    with path.open(newline="", encoding="utf-8") as file:
+        stride = max(1, -(-(sum(1 for _ in file) - 1) // most))
+        file.seek(0)
+        rows = csv.reader(file)
+        next(rows)
+        good = (row for row in rows if len(row) > len(_HEAD))
+        kept = [[float(cell) for cell in row[len(_HEAD) :]] for k, row in enumerate(good) if k % stride == 0]
+    table = np.array(kept).reshape(len(kept), len(_NUMBERS) + points + len(_ZERNIKE))
+    first = len(_NUMBERS)
+    return table[:, 0], table[:, first : first + points], table[:, first + points :]
+
+
+# Pictures of uncertainty and of stability, as PNG files.
+
+
+def draw_uncertainty(path: Path, axis_mm: FloatArray, height_um: FloatArray, rmse_um: FloatArray, pair: bool) -> None:
+    """Height, or its change, beside its RMSE; (n, n) maps."""
+    figure = Figure(figsize=(11, 4.8), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    if pair:
+        _image(left, "change of height (um)", axis_mm, height_um, "RdBu_r", even=True)
+    else:
+        _image(left, "height (mm)", axis_mm, height_um / 1e3, "viridis")
+    _image(right, f"RMSE (um), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
+    write_figure(path, figure)
+
+
+def draw_stability(
+    path: Path,
+    axis_mm: FloatArray,
+    sd_um: FloatArray,
+    time_s: FloatArray,
+    points: Mapping[str, tuple[float, float]],
+    heights_um: FloatArray,
+) -> None:
+    """The paper's figure: height at the named points (sets, points) in time, and the map of standard deviations."""
+    figure = Figure(figsize=(12, 2.2 * max(2, len(points))), layout="constrained")
+    grid = figure.add_gridspec(len(points), 2, width_ratios=(1.4, 1))
+    for k, name in enumerate(points):
+        axes = figure.add_subplot(grid[k, 0])
+        change = heights_um[:, k] - heights_um[:, k].mean()
+        axes.plot(time_s, change, ".-", markersize=3, linewidth=0.7)
+        axes.set(ylabel=f"{name} (um)", xlabel="time (s)" if k == len(points) - 1 else "")
+    shown = figure.add_subplot(grid[:, 1])
+    _image(shown, f"SD (um), mean {np.nanmean(sd_um):.3g}", axis_mm, sd_um, "magma")
+    for name, (x, y) in points.items():
+        shown.plot(x, y, "o", color="white", markeredgecolor="black")
+        frame = {"boxstyle": "round,pad=0.15", "facecolor": "black", "alpha": 0.6}  # readable on any colour
+        shown.annotate(name, (x, y), xytext=(7, 7), textcoords="offset points", color="white", bbox=frame)
+    write_figure(path, figure)
+
+
+def draw_zernike(path: Path, time_s: FloatArray, coeffs_um: FloatArray) -> None:
+    """Changes of the terms (sets, 36) against their means: the eight that move most, named by Noll's index."""
+    change = coeffs_um - coeffs_um.mean(axis=0)
+    figure = Figure(figsize=(10, 5), layout="constrained")
+    axes = figure.subplots()
+    for j in 1 + np.argsort(-change[:, 1:].std(axis=0))[:8]:
+        axes.plot(time_s, change[:, j], linewidth=0.9, label=f"Z{j + 1}")
+    axes.set(xlabel="time (s)", ylabel="change (um RMS)", title="Zernike terms that move most")
+    axes.legend(ncols=4)
+    write_figure(path, figure)
+
+
+def draw_pairs(path: Path, axis_mm: FloatArray, maps: Mapping[float, tuple[FloatArray, FloatArray]]) -> None:
+    """For each lag in s a pair's change of height beside its RMSE, in um."""
+    figure = Figure(figsize=(11, 4.6 * len(maps)), layout="constrained")
+    axes = figure.subplots(len(maps), 2, squeeze=False)
+    for row, (lag_s, (change_um, rmse_um)) in zip(axes, maps.items(), strict=True):
+        _image(row[0], f"change over {lag_s / 60:g} min (um)", axis_mm, change_um, "RdBu_r", even=True)
+        _image(row[1], f"RMSE (um), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
+    write_figure(path, figure)
+
+
+def _image(axes: Any, title: str, axis_mm: FloatArray, values: FloatArray, colours: str, even: bool = False) -> None:
+    low, high = np.nanpercentile(values, [0.5, 99.5])
+    if even:
+        high = max(abs(low), abs(high))
+        low = -high
+    extent = (axis_mm[0], axis_mm[-1], axis_mm[0], axis_mm[-1])
+    shown = axes.imshow(values, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high)
+    axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)")
+    axes.figure.colorbar(shown, ax=axes, shrink=0.85)
+
+
+# A stability run as a Rerun recording: heights and terms in time, the map of standard deviations, the pictures.
+
+
+def log_stability(
+    path: Path,
+    points: Sequence[str],
+    time_s: FloatArray,
+    heights_um: FloatArray,
+    coeffs_um: FloatArray,
+    sd_um: FloatArray,
+    lines: Sequence[str],
+    pictures: Sequence[Path],
+) -> None:
+    """Write a recording.
+
+    Parameters
+    ----------
+    path : Path
+        The `.rrd` file, overwritten.
+    points : names
+        Of the heights that were followed.
+    time_s : (n,) array
+        Of the sets.
+    heights_um : (n, points) array
+        Shown against their means.
+    coeffs_um : (n, 36) array
+        Zernike terms; shown against their means, piston left out.
+    sd_um : (m, m) array
+        Map of standard deviations, rows along y, NaN outside.
+    lines, pictures
+        The report, and what was drawn.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    terms = [f"Z{j}" for j in range(2, 37)]
+    with result_recording(path, "membrane_ctrl_stability", _blueprint(pictures)) as recording:
+        recording.log("stability/report", rr.TextDocument("\n".join(lines)), static=True)
+        # row 0 of a picture is on top, that is at +y
+        sd = rr.Tensor(sd_um[::-1].astype(np.float32), dim_names=["y", "x"])
+        recording.log("stability/sd_um", sd, static=True)
+        for entity, names, values in (("points_um", points, heights_um), ("zernike_um", terms, coeffs_um[:, 1:])):
+            recording.log(f"stability/{entity}", rr.SeriesLines(names=list(names)), static=True)
+            change = rr.Scalars.columns(scalars=values - values.mean(axis=0))
+            recording.send_columns(f"stability/{entity}", [rr.TimeColumn("run_time", duration=time_s)], change)
+        log_pictures(recording, "stability/pictures", pictures)
+
+
+def _blueprint(pictures: Sequence[Path]) -> rrb.Blueprint:
+    """Plots over the whole run: without it they show a minute about the cursor."""
+    axis = rrb.TimeAxis(
+        view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
+    )
+    plots = (
+        rrb.TimeSeriesView(origin=f"stability/{name}", name=title, axis_x=axis)
+        for name, title in (("points_um", "height at the points (um)"), ("zernike_um", "Zernike terms (um RMS)"))
+    )
+    maps = (rrb.TensorView(origin="stability/sd_um", name="SD (um)"), rrb.TextDocumentView(origin="stability/report"))
+    drawn = [rrb.Spatial2DView(origin=f"stability/pictures/{file.stem}", name=file.stem) for file in pictures]
+    columns = (rrb.Vertical(*plots), rrb.Vertical(*maps), rrb.Tabs(*drawn))
+    return rrb.Blueprint(rrb.Horizontal(*columns), collapse_panels=True)

@@ -1,0 +1,237 @@
+"""The `uncertainty` command: Monte Carlo over geometry and pixel noise, of a set or of the change between two."""
+
+import importlib
+import json
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
+
+from membrane_ctrl.geometry import file, spread_file
+from membrane_ctrl.measure.measurement import Figures, SetFigure
+from membrane_ctrl.measure.results import write_arrays, write_json
+from membrane_ctrl.metrology.optics.surface import parameter_to_coeffs, sag_gradient
+from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
+from membrane_ctrl.model import errors, files
+
+# Runs Monte Carlo trials: here, over the cores, or on a Dask cluster; the numbers are the same wherever they run.
+
+
+FloatArray = NDArray[np.float64]
+
+_BATCH = 100  # trials a job: a tenth of a second each, so that the bar moves and no worker waits for long
+# A process takes some two seconds to start (imports, compiled loops): less work than this is done here.
+_WORTH_PROCESSES = 5000
+_CONNECT_S = 10
+
+
+def run_everywhere(
+    benches: Sequence[monte_carlo.TrialBench],
+    spread: geometry_spread.GeometrySpread,
+    seed: int,
+    trials: int,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> FloatArray:
+    """Parameters (trials, sets, 36) in mm, with a progress bar on a terminal.
+
+    Parameters
+    ----------
+    benches, spread, seed
+        See `monte_carlo.run_trials`.
+    workers : int, optional
+        Processes; chosen by the amount of work if not given.
+    scheduler : str, optional
+        Address of a Dask scheduler, as tcp://host:8786, to run there instead.
+
+    Raises
+    ------
+    InputError
+        If Dask is asked for and not installed, or if the spread is too wide for the fit to converge.
+    DeviceError
+        If the scheduler does not answer.
+    """
+    batches = [range(first, min(first + _BATCH, trials)) for first in range(0, trials, _BATCH)]
+    job = partial(monte_carlo.run_trials, benches, spread, seed)
+    if workers is None:
+        workers = (os.cpu_count() or 1) if trials * len(benches) >= _WORTH_PROCESSES else 1
+    try:
+        with _results(job, batches, min(workers, len(batches)), scheduler) as results:
+            return np.concatenate(list(_shown(results, trials)))
+    except ArithmeticError as error:
+        raise errors.InputError(f"uncertainty: {error}") from None
+
+
+@contextmanager
+def _results(job: Any, batches: list[range], workers: int, scheduler: str | None) -> Iterator[Iterator[FloatArray]]:
+    """Results of the batches, in their order."""
+    if scheduler is not None:
+        with _dask_client(scheduler) as client:
+            yield (future.result() for future in client.map(job, batches, pure=False))
+    elif workers > 1:
+        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+            yield pool.map(job, batches)
+    else:
+        yield map(job, batches)
+
+
+def _dask_client(address: str) -> Any:
+    try:
+        distributed = importlib.import_module("distributed")
+    except ImportError:
+        text = "--scheduler: Dask is not installed; install the extra `dask` (pip install 'membrane-ctrl[dask]')"
+        raise errors.InputError(text) from None
+    try:
+        return distributed.Client(address, timeout=_CONNECT_S)
+    except ValueError as error:
+        raise errors.InputError(f"--scheduler {address}: {error}") from None
+    except OSError as error:  # a timeout is one
+        raise errors.DeviceError(f"--scheduler {address}: does not answer ({error})") from None
+
+
+def _shown(results: Iterator[FloatArray], trials: int) -> Iterator[FloatArray]:
+    """The same, with a bar on stderr if that is a terminal."""
+    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
+        task = progress.add_task("trials", total=trials)
+        for part in results:
+            progress.update(task, advance=len(part))
+            yield part
+
+
+@dataclass(frozen=True)
+class UncertaintyOptions:
+    """What the command was asked for."""
+
+    folder: Path
+    against: Path | None
+    geometry: Path | None
+    trials: int
+    seed: int
+    workers: int | None
+    scheduler: str | None
+    out: Path | None
+    as_json: bool
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Spread of the height of a set, or of its change since another.
+
+    Attributes
+    ----------
+    covariance, linear, noise : (36, 36) arrays
+        Of the parameters in mm^2: over the trials, from the Jacobian and the noise, from the noise alone.
+    """
+
+    covariance: FloatArray
+    linear: FloatArray
+    noise: FloatArray
+
+
+def uncertainty_command(options: UncertaintyOptions) -> int:
+    """Run the trials, write map, table and picture, say what came out. Raises CommandError."""
+    figures = Figures(None if options.geometry is None else file.read_geometry(options.geometry))
+    sets = [figures.of(folder) for folder in (options.folder, options.against) if folder is not None]
+    spread, source = spread_file.spread_of(sets[0].head.optics.geometry, options.geometry)
+    print(f"geometry's spread: {source}", file=sys.stderr)
+    benches = [one.bench() for one in sets]
+    if len({bench.optics.geometry for bench in benches}) > 1:
+        raise errors.InputError(f"{options.against}: geometry: not that of {options.folder}; a pair has one bench")
+    begin = time.perf_counter()
+    parameters = run_everywhere(
+        benches, spread, options.seed, options.trials, workers=options.workers, scheduler=options.scheduler
+    )
+    seconds = time.perf_counter() - begin
+    result = _spread(benches, spread, parameters)
+    mirror = sets[0].head.optics.mirror
+    grid = monte_carlo.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
+    table = _table(options, sets, spread, source, result, grid) | {"timing_s": {"trials": seconds}}
+    out = options.out.resolve() if options.out else options.folder / "uncertainty"
+    _write(out, grid, result, _height_um(sets, grid), table)
+    print(json.dumps(table) if options.as_json else "\n".join(_lines(table)))
+    return 0
+
+
+def _spread(
+    benches: list[monte_carlo.TrialBench], spread: geometry_spread.GeometrySpread, parameters: FloatArray
+) -> Spread:
+    """Of the only set, or of the first minus the second, trial by trial."""
+    own = parameters[:, 0] if len(benches) == 1 else parameters[:, 0] - parameters[:, 1]
+    noise = np.sum([monte_carlo.noise_covariance(bench) for bench in benches], axis=0)
+    return Spread(monte_carlo.trial_covariance(own), monte_carlo.linear_covariance(benches, spread), noise)
+
+
+def _height_um(sets: list[SetFigure], grid: monte_carlo.HeightMap) -> FloatArray:
+    """The height, or its change, at the points of the grid."""
+    own = sets[0].figure.fit.surface.parameters
+    other = sets[1].figure.fit.surface.parameters if len(sets) > 1 else np.zeros_like(own)
+    return np.asarray(1e3 * grid.matrix @ (own - other))
+
+
+def _table(
+    options: UncertaintyOptions,
+    sets: list[SetFigure],
+    spread: geometry_spread.GeometrySpread,
+    source: str,
+    result: Spread,
+    grid: monte_carlo.HeightMap,
+) -> dict[str, Any]:
+    rmse, linear, noise = (1e3 * grid.sigma(c) for c in (result.covariance, result.linear, result.noise))
+    coeffs = np.sqrt(np.diag(parameter_to_coeffs() @ result.covariance @ parameter_to_coeffs().T))
+    sag = sag_gradient()
+    return {
+        "schema": "membrane-uncertainty/1",
+        "set": str(options.folder),
+        "against": None if options.against is None else str(options.against),
+        "verdicts": [{"set": str(one.head.folder), "verdict": one.verdict, "reason": one.reason} for one in sets],
+        "trials": options.trials,
+        "seed": options.seed,
+        "geometry": sets[0].head.geometry.table()
+        | {"names": list(spread.names), "sigmas": spread.sigmas.tolist(), "source": source},
+        "rmse_um": {"mean": float(rmse.mean()), "max": float(rmse.max())},
+        "linear_um": {"mean": float(linear.mean()), "max": float(linear.max())},
+        "noise_um": {"mean": float(noise.mean()), "max": float(noise.max())},
+        "sag_sigma_um": 1e3 * float(np.sqrt(sag @ result.covariance @ sag)),
+        "coeffs_sigma_um": (1e3 * coeffs).tolist(),
+    }
+
+
+def _write(
+    out: Path, grid: monte_carlo.HeightMap, result: Spread, height_um: FloatArray, table: dict[str, Any]
+) -> None:
+    from membrane_ctrl.measure.stability_results import draw_uncertainty  # matplotlib takes a second to load
+
+    rmse = grid.picture(1e3 * grid.sigma(result.covariance))
+    try:
+        files.make_folder(out)
+        write_json(out / "uncertainty.json", table)
+        write_arrays(out / "rmse.npz", x_mm=grid.axis_mm, y_mm=grid.axis_mm, rmse_um=rmse)
+        height = grid.picture(height_um)
+        draw_uncertainty(out / "uncertainty.png", grid.axis_mm, height, rmse, table["against"] is not None)
+    except OSError as error:
+        raise errors.InputError(f"{out}: cannot be written: {error.strerror or error}") from None
+    print(f"written to {out}", file=sys.stderr)
+
+
+def _lines(table: dict[str, Any]) -> list[str]:
+    what = "height" if table["against"] is None else "change of height"
+    return [
+        f"{what}: mean RMSE {table['rmse_um']['mean']:.4g} um, largest {table['rmse_um']['max']:.4g} um "
+        f"({table['trials']} trials, seed {table['seed']})",
+        f"linear      mean {table['linear_um']['mean']:.4g} um, largest {table['linear_um']['max']:.4g} um",
+        f"noise alone mean {table['noise_um']['mean']:.4g} um, largest {table['noise_um']['max']:.4g} um",
+        f"sag         1 sigma {table['sag_sigma_um']:.4g} um",
+    ]

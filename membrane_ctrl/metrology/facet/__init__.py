@@ -1,0 +1,1 @@
+"""Facets of a concentrator, from other programs' measured sets."""

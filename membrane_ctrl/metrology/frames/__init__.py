@@ -1,0 +1,1 @@
+"""Frames of a set, and whether they belong together."""

@@ -1,0 +1,276 @@
+"""What each frame shows, measured against what the surface predicts it should show.
+
+After the fit the phase of every bin is known without any single frame, so each frame alone can be asked for its own
+phase step, brightness, contrast and film position. For a sinusoid with predicted phase psi = phi + d_k
+
+    I = g [m + b cos(psi + delta) + c2 cos 2 psi + c3 cos 3 psi - b e (q - <q>) sin psi]
+
+with g the bin's light and q its known change of phase per um of film motion: linear in m, b cos delta, b sin delta,
+b e, c2 and c3. The harmonics are the display's response, alike in all frames. A Gray frame has two levels,
+I = g (lo + (hi - lo) bit); white and black have one. Over thousands of bins noise is no matter; what is left over is
+what does not belong there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.frames.frame_stack import Binned, FrameStack
+from membrane_ctrl.metrology.orders import gray_bit
+from membrane_ctrl.metrology.phase import AXES, CONTRAST_SHARE, FRINGE_SHARE, step_weights
+
+FloatArray = NDArray[np.float64]
+
+_SAMPLE = 20_000
+# Distance from a Gray bit's edge, rad: blur, and the film's motion by up to some hundred um, stay inside
+_EDGE_RAD = 0.5
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is known of the sampled bins: (n,) and (2, n) arrays.
+
+    Attributes
+    ----------
+    index : (n,) int array
+        Bins.
+    light : (n,) array
+        Brightness, see `view`.
+    phase_rad : (2, n) array
+        Predicted absolute phase, film at its mean displacement.
+    sensitivity_rad_per_um : (2, n) array
+        Change of phase per um of displacement.
+    """
+
+    index: NDArray[np.int64]
+    light: FloatArray
+    phase_rad: FloatArray
+    sensitivity_rad_per_um: FloatArray
+
+    def thinned(self) -> Scene:
+        """Enough of the bins."""
+        every = slice(None, None, max(1, self.index.size // _SAMPLE))
+        return Scene(
+            self.index[every],
+            self.light[every],
+            self.phase_rad[:, every],
+            self.sensitivity_rad_per_um[:, every],
+        )
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One frame; units of light are those of `Scene.light`.
+
+    Attributes
+    ----------
+    level : float
+        m of a sinusoid, hi of a Gray frame, the level of white and black.
+    swing : float
+        b of a sinusoid, hi - lo of a Gray frame, 0 else.
+    step_rad : float
+        delta of a sinusoid: how far its phase step is from the stated one.
+    moved_um : float
+        e of a sinusoid: how far the film is from where the laser says.
+    rest : float
+        RMS of what is left over, as a share of the light.
+    saturated : float
+        Share of bins with a saturated pixel.
+    shows : int
+        Frame whose pattern this one fits best.
+    lit : float
+        Share of the bins where a Gray frame is predicted bright: 0 or 1 where the mirror shows no edge of that bit.
+    """
+
+    level: float
+    swing: float
+    step_rad: float
+    moved_um: float
+    rest: float
+    saturated: float
+    shows: int
+    lit: float = 1.0
+
+
+def gather(stack: FrameStack, binned: Binned, scene: Scene, readable: list[int]) -> dict[int, Evidence]:
+    """Evidence of all readable frames."""
+    scene = scene.thinned()
+    readings = stack.displacement_um - np.nan_to_num(stack.mean_reading_um)
+    templates = {k: _template(stack, scene, k, float(np.nan_to_num(readings[k]))) for k in range(len(stack.patterns))}
+    out = {}
+    for k in readable:
+        seen = binned.means[k].reshape(-1)[scene.index].astype(float)
+        saturated = float(np.mean(binned.saturated[k].reshape(-1)[scene.index]))
+        out[k] = _evidence(seen, templates[k], scene.light, saturated, _best(seen, templates, scene.light, k))
+    return out
+
+
+@dataclass(frozen=True)
+class _Template:
+    """Columns (p, n) that a frame is a sum of, in units of the light; `sure` are the bins to compare on."""
+
+    role: str
+    columns: FloatArray
+    sure: NDArray[np.bool_]
+
+
+def _template(stack: FrameStack, scene: Scene, frame: int, reading_um: float) -> _Template:
+    pattern = stack.patterns[frame]
+    ones = np.ones(scene.index.size)
+    if pattern.role in ("white", "black"):
+        return _Template(pattern.role, ones[None], ones.astype(bool))
+    axis = AXES.index(pattern.axis)
+    slope = scene.sensitivity_rad_per_um[axis]
+    phase = scene.phase_rad[axis] + slope * reading_um
+    if pattern.role == "gray":
+        shown, from_edge = gray_bit(phase, pattern.index)
+        sure = from_edge > _EDGE_RAD
+        # where edges are everywhere (a prediction that is nonsense) all bins must do
+        return _Template("gray", np.stack([ones, shown.astype(float)]), sure if sure.any() else ones.astype(bool))
+    psi = phase + pattern.shift_rad
+    sine = np.sin(psi)
+    columns = [ones, np.cos(psi), -sine, -(slope - slope.mean()) * sine, np.cos(2 * psi), np.cos(3 * psi)]
+    return _Template("sin", np.stack(columns), ones.astype(bool))
+
+
+def _solve(seen: FloatArray, template: _Template, light: FloatArray) -> tuple[FloatArray, float]:
+    """Coefficients and the RMS of the rest over the light."""
+    sure = template.sure
+    columns = (template.columns * light)[:, sure]
+    normal = columns @ columns.T
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-30))  # columns of very different size
+    solved = np.linalg.pinv(normal / np.outer(scale, scale)) @ (columns @ seen[sure] / scale) / scale
+    rest = seen[sure] - solved @ columns
+    return solved, float(np.sqrt(np.mean(rest**2)) / np.mean(light[sure]))
+
+
+def _evidence(seen: FloatArray, template: _Template, light: FloatArray, saturated: float, shows: int) -> Evidence:
+    solved, rest = _solve(seen, template, light)
+    if template.role == "sin":
+        swing = float(np.hypot(solved[1], solved[2]))
+        step = float(np.arctan2(solved[2], solved[1]))
+        return Evidence(float(solved[0]), swing, step, float(solved[3]) / max(swing, 1e-9), rest, saturated, shows)
+    if template.role == "gray":
+        lit = float(np.mean(template.columns[1][template.sure]))
+        return Evidence(float(solved.sum()), float(solved[1]), 0.0, 0.0, rest, saturated, shows, lit)
+    return Evidence(float(solved[0]), 0.0, 0.0, 0.0, rest, saturated, shows)
+
+
+def _best(seen: FloatArray, templates: dict[int, _Template], light: FloatArray, own: int) -> int:
+    """The pattern that the frame looks like most: largest correlation of the picture over the light.
+
+    A flat picture, white or black, correlates with nothing: then its own is as good as any.
+    """
+    picture = seen / np.maximum(light, 1e-9)
+    flat = max(float(np.mean(picture)), 1e-9)
+    best, where = 0.7, own  # less than 0.7 is no likeness: a sinusoid and its square wave have 0.9
+    for frame, template in templates.items():
+        if template.role not in ("sin", "gray"):
+            continue
+        wave = template.columns[1]
+        sure = template.sure
+        if np.std(picture[sure]) < 0.02 * flat or np.std(wave[sure]) < 1e-6:
+            continue
+        likeness = float(np.corrcoef(picture[sure], wave[sure])[0, 1])
+        if likeness > best + (0.0 if frame == own else 1e-3):
+            best, where = likeness, frame
+    return where
+
+
+# What the usable frames say of each bin: light, fringes, wrapped phase, and where the pattern is seen.
+#
+# The light of a bin has three witnesses, the mean of the x fringes, that of the y fringes, and white minus black; the
+# fringes' swing likewise. The median of three is right when one of them is wrong, so that one bad frame, whichever it
+# is, does not spoil the picture that all frames are compared with.
+
+
+_LEAST_SWING_ADU = 1.0  # less than a rounding step is no fringe
+
+
+class NoFigureError(Exception):
+    """The frames do not carry a figure; the message says why."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Arrays over the bins, (rows, columns) each.
+
+    Attributes
+    ----------
+    used : two lists of int
+        The sinusoids of x and y that the phases are made of.
+    phase_rad, swing_adu : (2, rows, columns) arrays
+        Wrapped phase and fringe amplitude of x and y.
+    light : array
+        Brightness, in units of the fringes' mean.
+    mask : bool array
+        Bins that see the pattern in the mirror.
+    """
+
+    used: tuple[list[int], list[int]]
+    phase_rad: FloatArray
+    swing_adu: FloatArray
+    light: FloatArray
+    mask: NDArray[np.bool_]
+
+
+def look(stack: FrameStack, binned: Binned, excluded: Collection[int], witness: FloatArray | None = None) -> View:
+    """Combine the frames that are not excluded.
+
+    Parameters
+    ----------
+    witness : (rows, columns) array, optional
+        The light as another set saw it: the third witness of a set without white and black.
+
+    Raises
+    ------
+    NoFigureError
+        If an axis has fewer than three usable steps, or if there are no fringes.
+    """
+    used = tuple([k for k in stack.sinusoids(axis) if k not in excluded] for axis in AXES)
+    light, swing, phase, saturated = [], [], [], np.zeros(binned.means.shape[1:], bool)
+    for axis, frames in zip(AXES, used, strict=True):
+        try:
+            weights = step_weights(stack.shifts_rad(frames))
+        except ValueError:
+            raise NoFigureError(
+                f"{len(frames)} of {len(stack.sinusoids(axis))} {axis} phase steps are usable: too few for a phase"
+            ) from None
+        mean, cosine, sine = np.tensordot(weights, binned.means[frames].astype(float), axes=1)
+        light.append(mean)
+        swing.append(np.hypot(cosine, sine))
+        phase.append(np.arctan2(sine, cosine))
+        saturated |= binned.saturated[frames].any(axis=0)
+    third = _third_witness(stack, binned, excluded) if witness is None else witness
+    seen = _middle([*swing] if third is None else [*swing, third])
+    brightest = float(np.percentile(seen, 95))
+    if not brightest > _LEAST_SWING_ADU:
+        raise NoFigureError(f"no fringes: they swing by {brightest:.2g} ADU where they swing most")
+    mask = seen > CONTRAST_SHARE * brightest
+    mask &= np.minimum(*swing) > FRINGE_SHARE * seen
+    mask &= ~saturated
+    every = light if third is None else [*light, third]
+    return View((used[0], used[1]), np.stack(phase), np.stack(swing), _middle(every, mask), mask)
+
+
+def _third_witness(stack: FrameStack, binned: Binned, excluded: Collection[int]) -> FloatArray | None:
+    white, black = stack.single("white"), stack.single("black")
+    if white is None or black is None or {white, black} & set(excluded):
+        return None
+    return np.asarray(binned.means[white].astype(float) - binned.means[black])
+
+
+def _middle(maps: list[FloatArray], where: NDArray[np.bool_] | None = None) -> FloatArray:
+    """Median of two or three maps, each scaled to the median of the first (over its brighter half by default)."""
+    if where is None or not where.any():
+        where = maps[0] >= np.median(maps[0])
+    medians = [max(float(np.median(m[where])), 1e-9) for m in maps]
+    scaled = [m * (medians[0] / own) for m, own in zip(maps, medians, strict=True)]
+    if len(scaled) == 2:
+        return np.asarray((scaled[0] + scaled[1]) / 2)
+    a, b, c = scaled
+    return np.asarray(np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c)))

@@ -1,0 +1,214 @@
+"""The frames of one set in memory, and their means over bins."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.roles import Pattern
+from membrane_ctrl.metrology.optics.compiled import kernel, split
+from membrane_ctrl.metrology.phase import AXES, step_weights
+from membrane_ctrl.metrology.phasor import Binner, StepCombination, arctan2
+
+FloatArray = NDArray[np.float64]
+Frames = NDArray[np.uint8] | NDArray[np.uint16]
+
+_ENOUGH_BINS = 50_000  # for 36 terms and for the checks of the frames; more only cost time
+_LARGEST_BIN_PX = 4  # curvature of the phase over a larger bin is no longer small
+
+
+@dataclass(frozen=True)
+class FrameStack:
+    """Frames of a capture set in the order of their patterns.
+
+    Attributes
+    ----------
+    frames : (frames, height, width) array
+        uint8 or uint16.
+    patterns : tuple of Pattern
+        What each frame should show; sinusoids with their phase step.
+    displacement_um : (frames,) array
+        Laser reading at each, NaN without.
+    unusable : dict from frame to reason
+        Frames that hold no picture.
+    """
+
+    frames: Frames
+    patterns: tuple[Pattern, ...]
+    displacement_um: FloatArray
+    unusable: dict[int, str]
+
+    def sinusoids(self, axis: str) -> list[int]:
+        """Frames that show the sinusoids of an axis."""
+        return [k for k, p in enumerate(self.patterns) if p.role == "sin" and p.axis == axis]
+
+    def gray(self, axis: str) -> list[int]:
+        """Frames that show the Gray bits of an axis, most significant first; empty for fringes alone."""
+        return [k for k, p in enumerate(self.patterns) if p.role == "gray" and p.axis == axis]
+
+    def single(self, role: str) -> int | None:
+        """The white or the black frame."""
+        return next((k for k, p in enumerate(self.patterns) if p.role == role), None)
+
+    def shifts_rad(self, frames: list[int]) -> FloatArray:
+        """Phase steps of sinusoids."""
+        return np.array([self.patterns[k].shift_rad for k in frames])
+
+    def reordered(self, order: list[int]) -> FrameStack:
+        """The same with other pictures for the patterns: frame k shows what `order[k]` did."""
+        return replace(self, frames=self.frames[order])
+
+    @property
+    def readings_um(self) -> FloatArray:
+        """Laser readings of the sinusoids, x and then y."""
+        return self.displacement_um[[k for axis in AXES for k in self.sinusoids(axis)]]
+
+    @property
+    def mean_reading_um(self) -> float:
+        """Their mean, the moment that a figure belongs to; NaN unless all have one."""
+        return float(np.mean(self.readings_um))
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.frames.shape[1], self.frames.shape[2]
+
+
+@dataclass(frozen=True)
+class Binned:
+    """Frames as means over bins.
+
+    Attributes
+    ----------
+    bin_px : int
+        Side of a bin.
+    means : (frames, rows, columns) float32 array
+        In the frames' units.
+    saturated : (frames, rows, columns) bool array
+        Bins with a saturated pixel.
+    """
+
+    bin_px: int
+    means: NDArray[np.float32]
+    saturated: NDArray[np.bool_]
+
+    def reordered(self, order: list[int]) -> Binned:
+        """As `FrameStack.reordered`."""
+        return replace(self, means=self.means[order], saturated=self.saturated[order])
+
+
+def bin_side_px(size_px: tuple[int, int]) -> int:
+    """The largest bin that leaves enough of them."""
+    return int(np.clip((size_px[0] * size_px[1] / _ENOUGH_BINS) ** 0.5, 1, _LARGEST_BIN_PX))
+
+
+def bin_frames(stack: FrameStack, full_scale_adu: int) -> Binned:
+    """Means and saturation of each frame over bins."""
+    bin_px = bin_side_px(stack.size_px)
+    binner = Binner(*stack.size_px, bin_px, full_scale_adu, 1)
+    shape = (len(stack.patterns), *binner.saturated.shape)
+    means, saturated = np.empty(shape, np.float32), np.empty(shape, bool)
+    for k, frame in enumerate(stack.frames):
+        binner.clear()
+        binner.add([frame], [0])
+        np.multiply(binner.sums[0], 1 / bin_px**2, out=means[k], casting="unsafe")
+        saturated[k] = binner.saturated > 0
+    return Binned(bin_px, means, saturated)
+
+
+# Phase, modulation and closure of every pixel: the full result's pass over the frames.
+
+
+@dataclass(frozen=True)
+class PixelPhases:
+    """One axis at n pixels.
+
+    Attributes
+    ----------
+    phase_rad : (n,) array
+        Absolute phase, the period nearest to the reference.
+    swing_adu : (n,) float32 array
+        Fringe amplitude.
+    rest_adu : (n,) float32 array
+        Root of the sum of squares that the sinusoid leaves; 0 for three frames.
+    saturated : (n,) bool array
+        Whether a frame is saturated there.
+    """
+
+    phase_rad: FloatArray
+    swing_adu: NDArray[np.float32]
+    rest_adu: NDArray[np.float32]
+    saturated: NDArray[np.bool_]
+
+
+@kernel
+def _phases(frames, index, weights, shift_cos, shift_sin, turn, mirror, slope, reference, limit, out, start, stop):  # type: ignore[no-untyped-def]
+    """Rows of `out` (2, n): swing (negative where saturated) and rest; `reference` (n,) is replaced by the phase."""
+    steps = weights.shape[1]
+    for p in range(start, stop):
+        place = index[p]
+        mean = 0.0
+        c = 0.0
+        s = 0.0
+        top = 0.0
+        for k in range(steps):
+            value = float(frames[k, place])
+            top = max(top, value)
+            mean += weights[0, k] * value
+            c += weights[1, k] * value
+            s += weights[2, k] * value
+        rest = 0.0
+        for k in range(steps):
+            left = float(frames[k, place]) - mean - c * shift_cos[k] + s * shift_sin[k]
+            rest += left * left
+        # z - i q (turn z - mirror conj z): the film's motion between the frames taken out (see `motion`)
+        q = slope[p]
+        u = turn.real * c - turn.imag * s - mirror.real * c - mirror.imag * s
+        v = turn.real * s + turn.imag * c - mirror.imag * c + mirror.real * s
+        c, s = c + q * v, s - q * u
+        wrapped = arctan2(s, c)
+        reference[p] = wrapped + 2 * math.pi * math.floor((reference[p] - wrapped) / (2 * math.pi) + 0.5)
+        swing = math.sqrt(c * c + s * s)
+        out[0, p] = -swing if top >= limit else swing
+        out[1, p] = math.sqrt(rest)
+
+
+def pixel_phases(
+    frames: Frames,
+    shifts_rad: FloatArray,
+    combined: StepCombination,
+    index: NDArray[np.int64],
+    sensitivity_rad_per_um: FloatArray,
+    reference_rad: FloatArray,
+    full_scale_adu: int,
+) -> PixelPhases:
+    """Phases of one axis.
+
+    Parameters
+    ----------
+    frames : (N, height, width) array
+        The axis' usable sinusoids.
+    shifts_rad : (N,) array
+        Their steps.
+    combined : StepCombination
+        Motion of the film between them (`motion.combine_steps` for bins of one pixel).
+    index : (n,) int array
+        Pixels, counted row by row.
+    sensitivity_rad_per_um : (n,) array
+        Change of phase per um of displacement; zeros if no motion is taken out.
+    reference_rad : (n,) array
+        Absolute phase to within half a period; left alone.
+    """
+    flat = frames.reshape(len(frames), -1)
+    phase = reference_rad.copy()
+    out = np.empty((2, index.size), np.float32)
+    fixed = (step_weights(shifts_rad), np.cos(shifts_rad), np.sin(shifts_rad), combined.turn, combined.mirror)
+
+    def run(start: int, stop: int) -> None:
+        _phases(flat, index, *fixed, sensitivity_rad_per_um, phase, float(full_scale_adu), out, start, stop)
+
+    split(run, index.size)
+    return PixelPhases(phase, np.abs(out[0]), out[1], np.signbit(out[0]))

@@ -1,0 +1,239 @@
+"""Which frames do not belong to their set, and why: from the data alone.
+
+Every frame is judged against the other frames of its own set, so the display's gamma, vignetting, the film's ripple
+or a motion that all share are nobody's fault. A limit is the larger of a floor, below which the figure does not care,
+and a multiple of the scatter of the set's own good frames.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.frames.evidence import Evidence, Scene, gather
+from membrane_ctrl.metrology.frames.frame_stack import Binned, FrameStack
+from membrane_ctrl.metrology.phase import AXES
+
+FloatArray = NDArray[np.float64]
+
+# Floors. Good frames of simulated sets (gamma 2.2, a rippled film, 20 um of motion) differ by up to 0.005 rad of step
+# and 0.005 of swing. A twentieth of the frame before left in one by a slow display is 0.05 rad, and 4 um of figure.
+STEP_RAD = 0.03
+LEVEL_SHARE = 0.015
+SWING_SHARE = 0.03
+_FLICKER = 0.03  # of light is called flicker whatever else is wrong
+# A frame taken 15 um off bends the figure by a few um at most; a laser that is off by less is usual.
+MOVED_UM = 15.0
+REST_SHARE = 0.015
+SATURATED_SHARE = 0.02
+# Bits are read against half the light: a Gray frame may be a tenth off; its own kind agrees better than with white.
+GRAY_SHARE = 0.04
+WHITE_SHARE = 0.08
+GRAY_REST = 0.15
+FLAT_REST = 0.08
+# Fewer bins than this beyond a Gray frame's only edge leave no more than FLAT_REST of light that is not flat.
+_NO_EDGE = 0.005
+_SCATTERS = 6.0  # of the good frames' scatter
+_DARK = 0.4  # less than this share of the light is no flicker
+
+
+@dataclass(frozen=True)
+class Flag:
+    """A frame that does not belong.
+
+    Attributes
+    ----------
+    frame : int
+        Which.
+    reason : str
+        First word: stale, swapped, saturated, dark, flicker, moved, or what could not be read.
+    severity : float
+        Times the limit.
+    swapped_with : int or None
+        The frame that shows this one's pattern while this one shows its.
+    """
+
+    frame: int
+    reason: str
+    severity: float
+    swapped_with: int | None = None
+
+
+def identical_frames(stack: FrameStack) -> dict[int, int]:
+    """Frames that are byte for byte an earlier one of the sequence, and which: noise never repeats."""
+    seen: dict[bytes, int] = {}
+    out: dict[int, int] = {}
+    for k, frame in enumerate(stack.frames):
+        if k in stack.unusable:
+            continue
+        key = frame[:: max(1, len(frame) // 16)].tobytes()  # 16 rows tell two frames apart ...
+        if key in seen and np.array_equal(stack.frames[seen[key]], frame):  # ... and all rows are compared then
+            out[k] = seen[key]
+        else:
+            seen.setdefault(key, k)
+    return out
+
+
+def obvious(stack: FrameStack, binned: Binned) -> list[Flag]:
+    """Sinusoids that need no prediction to be seen as bad: far too dark or burnt out against the others."""
+    frames = [k for axis in AXES for k in stack.sinusoids(axis) if k not in stack.unusable]
+    if not frames:
+        return []
+    bright = np.max(binned.means[frames], axis=0)
+    where = bright >= np.median(bright)
+    light = {k: float(np.mean(binned.means[k][where])) for k in frames}
+    burnt = {k: float(np.mean(binned.saturated[k][where])) for k in frames}
+    middle, usual = float(np.median(list(light.values()))), float(np.median(list(burnt.values())))
+    flags = []
+    for k in frames:
+        if light[k] < _DARK * middle:
+            flags.append(
+                Flag(k, f"dark: {light[k] / middle:.2f} of the light of the others", middle / max(light[k], 1e-9))
+            )
+        elif burnt[k] > usual + 10 * SATURATED_SHARE:
+            flags.append(Flag(k, f"saturated: {burnt[k]:.0%} of the bins", burnt[k] / SATURATED_SHARE))
+    return flags
+
+
+def inspect(stack: FrameStack, binned: Binned, scene: Scene, excluded: Collection[int]) -> list[Flag]:
+    """Judge all readable frames, worst first.
+
+    Parameters
+    ----------
+    scene : Scene
+        Prediction from the surface fitted to the frames that are not excluded.
+    excluded : collection of int
+        Frames that the surface was made without; judged too, but no measure for the others.
+    """
+    readable = [k for k in range(len(stack.patterns)) if k not in stack.unusable]
+    evidence = gather(stack, binned, scene, readable)
+    trusted = {k: e for k, e in evidence.items() if k not in excluded}
+    flags = [*_judge_sinusoids(stack, evidence, trusted), *_judge_gray(stack, evidence, trusted)]
+    twins = identical_frames(stack)
+    flags = [_named(stack, flag, evidence, twins) for flag in flags]
+    return sorted(flags, key=lambda flag: -flag.severity)
+
+
+def _judge_sinusoids(stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[int, Evidence]) -> list[Flag]:
+    """Each against the others, itself left out, so that it cannot widen its own limit."""
+    flags = []
+    for axis in AXES:
+        frames = [k for k in stack.sinusoids(axis) if k in evidence]
+        for k in frames:
+            same = [trusted[j] for j in frames if j != k and j in trusted]
+            every = [e for j, e in trusted.items() if j != k and stack.patterns[j].role == "sin"]
+            if same:
+                flags += _judge_sinusoid(k, evidence[k], same, every, trusted)
+    return flags
+
+
+def _judge_sinusoid(
+    frame: int, e: Evidence, same: list[Evidence], every: list[Evidence], trusted: dict[int, Evidence]
+) -> list[Flag]:
+    """One sinusoid against those of its axis and, for the light, against those of both."""
+    step_limit, step = _limit([o.step_rad for o in same], STEP_RAD)
+    moved_limit, moved_um = _limit([o.moved_um for o in same], MOVED_UM)
+    level_limit, level = _limit([o.level for o in every], 0.0)
+    swing_limit, swing = _limit([o.swing for o in same], 0.0)
+    rest = float(np.median([o.rest for o in same]))
+    saturated = float(np.median([o.saturated for o in same]))
+    worst = {
+        "step": abs(_wrapped(e.step_rad - step)) / step_limit,
+        "light": abs(e.level - level) / max(LEVEL_SHARE * level, level_limit),
+        "swing": abs(e.swing - swing) / max(SWING_SHARE * swing, swing_limit),
+        "moved": abs(e.moved_um - moved_um) / moved_limit,
+        "rest": max(e.rest**2 - rest**2, 0.0) ** 0.5 / max(REST_SHARE, 1.2 * rest),
+        "saturated": (e.saturated - saturated) / SATURATED_SHARE,
+    }
+    kind = max(worst, key=lambda name: worst[name])
+    return [Flag(frame, _sinusoid_reason(kind, e, level, moved_um), worst[kind])] if worst[kind] > 1 else []
+
+
+def _sinusoid_reason(kind: str, e: Evidence, level: float, moved_um: float) -> str:
+    light = e.level / max(level, 1e-9)
+    if e.saturated > 10 * SATURATED_SHARE or kind == "saturated":
+        return f"saturated: {e.saturated:.0%} of the bins"
+    if light < _DARK:
+        return f"dark: {light:.2f} of the light of the others"
+    if kind == "light" or abs(light - 1) > _FLICKER:
+        return f"flicker: {light:.3f} of the light of the others"
+    if kind in ("moved", "rest") and abs(e.moved_um - moved_um) > MOVED_UM:
+        return f"moved: the film stood {e.moved_um - moved_um:+.0f} um from where the others saw it"
+    if kind == "step":
+        return f"stale or wrong picture: its phase step is {e.step_rad:+.2f} rad off"
+    return f"differs from its prediction by {e.rest:.1%} of the light"
+
+
+def _judge_gray(stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[int, Evidence]) -> list[Flag]:
+    """Gray frames against each other, white against them, black against white."""
+    gray = [k for axis in AXES for k in stack.gray(axis) if k in evidence]
+    good = [evidence[k] for k in gray if k in trusted and evidence[k].lit > _NO_EDGE]
+    if not good:
+        return []
+    bright_limit, bright = _limit([e.level for e in good], 0.0)
+    flags = []
+    for k in gray:
+        e = evidence[k]
+        if not _NO_EDGE < e.lit < 1 - _NO_EDGE:
+            flags += _judge_flat(k, e, bright, white=e.lit > 0.5)
+            continue
+        light = abs(e.level / max(bright, 1e-9) - 1) / max(GRAY_SHARE, bright_limit / max(bright, 1e-9))
+        content = max(e.rest / (GRAY_REST * bright), 2.0 if e.shows != k else 0.0, 0.5 * bright / max(e.swing, 1e-9))
+        if max(light, content) > 1:
+            flags.append(Flag(k, _gray_reason(e, bright, content > light), max(light, content)))
+    for role in ("white", "black"):
+        single = stack.single(role)
+        if single is not None and single in evidence:
+            flags += _judge_flat(single, evidence[single], bright, white=role == "white")
+    return flags
+
+
+def _gray_reason(e: Evidence, bright: float, content: bool) -> str:
+    light = e.level / max(bright, 1e-9)
+    if light < _DARK and e.swing < _DARK * bright:
+        return f"dark: {light:.2f} of the light of the others"
+    if content:
+        return f"stale or wrong picture: differs from its prediction by {e.rest / bright:.0%} of the light"
+    return f"{'saturated' if e.saturated > 0.5 else 'flicker'}: {light:.3f} of the light of the others"
+
+
+def _judge_flat(frame: int, e: Evidence, bright: float, white: bool) -> list[Flag]:
+    light = e.level / max(bright, 1e-9)
+    rest = e.rest / (FLAT_REST * bright)
+    off = abs(light - 1) / WHITE_SHARE if white else light / 0.5
+    if max(rest, off) <= 1:
+        return []
+    if rest > off or not white:
+        return [Flag(frame, f"stale or wrong picture: differs from its prediction by {e.rest / bright:.0%}", rest)]
+    word = "dark" if light < _DARK else "saturated" if e.saturated > 0.5 else "flicker"
+    return [Flag(frame, f"{word}: {light:.3f} of the light of the others", off)]
+
+
+def _named(stack: FrameStack, flag: Flag, evidence: dict[int, Evidence], twins: dict[int, int]) -> Flag:
+    """With the frame whose picture it is, if that is known."""
+    k = flag.frame
+    e = evidence[k]
+    same = twins.get(k, next((late for late, early in twins.items() if early == k), None))
+    if same is not None:
+        return Flag(k, f"stale: the same picture as {stack.patterns[same].name}", flag.severity)
+    if e.shows != k:
+        name = stack.patterns[e.shows].name
+        partner = evidence.get(e.shows)
+        if partner is not None and partner.shows == k:
+            return Flag(k, f"swapped with {name}", flag.severity, e.shows)
+        return Flag(k, f"stale: shows {name}", flag.severity)
+    return flag
+
+
+def _limit(values: list[float], floor: float) -> tuple[float, float]:
+    """Limit and middle of a figure over the trusted frames."""
+    if not values:
+        return max(floor, 1e-9), 0.0
+    middle = float(np.median(values))
+    scatter = 1.4826 * float(np.median(np.abs(np.array(values) - middle)))
+    return max(floor, _SCATTERS * scatter, 1e-9), middle
+
+
+def _wrapped(angle_rad: float) -> float:
+    return float((angle_rad + np.pi) % (2 * np.pi) - np.pi)

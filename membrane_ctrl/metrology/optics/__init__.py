@@ -1,0 +1,1 @@
+"""Rays, surfaces and the screen: the geometry behind every measurement."""

@@ -1,0 +1,51 @@
+"""How the package's loops are compiled."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
+from typing import Any, TypeVar
+
+from numba import njit
+
+# Sums may be reordered, which vector units need; NaN and infinity keep their meaning.
+_OPTIONS: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"reassoc", "contract", "nsz", "arcp"},
+}
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile a loop; the result is cached on disk and runs without the interpreter lock."""
+    return njit(**_OPTIONS)(function)
+
+
+def step(function: Callable[..., Any]) -> Any:
+    """Compile what a loop does to one point. Inlined by force: a loop with a call in it uses no vector units."""
+    return njit(forceinline=True, **_OPTIONS)(function)
+
+
+# Two threads of our own for kernels that release the interpreter lock.
+#
+# The kernels are plain compiled loops over [start, stop). Splitting them here, instead of in the compiler's parallel
+# loops, keeps idle threads asleep (the control loop shares the machine), has no library that may be entered only
+# once, and adds partial sums in a fixed order, so that results repeat to the last bit.
+
+
+T = TypeVar("T")
+WORKERS = 2
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(WORKERS - 1, thread_name_prefix="metrology")
+
+
+def split(run: Callable[[int, int], T], count: int) -> list[T]:
+    """`run(start, stop)` over [0, count) in WORKERS pieces; results in order. The caller's thread takes one."""
+    edges = [count * k // WORKERS for k in range(WORKERS + 1)]
+    others = [_pool().submit(run, start, stop) for start, stop in pairwise(edges[1:])]
+    first = run(edges[0], edges[1])
+    return [first, *(other.result() for other in others)]

@@ -1,0 +1,243 @@
+"""Camera and screen in world coordinates: the one form the code behind knows (INTERFACES section 1).
+
+The short form is turned into it on loading. With the camera at F = a (cos alpha, 0, sin alpha) looking at O
+without roll, image down is world -y, forward is -F / a, and image right is the unit vector normal to both that points
+towards +x: (sin alpha, 0, -cos alpha).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import map_coordinates
+
+from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
+from membrane_ctrl.metrology.optics.screen_face import Face
+
+FloatArray = NDArray[np.float64]
+
+_UNDONE = 1e-9  # of a tangent: 5e-6 of a pixel of the paper's lens
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Where camera and screen stand and how the lens maps.
+
+    Attributes
+    ----------
+    pinhole_mm : (3,) array
+        Camera pinhole F in world.
+    rotation : (3, 3) array
+        Rows are the camera's x (right), y (down) and z (forward) in world.
+    focal_px : float
+        Focal length in pixels.
+    principal_px : (column, row)
+        Principal point.
+    distortion : tuple of float
+        OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for a pinhole.
+    screen_origin_mm : (3,) array
+        O' in world.
+    screen_s_x, screen_s_y : (3,) arrays
+        Unit vectors of s_x and s_y in world.
+    face : Face
+        How the screen stands off the plane of s_x and s_y.
+    """
+
+    pinhole_mm: FloatArray
+    rotation: FloatArray
+    focal_px: float
+    principal_px: tuple[float, float]
+    distortion: tuple[float, ...]
+    screen_origin_mm: FloatArray
+    screen_s_x: FloatArray
+    screen_s_y: FloatArray
+    face: Face
+
+    @classmethod
+    def from_config(cls, optics: OpticsConfig) -> Geometry:
+        """The geometry a configuration describes."""
+        camera = optics.camera
+        pinhole, rotation, origin, s_x, s_y = _poses(optics.geometry)
+        return cls(
+            pinhole_mm=pinhole,
+            rotation=rotation,
+            focal_px=camera.focal_mm / (camera.pixel_um * 1e-3),
+            principal_px=camera.principal,
+            distortion=camera.distortion,
+            screen_origin_mm=origin,
+            screen_s_x=s_x,
+            screen_s_y=s_y,
+            face=Face.of(optics.geometry.screen),
+        )
+
+    def rays(self, columns_px: ArrayLike, rows_px: ArrayLike) -> FloatArray:
+        """Unit vectors in world, (3, ...), from the pinhole through image points (pixel centres are integers)."""
+        columns, rows = np.broadcast_arrays(np.asarray(columns_px, float), np.asarray(rows_px, float))
+        x = (columns - self.principal_px[0]) / self.focal_px
+        y = (rows - self.principal_px[1]) / self.focal_px
+        if any(self.distortion):
+            x, y = _undistort(x, y, self.distortion)
+        camera = np.stack([x, y, np.ones_like(x)])
+        camera /= np.linalg.norm(camera, axis=0)
+        return np.asarray(np.tensordot(self.rotation.T, camera, axes=1))
+
+    @property
+    def screen_axes(self) -> FloatArray:
+        """Unit vectors of s_x, s_y and of the normal towards the mirror, as rows (3, 3) in world."""
+        return np.stack([self.screen_s_x, self.screen_s_y, np.cross(self.screen_s_x, self.screen_s_y)])
+
+    def screen_points(self, screen_mm: FloatArray) -> FloatArray:
+        """World points (3, ...) on the face at screen coordinates (2, ...) in mm from O'."""
+        origin = self.screen_origin_mm.reshape(3, *[1] * (screen_mm.ndim - 1))
+        in_screen = np.concatenate([screen_mm, self.face.heights(screen_mm)[:1]])
+        return np.asarray(origin + np.tensordot(self.screen_axes.T, in_screen, axes=1))
+
+
+def _poses(config: GeometryConfig) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Pinhole, rotation, O', s_x, s_y in world from either form."""
+    screen = None if config.screen is None else config.screen.pose
+    if config.camera is not None and screen is not None:
+        general = (config.camera.position_mm, config.camera.rotation, *screen)
+        pinhole, rotation, origin, s_x, s_y = (np.array(value, float) for value in general)
+        return pinhole, rotation, origin, s_x, s_y
+    if config.a_mm is None or config.b_mm is None or config.alpha_deg is None:
+        raise ValueError("geometry has neither a_mm, b_mm, alpha_deg nor both poses")
+    cosine, sine = math.cos(math.radians(config.alpha_deg)), math.sin(math.radians(config.alpha_deg))
+    rotation = np.array([[sine, 0.0, -cosine], [0.0, -1.0, 0.0], [-cosine, 0.0, -sine]])
+    return (
+        config.a_mm * np.array([cosine, 0.0, sine]),
+        rotation,
+        config.b_mm * np.array([-cosine, 0.0, sine]),
+        np.array([-sine, 0.0, -cosine]),
+        np.array([0.0, 1.0, 0.0]),
+    )
+
+
+def _undistort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    """Normalised pinhole coordinates of distorted ones; iterated until the last digit stands still.
+
+    NaN where the way back does not lead to the point, or leads to one beyond a fold of the model, where distance from
+    the axis falls again: no ray, or not this one, belongs to such a point.
+    """
+    points, lens = np.stack([x.ravel(), y.ravel()], axis=1), np.array(distortion)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-15)
+    solved = cv2.undistortPoints(points[:, None], np.eye(3), lens, None, None, None, criteria)
+    straight: FloatArray = np.asarray(solved, np.float64)[:, 0]
+    back = distort(straight[:, 0], straight[:, 1], distortion)
+    undone = np.abs(back.T - points).max(axis=1) <= _UNDONE
+    straight[~undone | (np.hypot(*straight.T) > _fold(distortion))] = np.nan
+    return straight[:, 0].reshape(x.shape), straight[:, 1].reshape(x.shape)
+
+
+def _fold(distortion: tuple[float, ...]) -> float:
+    """Distance from the axis, as a tangent, at which the lens' radial part stops growing; at most 2 (63 degrees)."""
+    radius: FloatArray = np.linspace(0.0, 2.0, 2001)
+    radial = (*distortion[:2], 0.0, 0.0, *distortion[4:])
+    falls = np.diff(distort(radius, np.zeros_like(radius), radial)[0]) <= 0
+    return float(radius[np.argmax(falls)]) if falls.any() else float(radius[-1])
+
+
+def distort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> FloatArray:
+    """Distorted coordinates (2, n) of normalised pinhole ones, by OpenCV's model."""
+    through = np.stack([x, y, np.ones_like(x)], axis=1)
+    seen = cv2.projectPoints(through, np.zeros(3), np.zeros(3), np.eye(3), np.array(distortion))[0]
+    return np.asarray(seen[:, 0].T, np.float64)
+
+
+# The mirror's rim in the picture: where the light ends, against where the camera's pose puts the rim.
+#
+# A circle on the mirror is an ellipse in the picture. The rim's points from the pose are drawn, and along the line
+# from the middle through each the light's edge is looked for; the edge is half the light of what is well inside.
+
+
+_POINTS = 180
+_FROM, _TO = 0.85, 1.15  # of the expected radius
+_SAMPLES = 121
+_LEAST_FOUND = 0.4
+
+
+@dataclass(frozen=True)
+class Outline:
+    """The rim as seen and as expected.
+
+    Attributes
+    ----------
+    rim_px : (2, n) array
+        Column and row of the rim's points that were found.
+    centre_px, expected_px : (column, row)
+        Middle of the ellipse that fits them, and of the one that the pose predicts.
+    offset_mm : float
+        Distance of the two, on the mirror.
+    size_ratio : float
+        Seen over expected, mean radius.
+    """
+
+    rim_px: FloatArray
+    centre_px: tuple[float, float]
+    expected_px: tuple[float, float]
+    offset_mm: float
+    size_ratio: float
+
+
+def find_outline(light: FloatArray, geometry: Geometry, rim_mm: float, rim_z_mm: float) -> Outline | None:
+    """Look for the rim.
+
+    Parameters
+    ----------
+    light : (H, W) array
+        White minus black, or the fringes' mean.
+    rim_mm, rim_z_mm : float
+        Radius of the rim, and where its plane stands in world (the sag).
+
+    Returns
+    -------
+    Outline or None
+        None if the rim is not in the picture (a stop inside it, a pattern too small to light it).
+    """
+    theta = 2 * np.pi * np.arange(_POINTS) / _POINTS
+    circle = np.stack([rim_mm * np.cos(theta), rim_mm * np.sin(theta), np.full(_POINTS, rim_z_mm)])
+    expected = project(geometry, circle)
+    middle = expected.mean(axis=1)
+    reach = np.linspace(_FROM, _TO, _SAMPLES)
+    lines = middle[:, None, None] + (expected - middle[:, None])[:, :, None] * reach
+    values = map_coordinates(light, [lines[1], lines[0]], order=1, mode="constant", cval=np.nan)
+    whole = np.isfinite(values).all(axis=1)  # a line that leaves the picture tells nothing
+    inside = np.where(whole, np.median(values[:, :10], axis=1), 0.0)
+    below = values < inside[:, None] / 2
+    first = np.argmax(below, axis=1)
+    found = whole & below.any(axis=1) & (first > 0) & (inside > np.max(inside) / 4)
+    if np.count_nonzero(found) < _LEAST_FOUND * _POINTS:
+        return None
+    scale = reach[first] - (reach[1] - reach[0]) / 2
+    ray = expected - middle[:, None]
+    rim = middle[:, None] + ray * scale
+    # A rim shifted by w and scaled by ratio meets the ray at scale |ray| = ratio |ray| + (n w) / (n u), with n the
+    # normal of the expected rim and u the ray's direction.
+    length = np.linalg.norm(ray, axis=0)
+    tangent = np.roll(expected, -1, axis=1) - np.roll(expected, 1, axis=1)
+    normal = np.stack([tangent[1], -tangent[0]])
+    design = np.stack([length, *(normal / np.sum(normal * ray / length, axis=0))], axis=1)[found]
+    ratio, shift_x, shift_y = np.linalg.lstsq(design, (scale * length)[found], rcond=None)[0]
+    rim = rim[:, found]
+    mm_per_px = rim_mm / float(np.mean(np.linalg.norm(expected - middle[:, None], axis=0)))
+    return Outline(
+        rim_px=rim,
+        centre_px=(float(middle[0] + shift_x), float(middle[1] + shift_y)),
+        expected_px=(float(middle[0]), float(middle[1])),
+        offset_mm=float(np.hypot(shift_x, shift_y)) * mm_per_px,
+        size_ratio=float(ratio),
+    )
+
+
+def project(geometry: Geometry, world_mm: FloatArray) -> FloatArray:
+    """Column and row (2, n) of world points (3, n), through the lens."""
+    camera = geometry.rotation @ (world_mm - geometry.pinhole_mm[:, None])
+    through = camera[:2] / camera[2]
+    if any(geometry.distortion):
+        through = distort(through[0], through[1], geometry.distortion)
+    column, row = geometry.focal_px * through
+    return np.stack([column + geometry.principal_px[0], row + geometry.principal_px[1]])

@@ -1,0 +1,175 @@
+"""The fitted surface: 36 Zernike terms plus the part of a Hencky bowl that they cannot carry.
+
+The excess is orthogonal to the 36 terms over the disc, so the coefficients are those of the whole surface whatever
+its amplitude: a shape made of 36 terms has amplitude 0, a true Hencky bowl has its own sag.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.optics import hencky, zernike
+
+FloatArray = NDArray[np.float64]
+
+PARAMETERS = 36  # j = 2..36 and the excess; piston follows from h(0) = 0
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Height above the vertex, h(0, 0) = 0, over a disc.
+
+    Attributes
+    ----------
+    coeffs_mm : (36,) array
+        Noll j = 1..36, orthonormal; piston is whatever makes h(0, 0) = 0.
+    hencky_mm : float
+        Amplitude of the excess, as the sag of the Hencky bowl it belongs to.
+    radius_mm : float
+        Radius of the Zernike disc.
+    """
+
+    coeffs_mm: FloatArray
+    hencky_mm: float
+    radius_mm: float
+
+    @classmethod
+    def from_parameters(cls, parameters: FloatArray, radius_mm: float) -> Surface:
+        """The surface of a parameter vector [a_2..a_36, excess with unit RMS] in mm; piston set for h(0, 0) = 0."""
+        hencky_mm = float(parameters[-1]) / hencky.excess_rms()
+        return cls(parameter_to_coeffs() @ parameters, hencky_mm, radius_mm)
+
+    @classmethod
+    def hencky_bowl(cls, sag_mm: float, radius_mm: float) -> Surface:
+        """A Hencky bowl of the given sag."""
+        return cls(sag_mm * hencky.zernike_projection(), sag_mm, radius_mm)
+
+    @property
+    def parameters(self) -> FloatArray:
+        """[a_2..a_36, excess with unit RMS] in mm."""
+        return np.append(self.coeffs_mm[1:], self.hencky_mm * hencky.excess_rms())
+
+    @cached_property
+    def polynomial(self) -> FloatArray:
+        """The Zernike part as a polynomial (8, 8) in x / R, y / R."""
+        return zernike.polynomial(self.coeffs_mm)
+
+    @cached_property
+    def excess(self) -> FloatArray:
+        """The excess as a power series in (r / R)^2, in mm."""
+        return self.hencky_mm * hencky.excess()
+
+    @property
+    def sag_mm(self) -> float:
+        """Height on the rim of the disc, mean over azimuth."""
+        return float(sag_gradient() @ self.parameters)
+
+    def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Height in mm at points (...) in mm."""
+        x, y = np.asarray(x_mm) / self.radius_mm, np.asarray(y_mm) / self.radius_mm
+        bowl = np.polynomial.polynomial.polyval2d(x, y, self.polynomial)
+        return np.asarray(bowl + np.polynomial.polynomial.polyval(x * x + y * y, self.excess))
+
+
+@cache
+def parameter_to_coeffs() -> FloatArray:
+    """Matrix (36, 36) from parameters to Noll coefficients.
+
+    Row 1 is the piston that puts the vertex at 0: a_1 = -(sum over j >= 2 of a_j Z_j(0) + excess(0)).
+    """
+    out = np.zeros((zernike.TERMS, PARAMETERS))
+    out[1:, :-1] = np.eye(zernike.TERMS - 1)
+    out[0, :-1] = -zernike.at_vertex()[1:]
+    out[0, -1] = -hencky.excess()[0] / hencky.excess_rms()
+    return out
+
+
+@cache
+def sag_gradient() -> FloatArray:
+    """d sag / d parameters (36,): mean over the rim minus the vertex, term by term."""
+    excess = hencky.excess()
+    rim_minus_vertex = (excess.sum() - excess[0]) / hencky.excess_rms()
+    return np.append((zernike.at_rim() - zernike.at_vertex())[1:], rim_minus_vertex)
+
+
+@cache
+def height_probe() -> FloatArray:
+    """Matrix from parameters to heights at 512 points spread evenly over the disc (a sunflower), vertex at 0.
+
+    Enough to see the largest height of a degree-7 surface to a few per cent.
+    """
+    k = np.arange(512)
+    rho, theta = np.sqrt((k + 0.5) / 511.5), k * np.pi * (3 - np.sqrt(5))
+    x, y = rho * np.cos(theta), rho * np.sin(theta)
+    excess = np.polynomial.polynomial.polyval(rho**2, hencky.excess()) / hencky.excess_rms()
+    terms = np.vstack([zernike.values(x, y), excess])
+    return np.asarray(terms[:-1].T @ parameter_to_coeffs() + np.outer(terms[-1], np.eye(PARAMETERS)[-1]))
+
+
+# The radial profile against Hencky's bowl, and the pressure it stands for.
+
+
+# The paper's mirror film (PET, 50 um): from its sag follows the pressure, p = E t / a (w0 / (0.653 a))^3
+_YOUNG_PA = 4.1e9
+_THICKNESS_MM = 0.05
+_CENTRE = 0.65344  # w0 / (a q^(1/3)) for a Poisson ratio of 0.3
+_RINGS = 48
+
+
+@dataclass(frozen=True)
+class RadialProfile:
+    """Height over radius.
+
+    Attributes
+    ----------
+    radius_mm : (n,) array
+        Middle of the rings.
+    mean_mm, low_mm, high_mm : (n,) arrays
+        Mean over azimuth and the band that holds 95 % of the ring.
+    hencky_mm : (n,) array
+        Hencky's bowl of the sag that fits best.
+    sag_mm : float
+        That sag, at the rim.
+    pressure_pa : float
+        Gauge pressure that bends the paper's film to that sag.
+    """
+
+    radius_mm: FloatArray
+    mean_mm: FloatArray
+    low_mm: FloatArray
+    high_mm: FloatArray
+    hencky_mm: FloatArray
+    sag_mm: float
+    pressure_pa: float
+
+
+def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) -> RadialProfile:
+    """Profile of a height map (n, n) on `axis_mm`, NaN where not measured, of a film with its rim at `rim_mm`."""
+    x, y = np.meshgrid(axis_mm, axis_mm)
+    seen = np.isfinite(height_mm)
+    r, h = np.hypot(x[seen], y[seen]), height_mm[seen]
+    shape = hencky.profile(r / rim_mm)
+    shape_mean, h_mean = shape.mean(), h.mean()
+    # least squares with a free offset: a dimple at the vertex must not tilt the whole comparison
+    sag = float(np.sum((shape - shape_mean) * (h - h_mean)) / np.sum((shape - shape_mean) ** 2))
+    left = h - (sag * (shape - shape_mean) + h_mean)
+    edges = np.linspace(0.0, float(r.max()), _RINGS + 1)
+    ring = np.clip(np.digitize(r, edges) - 1, 0, _RINGS - 1)
+    rows = []
+    for k in range(_RINGS):
+        inside = ring == k
+        if np.any(inside):
+            # of the difference to the bowl: across a ring the bowl itself climbs by millimetres
+            rows.append((r[inside].mean(), left[inside].mean(), *np.percentile(left[inside], [2.5, 97.5])))
+    radius, mean, low, high = np.array(rows).T
+    bowl = sag * hencky.profile(radius / rim_mm) + h_mean - sag * shape_mean
+    return RadialProfile(radius, bowl + mean, bowl + low, bowl + high, bowl, sag, pressure_pa(sag, rim_mm))
+
+
+def pressure_pa(sag_mm: float, rim_mm: float) -> float:
+    """Gauge pressure under a film of the paper's kind with that sag: (w0 / (0.65344 a))^3 E t / a."""
+    return (sag_mm / (_CENTRE * rim_mm)) ** 3 * _YOUNG_PA * _THICKNESS_MM / rim_mm

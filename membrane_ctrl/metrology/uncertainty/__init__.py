@@ -1,0 +1,1 @@
+"""How well a figure is known."""

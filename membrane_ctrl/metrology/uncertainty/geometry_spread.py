@@ -1,0 +1,144 @@
+"""How well a geometry is known: a covariance over named changes of it, from which trials draw.
+
+The short form changes in a, b and alpha. The general form changes in twelve numbers: camera and screen are each
+shifted (mm, in world) and turned (rad, a rotation vector in world, about the pinhole and about O').
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, Vector3
+
+FloatArray = NDArray[np.float64]
+
+SHORT_NAMES = ("a_mm", "b_mm", "alpha_deg")
+GENERAL_NAMES = tuple(
+    f"{thing}_{move}_{axis}_{unit}"
+    for thing in ("camera", "screen")
+    for move, unit in (("shift", "mm"), ("turn", "rad"))
+    for axis in "xyz"
+)
+
+
+@dataclass(frozen=True)
+class GeometrySpread:
+    """Covariance of a geometry.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of `SHORT_NAMES` or of `GENERAL_NAMES`; what is not named is exact.
+    covariance : (k, k) array
+        Of their changes, in the units of the names.
+
+    Raises
+    ------
+    ValueError
+        On construction, for unknown or mixed names and for what is no covariance.
+    """
+
+    names: tuple[str, ...]
+    covariance: FloatArray
+
+    def __post_init__(self) -> None:
+        if len(set(self.names)) != len(self.names):
+            raise ValueError("names: one is there twice")
+        if not (set(self.names) <= set(SHORT_NAMES) or set(self.names) <= set(GENERAL_NAMES)):
+            raise ValueError(f"names: either of {', '.join(SHORT_NAMES)} or of {', '.join(GENERAL_NAMES)}")
+        if self.covariance.shape != (len(self.names), len(self.names)):
+            raise ValueError(f"matrix: {len(self.names)} names need as many rows and columns")
+        if not np.all(np.isfinite(self.covariance)) or not np.allclose(self.covariance, self.covariance.T):
+            raise ValueError("matrix: not finite and symmetric")
+        if np.any(np.diag(self.covariance) < 0):
+            raise ValueError("matrix: a variance is negative")
+        # rounding of a written matrix may leave a little below 0
+        if self.names and np.linalg.eigvalsh(self.correlation()).min() < -1e-6:
+            raise ValueError("matrix: not a covariance (an eigenvalue is negative)")
+
+    @classmethod
+    def independent(cls, sigmas: dict[str, float]) -> GeometrySpread:
+        """From one sigma a name."""
+        return cls(tuple(sigmas), np.diag(np.square(np.array(list(sigmas.values()), float))))
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(k,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def correlation(self) -> FloatArray:
+        """(k, k), 1 on the diagonal where there is any spread: mm and rad on one footing."""
+        scale = np.where(self.sigmas > 0, self.sigmas, 1.0)
+        return np.asarray(self.covariance / np.outer(scale, scale))
+
+    def draw(self, rng: np.random.Generator) -> FloatArray:
+        """(k,) one change."""
+        standard = rng.standard_normal(len(self.names))
+        values, vectors = np.linalg.eigh(self.correlation())
+        root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+        return np.asarray(self.sigmas * (root @ standard))
+
+
+def stated_spread(geometry: GeometryConfig) -> GeometrySpread | None:
+    """What `a_sigma_mm`, `b_sigma_mm` and `alpha_sigma_deg` say; None if the geometry has none of them."""
+    sigmas = (geometry.a_sigma_mm, geometry.b_sigma_mm, geometry.alpha_sigma_deg)
+    if geometry.a_mm is None or all(sigma is None for sigma in sigmas):
+        return None
+    return GeometrySpread.independent({n: s or 0.0 for n, s in zip(SHORT_NAMES, sigmas, strict=True)})
+
+
+def changed(geometry: GeometryConfig, names: tuple[str, ...], change: ArrayLike) -> GeometryConfig:
+    """The geometry changed by (k,) amounts.
+
+    Raises
+    ------
+    ValueError
+        If the names belong to the other form.
+    """
+    amounts = dict(zip(names, np.asarray(change, float).tolist(), strict=True))
+    if not amounts:
+        return geometry
+    camera, screen = geometry.camera, geometry.screen
+    if camera is None or screen is None or screen.pose is None:
+        if unknown := set(names) - set(SHORT_NAMES):
+            raise ValueError(f"{min(unknown)}: the geometry is given by a, b and alpha")
+        return geometry.model_copy(update={n: getattr(geometry, n) + d for n, d in amounts.items()})
+    if unknown := set(names) - set(GENERAL_NAMES):
+        raise ValueError(f"{min(unknown)}: the geometry is given by two poses")
+    turn = _turn(amounts, "camera")
+    rows = [_vector(turn @ np.array(row)) for row in camera.rotation]
+    moved_camera = CameraPoseConfig(
+        position_mm=_shifted(camera.position_mm, amounts, "camera"), rotation=(rows[0], rows[1], rows[2])
+    )
+    turn = _turn(amounts, "screen")
+    origin_mm, s_x, s_y = screen.pose
+    moved_screen = screen.model_copy(
+        update={
+            "origin_mm": _shifted(origin_mm, amounts, "screen"),
+            "s_x": _vector(turn @ np.array(s_x)),
+            "s_y": _vector(turn @ np.array(s_y)),
+        }
+    )
+    return geometry.model_copy(update={"camera": moved_camera, "screen": moved_screen})
+
+
+def _turn(amounts: dict[str, float], thing: str) -> FloatArray:
+    vector = [amounts.get(f"{thing}_turn_{axis}_rad", 0.0) for axis in "xyz"]
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+
+
+def _shifted(place_mm: Vector3, amounts: dict[str, float], thing: str) -> Vector3:
+    return _vector(np.array(place_mm) + [amounts.get(f"{thing}_shift_{axis}_mm", 0.0) for axis in "xyz"])
+
+
+def _vector(values: FloatArray) -> Vector3:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+# The paper's instruments: laser distance meter and digital protractor.
+PAPER_SPREAD = GeometrySpread.independent({"a_mm": 2.0, "b_mm": 2.0, "alpha_deg": 0.3})

@@ -1,0 +1,280 @@
+"""Monte Carlo over geometry and pixel noise (the paper's section 3.1), as cheap as it can honestly be.
+
+A trial of the paper disturbs the frames of every pixel and reconstructs them anew. The disturbance of a bin's phase
+by white noise of the pixels is known: sigma sqrt(2 / N) / (B m) for bins of m x m pixels. And of all the bins a few
+thousand hold 36 terms: one in k, with a k-th of the variance each, gives the fit the same covariance as all of them.
+So a trial draws a geometry, disturbs the screen points that the fitted surface predicts, and takes the two or three
+Gauss-Newton steps from the fitted surface to the disturbed one.
+
+Seeds: the geometry of trial t comes from (seed, 0, t), the noise of set s in it from (seed, 1 + s, t): independent
+of the order, of the number of workers and of what else is in the run, and the geometry is common to all sets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.metrology import bins, full, reconstruct
+from membrane_ctrl.metrology.checked import Checked
+from membrane_ctrl.metrology.optics import hencky
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, parameter_to_coeffs
+from membrane_ctrl.metrology.optics.zernike import values
+from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread, changed
+
+FloatArray = NDArray[np.float64]
+
+# 170 a parameter: errors of a geometry are smooth and need fewer; a trial then takes about a millisecond
+TRIAL_POINTS = 6000
+
+
+@dataclass(frozen=True)
+class TrialBench:
+    """All that the trials of one set need; half a megabyte, so that it can be sent to where they run.
+
+    Attributes
+    ----------
+    optics : OpticsConfig
+        With the nominal geometry.
+    vertex_z_mm : float
+        Where the vertex stood.
+    column_px, row_px : (n,) arrays
+        The points in the picture.
+    screen_mm, sigma_mm : (2, n) arrays
+        Where the fitted surface sends them, and 1 sigma of noise there.
+    t_mm : (n,) array
+        Lengths of their rays.
+    surface, normal
+        The fit, and the normal matrix of these points.
+    """
+
+    optics: OpticsConfig
+    vertex_z_mm: float
+    column_px: FloatArray
+    row_px: FloatArray
+    screen_mm: FloatArray
+    sigma_mm: FloatArray
+    t_mm: FloatArray
+    surface: Surface
+    normal: reconstruct.NormalMatrix
+
+    @classmethod
+    def of(
+        cls, optics: OpticsConfig, checked: Checked, figure: full.BinFigure, count: int = TRIAL_POINTS
+    ) -> TrialBench:
+        """Of a set's figure, its points thinned to about `count`."""
+        row, column = np.divmod(figure.index, checked.phase_rad.shape[2])
+        side = checked.binned.bin_px
+        place_px = side * np.stack([column, row]) + (side - 1) / 2
+        return cls.of_points(
+            optics, checked.tracer, figure.fit.surface, figure.points, place_px, figure.sigma_mm, count
+        )
+
+    @classmethod
+    def of_points(
+        cls,
+        optics: OpticsConfig,
+        tracer: reconstruct.Tracer,
+        surface: Surface,
+        points: reconstruct.Points,
+        place_px: FloatArray,
+        sigma_mm: FloatArray,
+        count: int,
+    ) -> TrialBench:
+        """Of points that stand on a surface, seen at `place_px` (2, n), thinned to about `count`."""
+        chosen = _spread_evenly(points.t_mm.size, count)
+        thinning = points.t_mm.size / np.count_nonzero(chosen)
+        points = points.subset(chosen)
+        column_px, row_px = place_px[:, chosen]
+        return cls(
+            optics=optics,
+            vertex_z_mm=tracer.vertex_z_mm,
+            column_px=column_px,
+            row_px=row_px,
+            screen_mm=tracer.predict_screen(points, surface),
+            sigma_mm=sigma_mm[:, chosen] / np.sqrt(thinning),
+            t_mm=points.t_mm,
+            surface=surface,
+            normal=tracer.normal_matrix(points),
+        )
+
+    def solve(self, geometry: Geometry, disturbance_mm: FloatArray | float = 0.0) -> FloatArray:
+        """Parameters (36,) in mm of the surface under a geometry, the screen points (2, n) off by a disturbance.
+
+        Raises
+        ------
+        ArithmeticError
+            If the fit does not converge: the geometry is not near the nominal one.
+        """
+        tracer = reconstruct.Tracer(geometry, self.surface.radius_mm, self.vertex_z_mm)
+        points = reconstruct.Points.of(geometry.rays(self.column_px, self.row_px), self.screen_mm + disturbance_mm)
+        points.t_mm[:] = self.t_mm
+        tracer.intersect(points, self.surface, newton=3)
+        with np.errstate(over="ignore", invalid="ignore"):  # of a fit that runs away, which is told below
+            fit = reconstruct.solve(tracer, points, self.surface, normal=self.normal)
+        if not fit.converged:
+            raise ArithmeticError("a trial did not converge: the geometry's spread is too wide to be a spread")
+        return fit.surface.parameters
+
+    def geometry(self, names: tuple[str, ...], change: FloatArray) -> Geometry:
+        """The nominal geometry changed."""
+        return Geometry.from_config(
+            self.optics.model_copy(update={"geometry": changed(self.optics.geometry, names, change)})
+        )
+
+    def slope_variance(self) -> FloatArray:
+        """(2,) variance of an x and of a y slope from the noise."""
+        gain = bins.slope_per_screen(Geometry.from_config(self.optics), self.surface.radius_mm, self.surface.sag_mm)
+        return np.asarray(gain @ np.mean(np.square(self.sigma_mm), axis=1))
+
+
+def _spread_evenly(size: int, count: int) -> NDArray[np.bool_]:
+    """About `count` of `size` points by a golden-ratio sequence: even along rows and columns alike."""
+    if size <= count:
+        return np.ones(size, bool)
+    place = (np.arange(size) * ((np.sqrt(5) - 1) / 2)) % 1
+    return np.asarray(place < count / size)
+
+
+def run_trials(
+    benches: Sequence[TrialBench],
+    spread: GeometrySpread,
+    seed: int,
+    trials: Sequence[int],
+    first_set: int = 0,
+) -> FloatArray:
+    """Parameters (trials, sets, 36) in mm of some trials; all sets share the geometry of a trial.
+
+    Parameters
+    ----------
+    benches : sequence of TrialBench
+        One a set; of one bench, that is with the same nominal geometry.
+    spread : GeometrySpread
+        Of the geometry.
+    seed : int
+        Of all that is random.
+    trials : sequence of int
+        Numbers of the trials.
+    first_set : int
+        Number of the first set in its run: noise differs from set to set.
+    """
+    out = np.empty((len(trials), len(benches), PARAMETERS))
+    for row, trial in enumerate(trials):
+        change = spread.draw(np.random.default_rng((seed, 0, trial)))
+        for k, bench in enumerate(benches):
+            noise = np.random.default_rng((seed, 1 + first_set + k, trial)).standard_normal(bench.sigma_mm.shape)
+            out[row, k] = bench.solve(bench.geometry(spread.names, change), noise * bench.sigma_mm)
+    return out
+
+
+# From the spread of the parameters to the spread of the height, and the linear covariance beside the Monte Carlo.
+#
+# The fitted height is linear in the 36 parameters, h = P a, so its standard deviation at every point follows from
+# their covariance C alone: sigma^2 = diag(P C P^T). With C the sample covariance of the trials that is, to the last
+# bit of rounding, the standard deviation over the trials' heights: the paper's RMSE map.
+#
+# Linear: C = J S J^T + C_noise with S the covariance of the geometry and J the change of the parameters with it, from
+# two solutions a number (some ms each); J hardly changes while the film moves by micrometres, so a live loop works it
+# out once a full cycle.
+
+
+MAP_SIDE = 101  # points across a map: 10 mm a cell, far below what 36 terms can change over
+
+
+@dataclass(frozen=True)
+class HeightMap:
+    """Points of a square grid inside a radius, and the matrix that makes heights of parameters there.
+
+    Attributes
+    ----------
+    axis_mm : (n,) array
+        Of x and of y.
+    inside : (n, n) bool array
+        Rows along y.
+    matrix : (points, 36) array
+        Heights, 0 at the vertex, of the points inside.
+    """
+
+    axis_mm: FloatArray
+    inside: NDArray[np.bool_]
+    matrix: FloatArray
+
+    @classmethod
+    def over(cls, analysis_radius_mm: float, radius_mm: float, side: int = MAP_SIDE) -> HeightMap:
+        """A grid over the analysis radius; `radius_mm` is that of the Zernike disc."""
+        axis = np.linspace(-analysis_radius_mm, analysis_radius_mm, side)
+        x, y = np.meshgrid(axis, axis)
+        inside = np.hypot(x, y) <= analysis_radius_mm
+        return cls(axis, inside, height_matrix(x[inside], y[inside], radius_mm))
+
+    def picture(self, heights: FloatArray) -> FloatArray:
+        """(n, n) of values at the points inside; NaN outside."""
+        out = np.full(self.inside.shape, np.nan)
+        out[self.inside] = heights
+        return out
+
+    def sigma(self, covariance: FloatArray) -> FloatArray:
+        """(points,) standard deviation for a covariance (36, 36) of the parameters, in its unit."""
+        variance = np.einsum("pi,pi->p", self.matrix @ covariance, self.matrix)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> FloatArray:
+    """Matrix (points, 36) from parameters to heights, 0 at the vertex."""
+    x, y = np.asarray(x_mm) / radius_mm, np.asarray(y_mm) / radius_mm
+    out = np.asarray(values(x, y).T @ parameter_to_coeffs())
+    out[:, -1] += np.polynomial.polynomial.polyval(x * x + y * y, hencky.excess()) / hencky.excess_rms()
+    return out
+
+
+def trial_covariance(parameters: FloatArray) -> FloatArray:
+    """Covariance (36, 36) over trials (trials, 36)."""
+    return np.atleast_2d(np.cov(parameters, rowvar=False))
+
+
+def geometry_jacobian(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
+    """Change (36, k) of the parameters in mm with each number of the geometry, by central differences of one sigma.
+
+    A difference as wide as the spread itself: what curvature there is then has the say it has in the spread.
+    """
+    columns = []
+    for k, sigma in enumerate(spread.sigmas):
+        if sigma == 0:
+            columns.append(np.zeros(PARAMETERS))
+            continue
+        step = np.zeros(len(spread.names))
+        step[k] = sigma
+        ends = [bench.solve(bench.geometry(spread.names, sign * step)) for sign in (1.0, -1.0)]
+        columns.append((ends[0] - ends[1]) / (2 * sigma))
+    return np.stack(columns, axis=1) if columns else np.zeros((PARAMETERS, 0))
+
+
+def noise_covariance(bench: TrialBench) -> FloatArray:
+    """Covariance (36, 36) in mm^2 of the parameters from the noise of the pixels."""
+    ideal = reconstruct.Fit(bench.surface, bench.normal, (0.0,), True, 0.0, 0.0, float(bench.t_mm.size))
+    return bins.parameter_covariance(ideal, bench.slope_variance())
+
+
+def geometry_covariance(jacobian: FloatArray, spread: GeometrySpread) -> FloatArray:
+    """Covariance (36, 36) in mm^2 of the parameters from the geometry; the live loop adds it to a cycle's own."""
+    return np.asarray(jacobian @ spread.covariance @ jacobian.T)
+
+
+def linear_covariance(benches: Sequence[TrialBench], spread: GeometrySpread) -> FloatArray:
+    """What the Monte Carlo finds, without it: (36, 36) in mm^2.
+
+    Parameters
+    ----------
+    benches : one or two TrialBench
+        Of two the covariance is that of the change between them: the geometry is common to both, the noise is not.
+    """
+    jacobian = geometry_jacobian(benches[0], spread)
+    if len(benches) > 1:
+        jacobian = jacobian - geometry_jacobian(benches[1], spread)
+    noise: FloatArray = np.sum([noise_covariance(bench) for bench in benches], axis=0)
+    return geometry_covariance(jacobian, spread) + noise

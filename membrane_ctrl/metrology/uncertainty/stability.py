@@ -1,0 +1,165 @@
+"""Statistics of a run of figures in memory that does not grow with it.
+
+The fitted height is linear in the 36 parameters: their running mean and covariance hold the standard deviation at
+every point of the mirror (see `uncertainty.HeightMap.sigma`).
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.uncertainty.monte_carlo import trial_covariance
+
+FloatArray = NDArray[np.float64]
+
+# Where the film is watched, as (radius in analysis radii, azimuth in degrees): a third of a turn apart and inside,
+# halfway and near the rim, so that a tilt, a bend and a wave of the rim look different in the three.
+_WATCHED = {"A": (0.45, 90.0), "B": (0.70, 210.0), "C": (0.95, 330.0)}
+
+
+def default_points_mm(analysis_radius_mm: float) -> dict[str, tuple[float, float]]:
+    """A, B and C: name to (x, y) in mm."""
+    return {
+        name: (
+            analysis_radius_mm * share * math.cos(math.radians(azimuth)),
+            analysis_radius_mm * share * math.sin(math.radians(azimuth)),
+        )
+        for name, (share, azimuth) in _WATCHED.items()
+    }
+
+
+class RunningCovariance:
+    """Mean and covariance of vectors that pass by, by Welford's update.
+
+    Attributes
+    ----------
+    count : int
+        Vectors seen.
+    mean : (k,) array
+        Of them.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.count = 0
+        self.mean: FloatArray = np.zeros(size)
+        self._squares: FloatArray = np.zeros((size, size))
+
+    def add(self, vector: FloatArray) -> None:
+        """Count one more."""
+        self.count += 1
+        before = vector - self.mean
+        self.mean = self.mean + before / self.count
+        self._squares += np.outer(before, vector - self.mean)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(k, k), unbiased; zeros before the second vector."""
+        return self._squares / max(self.count - 1, 1)
+
+
+@dataclass
+class Tally:
+    """Count, mean and range of a number that passes by; NaN before the first."""
+
+    count: int = 0
+    mean: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+
+    def add(self, value: float) -> None:
+        """Count one more."""
+        self.count += 1
+        self.mean = value if self.count == 1 else self.mean + (value - self.mean) / self.count
+        self.low, self.high = float(np.fmin(self.low, value)), float(np.fmax(self.high, value))
+
+
+# Changes of the figure over fixed times, with their uncertainty, for every set of a run.
+#
+# Both sets of a pair were disturbed with the same geometries (see `monte_carlo`), so that what a wrong geometry does
+# to both alike cancels, trial by trial. Only the sets within the longest lag are kept.
+
+
+LAGS_S = (60.0, 600.0)  # the paper's
+# A set this far from the wanted moment still stands for it: a run with a bad set in it has a neighbour there.
+_TOLERANCE = 0.1
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A set at its time.
+
+    Attributes
+    ----------
+    name : str
+        Of the set.
+    time_s : float
+        Its middle on the run's clock.
+    parameters : (36,) array
+        Of its surface, in mm.
+    trials : (trials, 36) array
+        The same under the trials' geometries and noise.
+    """
+
+    name: str
+    time_s: float
+    parameters: FloatArray
+    trials: FloatArray
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A change of the figure.
+
+    Attributes
+    ----------
+    lag_s : float
+        The lag that was asked for.
+    earlier, later : Moment
+        The two sets.
+    """
+
+    lag_s: float
+    earlier: Moment
+    later: Moment
+
+    @property
+    def change(self) -> FloatArray:
+        """(36,) later minus earlier, in mm."""
+        return self.later.parameters - self.earlier.parameters
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(36, 36) in mm^2, of the change trial by trial."""
+        return trial_covariance(self.later.trials - self.earlier.trials)
+
+
+class PairFinder:
+    """Finds for each set the ones some lags before it."""
+
+    def __init__(self, lags_s: Sequence[float] = LAGS_S) -> None:
+        self._lags_s = tuple(lags_s)
+        self._kept: deque[Moment] = deque()
+
+    def add(self, moment: Moment) -> list[Pair]:
+        """The pairs that end with this set: at most one a lag, none for a set without a time."""
+        if not math.isfinite(moment.time_s):
+            return []
+        if self._kept and moment.time_s < self._kept[-1].time_s:
+            self._kept.clear()  # another clock
+        while self._kept and moment.time_s - self._kept[0].time_s > (1 + _TOLERANCE) * max(self._lags_s):
+            self._kept.popleft()
+        pairs = [
+            Pair(lag, earlier, moment) for lag in self._lags_s if (earlier := self._at(moment.time_s - lag, lag))
+        ]
+        self._kept.append(moment)
+        return pairs
+
+    def _at(self, time_s: float, lag_s: float) -> Moment | None:
+        nearest = min(self._kept, key=lambda kept: abs(kept.time_s - time_s), default=None)
+        if nearest is None or abs(nearest.time_s - time_s) > _TOLERANCE * lag_s:
+            return None
+        return nearest

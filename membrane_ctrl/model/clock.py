@@ -1,0 +1,71 @@
+"""One clock through all code: seconds since the run's start on the system's monotonic axis.
+
+CLOCK_MONOTONIC is one axis for all processes of a machine, so a clock made from the same origin reads the same
+everywhere. UTC is taken once at the start: a stepped wall clock moves nothing.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from membrane_ctrl.model.errors import InputError
+
+
+@dataclass(frozen=True, slots=True)
+class RunClock:
+    """The run's time axis; picklable, so that every process of the run has the same.
+
+    Attributes
+    ----------
+    origin_mono_s : float
+        `time.monotonic()` at the start of the run.
+    origin_utc : datetime
+        UTC at that moment.
+    """
+
+    origin_mono_s: float
+    origin_utc: datetime
+
+    @classmethod
+    def start(cls) -> RunClock:
+        """A clock that reads 0 now."""
+        return cls(time.monotonic(), datetime.now(UTC))
+
+    def now(self) -> float:
+        """Seconds since the run's start."""
+        return time.monotonic() - self.origin_mono_s
+
+    def utc(self, mono_s: float) -> datetime:
+        """UTC of a moment on the run's axis."""
+        return self.origin_utc + timedelta(seconds=mono_s)
+
+
+# Durations as people write them: `90`, `40s`, `3m`, `2h30m`, `1d`.
+
+
+_SECONDS = {"d": 86400.0, "h": 3600.0, "m": 60.0, "s": 1.0}
+_PART = re.compile(r"(\d+(?:\.\d+)?)([dhms])")
+
+
+def parse_duration_s(text: str) -> float:
+    """Seconds of a duration; a bare number is seconds.
+
+    Raises
+    ------
+    InputError
+        If the text is not a positive duration.
+    """
+    compact = text.strip().lower().replace(" ", "")
+    try:
+        seconds = float(compact)
+    except ValueError:
+        parts = _PART.findall(compact)
+        if not parts or "".join(number + unit for number, unit in parts) != compact:
+            raise InputError(f"duration {text!r} is not understood; write it like 90s, 3m or 2h30m") from None
+        seconds = sum(float(number) * _SECONDS[unit] for number, unit in parts)
+    if not 0 < seconds < 1e9:
+        raise InputError(f"duration {text!r} must be more than 0")
+    return seconds

@@ -1,0 +1,54 @@
+"""Errors that end a command with one line and an exit code (INTERFACES section 4)."""
+
+from collections.abc import Sequence
+from enum import IntEnum
+
+
+class Exit(IntEnum):
+    """Exit codes of every command."""
+
+    DONE = 0
+    BAD_INPUT = 2
+    REJECTED = 3
+    DEVICE_FAILED = 4
+    SAFETY_TRIP = 5
+    INTERRUPTED = 130
+
+
+class CommandError(Exception):
+    """Ends a command: the message is the one line that says what, where and what to do."""
+
+    exit = Exit.BAD_INPUT
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """What is printed: one line, whatever line ends are in what it quotes."""
+        return (str(self),)
+
+
+class InputError(CommandError):
+    """Bad usage, configuration or input."""
+
+
+class FindingsError(InputError):
+    """Several things that are wrong with the input, a line each."""
+
+    def __init__(self, lines: Sequence[str]) -> None:
+        super().__init__("\n".join(lines))
+        self._lines = tuple(lines)
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        return self._lines
+
+
+class RejectedError(CommandError):
+    """A measurement that must not be used."""
+
+    exit = Exit.REJECTED
+
+
+class DeviceError(CommandError):
+    """A device, port, folder or disk that cannot be used."""
+
+    exit = Exit.DEVICE_FAILED

@@ -1,0 +1,201 @@
+"""Files in folders that may come from a stranger: plain files alone, no link followed, nothing read without a bound.
+
+A run folder or a capture set travels: by mail, on a stick, out of an archive. Whatever lies in one is opened through
+a handle of its folder and without following a link, so that a link in it leads nowhere, neither to read nor to write.
+What is written is the old file or the whole new one, also after a power cut.
+
+The folder itself is given by who knows it (a command resolves the path that the user named); its subfolders and
+files are the stranger's.
+"""
+
+import contextlib
+import errno
+import io
+import os
+import stat
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, TextIO
+
+# A summary or a configuration is some kilobytes; JSON and TOML take fifty times their text once parsed.
+SMALL_BYTES = 4_000_000
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+# not blocking: a pipe without a writer would be waited for
+_READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_APPEND = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+
+
+@contextlib.contextmanager
+def folder_handle(folder: Path) -> Iterator[int]:
+    """A folder's descriptor, for `dir_fd`. Raises OSError for a link in its place."""
+    try:
+        descriptor = os.open(folder, _FOLDER)
+    except OSError as error:
+        raise _told(error, folder) from None
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def open_plain(path: Path, follow: bool = False) -> BinaryIO:
+    """A plain file, opened for reading.
+
+    Parameters
+    ----------
+    path : Path
+    follow : bool
+        The path is the user's own (a configuration that was named): links on the way are meant.
+
+    Raises
+    ------
+    OSError
+        Not there, a link, a link in place of its folder, or no plain file; `strerror` says which.
+    """
+    with contextlib.ExitStack() as stack:
+        if follow:
+            descriptor = os.open(path, _READ & ~os.O_NOFOLLOW)
+        else:
+            folder = stack.enter_context(folder_handle(path.parent))
+            descriptor = _opened(path, _READ, folder)
+    return os.fdopen(_plain(descriptor, path), "rb")
+
+
+def read_bytes(path: Path, most_bytes: int, follow: bool = False) -> bytes:
+    """All of a plain file. Raises OSError as `open_plain`, and for a file of more than `most_bytes`."""
+    with open_plain(path, follow) as file:
+        size = os.fstat(file.fileno()).st_size
+        data = file.read(size) if size <= most_bytes else b""  # of one that grows, what there was
+    if size > most_bytes:
+        raise OSError(
+            errno.EFBIG, f"{size / 1e6:.0f} MB; more than {most_bytes / 1e6:.0f} MB are not read", str(path)
+        )
+    return data
+
+
+def read_text(path: Path, most_bytes: int = SMALL_BYTES, errors: str = "strict", follow: bool = False) -> str:
+    """The same as text. Raises UnicodeDecodeError, too, unless `errors` says otherwise."""
+    return read_bytes(path, most_bytes, follow).decode("utf-8", errors)
+
+
+def users(path: Path) -> Path:
+    """A path that the user named: links on the way to it are meant. The file itself is replaced, link or not."""
+    return path.parent.resolve() / path.name
+
+
+def write_text_atomic(path: Path, text: str) -> None:
+    """Write UTF-8 text beside `path`, sync it, and put it in place in one step. Raises OSError.
+
+    A lone surrogate, which JSON may hold and UTF-8 may not, is written as JSON writes it.
+    """
+    write_bytes_atomic(path, text.encode("utf-8", "backslashreplace"))
+
+
+def write_bytes_atomic(path: Path, data: bytes) -> None:
+    """The same with bytes."""
+    with folder_handle(path.parent) as folder:
+        part = f".{path.name}.part"
+        try:
+            with _fresh(part, folder, path) as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(part, path.name, src_dir_fd=folder, dst_dir_fd=folder)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                os.unlink(part, dir_fd=folder)
+            raise type(error)(error.errno, error.strerror, str(path)) from None
+
+
+def fresh_file(path: Path) -> BinaryIO:
+    """A new file for what is written bit by bit, in place of one that is there. Raises OSError."""
+    with folder_handle(path.parent) as folder:
+        return _fresh(path.name, folder, path)
+
+
+def fresh_text(path: Path) -> TextIO:
+    """The same for text, line ends as they are given."""
+    return io.TextIOWrapper(fresh_file(path), encoding="utf-8", newline="")
+
+
+def append_text(path: Path, text: str) -> None:
+    """Append to a plain file of one name, made if it is not there. Raises OSError."""
+    with folder_handle(path.parent) as folder:
+        descriptor = _plain(_opened(path, _APPEND, folder), path)
+        with os.fdopen(descriptor, "ab") as file:
+            # a second name may be that of a file elsewhere
+            if os.fstat(file.fileno()).st_nlink > 1:
+                raise OSError(errno.EMLINK, "has another name elsewhere (a hard link), and is not written", str(path))
+            file.write(text.encode("utf-8", "backslashreplace"))
+
+
+def move(source: Path, target: Path) -> None:
+    """Put a file in the place of another, which may be a link: it goes, what it leads to stays. Raises OSError."""
+    with folder_handle(source.parent) as from_folder, folder_handle(target.parent) as folder:
+        try:
+            os.replace(source.name, target.name, src_dir_fd=from_folder, dst_dir_fd=folder)
+        except OSError as error:  # it names the file alone
+            raise type(error)(error.errno, error.strerror, str(target)) from None
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a link, if it is there. Raises OSError."""
+    with folder_handle(path.parent) as folder, contextlib.suppress(FileNotFoundError):
+        os.unlink(path.name, dir_fd=folder)
+
+
+def make_folder(path: Path) -> Path:
+    """Make a folder, and those above it, unless it is there. Raises OSError for a link in its place."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(FileExistsError):
+        path.mkdir()
+    with folder_handle(path):
+        return path
+
+
+@contextlib.contextmanager
+def scratch_folder(folder: Path, prefix: str) -> Iterator[Path]:
+    """A folder of nobody else's within a folder, for programs that write by name; gone at the end. Raises OSError."""
+    with folder_handle(folder), tempfile.TemporaryDirectory(prefix=prefix, dir=folder) as scratch:
+        yield Path(scratch)
+
+
+def sync_data(path: Path) -> None:
+    """Wait until the disk has a file's content, whoever wrote it. Raises OSError."""
+    with open_plain(path) as file:
+        os.fdatasync(file.fileno())
+
+
+def _opened(path: Path, flags: int, folder: int) -> int:
+    try:
+        return os.open(path.name, flags, 0o644, dir_fd=folder)
+    except OSError as error:
+        raise _told(error, path) from None
+
+
+def _fresh(name: str, folder: int, path: Path) -> BinaryIO:
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(name, dir_fd=folder)
+    return os.fdopen(_opened(path.with_name(name), _NEW, folder), "wb")
+
+
+def _plain(descriptor: int, path: Path) -> int:
+    """The descriptor, if it is of a plain file; else it is closed. Raises OSError."""
+    mode = os.fstat(descriptor).st_mode
+    if stat.S_ISREG(mode):
+        return descriptor
+    os.close(descriptor)
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, "a folder in place of a file", str(path))
+    raise OSError(errno.EINVAL, "no plain file (a pipe or a device)", str(path))
+
+
+def _told(error: OSError, path: Path) -> OSError:
+    """What a refused link means; Linux says it in two ways, and names neither folder nor link."""
+    if path.is_symlink():
+        return OSError(errno.ELOOP, "a link, and links are not followed here", str(path))
+    if error.errno == errno.ENXIO:  # a pipe without a reader, a socket
+        return OSError(errno.EINVAL, "no plain file (a pipe or a device)", str(path))
+    return type(error)(error.errno, error.strerror, str(path))

@@ -1,0 +1,221 @@
+"""The small result of a measurement cycle, and the bytes in which it crosses to control, recorder and session.
+
+The ring of shapes and a run's inputs file hold the same bytes: one line of JSON with the numbers and words, then the
+coefficients, then the covariance (of a symmetric one the upper half). A reader checks every length, type and range
+first, because a run folder may come from anywhere.
+"""
+
+import json
+import math
+from dataclasses import dataclass, fields
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+Kind = Literal["full", "fringes"]
+Verdict = Literal["ok", "degraded", "rejected"]
+TERMS = 36
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeEstimate:
+    """Figure of the mirror from one cycle.
+
+    Attributes
+    ----------
+    time_s : float
+        Middle of the exposures on the run's clock.
+    kind : str
+        "full" (Gray codes taken) or "fringes" (fringe orders carried over from the last absolute phase).
+    coeffs_um : (36,) array
+        Noll j = 1..36, orthonormal over `mirror.radius_mm`, of the height measured from the vertex;
+        piston makes the surface 0 at the vertex.
+    hencky_um : float
+        Amplitude of the part of a Hencky bowl that the 36 terms cannot carry, as the sag of that bowl.
+    covariance_um2 : (36, 36) array
+        Of `coeffs_um`, from pixel noise and the residual of the fit.
+    sag_um : float
+        Height at `mirror.radius_mm`, mean over azimuth, above the vertex.
+    sag_sigma_um : float
+        Its standard deviation from `covariance_um2`.
+    geometry_sag_sigma_um : float
+        Its standard deviation from how well the geometry is known, which all cycles have in common; NaN if that is
+        not stated.
+    displacement_um : float
+        Mean laser reading during the exposures (NaN without a laser).
+    slope_residual_urad : float
+        RMS of measured minus fitted slopes.
+    valid_fraction : float
+        Share of the analysis area that gave a slope.
+    modulation_median_adu, saturated_fraction : float
+        Fringe quality.
+    verdict, reason : str
+        "ok", "degraded" or "rejected", and why.
+    latency_s : float
+        Last frame to this result (filled by the acquisition).
+    cycle : int
+        Number of the cycle in the run (filled by the acquisition).
+    """
+
+    time_s: float
+    kind: Kind
+    coeffs_um: NDArray[np.float64]
+    hencky_um: float
+    covariance_um2: NDArray[np.float64]
+    sag_um: float
+    sag_sigma_um: float
+    displacement_um: float
+    slope_residual_urad: float
+    valid_fraction: float
+    modulation_median_adu: float
+    saturated_fraction: float
+    verdict: Verdict
+    reason: str = ""
+    latency_s: float = float("nan")
+    cycle: int = 0
+    geometry_sag_sigma_um: float = float("nan")
+
+
+_WORDS = {"kind": get_args(Kind), "verdict": get_args(Verdict)}
+_ARRAYS = ("coeffs_um", "covariance_um2")
+_NUMBERS = tuple(
+    field.name for field in fields(ShapeEstimate) if field.name not in {*_WORDS, *_ARRAYS, "reason", "cycle"}
+)
+_KEYS = {*_NUMBERS, *_WORDS, "reason", "cycle", "terms", "symmetric", "single"}
+_UPPER = np.triu_indices(TERMS)
+_LINE_BYTES_MAX = 8192  # the numbers take 0.5 kB; the rest is room for a reason
+_COEFFS_BYTES = 8 * TERMS
+_LARGEST = 1e300  # no infinity, and no whole number that a float cannot hold
+
+
+def pack_estimate(estimate: ShapeEstimate) -> bytes:
+    """A shape estimate as bytes, exact to the last bit."""
+    covariance = np.asarray(estimate.covariance_um2, dtype="<f8")
+    symmetric = np.array_equal(covariance, covariance.T)
+    values = covariance[_UPPER] if symmetric else covariance.ravel()
+    single = np.array_equal(values, values.astype("<f4"), equal_nan=True)  # as the acquisition sends them
+    head = {field.name: getattr(estimate, field.name) for field in fields(ShapeEstimate) if field.name not in _ARRAYS}
+    line = json.dumps({**head, "terms": TERMS, "symmetric": symmetric, "single": single}, default=float)
+    coeffs = np.asarray(estimate.coeffs_um, dtype="<f8")
+    return b"\n".join((line.encode(), coeffs.tobytes() + values.astype("<f4" if single else "<f8").tobytes()))
+
+
+def unpack_estimate(data: bytes) -> ShapeEstimate:
+    """The estimate of `pack_estimate`. Raises ValueError if these are not its bytes."""
+    line, _, arrays = data.partition(b"\n")
+    if len(line) > _LINE_BYTES_MAX:
+        raise ValueError(f"shape estimate: {len(line)} bytes where at most {_LINE_BYTES_MAX} are expected")
+    try:
+        head = json.loads(line)
+    except RecursionError:
+        raise ValueError("shape estimate: not one flat JSON object") from None
+    symmetric, single = _checked(head)
+    count = _UPPER[0].size if symmetric else TERMS**2
+    if len(arrays) != _COEFFS_BYTES + count * (4 if single else 8):
+        raise ValueError(f"shape estimate: {len(arrays)} bytes of arrays do not fit its first line")
+    coeffs_um = np.frombuffer(arrays, dtype="<f8", count=TERMS)
+    values = np.frombuffer(arrays, dtype="<f4" if single else "<f8", offset=_COEFFS_BYTES)
+    if np.isinf(coeffs_um).any() or np.isinf(values).any():
+        raise ValueError("shape estimate: infinite coefficient or covariance")
+    covariance = np.empty((TERMS, TERMS))
+    if symmetric:
+        rows, columns = _UPPER
+        covariance[rows, columns] = covariance[columns, rows] = values
+    else:
+        covariance[:] = values.reshape(TERMS, TERMS)
+    return ShapeEstimate(**head, coeffs_um=coeffs_um.copy(), covariance_um2=covariance)
+
+
+def _checked(head: Any) -> tuple[bool, bool]:
+    """Whether the covariance is symmetric and in singles; leaves the estimate's own fields. Raises ValueError."""
+    if not isinstance(head, dict) or not set(head) <= _KEYS:
+        raise ValueError("shape estimate: its first line names other fields")
+    layout = (head.pop("terms", None), head.pop("symmetric", None), head.pop("single", None))
+    if layout[0] != TERMS or not all(isinstance(flag, bool) for flag in layout[1:]):
+        raise ValueError(f"shape estimate: not of {TERMS} terms")
+    for name in _NUMBERS:
+        value = head.get(name, math.nan)  # what an older version did not know is NaN
+        if type(value) not in (float, int) or abs(value) > _LARGEST:
+            raise ValueError(f"shape estimate: {name} is no number")
+        head[name] = float(value)
+    if math.isnan(head["time_s"]):
+        raise ValueError("shape estimate: it has no time")
+    for name, words in _WORDS.items():
+        if head.get(name) not in words:
+            raise ValueError(f"shape estimate: {name} is none of {', '.join(words)}")
+    cycle = head.setdefault("cycle", 0)
+    if type(cycle) is not int or not 0 <= cycle < 2**63 or not isinstance(head.setdefault("reason", ""), str):
+        raise ValueError("shape estimate: cycle or reason is of a wrong kind")
+    return layout[1], layout[2]
+
+
+# What one cycle's numbers say about it: a pure table of limits.
+
+
+# Fringes weaker than this share of the sensor's range: at 2 % (5 of 255) the noise of the phase passes 0.06 rad a
+# pixel and rounding no longer averages out; at 6 % something is wrong with exposure, focus or screen.
+MODULATION_REJECTED_SHARE = 0.02
+MODULATION_DEGRADED_SHARE = 0.06
+# Saturated pixels bend the phase by harmonics; their bins are left out, so a few (glints) do no harm.
+SATURATED_REJECTED_FRACTION = 0.20
+SATURATED_DEGRADED_FRACTION = 0.005
+# 36 terms over a disc with a quarter missing are extrapolated there.
+VALID_REJECTED_FRACTION = 0.5
+VALID_DEGRADED_FRACTION = 0.9
+# Wrinkles and ripple leave some tens of microradian; a wrong fringe order leaves 8700 at its place.
+RESIDUAL_REJECTED_URAD = 1000.0
+RESIDUAL_DEGRADED_URAD = 200.0
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Figures of one cycle.
+
+    Attributes
+    ----------
+    modulation_share : float
+        Median fringe amplitude over the sensor's full scale.
+    saturated_fraction : float
+        Share of the points with a saturated pixel.
+    valid_fraction : float
+        Share of the analysis area that gave a slope.
+    residual_urad : float
+        RMS of measured minus fitted slopes.
+    converged : bool
+        Whether the fit stood still at its end.
+    """
+
+    modulation_share: float
+    saturated_fraction: float
+    valid_fraction: float
+    residual_urad: float
+    converged: bool
+
+
+def judge(quality: Quality) -> tuple[Verdict, str]:
+    """The worst verdict and its reason; NaN anywhere is a rejection."""
+    q = quality
+    rejected = (
+        (
+            q.modulation_share >= MODULATION_REJECTED_SHARE,
+            f"fringe modulation {q.modulation_share:.1%} of full scale",
+        ),
+        (q.saturated_fraction <= SATURATED_REJECTED_FRACTION, f"{q.saturated_fraction:.1%} of the points saturated"),
+        (q.valid_fraction >= VALID_REJECTED_FRACTION, f"only {q.valid_fraction:.0%} of the area gave a slope"),
+        (q.converged, "the fit did not converge"),
+        (q.residual_urad <= RESIDUAL_REJECTED_URAD, f"slope residual {q.residual_urad:.0f} urad"),
+    )
+    degraded = (
+        (q.modulation_share >= MODULATION_DEGRADED_SHARE, rejected[0][1]),
+        (q.saturated_fraction <= SATURATED_DEGRADED_FRACTION, rejected[1][1]),
+        (q.valid_fraction >= VALID_DEGRADED_FRACTION, rejected[2][1]),
+        (q.residual_urad <= RESIDUAL_DEGRADED_URAD, rejected[4][1]),
+    )
+    for fine, reason in rejected:
+        if not fine:
+            return "rejected", reason
+    for fine, reason in degraded:
+        if not fine:
+            return "degraded", reason
+    return "ok", ""

@@ -1,0 +1,87 @@
+"""One row of telemetry a tick: what the recorder stores and the live screen shows.
+
+A row crosses to the other processes as plain doubles, so that writing it costs the tick a few microseconds.
+Codes (state, shape state, fault, rung) are small integers; their names are in `states.py`.
+"""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from operator import attrgetter
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class TelemetryRow:
+    """Everything one tick saw, decided and wrote; NaN where there was nothing."""
+
+    mono_s: float  # the run's clock at the start of the tick
+    tick: float
+    dt_s: float
+    lateness_ms: float
+    missed_ticks: float  # running count
+    state: float
+    shape_state: float
+    rung: float
+    fault: float  # 0: none
+    target_um: float  # where the setpoint ramp is heading
+    setpoint_um: float  # what the loop is given, trim included
+    displacement_um: float
+    filtered_um: float
+    error_um: float
+    p_um_per_s: float
+    i_um_per_s: float
+    d_um_per_s: float
+    feedforward_um_per_s: float
+    flow_wanted_um_per_s: float  # before the limits
+    flow_um_per_s: float  # after them
+    pump_fraction: float
+    vent_fraction: float
+    pump_readback_fraction: float
+    vent_readback_fraction: float
+    gauge_pressure_pa: float
+    ambient_pressure_pa: float
+    air_temperature_c: float
+    gas_temperature_c: float
+    displacement_quality: float
+    sample_counter: float
+    device_time_s: float
+    leak_um_per_s: float
+    trim_um: float
+    truth_displacement_um: float  # twin only: what the mirror's centre really does
+    truth_laser_bias_um: float  # twin only
+
+    def pack(self) -> bytes:
+        """The row as doubles in field order."""
+        return _STRUCT.pack(*_values(self))
+
+
+FIELDS: tuple[str, ...] = tuple(field.name for field in fields(TelemetryRow))
+_values = attrgetter(*FIELDS)  # astuple would copy deeply: 15 us a tick
+_STRUCT = struct.Struct(f"<{len(FIELDS)}d")
+ROW_BYTES = _STRUCT.size
+
+
+# Telemetry rows as a table: messages of the telemetry ring in, one NumPy column a field out.
+
+
+Rows = NDArray[np.float64]
+COLUMN: dict[str, int] = {name: place for place, name in enumerate(FIELDS)}
+
+
+def unpack(messages: Sequence[bytes]) -> Rows:
+    """(n, len(FIELDS)) table of packed `TelemetryRow`s, in their order."""
+    return np.frombuffer(b"".join(messages), dtype="<f8").reshape(-1, len(FIELDS))
+
+
+def column(rows: Rows, name: str) -> NDArray[np.float64]:
+    """One field of all rows, (n,)."""
+    return rows[:, COLUMN[name]]
+
+
+def changes(codes: NDArray[np.float64], before: float) -> list[tuple[int, int]]:
+    """Where a code changes: (row, new code) for each, the first row compared with `before` (NaN: nothing before)."""
+    previous = np.concatenate(([before], codes[:-1]))
+    return [(int(row), int(codes[row])) for row in np.flatnonzero((codes != previous) & np.isfinite(codes))]

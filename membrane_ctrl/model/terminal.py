@@ -1,0 +1,129 @@
+"""What may reach a terminal: text and line ends. The edge through which every command prints.
+
+Text comes out of files and off the network. A terminal obeys control bytes in it (it moves the cursor, sets the
+title, answers as if typed), and bidirectional marks show a line in another order than it is in. Here each such
+character becomes its JSON escape, so that what is printed as JSON stays JSON and keeps its meaning.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import unicodedata
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import TYPE_CHECKING, Any, TextIO, cast
+
+if TYPE_CHECKING:  # a command that draws no table need not load it
+    from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderableType, RenderResult
+
+
+# Control, invisible and direction marks, halves of a pair, and the two line ends that no terminal shows.
+_REFUSED = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
+_KEPT = frozenset("\n\t")
+
+
+def plain(text: str) -> str:
+    """The text with every character that a terminal might obey as its JSON escape."""
+    if text.isprintable():
+        return text
+    return "".join(_escape(letter) if _refused(letter) else letter for letter in text)
+
+
+def one_line(text: str) -> str:
+    """The same in one line: a line end is a space."""
+    return plain(" ".join(text.split("\n")))
+
+
+@contextlib.contextmanager
+def only_text() -> Iterator[None]:
+    """Within it nothing printed, by whatever part of the program, is more than text."""
+    with (
+        contextlib.redirect_stdout(cast("TextIO", _Text(sys.stdout))),
+        contextlib.redirect_stderr(cast("TextIO", _Text(sys.stderr))),
+    ):
+        yield
+
+
+def table_console(stderr: bool = False, width: int | None = None) -> Console:
+    """A Rich console for tables: Rich's own colours pass, control characters in the cells do not."""
+    from rich.console import Console
+
+    made = Console(stderr=stderr, width=width)
+    made.push_render_hook(_Cells())  # type: ignore[arg-type]  # its base class is Rich's, loaded here only
+    return made
+
+
+class Plain:
+    """What Rich draws, without control characters; for a `Live`, which draws past a console's hooks."""
+
+    def __init__(self, inner: RenderableType) -> None:
+        self._inner = inner
+
+    def __rich_console__(self, rich: Console, options: ConsoleOptions) -> RenderResult:
+        from rich.segment import Segment
+
+        for segment in rich.render(self._inner, options):
+            yield segment if segment.control else Segment(plain(segment.text), segment.style)
+
+
+class _Cells:
+    def process_renderables(self, renderables: list[ConsoleRenderable]) -> list[ConsoleRenderable]:
+        return [Plain(renderable) for renderable in renderables]
+
+
+class _Text:
+    """A stream in front of another."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        # where Rich writes, which colours what it prints: its cells are looked through in `table_console`
+        self.rich_proxied_file = getattr(stream, "rich_proxied_file", stream)
+
+    def write(self, text: str) -> int:
+        """Write what of a text is text."""
+        self._stream.write(plain(text))
+        return len(text)
+
+    def writelines(self, lines: Any) -> None:
+        """Write several."""
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _refused(letter: str) -> bool:
+    return letter not in _KEPT and unicodedata.category(letter) in _REFUSED
+
+
+def _escape(letter: str) -> str:
+    units = letter.encode("utf-16-be", "surrogatepass")
+    return "".join(f"\\u{int.from_bytes(units[k : k + 2]):04x}" for k in range(0, len(units), 2))
+
+
+# A command that is ended from outside cleans up behind itself, as it does after Ctrl-C.
+
+
+@contextmanager
+def ends_as_by_ctrl_c() -> Iterator[None]:
+    """SIGTERM and SIGHUP raise KeyboardInterrupt inside: temporary files go, viewers end.
+
+    A SIGHUP that is ignored stays so: `nohup` asks to go on without the terminal.
+    """
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    for number, handler in before.items():
+        if handler != signal.SIG_IGN:
+            signal.signal(number, _interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt

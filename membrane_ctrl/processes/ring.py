@@ -1,0 +1,326 @@
+"""A ring of messages in shared memory: one writer that never waits, any number of readers.
+
+The writer overwrites the oldest slot; a reader that was too slow sees a gap in the sequence numbers and counts
+it. What a killed writer had put is still there for its readers.
+
+Counter and sequence numbers are 8-byte aligned and written through a memoryview of 8-byte words, which makes one
+store of each assignment. (`struct.pack_into` clears the bytes first, and a racing reader sees the counter as 0.)
+Each slot carries its sequence number before and after the message. A reader takes a message only if both are the one
+it expects: it reads the one behind before it copies and the one in front afterwards. That is enough on x86-64, where
+stores become visible in their order. On ARM64 they may not, so each slot also has a CRC-32 of its message, seeded
+with the sequence number: a message that is not all there yet does not fit, and the reader looks again at its next
+call.
+"""
+
+import json
+import os
+import re
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from mmap import PROT_READ, mmap
+from multiprocessing.shared_memory import SharedMemory
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl.model.files import open_plain, read_bytes, write_text_atomic
+
+_MAGIC = int.from_bytes(b"MBRring1", "little")
+_WRITTEN, _IS_RING, _SLOTS, _SLOT_BYTES = range(4)  # words of the header
+_HEADER_BYTES = 64  # a cache line of its own for the write counter
+_SLOT_OVERHEAD = 3 * 8  # sequence; length and CRC-32; sequence again
+# The largest ring of a run, a minute of inputs at 1 kHz, is 32 MB
+_RING_BYTES_MAX = 1 << 27
+# A writer that goes round meanwhile takes a few tries; a newest slot that never fits is damage and must end `latest`
+_TRIES = 100
+
+
+class RingError(ValueError):
+    """The memory is no ring, or not the one that the address tells of."""
+
+
+@dataclass(frozen=True, slots=True)
+class RingAddress:
+    """What another process needs to read a ring (or to become its only writer)."""
+
+    name: str
+    slots: int
+    slot_bytes: int
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the shared memory. Raises RingError if no ring of ours is like that."""
+        size_bytes = _HEADER_BYTES + self.slots * _stride(self.slot_bytes)
+        if self.slots < 1 or self.slot_bytes < 0 or size_bytes > _RING_BYTES_MAX:
+            raise RingError(f"no ring has {self.slots} slots of {self.slot_bytes} bytes")
+        return size_bytes
+
+
+class Ring:
+    """Owns the shared memory; create it in the process that outlives the readers' start.
+
+    Parameters
+    ----------
+    slots : int
+        Messages kept.
+    slot_bytes : int
+        Longest message.
+    """
+
+    def __init__(self, slots: int, slot_bytes: int) -> None:
+        size_bytes = RingAddress("", slots, slot_bytes).size_bytes
+        self._memory = SharedMemory(create=True, size=size_bytes)
+        self.address = RingAddress(self._memory.name, slots, slot_bytes)
+        assert self._memory.buf is not None  # None only after close()
+        with self._memory.buf[:_HEADER_BYTES].cast("Q") as words:
+            words[_IS_RING], words[_SLOTS], words[_SLOT_BYTES] = _MAGIC, slots, slot_bytes
+
+    def close(self) -> None:
+        """Give the memory back; readers that are still attached keep theirs."""
+        self._memory.close()
+        self._memory.unlink()
+
+
+class _Slots:
+    """The layout, over memory that is checked against its address. Raises RingError."""
+
+    def __init__(self, memory: SharedMemory | mmap, address: RingAddress) -> None:
+        whole = memoryview(memory) if isinstance(memory, mmap) else memory.buf
+        assert whole is not None  # None only after close()
+        self._memory, self._views = memory, [whole]
+        size_bytes = address.size_bytes
+        if whole.nbytes < size_bytes:
+            raise RingError(f"{address.name}: {whole.nbytes} bytes where a ring of {size_bytes} is expected")
+        self.bytes = whole[:size_bytes]
+        self.words = self.bytes.cast("Q")
+        self._views[:0] = self.words, self.bytes
+        self.count, self._stride = address.slots, _stride(address.slot_bytes)
+        head = [self.words[word] for word in (_IS_RING, _SLOTS, _SLOT_BYTES)]
+        if head != [_MAGIC, address.slots, address.slot_bytes]:
+            raise RingError(f"{address.name}: not the ring of {address.slots} slots that is expected")
+
+    @property
+    def written(self) -> int:
+        """Messages put so far."""
+        return self.words[_WRITTEN]
+
+    def span(self, index: int) -> tuple[int, int]:
+        """First and last word of a message's slot."""
+        start = _HEADER_BYTES + (index % self.count) * self._stride
+        return start // 8, (start + self._stride) // 8 - 1
+
+    def close(self) -> None:
+        """Detach: memory with a view of it cannot be closed."""
+        for view in self._views:
+            view.release()
+        self._memory.close()
+
+    __del__ = close  # before the memory's own end, which would complain of the views
+
+
+class RingWriter:
+    """The one writer of a ring. Raises RingError for what is none."""
+
+    def __init__(self, address: RingAddress) -> None:
+        self._slots = _Slots(SharedMemory(address.name), address)
+        self._next = self._slots.written
+        self.slot_bytes = address.slot_bytes
+
+    def put(self, message: bytes) -> None:
+        """Write one message over the oldest. Raises ValueError if it is longer than a slot."""
+        length = len(message)
+        if length > self.slot_bytes:
+            raise ValueError(f"message of {length} bytes in a ring of {self.slot_bytes}-byte slots")
+        words = self._slots.words
+        first, last = self._slots.span(self._next)
+        sequence = self._next + 1
+        words[first] = sequence
+        words[first + 1] = _seal(message, sequence)
+        self._slots.bytes[8 * first + 16 : 8 * first + 16 + length] = message
+        words[last] = sequence
+        self._next = sequence
+        words[_WRITTEN] = sequence
+
+    def close(self) -> None:
+        """Detach."""
+        self._slots.close()
+
+
+class RingReader:
+    """One reader; it starts at the oldest message still in the ring.
+
+    Parameters
+    ----------
+    address : RingAddress
+        Of the ring.
+    memory : mmap, optional
+        The ring's memory, if the caller has mapped it.
+
+    Attributes
+    ----------
+    dropped : int
+        Messages overwritten before this reader got to them.
+
+    Raises
+    ------
+    RingError
+    """
+
+    def __init__(self, address: RingAddress, memory: mmap | None = None) -> None:
+        self._slots = _Slots(SharedMemory(address.name) if memory is None else memory, address)
+        self._slot_bytes = address.slot_bytes
+        self._read = 0
+        self._looked_at = -1
+        self.dropped = 0
+
+    def drain(self, limit: int | None = None) -> list[bytes]:
+        """All messages since the last call (at most `limit`, and one round of the ring), oldest first."""
+        messages: list[bytes] = []
+        for _ in range(self._slots.count):
+            written = self._slots.written
+            if self._read >= written or (limit is not None and len(messages) >= limit):
+                break
+            oldest = max(0, written - self._slots.count)
+            if self._read < oldest:
+                self.dropped += oldest - self._read
+                self._read = oldest
+            message = self._take(self._read)
+            if message is None and self._not_there_yet():
+                break
+            self._read += 1
+            if message is None:
+                self.dropped += 1
+            else:
+                messages.append(message)
+        return messages
+
+    def latest(self) -> bytes | None:
+        """The newest message, or None if there is none yet; older ones are passed over and not counted."""
+        for _ in range(_TRIES):
+            written = self._slots.written
+            if not written:
+                break
+            self._read = written
+            if (message := self._take(written - 1)) is not None:
+                return message
+        return None
+
+    def _not_there_yet(self) -> bool:
+        """Nobody has written over the message, so it has yet to become visible; True once for each message."""
+        again = self._looked_at != self._read and self._read > self._slots.written - self._slots.count
+        self._looked_at = self._read
+        return again
+
+    def _take(self, index: int) -> bytes | None:
+        slots = self._slots
+        first, last = slots.span(index)
+        after = slots.words[last]
+        seal = slots.words[first + 1]
+        length = min(seal & 0xFFFFFFFF, self._slot_bytes)
+        message = bytes(slots.bytes[8 * first + 16 : 8 * first + 16 + length])
+        before = slots.words[first]
+        return message if before == after == index + 1 and seal == _seal(message, index + 1) else None
+
+    def close(self) -> None:
+        """Detach."""
+        self._slots.close()
+
+
+@contextmanager
+def ring(slots: int, slot_bytes: int) -> Iterator[RingAddress]:
+    """A ring for the length of a `with` block."""
+    owner = Ring(slots, slot_bytes)
+    try:
+        yield owner.address
+    finally:
+        owner.close()
+
+
+def _seal(message: bytes, sequence: int) -> int:
+    """Length and CRC-32 of a message, in one word."""
+    return len(message) | zlib.crc32(message, sequence & 0xFFFFFFFF) << 32
+
+
+def _stride(slot_bytes: int) -> int:
+    return (slot_bytes + _SLOT_OVERHEAD + 7) // 8 * 8
+
+
+# The rings of a run for programs that the run did not start: their addresses in its folder, `rings.json`.
+#
+# Reading them costs the control process nothing, and every tick is there for a minute: what a session needs and a
+# stream of status lines through the port is not (docs/decisions/79-tuning-sessions.md). The folder may have
+# been made by somebody else: only shared memory of this user that is the ring it is said to be is opened, to be read.
+
+
+_FILE = "rings.json"
+_FILE_BYTES_MAX = 4096  # three rings take 250
+_NAME = re.compile(r"psm_[0-9a-f]{8}")  # as Python's `SharedMemory` names what it makes
+_RINGS = frozenset({"telemetry", "events", "shapes"})
+_SHARED_MEMORY_FOLDER = Path("/dev/shm")
+
+
+def publish(run_dir: Path, rings: Mapping[str, RingAddress | None]) -> None:
+    """Write the addresses of the rings that there are. Raises OSError."""
+    found = {name: asdict(address) for name, address in rings.items() if address is not None}
+    write_text_atomic(run_dir / _FILE, json.dumps(found, indent=1) + "\n")
+
+
+def attach(run_dir: Path) -> dict[str, RingReader]:
+    """Readers of a run's rings, each at its newest message.
+
+    Raises
+    ------
+    FileNotFoundError
+        The run has published none, or is over.
+    OSError, RingError
+        `rings.json` or what it names is none of ours.
+    """
+    readers: dict[str, RingReader] = {}
+    with ExitStack() as stack:
+        for name, address in _addresses(run_dir / _FILE).items():
+            readers[name] = RingReader(address, _mapped(address))
+            stack.callback(readers[name].close)
+            readers[name].latest()
+        stack.pop_all()
+    return readers
+
+
+def _addresses(path: Path) -> dict[str, RingAddress]:
+    text = read_bytes(path, _FILE_BYTES_MAX)
+    try:
+        return {name: _address(name, values) for name, values in json.loads(text).items()}
+    except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
+        raise RingError(f"{_FILE} is damaged: {error}") from None
+
+
+def _address(ring: str, values: dict[str, Any]) -> RingAddress:
+    name, slots, slot_bytes = values["name"], values["slots"], values["slot_bytes"]
+    if ring not in _RINGS or not _NAME.fullmatch(name) or type(slots) is not int or type(slot_bytes) is not int:
+        raise RingError(f"{ring!r:.40} is the address of no ring")
+    return RingAddress(name, slots, slot_bytes)
+
+
+def _mapped(address: RingAddress) -> mmap:
+    """The ring's memory, read only. Raises OSError, RingError."""
+    with open_plain(_SHARED_MEMORY_FOLDER / address.name) as file:
+        found, size_bytes = os.fstat(file.fileno()), address.size_bytes
+        if found.st_uid != os.geteuid():
+            raise RingError(f"{address.name} belongs to user {found.st_uid}: tune as that user")
+        if found.st_size != size_bytes:
+            raise RingError(f"{address.name} has {found.st_size} bytes, not the {size_bytes} of the ring")
+        return mmap(file.fileno(), size_bytes, prot=PROT_READ)
+
+
+# How another process finds the shared frames: plain data, free of NumPy (see `threads.py` for why that counts).
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAddress:
+    """What another process needs to read the frames (or to become their only writer)."""
+
+    name: str
+    slots: int
+    height_px: int
+    width_px: int
+    dtype: str

@@ -1,0 +1,1 @@
+"""The recorder process: Rerun segments and exact tables."""

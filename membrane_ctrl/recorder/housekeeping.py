@@ -1,0 +1,239 @@
+"""What the recorder does beside recording: looks at the disk, optimises closed segments, deletes old runs."""
+
+import contextlib
+import importlib.util
+import os
+import subprocess
+import time
+from collections import deque
+from functools import partial
+from pathlib import Path
+
+from membrane_ctrl.config.schema import Config, RecordingConfig
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.recorder.sink import LAYOUT, Complaints, is_whole
+from membrane_ctrl.run_files import disk_budget, run_folder
+
+# Whether the run's folder is still the one that was begun, and another in its place if it is not.
+
+
+class FolderWatch:
+    """Holds the folder open: as long as that is so its number is nobody else's, and it cannot be mistaken.
+
+    Parameters
+    ----------
+    run_dir : Path
+        Folder of the run.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self._run_dir = run_dir
+        self._descriptor = _opened(run_dir)
+        # an `rm -r` that met a file just written leaves the folder, without what was in it
+        self._has_config = (run_dir / run_folder.CONFIG).exists()
+
+    def gone(self) -> bool:
+        """Whether the folder, or what was in it, was removed or moved. Raises OSError (not if it is missing)."""
+        if self._descriptor is None or (self._has_config and not (self._run_dir / run_folder.CONFIG).exists()):
+            return True
+        try:
+            found = self._run_dir.stat()
+        except FileNotFoundError:
+            return True
+        return not os.path.samestat(found, os.fstat(self._descriptor))
+
+    def begin_anew(self, config: Config) -> None:
+        """Make the folder again, with the configuration in it. Raises OSError; then it is still `gone`."""
+        self._run_dir.mkdir(parents=True, exist_ok=True)
+        run_folder.write_config(self._run_dir, config)
+        self.close()
+        self._descriptor = _opened(self._run_dir)
+        self._has_config = True
+
+    def close(self) -> None:
+        """Let go of the folder."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+
+def _opened(folder: Path) -> int | None:
+    try:
+        return os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        return None
+
+
+# Closed segments through `rerun rrd optimize`, one at a time, in a process that steps back behind everything.
+#
+# It takes a third off a segment and the wait off opening it. The original is replaced in one step, and only by a
+# file that has its footer and was made without a complaint.
+
+
+_PACKAGE = importlib.util.find_spec("rerun_cli")
+assert _PACKAGE is not None
+assert _PACKAGE.origin is not None  # it comes with rerun-sdk
+_RERUN = Path(_PACKAGE.origin).parent / "rerun"
+
+
+def optimize_command(source: Path, target: Path, *options: str) -> list[str]:
+    """The command that writes `target` from `source`; the binary itself, as its Python wrapper outlives a kill.
+
+    An option may be another source.
+    """
+    return ["nice", "-n", "19", str(_RERUN), "rrd", "optimize", *options, str(source), "-o", str(target)]
+
+
+def quiet_environment() -> dict[str, str]:
+    """Rerun's command without its log and its usage statistics."""
+    return os.environ | {"RUST_LOG": "error", "TELEMETRY_ENABLED": "false"}
+
+
+class Optimizer:
+    """Works through closed segments beside the recorder; call `poll` now and then.
+
+    Parameters
+    ----------
+    run_dir : Path
+        Where the segments are; what a recorder that was killed has left half done there is removed.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        for half_done in run_dir.glob(".*.rrd.part"):
+            half_done.unlink(missing_ok=True)
+        self._waiting: deque[Path] = deque()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._source = self._part = Path()
+
+    def add(self, path: Path) -> None:
+        """Take a closed segment on."""
+        self._waiting.append(path)
+
+    def poll(self) -> None:
+        """Put a finished file in place, start the next. Raises OSError, also for one that could not be optimised."""
+        if self._process is not None:
+            code = self._process.poll()
+            if code is None:
+                return
+            self._process = None
+            self._put_in_place(code)
+        if self._waiting:
+            self._source = self._waiting.popleft()
+            self._part = self._source.with_name(f".{self._source.name}.part")
+            # the run's layout, which only its first segment has
+            layout = [str(path) for path in (self._source.with_name(LAYOUT),) if path.exists()]
+            self._process = subprocess.Popen(
+                optimize_command(self._source, self._part, *layout),
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                env=quiet_environment(),
+            )
+
+    def _put_in_place(self, code: int) -> None:
+        if code == 0 and self._part.exists() and is_whole(self._part):
+            with self._part.open("rb") as file:
+                os.fsync(file.fileno())
+            self._part.replace(self._source)
+            return
+        self._part.unlink(missing_ok=True)
+        raise OSError(f"{self._source.name} stays as it is: rrd optimize ended with {code}")
+
+    @property
+    def busy(self) -> bool:
+        """Something is under way or waits."""
+        return self._process is not None or bool(self._waiting)
+
+    def close(self) -> None:
+        """End what is under way; its segment stays as it is."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+            self._part.unlink(missing_ok=True)
+
+
+# Counting the bytes of a hundred runs takes a second of disk.
+RETENTION_INTERVAL_S = 3600.0
+# At the run's end a person waits for the prompt, and a service manager is about to kill what is left. A segment of an
+# hour takes longer only on a very busy machine (docs/recording.md).
+_OPTIMISE_LAST_S = 20.0
+_LOOK_S = 0.05
+_RUN = "retention: "  # and the run that cannot be deleted
+
+
+class Housekeeping:
+    """One look each second.
+
+    Attributes
+    ----------
+    thrift : Thrift
+        What has to be left out.
+    """
+
+    def __init__(self, run_dir: Path, clock: RunClock, config: RecordingConfig, complaints: Complaints) -> None:
+        self._run_dir = run_dir
+        self._clock = clock
+        self._config = config
+        self._complaints = complaints
+        self._optimizer = Optimizer(run_dir)
+        self._retention_due_s = 0.0
+        self.thrift = disk_budget.Thrift.ALL
+
+    def finish(self, closed: list[Path]) -> None:
+        """The run is over: optimise what is closed; what takes too long stays as it is."""
+        give_up_s = time.monotonic() + _OPTIMISE_LAST_S
+        self._take(closed)
+        while True:
+            self._complaints.guarded("optimise", self._optimizer.poll)
+            if not self._optimizer.busy or time.monotonic() > give_up_s:
+                return
+            time.sleep(_LOOK_S)
+
+    def _take(self, closed: list[Path]) -> None:
+        if self.thrift == disk_budget.Thrift.ALL:  # a second copy of a segment needs room
+            for path in closed:
+                self._optimizer.add(path)
+
+    def look(self, now_s: float, closed: list[Path]) -> None:
+        """Watch the disk, go on with what is under way; `closed` are segments to optimise."""
+        self._complaints.guarded("disk check", self._watch_disk)
+        self._take(closed)
+        self._complaints.guarded("optimise", self._optimizer.poll)
+        if now_s >= self._retention_due_s:
+            self._retention_due_s = now_s + RETENTION_INTERVAL_S
+            self._complaints.guarded("retention", self._delete_old)
+
+    def _watch_disk(self) -> None:
+        left_mb, least_mb = run_folder.free_mb(self._run_dir), self._config.min_free_mb
+        self.thrift = disk_budget.thrift(left_mb, least_mb, self.thrift)
+        if left_mb < least_mb:
+            limit = f"less than recording.min_free_mb = {least_mb:g} MB free"
+            self._complaints.complain("disk", f"{self._run_dir}: {limit}; delete old runs", kind="disk_low")
+        else:
+            self._complaints.recovered("disk")
+
+    def _delete_old(self) -> None:
+        config = self._config
+        if config.keep_gb is None and config.keep_days is None:
+            return
+        # the run's own axis: a wall clock that is set wrong meanwhile deletes nothing
+        now_utc = self._clock.utc(self._clock.now())
+        disk_budget.delete_remains(self._run_dir.parent)
+        runs = disk_budget.deletable_runs(self._run_dir.parent, self._run_dir, now_utc)
+        gone = disk_budget.expired(
+            runs, disk_budget.size_bytes(self._run_dir), config.keep_gb, config.keep_days, now_utc
+        )
+        # a folder that a person has moved away by hand is no trouble any more
+        self._complaints.forget(_RUN, but={_RUN + run.folder.name for run, _ in gone})
+        for run, why in gone:  # one by one: a folder that cannot go must not keep the others
+            self._complaints.guarded(_RUN + run.folder.name, partial(self._delete, run, why))
+
+    def _delete(self, run: disk_budget.OldRun, why: str) -> None:
+        disk_budget.delete_run(run)
+        self._complaints.report({"kind": "run_deleted", "run": run.folder.name, "message": why})
+
+    def close(self) -> None:
+        """End what is under way."""
+        with contextlib.suppress(OSError):
+            self._optimizer.close()
+            (self._run_dir / LAYOUT).unlink(missing_ok=True)

@@ -1,0 +1,198 @@
+"""The recorder's process: started with `spawn`, fed by rings, ended by the run's "end" event.
+
+Rerun is imported here only after the process has started: the control process must not load it, and a stream
+that a forked child inherited loses what the child logs.
+"""
+
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from threading import Event as Flag
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.processes.child import STOP, alive, reporter
+from membrane_ctrl.processes.frames import FrameHead, FrameReader, Pixels
+from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
+from membrane_ctrl.recorder.sink import Recording
+
+# Rings are emptied this often: the telemetry ring has to hold a few of these.
+POLL_S = 0.25
+# A recorder that has not got round for so long is replaced: half of what the rings hold, so that the next one
+# still finds everything. A disk that is slower than this for one second of a run is as good as gone.
+_ROUND_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderSpec:
+    """What the recorder's process needs; picklable.
+
+    Attributes
+    ----------
+    run_dir : Path
+        From `run_folder.create_run_folder`.
+    run_name : str
+        Name of the `.rrd` segments.
+    clock : RunClock
+    config : Config
+    telemetry : RingAddress
+        Packed `TelemetryRow`s.
+    events : RingAddress
+        JSON objects with `time_utc`, `mono_s`, `kind`, ...; the one of kind "end" (with `exit`) is the last.
+    shapes : RingAddress or None
+        `estimate.pack_estimate`.
+    frames : FrameAddress or None
+        Shared camera frames, for thumbnails.
+    inputs : RingAddress or None
+        What the ticks were given (`tick_record`), for a replay.
+    resumes : int
+        How many recorders of this run have died before this one; it goes on where they stopped.
+    flush_s : float
+        From one write to the next: with the round it waits for, what a power cut may lose.
+    """
+
+    run_dir: Path
+    run_name: str
+    clock: RunClock
+    config: Config
+    telemetry: RingAddress
+    events: RingAddress
+    shapes: RingAddress | None = None
+    frames: FrameAddress | None = None
+    inputs: RingAddress | None = None
+    resumes: int = 0
+    flush_s: float = 1.0 - POLL_S
+
+
+def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
+    """Record until the "end" event, until `processes.STOP`, or until the parent has died; then close and summarise.
+
+    Parameters
+    ----------
+    spec : RecorderSpec
+        What to record and where.
+    status : Connection or None
+        Gets small dicts {"kind": "recorder_error" | "recorder_recovered" | "disk_low" | "recorder_done", "message":
+        ...} and each second that it is alive; one that cannot be taken at once is given up.
+    """
+    asked = Flag()
+    # ctrl-C reaches the whole terminal group: the supervisor decides when the run is over, with the "end" event
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(STOP, lambda *_: asked.set())
+    os.environ["RUST_LOG"] = "off"  # Rerun's own log would write over the live screen; its errors come as exceptions
+    # read when Rerun is imported: its allocator gives back at once what a closed segment leaves, or 30 MB would stay
+    os.environ["MIMALLOC_PURGE_DELAY"] = "0"
+    if not _record(spec, reporter(status), asked.is_set, parent_died):
+        os._exit(0)  # everything is written; Rerun's exit handler would wait for a dead writer
+
+
+def _record(
+    spec: RecorderSpec,
+    report: Callable[[dict[str, Any]], None],
+    asked: Callable[[], bool],
+    orphan: Callable[[], bool],
+) -> bool:
+    """Record until the end; whether the process may end in the ordinary way."""
+    from membrane_ctrl.recorder.recorder import Recorder
+    from membrane_ctrl.recorder.sink import Recording
+
+    pass
+
+    addresses = {
+        "telemetry": spec.telemetry,
+        "events": spec.events,
+        "shapes": spec.shapes,
+        "inputs": spec.inputs,
+    }
+    rings = {name: RingReader(address) for name, address in addresses.items() if address is not None}
+    first = sum(1 for _ in spec.run_dir.glob(f"{spec.run_name}-*.rrd")) if spec.resumes else 0
+    recording = Recording(spec.run_dir, spec.run_name, spec.clock, spec.config, first)
+    wanted = spec.frames is not None and spec.config.recording.thumbnails
+    thumbnails = Thumbnails(recording, spec.frames) if wanted and spec.frames is not None else None
+    recorder = Recorder(spec.run_dir, spec.clock, spec.config, rings, recording, thumbnails, report, spec.resumes)
+    next_write_s = 0.0
+    while not recorder.ended:
+        # asked before draining: what a parent put before it died is then seen in this round
+        exit_word = "killed" if orphan() else "terminated" if asked() else ""
+        recorder.drain()
+        if exit_word and not recorder.ended:
+            recorder.take_events([_end_event(spec.clock, exit_word)])
+        elif recorder.urgent or time.monotonic() >= next_write_s:
+            next_write_s = time.monotonic() + spec.flush_s
+            recorder.write()
+            report(alive(_ROUND_S))
+        if not recorder.ended:
+            time.sleep(POLL_S)
+    recorder.finish(in_haste=asked())
+    if thumbnails is not None:
+        thumbnails.close()
+    for ring in rings.values():
+        ring.close()
+    return not recording.stuck
+
+
+def _end_event(clock: RunClock, exit_word: str) -> dict[str, Any]:
+    now_s = clock.now()
+    return {"time_utc": clock.utc(now_s).isoformat(), "mono_s": now_s, "kind": "end", "exit": exit_word}
+
+
+def parent_died() -> bool:
+    """Whether the process that started this one is gone: its children get another parent."""
+    started_by = multiprocessing.parent_process()
+    return started_by is not None and os.getppid() != started_by.pid
+
+
+# Small pictures of the camera's frames, now and then.
+
+
+# Raw frames would be 1.7 TB a day; a set of eight thumbnails each half minute is about 0.3 GB.
+THUMBNAIL_INTERVAL_S = 30.0
+THUMBNAIL_HEIGHT_PX = 256
+_JPEG_QUALITY = 80
+
+
+class Thumbnails:
+    """Takes the newest frame of each pattern from the shared frames, at most one set each `THUMBNAIL_INTERVAL_S`."""
+
+    def __init__(self, recording: Recording, address: FrameAddress) -> None:
+        self._recording = recording
+        self._reader = FrameReader(address)
+        self._step = max(1, address.height_px // THUMBNAIL_HEIGHT_PX)
+        self._next_s = 0.0
+        self._newest_index = -1
+
+    def send(self, now_s: float) -> None:
+        """Send a set if one is due and there are new frames."""
+        if now_s < self._next_s:
+            return
+        newest: dict[str, FrameHead] = {head.pattern: head for head in self._reader.heads()}
+        fresh = [head for head in newest.values() if head.index > self._newest_index]
+        if not fresh:
+            return
+        self._next_s = now_s + THUMBNAIL_INTERVAL_S
+        self._newest_index = max(head.index for head in fresh)
+        for head in fresh:
+            pixels = self._reader.copy(head, self._step)
+            if pixels is not None:
+                picture = rr.Image(_eight_bit(pixels), color_model="L").compress(jpeg_quality=_JPEG_QUALITY)
+                self._recording.log(f"/frames/{head.pattern}", head.time_s, picture)
+
+    def close(self) -> None:
+        """Detach from the shared frames."""
+        self._reader.close()
+
+
+def _eight_bit(pixels: Pixels) -> NDArray[np.uint8]:
+    """JPEG takes 8 bits: of wider pixels the upper ones that are in use."""
+    shift = max(0, int(pixels.max()).bit_length() - 8)
+    return (pixels >> shift).astype(np.uint8)

@@ -1,0 +1,329 @@
+"""What the recorder does with what the rings bring: files, Rerun, summary. Nothing here may end it silently."""
+
+import contextlib
+import json
+import math
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl import __version__
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller.tick import TickAssembler
+from membrane_ctrl.model import files, object_codec, plain_json, shape_estimate, telemetry
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.processes.ring import RingReader
+from membrane_ctrl.recorder import housekeeping, rerun_output, sink
+from membrane_ctrl.run_files import events, inputs_file, tables
+from membrane_ctrl.run_files.events import Event, EventsFile
+from membrane_ctrl.run_files.summary import Summary
+
+# A ring as the recorder reads it: each message once, also when another recorder goes on where one was killed.
+
+
+class Feed:
+    """Counts messages from the ring's first one on, and passes over those a former recorder has brought to the disk.
+
+    Parameters
+    ----------
+    reader : RingReader
+        Fresh: it starts at the oldest message still in the ring.
+    position : int
+        Messages already recorded.
+    dropped : int
+        Messages already known to be lost.
+
+    Attributes
+    ----------
+    position : int
+        Messages recorded or lost so far.
+    dropped : int
+        Lost: overwritten before any recorder got to them.
+    """
+
+    def __init__(self, reader: RingReader, position: int = 0, dropped: int = 0) -> None:
+        self._reader = reader
+        self._end = 0
+        self._lost_by_reader = 0
+        self.position = position
+        self.dropped = dropped
+
+    def drain(self) -> list[bytes]:
+        """All messages since the last call that nobody has recorded yet."""
+        messages = self._reader.drain()
+        lost = self._reader.dropped - self._lost_by_reader
+        self._lost_by_reader = self._reader.dropped
+        first = self._end + lost
+        self._end = first + len(messages)
+        known = min(max(0, self.position - first), len(messages))
+        self.dropped += max(0, first - self.position) if lost else 0
+        self.position = max(self.position, self._end)
+        return messages[known:]
+
+
+# What a recorder hands on to the one that takes its place: how far it got, and the statistics so far.
+#
+# Plain JSON (`object_codec`), written and read by the same program and removed at the run's end.
+
+
+_NAME = ".recorder-state"
+_BYTES_MAX = 16_000_000  # it takes 0.2 MB, and 0.5 MB with all the transitions and faults that a summary lists
+_SPECIALS: object_codec.Specials = {shape_estimate.ShapeEstimate: object_codec.ESTIMATE}
+
+
+@dataclass(slots=True)
+class RecorderState:
+    """Everything of a recorder that is not in the run's files.
+
+    Attributes
+    ----------
+    summary : Summary
+    positions, dropped : dict
+        Of each ring: messages recorded, messages lost.
+    reference : ShapeEstimate or None
+        What changes of the figure are told against.
+    state : float
+        The controller's state in the last row.
+    windows : OpenWindows
+        Of the overview tables.
+    errors, rows_lost, events_lost, input_ticks_lost : int
+        The recorder's own account.
+    folder_anew_s : float or None
+        When the folder was last begun anew, because somebody had taken it away.
+    """
+
+    summary: Summary
+    positions: dict[str, int] = field(default_factory=dict)
+    dropped: dict[str, int] = field(default_factory=dict)
+    reference: shape_estimate.ShapeEstimate | None = None
+    state: float = math.nan
+    windows: tables.OpenWindows = field(default_factory=tables.OpenWindows)
+    errors: int = 0
+    rows_lost: int = 0
+    events_lost: int = 0
+    input_ticks_lost: int = 0
+    folder_anew_s: float | None = None
+
+
+def save_state(run_dir: Path, state: RecorderState) -> None:
+    """Write the state in one step. Raises OSError.
+
+    Not synced: it is of use after a killed recorder, not after a power cut, when the rings are gone as well.
+    """
+    part = run_dir / f"{_NAME}.part"
+    with files.fresh_file(part) as file:
+        file.write(json.dumps(object_codec.encode(state, _SPECIALS)).encode())
+    files.move(part, run_dir / _NAME)
+
+
+def load_state(run_dir: Path) -> RecorderState | None:
+    """The state left behind; None if there is none that can be read."""
+    decoder = object_codec.Decoder((RecorderState(Summary(Config())),), _SPECIALS)
+    try:
+        state = decoder.decode(json.loads(files.read_bytes(run_dir / _NAME, _BYTES_MAX)), RecorderState)
+    except (OSError, ValueError, RecursionError):  # the recorder begins anew and says so
+        return None
+    assert isinstance(state, RecorderState)
+    return state
+
+
+def remove_state(run_dir: Path) -> None:
+    """The run is over: nobody goes on."""
+    with contextlib.suppress(OSError):
+        (run_dir / _NAME).unlink(missing_ok=True)
+
+
+# After these the disk is waited for at once: a power cut may follow.
+_URGENT = frozenset({"fault", "end"})
+
+
+class Recorder:
+    """Everything of a run that goes to the disk.
+
+    Parameters
+    ----------
+    run_dir : Path
+        Folder of the run.
+    clock : RunClock
+        The run's clock.
+    config : Config
+        The run's configuration.
+    rings : dict
+        Readers by name: "telemetry", "events", "inputs" and, if the shape is measured, "shapes".
+    recording : Recording
+        The Rerun file, no segment begun yet.
+    thumbnails : FrameSource or None
+        Thumbnails of frames.
+    report : callable
+        Takes a small dict for the supervisor; never blocks, never raises.
+    resumes : int
+        How many recorders of this run have died before.
+
+    Attributes
+    ----------
+    ended : bool
+        The run's "end" event has come.
+    urgent : bool
+        Something has come that `write` should not wait for its second with.
+    """
+
+    def __init__(
+        self,
+        run_dir: Path,
+        clock: RunClock,
+        config: Config,
+        rings: dict[str, RingReader],
+        recording: sink.Recording,
+        thumbnails: rerun_output.FrameSource | None,
+        report: sink.Report,
+        resumes: int = 0,
+    ) -> None:
+        handed_on = load_state(run_dir) if resumes else None
+        before = handed_on or RecorderState(Summary(config))
+        self._run_dir = run_dir
+        self._config = config
+        self._folder = housekeeping.FolderWatch(run_dir)
+        self._folder_anew_s = before.folder_anew_s
+        self._clock = clock
+        self._feeds = {
+            name: Feed(ring, before.positions.get(name, 0), before.dropped.get(name, 0))
+            for name, ring in rings.items()
+        }
+        self._complaints = sink.Complaints(report, before.errors)
+        self._housekeeping = housekeeping.Housekeeping(run_dir, clock, config.recording, self._complaints)
+        self._rerun = rerun_output.RerunOutput(recording, config, thumbnails, self._complaints)
+        self._rerun.shapes.reference, self._rerun.state = before.reference, before.state
+        self._events_file = EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
+        self._events_lost = before.events_lost
+        self._summary = before.summary
+        self._columns = tables.ColumnTables(run_dir, before.windows if resumes else None)
+        self._inputs_file = inputs_file.InputsFile(run_dir, __version__, config.recording.segment_s)
+        self._input_ticks_lost = before.input_ticks_lost
+        self._assembler = TickAssembler()
+        self._resumes = resumes
+        self._began_anew = resumes > 0 and handed_on is None
+        self._messages: list[bytes] = []
+        self._input_messages: list[bytes] = []
+        self._shapes: list[shape_estimate.ShapeEstimate] = []
+        self._events: list[Event] = []
+        self._rows_lost = before.rows_lost
+        self.ended = self.urgent = False
+
+    def drain(self) -> None:
+        """Take in what the rings hold; events go to `events.jsonl` at once."""
+        self._messages += self._feeds["telemetry"].drain()
+        if "inputs" in self._feeds:
+            self._input_messages += self._feeds["inputs"].drain()
+        if "shapes" in self._feeds:
+            for message in self._feeds["shapes"].drain():
+                self._complaints.guarded("shape estimate", partial(self._take_shape, message))
+        self.take_events([events.parse(message) for message in self._feeds["events"].drain()])
+
+    def take_events(self, new: list[Event]) -> None:
+        """Take in events; an "end" among them ends the run."""
+        for event in new:
+            self._summary.add_event(event)
+            self.urgent |= event.get("kind") in _URGENT
+            self.ended |= event.get("kind") == "end"
+        self._events += new
+        self._complaints.guarded("events.jsonl", lambda: self._events_file.append(new))
+
+    def _take_shape(self, message: bytes) -> None:
+        estimate = shape_estimate.unpack_estimate(message)
+        self._summary.add_shape(estimate)
+        self._shapes.append(estimate)
+        self._complaints.guarded("shape columns", lambda: self._columns.add_shape(estimate))
+
+    def write(self) -> None:
+        """Bring what came since the last call to the disk, and see that it got there."""
+        now_s = self._clock.now()
+        self._complaints.guarded("new run folder", lambda: self._see_folder(now_s))
+        rows = telemetry.unpack(self._messages)
+        shapes, new_events = self._shapes, self._events
+        self._messages, self._shapes, self._events = [], [], []
+        self.urgent = False
+        guarded = self._complaints.guarded
+        guarded("inputs file", lambda: self._write_inputs(now_s, shapes))
+        guarded("summary", lambda: self._summary.add_rows(rows))
+        guarded("tick columns", lambda: self._columns.add_rows(rows))
+        guarded("columns", self._columns.sync)
+        closed, self._rerun.closed = self._rerun.closed, []
+        self._housekeeping.look(now_s, closed)
+        if not self._rerun.send(now_s, rows, new_events, shapes, self._housekeeping.thrift):
+            self._rows_lost += len(rows)
+        guarded("state file", self._hand_on)
+
+    def _see_folder(self, now_s: float) -> None:
+        """Go on in a new folder if the run's was taken away: writing to a deleted file goes without an error."""
+        if not self._folder.gone():
+            return
+        self._folder.begin_anew(self._config)
+        self._folder_anew_s = now_s
+        # never taken back: what is missing stays missing
+        what = f"{self._run_dir} was removed or moved, and is begun anew at {now_s:.1f} s"
+        self._complaints.complain("run folder", f"{what}; what was recorded before is not in it")
+        self._inputs_file.close()
+        self._columns.leave_folder()
+        self._rerun.leave_folder()
+        self._events_file.begin_anew(self._events)
+
+    def _write_inputs(self, now_s: float, shapes: list[shape_estimate.ShapeEstimate]) -> None:
+        batch = self._assembler.take(self._input_messages)
+        self._input_messages = []
+        self._inputs_file.append(batch, shapes, now_s)
+        self._inputs_file.sync()
+
+    def _hand_on(self) -> None:
+        """Leave behind what another recorder would need to go on from here."""
+        state = RecorderState(
+            self._summary,
+            {name: feed.position for name, feed in self._feeds.items()},
+            self._dropped(),
+            self._rerun.shapes.reference,
+            self._rerun.state,
+            self._columns.open_windows,
+            self._complaints.errors,
+            self._rows_lost,
+            self._events_lost + self._events_file.lost,
+            self._input_ticks_lost + self._inputs_file.lost_ticks,
+            self._folder_anew_s,
+        )
+        save_state(self._run_dir, state)
+
+    def _dropped(self) -> dict[str, int]:
+        return {name: feed.dropped for name, feed in self._feeds.items()}
+
+    def finish(self, in_haste: bool = False) -> None:
+        """Last drain, close the recording with its footer, write `summary.json`, optimise unless `in_haste`."""
+        self.drain()
+        self.write()
+        guarded = self._complaints.guarded
+        guarded("recording", self._rerun.close)
+        guarded("columns", self._columns.close)
+        account = {
+            "segments": self._rerun.segments,
+            "tables": self._columns.files,
+            "errors": self._complaints.errors,
+            "rows_lost": self._rows_lost,
+            "column_rows_lost": self._columns.lost,
+            "events_lost": self._events_lost + self._events_file.lost,
+            "input_ticks_lost": self._input_ticks_lost + self._inputs_file.lost_ticks,
+            "restarts": self._resumes,
+            "folder_anew_s": self._folder_anew_s,  # None: it is the one that was begun
+            # without what the former recorder knew, the statistics begin with what the ring still had
+            "partial": self._began_anew and self._feeds["telemetry"].dropped > 0,
+        }
+        text = plain_json.dumps_checked(self._summary.as_dict(self._dropped(), account), indent=2) + "\n"
+        guarded("summary.json", lambda: files.write_text_atomic(self._run_dir / "summary.json", text))
+        self._events_file.close()
+        self._inputs_file.close()
+        self._folder.close()
+        remove_state(self._run_dir)
+        # last, as nobody needs it: whoever is in a hurry may kill this process now
+        closed, self._rerun.closed = self._rerun.closed, []
+        if not in_haste:
+            self._housekeeping.finish(closed)
+        self._housekeeping.close()
+        done: dict[str, Any] = {"kind": "recorder_done", "dropped": self._dropped(), **account}
+        self._complaints.report(done)

@@ -1,0 +1,158 @@
+"""What goes to Rerun each second, in segments; a writer that died is given a new file."""
+
+import math
+from pathlib import Path
+from typing import Protocol
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model import shape_estimate, states, telemetry
+from membrane_ctrl.recorder import rerun_streams, sink
+from membrane_ctrl.run_files.disk_budget import Thrift
+from membrane_ctrl.run_files.events import Event
+
+# A full disk is tried again this often: a person who made room sees the recording go on.
+RETRY_S = 10.0
+
+
+class FrameSource(Protocol):
+    """Sends thumbnails when they are due (`thumbnails.Thumbnails`)."""
+
+    def send(self, now_s: float) -> None:
+        """Send a set if one is due."""
+
+
+class RerunOutput:
+    """Streams and segments.
+
+    Parameters
+    ----------
+    recording : Recording
+        No segment begun yet.
+    config : Config
+        The run's configuration.
+    thumbnails : FrameSource or None
+        Thumbnails of frames.
+    complaints : Complaints
+        Where trouble goes.
+
+    Attributes
+    ----------
+    shapes : ShapeStreams
+    state : float
+        The controller's state in the last row.
+    closed : list of Path
+        Segments closed since somebody last took them from here.
+    """
+
+    def __init__(
+        self, recording: sink.Recording, config: Config, thumbnails: FrameSource | None, complaints: sink.Complaints
+    ) -> None:
+        self._recording = recording
+        self._segment_s = config.recording.segment_s
+        self._thumbnails = thumbnails
+        self._complaints = complaints
+        self._telemetry = rerun_streams.TelemetryStreams(recording, config)
+        self.shapes = rerun_streams.ShapeStreams(recording)
+        self.state = math.nan
+        self.closed: list[Path] = []
+        self._alive = False
+        self._segment_until_s = 0.0
+        self._retry_s = 0.0
+
+    @property
+    def segments(self) -> int:
+        """Number of the next file."""
+        return self._recording.segments
+
+    def send(
+        self,
+        now_s: float,
+        rows: telemetry.Rows,
+        events: list[Event],
+        shapes: list[shape_estimate.ShapeEstimate],
+        thrift: Thrift,
+    ) -> bool:
+        """One second's worth, until it is on the disk; False if it is lost to Rerun."""
+        self._complaints.guarded("shape reference", lambda: self._watch_hold(rows))
+        if thrift == Thrift.ESSENTIAL:
+            self._stop()
+            return False
+        self.shapes.pictures = thrift == Thrift.ALL
+        for _ in range(2):
+            if (not self._alive or now_s >= self._segment_until_s) and not self._begin_segment(now_s):
+                return False
+            self._complaints.guarded("telemetry streams", lambda: self._telemetry.send(rows))
+            self._complaints.guarded("event streams", lambda: rerun_streams.send_events(self._recording, events))
+            self._complaints.guarded("shape streams", lambda: self._send_shapes(now_s, shapes, thrift))
+            try:
+                self._recording.flush()
+            except sink.RecordingError as error:
+                self._alive = False
+                self._complaints.complain("recording", str(error))
+            else:
+                self._complaints.recovered("recording")
+                self._complaints.guarded("disk sync", self._sync)
+                return True
+        self._retry_s = now_s + RETRY_S
+        return False
+
+    def _sync(self) -> None:
+        try:
+            self._recording.sync()
+        except FileNotFoundError:  # somebody has deleted it under us
+            self._alive = False
+            raise
+
+    def _send_shapes(self, now_s: float, shapes: list[shape_estimate.ShapeEstimate], thrift: Thrift) -> None:
+        for estimate in shapes:
+            self.shapes.send(estimate)
+        if self._thumbnails is not None and thrift == Thrift.ALL:
+            self._thumbnails.send(now_s)
+
+    def _begin_segment(self, now_s: float) -> bool:
+        if now_s < self._retry_s:
+            return False
+        before = self._recording.path
+        try:
+            self._recording.next_segment()
+        except sink.RecordingError as error:
+            self._alive = False
+            self._retry_s = now_s + RETRY_S
+            self._complaints.complain("recording", str(error))
+            return False
+        if self._alive and before is not None:
+            self.closed.append(before)
+        self._alive = True
+        self._segment_until_s = now_s + self._segment_s
+        self._telemetry.start_segment()
+        self.shapes.start_segment()
+        return True
+
+    def _stop(self) -> None:
+        """Close the file while there is room for its footer; with room again another is begun."""
+        if self._alive:
+            self._alive = False
+            self._complaints.guarded("recording", self._recording.pause)
+
+    def leave_folder(self) -> None:
+        """The run's folder was taken away, and another is in its place: go on there, at once."""
+        self._alive = False
+        self._retry_s = 0.0
+        self.closed.clear()
+        self._recording.lay_out_again()
+
+    def _watch_hold(self, rows: telemetry.Rows) -> None:
+        """Changes of the figure are against the first of the hold: before it they only show the way there."""
+        if not len(rows):
+            return
+        state = telemetry.column(rows, "state")
+        if any(code == states.State.HOLD for _, code in telemetry.changes(state, self.state)):
+            self.shapes.rebase()
+        self.state = float(state[-1])
+
+    def close(self) -> None:
+        """Write the footer; the last segment is then among `closed`. Raises RecordingError."""
+        last = self._recording.path
+        self._recording.close()
+        if last is not None:
+            self.closed.append(last)

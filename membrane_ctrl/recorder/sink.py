@@ -1,0 +1,267 @@
+"""The Rerun file: segments, time axes, statics, and a flush that says when the writer has died.
+
+Rerun facts behind this module (0.41, all reproduced): on a full disk `log` and `send_columns` go on without a
+word, only `flush` raises; `save` on a healthy stream starts a new file at once and loses no row; statics
+and properties have to be sent again after each `save`, and so would the blueprint, but each sending of one keeps 3 MB
+for ever (of a week of hours that would be 0.5 GB): it goes into the first file, and to the others when they are
+optimised (`optimizer`); segments with the same recording id are one
+recording in the viewer. When the writer died between taking a flush and answering it, `flush` times out, and then
+`save`, `disconnect`, the stream's destructor and Rerun's own exit handler wait for it for ever: such a stream is
+kept and left alone, and the process has to end without exit handlers.
+"""
+
+import traceback
+import warnings
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.files import sync_data
+from membrane_ctrl.recorder.blueprint import LANES, run_blueprint
+from membrane_ctrl.run_files import segments, shapes, streams
+
+APPLICATION = "membrane_ctrl"
+RUN_TIME = "run_time"
+UTC = "utc"
+OUTSIDE_CLASS = 1
+LAYOUT = ".layout.rbl"  # the blueprint in a file of its own, while the run is recorded
+
+# A disk that takes longer than this to take a second of data (tens of kB) is as good as gone.
+_FLUSH_TIMEOUT_S = 5.0
+
+
+# Held by the module, so that no destructor ever runs.
+_abandoned: list[rr.RecordingStream] = []
+
+
+class RecordingError(Exception):
+    """The writer behind the Rerun stream is dead or could not be started; the message is Rerun's."""
+
+
+class Recording:
+    """One Rerun recording in segments `<name>-000.rrd`, `-001.rrd`, ...
+
+    Parameters
+    ----------
+    run_dir : Path
+        Folder of the run; its name is the recording's id, so that all segments are one recording.
+    run_name : str
+        In front of the segment's number.
+    clock : RunClock
+        Gives UTC for the run's seconds.
+    config : Config
+        Shown among the recording's properties and used for the blueprint.
+    first_segment : int
+        Number of the first file: not 0 when another recorder has begun the run.
+
+    Attributes
+    ----------
+    segments : int
+        Number of the next file.
+    path : Path or None
+        The file there is.
+    stuck : bool
+        A stream was abandoned: Rerun's exit handler may wait for it for ever.
+    """
+
+    def __init__(self, run_dir: Path, run_name: str, clock: RunClock, config: Config, first_segment: int = 0) -> None:
+        self._run_dir = run_dir
+        self._run_name = run_name
+        self._origin = np.datetime64(clock.origin_utc.replace(tzinfo=None), "ns")
+        self._config = config
+        self._stream = self._new_stream()
+        self.stuck = False
+        self.path: Path | None = None
+        self.segments = first_segment
+        self._laid_out = False
+
+    def next_segment(self) -> None:
+        """Close the file there is and go on in a new one. Raises RecordingError; then call it again later."""
+        path = self._run_dir / f"{self._run_name}-{self.segments:03d}.rrd"
+        try:
+            self._stream.save(path)
+            self._send_statics()
+            self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
+        except (RuntimeError, OSError) as error:
+            path.unlink(missing_ok=True)
+            self._abandon()
+            raise RecordingError(f"{path}: {error}") from None
+        self.path = path
+        self.segments += 1
+
+    def _new_stream(self) -> rr.RecordingStream:
+        return rr.RecordingStream(APPLICATION, recording_id=self._run_dir.name)
+
+    def _abandon(self) -> None:
+        """Go on with another stream and never touch the old one again (see the module's facts)."""
+        _abandoned.append(self._stream)
+        self.stuck = True
+        self._stream = self._new_stream()
+        self.path = None
+
+    def _send_statics(self) -> None:
+        stream = self._stream
+        if not self._laid_out:
+            self._laid_out = True  # also if it fails: a full disk is tried again every few seconds
+            blueprint = run_blueprint(self._config)
+            stream.send_blueprint(blueprint)
+            blueprint.save(APPLICATION, str(self._run_dir / LAYOUT))
+        stream.send_recording_name(self._run_dir.name)
+        stream.send_property("run", rr.AnyValues(name=self._run_name, started_utc=str(self._origin)))
+        for block in (*streams.STREAMS, *streams.DERIVED, *streams.SHAPE_STREAMS):
+            stream.log(block.path, _style(block), static=True)
+        for lane in LANES:
+            words = list(lane.colours)
+            colours = np.array([lane.colours[word] for word in words], dtype=np.uint32)
+            stream.log(lane.path, rr.StateConfiguration(values=words, labels=words, colors=colours), static=True)
+        stream.log(
+            "/shape",
+            rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (OUTSIDE_CLASS, "", (24, 24, 24, 255))]),
+            static=True,
+        )
+        outside = rr.SegmentationImage(shapes.outside_disc() * OUTSIDE_CLASS, opacity=1.0, draw_order=1.0)
+        for kind in ("height", "difference", "uncertainty"):
+            stream.log(f"/shape/map/{kind}/outside", outside, static=True)
+
+    def columns(self, path: str, time_s: NDArray[np.float64], columns: Iterable[rr.ComponentColumn]) -> None:
+        """Send rows of one entity at (n,) times of the run."""
+        nanoseconds = np.round(time_s * 1e9).astype("timedelta64[ns]")
+        indexes = [
+            rr.TimeColumn(RUN_TIME, duration=nanoseconds),
+            rr.TimeColumn(UTC, timestamp=self._origin + nanoseconds),
+        ]
+        self._stream.send_columns(path, indexes=indexes, columns=columns)
+
+    def scalars(self, path: str, time_s: NDArray[np.float64], values: NDArray[np.float64]) -> None:
+        """Send (n, m) values of one entity at (n,) times of the run."""
+        self.columns(path, time_s, rr.Scalars.columns(scalars=values))
+
+    def log(self, path: str, time_s: float, archetype: rr.AsComponents) -> None:
+        """Send one thing at one time of the run."""
+        nanoseconds = np.timedelta64(round(time_s * 1e9), "ns")
+        self._stream.set_time(RUN_TIME, duration=nanoseconds)
+        self._stream.set_time(UTC, timestamp=self._origin + nanoseconds)
+        self._stream.log(path, archetype)
+
+    def lay_out_again(self) -> None:
+        """The next segment is the first one that will be found: it gets the blueprint."""
+        self._laid_out = False
+
+    def flush(self) -> None:
+        """Bring everything sent to the file. Raises RecordingError if the writer has died since the last call."""
+        try:
+            self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
+        except (RuntimeError, OSError) as error:
+            self._abandon()
+            raise RecordingError(str(error)) from None
+
+    def pause(self) -> None:
+        """Close the file and begin no other; `next_segment` goes on. Raises RecordingError as `close`."""
+        self.close()
+        self._stream = self._new_stream()
+
+    def sync(self) -> None:
+        """Wait until the disk has what was flushed: Rerun never asks it to. Raises OSError."""
+        if self.path is not None:
+            sync_data(self.path)
+
+    def close(self) -> None:
+        """Write the footer and close the file.
+
+        Raises
+        ------
+        RecordingError
+            If the file has no footer: then it is slow to open, and its last second may be missing.
+        """
+        self.flush()
+        self._stream.disconnect()
+        path, self.path = self.path, None
+        if path is not None and not is_whole(path):
+            raise RecordingError(f"{path}: closed without its footer; `membrane-ctrl repair` mends it")
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a closed file has its footer: `disconnect` does not say."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the reader's own way to say that there is none
+        try:
+            with segments.panics_are_faults():
+                RrdReader(path).store()
+        except (RuntimeError, ValueError, OSError):
+            return False
+    return True
+
+
+def _style(stream: streams.Stream) -> rr.SeriesLines:
+    lines = stream.lines
+    return rr.SeriesLines(
+        names=[line.name for line in lines],
+        colors=[line.colour for line in lines],
+        widths=[line.width for line in lines],
+    )
+
+
+# Trouble of the recorder: told once for as long as it is the same, and nothing of it ends the recorder.
+
+
+Report = Callable[[dict[str, Any]], None]
+
+
+class Complaints:
+    """Runs what may fail, and reports what did.
+
+    Parameters
+    ----------
+    report : callable
+        Takes a small dict for the supervisor; never blocks, never raises.
+    errors : int
+        Of a recorder before this one.
+
+    Attributes
+    ----------
+    errors : int
+        Reports of kind "recorder_error".
+    """
+
+    def __init__(self, report: Report, errors: int = 0) -> None:
+        self.report = report
+        self.errors = errors
+        self._trouble: dict[str, str] = {}
+
+    def guarded(self, what: str, action: Callable[[], None]) -> None:
+        """Do it; what goes wrong is reported, and the rest of the recorder goes on."""
+        try:
+            action()
+        except (OSError, RecordingError) as error:
+            self.complain(what, f"{what}: {error}")
+        except Exception as error:
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            self.complain(
+                what, f"{what}: {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"
+            )
+        else:
+            self.recovered(what)
+
+    def complain(self, what: str, message: str, kind: str = "recorder_error") -> None:
+        """Report trouble once for as long as it is the same; the report says in `what` whose end to wait for."""
+        if self._trouble.get(what) != message:
+            self._trouble[what] = message
+            self.errors += kind == "recorder_error"
+            self.report({"kind": kind, "what": what, "message": message})
+
+    def recovered(self, what: str) -> None:
+        """Say that it works again, if it did not."""
+        if self._trouble.pop(what, None) is not None:
+            self.report({"kind": "recorder_recovered", "what": what, "message": f"{what} works again"})
+
+    def forget(self, prefix: str, but: set[str]) -> None:
+        """Say that trouble is over whose cause is there no longer: what begins with `prefix` and is not in `but`."""
+        for what in [what for what in self._trouble if what.startswith(prefix) and what not in but]:
+            self.recovered(what)

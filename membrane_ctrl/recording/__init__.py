@@ -1,1 +1,0 @@
-"""The recorder process: run folder, Rerun streams, blueprint, summary."""

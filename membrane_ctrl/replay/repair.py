@@ -1,0 +1,288 @@
+"""`repair RUN`: what a crash left of a run, made whole again. Originals stay as they are unless a person says so."""
+
+import json
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+
+from membrane_ctrl.model import errors, files, plain_json, telemetry
+from membrane_ctrl.model.plain_json import take_checksum
+from membrane_ctrl.recorder import housekeeping, sink
+from membrane_ctrl.run_files import column_reader, inputs_file, run, run_folder, streams, tables
+from membrane_ctrl.run_files.rrd_reader import REPAIRED
+from membrane_ctrl.run_files.segments import panics_are_faults, require_bounded
+from membrane_ctrl.run_files.summary import Summary
+
+# Rerun segments back to telemetry rows, for a repair and for a replay that differs.
+
+
+_SCALARS = "Scalars:scalars"
+
+
+def read_rows(path: Path) -> telemetry.Rows:
+    """Telemetry rows of a segment, by time; fields that were left out are NaN.
+
+    Parameters
+    ----------
+    path : Path
+        A segment, closed or not. What lies behind damage is not read.
+
+    Returns
+    -------
+    (n, len(FIELDS)) array
+        `mono_s` is the recording's time, in whole nanoseconds.
+
+    Raises
+    ------
+    RuntimeError, ValueError, OSError
+        Rerun's ways to say that nothing can be read.
+    """
+    where = {stream.path: [telemetry.COLUMN[line.field] for line in stream.lines] for stream in streams.STREAMS}
+    found: dict[str, tuple[list[NDArray[np.int64]], list[telemetry.Rows]]] = {path: ([], []) for path in where}
+    require_bounded(path)
+    with warnings.catch_warnings(), panics_are_faults():
+        warnings.simplefilter("ignore")  # a segment without its footer is what this is for
+        for chunk in RrdReader(path).stream():
+            if chunk.entity_path not in where:
+                continue
+            batch = chunk.to_record_batch()
+            if _SCALARS in batch.schema.names and sink.RUN_TIME in batch.schema.names:
+                times, values = found[chunk.entity_path]
+                times.append(np.asarray(batch.column(sink.RUN_TIME).cast("int64")))
+                flat = np.asarray(batch.column(_SCALARS).flatten())
+                values.append(flat.reshape(-1, len(where[chunk.entity_path])))
+    every = [times for times, _ in found.values() if times]
+    if not every:
+        return np.empty((0, len(telemetry.FIELDS)))
+    axis_ns = np.unique(np.concatenate([np.concatenate(times) for times in every]))
+    rows = np.full((len(axis_ns), len(telemetry.FIELDS)), np.nan)
+    rows[:, telemetry.COLUMN["mono_s"]] = axis_ns * 1e-9
+    for entity, (times, values) in found.items():
+        if times:
+            places = np.searchsorted(axis_ns, np.concatenate(times))
+            rows[places[:, np.newaxis], where[entity]] = np.concatenate(values)
+    return rows
+
+
+# A recorder writes each second: what has changed since is a run that is still going on.
+_STILL_RUNNING_S = 5.0
+_SEGMENT_TIMEOUT_S = 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One file of the run: what was wrong with it, and what was done."""
+
+    file: str
+    state: str
+    action: str
+
+
+def repair_command(run_dir: Path, in_place: bool, as_json: bool) -> int:
+    """Repair and report; exit 0 also when nothing was wrong.
+
+    Raises
+    ------
+    InputError
+        Not a run folder, or a run that is still going on.
+    """
+    findings = repair(run_dir, in_place)
+    if as_json:
+        rows = [{"file": f.file, "state": f.state, "action": f.action} for f in findings]
+        print(json.dumps({"run": run_dir.resolve().name, "files": rows}))
+    else:
+        for finding in findings:
+            print(f"{finding.file:28} {finding.state}{': ' if finding.action else ''}{finding.action}")
+    if not in_place and (run_dir / REPAIRED).exists():
+        print(f"repaired files: {run_dir / REPAIRED}; --in-place puts them in the originals' place", file=sys.stderr)
+    return int(errors.Exit.DONE)
+
+
+def repair(run_dir: Path, in_place: bool = False) -> list[Finding]:
+    """Mend every file of a run that a crash can have torn.
+
+    Parameters
+    ----------
+    run_dir : Path
+        Folder of the run.
+    in_place : bool
+        Repaired files replace the originals; what was cut off the event log stays beside it as `.torn`. Otherwise
+        they go to `repaired/`. A summary that is missing is written to its place in either case.
+    """
+    if not (run_dir / "config.toml").is_file():
+        raise errors.InputError(f"{run_dir}: not a run folder: there is no config.toml in it")
+    _refuse_running(run_dir)
+    segments = sorted(run_dir.glob("*.rrd"))
+    findings = [_repair_segment(path, in_place) for path in segments]
+    findings += _repair_events(run_dir, in_place)
+    findings += _look_at_inputs(run_dir)
+    findings += _look_at_config(run_dir)
+    return [*findings, _repair_summary(run_dir, in_place)]
+
+
+def _refuse_running(run_dir: Path) -> None:
+    state = run_dir / ".recorder-state"
+    if state.exists():
+        age_s = _now_s(run_dir) - state.stat().st_mtime
+        if 0 <= age_s < _STILL_RUNNING_S:
+            raise errors.InputError(f"{run_dir}: this run is still being recorded; stop it first")
+
+
+def _now_s(folder: Path) -> float:
+    """The file system's own time: that of another machine's disk need not be ours."""
+    probe = folder / ".probe"
+    try:
+        with files.fresh_file(probe) as file:
+            now_s = os.fstat(file.fileno()).st_mtime
+        files.remove(probe)
+    except OSError as error:
+        raise errors.InputError(f"{folder}: cannot be written ({error.strerror}); copy the run first") from None
+    return now_s
+
+
+def _target(path: Path, in_place: bool) -> Path:
+    if in_place:
+        return path
+    return files.make_folder(path.parent / REPAIRED) / path.name
+
+
+def _repair_segment(path: Path, in_place: bool) -> Finding:
+    try:
+        require_bounded(path)
+    except OSError as error:
+        return Finding(path.name, "torn", f"nothing could be recovered ({error.strerror})")
+    if sink.is_whole(path):
+        return Finding(path.name, "whole", "")
+    with files.scratch_folder(path.parent, ".repair-") as folder:
+        part = folder / path.name
+        done = subprocess.run(
+            housekeeping.optimize_command(path, part, "--continue-on-error"),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            env=housekeeping.quiet_environment(),
+            timeout=_SEGMENT_TIMEOUT_S,
+            check=False,
+        )
+        if not part.exists() or not sink.is_whole(part):
+            why = done.stderr.decode(errors="replace").strip().splitlines()
+            return Finding(path.name, "torn", f"nothing could be recovered ({why[-1] if why else 'no data in it'})")
+        target = _target(path, in_place)
+        files.move(part, target)
+    return Finding(path.name, "torn", f"recovered to {target.relative_to(path.parent)}")
+
+
+def _repair_events(run_dir: Path, in_place: bool) -> list[Finding]:
+    path = run_dir / "events.jsonl"
+    if not path.exists():
+        return [Finding(path.name, "missing", "the run had no event, or it was lost")]
+    data = files.read_bytes(path, run_folder.EVENTS_BYTES_MAX)
+    good, torn = _split_events(data)
+    if not torn:
+        return [Finding(path.name, "whole", "")]
+    target = _target(path, in_place)
+    files.write_bytes_atomic(target.with_name(f"{path.name}.torn"), torn)
+    files.write_bytes_atomic(target, good)
+    where = target.relative_to(run_dir)
+    return [Finding(path.name, "torn", f"{len(torn)} bytes cut to {where}.torn, the rest in {where}")]
+
+
+def _split_events(data: bytes) -> tuple[bytes, bytes]:
+    """Whole lines, and what is none: a torn tail, a block of zeros that a power cut left."""
+    good: list[bytes] = []
+    torn: list[bytes] = []
+    for line in data.splitlines(keepends=True):
+        whole = line.endswith(b"\n") and run_folder.event_of(line.decode(errors="replace")) is not None
+        (good if whole else torn).append(line)
+    return b"".join(good), b"".join(torn)
+
+
+def _is_whole_object(data: bytes) -> bool:
+    try:
+        table = plain_json.loads(data.decode())
+    except ValueError:
+        return False
+    return isinstance(table, dict) and take_checksum(table)
+
+
+def _look_at_inputs(run_dir: Path) -> list[Finding]:
+    """Nothing to mend: a replay reads every frame that is whole."""
+    reader = inputs_file.InputsReader(run_dir)
+    ticks = sum(len(frame.records) for frame in reader)
+    name = f"inputs ({len(reader.paths)} files)"
+    if reader.damage:
+        return [Finding(name, "torn", f"{ticks} ticks are readable; {'; '.join(reader.damage)}")]
+    return [Finding(name, "whole", f"{ticks} ticks")] if reader.paths else []
+
+
+def _look_at_config(run_dir: Path) -> list[Finding]:
+    """Nothing to mend: a summary that is rebuilt takes what cannot be read of it at its default."""
+    notes: list[str] = []
+    run_folder.read_config(run_dir, notes)
+    return [Finding("config.toml", "damaged", "; ".join(notes))] if notes else []
+
+
+def _repair_summary(run_dir: Path, in_place: bool) -> Finding:
+    path = run_dir / "summary.json"
+    there = path.is_symlink() or path.exists()
+    if there and _is_whole_object(files.read_bytes(path, files.SMALL_BYTES)):
+        return Finding(path.name, "whole", "")
+    table = rebuild_summary(run_dir)
+    target = _target(path, in_place or not there)
+    files.write_text_atomic(target, plain_json.dumps(table, indent=2) + "\n")
+    state = "unreadable" if there else "missing"
+    return Finding(path.name, state, f"rebuilt from {table['ticks']} ticks: {target.relative_to(run_dir)}")
+
+
+def rebuild_summary(run_dir: Path) -> dict[str, Any]:
+    """`summary.json` from what is on the disk; `"rebuilt": true` says so.
+
+    Of a run without tables the ticks that Rerun does not have (in quiet times) are not in the statistics.
+    """
+    summary = Summary(run_folder.read_config(run_dir, []))
+    path = run_dir / "events.jsonl"
+    last_s = -np.inf
+    for rows in _all_rows(run_dir):
+        new = rows[telemetry.column(rows, "mono_s") > last_s]
+        if len(new):
+            last_s = float(new[-1, telemetry.COLUMN["mono_s"]])
+            summary.add_rows(new[np.isfinite(telemetry.column(new, "state"))])
+    ticks = 0
+    for frame in inputs_file.InputsReader(run_dir):
+        ticks += len(frame.records)
+        for estimate in frame.estimates.values():
+            summary.add_shape(estimate)
+    good, _ = _split_events(files.read_bytes(path, run_folder.EVENTS_BYTES_MAX)) if path.exists() else (b"", b"")
+    for line in good.splitlines():
+        summary.add_event(run_folder.event_of(line.decode()) or {})
+    table = summary.as_dict({}, {"segments": len(_segments(run_dir))})
+    table["ticks"] = max(table["ticks"], ticks)
+    return {**table, "exit": table["exit"] or "crashed", "rebuilt": True}
+
+
+def _segments(run_dir: Path) -> Sequence[Path]:
+    """Each segment once: the repaired one where there is one."""
+    repaired = run_dir / REPAIRED
+    paths = sorted(run_dir.glob("*.rrd"))
+    return [repaired / path.name if (repaired / path.name).exists() else path for path in paths]
+
+
+def _all_rows(run_dir: Path) -> Iterator[telemetry.Rows]:
+    """Every tick of the tables; without them the rows of all segments that can be read."""
+    if column_reader.column_files(run_dir, tables.TICKS):
+        for block in run.open_run(run_dir).tick_blocks(telemetry.FIELDS):
+            yield np.column_stack([block[name] for name in telemetry.FIELDS])
+        return
+    for path in _segments(run_dir):
+        try:
+            yield read_rows(path)
+        except (RuntimeError, ValueError, OSError):  # Rerun's own ways to say that nothing can be read
+            continue

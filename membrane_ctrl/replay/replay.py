@@ -1,0 +1,252 @@
+"""Replay: the recorded inputs of a run through today's control code, on the run's own clock.
+
+A tick is a pure function of its inputs and of the ticks before it, so the same code gives the same outputs to the
+last bit; what differs is a change of the code. A replay begins with the run, or in the middle of it with a recorded
+memory of the controller (`controller_memory`). Each tick's outputs are compared by their checksum. Where ticks are
+missing in the record, what follows starts from a controller that missed them, too: up to the next recorded memory
+only decisions (states, faults) are compared.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.controller.memory import UnknownMemoryError, recall
+from membrane_ctrl.controller.tick import TickInputs, TickOutputs, output_crc, unpack_tick
+from membrane_ctrl.model import errors, shape_estimate, telemetry
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.run_files.inputs_file import Frame
+
+# A shape is used in the tick it arrives in; more than these need not be remembered.
+_SHAPES_KEPT = 16
+# Events that are decisions, and the key that says which.
+_DECISIONS = {"state": "state", "fault": "name", "cleared": "name", "shape": "state"}
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What the controller decided, and when: a state, a fault, the shape loop's state."""
+
+    time_s: float
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedTick:
+    """One tick of the record: its inputs, the checksum of what came out of it, what was remembered before it."""
+
+    tick: int
+    inputs: TickInputs
+    output_crc: int
+    memory: bytes = b""
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Ticks that are not in the record, or not whole."""
+
+    after_tick: int
+    time_s: float
+    ticks: int
+    reason: str
+
+
+@dataclass(slots=True)
+class Replay:
+    """What a replay found.
+
+    Attributes
+    ----------
+    begin_s : float
+        Time of the first tick replayed.
+    ticks : int
+        Replayed.
+    compared : int
+        Of these, compared bit by bit.
+    different : int
+        Of these, not the same.
+    first_different : TelemetryRow or None
+        Row of today's code in the first tick that differs.
+    gaps : list of Gap
+    decisions : list of Decision
+        Of today's code.
+    last_s : float
+        Time of the last tick replayed.
+    finished : Exit or None
+        How today's code ended the run.
+    """
+
+    begin_s: float = math.nan
+    ticks: int = 0
+    compared: int = 0
+    different: int = 0
+    first_different: telemetry.TelemetryRow | None = None
+    gaps: list[Gap] = field(default_factory=list)
+    decisions: list[Decision] = field(default_factory=list)
+    last_s: float = -math.inf
+    finished: errors.Exit | None = None
+
+
+def replay(
+    config: Config,
+    record: Iterable[RecordedTick | Gap],
+    sag_sensitivity: NDArray[np.float64],
+    from_s: float = 0.0,
+    to_s: float = math.inf,
+) -> Replay:
+    """Run recorded ticks through a new controller.
+
+    Parameters
+    ----------
+    config : Config
+        As the run had it.
+    record : iterable
+        From the run's first tick on, or from one that has its memory with it.
+    sag_sensitivity : (36,) array
+        See `Controller`.
+    from_s, to_s : float
+        What is compared bit by bit; ticks before it run all the same.
+
+    Raises
+    ------
+    UnknownMemoryError
+        The record begins with a memory that today's code cannot take up, or a tick raises after one was taken up.
+    """
+    controller = Controller(config, sag_sensitivity)
+    found = Replay()
+    same_past, remembered = True, False
+    for item in record:
+        if isinstance(item, Gap):
+            if item.time_s <= to_s:
+                found.gaps.append(item)
+            same_past = False
+            continue
+        if item.inputs.now_s > to_s or found.finished is not None:
+            break
+        if not found.ticks:
+            found.begin_s = item.inputs.now_s
+            if item.tick > 1 and item.memory:
+                controller, remembered = recall(item.memory, controller), True
+        elif item.memory and not same_past:
+            with suppress(UnknownMemoryError):  # then decisions only, as before
+                controller, same_past = recall(item.memory, Controller(config, sag_sensitivity)), True
+                remembered = True
+        outputs = _ticked(controller, item, remembered)
+        found.ticks += 1
+        found.last_s = item.inputs.now_s
+        found.finished = outputs.finished
+        found.decisions += decisions_of(outputs.events, item.inputs.now_s)
+        if item.inputs.now_s >= from_s and same_past:
+            _compare(item, outputs, found)
+    return found
+
+
+def _ticked(controller: Controller, item: RecordedTick, remembered: bool) -> TickOutputs:
+    """A tick, which never raises by itself: if it does after a memory was taken up, the memory was forged."""
+    try:
+        return controller.tick(item.inputs)
+    except Exception as error:
+        if not remembered:
+            raise
+        what = f"{type(error).__name__} at {item.inputs.now_s:.2f} s: {error}"
+        raise UnknownMemoryError(f"the recorded memory cannot be used: {what}") from None
+
+
+def _compare(item: RecordedTick, outputs: TickOutputs, found: Replay) -> None:
+    found.compared += 1
+    if output_crc(outputs, outputs.row.pack()) != item.output_crc:
+        found.different += 1
+        found.first_different = found.first_different or outputs.row
+
+
+def decisions_of(events: Iterable[Event], time_s: float | None = None) -> list[Decision]:
+    """The decisions among events; their time is `time_s`, or that of the event itself."""
+    return [
+        Decision(
+            float(event.get("mono_s") or 0.0) if time_s is None else time_s,
+            f"{event['kind']} {event[_DECISIONS[event['kind']]]}",
+        )
+        for event in events
+        if event.get("kind") in _DECISIONS and _DECISIONS[event["kind"]] in event
+    ]
+
+
+def tick_to_begin_with(frames: Iterable[Frame], from_s: float) -> int:
+    """The last tick before a time of the run that has its memory with it; 1 if there is none."""
+    begin = 1
+    for frame in frames:
+        for record in frame.records[np.isin(frame.records["tick"], list(frame.memories))]:
+            if record["now_s"] <= from_s:
+                begin = int(record["tick"])
+        if len(frame.records) and frame.records["now_s"][-1] > from_s:
+            break
+    return begin
+
+
+def recorded_ticks(frames: Iterable[Frame], begin: int = 1, memories: bool = True) -> Iterator[RecordedTick | Gap]:
+    """The ticks of a record in order from the tick `begin` on, and a `Gap` wherever some are missing."""
+    estimates: dict[float, shape_estimate.ShapeEstimate] = {}
+    last, last_s = begin - 1, 0.0
+    for frame in frames:
+        estimates |= frame.estimates
+        for record in frame.records[frame.records["tick"] >= begin]:
+            tick = int(record["tick"])
+            try:
+                inputs = unpack_tick(record, frame.tails.get(tick, b""), estimates)
+            except (LookupError, ValueError, TypeError) as error:
+                yield Gap(tick - 1, last_s, 1, str(error.args[0] if error.args else error))
+            else:
+                if tick > last + 1:
+                    yield Gap(last, last_s, tick - last - 1, "not recorded")
+                memory = frame.memories.get(tick, b"") if memories else b""
+                yield RecordedTick(tick, inputs, int(record["output_crc"]), memory)
+            last, last_s = tick, float(record["now_s"])
+        while len(estimates) > _SHAPES_KEPT:
+            del estimates[next(iter(estimates))]
+
+
+def differing_fields(
+    today: telemetry.TelemetryRow, recorded: telemetry.TelemetryRow
+) -> dict[str, tuple[float, float]]:
+    """Fields that are not the same to the last bit: recorded and today's value."""
+    fields: dict[str, tuple[float, float]] = {}
+    for name in telemetry.TelemetryRow.__slots__:
+        then, now = getattr(recorded, name), getattr(today, name)
+        if then != now and not (math.isnan(then) and math.isnan(now)):
+            fields[name] = (float(then), float(now))
+    return fields
+
+
+def without_repeats(decisions: list[Decision]) -> list[Decision]:
+    """Without those of the shape loop that only give another reason for the state it is in."""
+    kept: list[Decision] = []
+    shape = ""
+    for decision in decisions:
+        if decision.what != shape:
+            kept.append(decision)
+        shape = decision.what if decision.what.startswith("shape") else shape
+    return kept
+
+
+def unmatched(recorded: list[Decision], today: list[Decision], slack_s: float) -> list[str]:
+    """Where two lists of decisions differ, as sentences; times may differ by `slack_s`."""
+    said: list[str] = []
+    recorded, today = without_repeats(recorded), without_repeats(today)
+    for place in range(max(len(recorded), len(today))):
+        then = recorded[place] if place < len(recorded) else None
+        now = today[place] if place < len(today) else None
+        if then is None or now is None or then.what != now.what or abs(then.time_s - now.time_s) > slack_s:
+            said.append(f"recorded: {_told(then)}; today: {_told(now)}")
+            if then is None or now is None or then.what != now.what:
+                break  # all that follow are shifted against each other
+    return said
+
+
+def _told(decision: Decision | None) -> str:
+    return "nothing more" if decision is None else f"{decision.what} at {decision.time_s:.2f} s"

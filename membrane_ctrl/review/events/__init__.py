@@ -1,0 +1,1 @@
+"""Events found in a run that nobody reported."""

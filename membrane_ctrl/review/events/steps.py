@@ -1,0 +1,229 @@
+"""Steps in a noisy series: the mean behind a place against the mean before it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, special
+
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.states import State
+from membrane_ctrl.run_files.shapes import Shapes
+
+Column = NDArray[np.float64]
+
+# The noise is judged over stretches of this many values: weather changes over a night.
+_STRETCH = 3600
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A step found.
+
+    Attributes
+    ----------
+    row : int
+        Place in the series.
+    size : float
+        After minus before, in the series' unit.
+    sigmas : float
+        Its size over the noise of such differences.
+    """
+
+    row: int
+    size: float
+    sigmas: float
+
+
+def steps(values: Column, half: int, skip: int, least: float, least_sigmas: float) -> list[Step]:
+    """Steps of at least `least` and `least_sigmas`, one for each that happened.
+
+    Parameters
+    ----------
+    values : (n,) array
+        Equally spaced; NaN where there is nothing, which no step crosses.
+    half : int
+        Values averaged on each side.
+    skip : int
+        Values left out between the sides: how long a step may take.
+    least : float
+        Unit of the values.
+    least_sigmas : float
+        Against the robust spread of the differences nearby.
+    """
+    difference = differences(values, half, skip)
+    sigma = local_sigma(difference)
+    size = np.nan_to_num(np.abs(difference))
+    score = np.where(sigma > 0, size / np.maximum(sigma, 1e-300), np.inf)
+    found = (size >= least) & (score >= least_sigmas)
+    # the greatest within reach stands for all of one step
+    reach = 2 * half + skip
+    peak = found & (size >= ndimage.maximum_filter1d(size, 2 * reach + 1, mode="constant"))
+    rows = np.flatnonzero(peak)
+    if rows.size:
+        rows = rows[np.concatenate(([True], np.diff(rows) > reach))]
+    return [Step(int(row), float(difference[row]), float(score[row])) for row in rows]
+
+
+def differences(values: Column, half: int, skip: int) -> Column:
+    """(n,) mean of the `half` values behind a place minus that of those before it; NaN at the ends and at gaps."""
+    result = np.full(values.size, np.nan)
+    span = 2 * half + skip
+    if values.size < span:
+        return result
+    windows = np.lib.stride_tricks.sliding_window_view(np.asarray(values, dtype=np.float64), half).mean(axis=1)
+    middle = half + skip // 2
+    count = values.size - span + 1
+    result[middle : middle + count] = windows[half + skip :][:count] - windows[:count]
+    return result
+
+
+def local_sigma(values: Column, share: float = 0.5) -> Column:
+    """(n,) robust standard deviation of stretches of the series, constant within each, about 0.
+
+    Parameters
+    ----------
+    values : (n,) array
+    share : float
+        Of the values that are nothing but noise: what this share of them keeps below is judged by a normal
+        distribution. Half of them (the median) is the most robust, and blind to values that mostly repeat.
+    """
+    result = np.full(values.size, np.nan)
+    sigmas = float(special.ndtri(0.5 * (1 + share)))
+    for first in range(0, values.size, _STRETCH):
+        # the last stretch is a full one, too
+        start = max(0, min(first, values.size - _STRETCH))
+        part = values[start : first + _STRETCH]
+        part = np.abs(part[np.isfinite(part)])
+        result[first : first + _STRETCH] = np.quantile(part, share) / sigmas if part.size else np.nan
+    return result
+
+
+def confidence(sigmas: float, looked_at: int) -> float:
+    """1 minus the chance that noise alone (normal) makes a step this high anywhere in `looked_at` places."""
+    return float(max(0.0, 1.0 - looked_at * special.erfc(sigmas / np.sqrt(2))))
+
+
+# One event found by machine, and what its finders share.
+
+
+Level = dict[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """An event that nobody reported.
+
+    Attributes
+    ----------
+    kind : str
+        "pressure step", "leak step", "laser glitch", "laser lost", "barometer lost", "thermometer lost",
+        "lateness burst", "noise change", "shape jump" or "excursion".
+    start_s, end_s : float
+        Time range of the run that shows it.
+    time_s : float
+        When it happened.
+    size : float
+        In `unit`.
+    unit : str
+    confidence : float
+        1 minus the chance that noise alone looks like this somewhere in the run.
+    """
+
+    kind: str
+    time_s: float
+    start_s: float
+    end_s: float
+    size: float
+    unit: str
+    confidence: float
+
+
+def event_around(kind: str, table: Level, row: int, half_s: float, size: float, unit: str, sure: float) -> Found:
+    """An event with a range about it of some times what it was found in."""
+    time_s = float(table["time_s"][row])
+    return Found(kind, time_s, time_s - 30 * half_s**0.5, time_s + 30 * half_s**0.5, size, unit, sure)
+
+
+def widened(flags: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:
+    """True rows and so many on each side of them."""
+    return np.asarray(ndimage.maximum_filter1d(flags, 2 * rows + 1, mode="constant", cval=0), dtype=bool)
+
+
+def runs(flags: NDArray[np.bool_], join: int) -> list[tuple[int, int]]:
+    """First and last row of each stretch of true rows; those `join` or fewer apart are one."""
+    rows = np.flatnonzero(flags)
+    if not rows.size:
+        return []
+    parts = np.split(rows, np.flatnonzero(np.diff(rows) > join) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts]
+
+
+# Times out of the band that nothing else of the run explains.
+
+
+# After what explains it: what the loop needs to be back in the band (a leak of 1.2 um/s and 40 um: 32 s).
+BACK_S = 30
+# Means of so many seconds tell a setpoint on its way from noise.
+RAMP_HALF_S = 5
+# An event timed to a second may be found some after its effect begins.
+TIMED_S = 5.0
+# These are timed to minutes; what they explain is within their range.
+_TIMED_TO_MINUTES = ("leak step", "noise change")
+
+
+def excursions(level: Level, band_um: float, known: Sequence[Found]) -> list[Found]:
+    """The 1 s mean of the error leaves the band, and no fault, pause, ramp or event known explains it."""
+    time_s, error_um = level["time_s"], level["mean_error_um"]
+    out = (np.abs(error_um) > band_um) & (level["state"] == State.HOLD)
+    paused = np.diff(error_um, prepend=np.nan) == 0  # a loop that waits repeats its error
+    setpoint_um = error_um + level["mean_displacement_um"]
+    ramped = np.abs(differences(setpoint_um, RAMP_HALF_S, 1)) > band_um
+    out &= ~widened((level["fault"] > 0) | paused | ramped, BACK_S)
+    for event in known:
+        from_s = event.start_s if event.kind in _TIMED_TO_MINUTES else event.time_s - TIMED_S
+        first, end = np.searchsorted(time_s, [from_s, event.end_s + BACK_S])
+        out[first:end] = False
+    found = []
+    for a, b in runs(out, BACK_S):
+        worst = a + int(np.nanargmax(np.abs(error_um[a : b + 1])))
+        found.append(Found("excursion", float(time_s[a]), float(time_s[a]) - 30, float(time_s[b]) + 30,
+                           float(error_um[worst]), "um", 1.0))  # fmt: skip
+    return found
+
+
+# Steps of the figure from one cycle to the next.
+
+
+JUMP_LEAST_UM = 0.3
+JUMP_LEAST_SIGMAS = 8.0
+JUMP_HALF_CYCLES = 5
+# From cycle to cycle; a setpoint's ramp is faster, and frames of a mirror that moves do not fit each other.
+JUMP_STILL_UM = 2.0
+# Standard deviation over median absolute deviation, of normal noise.
+_SIGMA_OVER_MAD = 1.4826
+
+
+def shape_jumps(shapes: Shapes, held: NDArray[np.bool_]) -> list[Found]:
+    """The figure beside its sag (terms 5 to 11, without what a deeper bowl has of them) steps between cycles."""
+    moved_um = np.abs(np.diff(shapes.displacement_um, prepend=np.nan, append=np.nan))
+    still = ~(np.fmax(moved_um[:-1], moved_um[1:]) > JUMP_STILL_UM)
+    good = held & still & (shapes.verdict != "rejected")
+    if np.count_nonzero(good) < 4 * JUMP_HALF_CYCLES:
+        return []
+    # of a month all 36 terms are 190 MB
+    terms = shapes.coeffs_um[good, 4:11] - np.outer(shapes.sag_um[good], zernike_projection()[4:11])
+    change = np.stack([differences(term, JUMP_HALF_CYCLES, 0) for term in terms.T])
+    size = np.sqrt((change**2).sum(axis=0))
+    scale = np.nanmedian(size)
+    sigma = _SIGMA_OVER_MAD * float(np.nanmedian(np.abs(size - scale))) + 1e-12
+    score = np.nan_to_num((size - scale) / sigma)
+    rows = np.flatnonzero((np.nan_to_num(size) >= JUMP_LEAST_UM) & (score >= JUMP_LEAST_SIGMAS))
+    groups = np.split(rows, np.flatnonzero(np.diff(rows) > 2 * JUMP_HALF_CYCLES) + 1) if rows.size else []
+    best = [int(group[np.argmax(size[group])]) for group in groups]
+    time_s = {"time_s": shapes.time_s[good]}
+    return [
+        event_around("shape jump", time_s, row, 60, float(size[row]), "um", confidence(float(score[row]), size.size))
+        for row in best
+    ]

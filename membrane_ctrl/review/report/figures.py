@@ -1,0 +1,313 @@
+"""Pictures of the hold: the run at a glance, surroundings, distributions."""
+
+import io
+import re
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from membrane_ctrl.model.states import State
+from membrane_ctrl.review.report.json import timeline
+from membrane_ctrl.review.statistics import shape_review, spectra
+from membrane_ctrl.review.statistics.analysis import Analysis
+from membrane_ctrl.review.words import one_line
+
+# Pictures of a report as SVG text; the style all of them share.
+
+
+BLUE, ORANGE, GREEN, RED, VIOLET, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#8a8f98"
+WIDTH_IN = 10.5
+
+_STYLE: dict[Any, Any] = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.edgecolor": "#c3c8d0",
+    "axes.labelcolor": "#444b55",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e6e9ee",
+    "grid.linewidth": 0.7,
+    "xtick.color": "#667",
+    "ytick.color": "#667",
+    "lines.linewidth": 1.1,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "figure.facecolor": "none",
+    "axes.facecolor": "white",
+    "path.simplify_threshold": 0.3,
+    # the same report twice is the same text
+    "svg.hashsalt": "membrane",
+    "svg.fonttype": "none",
+}
+
+
+@contextmanager
+def picture(rows: int = 1, columns: int = 1, height_in: float = 3.0, **subplots: Any) -> Iterator[tuple[Figure, Any]]:
+    """A figure in the report's style and its axes, as `Figure.subplots` gives them."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+        yield figure, figure.subplots(rows, columns, **subplots)
+
+
+def svg(figure: Figure) -> str:
+    """The figure as an `<svg>` element that scales with the page."""
+    with mpl.rc_context(_STYLE), warnings.catch_warnings():
+        # letters are text in the page, drawn with the reader's fonts
+        warnings.filterwarnings("ignore", r"Glyph \d+ .* missing from font")
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    return re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1))
+
+
+# Where nothing was measured, no line is drawn.
+
+
+Column = NDArray[np.float64]
+
+# A cycle or a second that is left out now and then is no gap.
+_STEPS = 3.0
+_LEAST_S = 5.0
+
+
+def broken_at_gaps(columns: Mapping[str, Column], time_name: str = "time_s") -> dict[str, Column]:
+    """Columns with a row of NaN in every gap, so that a plot does not bridge it with a straight line.
+
+    Parameters
+    ----------
+    columns : mapping of str to (n,) or (n, m) array
+    time_name : str
+        The column of times, s, ascending. A gap is longer than 5 s and three of its usual steps.
+    """
+    time_s = columns[time_name]
+    steps_s = np.diff(time_s)
+    longest_s = max(_LEAST_S, _STEPS * float(np.median(steps_s))) if steps_s.size else np.inf
+    before = np.flatnonzero(steps_s > longest_s)
+    broken = {name: np.insert(np.asarray(values, np.float64), before + 1, np.nan, axis=0)
+              for name, values in columns.items()}  # fmt: skip
+    broken[time_name] = np.insert(time_s, before + 1, time_s[before] + steps_s[before] / 2)
+    return broken
+
+
+_STATE_COLOURS = {
+    State.STANDBY: "#c9ccd1", State.CHECK: "#9ecae1", State.INFLATE: "#56b4e9", State.SETTLE: ORANGE,
+    State.HOLD: GREEN, State.MANUAL: VIOLET, State.TUNE: "#f0e442", State.LOWER: ORANGE, State.FAULT: RED,
+}  # fmt: skip
+# Of a mark's text: more would not fit beside its line, and the timeline has all of it.
+_LETTERS_MOST = 40
+_FOUND_COLOURS = {"pressure step": VIOLET, "leak step": ORANGE, "noise change": ORANGE, "shape jump": BLUE}
+
+
+def hours_or_less(time_s: Column | float, span_s: float) -> tuple[Any, str]:
+    """Times in the unit that suits the span, and its name."""
+    for seconds, name in ((86400.0 * 3, "d"), (3600.0 * 3, "h"), (60.0 * 5, "min")):
+        if span_s >= seconds:
+            unit_s = {"d": 86400.0, "h": 3600.0, "min": 60.0}[name]
+            return np.asarray(time_s) / unit_s, name
+    return np.asarray(time_s), "s"
+
+
+def overview(analysis: Analysis) -> str:
+    """Error with its envelope, the band, states, what was found and marked."""
+    level, band_um = broken_at_gaps(analysis.level), analysis.run.config.limits.band_um
+    span_s = analysis.ticks.end_s - analysis.ticks.start_s
+    time, unit = hours_or_less(level["time_s"], span_s)
+    with picture(2, 1, 4.2, sharex=True, height_ratios=[8, 1.1]) as (figure, (plot, lane)):
+        plot.axhspan(-band_um, band_um, color=GREEN, alpha=0.09, lw=0)
+        plot.fill_between(
+            time,
+            level["min_error_um"],
+            level["max_error_um"],
+            color=GREY,
+            alpha=0.35,
+            lw=0,
+            label="least to greatest",
+        )
+        plot.plot(time, level["mean_error_um"], color=BLUE, label=f"error, mean of {analysis.level_s:g} s")
+        if np.isfinite(level["mean_true_error_um"]).any():
+            plot.plot(time, level["mean_true_error_um"], color=GREEN, lw=0.9, label="true centre (twin)")
+        plot.set_ylim(-3 * band_um, 3 * band_um)
+        plot.set(ylabel="setpoint − centre, µm", title="The run at a glance")
+        _found(plot, analysis, span_s)
+        plot.legend(loc="upper right", ncols=3)
+        _lane(lane, analysis, span_s)
+        lane.set_xlabel(f"time since {analysis.run.origin_utc:%Y-%m-%d %H:%M:%S} UTC, {unit}")
+        return svg(figure)
+
+
+def _found(plot: Any, analysis: Analysis, span_s: float) -> None:
+    top = plot.get_ylim()[1]
+    for event in analysis.found:
+        at, _ = hours_or_less(event.time_s, span_s)
+        colour = _FOUND_COLOURS.get(event.kind, RED)
+        plot.axvline(at, color=colour, lw=0.8, ls=":")
+        plot.plot([at], [0.96 * top], marker="v", ms=5, color=colour, clip_on=False)
+    for noted in timeline(analysis):
+        if noted.get("kind") in {"mark", "fault"}:
+            at, _ = hours_or_less(float(noted.get("mono_s") or 0.0), span_s)
+            colour = RED if noted["kind"] == "fault" else "black"
+            plot.axvline(at, color=colour, lw=1)
+            text = one_line(str(noted.get("text") or noted.get("name") or "fault"))
+            if len(text) > _LETTERS_MOST:
+                text = f"{text[: _LETTERS_MOST - 1]}…"
+            plot.annotate(
+                text, (at, 0.8 * top), rotation=90, fontsize=7, color=colour, ha="right", va="top", parse_math=False
+            )
+
+
+def _lane(lane: Any, analysis: Analysis, span_s: float) -> None:
+    """States as coloured stretches, named where there is room."""
+    states = [event for event in timeline(analysis) if event.get("kind") == "state"]
+    edges_s = [float(event.get("mono_s") or 0.0) for event in states]
+    edges_s.append(max(analysis.ticks.end_s, *edges_s, 0.0))
+    for event, start_s, end_s in zip(states, edges_s, edges_s[1:], strict=False):
+        try:
+            state = State[str(event.get("state", "")).upper()]
+        except KeyError:
+            continue
+        (start, end), _ = hours_or_less(np.array([start_s, end_s]), span_s)
+        lane.axvspan(start, end, color=_STATE_COLOURS[state], lw=0)
+        if end_s - start_s > 0.06 * span_s:
+            lane.text((start + end) / 2, 0.5, state.name.lower(), ha="center", va="center", fontsize=8, color="white")
+    lane.set(ylim=(0, 1), yticks=[])
+    lane.grid(False)
+
+
+def surroundings(analysis: Analysis) -> str:
+    """Air, leak and pump, lateness."""
+    level = broken_at_gaps(analysis.level)
+    time, unit = hours_or_less(level["time_s"], analysis.ticks.end_s - analysis.ticks.start_s)
+    with picture(2, 2, 4.2, sharex=True) as (figure, plots):
+        pressure, temperature, flow, late = plots.ravel()
+        _envelope(pressure, time, level, "ambient_pressure_pa", BLUE)
+        pressure.set(title="Ambient pressure, Pa")
+        pressure.ticklabel_format(useOffset=False)
+        _envelope(temperature, time, level, "air_temperature_c", ORANGE)
+        temperature.set(title="Air temperature, °C")
+        flow.plot(time, level["mean_flow_um_per_s"], color=GREY, lw=0.8, label="flow")
+        flow.plot(time, level["mean_leak_um_per_s"], color=RED, label="leak")
+        flow.set(title="Flow and leak, µm/s", xlabel=unit)
+        flow.legend(loc="upper right", ncols=2)
+        late.plot(time, level["max_lateness_ms"], color=GREY, lw=0.8, label="greatest")
+        late.plot(time, level["mean_lateness_ms"], color=BLUE, label="mean")
+        late.set(title="Lateness of the tick, ms", xlabel=unit)
+        if np.nanmax(level["max_lateness_ms"], initial=0.0) > 0:
+            late.set_yscale("log")
+        late.legend(loc="upper right", ncols=2)
+        return svg(figure)
+
+
+def _envelope(plot: Any, time: Column, level: dict[str, Column], name: str, colour: str) -> None:
+    plot.fill_between(time, level[f"min_{name}"], level[f"max_{name}"], color=colour, alpha=0.2, lw=0)
+    plot.plot(time, level[f"mean_{name}"], color=colour)
+
+
+def distributions(analysis: Analysis) -> str:
+    """Histogram, Allan deviation, spectrum."""
+    reading, true = analysis.reading, analysis.true
+    with picture(1, 3, 3.3) as (figure, (histogram, allan, spectrum)):
+        edges, counts = analysis.ticks.histogram_um, analysis.ticks.histogram_counts
+        merged = counts.reshape(-1, 5).sum(axis=1)
+        middle = edges[:-1].reshape(-1, 5).mean(axis=1) + (edges[1] - edges[0]) / 2
+        share = 100 * merged / max(1, counts.sum())
+        histogram.bar(middle, share, width=5 * (edges[1] - edges[0]), color=BLUE, lw=0.3, ec=BLUE)
+        band_um = analysis.run.config.limits.band_um
+        for side in (-band_um, band_um):
+            histogram.axvline(side, color=GREEN, lw=1)
+        histogram.set(title="Single readings", xlabel="setpoint − reading, µm", ylabel="share, %")
+        for series, colour, name in ((reading, BLUE, "reading"), (true, GREEN, "true centre")):
+            if series is None:
+                continue
+            if series.allan.tau_s.size:
+                allan.loglog(series.allan.tau_s, series.allan.deviation, "o-", ms=3, color=colour, label=name)
+            frequency_hz, power = spectra.density(series.spectrum, series.slow)
+            if np.isfinite(power).any():
+                spectrum.loglog(frequency_hz, np.sqrt(power), color=colour, lw=0.8, label=name)
+        allan.set(title="Overlapping Allan deviation", xlabel="τ, s", ylabel="µm")
+        spectrum.set(title="Amplitude spectral density", xlabel="Hz", ylabel="µm/√Hz")
+        for plot in (allan, spectrum):
+            if plot.lines:
+                plot.legend()
+        return svg(figure)
+
+
+# Pictures of the figure: the paper's stability plots, from the live cycles.
+
+
+# More points than pixels only make the file large.
+_LINE_POINTS = 1500
+_POINT_COLOURS = {"A": BLUE, "B": ORANGE, "C": VIOLET}
+
+
+def stability(shape: shape_review.ShapeReview) -> str:
+    """Heights at A, B, C; camera against laser; the map of the standard deviation; drift of the terms."""
+    span_s = float(np.ptp(shape.time_s))
+    every = max(1, shape.time_s.size // _LINE_POINTS)
+    lines = {"time_s": shape.time_s, "sag": shape.sag_um, "laser": shape.laser_um, **shape.points_um}
+    lines = broken_at_gaps({name: values[::every] for name, values in lines.items()})
+    time, unit = hours_or_less(lines["time_s"], span_s)
+    with picture(2, 2, 6.2, width_ratios=[1.9, 1]) as (figure, plots):
+        points, sd, loops, drift = plots.ravel()
+        for name in shape.points_um:
+            points.plot(time, lines[name], color=_POINT_COLOURS[name], lw=0.9, label=name)
+        points.set(title="Height at A, B and C since the first cycle, µm", xlabel=unit)
+        points.legend(loc="upper right", ncols=3)
+        _map(figure, sd, shape.sd_um, "Standard deviation of the height, µm", "viridis", (0, None))
+        for name, (x, y) in shape_review.POINTS.items():
+            sd.plot(x, y, "o", ms=4, mfc="none", mec="white")
+            sd.annotate(name, (x, y), color="white", fontsize=8, xytext=(4, 3), textcoords="offset points")
+        loops.plot(time, lines["laser"], color=GREY, lw=0.9, label="laser (in the loop)")
+        loops.plot(time, lines["sag"], color=BLUE, lw=0.9, label="sag by the camera")
+        loops.set(title="In the loop and out of it: change of the centre, µm", xlabel=unit)
+        loops.legend(loc="upper right", ncols=2)
+        _drift(drift, shape)
+        return svg(figure)
+
+
+def _drift(plot: Any, shape: shape_review.ShapeReview) -> None:
+    noll = np.arange(2, 37)
+    rate = np.array([term.per_hour for term in shape.drift_um_per_hour])
+    reach = np.array([(term.high - term.low) / 2 for term in shape.drift_um_per_hour])
+    colours = [RED if term.significant else GREY for term in shape.drift_um_per_hour]
+    if np.isfinite(rate).any():
+        plot.bar(noll, rate, yerr=reach, color=colours, error_kw={"lw": 0.7, "ecolor": "#555"})
+        # one term that wandered, and whose interval says nothing, would hide all the others
+        plot.set_yscale("symlog", linthresh=4 * max(float(np.nanmedian(reach)), 1e-6), linscale=2)
+    plot.set(title="Drift of the terms, µm/h (95 %)", xlabel="Noll index")
+
+
+def pairs(shape: shape_review.ShapeReview) -> str:
+    """Height change of a pair of cycles 1 and 10 minutes apart, and its uncertainty."""
+    with picture(len(shape.pairs), 2, 3.4 * len(shape.pairs), squeeze=False) as (figure, plots):
+        for (change, sigma), pair in zip(plots, shape.pairs, strict=True):
+            most = float(np.nanmax(np.abs(pair.change_um))) or 1e-3
+            title = f"Change over {pair.lag_s:.0f} s, µm (RMS {pair.rms_um:.3f})"
+            _map(figure, change, pair.change_um, title, "RdBu_r", (-most, most))
+            if pair.sigma_um is None:
+                sigma.text(0.5, 0.5, "no covariance was recorded", ha="center", transform=sigma.transAxes)
+                sigma.set_axis_off()
+            else:
+                title = f"Its uncertainty, 1 σ, µm (mean {pair.mean_sigma_um:.4f})"
+                _map(figure, sigma, pair.sigma_um, title, "viridis", (0, None))
+        return svg(figure)
+
+
+def _map(figure: Any, plot: Any, values: Column, title: str, colours: str, span: tuple[float, float | None]) -> None:
+    shown = plot.imshow(values, extent=(-1, 1, -1, 1), cmap=colours, vmin=span[0], vmax=span[1], interpolation="none")
+    plot.set(title=title, xticks=[], yticks=[])
+    plot.grid(False)
+    for side in plot.spines.values():
+        side.set_visible(False)
+    figure.colorbar(shown, ax=plot, shrink=0.85)

@@ -1,0 +1,284 @@
+"""The report for people: one HTML file with everything in it."""
+
+import html
+import math
+import shlex
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from membrane_ctrl import __version__
+from membrane_ctrl.review.report import figures as figures_hold
+from membrane_ctrl.review.report import figures as figures_shape
+from membrane_ctrl.review.report.json import timeline, verdict
+from membrane_ctrl.review.statistics import compare, drift, shape_review
+from membrane_ctrl.review.statistics.analysis import Analysis, Series
+from membrane_ctrl.review.statistics.spectra import bands, unseen_s
+from membrane_ctrl.review.words import number, span
+
+# The look of a report; print gives the same.
+
+
+STYLE = """
+:root{color-scheme:light}
+*{box-sizing:border-box}
+body{margin:0;background:#f3f5f8;color:#20242b;font:15px/1.5 system-ui,"Segoe UI","DejaVu Sans",sans-serif}
+main{max-width:1080px;margin:0 auto;padding:28px 32px;background:#fff;min-height:100vh}
+header{display:flex;align-items:baseline;justify-content:space-between;gap:16px;flex-wrap:wrap}
+h1,h2,code{overflow-wrap:anywhere}
+h1{font-size:21px;margin:0}
+h2{font-size:16px;margin:28px 0 8px;border-bottom:1px solid #e3e7ed;padding-bottom:4px}
+.when{margin:0;color:#667}
+.verdict{font-size:17px;padding:12px 16px;border-left:5px solid;border-radius:4px;margin:16px 0}
+.good{border-color:#009e73;background:#eaf7f2}
+.look{border-color:#e69f00;background:#fdf5e3}
+.bad{border-color:#d55e00;background:#fdece3}
+ul.odd{margin:8px 0;padding-left:22px}
+figure{margin:14px 0}
+svg{width:100%;height:auto;display:block}
+.scroll{overflow-x:auto}
+table{border-collapse:collapse;width:100%;font-size:13.5px;font-variant-numeric:tabular-nums}
+th{text-align:left;color:#667;font-weight:600;border-bottom:1px solid #d5dae2;padding:4px 10px 4px 0}
+td{border-bottom:1px solid #eef0f4;padding:4px 10px 4px 0;vertical-align:top}
+td:first-child{white-space:nowrap}
+code{font-size:12px;background:#f3f5f8;padding:1px 5px;border-radius:3px}
+dl{display:grid;grid-template-columns:max-content 1fr;gap:4px 18px;margin:10px 0;font-size:14px}
+dt{color:#667}
+dd{margin:0}
+footer{margin-top:30px;color:#889;font-size:12px}
+@media print{body{background:#fff}main{padding:0}section,figure{break-inside:avoid}}
+"""
+
+
+# A month has thousands of lines; the file beside the report has all.
+_LINES_MOST = 200
+READING, TRUE = "reading (in the loop)", "true centre (twin)"
+_HIDDEN = {"time_utc", "mono_s", "kind", "exit_code", "made_utc"}
+
+
+def render(analysis: Analysis, other: Analysis | None = None, differences: Sequence[compare.Difference] = ()) -> str:
+    """HTML of a report.
+
+    Parameters
+    ----------
+    analysis : Analysis
+    other : Analysis, optional
+        A run it is set against.
+    differences : sequence of Difference
+        From `compare.compare`, if there is another.
+    """
+    run = analysis.run
+    word, sentence = verdict(analysis)
+    parts = [
+        f"<header><h1>{_text(run.name)}</h1>"
+        f"<p class='when'>{run.utc(analysis.ticks.start_s):%Y-%m-%d %H:%M:%S} UTC, "
+        f"{span(analysis.ticks.end_s - analysis.ticks.start_s)}</p></header>",
+        f"<p class='verdict {word}'>{_text(sentence)}</p>",
+        _anomalies(analysis),
+        f"<figure>{figures_hold.overview(analysis)}</figure>",
+        _section("Found by machine", _found(analysis)),
+        _section("How well it was held", _windows(analysis) + _details(analysis)),
+        f"<figure>{figures_hold.distributions(analysis)}</figure>",
+        _section("Pump, leak, feed-forward, ticks", _pump(analysis)),
+        f"<figure>{figures_hold.surroundings(analysis)}</figure>",
+    ]
+    if analysis.shape is not None:
+        parts.append(_section("Figure", _shape(analysis.shape)))
+        parts.append(f"<figure>{figures_shape.stability(analysis.shape)}</figure>")
+        if analysis.shape.pairs:
+            parts.append(f"<figure>{figures_shape.pairs(analysis.shape)}</figure>")
+    if other is not None:
+        parts.append(_section(f"Against {_text(other.run.name)}", _compared(analysis, other, differences)))
+        parts.append(f"<figure>{figures_hold.overview(other)}</figure>")
+    parts.append(_section("Timeline", _timeline(analysis)))
+    parts.append(f"<footer>membrane-ctrl {__version__}, report of {_text(str(run.folder.name))}</footer>")
+    return (
+        "<!doctype html><html lang='en'><head><meta charset='utf-8'>"
+        "<meta name='viewport' content='width=device-width, initial-scale=1'>"
+        f"<title>{_text(run.name)}</title><style>{STYLE}</style></head><body><main>{''.join(parts)}</main></body></html>"
+    )
+
+
+def _anomalies(analysis: Analysis) -> str:
+    if not analysis.anomalies:
+        return ""
+    return _list(f"<b>{_text(a.name)}</b> {_text(a.seen)}" for a in analysis.anomalies)
+
+
+def _found(analysis: Analysis) -> str:
+    if not analysis.found:
+        return (
+            "<p>Nothing: no door, leak step, laser glitch, lateness burst, change of noise, excursion or jump "
+            "of the figure.</p>"
+        )
+    name = _text(shlex.quote(analysis.run.name))
+    rows = [
+        [
+            f"{analysis.run.utc(event.time_s):%Y-%m-%d %H:%M:%S}",
+            event.kind,
+            f"{number(event.size)} {_text(event.unit)}",
+            f"{event.confidence:.3f}",
+            f"<code>membrane-ctrl review {name} --from +{max(event.start_s, 1):.0f}s --to +{event.end_s:.0f}s</code>",
+        ]
+        for event in analysis.found[:_LINES_MOST]
+    ]
+    return _table(["UTC", "what", "size", "confidence", "look at it"], rows) + _more(len(analysis.found))
+
+
+def _windows(analysis: Analysis) -> str:
+    both = ((READING, analysis.reading), (TRUE, analysis.true))
+    rows = [
+        [
+            name,
+            f"{window.window_s:g} s",
+            f"{window.count}",
+            *(number(v) for v in (window.mean_um, window.std_um, window.p99_7_um, window.max_um)),
+            f"{number(100 * window.in_band, 6)} %",
+        ]
+        for name, series in both
+        for window in (() if series is None else series.windows)
+    ]
+    band = f"in ±{analysis.run.config.limits.band_um:g} µm"
+    return _table(["", "means of", "count", "mean µm", "std µm", "p99.7 µm", "greatest µm", band], rows)
+
+
+def _details(analysis: Analysis) -> str:
+    series, name = (analysis.reading, READING) if analysis.true is None else (analysis.true, TRUE)
+    if series is None:
+        return ""
+    ticks = analysis.ticks
+    return _facts(
+        [
+            (f"drift, {name}", _slope(series.drift, "µm/h")),
+            (
+                "single readings of the laser",
+                f"std {number(ticks.raw_reading.std)} µm, {100 * ticks.raw_in_band:.2f} % in the band; "
+                f"{number(ticks.unread_s)} s held without one",
+            ),
+            (f"RMS by frequency, {name}", _bands(series)),
+        ]
+    )
+
+
+def _bands(series: Series) -> str:
+    there = [band for band in bands(series.spectrum, series.slow) if band.rms_um == band.rms_um]
+    if not there:
+        return "too short to say"
+    said = [f"{number(b.from_hz)}–{number(b.high_hz)} Hz: {number(b.rms_um)} µm" for b in there]
+    return f"{'; '.join(said)}; not seen: what is slower than {span(unseen_s(there))}"
+
+
+def _pump(analysis: Analysis) -> str:
+    pump, ticks, late = analysis.ticks.pump, analysis.ticks, analysis.ticks.lateness_ms
+    median, least, most = analysis.leak_um_per_s
+    benefit = analysis.benefit
+    facts = [
+        ("pump", f"{100 * pump.mean_fraction:.1f} ± {100 * pump.std_fraction:.1f} % of full, running "
+                 f"{100 * pump.running_share:.1f} % of the time"),
+        ("wear", f"{number(pump.starts_per_hour)} starts and {number(pump.travel_per_hour)} full strokes an hour"),
+        ("at a limit", f"{100 * pump.saturated_share:.2f} % of ticks"),
+        ("leak", f"{number(median)} µm/s (from {number(least)} to {number(most)})"),
+        ("lateness", f"p50 {number(late.quantile(0.5))}, p99 {number(late.quantile(0.99))}, greatest "
+                     f"{number(late.largest)} ms; {ticks.missed_ticks} ticks missed"),
+    ]  # fmt: skip
+    if benefit is not None:
+        said = f"std of 1 s means {number(benefit.with_um)} µm, without it {number(benefit.without_um)} µm (computed)"
+        facts.insert(4, ("feed-forward", said))
+    return _facts(facts)
+
+
+def _shape(shape: shape_review.ShapeReview) -> str:
+    drifting = [
+        f"Z{j} {_slope(term, 'µm/h')}" for j, term in enumerate(shape.drift_um_per_hour, 2) if term.significant
+    ]
+    facts = [
+        ("cycles", f"{shape.time_s.size} used of {shape.cycles}, {shape.rejected} rejected"),
+        ("standard deviation", f"{number(shape.mean_sd_um)} µm, mean over the area"),
+        ("A, B, C", ", ".join(f"{name} {number(float(v.std()))} µm" for name, v in shape.points_um.items())),
+        ("drifting terms", ", ".join(drifting) or "none"),
+        ("sag by camera − laser", _slope(shape.disagreement, "µm/h")),
+    ]
+    facts += [
+        (
+            f"{pair.lag_s:.0f} s apart",
+            f"RMS change {number(pair.rms_um)} µm (pair shown), {number(pair.all_rms_um)} µm (all {pair.pairs}); "
+            f"uncertainty {number(pair.mean_sigma_um)} µm",
+        )
+        for pair in shape.pairs
+    ]
+    return _facts(facts)
+
+
+def _compared(analysis: Analysis, other: Analysis, differences: Sequence[compare.Difference]) -> str:
+    rows = [
+        [
+            d.name,
+            number(d.ours),
+            number(d.theirs),
+            d.unit,
+            d.said,
+            f"{d.p_value:.2g}" if d.p_value == d.p_value else "–",
+            _text(d.note),
+        ]
+        for d in differences
+    ]
+    _, sentence = verdict(other)
+    if _is_part(analysis) and not _is_part(other):
+        sentence = f"A part of this run against the whole of the other. {sentence}"
+    table = _table(["", "this run", "other run", "", "difference", "p", ""], rows)
+    return f"<p>{_text(sentence)}</p>{table}"
+
+
+def _is_part(analysis: Analysis) -> bool:
+    return any(math.isfinite(moment_s) for moment_s in analysis.part_s)
+
+
+def _timeline(analysis: Analysis) -> str:
+    events = timeline(analysis)
+    rows = [
+        [
+            f"{analysis.run.utc(float(event.get('mono_s') or 0)):%Y-%m-%d %H:%M:%S}",
+            _text(str(event.get("kind"))),
+            _text(_said(event)),
+        ]
+        for event in events[:_LINES_MOST]
+    ]
+    return _table(["UTC", "what", ""], rows) + _more(len(events))
+
+
+def _said(event: dict[str, Any]) -> str:
+    return ", ".join(
+        f"{key} {value}" for key, value in event.items() if key not in _HIDDEN and value not in (None, "")
+    )
+
+
+def _slope(slope: drift.Slope, unit: str) -> str:
+    if slope.per_hour != slope.per_hour:
+        return "too short to say"
+    said = f"{slope.per_hour:+.3g} {unit} (95 %: {slope.low:+.3g} to {slope.high:+.3g})"
+    return said if slope.significant else f"{said}, not significant"
+
+
+def _more(count: int) -> str:
+    return f"<p>{count - _LINES_MOST} more in the JSON report.</p>" if count > _LINES_MOST else ""
+
+
+def _section(title: str, body: str) -> str:
+    return f"<section><h2>{title}</h2>{body}</section>"
+
+
+def _facts(facts: Iterable[tuple[str, str]]) -> str:
+    return "<dl>" + "".join(f"<dt>{_text(name)}</dt><dd>{said}</dd>" for name, said in facts) + "</dl>"
+
+
+def _list(items: Iterable[str]) -> str:
+    return "<ul class='odd'>" + "".join(f"<li>{item}</li>" for item in items) + "</ul>"
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    cells = "".join(f"<th>{title}</th>" for title in head)
+    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<div class='scroll'><table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>"
+
+
+def _text(text: str) -> str:
+    return html.escape(text)

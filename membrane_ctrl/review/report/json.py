@@ -1,0 +1,170 @@
+"""The report for programs: plain data, units in the names."""
+
+import math
+from dataclasses import asdict
+from typing import Any, Literal
+
+from membrane_ctrl.model.states import State
+from membrane_ctrl.review.statistics import drift, shape_review, spectra
+from membrane_ctrl.review.statistics.analysis import Analysis, Series
+from membrane_ctrl.review.words import span
+
+# A run in one sentence.
+
+
+Word = Literal["good", "look", "bad"]
+
+# Anomalies that end the claim that the mirror was held.
+_GRAVE = {"fault", "band left", "never settled"}
+# Single readings that fail to come are any laser's.
+_UNREAD_LEAST_S = 1.0
+# Every hold begins with some seconds that do not count; more is a setpoint on its way.
+_MOVING_LEAST_S = 60.0
+
+
+def verdict(analysis: Analysis) -> tuple[Word, str]:
+    """One word for a colour, and the sentence."""
+    run, ticks = analysis.run, analysis.ticks
+    series = analysis.true or analysis.reading
+    whole = span(ticks.end_s - ticks.start_s)
+    names = [anomaly.name for anomaly in analysis.anomalies]
+    word: Word = "bad" if _GRAVE & set(names) else "look" if names else "good"
+    if series is None or not series.windows[0].count:
+        return "bad", f"Not held: no second of {whole} counts as settled{_what(names)}."
+    seconds = series.windows[0]
+    who = "true centre" if analysis.true else "laser reading"
+    std = f"std {seconds.std_um:.3f} µm, " if seconds.count > 1 else ""
+    share = 100 * seconds.in_band
+    parts = []
+    if ticks.unread_s >= _UNREAD_LEAST_S:
+        parts.append(f"{span(ticks.unread_s)} of it without a reading")
+    if ticks.hold_s - ticks.settled_s >= _MOVING_LEAST_S:
+        parts.append(f"{span(ticks.hold_s - ticks.settled_s)} of it not yet settled")
+    but = f" ({', '.join(parts)})" if parts else ""
+    return word, (
+        f"Held for {span(ticks.hold_s)} of {whole}{but}; {share:.6g} % of its seconds within "
+        f"±{run.config.limits.band_um:g} µm ({who}: {std}mean {seconds.mean_um:+.3f} µm)"
+        f"{_what(names)}."
+    )
+
+
+def _what(names: list[str]) -> str:
+    if not names:
+        return "; nothing out of the ordinary"
+    distinct = list(dict.fromkeys(names))
+    return f"; to look at: {', '.join(distinct)}"
+
+
+SCHEMA = "membrane-report/1"
+
+_TOLD = frozenset(
+    ["start", "geometry", "state", "fault", "cleared", "maintenance", "maintenance_over", "command", "mark", "end"]
+)
+
+
+def report_table(analysis: Analysis) -> dict[str, Any]:
+    """All figures of the report (`membrane-report/1`); NaN where there is nothing to say."""
+    run, ticks = analysis.run, analysis.ticks
+    word, sentence = verdict(analysis)
+    late = ticks.lateness_ms
+    return {
+        "schema": SCHEMA,
+        "run": run.name,
+        "started_utc": run.origin_utc.isoformat(),
+        "verdict": word,
+        "sentence": sentence,
+        "part_s": {"start": ticks.start_s, "end": ticks.end_s},
+        "duration_s": ticks.end_s - ticks.start_s,
+        "hold_s": ticks.hold_s,
+        "settled_s": ticks.settled_s,
+        "held_without_every_tick_s": ticks.thin_s,
+        "held_without_reading_s": ticks.unread_s,
+        "ticks": ticks.ticks,
+        "ticks_settled": ticks.settled,
+        "ticks_missed": ticks.missed_ticks,
+        "band_um": run.config.limits.band_um,
+        "in_band_single_ticks": ticks.raw_in_band,
+        "std_single_ticks_um": ticks.raw_reading.std,
+        "reading": _series(analysis.reading),
+        "true": _series(analysis.true),
+        "histogram": {"edges_um": list(ticks.histogram_um), "counts": [int(n) for n in ticks.histogram_counts]},
+        "pump": asdict(ticks.pump),
+        "leak_um_per_s": dict(zip(("median", "min", "max"), analysis.leak_um_per_s, strict=True)),
+        "feedforward": None
+        if analysis.benefit is None
+        else {"std_1s_with_um": analysis.benefit.with_um, "std_1s_without_um": analysis.benefit.without_um},
+        "lateness_ms": {"p50": late.quantile(0.5), "p99": late.quantile(0.99), "max": late.largest},
+        "timeline": timeline(analysis),
+        "found": [asdict(event) for event in analysis.found],
+        "shape": None if analysis.shape is None else _shape(analysis.shape),
+        "anomalies": [asdict(anomaly) for anomaly in analysis.anomalies],
+        "notes": list(run.notes),
+        "exit": None if not run.summary else run.summary.get("exit"),
+    }
+
+
+def timeline(analysis: Analysis) -> list[dict[str, Any]]:
+    """State changes, faults, commands and marks in their order; without events, states from the telemetry."""
+    start_s, end_s = analysis.part_s
+    events = [event for event in analysis.run.events if event.get("kind") in _TOLD]
+    if not any(event.get("kind") == "state" for event in events):
+        level = analysis.level
+        codes = level["state"]
+        events += [
+            {"mono_s": float(level["time_s"][row]), "kind": "state", "state": State(int(codes[row])).name.lower()}
+            for row in range(codes.size)
+            if math.isfinite(codes[row]) and (row == 0 or codes[row] != codes[row - 1])
+        ]
+    inside = [event for event in events if start_s <= _moment_s(event) < end_s]
+    return sorted(inside, key=_moment_s)
+
+
+def _moment_s(event: dict[str, Any]) -> float:
+    moment = event.get("mono_s")
+    return float(moment) if isinstance(moment, (int, float)) else 0.0
+
+
+def _series(series: Series | None) -> dict[str, Any] | None:
+    if series is None:
+        return None
+    return {
+        "windows": [asdict(window) for window in series.windows],
+        "drift_um_per_hour": _slope(series.drift),
+        "allan": {
+            "tau_s": list(series.allan.tau_s),
+            "deviation_um": list(series.allan.deviation),
+            "windows": [int(n) for n in series.allan.windows],
+        },
+        "bands_rms_um": [asdict(band) for band in spectra.bands(series.spectrum, series.slow)],
+        "spectrum_segments": series.spectrum.segments,
+        "slow_spectrum_segments": series.slow.segments,
+    }
+
+
+def _slope(slope: drift.Slope) -> dict[str, float | bool]:
+    return asdict(slope) | {"significant": slope.significant}
+
+
+def _shape(shape: shape_review.ShapeReview) -> dict[str, Any]:
+    return {
+        "cycles": shape.cycles,
+        "rejected": shape.rejected,
+        "used": int(shape.time_s.size),
+        "mean_sd_um": shape.mean_sd_um,
+        "points_sd_um": {name: float(values.std()) for name, values in shape.points_um.items()},
+        "drift_um_per_hour": {f"Z{j}": _slope(term) for j, term in enumerate(shape.drift_um_per_hour, 2)},
+        "sag_minus_laser_um_per_hour": _slope(shape.disagreement),
+        "sag_std_um": float(shape.sag_um.std()),
+        "laser_std_um": float(shape.laser_um.std()),
+        "pairs": [
+            {
+                "first_s": pair.first_s,
+                "lag_s": pair.lag_s,
+                "rms_um": pair.rms_um,
+                "mean_sigma_um": pair.mean_sigma_um,
+                "all_pairs_rms_um": pair.all_rms_um,
+                "pairs": pair.pairs,
+            }
+            for pair in shape.pairs
+        ],
+    }

@@ -1,0 +1,245 @@
+"""Everything a report says of a run, computed once; `report_json` and `report_html` only write it down."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from membrane_ctrl.model import errors, states
+from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
+from membrane_ctrl.review.events.steps import Found
+from membrane_ctrl.review.statistics import shape_review, spectra
+from membrane_ctrl.review.statistics.anomalies import Anomaly, anomalies
+from membrane_ctrl.review.statistics.drift import Slope, slope
+from membrane_ctrl.review.statistics.hold_pass import ERROR, KEPT_AWAY, READING, TRUE, HoldPass, hold_pass
+from membrane_ctrl.review.statistics.windows import WindowStatistics, describe, window_means
+from membrane_ctrl.run_files.run import Block, Run
+from membrane_ctrl.run_files.summary import held_at
+
+Column = NDArray[np.float64]
+
+WINDOWS_S = (1, 4, 60)
+# A level with about this many rows makes a picture.
+_PICTURE_ROWS = 9000
+# The slope is fitted to minutes, of a short run to seconds.
+_SLOPE_MINUTES_FROM_S = 3600.0
+# A missed tick or a glitch is bridged by a straight line, or no segment of a spectrum would be whole.
+FILLED_S = 0.5
+# Of the seconds, whose spectrum is used below 0.1 Hz at most: what a laser without light for a moment leaves.
+_FILLED_SECONDS = 5
+# A day has slower and larger motions than any hold; longer means say no more than the slope.
+_ALLAN_LONGEST_S = 1e5
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Statistics of one error: `reading` (in the loop) or `true` (the twin's centre).
+
+    Attributes
+    ----------
+    windows : tuple of WindowStatistics
+        At `WINDOWS_S`.
+    seconds_um : (2, n) array
+        Times and means of the 1 s windows.
+    allan : Allan
+    spectrum : Spectrum
+        Of the ticks.
+    slow : Spectrum
+        Of the 1 s means, in segments of half the hold: for what is slower than the segments of `spectrum`.
+    drift : Slope
+        um per hour.
+    """
+
+    windows: tuple[WindowStatistics, ...]
+    seconds_um: Column
+    allan: spectra.Allan
+    spectrum: spectra.Spectrum
+    slow: spectra.Spectrum
+    drift: Slope
+
+
+@dataclass(frozen=True, slots=True)
+class Benefit:
+    """Feed-forward: std of the 1 s means as held, and as they would have been without it (um).
+
+    Attributes
+    ----------
+    with_um, without_um : float
+    without_seconds_um : (2, n) array
+        Times and 1 s means without it.
+    """
+
+    with_um: float
+    without_um: float
+    without_seconds_um: Column
+
+
+@dataclass(frozen=True, slots=True)
+class Analysis:
+    """What is known of a run.
+
+    Attributes
+    ----------
+    run : Run
+    part_s : tuple
+        Part of the run that was asked for.
+    ticks : HoldPass
+    level : dict
+        Overview for the pictures; its windows are `level_s` long.
+    level_s : float
+    reading, true : Series or None
+        None when there is nothing settled (or, of `true`, on a real bench).
+    benefit : Benefit or None
+    leak_um_per_s : tuple
+        Median, least and greatest minute of the leak estimate while held.
+    found : tuple of Found
+    shape : ShapeReview or None
+    anomalies : tuple of Anomaly
+    """
+
+    run: Run
+    part_s: tuple[float, float]
+    ticks: HoldPass
+    level: Block
+    level_s: float
+    reading: Series | None
+    true: Series | None
+    benefit: Benefit | None
+    leak_um_per_s: tuple[float, float, float]
+    found: tuple[Found, ...]
+    shape: shape_review.ShapeReview | None
+    anomalies: tuple[Anomaly, ...]
+
+
+def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> Analysis:
+    """Analyse a run or a part of it.
+
+    Parameters
+    ----------
+    run : Run
+    start_s, end_s : float
+        Seconds of the run.
+
+    Raises
+    ------
+    InputError
+        If there is no tick in it.
+    """
+    seconds = run.level(1.0, start_s, end_s, LEVEL_COLUMNS)
+    if not seconds["time_s"].size:
+        known = "".join(f"; {note}" for note in run.notes)
+        raise errors.InputError(f"{run.folder}: nothing to report: no telemetry in this part of the run{known}")
+    span_s = (float(seconds["time_s"][0]), float(seconds["time_s"][-1]) + 1.0)
+    found, shape = _found_and_shape(run, seconds, start_s, end_s)
+    del seconds  # of a month a quarter of a GB, and what comes needs more
+    ticks = hold_pass(run, span_s, (start_s, end_s))
+    level_s = _level_for(span_s[1] - span_s[0])
+    level = run.level(level_s, start_s, end_s)
+    reading = _series(run, ticks, READING)
+    true = _series(run, ticks, TRUE)
+    benefit = _benefit(run, ticks, true is not None)
+    leak = _leak(level)
+    odd = anomalies(run, (start_s, end_s), ticks, reading, true, leak[0], _tracking(level), found, shape)
+    return Analysis(
+        run, (start_s, end_s), ticks, level, level_s, reading, true, benefit, leak, found, shape, odd
+    )  # fmt: skip
+
+
+def _found_and_shape(
+    run: Run, seconds: Block, start_s: float, end_s: float
+) -> tuple[tuple[Found, ...], shape_review.ShapeReview | None]:
+    """What needs the cycles; they are let go again before the ticks are read."""
+    shapes = run.shapes()
+    shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
+    mirror = run.config.optics.mirror
+    held = held_at(seconds, shapes.time_s)
+    shape = shape_review.review_shapes(shapes, held, mirror.analysis_radius_mm / mirror.radius_mm)
+    return tuple(find_events(seconds, shapes, run.config.limits.band_um)), shape
+
+
+def _series(run: Run, ticks: HoldPass, which: int) -> Series | None:
+    rate_hz, band_um = run.config.loop.rate_hz, run.config.limits.band_um
+    second, counts, sums = ticks.seconds[which]
+    moments = ticks.raw_reading if which == READING else ticks.raw_true
+    if not moments.count:
+        return None
+    means = {w: window_means(second, counts, sums[ERROR], w, rate_hz) for w in WINDOWS_S}
+    grid = ticks.reading_um if which == READING else ticks.true_um
+    grid = fill_short_gaps(grid[_first(grid) : grid.size - _first(grid[::-1])], round(FILLED_S * rate_hz))
+    longest = max(1, min(grid.size // 4, round(_ALLAN_LONGEST_S * rate_hz)))
+    lengths = 2 ** np.arange(int(np.log2(longest)) + 1)
+    minutes = ticks.hold_s >= _SLOPE_MINUTES_FROM_S
+    return Series(
+        windows=tuple(describe(means[w][1], w, band_um) for w in WINDOWS_S),
+        seconds_um=np.stack(means[1]),
+        allan=spectra.allan_deviation(grid, 1 / rate_hz, lengths),
+        spectrum=spectra.power_spectrum(grid, rate_hz),
+        slow=slow_spectrum(*means[1]),
+        drift=slope(*means[60 if minutes else 1]),
+    )
+
+
+def slow_spectrum(time_s: Column, means: Column) -> spectra.Spectrum:
+    """Spectrum of 1 s means in segments half as long as the longest stretch without a gap: three of a whole hold.
+
+    Parameters
+    ----------
+    time_s, means : (n,) arrays
+        Middles of the seconds, and means; gaps up to 5 s are bridged.
+    """
+    if not time_s.size:
+        return spectra.power_spectrum(np.empty(0), 1.0)
+    place = np.floor(time_s - time_s[0] + 0.5).astype(np.int64)
+    grid = np.full(int(place[-1]) + 1, np.nan, dtype=np.float32)
+    grid[place] = means
+    grid = fill_short_gaps(grid, _FILLED_SECONDS)
+    gaps = np.flatnonzero(~np.isfinite(np.concatenate(([np.nan], grid, [np.nan]))))
+    longest = int(np.diff(gaps).max()) - 1
+    return spectra.power_spectrum(grid, 1.0, fft.prev_fast_len(max(8, longest // 2), real=True))
+
+
+def fill_short_gaps(values: NDArray[np.float32], most: int) -> NDArray[np.float32]:
+    """Gaps of at most `most` values filled with straight lines; longer ones stay NaN."""
+    gap = ~np.isfinite(values)
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], gap, [False])).astype(np.int8)))
+    filled = values.copy()
+    for start, end in edges.reshape(-1, 2):
+        if end - start <= most and start > 0 and end < values.size:
+            filled[start:end] = np.linspace(values[start - 1], values[end], end - start + 2)[1:-1]
+    return filled
+
+
+def _first(grid: NDArray[np.float32]) -> int:
+    """Places in front of the first value."""
+    return int(np.argmax(np.isfinite(grid)))
+
+
+def _benefit(run: Run, ticks: HoldPass, true: bool) -> Benefit | None:
+    second, counts, sums = ticks.seconds[TRUE if true else READING]
+    if not np.isfinite(sums[KEPT_AWAY]).any():
+        return None
+    error = sums[ERROR]
+    _, held = window_means(second, counts, error, 1, run.config.loop.rate_hz)
+    without = np.stack(window_means(second, counts, error + sums[KEPT_AWAY], 1, run.config.loop.rate_hz))
+    return Benefit(float(held.std()), float(without[1].std()), without) if held.size else None
+
+
+def _leak(level: Block) -> tuple[float, float, float]:
+    leak = level["mean_leak_um_per_s"][level["state"] == states.State.HOLD]
+    leak = leak[np.isfinite(leak)]
+    if not leak.size:
+        return (math.nan, math.nan, math.nan)
+    return float(np.median(leak)), float(leak.min()), float(leak.max())
+
+
+def _tracking(level: Block) -> float:
+    """Share of the time held in which the shape loop moved the setpoint."""
+    state = level["shape_state"][level["state"] == states.State.HOLD]
+    state = state[np.isfinite(state)]
+    return float((state == states.ShapeState.TRACKING).mean()) if state.size else math.nan
+
+
+def _level_for(span_s: float) -> float:
+    return next((w for w in (1.0, 10.0) if span_s / w <= _PICTURE_ROWS), 60.0)

@@ -1,0 +1,173 @@
+"""Two runs side by side, with the significance of each difference."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from membrane_ctrl.control.shape_loop import SHAPES
+from membrane_ctrl.model.states import ShapeState, State
+from membrane_ctrl.review.statistics.analysis import Analysis, Series
+from membrane_ctrl.review.statistics.drift import Slope, mean_p, spread_p, windowed
+
+Column = NDArray[np.float64]
+
+_SIGNIFICANT = 0.01
+_SHORT = "no test: too short for blocks"
+_STRETCHES = "tests these two stretches of time, not the settings: the weather is another each day"
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One quantity of two runs.
+
+    Attributes
+    ----------
+    name, unit : str
+    ours, theirs : float
+    p_value : float
+        Chance of a difference as large between runs that are alike; NaN where there is no test.
+    note : str
+        Why there is none, or what the test does not know; empty: nothing to say.
+    """
+
+    name: str
+    unit: str
+    ours: float
+    theirs: float
+    p_value: float = math.nan
+    note: str = ""
+
+    @property
+    def said(self) -> str:
+        """The verdict in words."""
+        if math.isnan(self.p_value):
+            return ""
+        if self.p_value >= _SIGNIFICANT:
+            return "no significant difference"
+        return "larger" if self.ours > self.theirs else "smaller"
+
+
+def compare(ours: Analysis, theirs: Analysis) -> list[Difference]:
+    """Differences of two analyses.
+
+    Means and spreads are tested between blocks: each run gives a mean and a log variance every five minutes, and
+    Welch's t test asks whether the two sets differ. Slopes are tested by their own standard errors.
+    """
+    found: list[Difference] = []
+    for name, a, b in (("reading", ours.reading, theirs.reading), ("true centre", ours.true, theirs.true)):
+        if a is not None and b is not None:
+            offset_um = math.hypot(_reference_um(ours), _reference_um(theirs)) if name == "true centre" else 0.0
+            tracks = name == "true centre" and (_tracks(ours) or _tracks(theirs))
+            found += _series(name, a, b, offset_um, tracks)
+    if ours.benefit is not None and theirs.benefit is not None:
+        without = ours.benefit.without_um, theirs.benefit.without_um
+        p_value = spread_p(ours.benefit.without_seconds_um, theirs.benefit.without_seconds_um)
+        found.append(_tested("without feed-forward", "µm", *without, p_value))
+    found += _loop(ours, theirs)
+    if ours.shape is not None and theirs.shape is not None:
+        found += _figure(ours, theirs)
+    return found
+
+
+def _series(name: str, a: Series, b: Series, offset_um: float, tracks: bool) -> list[Difference]:
+    first = a.windows[0], b.windows[0]
+    mean = mean_p(a.seconds_um, b.seconds_um, offset=offset_um)
+    found = [
+        _tested(f"{name}, mean", "µm", first[0].mean_um, first[1].mean_um, mean, _of_mean(offset_um, tracks)),
+        _tested(f"{name}, std of 1 s", "µm", first[0].std_um, first[1].std_um, spread_p(a.seconds_um, b.seconds_um)),
+        _tested(f"{name}, drift", "µm/h", a.drift.per_hour, b.drift.per_hour, _slope_p(a.drift, b.drift)),
+    ]
+    for x, y in zip(a.windows[1:], b.windows[1:], strict=True):
+        parts = [np.stack(windowed(series.seconds_um[0], series.seconds_um[1], x.window_s)) for series in (a, b)]
+        p_value = spread_p(parts[0], parts[1], x.window_s)
+        found.append(_tested(f"{name}, std of {x.window_s:g} s", "µm", x.std_um, y.std_um, p_value))
+    return found
+
+
+def _of_mean(offset_um: float, tracks: bool) -> str:
+    if offset_um > 0:
+        return f"with ±{offset_um:.2g} µm for the references of the shape loops"
+    return f"{_STRETCHES}; nor does it know the reference of the shape loop" if tracks else ""
+
+
+def _loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
+    mine, other = ours.ticks, theirs.ticks
+    leak, pump, late = (
+        [_held(analysis, name) for analysis in (ours, theirs)]
+        for name in ("mean_leak_um_per_s", "mean_pump_fraction", "max_lateness_ms")
+    )
+    window_s = max(ours.level_s, theirs.level_s)
+    late = [np.stack((part[0], np.log(np.maximum(part[1], 1e-6)))) for part in late]
+    same = ours.level_s == theirs.level_s
+    late_p = mean_p(late[0], late[1], window_s, correlated=True) if same else math.nan
+    late_note = f"tested by the greatest of each {window_s:g} s" if same else "no test: levels of different length"
+    return [
+        _tested("leak", "µm/s", ours.leak_um_per_s[0], theirs.leak_um_per_s[0],
+                mean_p(leak[0], leak[1], window_s, correlated=True), _STRETCHES),
+        _tested("pump, mean", "of full", mine.pump.mean_fraction, other.pump.mean_fraction,
+                mean_p(pump[0], pump[1], window_s, correlated=True), _STRETCHES),
+        _tested("pump strokes", "1/h", mine.pump.travel_per_hour, other.pump.travel_per_hour, math.nan,
+                "no test: one sum over the run"),
+        _tested("lateness p99", "ms", mine.lateness_ms.quantile(0.99), other.lateness_ms.quantile(0.99),
+                late_p, late_note),
+    ]  # fmt: skip
+
+
+def _figure(ours: Analysis, theirs: Analysis) -> list[Difference]:
+    assert ours.shape is not None
+    assert theirs.shape is not None
+    cycle_s = max(float(np.median(np.diff(shape.time_s))) for shape in (ours.shape, theirs.shape))
+    points = [
+        spread_p(np.stack((ours.shape.time_s, height)), np.stack((theirs.shape.time_s, theirs.shape.points_um[name])),
+                 cycle_s)
+        for name, height in ours.shape.points_um.items()
+    ]  # fmt: skip
+    # the least of three tests, times three: Bonferroni's
+    least = float(np.minimum(1.0, len(points) * np.min(points)))
+    parting = ours.shape.disagreement, theirs.shape.disagreement
+    return [
+        _tested("figure, mean SD", "µm", ours.shape.mean_sd_um, theirs.shape.mean_sd_um, least,
+                "tested at A, B and C, within blocks"),
+        _tested("sag − laser", "µm/h", parting[0].per_hour, parting[1].per_hour, _slope_p(*parting)),
+    ]  # fmt: skip
+
+
+def _tested(name: str, unit: str, ours: float, theirs: float, p_value: float, note: str = "") -> Difference:
+    """A row that says so where it has no test."""
+    if math.isnan(p_value) and not note.startswith("no test"):
+        note = _SHORT
+    return Difference(name, unit, ours, theirs, p_value, note)
+
+
+def _held(analysis: Analysis, name: str) -> Column:
+    """(2, n): times and values of the level while held."""
+    level = analysis.level
+    held = (level["state"] == State.HOLD) & np.isfinite(level[name])
+    return np.stack((level["time_s"][held], level[name][held]))
+
+
+def _tracks(analysis: Analysis) -> bool:
+    return bool((analysis.level.get("shape_state", np.empty(0)) == ShapeState.TRACKING).any())
+
+
+def _reference_um(analysis: Analysis) -> float:
+    """Standard error (um) of the reference of the shape loop, an offset of the true centre for all of the run.
+
+    From the scatter of sag minus laser from cycle to cycle, as the data have it; 0 when the loop does not track or
+    too few cycles were measured.
+    """
+    shape = analysis.shape
+    if shape is None or shape.time_s.size < 2 * SHAPES or not _tracks(analysis):
+        return 0.0
+    scatter_um = float(np.std(np.diff(shape.sag_um - shape.laser_um))) / math.sqrt(2)
+    return scatter_um / math.sqrt(SHAPES)
+
+
+def _slope_p(a: Slope, b: Slope) -> float:
+    sigmas = [(slope.high - slope.low) / 2 / 1.96 for slope in (a, b)]
+    if not all(math.isfinite(sigma) and sigma > 0 for sigma in sigmas):
+        return math.nan
+    return float(2 * stats.norm.sf(abs(a.per_hour - b.per_hour) / math.hypot(*sigmas)))

@@ -1,0 +1,343 @@
+"""One pass over every tick of a run: everything of the report that needs single ticks, in memory for two series."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.model.states import State
+from membrane_ctrl.review.statistics import windows
+from membrane_ctrl.run_files import summary, tables
+from membrane_ctrl.run_files.run import Block, Run
+
+# Seconds of which the ticks are not all there (segments while nothing happens): their means are in the 1 s level.
+
+
+Column = NDArray[np.float64]
+
+LEVEL_COLUMNS = ("state", "mean_displacement_um", "mean_true_error_um")
+
+
+class ThinSeconds:
+    """Finds them, over blocks that come in their order.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Ticks a second of the run.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._least = windows.least_ticks(1.0, rate_hz)
+        self._parts: list[tuple[windows.Seconds, Column]] = []
+
+    def add(self, time_s: Column, setpoint_um: Column, settled: NDArray[np.bool_]) -> None:
+        """Take in (n,) times, setpoints and whether each tick is settled."""
+        if not time_s.size:
+            return
+        second = np.floor(time_s + 1e-9).astype(np.int32)
+        starts = _starts(second)
+        rows = np.stack((np.ones(time_s.size), settled.astype(np.float64), setpoint_um))
+        sums = np.add.reduceat(rows, starts, axis=1)
+        # a second that two blocks share is thin in both
+        thin = (sums[0] < self._least) & (sums[1] > 0)
+        self._parts.append((second[starts][thin], sums[:, thin]))
+
+    def result(self) -> tuple[windows.Seconds, Column]:
+        """(k,) seconds whose few ticks are all settled, (k,) their mean setpoint in um."""
+        if not self._parts:
+            return np.empty(0, dtype=np.int32), np.empty(0)
+        second = np.concatenate([part[0] for part in self._parts])
+        if not second.size:
+            return second, np.empty(0)
+        starts = _starts(second)
+        ticks, settled, setpoint_um = np.add.reduceat(np.hstack([part[1] for part in self._parts]), starts, axis=1)
+        thin = (ticks < self._least) & (settled == ticks)
+        return second[starts][thin], setpoint_um[thin] / ticks[thin]
+
+
+@dataclass(frozen=True, slots=True)
+class LevelMeans:
+    """Means of (k,) thin seconds by the level: with the ticks they had, errors in um, NaN where there is none."""
+
+    second: windows.Seconds
+    ticks: Column
+    reading_um: Column
+    true_um: Column
+
+
+def level_means(run: Run, second: windows.Seconds, setpoint_um: Column) -> LevelMeans:
+    """What the 1 s level knows of thin seconds, as far as its own are whole."""
+    level: Block = run.level(1.0, float(second[0]), float(second[-1]) + 1.0, LEVEL_COLUMNS)
+    _, place, row = np.intersect1d(second, np.rint(level["time_s"]).astype(np.int32), return_indices=True)
+    whole = (level["rows"][row] >= windows.least_ticks(1.0, run.config.loop.rate_hz)) & (
+        level["state"][row] == State.HOLD
+    )
+    place, row = place[whole], row[whole]
+    reading_um = setpoint_um[place] - level["mean_displacement_um"][row]
+    return LevelMeans(second[place], level["rows"][row], reading_um, level["mean_true_error_um"][row])
+
+
+def filled(seconds: windows.SecondsOf, means: LevelMeans, error_um: Column) -> windows.SecondsOf:
+    """Sums over seconds, with those of the level in the place of the thin ones.
+
+    What the feed-forward kept away (the second row) needs every tick before it: it is nowhere known then.
+    """
+    there = np.isfinite(error_um)
+    second, counts, sums = seconds
+    kept = ~np.isin(second, means.second[there])
+    ticks = means.ticks[there].astype(np.float32)
+    joined = np.concatenate((second[kept], means.second[there]))
+    order = np.argsort(joined, kind="stable")
+    errors_um = np.concatenate((sums[0][kept], error_um[there] * ticks))[order]
+    return joined[order], np.concatenate((counts[kept], ticks))[order], np.stack((errors_um, errors_um * np.nan))
+
+
+def _starts(second: windows.Seconds) -> NDArray[np.intp]:
+    return np.flatnonzero(np.concatenate(([True], second[1:] != second[:-1])))
+
+
+Single = NDArray[np.float32]
+
+NAMES = (
+    *summary.FIELDS, "displacement_um", "truth_displacement_um", "feedforward_um_per_s", "flow_wanted_um_per_s",
+    "pump_fraction", "lateness_ms", "missed_ticks",
+)  # fmt: skip
+# Which error: a tick without a reading has a true centre all the same, so each has sums of its own,
+READING, TRUE = range(2)
+# and these are their rows.
+ERROR, KEPT_AWAY = range(2)
+# The histogram reaches this many bands to each side, in bins of a fiftieth of a band.
+_HISTOGRAM_BANDS = 5
+_HISTOGRAM_BINS = 500
+# A second here and there has lost ticks, beside a damaged batch or by a slow machine: it is left out, the rest kept.
+_THIN_FROM = 0.05
+# A flow wanted beyond what the pump can give by less than this is single precision.
+_SATURATED_UM_PER_S = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class PumpActivity:
+    """What the pump did while the mirror was held."""
+
+    mean_fraction: float
+    std_fraction: float
+    travel_per_hour: float  # sum of the changes of its command: what wears it
+    starts_per_hour: float
+    running_share: float
+    saturated_share: float  # of ticks that wanted less than no flow, or more than the full one
+
+
+@dataclass(frozen=True, slots=True)
+class HoldPass:
+    """What single ticks say.
+
+    Attributes
+    ----------
+    ticks, settled : int
+        Of `settled` only those with a reading.
+    unread_s : float
+        Settled time without a reading.
+    missed_ticks : int
+        Within the part.
+    start_s, end_s : float
+    hold_s, settled_s : float
+        Time in `hold`, and that of it which was settled.
+    thin_s : float
+        Settled seconds whose ticks are not all there: their means are those of the level.
+    uncovered_s : float
+        Those whose means the level has not either: no statistics cover them.
+    grid_s : float
+        Time of the first place of the grids.
+    reading_um, true_um : (n,) float32
+        Setpoint minus laser reading and target minus true centre on a grid of ticks, NaN where not settled.
+    seconds : tuple
+        `SecondSums.result` of the ticks with a reading (`READING`) and of those with a true centre (`TRUE`): rows of
+        sums are the error (`ERROR`) and what the feed-forward kept away (`KEPT_AWAY`: of the true centre, if known).
+    raw_reading, raw_true : Moments
+    raw_in_band : float
+        Share of settled readings within the band.
+    histogram_um, histogram_counts : arrays
+        Edges and counts of the reading error.
+    lateness_ms : LogHistogram
+    pump : PumpActivity
+    """
+
+    ticks: int
+    settled: int
+    unread_s: float
+    missed_ticks: int
+    start_s: float
+    end_s: float
+    hold_s: float
+    settled_s: float
+    thin_s: float
+    uncovered_s: float
+    grid_s: float
+    reading_um: Single
+    true_um: Single
+    seconds: tuple[windows.SecondsOf, windows.SecondsOf]
+    raw_reading: summary.Moments
+    raw_true: summary.Moments
+    raw_in_band: float
+    histogram_um: Column
+    histogram_counts: NDArray[np.int64]
+    lateness_ms: summary.LogHistogram
+    pump: PumpActivity
+
+
+def hold_pass(run: Run, span_s: tuple[float, float], part_s: tuple[float, float] = (-np.inf, np.inf)) -> HoldPass:
+    """Go through a run once.
+
+    Parameters
+    ----------
+    run : Run
+    span_s : tuple
+        First and last second, from a level.
+    part_s : tuple
+        Part of the run wanted.
+    """
+    collected = _Collector(run, span_s, math.isfinite(part_s[0]))
+    for block in run.tick_blocks(NAMES, *part_s):
+        collected.add(block)
+    ticks = collected.result()
+    thin, setpoint_um = collected.thin.result()
+    within = (thin >= part_s[0]) & (thin + 1 <= part_s[1])
+    if np.count_nonzero(within) <= _THIN_FROM * ticks.seconds[READING][0].size:
+        return ticks
+    means = level_means(run, thin[within], setpoint_um[within])
+    return replace(_with_level(ticks, means), uncovered_s=float(np.count_nonzero(within) - means.second.size))
+
+
+def _with_level(ticks: HoldPass, means: LevelMeans) -> HoldPass:
+    """The means of seconds whose ticks are not all there, from the level."""
+    reading, true = ticks.seconds
+    if means.second.size <= _THIN_FROM * reading[0].size:
+        return ticks
+    seconds = filled(reading, means, means.reading_um), filled(true, means, means.true_um)
+    return replace(ticks, seconds=seconds, thin_s=float(means.second.size))
+
+
+class _Collector:
+    def __init__(self, run: Run, span_s: tuple[float, float], from_within: bool) -> None:
+        loop, self._band_um = run.config.loop, run.config.limits.band_um
+        self._period_s = 1 / loop.rate_hz
+        self._settled = summary.Settled()
+        self._without = windows.WithoutFeedforward(loop.kp_per_s, loop.ti_s, self._period_s)
+        self._grid_s = span_s[0]
+        size = max(0, math.ceil((span_s[1] - span_s[0]) / self._period_s) + 2)
+        self._reading = np.full(size, np.nan, dtype=np.float32)
+        self._true = np.full(size, np.nan, dtype=np.float32)
+        self._seconds = windows.SecondSums(2), windows.SecondSums(2)
+        self._raw_reading, self._raw_true = summary.Moments(), summary.Moments()
+        reach_um = _HISTOGRAM_BANDS * self._band_um
+        self._edges_um = np.linspace(-reach_um, reach_um, _HISTOGRAM_BINS + 1)
+        self._histogram = np.zeros(_HISTOGRAM_BINS, dtype=np.int64)
+        self._lateness = summary.LogHistogram()
+        self._pump = _PumpSums(loop.flow_max_um_per_s)
+        self._ticks = self._counted = self._unread = self._inside = 0
+        self._hold, self._calm = (windows.HeldTime(run.config.recording.quiet_hz) for _ in range(2))
+        self.thin = ThinSeconds(loop.rate_hz)
+        # the running count at the beginning: of a part its first tick's, which says what was before
+        self._missed_before = math.nan if from_within else 0.0
+        self._missed = 0.0
+        self._span = (math.nan, math.nan)
+
+    def add(self, block: Mapping[str, Column]) -> None:
+        time_s = block["mono_s"]
+        mask = self._settled.mask(block)
+        kept_away = self._without.kept_away_um(block["feedforward_um_per_s"])[mask]
+        self._ticks += time_s.size
+        self._span = (self._span[0] if self._ticks > time_s.size else float(time_s[0]), float(time_s[-1]))
+        self._hold.add(time_s, block["state"] == State.HOLD)
+        self._calm.add(time_s, mask)
+        self.thin.add(time_s, block["setpoint_um"], mask)
+        missed = block["missed_ticks"][np.isfinite(block["missed_ticks"])]
+        if missed.size:
+            self._missed_before = float(missed[0]) if math.isnan(self._missed_before) else self._missed_before
+            self._missed = max(self._missed, float(missed.max()) - self._missed_before)
+        self._lateness.add(block["lateness_ms"])
+        held = {name: np.asarray(block[name][mask], dtype=np.float64) for name in NAMES}
+        self._pump.add(held)
+        reading = held["setpoint_um"] - held["displacement_um"]
+        true = tables.true_error_um(held)
+        place = np.rint((held["mono_s"] - self._grid_s) / self._period_s).astype(np.int64)
+        inside = (place >= 0) & (place < self._reading.size)
+        self._reading[place[inside]] = reading[inside]
+        self._true[place[inside]] = true[inside]
+        for sums, error in zip(self._seconds, (reading, true), strict=True):
+            known = np.isfinite(error)
+            sums.add(held["mono_s"][known], np.stack((error, kept_away))[:, known])
+        self._raw_reading.add(reading)
+        self._raw_true.add(true)
+        reading = reading[np.isfinite(reading)]
+        self._counted += reading.size
+        self._unread += true.size - reading.size
+        self._inside += int((np.abs(reading) <= self._band_um).sum())
+        scale = _HISTOGRAM_BINS / (self._edges_um[-1] - self._edges_um[0])
+        bins = np.clip((reading - self._edges_um[0]) * scale, 0, _HISTOGRAM_BINS - 1).astype(np.int64)
+        self._histogram += np.bincount(bins, minlength=_HISTOGRAM_BINS)
+
+    def result(self) -> HoldPass:
+        reading, true = (sums.result() for sums in self._seconds)
+        if true[0].size:  # what was kept away is asked of one of the two only: of a month 20 MB
+            reading = reading[0], reading[1], reading[2][:KEPT_AWAY].copy()
+        return HoldPass(
+            ticks=self._ticks,
+            settled=self._counted,
+            unread_s=self._unread * self._period_s,
+            missed_ticks=int(self._missed),
+            start_s=self._span[0],
+            end_s=self._span[1],
+            hold_s=self._hold.result_s(self._period_s),
+            settled_s=self._calm.result_s(self._period_s),
+            thin_s=0.0,
+            uncovered_s=0.0,
+            grid_s=self._grid_s,
+            reading_um=self._reading,
+            true_um=self._true,
+            seconds=(reading, true),
+            raw_reading=self._raw_reading,
+            raw_true=self._raw_true,
+            raw_in_band=self._inside / self._counted if self._counted else math.nan,
+            histogram_um=self._edges_um,
+            histogram_counts=self._histogram,
+            lateness_ms=self._lateness,
+            pump=self._pump.result(self._period_s),
+        )
+
+
+class _PumpSums:
+    """Sums behind `PumpActivity`."""
+
+    def __init__(self, flow_max_um_per_s: float) -> None:
+        self._most_um_per_s = flow_max_um_per_s + _SATURATED_UM_PER_S
+        self._fraction = summary.Moments()
+        self._travel = 0.0
+        self._starts = self._running = self._saturated = 0
+
+    def add(self, held: Mapping[str, Column]) -> None:
+        pump = np.nan_to_num(held["pump_fraction"])
+        self._fraction.add(pump)
+        running = pump > 0
+        self._travel += float(np.abs(np.diff(pump)).sum())
+        self._starts += int((running[1:] & ~running[:-1]).sum())
+        self._running += int(running.sum())
+        wanted = held["flow_wanted_um_per_s"]
+        self._saturated += int(((wanted < -_SATURATED_UM_PER_S) | (wanted > self._most_um_per_s)).sum())
+
+    def result(self, period_s: float) -> PumpActivity:
+        count = self._fraction.count
+        hours = count * period_s / 3600
+        per_hour = 1 / hours if hours else math.nan
+        share = 1 / count if count else math.nan
+        return PumpActivity(
+            mean_fraction=self._fraction.mean if count else math.nan,
+            std_fraction=self._fraction.std,
+            travel_per_hour=self._travel * per_hour,
+            starts_per_hour=self._starts * per_hour,
+            running_share=self._running * share,
+            saturated_share=self._saturated * share,
+        )

@@ -1,0 +1,183 @@
+"""The figure over a run: what the paper shows of half an hour, of any hold."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.review.statistics.drift import Slope, slope
+from membrane_ctrl.run_files.shapes import MAP_PX, Shapes, height_basis
+
+Column = NDArray[np.float64]
+
+# Monitored points on the unit disc: within the analysis area, at three radii and azimuths (the paper's A, B and C
+# are given in a figure only).
+POINTS: dict[str, tuple[float, float]] = {"A": (0.0, 0.3), "B": (-0.52, -0.3), "C": (0.74, -0.43)}
+PAIRS_S = (60.0, 600.0)
+# Slopes are fitted to means of so many cycles that no more than this many values are left.
+_SLOPE_VALUES = 5000
+_LEAST_CYCLES = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Two cycles some time apart.
+
+    Attributes
+    ----------
+    first_s, lag_s : float
+    change_um : (MAP_PX, MAP_PX) array
+        Height change; NaN outside the analysis area.
+    sigma_um : (MAP_PX, MAP_PX) array or None
+        1 sigma of that change from both covariances.
+    rms_um, mean_sigma_um : float
+        Over the area.
+    all_rms_um : float
+        RMS change of all pairs so far apart.
+    pairs : int
+        Of those, how many.
+    """
+
+    first_s: float
+    lag_s: float
+    change_um: Column
+    sigma_um: Column | None
+    rms_um: float
+    mean_sigma_um: float
+    all_rms_um: float
+    pairs: int
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeReview:
+    """Figure of a held mirror over the run.
+
+    Attributes
+    ----------
+    time_s : (n,) array
+        Of the cycles used: held and not rejected.
+    cycles, rejected : int
+        Of the run.
+    points_um : dict
+        (n,) change of height at `POINTS` against the first cycle.
+    sd_um : (MAP_PX, MAP_PX) array
+        Standard deviation of the height.
+    mean_sd_um : float
+        Mean over the area.
+    drift_um_per_hour : list of Slope
+        Of Z2..Z36.
+    sag_um, laser_um : (n,) arrays
+        Changes by camera and by laser since the first cycle.
+    disagreement : Slope
+        Of sag by the camera minus laser: the mount's drift, or the films'.
+    pairs : tuple of Pair
+    """
+
+    time_s: Column
+    cycles: int
+    rejected: int
+    points_um: dict[str, Column]
+    sd_um: Column
+    mean_sd_um: float
+    drift_um_per_hour: tuple[Slope, ...]
+    sag_um: Column
+    laser_um: Column
+    disagreement: Slope
+    pairs: tuple[Pair, ...]
+
+
+def review_shapes(shapes: Shapes, held: NDArray[np.bool_], analysis_share: float) -> ShapeReview | None:
+    """Review of the cycles; None when fewer than three held ones are good.
+
+    Parameters
+    ----------
+    shapes : Shapes
+        All of the run.
+    held : (n,) array of bool
+        Which cycles fell into a settled hold.
+    analysis_share : float
+        Radius of the analysis area over the mirror's.
+    """
+    good = shapes.select(held & (shapes.verdict != "rejected") & np.isfinite(shapes.coeffs_um).all(axis=1))
+    if len(good) < _LEAST_CYCLES:
+        return None
+    area = _Area(analysis_share)
+    parameters = good.parameters_um()
+    parameters -= parameters[0].copy()
+    sd_um = np.sqrt(np.maximum(_quadratic(area.basis, np.cov(parameters.T)), 0.0))
+    x, y = (np.array([point[axis] for point in POINTS.values()]) for axis in (0, 1))
+    points = parameters @ height_basis(x, y)
+    sag_um = good.sag_um - good.sag_um[0]
+    laser_um = good.displacement_um - good.displacement_um[0]
+    return ShapeReview(
+        time_s=good.time_s,
+        cycles=len(shapes),
+        rejected=int((shapes.verdict == "rejected").sum()),
+        points_um=dict(zip(POINTS, points.T, strict=True)),
+        sd_um=area.map(sd_um),
+        mean_sd_um=float(sd_um.mean()),
+        drift_um_per_hour=tuple(_slope(good.time_s, term) for term in good.coeffs_um[:, 1:].T),
+        sag_um=sag_um,
+        laser_um=laser_um,
+        disagreement=_slope(good.time_s, sag_um - laser_um),
+        pairs=tuple(pair for lag_s in PAIRS_S if (pair := _pair(good, parameters, area, lag_s)) is not None),
+    )
+
+
+class _Area:
+    """The pixels of a map inside the analysis area, and what a unit of each parameter does there."""
+
+    def __init__(self, share: float) -> None:
+        axis = (np.arange(MAP_PX) + 0.5) * 2 / MAP_PX - 1
+        x, y = np.meshgrid(axis, -axis)
+        self._inside = np.hypot(x, y) <= share
+        self.basis = height_basis(x[self._inside], y[self._inside])
+        self.gram = self.basis @ self.basis.T / self.basis.shape[1]
+
+    def map(self, values: Column) -> Column:
+        picture = np.full((MAP_PX, MAP_PX), np.nan)
+        picture[self._inside] = values
+        return picture
+
+
+def _pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) -> Pair | None:
+    """The pair nearest to the run's middle, and the RMS of all pairs as far apart (within half a cycle)."""
+    time_s = good.time_s
+    half_s = 0.5 * float(np.median(np.diff(time_s)))
+    other = np.minimum(np.searchsorted(time_s, time_s + lag_s - half_s), time_s.size - 1)
+    near = np.abs(time_s[other] - time_s - lag_s) <= 1.1 * half_s
+    firsts = np.flatnonzero(near)
+    if not firsts.size:
+        return None
+    changes = parameters[other[firsts]] - parameters[firsts]
+    all_rms = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", changes, area.gram, changes), 0.0))
+    first = int(firsts[np.argmin(np.abs(time_s[firsts] + lag_s / 2 - time_s[[0, -1]].mean()))])
+    second = int(other[first])
+    change_um = (parameters[second] - parameters[first]) @ area.basis
+    covariances = [good.covariance_near(float(time_s[k])) for k in (first, second)]
+    sigma_um = None
+    if covariances[0] is not None and covariances[1] is not None:
+        variance = _quadratic(area.basis[:36], covariances[0] + covariances[1])
+        sigma_um = np.sqrt(np.maximum(variance, 0.0))
+    return Pair(
+        first_s=float(time_s[first]),
+        lag_s=float(time_s[second] - time_s[first]),
+        change_um=area.map(change_um),
+        sigma_um=None if sigma_um is None else area.map(sigma_um),
+        rms_um=float(np.sqrt((change_um**2).mean())),
+        mean_sigma_um=float("nan") if sigma_um is None else float(sigma_um.mean()),
+        all_rms_um=float(np.sqrt((all_rms**2).mean())),
+        pairs=int(firsts.size),
+    )
+
+
+def _quadratic(basis: Column, covariance: Column) -> Column:
+    """b' C b at each point (column of the basis)."""
+    return np.asarray(np.einsum("jp,jp->p", basis, covariance @ basis))
+
+
+def _slope(time_s: Column, values: Column) -> Slope:
+    every = max(1, time_s.size // _SLOPE_VALUES)
+    whole = time_s.size // every * every
+    means = [part[:whole].reshape(-1, every).mean(axis=1) for part in (time_s, values)]
+    return slope(means[0], means[1])

@@ -1,0 +1,215 @@
+"""Power spectral density of a series with gaps, and the RMS in its bands."""
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy import signal
+
+Column = NDArray[np.float64]
+
+# Enough segments for an estimate that is good to a third, and no segment longer than shows one more decade.
+_SEGMENTS = 8
+_LONGEST = 1 << 15
+# Segments transformed at once: what bounds the memory.
+_BATCH = 32
+
+
+@dataclass(frozen=True, slots=True)
+class Spectrum:
+    """One-sided density.
+
+    Attributes
+    ----------
+    frequency_hz : (k,) array
+    density : (k,) array
+        Unit squared per Hz.
+    segments : int
+        Averaged; 0: nothing was long enough.
+    """
+
+    frequency_hz: Column
+    density: Column
+    segments: int
+
+    def band_rms(self, low_hz: float, high_hz: float) -> float:
+        """RMS between two frequencies, low one excluded; NaN if no frequency lies there."""
+        inside = (self.frequency_hz > low_hz) & (self.frequency_hz <= high_hz)
+        if not inside.any():
+            return float("nan")
+        step_hz = self.frequency_hz[1] - self.frequency_hz[0]
+        return float(np.sqrt(self.density[inside].sum() * step_hz))
+
+
+def power_spectrum(values: NDArray[np.floating], rate_hz: float, length: int | None = None) -> Spectrum:
+    """Welch's estimate: Hann window, half overlapping segments, each without its mean; as `scipy.signal.welch`.
+
+    Parameters
+    ----------
+    values : (n,) array
+        NaN where there is a gap: a segment with one is left out.
+    rate_hz : float
+    length : int, optional
+        Of a segment; by default an eighth of the series, at most 32768.
+    """
+    if length is None:
+        length = min(_LONGEST, 1 << max(3, int(np.log2(max(values.size, 8) * 2 / (_SEGMENTS + 1)))))
+    frequency_hz = np.asarray(np.fft.rfftfreq(length, 1 / rate_hz), dtype=np.float64)
+    if values.size < length:
+        return Spectrum(frequency_hz, np.full(frequency_hz.size, np.nan), 0)
+    pieces = np.lib.stride_tricks.sliding_window_view(values, length)[:: length // 2]
+    window = signal.get_window("hann", length)
+    power = np.zeros(frequency_hz.size)
+    count = 0
+    for first in range(0, len(pieces), _BATCH):
+        batch = np.asarray(pieces[first : first + _BATCH], dtype=np.float64)
+        batch = batch[np.isfinite(batch).all(axis=1)]
+        batch = batch - batch.mean(axis=1, keepdims=True)
+        power += (np.abs(np.fft.rfft(batch * window)) ** 2).sum(axis=0)
+        count += len(batch)
+    scale = 1.0 / (rate_hz * (window**2).sum())
+    density = power * scale / count if count else np.full(frequency_hz.size, np.nan)
+    # the other half of the plane; 0 and, for an even length, half the rate have none
+    density[1 : -1 if length % 2 == 0 else None] *= 2
+    return Spectrum(frequency_hz, density, count)
+
+
+# Overlapping Allan deviation of a series with gaps.
+
+
+@dataclass(frozen=True, slots=True)
+class Allan:
+    """Overlapping Allan deviation.
+
+    Attributes
+    ----------
+    tau_s : (k,) array
+        Averaging times.
+    deviation : (k,) array
+        Same unit as the series.
+    windows : (k,) array of int
+        Differences of neighbouring means that went in.
+    """
+
+    tau_s: Column
+    deviation: Column
+    windows: NDArray[np.int64]
+
+
+def allan_deviation(values: NDArray[np.floating], period_s: float, lengths: NDArray[np.int64] | None = None) -> Allan:
+    """Overlapping Allan deviation of equally spaced values.
+
+    With x the running sum of y and m the samples in tau,
+
+        sigma^2(tau) = < (x[i + 2m] - 2 x[i + m] + x[i])^2 > / (2 m^2)
+
+    (IEEE 1139; Riley, NIST SP 1065, eq. 10 with y for frequency). A triple with a gap in it is left out.
+
+    Parameters
+    ----------
+    values : (n,) array
+        NaN where there is a gap.
+    period_s : float
+        Between values.
+    lengths : (k,) array of int, optional
+        Samples in each tau; powers of two up to a quarter of the series by default, where some four independent
+        means are left.
+    """
+    there = np.isfinite(values)
+    count = int(there.sum())
+    if lengths is None:
+        lengths = 2 ** np.arange(max(0, int(np.log2(max(values.size, 4) / 4)) + 1))
+    if count < 3:
+        return Allan(np.empty(0), np.empty(0), np.empty(0, dtype=np.int64))
+    mean = float(values[there].mean(dtype=np.float64))
+    total = np.zeros(values.size + 1)
+    np.cumsum(np.where(there, values - mean, 0.0), out=total[1:])
+    gaps = np.zeros(values.size + 1, dtype=np.int32)
+    np.cumsum(~there, out=gaps[1:])
+    found = [_second_differences(total, gaps, int(m)) for m in lengths if 2 * m <= values.size]
+    tau = np.array([m * period_s for m in lengths if 2 * m <= values.size])
+    windows = np.array([pairs for _, pairs in found], dtype=np.int64)
+    samples = np.array([m for m in lengths if 2 * m <= values.size], dtype=np.float64)
+    squares = np.array([square for square, _ in found])
+    kept = windows > 0
+    deviation = np.sqrt(squares[kept] / windows[kept] / 2) / samples[kept]
+    return Allan(tau[kept], deviation, windows[kept])
+
+
+@njit(cache=True)
+def _second_differences(total: Column, gaps: NDArray[np.int32], m: int) -> tuple[float, int]:
+    square = 0.0
+    count = 0
+    for i in range(total.size - 2 * m):
+        if gaps[i + 2 * m] == gaps[i]:
+            difference = total[i + 2 * m] - 2.0 * total[i + m] + total[i]
+            square += difference * difference
+            count += 1
+    return square, count
+
+
+# RMS by decades of frequency, from the spectrum that resolves each.
+
+
+# Decades of frequency whose RMS is given; the last ends at half the tick rate. The first is that of days.
+BANDS_HZ = (1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)
+# A Hann window smears over two lines to each side: from the fourth on a band has nothing of what is slower.
+_RESOLVED_LINES = 4
+# Above this the mean of a second takes away what is looked for (0.1 Hz: 2 % of its amplitude).
+_SLOW_MOST_HZ = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """RMS between two frequencies.
+
+    Attributes
+    ----------
+    low_hz, high_hz : float
+    from_hz : float
+        Lowest frequency that was seen: above `low_hz` when the series is too short for the whole band; NaN when it
+        is too short for any of it.
+    rms_um : float
+        NaN if nothing was seen.
+    """
+
+    low_hz: float
+    high_hz: float
+    from_hz: float
+    rms_um: float
+
+
+def bands(fast: Spectrum, slow: Spectrum) -> list[Band]:
+    """RMS in each of `BANDS_HZ`: of the ticks' spectrum where it resolves a band, below of that of the 1 s means."""
+    edges = [*BANDS_HZ, float(fast.frequency_hz[-1])]
+    return [_band(slow if _is_slow(fast, slow, low, high) else fast, low, high) for low, high in pairwise(edges)]
+
+
+def unseen_s(found: list[Band]) -> float:
+    """The period (s) from which on motion is in none of the bands; NaN when none has anything."""
+    return max((1 / band.from_hz for band in found if math.isfinite(band.from_hz)), default=math.nan)
+
+
+def density(fast: Spectrum, slow: Spectrum) -> tuple[Column, Column]:
+    """Frequencies (Hz) and one density: of the 1 s means below what the ticks' spectrum resolves."""
+    resolved_hz = min(_RESOLVED_LINES * float(fast.frequency_hz[1]), _SLOW_MOST_HZ)
+    below = slow.frequency_hz < resolved_hz if slow.segments else np.zeros(slow.frequency_hz.size, dtype=bool)
+    above = fast.frequency_hz >= (resolved_hz if slow.segments else 0.0)
+    joined = [(x[below], y[above]) for x, y in ((slow.frequency_hz, fast.frequency_hz), (slow.density, fast.density))]
+    frequency_hz, together = (np.concatenate(parts) for parts in joined)
+    return frequency_hz[frequency_hz > 0], together[frequency_hz > 0]
+
+
+def _is_slow(fast: Spectrum, slow: Spectrum, low_hz: float, high_hz: float) -> bool:
+    if not slow.segments or high_hz > _SLOW_MOST_HZ:
+        return False
+    return not fast.segments or low_hz < _RESOLVED_LINES * float(fast.frequency_hz[1])
+
+
+def _band(spectrum: Spectrum, low_hz: float, high_hz: float) -> Band:
+    first_hz = max(low_hz, float(spectrum.frequency_hz[1]))
+    rms_um = spectrum.band_rms(low_hz, high_hz)
+    return Band(low_hz, high_hz, first_hz if rms_um == rms_um else math.nan, rms_um)

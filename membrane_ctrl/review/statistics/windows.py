@@ -1,0 +1,191 @@
+"""Means over windows of seconds, and what is said of them."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+Column = NDArray[np.float64]
+# Of a month there are millions: single precision, which counts ticks exactly.
+Seconds = NDArray[np.int32]
+Counts = NDArray[np.float32]
+SecondsOf = tuple[Seconds, Counts, Column]
+
+# A window with fewer of its ticks than this says nothing of its length.
+_LEAST_SHARE = 0.9
+
+
+@dataclass(frozen=True, slots=True)
+class WindowStatistics:
+    """Statistics of means over windows of one length; NaN without windows, and one alone has no `std_um`.
+
+    Attributes
+    ----------
+    window_s : float
+        0: single ticks.
+    count : int
+    mean_um, std_um, max_um, p99_7_um : float
+        `max` and `p99_7` of the absolute value.
+    in_band : float
+        Share within the band.
+    """
+
+    window_s: float
+    count: int
+    mean_um: float
+    std_um: float
+    max_um: float
+    p99_7_um: float
+    in_band: float
+
+
+class SecondSums:
+    """Sums over whole seconds of the run of several series at once, from blocks that come in their order.
+
+    Parameters
+    ----------
+    series : int
+        How many.
+    """
+
+    def __init__(self, series: int) -> None:
+        self._parts: list[SecondsOf] = []
+        self._series = series
+
+    def add(self, time_s: Column, values: Column) -> None:
+        """Take in (n,) times and (series, n) values, all finite or NaN together."""
+        if not time_s.size:
+            return
+        second = np.floor(time_s + 1e-9).astype(np.int32)
+        starts = np.flatnonzero(np.concatenate(([True], second[1:] != second[:-1])))
+        counts = np.diff(np.append(starts, time_s.size)).astype(np.float32)
+        self._parts.append((second[starts], counts, np.add.reduceat(values, starts, axis=1)))
+
+    def result(self) -> SecondsOf:
+        """(k,) seconds that have ticks, (k,) their ticks, (series, k) sums."""
+        if not self._parts:
+            return np.empty(0, dtype=np.int32), np.empty(0, dtype=np.float32), np.empty((self._series, 0))
+        second = np.concatenate([part[0] for part in self._parts])
+        counts = np.concatenate([part[1] for part in self._parts])
+        sums = np.concatenate([part[2] for part in self._parts], axis=1)
+        # a second that two blocks share
+        starts = np.flatnonzero(np.concatenate(([True], second[1:] != second[:-1])))
+        return second[starts], np.add.reduceat(counts, starts), np.add.reduceat(sums, starts, axis=1)
+
+
+def least_ticks(window_s: float, rate_hz: float) -> float:
+    """Ticks that a window must have: nine tenths, or all but one, which may have come just behind its end."""
+    ticks = window_s * rate_hz
+    return min(_LEAST_SHARE * ticks, ticks - 1)
+
+
+def window_means(
+    second: Seconds, counts: Counts, sums: Column, window_s: int, rate_hz: float
+) -> tuple[Column, Column]:
+    """Middles (k,) in s and means of the windows that have at least `least_ticks`.
+
+    Parameters
+    ----------
+    second, counts, sums : (n,) arrays
+        From `SecondSums`.
+    window_s : int
+        Length of a window.
+    rate_hz : float
+        Ticks a second.
+    """
+    if not second.size:
+        return np.empty(0), np.empty(0)
+    number = second // window_s
+    starts = np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
+    ticks, total = np.add.reduceat(counts, starts), np.add.reduceat(sums, starts)
+    whole = (ticks >= least_ticks(window_s, rate_hz)) & np.isfinite(total)
+    return np.asarray((number[starts][whole] + 0.5) * window_s, dtype=np.float64), total[whole] / ticks[whole]
+
+
+def describe(means_um: Column, window_s: float, band_um: float) -> WindowStatistics:
+    """What is said of windows' means."""
+    if not means_um.size:
+        return WindowStatistics(window_s, 0, math.nan, math.nan, math.nan, math.nan, math.nan)
+    size_um = np.abs(means_um)
+    return WindowStatistics(
+        window_s,
+        int(means_um.size),
+        float(means_um.mean()),
+        float(means_um.std()) if means_um.size > 1 else math.nan,
+        float(size_um.max()),
+        float(np.quantile(size_um, 0.997)),
+        float((size_um <= band_um).mean()),
+    )
+
+
+# How long the mirror was held, by the times of the ticks: not every one of them need be there.
+
+
+# Segments have some rows a second while nothing happens, and now and then one comes late.
+_ROWS_APART = 2.0
+_LEAST_GAP_S = 2.0
+
+
+class HeldTime:
+    """Sum of the times between ticks whose first is held, over blocks that come in their order.
+
+    Parameters
+    ----------
+    quiet_hz : float
+        Fewest rows a second that are recorded. A gap longer than twice that is a loss: nobody knows what was in it.
+    """
+
+    def __init__(self, quiet_hz: float) -> None:
+        self._longest_s = max(_LEAST_GAP_S, _ROWS_APART / quiet_hz)
+        self._last = (math.nan, False)
+        self.held_s = 0.0
+
+    def add(self, time_s: Column, held: NDArray[np.bool_]) -> None:
+        """Take in (n,) times and whether the mirror was held."""
+        if not time_s.size:
+            return
+        lasted_s = np.diff(np.concatenate(([self._last[0]], time_s)))
+        first = np.concatenate(([self._last[1]], held[:-1]))
+        self.held_s += float(lasted_s[first & (lasted_s <= self._longest_s)].clip(0.0).sum())
+        self._last = float(time_s[-1]), bool(held[-1])
+
+    def result_s(self, period_s: float) -> float:
+        """Seconds held; the last tick lasts for one more period."""
+        return self.held_s + (period_s if self._last[1] else 0.0)
+
+
+# What the feed-forward was worth: the error there would have been without it.
+
+
+class WithoutFeedforward:
+    """Adds to the error what the feed-forward's flow kept away, from blocks that come in their order.
+
+    The mirror's centre is nearly an integrator of the flow. A speed v that is not fed forward reaches the error
+    through the closed loop of a PI controller,
+
+        e / v = s / (s^2 + Kp s + Kp / Ti),
+
+    here by the bilinear transform. Dead time and pump lag (0.26 s together) are left out: they hardly change what a
+    disturbance of tens of seconds does, and make the benefit look a little smaller than it is.
+
+    Parameters
+    ----------
+    kp_per_s, ti_s : float
+        Of the loop as run.
+    period_s : float
+        Of the tick.
+    """
+
+    def __init__(self, kp_per_s: float, ti_s: float, period_s: float) -> None:
+        self._numerator, self._denominator = signal.bilinear(
+            [1.0, 0.0], [1.0, kp_per_s, kp_per_s / ti_s], 1 / period_s
+        )
+        self._state = np.zeros(2)
+
+    def kept_away_um(self, feedforward_um_per_s: Column) -> Column:
+        """(n,) um by which the error would have been larger; gaps count as no flow."""
+        flow = np.nan_to_num(np.asarray(feedforward_um_per_s, dtype=np.float64))
+        kept, self._state = signal.lfilter(self._numerator, self._denominator, flow, zi=self._state)
+        return np.asarray(kept, dtype=np.float64)

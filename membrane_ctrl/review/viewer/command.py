@@ -1,0 +1,235 @@
+"""`membrane-ctrl review RUN...`: the timeline of one run or several, on the moment asked for."""
+
+import math
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from membrane_ctrl.model import errors, states, terminal
+from membrane_ctrl.review import catalogue, words
+from membrane_ctrl.review.events.steps import Found
+from membrane_ctrl.review.viewer import viewer
+from membrane_ctrl.review.viewer.blueprints import TABS, ReviewBlueprint
+from membrane_ctrl.review.viewer.layer import Layer
+from membrane_ctrl.review.viewer.screenshot import screenshot_of
+from membrane_ctrl.run_files.run import Run, open_run
+from membrane_ctrl.run_files.run_folder import event_s
+
+_THIS_MACHINE = "127.0.0.1"
+# Seen about a moment asked for with --at or --around.
+_AROUND_S = 120.0
+
+
+@dataclass(frozen=True, slots=True)
+class ReviewOptions:
+    """What `review` was asked for; see `membrane-ctrl review --help`."""
+
+    runs: Sequence[Path]
+    at: str | None = None
+    around: str | None = None
+    start: str | None = None
+    end: str | None = None
+    tab: str = "overview"
+    align: str = "hold"
+    live: bool = False
+    web: bool = False
+    bind: str = _THIS_MACHINE
+    port: int = 0
+    save: Path | None = None
+    screenshot: Path | None = None
+
+
+def review_command(options: ReviewOptions) -> int:
+    """Make the review and show it."""
+    _require_sense(options)
+    runs = [open_run(catalogue.resolve(path)) for path in options.runs]
+    with terminal.ends_as_by_ctrl_c(), tempfile.TemporaryDirectory(prefix="membrane-review-") as folder:
+        if options.live:
+            return viewer.live(runs[0].folder, options.web, options.port)
+        for target in (options.save, options.screenshot):
+            if target is not None:
+                _require_writable(target, runs)
+        file = options.save or Path(folder) / "review.rrd"
+        try:
+            cursor_s = make_review(runs, options, file)
+        finally:
+            for run in runs:
+                for note in run.notes:
+                    print(f"note: {run.name}: {note}", file=sys.stderr)
+        return _show(file, options, cursor_s)
+
+
+def _show(file: Path, options: ReviewOptions, cursor_s: float | None) -> int:
+    if options.screenshot is not None:
+        try:
+            options.screenshot.write_bytes(screenshot_of([file], cursor_s))
+        except RuntimeError as error:
+            raise errors.DeviceError(f"no picture: {error}") from None
+        return 0
+    if options.save is not None:
+        print(file)
+        return 0
+    return viewer.serve([file], options.bind, options.port) if options.web else viewer.show([file], cursor_s)
+
+
+def _require_sense(options: ReviewOptions) -> None:
+    """No option that is unknown, or that would be passed over in silence."""
+    if options.tab not in TABS:
+        raise errors.InputError(f"--tab {options.tab}: known are {', '.join(TABS)}")
+    if options.align not in {"hold", "start", "utc"}:
+        raise errors.InputError(f"--align {options.align}: known are hold, start, utc")
+    if options.around is not None and not options.around.strip():
+        raise errors.InputError("--around: say which event, e.g. --around hold")
+    moments = (options.at, options.around, options.start or options.end)
+    if sum(moment is not None for moment in moments) > 1:
+        raise errors.InputError("--at, --around, --from with --to: only one of these at a time")
+    if not options.web and (options.bind != _THIS_MACHINE or options.port):
+        raise errors.InputError("--bind and --port: only with --web")
+    if not options.live:
+        return
+    if len(options.runs) != 1:
+        raise errors.InputError("--live: one run at a time")
+    if any(part is not None for part in (*moments, options.save, options.screenshot)):
+        raise errors.InputError("--live follows the run as it goes on: leave --at, --from, --save and the like away")
+    if options.bind != _THIS_MACHINE:
+        raise errors.InputError("--live serves this machine only: leave --bind away and use the ssh line it prints")
+
+
+def _require_writable(target: Path, runs: Sequence[Run]) -> None:
+    """Said before the work, not after it."""
+    if any(target.resolve().parent == run.folder.resolve() for run in runs):
+        raise errors.InputError(f"{target}: lies among what the recorder wrote; choose another folder")
+    try:
+        new = not target.exists()
+        target.open("ab").close()
+        if new:
+            target.unlink()
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise errors.DeviceError(f"{target}: cannot be written ({reason}); choose another place") from None
+
+
+def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> float | None:
+    """Write the recording that the viewer opens.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        One, or several that are laid over each other.
+    options : ReviewOptions
+    file : Path
+        To write.
+
+    Returns
+    -------
+    float or None
+        Second of the timeline that was asked for: the moment, or where the part begins.
+
+    Raises
+    ------
+    InputError
+        If a time or an event asked for is not in the first run, or no run has telemetry.
+    """
+    runs = _with_telemetry(runs)
+    span_s = _span(runs[0], options)
+    zeros_s = _zeros(runs, options.align)
+    prefixes = ("",) if len(runs) == 1 else tuple(f"/run_{number}" for number in range(1, len(runs) + 1))
+    layer = Layer(file, runs[0].name if len(runs) == 1 else " and ".join(run.name for run in runs))
+    shown = None if span_s is None else (span_s[0] - zeros_s[0], span_s[1] - zeros_s[0])
+    maps_um = []
+    for run, prefix, zero_s in zip(runs, prefixes, zeros_s, strict=True):
+        part_s = (-math.inf, math.inf) if shown is None else (shown[0] + zero_s, shown[1] + zero_s)
+        maps_um.append(layer.add(run, prefix, zero_s, part_s))
+        if prefix:
+            print(f"{prefix.strip('/')} is {run.name}", file=sys.stderr)
+    blueprint = ReviewBlueprint(prefixes, shown, runs[0].config.limits.band_um, maps_um)
+    layer.blueprint(blueprint.made(options.tab))
+    layer.close()
+    if shown is None:
+        return None
+    return shown[0] if options.start or options.end else (shown[0] + shown[1]) / 2
+
+
+def _with_telemetry(runs: Sequence[Run]) -> list[Run]:
+    """The runs that can be shown; of the others it is noted that they cannot."""
+    there = [run for run in runs if run.level(60.0, names=("rows",))["time_s"].size]
+    if not there:
+        raise errors.InputError(
+            f"{', '.join(str(run.folder) for run in runs)}: nothing to show: no telemetry can be read"
+        )
+    for run in runs:
+        if run not in there:
+            run.notes.append("not shown: no telemetry of it can be read")
+    return there
+
+
+def _span(run: Run, options: ReviewOptions) -> tuple[float, float] | None:
+    """The part of the run asked for, in its seconds."""
+    if options.start is not None or options.end is not None:
+        start_s = 0.0 if options.start is None else words.moment_s(options.start, run.origin_utc)
+        end_s = _end_s(run) if options.end is None else words.moment_s(options.end, run.origin_utc)
+        if options.start is not None and options.end is not None and not start_s < end_s:
+            raise errors.InputError(f"--from {options.start} is not before --to {options.end}")
+        if start_s >= _end_s(run):
+            raise _not_in(run, f"--from {options.start}")
+        if end_s <= 0:
+            raise _not_in(run, f"--to {options.end}")
+        return start_s, end_s
+    if options.at is not None:
+        at_s = words.moment_s(options.at, run.origin_utc)
+        if not -_AROUND_S <= at_s <= _end_s(run) + _AROUND_S:
+            raise _not_in(run, f"--at {options.at}")
+        return at_s - _AROUND_S, at_s + _AROUND_S
+    if options.around is not None:
+        at_s = _around(run, options.around)
+        return at_s - _AROUND_S, at_s + _AROUND_S
+    return None
+
+
+def _not_in(run: Run, asked: str) -> errors.InputError:
+    went = f"{run.utc(0):%Y-%m-%d %H:%M} to {run.utc(_end_s(run)):%Y-%m-%d %H:%M} UTC"
+    return errors.InputError(f"{asked}: not in the run, which went from {went}")
+
+
+def _around(run: Run, what: str) -> float:
+    """Time of the first event whose kind, name, state, text or command contains `what`; found ones count, too."""
+    wanted = what.lower()
+    # `hold` is the state, not the command that led to it
+    for keys in (("kind", "name", "state", "text"), ("command",)):
+        for event in run.events:
+            if any(wanted in str(event.get(key, "")).lower() for key in keys):
+                return event_s(event)
+    from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
+
+    found: list[Found] = find_events(run.level(1.0, names=LEVEL_COLUMNS), run.shapes(), run.config.limits.band_um)
+    for item in found:
+        if wanted in item.kind:
+            return item.time_s
+    told = {str(e.get("name") or e.get("state") or e.get("command") or e.get("kind")) for e in run.events}
+    named = sorted(told - {"why"} | {item.kind for item in found})
+    raise errors.InputError(f"--around {what}: no such event in {run.name}; there are {', '.join(named)}")
+
+
+def _zeros(runs: Sequence[Run], align: str) -> list[float]:
+    """The second of each run that the timeline calls 0."""
+    if len(runs) == 1 or align == "start":
+        return [0.0] * len(runs)
+    if align == "utc":
+        return [(runs[0].origin_utc - run.origin_utc).total_seconds() for run in runs]
+    return [_hold_s(run) for run in runs]
+
+
+def _hold_s(run: Run) -> float:
+    level = run.level(60.0, names=("state",))
+    entered = [e for e in run.events if e.get("kind") == "state" and e.get("state") == "hold"]
+    if entered:
+        return float(entered[0].get("mono_s") or 0.0)
+    rows = [float(t) for t, code in zip(level["time_s"], level["state"], strict=True) if code == states.State.HOLD]
+    return rows[0] if rows else 0.0
+
+
+def _end_s(run: Run) -> float:
+    time_s = run.level(60.0, names=("rows",))["time_s"]
+    return float(time_s[-1]) + 60.0 if time_s.size else 0.0

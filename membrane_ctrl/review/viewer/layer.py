@@ -1,0 +1,285 @@
+"""What the viewer is given: a recording of its own, made from the tables in a second; the run is only read.
+
+Overview levels over the whole run; every tick of the part that is looked at, where that is not too much to draw; the
+figure with maps; states; events, marks and what was found by machine.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from membrane_ctrl.model.telemetry import FIELDS, changes
+from membrane_ctrl.recorder.blueprint import TELEMETRY_LANES
+from membrane_ctrl.recorder.rerun_streams import event_text, event_time_s
+from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
+from membrane_ctrl.review.events.steps import Found
+from membrane_ctrl.review.report.figures import broken_at_gaps
+from membrane_ctrl.run_files import run_folder, streams, summary
+from membrane_ctrl.run_files.run import Block, Run
+from membrane_ctrl.run_files.shapes import Shapes, height_basis
+
+Column = NDArray[np.float64]
+
+APPLICATION = "membrane_review"
+# The viewer draws about this many rows of a dozen signals without stutter in software.
+RAW_ROWS_MOST = 400_000
+LEVEL_ROWS_MOST = 50_000
+SHAPES_MOST = 20_000
+MAPS_MOST = 40
+_MAP_PX = 96
+_RUN_COLOURS: tuple[streams.Colour, ...] = (streams.BLUE, streams.ORANGE, streams.GREEN, streams.VIOLET, streams.RED)
+
+
+@dataclass(frozen=True, slots=True)
+class Overview:
+    """One plot of a level: signals (column, name, colour) under a path."""
+
+    path: str
+    lines: tuple[tuple[str, str, streams.Colour], ...]
+
+
+OVERVIEWS: tuple[Overview, ...] = (
+    Overview(
+        "/overview/error",
+        (
+            ("min_error_um", "error, least um", streams.GREY),
+            ("mean_error_um", "error, mean um", streams.BLUE),
+            ("max_error_um", "error, greatest um", streams.GREY),
+        ),
+    ),
+    Overview("/overview/true", (("mean_true_error_um", "true error, mean um", streams.GREEN),)),
+    Overview(
+        "/overview/flow",
+        (("mean_flow_um_per_s", "flow um/s", streams.BLUE), ("mean_leak_um_per_s", "leak um/s", streams.RED)),
+    ),
+    Overview("/overview/pump", (("mean_pump_fraction", "pump", streams.BLUE),)),
+    Overview("/overview/trim", (("mean_trim_um", "trim um", streams.VIOLET),)),
+    Overview("/overview/ambient", (("mean_ambient_pressure_pa", "air pressure Pa", streams.BLUE),)),
+    Overview("/overview/gauge", (("mean_gauge_pressure_pa", "gauge pressure Pa", streams.BLUE),)),
+    Overview("/overview/temperature", (("mean_air_temperature_c", "air C", streams.ORANGE),)),
+    Overview(
+        "/overview/lateness",
+        (
+            ("mean_lateness_ms", "lateness, mean ms", streams.BLUE),
+            ("max_lateness_ms", "lateness, greatest ms", streams.GREY),
+        ),
+    ),
+    Overview("/overview/missed", (("max_missed_ticks", "ticks missed so far", streams.RED),)),
+)
+
+
+class Layer:
+    """Writes runs into one recording.
+
+    Parameters
+    ----------
+    path : Path
+        The `.rrd` file to write.
+    name : str
+        Of the recording.
+    """
+
+    def __init__(self, path: Path, name: str) -> None:
+        self._stream = rr.RecordingStream(APPLICATION, recording_id=name)
+        self._stream.save(path)
+        self._stream.send_recording_name(name)
+        self._prefix = self._label = ""
+        self._number = -1
+        self._shift_s = 0.0
+        self._origin = np.datetime64(0, "ns")
+
+    def blueprint(self, blueprint: rr.blueprint.Blueprint) -> None:
+        """The arrangement that the file opens with."""
+        self._stream.send_blueprint(blueprint)
+
+    def close(self) -> None:
+        """Bring everything to the file."""
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def add(self, run: Run, prefix: str, zero_s: float, part_s: tuple[float, float]) -> float:
+        """Put a run in.
+
+        Parameters
+        ----------
+        run : Run
+        prefix : str
+            In front of its paths; empty for a run alone.
+        zero_s : float
+            Second of the run that the timeline calls 0.
+        part_s : tuple
+            What is looked at: shown tick by tick, if that is not too much, and all that logs and maps hold, since a
+            cursor that stands at the end of the recording would show those of the end.
+
+        Returns
+        -------
+        float
+            The scale of its maps: the greatest change of height in them, um; NaN when there are none.
+        """
+        self._prefix, self._shift_s = prefix, zero_s
+        self._label = f"{prefix.strip('/')} " if prefix else ""
+        self._number += 1
+        self._origin = np.datetime64(run.origin_utc.replace(tzinfo=None), "ns")
+        level_s = _level_for(run)
+        level = run.level(level_s)
+        seconds = level if level_s == 1.0 else run.level(1.0, names=LEVEL_COLUMNS)
+        shapes = run.shapes()
+        found = find_events(seconds, shapes, run.config.limits.band_um)
+        self._overviews(level, run.config.limits.band_um)
+        self._ticks(run, part_s)
+        self._lanes(level)
+        self._events(run, found, part_s)
+        return self._figure(shapes.select(summary.held_at(level, shapes.time_s)), part_s)
+
+    def _overviews(self, level: Block, band_um: float) -> None:
+        for overview in OVERVIEWS:
+            values = np.column_stack([level[name] for name, _, _ in overview.lines])
+            if np.isfinite(values).any():
+                self._style(overview.path, [(name, colour) for _, name, colour in overview.lines])
+                self._scalars(overview.path, level["time_s"], values)
+        ends = level["time_s"][[0, -1]] if level["time_s"].size else np.empty(0)
+        self._style("/loop/band", [("+band um", streams.GREY), ("-band um", streams.GREY)])
+        self._scalars("/loop/band", ends, np.tile([band_um, -band_um], (ends.size, 1)))
+
+    def _ticks(self, run: Run, part_s: tuple[float, float]) -> None:
+        rows_expected = run.config.loop.rate_hz * (min(part_s[1], _end_s(run)) - max(part_s[0], 0.0))
+        if rows_expected > RAW_ROWS_MOST:
+            return
+        for block in run.tick_blocks(FIELDS, *part_s):
+            for stream in streams.STREAMS:
+                values = np.column_stack([block[line.field] for line in stream.lines])
+                if np.isfinite(values).any():
+                    self._style(stream.path, [(line.name, line.colour) for line in stream.lines])
+                    self._scalars(stream.path, block["mono_s"], values)
+
+    def _lanes(self, level: Block) -> None:
+        for lane in TELEMETRY_LANES:
+            path = self._prefix + lane.path
+            words = list(lane.colours)
+            colours = np.array([lane.colours[word] for word in words], dtype=np.uint32)
+            self._stream.log(path, rr.StateConfiguration(values=words, labels=words, colors=colours), static=True)
+            found = changes(level[lane.field], np.nan)
+            if found:
+                times = level["time_s"][[row for row, _ in found]]
+                states = [lane.word(code) for _, code in found]
+                self._columns(lane.path, times, rr.StateChange.columns(state=states))
+
+    def _events(self, run: Run, found: Sequence[Found], part_s: tuple[float, float]) -> None:
+        told = [e for e in run.events if e.get("kind") != "why" and part_s[0] <= event_time_s(e) <= part_s[1]]
+        if told:
+            levels = ["ERROR" if event.get("kind") == "fault" else "INFO" for event in told]
+            texts = [f"mark: {e.get('text')}" if e.get("kind") == run_folder.MARK else event_text(e) for e in told]
+            times = np.array([event_time_s(event) for event in told])
+            self._log(run, "/events", times, texts, levels)
+        seen = [f for f in found if part_s[0] <= f.time_s <= part_s[1]]
+        if seen:
+            texts = [f"{f.kind}: {f.size:.3g} {f.unit} (confidence {f.confidence:.3f})" for f in seen]
+            self._log(run, "/found", np.array([f.time_s for f in seen]), texts, ["WARN"] * len(seen))
+        if found:
+            times = np.array([f.time_s for f in found])
+            self._style("/found/marks", [("found by machine", streams.RED)], points=True)
+            self._scalars("/found/marks", times, np.zeros((len(found), 1)))
+
+    def _log(self, run: Run, path: str, time_s: Column, texts: list[str], levels: list[str]) -> None:
+        """Lines that begin with the time of the day, which is what people ask for."""
+        lines = [
+            f"{self._label}{run.utc(at_s):%H:%M:%S} {text}" for at_s, text in zip(time_s.tolist(), texts, strict=True)
+        ]
+        self._columns(path, time_s, rr.TextLog.columns(text=lines, level=levels))
+
+    def _figure(self, shapes: Shapes, part_s: tuple[float, float]) -> float:
+        good = shapes.select((shapes.verdict != "rejected") & np.isfinite(shapes.coeffs_um).all(axis=1))
+        if not len(good):
+            return float("nan")
+        shown = good.select(_some(len(good), SHAPES_MOST))
+        parameters = shown.parameters_um() - shown.parameters_um()[0]
+        terms = list(streams.LOW_ORDERS)
+        self._style("/shape/change", [streams.LOW_ORDERS[j] for j in terms])
+        self._scalars("/shape/change", shown.time_s, parameters[:, [j - 1 for j in terms]])
+        self._style("/shape/sag_change", [("sag by the camera um", streams.BLUE), ("laser um", streams.ORANGE)])
+        change = np.column_stack((shown.sag_um - shown.sag_um[0], shown.displacement_um - shown.displacement_um[0]))
+        self._scalars("/shape/sag_change", shown.time_s, change)
+        self._style("/shape/residual", [("slope residual urad", streams.BLUE)])
+        self._scalars("/shape/residual", shown.time_s, shown.slope_residual_urad[:, np.newaxis])
+        seen = (shown.time_s >= part_s[0]) & (shown.time_s <= part_s[1])
+        seen |= ~seen.any()  # nothing measured there: all, rather than no map
+        return self._maps(shown.time_s[seen], parameters[seen])
+
+    def _maps(self, time_s: Column, parameters: Column) -> float:
+        """Height changes against the first cycle of the hold, on one scale, so that they may be played."""
+        axis = (np.arange(_MAP_PX) + 0.5) * 2 / _MAP_PX - 1
+        x, y = np.meshgrid(axis, -axis)
+        inside = np.hypot(x, y) <= 1.0
+        wanted = np.flatnonzero(_some(time_s.size, MAPS_MOST))
+        heights = parameters[wanted] @ height_basis(x[inside], y[inside])
+        most = max(0.5, float(np.abs(heights).max()))
+        context = rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (1, "", (24, 24, 24, 255))])
+        self._stream.log(self._prefix + "/shape", context, static=True)
+        outside = rr.SegmentationImage((~inside).astype(np.uint8), opacity=1.0, draw_order=1.0)
+        self._stream.log(self._prefix + "/shape/map/outside", outside, static=True)
+        for row, height in zip(wanted, heights, strict=True):
+            picture = np.zeros((_MAP_PX, _MAP_PX), dtype=np.float32)
+            picture[inside] = height
+            image = rr.DepthImage(picture, colormap="turbo", depth_range=(-most, most))
+            self._at(float(time_s[row]))
+            self._stream.log(self._prefix + "/shape/map", image)
+        return most
+
+    def _style(self, path: str, lines: Iterable[tuple[str, streams.Colour]], points: bool = False) -> None:
+        names, colours = zip(*lines, strict=True)
+        style = rr.SeriesPoints if points else rr.SeriesLines
+        if self._prefix:
+            colours = tuple(_of_run(colour, self._number) for colour in colours)
+        archetype = style(names=[self._label + name for name in names], colors=list(colours))
+        self._stream.log(self._prefix + path, archetype, static=True)
+
+    def _scalars(self, path: str, time_s: Column, values: Column) -> None:
+        if time_s.size:
+            drawn = broken_at_gaps({"time_s": time_s, "values": values})
+            self._columns(path, drawn["time_s"], rr.Scalars.columns(scalars=drawn["values"]))
+
+    def _columns(self, path: str, time_s: Column, columns: Iterable[rr.ComponentColumn]) -> None:
+        indexes = [
+            rr.TimeColumn("run_time", duration=_nanoseconds(time_s - self._shift_s)),
+            rr.TimeColumn("utc", timestamp=self._origin + _nanoseconds(time_s)),
+        ]
+        self._stream.send_columns(self._prefix + path, indexes=indexes, columns=columns)
+
+    def _at(self, time_s: float) -> None:
+        self._stream.set_time("run_time", duration=_nanoseconds(np.array([time_s - self._shift_s]))[0])
+        self._stream.set_time("utc", timestamp=self._origin + _nanoseconds(np.array([time_s]))[0])
+
+
+def _of_run(colour: streams.Colour, number: int) -> streams.Colour:
+    """Runs that lie over each other differ by colour; what is grey in one alone is the dark shade."""
+    red, green, blue = _RUN_COLOURS[number % len(_RUN_COLOURS)]
+    return (red // 2, green // 2, blue // 2) if colour == streams.GREY else (red, green, blue)
+
+
+def _nanoseconds(time_s: Column) -> NDArray[np.timedelta64]:
+    return np.round(np.asarray(time_s, dtype=np.float64) * 1e9).astype("timedelta64[ns]")
+
+
+def _level_for(run: Run) -> float:
+    span_s = _end_s(run)
+    return next((w for w in (1.0, 10.0) if span_s / w <= LEVEL_ROWS_MOST), 60.0)
+
+
+def _end_s(run: Run) -> float:
+    """How long the run is: its summary, or its last event (a killed run: its last second)."""
+    duration = (run.summary or {}).get("duration_s")
+    if isinstance(duration, (int, float)):
+        return float(duration)
+    seconds = run.level(60.0, names=("rows",))["time_s"]
+    return float(seconds[-1]) + 60.0 if seconds.size else 0.0
+
+
+def _some(count: int, most: int) -> NDArray[np.bool_]:
+    """(count,) true for at most `most` places, evenly spread, the first among them."""
+    chosen = np.zeros(count, dtype=bool)
+    chosen[:: max(1, -(-count // most))] = True
+    return chosen

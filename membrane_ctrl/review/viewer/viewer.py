@@ -1,0 +1,220 @@
+"""Starts the viewer on a review: on this screen, for a browser, into a picture, or following a run that goes on."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO
+
+import rerun_cli  # type: ignore[import-untyped]
+from rerun.experimental import ViewerClient
+
+from membrane_ctrl.model.errors import DeviceError
+from membrane_ctrl.model.files import open_plain
+from membrane_ctrl.run_files.rrd_reader import segments
+from membrane_ctrl.run_files.segments import first_message_after
+
+# The recorder flushes every second.
+_FOLLOW_S = 0.5
+# A window opens in a few seconds, by a software driver in ten.
+_CURSOR_S = 30.0
+_CURSOR_AGAIN_S = 0.2
+_CHUNK_BYTES = 1 << 20
+_RECENT_BYTES = 20 << 20  # ten minutes at 50 Hz, as they are written
+_STYLE_BYTES = 1 << 20  # blueprint, colours and names come first, in a tenth of this
+
+
+def viewer_command(*arguments: str) -> list[str]:
+    """The viewer itself: the `rerun` command is a Python shim, and ending that would leave the viewer behind."""
+    return [str(Path(rerun_cli.__file__).parent / "rerun"), *arguments]
+
+
+def show(files: list[Path], at_s: float | None = None) -> int:
+    """Open files on this machine's screen, at a second of `run_time`; returns when the window is closed."""
+    _require_screen()
+    port = free_port()
+    command = viewer_command("--bind", "127.0.0.1", "--port", str(port), *(str(path) for path in files))
+    return _run(command, lambda process: None if at_s is None else put_cursor(process, port, at_s))
+
+
+def put_cursor(process: subprocess.Popen[bytes], port: int, at_s: float, most_s: float = _CURSOR_S) -> None:
+    """Put the time cursor of a viewer there as soon as it has opened its files; a blueprint cannot say it.
+
+    A viewer that does not answer in time is left as it opened: the plots show the part asked for all the same.
+    """
+    until_s = time.monotonic() + most_s
+    while time.monotonic() < until_s and process.poll() is None:
+        try:
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client.set_time("run_time", duration=at_s, play_state="paused")
+            if any(opened.current_time == round(1e9 * at_s) for opened in client.get_state().recordings):
+                return
+        except (RuntimeError, ConnectionError):
+            pass
+        time.sleep(_CURSOR_AGAIN_S)
+
+
+def serve(files: list[Path], bind: str, port: int) -> int:
+    """Serve files to browsers until interrupted.
+
+    Parameters
+    ----------
+    bind : str
+        127.0.0.1 unless the network may look: then the address to listen on.
+    port : int
+        Of the page; 0: a free one.
+
+    Raises
+    ------
+    DeviceError
+        If it cannot listen there, or the viewer does not start.
+    """
+    port = port or free_port()
+    _require_listening(bind, port)
+    data_port = free_port()
+    _say_where(bind, port, data_port)
+    options = ["--serve-web", "--bind", bind, "--port", str(data_port), "--web-viewer-port", str(port)]
+    return _run(viewer_command(*options, *(str(path) for path in files)))
+
+
+def live(folder: Path, web: bool, port: int = 0) -> int:
+    """Show a run that is still going, by reading behind its recorder: the run does not know that it is watched.
+
+    The segments are piped into a server of their own, which the viewer (or, with `web`, a browser) connects to: a
+    viewer that reads its standard input itself draws nothing before the input ends.
+    """
+    data_port, port = free_port(), port or free_port()
+    kind = ["--serve-web", "--web-viewer-port", str(port)] if web else ["--serve-grpc"]
+    server = viewer_command(*kind, "--bind", "127.0.0.1", "--port", str(data_port), "-")
+    proxy = f"rerun+http://127.0.0.1:{data_port}/proxy"
+    if web:
+        _require_listening("127.0.0.1", port)
+        _say_where("127.0.0.1", port, data_port)
+    else:
+        _require_screen()
+    try:
+        with subprocess.Popen(server, stdin=subprocess.PIPE, env=_environment()) as served:
+            watched = served if web else _connected(proxy)
+            assert served.stdin is not None
+            try:
+                follow(folder, served.stdin, lambda: watched.poll() is None)
+                watched.wait()
+            except (BrokenPipeError, KeyboardInterrupt):
+                pass
+            finally:
+                watched.terminate()
+                served.terminate()
+    except OSError as error:
+        raise DeviceError(f"the viewer did not start: {error}") from None
+    return 0
+
+
+def _connected(proxy: str) -> subprocess.Popen[bytes]:
+    command = viewer_command("--bind", "127.0.0.1", "--port", str(free_port()), "--connect", proxy)
+    return subprocess.Popen(command, env=_environment())
+
+
+def _require_screen() -> None:
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise DeviceError("no screen here: use --web and open the address in a browser, or --screenshot FILE")
+
+
+def _say_where(bind: str, port: int, data_port: int) -> None:
+    """The page's address, and how another machine gets to it."""
+    host = "127.0.0.1" if bind == "127.0.0.1" else socket.gethostname()
+    page = f"http://{host}:{port}/?url=rerun%2Bhttp%3A%2F%2F{host}%3A{data_port}%2Fproxy"
+    print(f"open {page}", file=sys.stderr)
+    if bind == "127.0.0.1":
+        tunnel = f"ssh -L {port}:127.0.0.1:{port} -L {data_port}:127.0.0.1:{data_port} {socket.gethostname()}"
+        print(f"from another machine first: {tunnel}", file=sys.stderr)
+
+
+def follow(
+    folder: Path, out: IO[bytes], wanted: Callable[[], bool], sleep: Callable[[float], None] = time.sleep
+) -> None:
+    """Copy what is new of a run as it grows, segment by segment, until it has its summary or nobody looks.
+
+    It begins some minutes back: a browser takes in a few times what comes, and would be hours behind a night. Before
+    that comes the beginning of the segment, which says how everything is to be drawn.
+
+    Raises BrokenPipeError when the reader has gone.
+    """
+    for data in _grown(folder, wanted, sleep):
+        out.write(data)
+        out.flush()
+
+
+def _grown(folder: Path, wanted: Callable[[], bool], sleep: Callable[[float], None]) -> Iterator[bytes]:
+    number, place, style = _recent(segments(folder))
+    yield style
+    while wanted():
+        over = (folder / "summary.json").exists()
+        files = segments(folder)
+        data = b""
+        if number < len(files):
+            with open_plain(files[number]) as file:
+                file.seek(place)
+                data = file.read(_CHUNK_BYTES)
+        if data:
+            place += len(data)
+            yield data
+        elif number + 1 < len(files):
+            number, place = number + 1, 0
+        elif over:
+            return
+        else:
+            sleep(_FOLLOW_S)
+
+
+def _recent(files: list[Path]) -> tuple[int, int, bytes]:
+    """Number of the segment to begin with, the place in it, and what has to come before that."""
+    sizes = [file.lstat().st_size for file in files]
+    number = max(0, len(files) - 1)
+    if number > 0 and sizes[number] < _RECENT_BYTES:
+        number -= 1
+    if not files or sizes[number] < _RECENT_BYTES + _STYLE_BYTES:
+        return number, 0, b""
+    style_ends = first_message_after(files[number], _STYLE_BYTES)
+    place = first_message_after(files[number], sizes[number] - _RECENT_BYTES)
+    with open_plain(files[number]) as file:
+        return number, place, file.read(style_ends) if place else b""
+
+
+def _require_listening(bind: str, port: int) -> None:
+    """The viewer says nothing of a port that is taken."""
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in bind else socket.AF_INET) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((bind, port))
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise DeviceError(
+            f"cannot listen on {bind}, port {port} ({reason}): choose another --port or --bind"
+        ) from None
+
+
+def free_port() -> int:
+    """A TCP port that nobody listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _run(command: list[str], started: Callable[[subprocess.Popen[bytes]], None] = lambda _: None) -> int:
+    try:
+        with subprocess.Popen(command, env=_environment()) as viewer:
+            try:
+                started(viewer)
+                return 0 if viewer.wait() == 0 else 4
+            except KeyboardInterrupt:
+                viewer.terminate()
+                return 0
+    except OSError as error:
+        raise DeviceError(f"the viewer did not start: {error}") from None
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, "RUST_LOG": os.environ.get("RUST_LOG", "error")}

@@ -1,0 +1,295 @@
+"""Reads the tables beside a recording (`recording.column_file`); what is damaged is said, the rest is given."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.files import open_plain, read_bytes
+from membrane_ctrl.run_files import sealed_stream, tables
+from membrane_ctrl.run_files.column_file import FOLDER, SUFFIX
+
+# Times that a file's rows cannot have: a flipped byte makes a second of the year 30 000 000 and a run as long.
+
+
+# A file of a table holds six hours, a segment at most a day (the limit of `recording.segment_s`).
+_FILE_MAX_S = 86_400.0
+
+
+def possible_times(time_s: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which of a file's (n,) times are finite and within a day of most others."""
+    finite = np.isfinite(time_s)
+    if not finite.any():
+        return finite
+    return np.asarray(finite & (np.abs(time_s - np.median(time_s[finite])) <= _FILE_MAX_S))
+
+
+# The column that says when: of ticks, and of the other tables.
+_TIMES = ("mono_s", "time_s")
+_LOOK_BYTES = 1 << 20  # holds the head and a first batch
+# Columns of `shapes` that are no numbers.
+_WORDS = frozenset({"kind", "verdict", "reason"})
+_LISTS = frozenset({"coeffs_um", "covariance_um2"})
+# What is in memory at a time, whatever a file is: numbers of eight bytes, and what a batch holds besides.
+_PART_CELLS = 24_000_000
+_PART_BYTES = 200_000_000
+
+
+def column_files(folder: Path, table: str) -> list[Path]:
+    """The files of a table in their order."""
+    return sorted((folder / FOLDER).glob(f"{table}-*{SUFFIX}"))
+
+
+def missing_files(files: Sequence[Path], first: str, count: int = 0) -> list[str]:
+    """Names of files that are not there, of a table or recording whose files are numbered.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        Those that are there.
+    first : str
+        Name of file 0: `ticks-000.arrows`.
+    count : int
+        How many there should be, where that is known.
+    """
+    pattern = re.fullmatch(r"(.*-)(\d+)(\.\w+)", first)
+    if pattern is None:  # somebody's own file
+        return []
+    stem, number, suffix = pattern.groups()
+    there = {int(found[1]) for path in files if (found := re.search(r"-(\d+)\.\w+$", path.name))}
+    every = range(max(max(there, default=-1) + 1, count))
+    return [f"{stem}{n:0{len(number)}d}{suffix}" for n in every if n not in there]
+
+
+def read_file(path: Path, names: Sequence[str] | None, notes: list[str], over: bool = False) -> pa.Table | None:
+    """One file's columns in one table, as `read_parts`; None if nothing of it can be read."""
+    parts = read_parts(path, names, notes, over)
+    found = list(itertools.islice(parts, 1))
+    if not found:
+        return None
+    if next(parts, None) is not None:
+        add_note(notes, f"{path.name}: more rows than a recorder writes: what is behind the first is left out")
+    return found[0]
+
+
+def read_parts(path: Path, names: Sequence[str] | None, notes: list[str], over: bool = False) -> Iterator[pa.Table]:
+    """One file's columns, in parts of at most `_PART_CELLS`; none if nothing of it can be read.
+
+    Parameters
+    ----------
+    path : Path
+        An Arrow stream.
+    names : sequence of str or None
+        Columns wanted (those that the file does not have are left out); None: all.
+    notes : list
+        Gets a line for a file that is damaged, or of a version without a wanted column.
+    over : bool
+        The file should have an end: it is its table's last one, and the run was closed.
+    """
+    try:
+        # a plain read: the pages of a mapped file would count as ours
+        content = sealed_stream.unseal(read_bytes(path, sealed_stream.FILE_BYTES_MAX))
+        if not content.data:
+            add_note(notes, f"{path.name}: cannot be read ({'its head is damaged' if content.damage else 'empty'})")
+            return
+        sealed_stream.require_bounded(content.data)
+        for table in _parts(path, content, names, notes, over):
+            yield table if content.sealed else _possible(path, table, notes)
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        add_note(notes, f"{path.name}: cannot be read ({_first_line(error)})")
+
+
+def _parts(
+    path: Path, content: sealed_stream.Unsealed, names: Sequence[str] | None, notes: list[str], over: bool
+) -> Iterator[pa.Table]:
+    schema = pa.ipc.open_stream(content.data).schema
+    known = [name for name in dict.fromkeys(schema.names) if _is_ours(schema, name)]
+    wanted = known if names is None else [name for name in names if name in known]
+    absent = sorted(set(names or ()) - set(wanted))
+    if absent:
+        add_note(notes, f"{path.name}: written by another version, without {', '.join(absent)}")
+    if not wanted:
+        return
+    # one thread: buffers of a minute are too small to hand around
+    options = pa.ipc.IpcReadOptions(included_fields=[schema.names.index(n) for n in wanted], use_threads=False)
+    reader = pa.ipc.open_stream(content.data, options=options)
+    waiting: list[pa.RecordBatch] = []
+    spans: list[_Span] = []
+    rows_max = _PART_CELLS // max(len(wanted), len(names or ()))
+    error: Exception | None = None
+    try:
+        for batch in reader:
+            batch.validate(full=True)  # Arrow trusts lengths and offsets otherwise, and reads what is not its own
+            if batch.num_rows > rows_max or any(column.null_count for column in batch.columns):
+                raise pa.ArrowInvalid("a batch that no recorder writes")
+            if waiting and (
+                sum(each.num_rows for each in waiting) + batch.num_rows > rows_max
+                or sum(each.nbytes for each in waiting) + batch.nbytes > _PART_BYTES
+            ):
+                yield pa.Table.from_batches(waiting, schema=reader.schema).select(wanted)
+                waiting = []
+            waiting.append(batch)
+            spans.append(_span(batch))
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as found:
+        error = found
+    _note_damage(path, content, spans, notes, over, error)
+    yield pa.Table.from_batches(waiting, schema=reader.schema).select(wanted)
+
+
+def _note_damage(
+    path: Path,
+    content: sealed_stream.Unsealed,
+    spans: Sequence[_Span],
+    notes: list[str],
+    over: bool,
+    error: Exception | None,
+) -> None:
+    if error is not None:
+        add_note(notes, f"{path.name}: damaged or cut short behind batch {len(spans)} ({_first_line(error)})")
+    if not content.sealed:
+        add_note(notes, "tables without checksums, of an earlier version: a flipped byte in them would not be seen")
+    for damage in content.damage:
+        size_kb = damage.size_bytes / 1e3
+        what = "cut short" if damage.at_end and not content.ended else "damaged"
+        add_note(notes, f"{path.name}: {what}, {size_kb:.1f} kB: {_rows_lost(spans, damage)} left out")
+    if content.sealed and over and not content.ended and not content.damage:
+        lost = _rows_lost(spans, sealed_stream.Damage(len(spans), 0, True))
+        add_note(notes, f"{path.name}: without the mark of its end: {lost} missing, if there were any")
+
+
+def _is_ours(schema: pa.Schema, name: str) -> bool:
+    """Whether a column is of the kind that a recorder writes under its name, and there once."""
+    places = schema.get_all_field_indices(name)
+    kind = schema.field(places[0]).type
+    if name in _WORDS:
+        right = pa.types.is_string(kind)
+    elif name in _LISTS:
+        right = isinstance(kind, (pa.ListType, pa.FixedSizeListType)) and pa.types.is_floating(kind.value_type)
+    else:
+        right = pa.types.is_floating(kind) or pa.types.is_integer(kind)
+    return len(places) == 1 and right
+
+
+def _possible(path: Path, table: pa.Table, notes: list[str]) -> pa.Table:
+    """Rows whose time can be: without a checksum it may be any number."""
+    name = next((name for name in _TIMES if name in table.schema.names), None)
+    if name is None:
+        return table
+    mask = possible_times(table.column(name).to_numpy())
+    if not mask.all():
+        add_note(notes, f"{path.name}: {np.count_nonzero(~mask)} rows with impossible times are left out")
+    return table.filter(pa.array(mask))
+
+
+def first_s(path: Path, time_name: str) -> float | None:
+    """Time of the first row; None if the file's beginning does not give it."""
+    times_s = first_column(path, time_name)
+    return float(times_s[0]) if times_s.size else None
+
+
+def first_column(path: Path, name: str) -> NDArray[np.float64]:
+    """A column of the first batch; empty if the file's beginning does not give it."""
+    try:
+        with open_plain(path) as file:
+            content = sealed_stream.unseal(file.read(_LOOK_BYTES))
+        sealed_stream.require_bounded(content.data)
+        reader = pa.ipc.open_stream(content.data)
+        if name not in reader.schema.names or not _is_ours(reader.schema, name):
+            return np.empty(0)
+        batch = reader.read_next_batch()
+        batch.validate(full=True)
+        return np.asarray(batch.column(name).to_numpy(zero_copy_only=False), dtype=np.float64)
+    except (pa.ArrowException, OSError, StopIteration, UnicodeDecodeError):
+        return np.empty(0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Span:
+    """Times of a batch's first and last row; None where it does not say."""
+
+    first_s: float | None
+    last_s: float | None
+
+
+def _span(batch: pa.RecordBatch) -> _Span:
+    name = next((name for name in _TIMES if name in batch.schema.names), None)
+    if name is None or not batch.num_rows:
+        return _Span(None, None)
+    column = batch.column(name)
+    return _Span(float(column[0].as_py()), float(column[-1].as_py()))
+
+
+def _rows_lost(spans: Sequence[_Span], damage: sealed_stream.Damage) -> str:
+    """The rows that a stretch has held, by the times of those around it."""
+    after = damage.batches
+    last_s = spans[after - 1].last_s if 0 < after <= len(spans) else None
+    next_s = spans[after].first_s if after < len(spans) else None
+    if last_s is not None and next_s is not None:
+        return f"rows between {last_s:.2f} s and {next_s:.2f} s are"
+    if last_s is not None:
+        return f"rows behind {last_s:.2f} s are"
+    return "all rows are" if next_s is None else f"rows before {next_s:.2f} s are"
+
+
+def add_note(notes: list[str], text: str) -> None:
+    """A line, once."""
+    if text not in notes:
+        notes.append(text)
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]
+
+
+# The rate of a run's ticks: what was recorded knows it better than a configuration that lost a line.
+
+
+# Rates in use are farther apart.
+_DIFFERS = 0.05
+# Nobody sets 9.998 Hz; that is a clock's jitter.
+_WHOLE = 0.005
+
+
+def at_recorded_rate(config: Config, folder: Path, notes: list[str]) -> Config:
+    """The configuration with the rate of the run's first minute, if that is another; a note says so."""
+    said_hz, found_hz = config.loop.rate_hz, recorded_rate_hz(folder)
+    if found_hz is None or abs(found_hz / said_hz - 1) <= _DIFFERS:
+        return config
+    notes.append(
+        f"config.toml: loop.rate_hz is {said_hz:g} Hz (by default, if it is not there), the ticks come at "
+        f"{found_hz:.4g} Hz: what was recorded is taken"
+    )
+    return config.model_copy(update={"loop": config.loop.model_copy(update={"rate_hz": found_hz})})
+
+
+def recorded_rate_hz(folder: Path) -> float | None:
+    """Ticks a second by the tables; None where they do not say."""
+    for path in column_files(folder, tables.TICKS):
+        spacing_s = _spacing_s(path)
+        spacing_s = spacing_s[spacing_s > 0]
+        if spacing_s.size:
+            return _whole(1 / float(np.median(spacing_s)))
+    for path in column_files(folder, tables.level_table(1.0)):
+        rows = first_column(path, "rows")
+        if rows.size:
+            return _whole(float(np.median(rows)))
+    return None
+
+
+def _spacing_s(path: Path) -> NDArray[np.float64]:
+    """From when one of a file's first ticks was due to when the next was: `dt_s` is that and the jitter of both."""
+    dt_s, late_ms = (first_column(path, name) for name in ("dt_s", "lateness_ms"))
+    return dt_s[1:] - 1e-3 * np.diff(np.nan_to_num(late_ms)) if late_ms.size == dt_s.size else dt_s
+
+
+def _whole(rate_hz: float) -> float:
+    whole_hz = float(round(rate_hz))
+    return whole_hz if abs(rate_hz - whole_hz) <= _WHOLE * rate_hz else rate_hz

@@ -1,0 +1,155 @@
+"""Old runs go when they are too old or too many bytes; never the present one, and none that a person keeps."""
+
+import os
+import re
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from enum import IntEnum
+from pathlib import Path
+
+from membrane_ctrl.model.files import folder_handle
+
+_RUN = re.compile(r"(\d{8}T\d{6}Z)-.+")
+_DOOMED = ".deleted-"
+_KEEP = ".keep"
+# A clock that is wrong by years must not take every run with it.
+_NEVER_TOO_OLD = 3
+# A run without a summary may be running, unless nothing in it has changed for this long.
+_ABANDONED_AFTER = timedelta(hours=24)
+
+
+@dataclass(frozen=True, slots=True)
+class OldRun:
+    """A run folder that may be deleted: its name begins with its start."""
+
+    folder: Path
+    started_utc: datetime
+    size_bytes: int
+
+
+def deletable_runs(logs_dir: Path, present: Path, now_utc: datetime) -> list[OldRun]:
+    """Runs in `logs_dir`, oldest first, but for the present one, those that may still run, and those with a `.keep`.
+
+    Only folders that look like a run are looked at: a name that begins with a time, and `config.toml`. A link is
+    none: what it leads to lies elsewhere.
+    """
+    found = []
+    for folder in sorted(logs_dir.iterdir()):
+        match = _RUN.fullmatch(folder.name)
+        if not match or folder.is_symlink() or not (folder / "config.toml").is_file():
+            continue
+        if folder.resolve() == present.resolve():
+            continue
+        if (folder / _KEEP).exists() or _may_run(folder, now_utc):
+            continue
+        try:
+            started = datetime.strptime(match[1], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+        except ValueError:  # digits, but no time
+            continue
+        found.append(OldRun(folder, started, size_bytes(folder)))
+    return found
+
+
+def size_bytes(folder: Path) -> int:
+    """Bytes of all files below a folder; one that goes away meanwhile counts nothing."""
+    total = 0
+    for path in folder.rglob("*"):
+        try:
+            total += path.lstat().st_size
+        except OSError:
+            continue
+    return total
+
+
+def _may_run(folder: Path, now_utc: datetime) -> bool:
+    if (folder / "summary.json").exists():
+        return False
+    try:
+        newest_s = max(path.lstat().st_mtime for path in folder.iterdir())
+    except OSError:  # something goes away while we look: somebody is at work there
+        return True
+    return now_utc - datetime.fromtimestamp(newest_s, UTC) < _ABANDONED_AFTER
+
+
+def expired(
+    runs: Sequence[OldRun], present_bytes: int, keep_gb: float | None, keep_days: float | None, now_utc: datetime
+) -> list[tuple[OldRun, str]]:
+    """Which runs have to go, and why.
+
+    Parameters
+    ----------
+    runs : sequence of OldRun
+        Oldest first.
+    present_bytes : int
+        Of the present run; it counts, and stays.
+    keep_gb, keep_days : float or None
+        Limits (1e9 bytes); None: no limit. The newest three are never too old.
+    now_utc : datetime
+    """
+    total = present_bytes + sum(run.size_bytes for run in runs)
+    gone: list[tuple[OldRun, str]] = []
+    for place, run in enumerate(runs):
+        old_enough = place < len(runs) - _NEVER_TOO_OLD
+        if keep_days is not None and old_enough and now_utc - run.started_utc > timedelta(days=keep_days):
+            gone.append((run, f"older than recording.keep_days = {keep_days:g}"))
+        elif keep_gb is not None and total > keep_gb * 1e9:
+            gone.append((run, f"all runs are more than recording.keep_gb = {keep_gb:g}"))
+        else:
+            continue
+        total -= run.size_bytes
+    return gone
+
+
+def delete_run(run: OldRun) -> None:
+    """Delete a run; renamed first, so that what a crash leaves of it is no run. Raises OSError."""
+    doomed = f"{_DOOMED}{run.folder.name}"
+    with folder_handle(run.folder.parent.resolve()) as logs:
+        os.rename(run.folder.name, doomed, src_dir_fd=logs, dst_dir_fd=logs)
+        shutil.rmtree(doomed, dir_fd=logs)  # of a link in it the link goes
+
+
+def delete_remains(logs_dir: Path) -> None:
+    """Delete what a crash in `delete_run` has left; what does not go now goes another time."""
+    for doomed in logs_dir.glob(f"{_DOOMED}*"):
+        shutil.rmtree(doomed, ignore_errors=True)
+
+
+# What is still recorded when the disk runs low: pictures go first, numbers last.
+
+
+class Thrift(IntEnum):
+    """How much is left out."""
+
+    ALL = 0
+    NO_PICTURES = 1  # thumbnails and maps are half of a recording
+    ESSENTIAL = 2  # events, inputs of the ticks, summary: some kB/s, from which the run can be replayed
+
+
+# In units of `recording.min_free_mb`: below it a person has been told, and what is left is for the essential.
+PICTURES_FROM, _RERUN_FROM = 2.0, 0.2
+# More must be free again than what a level began at, or it would come and go with every file.
+_HYSTERESIS = 1.1
+
+
+def thrift(free_mb: float, min_free_mb: float, before: Thrift) -> Thrift:
+    """What to leave out with this much space left.
+
+    Parameters
+    ----------
+    free_mb : float
+        Space left.
+    min_free_mb : float
+        `recording.min_free_mb`.
+    before : Thrift
+        As it was.
+    """
+    level = _level(free_mb, min_free_mb)
+    return max(level, min(before, _level(free_mb / _HYSTERESIS, min_free_mb)))
+
+
+def _level(free_mb: float, min_free_mb: float) -> Thrift:
+    if free_mb < _RERUN_FROM * min_free_mb:
+        return Thrift.ESSENTIAL
+    return Thrift.NO_PICTURES if free_mb < PICTURES_FROM * min_free_mb else Thrift.ALL

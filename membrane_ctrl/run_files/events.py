@@ -1,0 +1,107 @@
+"""`events.jsonl`: one JSON object a line, on the disk as soon as it is known."""
+
+import json
+import os
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl.model.plain_json import dumps_checked
+
+Event = dict[str, Any]
+
+# Synced at once: what must survive the power cut that may follow.
+_SYNCED = frozenset({"fault", "end"})
+# While the disk is full events wait here; a fault campaign makes some hundred.
+_WAITING_MAX = 10_000
+
+
+def parse(message: bytes) -> Event:
+    """The event of a ring message; one that is not a JSON object becomes an event that says so."""
+    try:
+        event = json.loads(message)
+    except (ValueError, RecursionError):
+        event = None
+    return event if isinstance(event, dict) else {"kind": "unreadable_event", "message": repr(message[:200])}
+
+
+class EventsFile:
+    """Appends events; after a failed write nothing is lost or torn, the next call goes on where it stopped.
+
+    Parameters
+    ----------
+    path : Path
+    resumed : bool
+        A recorder was killed: half a line at the end goes, and what is there is not written again.
+
+    Attributes
+    ----------
+    lost : int
+        Events given up because too many waited for a full disk.
+    """
+
+    def __init__(self, path: Path, resumed: bool = False) -> None:
+        self._path = path
+        self._written = _mend_tail(path) if resumed else frozenset()
+        self._waiting: deque[bytes] = deque()
+        self._sync = False
+        self._descriptor: int | None = None
+        self.lost = 0
+
+    def append(self, events: Sequence[Event]) -> None:
+        """Write events, and those still waiting from before. Raises OSError (full disk)."""
+        for event in events:
+            line = dumps_checked(event).encode() + b"\n"
+            if line in self._written:
+                continue
+            self._waiting.append(line)
+            self._sync |= event.get("kind") in _SYNCED
+        while len(self._waiting) > _WAITING_MAX:
+            # the front line may be half on the disk already: it stays, the one behind it goes
+            del self._waiting[1]
+            self.lost += 1
+        self._write()
+
+    def _write(self) -> None:
+        if self._waiting and self._descriptor is None:
+            self._descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        while self._waiting and self._descriptor is not None:
+            written = os.write(self._descriptor, self._waiting[0])
+            rest = self._waiting[0][written:]
+            if rest:
+                self._waiting[0] = rest
+            else:
+                self._waiting.popleft()
+        if self._sync and self._descriptor is not None:
+            os.fsync(self._descriptor)
+            self._sync = False
+
+    def begin_anew(self, recent: Sequence[Event]) -> None:
+        """The file was taken away: begin another, with those that had gone into it unseen. Raises OSError."""
+        gone = self._descriptor is not None  # not opened yet: nothing of it was taken
+        self.close()
+        self.append(recent if gone else [])
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+
+# A killed recorder had handed on how far it was a second before: at most this much may come twice.
+_TAIL_BYTES = 1_000_000
+
+
+def _mend_tail(path: Path) -> frozenset[bytes]:
+    """Cut half a line off the end; the last whole lines."""
+    if not path.exists():
+        return frozenset()
+    with path.open("r+b") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - _TAIL_BYTES))
+        tail = file.read()
+        whole = tail[: tail.rfind(b"\n") + 1]
+        file.truncate(size - len(tail) + len(whole))
+    return frozenset(whole.splitlines(keepends=True))

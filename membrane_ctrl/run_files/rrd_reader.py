@@ -1,0 +1,182 @@
+"""Telemetry and shapes out of Rerun segments: for runs without tables, and for a killed run's last minute.
+
+Slow against the tables (a chunk an entity a second), but everything is in there.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rerun.chunk import Chunk
+
+from membrane_ctrl.run_files import column_reader, streams
+from membrane_ctrl.run_files.segments import FAULTS, read_chunks, salvage
+
+Column = NDArray[np.float64]
+REPAIRED = "repaired"  # below the run: what `repair` made of damaged files
+_VALUES = "Scalars:scalars"
+_TIME = "run_time"
+
+
+def segments(folder: Path) -> list[Path]:
+    """The run's Rerun segments in their order."""
+    return sorted(folder.glob("*.rrd"))
+
+
+def read_ticks(path: Path, names: Sequence[str], notes: list[str]) -> dict[str, Column]:
+    """Columns of telemetry from one segment, on the ticks of `/tick/record`; NaN where a stream has no row.
+
+    Parameters
+    ----------
+    path : Path
+        Segment.
+    names : sequence of str
+        Fields of `TelemetryRow`, `mono_s` among them.
+    notes : list
+        Gets a line when the segment is damaged.
+    """
+    wanted = {stream.path: stream for stream in streams.STREAMS if any(line.field in names for line in stream.lines)}
+    found = _scalars(path, {*wanted, "/tick/record"}, notes)
+    if "/tick/record" not in found:
+        return {name: np.empty(0) for name in names}
+    clock_ns = found["/tick/record"][0]
+    columns: dict[str, Column] = {"mono_s": _seconds(clock_ns)}
+    for entity, stream in wanted.items():
+        times, values = found.get(entity, (clock_ns[:0], np.empty((0, len(stream.lines)))))
+        rows = np.searchsorted(clock_ns, times)
+        there = (rows < clock_ns.size) & (clock_ns[np.minimum(rows, clock_ns.size - 1)] == times)
+        for place, line in enumerate(stream.lines):
+            column = np.full(clock_ns.size, np.nan)
+            if place < values.shape[1]:
+                column[rows[there]] = values[there, place]
+            columns[line.field] = column
+    return {name: columns.get(name, np.full(clock_ns.size, np.nan)) for name in names}
+
+
+def read_shapes(path: Path, notes: list[str]) -> dict[str, Column]:
+    """Shape estimates of one segment: `time_s`, `coeffs_um` (n, 36), changes of sag and laser, quality."""
+    found = _scalars(path, {stream.path for stream in streams.SHAPE_STREAMS}, notes)
+    if streams.ZERNIKE.path not in found:
+        return {}
+    clock_ns, coeffs_um = found[streams.ZERNIKE.path]
+
+    def at(entity: str, place: int) -> Column:
+        values = np.full(clock_ns.size, np.nan)
+        times, rows = found.get(entity, (clock_ns[:0], np.empty((0, place + 1))))
+        _, here, there = np.intersect1d(clock_ns, times, return_indices=True)
+        values[here] = rows[there, place]
+        return values
+
+    sag_um = at(streams.SAG.path, 0)
+    return {
+        "time_s": _seconds(clock_ns),
+        "coeffs_um": coeffs_um,
+        "sag_um": sag_um,
+        "sag_sigma_um": at(streams.SAG.path, 1) - sag_um,
+        "displacement_um": at(streams.SAG.path, 3),
+        "slope_residual_urad": at(streams.RESIDUAL.path, 0),
+        "valid_fraction": at(streams.QUALITY.path, 0),
+        "saturated_fraction": at(streams.QUALITY.path, 1),
+        "modulation_median_adu": at(streams.MODULATION.path, 0),
+        "latency_s": at(streams.LATENCY.path, 0) * 1e-3,
+    }
+
+
+def _seconds(clock_ns: NDArray[np.int64]) -> Column:
+    return np.asarray(clock_ns * 1e-9, dtype=np.float64)
+
+
+def _scalars(path: Path, entities: set[str], notes: list[str]) -> dict[str, tuple[NDArray[np.int64], Column]]:
+    """(times in ns, (n, m) values) of each entity with scalars, sorted by time."""
+    parts: dict[str, list[tuple[NDArray[np.int64], Column]]] = {}
+    for entity, times, values in _chunks(path, entities, notes):
+        parts.setdefault(entity, []).append((times, values))
+    joined = {}
+    for entity, chunks in parts.items():
+        times = np.concatenate([chunk[0] for chunk in chunks])
+        values = np.concatenate([chunk[1] for chunk in chunks])
+        possible = column_reader.possible_times(_seconds(times))
+        if not possible.all():
+            column_reader.add_note(notes, f"{path.name}: rows with impossible times are left out")
+            times, values = times[possible], values[possible]
+        order = np.argsort(times, kind="stable")
+        joined[entity] = (times[order], values[order])
+    return joined
+
+
+def _chunks(path: Path, entities: set[str], notes: list[str]) -> Iterator[tuple[str, NDArray[np.int64], Column]]:
+    for chunk in _readable(path, entities, notes):
+        batch = chunk.to_record_batch()
+        if _VALUES not in batch.schema.names or _TIME not in batch.schema.names:
+            continue
+        cells = batch.column(_VALUES)
+        values = cells.flatten().to_numpy(zero_copy_only=False).reshape(batch.num_rows, -1)
+        yield chunk.entity_path, batch.column(_TIME).cast("int64").to_numpy(), values
+
+
+def _readable(path: Path, entities: set[str], notes: list[str]) -> list[Chunk]:
+    try:
+        return read_chunks(path, entities)
+    except FAULTS as error:
+        why = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {path}: ")[:120]
+    try:
+        chunks = read_chunks(path.parent / REPAIRED / path.name, entities)
+    except FAULTS:
+        pass
+    else:
+        column_reader.add_note(notes, f"{path.name}: damaged or cut short, read from its copy in {REPAIRED}/ ({why})")
+        return chunks
+    try:
+        chunks, lost_bytes = salvage(path, entities)
+    except OSError as error:
+        why, chunks, lost_bytes = error.strerror or str(error), [], 0
+    what = f"{lost_bytes / 1e3:.1f} kB of it are left out" if chunks else "nothing of it can be read"
+    column_reader.add_note(notes, f"{path.name}: damaged or cut short, {what} ({why})")
+    return chunks
+
+
+# A part of a run's telemetry out of its Rerun segments, reading those alone that may hold some of it.
+
+
+Block = dict[str, Column]
+
+
+def segment_blocks(
+    folder: Path, names: Sequence[str], start_s: float, end_s: float, notes: list[str]
+) -> Iterator[Block]:
+    """Telemetry of the segments from `start_s` up to `end_s`, a block each; what is damaged of them is noted."""
+    paths = segments(folder)
+    first = _last_begun(paths, start_s) if np.isfinite(start_s) else 0
+    last = _last_begun(paths, end_s) if np.isfinite(end_s) else len(paths) - 1
+    for path in paths[first : last + 1]:
+        block = cut(read_ticks(path, names, notes), "mono_s", start_s, end_s)
+        if block["mono_s"].size:
+            yield block
+
+
+def cut(block: Block, time_name: str, start_s: float, end_s: float) -> Block:
+    """Rows of a block from `start_s` up to `end_s`."""
+    time_s = block[time_name]
+    first, last = np.searchsorted(time_s, [start_s, end_s])
+    if first == 0 and last == time_s.size:
+        return block
+    return {name: values[first:last] for name, values in block.items()}
+
+
+def _last_begun(paths: Sequence[Path], time_s: float) -> int:
+    """Number of the last segment that begins before a time, or the first one: halves what is left at each look."""
+    low, high = 0, len(paths)
+    while high - low > 1:
+        middle = (low + high) // 2
+        # a segment that gives no time gives no rows: the next one says where it is
+        looks = ((place, _first_s(paths[place])) for place in range(middle, high))
+        place, begins_s = next(((place, at_s) for place, at_s in looks if at_s is not None), (middle, np.inf))
+        low, high = (place, high) if begins_s <= time_s else (low, middle)
+    return low
+
+
+def _first_s(path: Path) -> float | None:
+    """Its first tick. That it is damaged is no note yet: it may be far from the part that is read."""
+    times_s = read_ticks(path, ["mono_s"], [])["mono_s"]
+    return float(times_s[0]) if times_s.size else None

@@ -1,0 +1,331 @@
+"""A run folder as data: `open_run(path)`, then columns, levels, shapes, events. Nothing here ever writes."""
+
+import json
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.telemetry import FIELDS
+from membrane_ctrl.run_files import column_reader, rrd_reader, run_folder, shapes
+from membrane_ctrl.run_files.column_file import SUFFIX
+from membrane_ctrl.run_files.rrd_reader import cut, segment_blocks
+from membrane_ctrl.run_files.segments import is_closed
+from membrane_ctrl.run_files.shapes import Shapes
+from membrane_ctrl.run_files.tables import NAMES as LEVEL_NAMES
+from membrane_ctrl.run_files.tables import (
+    SHAPES,
+    TICK_FIELDS,
+    TICKS,
+    WINDOWS_S,
+    coarser_level,
+    first_level,
+    level_table,
+)
+
+Column = NDArray[np.float64]
+Block = dict[str, Column]
+# Rerun rounds the time of a tick to the nanosecond; the next one is milliseconds away
+_SAME_TICK_S = 1e-6
+# From the last tick to the end of a run, and what of a killed one is in the segments only.
+_WAY_DOWN_S = 60.0
+# A batch of a level spans minutes; in shorter gaps there was nothing to record.
+_HOLE_S = 30.0
+_FILES_MAX = 100_000  # ten years of hours
+# What a damaged line may say else is no time of a run, and dates end.
+_YEARS = range(1970, 2200)
+_RUN_MAX_S = 1e9
+TABLES = (TICKS, *(level_table(window_s) for window_s in WINDOWS_S), SHAPES)
+_STAND_IN = "Rerun segments stand in for ticks that the tables lack: without every tick, and without checksums"
+
+
+@dataclass(frozen=True, slots=True)
+class _Reach:
+    """How far a table goes: last row given of a part, and last row known of, which may lie behind it; -inf: none."""
+
+    given_s: float
+    known_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A run, opened for reading.
+
+    Attributes
+    ----------
+    folder : Path
+    config : Config
+        As run; of a version that is not ours, what of it can be read, the rest at its default.
+    events : tuple of dict
+        `events.jsonl` and the annotations made later, in the order of time.
+    summary : dict or None
+        `summary.json`; None while the run goes on, or if its recorder was killed.
+    origin_utc : datetime
+        UTC at 0 s of the run.
+    notes : list of str
+        What is missing or damaged, a line each; reading may add to it.
+    """
+
+    folder: Path
+    config: Config
+    events: tuple[dict[str, Any], ...]
+    summary: dict[str, Any] | None
+    origin_utc: datetime
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.folder.name
+
+    def utc(self, mono_s: float) -> datetime:
+        """UTC of a second of the run; of one that is none, as damaged tables may have, of its start."""
+        return self.origin_utc + timedelta(seconds=mono_s if abs(mono_s) < _RUN_MAX_S else 0.0)
+
+    def events_between(self, start_s: float, end_s: float) -> tuple[dict[str, Any], ...]:
+        """Events of a part of the run."""
+        return tuple(event for event in self.events if start_s <= run_folder.event_s(event) < end_s)
+
+    def ticks(self, names: Sequence[str] | None = None, start_s: float = -np.inf, end_s: float = np.inf) -> pa.Table:
+        """Telemetry as an Arrow table (`.to_pandas()` where pandas is installed).
+
+        Parameters
+        ----------
+        names : sequence of str, optional
+            Fields of `telemetry.TelemetryRow`; all by default. `mono_s` is always there.
+        start_s, end_s : float
+            Part of the run wanted.
+        """
+        wanted = _with_time(names or FIELDS)
+        blocks = [pa.table(block) for block in self.tick_blocks(wanted, start_s, end_s)]
+        empty = pa.table({name: np.empty(0) for name in wanted})
+        return pa.concat_tables(blocks, promote_options="permissive") if blocks else empty
+
+    def tick_blocks(self, names: Sequence[str], start_s: float = -np.inf, end_s: float = np.inf) -> Iterator[Block]:
+        """Telemetry in blocks of some hours, so that a month needs no more memory than a night."""
+        wanted = _with_time(names)
+        table = yield from self._table_blocks(TICKS, "mono_s", wanted, start_s, end_s)
+        # a part that lies in a hole of the table; one behind its end is none
+        hole = table.given_s == -np.inf and start_s < table.known_s
+        if not hole and (table.known_s >= end_s or self._reaches_end(table.known_s)):
+            return
+        last_s = -np.inf if hole else table.known_s
+        for block in segment_blocks(self.folder, wanted, max(start_s, last_s + _SAME_TICK_S), end_s, self.notes):
+            if block["mono_s"][-1] - last_s > _WAY_DOWN_S:
+                column_reader.add_note(self.notes, _STAND_IN)
+            yield block
+
+    def _reaches_end(self, until_s: float) -> bool:
+        """Whether a table that ends there has all that there was: a run without a summary may have more."""
+        if self.summary is None or until_s == -np.inf:
+            return False
+        duration_s = self.summary.get("duration_s")
+        return not isinstance(duration_s, (int, float)) or until_s > duration_s - _WAY_DOWN_S
+
+    def level(
+        self,
+        window_s: float,
+        start_s: float = -np.inf,
+        end_s: float = np.inf,
+        names: Sequence[str] = LEVEL_NAMES,
+    ) -> Block:
+        """Overview: least, mean and greatest of each signal in windows of 1, 10 or 60 s (`recording.levels`).
+
+        What is not in the table of the level is made from the next finer one, in the end from the ticks.
+        """
+        names = tuple(dict.fromkeys(("time_s", "rows", *names)))
+        if window_s not in WINDOWS_S:
+            raise ValueError(f"levels are {', '.join(f'{w:g}' for w in WINDOWS_S)} s, not {window_s:g}")
+        blocks, table = _listed(self._table_blocks(level_table(window_s), "time_s", names, start_s, end_s))
+        time_s = np.concatenate([block["time_s"] for block in blocks] or [np.empty(0)])
+        missing = _holes(time_s, window_s, start_s)
+        until_s = float(time_s[-1]) + window_s if time_s.size else start_s
+        within = table.known_s >= end_s  # the table goes on behind the part
+        if not time_s.size or (end_s - until_s > _HOLE_S if within else not self._reaches_end(until_s)):
+            missing.append((until_s, end_s))
+        for begins_s, ends_s in missing:
+            blocks += self._made_level(window_s, begins_s, ends_s, names) if begins_s < ends_s else []
+        if not blocks:
+            return {name: np.empty(0) for name in names}
+        level = {name: np.concatenate([block[name] for block in blocks]) for name in names}
+        order = np.argsort(level["time_s"], kind="stable") if missing else slice(None)
+        return {name: values[order] for name, values in level.items()}
+
+    def _made_level(self, window_s: float, start_s: float, end_s: float, names: Sequence[str]) -> list[Block]:
+        """A part of a level, from the next finer one or from the ticks."""
+        finer = {coarse: fine for fine, coarse in pairwise(WINDOWS_S)}
+        if window_s in finer:
+            return [coarser_level(self.level(finer[window_s], start_s, end_s, names), window_s)]
+        return [first_level(block) for block in self.tick_blocks(TICK_FIELDS, start_s, end_s)]
+
+    def shapes(self) -> Shapes:
+        """Every measured figure of the run."""
+        files = column_reader.column_files(self.folder, SHAPES)
+        tables = (part for path in files for part in self._parts(path, files[-1], shapes.TABLE_COLUMNS))
+        found = [shapes.from_table(table) for table in tables if table.num_rows]
+        if not found:
+            columns = [rrd_reader.read_shapes(path, self.notes) for path in rrd_reader.segments(self.folder)]
+            found = [shapes.from_columns(part) for part in columns if part]
+        return shapes.joined(found)
+
+    def look_through(self) -> None:
+        """See that every table and segment is whole, so that `notes` names what is damaged.
+
+        A segment whose messages follow one another is not decoded: that would take minutes for a month.
+        """
+        for table in TABLES:
+            files = column_reader.column_files(self.folder, table)
+            for path in files:
+                for _ in self._parts(path, files[-1], ["mono_s" if table == TICKS else "time_s"]):
+                    pass
+        for path in rrd_reader.segments(self.folder):
+            if not _is_closed(path):
+                rrd_reader.read_ticks(path, ["mono_s"], self.notes)
+
+    def _parts(self, path: Path, last: Path, names: Sequence[str]) -> Iterator[pa.Table]:
+        """Columns of a file; the last one of a run that was closed has an end."""
+        closed = self.summary is not None and not self.summary.get("rebuilt")
+        return column_reader.read_parts(path, names, self.notes, closed and path == last)
+
+    def _table_blocks(
+        self, table: str, time_name: str, names: Sequence[str], start_s: float, end_s: float
+    ) -> Generator[Block, None, _Reach]:
+        """Blocks of a table's part; returns how far the table goes."""
+        files = column_reader.column_files(self.folder, table)
+        limited = np.isfinite(start_s) or np.isfinite(end_s)
+        starts = [column_reader.first_s(path, time_name) if limited else None for path in files]
+        last_s = known_s = -np.inf
+        for place, path in enumerate(files):
+            begins, ends = starts[place], next((s for s in starts[place + 1 :] if s is not None), None)
+            known_s = max(known_s, -np.inf if begins is None else begins)
+            if (begins is not None and begins >= end_s) or (ends is not None and ends <= start_s):
+                continue
+            for read in self._parts(path, files[-1], names):
+                if time_name not in read.column_names:
+                    continue
+                block = {name: _array(read, name) for name in names}
+                known_s = max(known_s, block[time_name][-1] if block[time_name].size else -np.inf)
+                # a journal may repeat what the recorder had just written when it was killed
+                block = cut(block, time_name, max(start_s, np.nextafter(last_s, np.inf)), end_s)
+                if block[time_name].size:
+                    last_s = float(block[time_name][-1])
+                    yield block
+        return _Reach(last_s, float(known_s))
+
+
+def _listed(blocks: Generator[Block, None, _Reach]) -> tuple[list[Block], _Reach]:
+    """All blocks, and what their generator returns."""
+    found: list[Block] = []
+    while True:
+        try:
+            found.append(next(blocks))
+        except StopIteration as end:
+            return found, end.value
+
+
+def open_run(path: Path | str) -> Run:
+    """Open a run folder, also one that is still going, was killed, or lacks parts.
+
+    Parameters
+    ----------
+    path : Path or str
+        Folder of the run, or a file in it.
+
+    Raises
+    ------
+    InputError
+        If there is no such folder, or nothing in it is of a run.
+    """
+    folder = run_folder.find_folder(Path(path))
+    notes: list[str] = []
+    events = run_folder.read_events(folder, notes)
+    summary = run_folder.read_summary(folder, notes)
+    if summary and summary.get("exit") and not any(event.get("kind") == "end" for event in events):
+        notes.append("events.jsonl: lines are missing, the last one at least: the run has ended, and no line says so")
+    notes += _missing(folder, summary)
+    config = column_reader.at_recorded_rate(run_folder.read_config(folder, notes), folder, notes)
+    return Run(folder, config, events, summary, origin_of(folder, events), notes)
+
+
+def _is_closed(path: Path) -> bool:
+    try:
+        return is_closed(path)
+    except OSError:
+        return False
+
+
+def _missing(folder: Path, summary: dict[str, Any] | None) -> list[str]:
+    """Tables and segments that are not there: by their numbers, and by the summary's count of them."""
+    account = (summary or {}).get("recorder")
+    counts = account if isinstance(account, dict) else {}
+    tables = counts.get("tables")
+    notes = []
+    for table in TABLES:
+        count = _count(tables.get(table) if isinstance(tables, dict) else 0)
+        gone = column_reader.missing_files(column_reader.column_files(folder, table), f"{table}-000{SUFFIX}", count)
+        notes += [f"{name}: missing; what it held is left out" for name in gone]
+    segments = rrd_reader.segments(folder)
+    ticks = bool(column_reader.column_files(folder, TICKS))
+    if not ticks and segments:
+        notes.append("the tables of ticks are missing; the Rerun segments stand in for them, without every tick")
+    count = _count(counts.get("segments"))
+    gone = column_reader.missing_files(
+        segments, segments[0].name if segments else f"{folder.name[17:]}-000.rrd", count
+    )
+    held = "its ticks are in the tables" if ticks else "what it held is left out"
+    return notes + [f"{name}: missing; {held}" for name in gone]
+
+
+def _count(value: object) -> int:
+    """Of files, as the summary says: no run has as many as a damaged one may say."""
+    return value if isinstance(value, int) and value <= _FILES_MAX else 0
+
+
+def origin_of(folder: Path, events: Sequence[dict[str, Any]]) -> datetime:
+    """UTC at 0 s of a run: from its first event that says both, else from the folder's name or age."""
+    for event in events:
+        try:
+            moment = datetime.fromisoformat(event["time_utc"])
+            began = moment.astimezone(UTC) - timedelta(seconds=float(event["mono_s"]))
+        except (KeyError, TypeError, ValueError, OverflowError):
+            continue
+        if began.year in _YEARS:
+            return began
+    try:
+        began = datetime.strptime(folder.name[:16], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+        if began.year in _YEARS:
+            return began
+    except ValueError:
+        pass
+    return datetime.fromtimestamp(folder.stat().st_mtime, UTC)
+
+
+def _holes(time_s: Column, window_s: float, start_s: float) -> list[tuple[float, float]]:
+    """Parts that a level's windows leave out, in front of them and between them: batches that were damaged."""
+    if not time_s.size:
+        return []
+    least_s = window_s + _HOLE_S
+    ends = np.flatnonzero(np.diff(time_s) > least_s)
+    holes = [(float(time_s[row]) + window_s, float(time_s[row + 1])) for row in ends]
+    begins = [(start_s, float(time_s[0]))] if time_s[0] - max(start_s, 0.0) > least_s else []
+    return begins + holes
+
+
+def _with_time(names: Sequence[str]) -> tuple[str, ...]:
+    unknown = sorted(set(names) - set(FIELDS))
+    if unknown:
+        raise ValueError(f"no such column: {', '.join(unknown)}; known are {json.dumps(FIELDS)}")
+    return tuple(dict.fromkeys(("mono_s", *names)))
+
+
+def _array(table: pa.Table, name: str) -> Column:
+    if name not in table.column_names:
+        return np.full(table.num_rows, np.nan)
+    return np.asarray(table.column(name).to_numpy())

@@ -1,0 +1,340 @@
+"""The small files of a run folder, read so that what is broken is named and the rest is used."""
+
+import errno
+import getpass
+import json
+import re
+import shutil
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from membrane_ctrl.config import toml_file as config_file
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.toml_file import parse, read_toml
+from membrane_ctrl.model import errors, files, plain_json
+from membrane_ctrl.model.plain_json import comment_is_right, take_checksum, with_comment
+from membrane_ctrl.run_files.column_file import FOLDER
+
+# The folder of a run: `logs/<UTC time>-<name>/` with the configuration as it ran (INTERFACES section 6).
+
+
+CONFIG = "config.toml"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+def create_run_folder(logs_dir: Path, name: str, started_utc: datetime, config: Config) -> Path:
+    """Make the run's folder and write `config.toml` into it, every default written out.
+
+    Parameters
+    ----------
+    logs_dir : Path
+        Where runs go; made if it is not there.
+    name : str
+        Letters, digits, dot, dash and underscore.
+    started_utc : datetime
+        The run's start, aware.
+    config : Config
+        As run.
+
+    Returns
+    -------
+    Path
+        `<logs_dir>/20261121T012345Z-<name>`; a second run in the same second gets `-2` behind it.
+
+    Raises
+    ------
+    InputError
+        If the name is not one.
+    DeviceError
+        If the folder cannot be written or the disk has less than `recording.min_free_mb` free: one line that
+        names the folder and the remedy. Nothing is left behind.
+    """
+    if not _NAME.fullmatch(name):
+        raise errors.InputError(
+            f"run name {name!r}: use letters, digits, '.', '-' and '_' (at most 64, no '.' in front)"
+        )
+    try:
+        logs_dir.mkdir(parents=True, exist_ok=True)
+        _require_free(logs_dir, config.recording.min_free_mb)
+        run_dir = _make_unique(logs_dir, f"{started_utc.astimezone(UTC):%Y%m%dT%H%M%SZ}-{name}")
+    except OSError as error:
+        raise _unwritable(logs_dir, error) from None
+    try:
+        write_config(run_dir, config)
+    except OSError as error:
+        shutil.rmtree(run_dir, ignore_errors=True)
+        raise _unwritable(run_dir, error) from None
+    return run_dir
+
+
+def write_config(run_dir: Path, config: Config) -> None:
+    """Write `config.toml`, every default written out. Raises OSError."""
+    files.write_text_atomic(run_dir / CONFIG, with_comment(config_file.dump(config)))
+
+
+def free_mb(folder: Path) -> float:
+    """Space left for us on the folder's disk in MB (1e6 bytes). Raises OSError."""
+    return shutil.disk_usage(folder).free / 1e6
+
+
+def _require_free(folder: Path, least_mb: float) -> None:
+    left_mb = free_mb(folder)
+    if left_mb < least_mb:
+        raise errors.DeviceError(
+            f"{folder}: only {left_mb:.0f} MB free, recording.min_free_mb asks for {least_mb:.0f}; "
+            "delete old runs or choose another disk with --logs"
+        )
+
+
+def _make_unique(logs_dir: Path, name: str) -> Path:
+    for number in range(1, 1000):
+        run_dir = logs_dir / (name if number == 1 else f"{name}-{number}")
+        try:
+            run_dir.mkdir()
+        except FileExistsError:
+            continue
+        return run_dir
+    raise FileExistsError(17, "a thousand runs of this second and name are there")
+
+
+def _unwritable(folder: Path, error: OSError) -> errors.DeviceError:
+    reason = (error.strerror or str(error)).lower()
+    return errors.DeviceError(f"{folder}: cannot be written ({reason}); give a folder you may write with --logs DIR")
+
+
+# A configuration of another version, or a damaged one: what this version understands of it.
+
+
+def understood(tables: dict[str, Any]) -> tuple[Config, list[str]]:
+    """A configuration without the keys that are not known or whose values cannot be, and the names of those.
+
+    A key that this version does not know says nothing about its neighbours: they stay as they were run.
+    """
+    tables = _copied(tables)
+    left_out: list[str] = []
+    while True:
+        try:
+            return Config.model_validate(tables), left_out
+        except ValidationError as error:
+            # all at once: of ten thousand keys each alone would take as many looks at all of them
+            names = [_take_out(tables, found["loc"]) for found in error.errors(include_url=False)]
+        if not any(names):  # tables that do not go together
+            return Config(), [*left_out, "tables that do not go together"]
+        left_out += filter(None, names)
+
+
+def _take_out(tables: dict[str, Any], location: Sequence[int | str]) -> str:
+    """Delete the deepest key of an error's location that is there; its name, "" if none is."""
+    inside: Any = tables
+    path: list[str] = []
+    found: tuple[dict[str, Any], str] | None = None
+    for part in location:
+        # the tag of a union's member stands in a location, and not in the file
+        if isinstance(inside, dict) and isinstance(part, str) and part in inside:
+            found = inside, part
+            path.append(part)
+            inside = inside[part]
+        elif isinstance(inside, list) and isinstance(part, int) and part < len(inside):
+            inside = inside[part]
+    if found is None:
+        return ""
+    del found[0][found[1]]
+    return ".".join(path)
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _copied(inner) for key, inner in value.items()}
+    return [_copied(inner) for inner in value] if isinstance(value, list) else value
+
+
+# Marks made after a run: a file of their own beside the recording, which itself is never touched.
+
+
+ANNOTATIONS_FILE = "annotations.jsonl"
+MARK = "mark"
+
+
+def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> dict[str, Any]:
+    """Append a mark at a second of the run; it stands among the run's events from then on.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the run.
+    origin_utc : datetime
+        UTC at 0 s of the run.
+    mono_s : float
+        Where the mark belongs.
+    text : str
+        What it says.
+
+    Raises
+    ------
+    DeviceError
+        If the folder cannot be written.
+    """
+    moment = datetime.fromtimestamp(origin_utc.timestamp() + mono_s, UTC)
+    event = {
+        "time_utc": moment.isoformat(),
+        "mono_s": mono_s,
+        "kind": MARK,
+        "text": text,
+        "who": _user(),
+        "made_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    try:
+        files.append_text(folder / ANNOTATIONS_FILE, json.dumps(event, ensure_ascii=False) + "\n")
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise errors.DeviceError(f"{folder / ANNOTATIONS_FILE}: cannot be written ({reason})") from None
+    return event
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return ""
+
+
+_SUMMARY_SCHEMA = "membrane-summary/1"
+# A fault campaign of months; a line is some 150 bytes.
+EVENTS_BYTES_MAX = 64_000_000
+_RUN_MAX_S = 1e9  # thirty years
+_NAMED_MAX = 20
+
+
+def find_folder(path: Path) -> Path:
+    """The run's folder for a path to it or into it. Raises InputError if it is not a run."""
+    folder = path.parent if path.is_file() else path
+    if not folder.exists():
+        raise errors.InputError(f"{path}: no such run; `membrane-ctrl runs` lists those there are")
+    if not is_run(folder):
+        raise errors.InputError(f"{path}: not a run: neither events.jsonl nor a recording is in it")
+    return folder.resolve()
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder holds anything of a run."""
+    return folder.is_dir() and (
+        (folder / "events.jsonl").exists() or any(folder.glob("*.rrd")) or any(folder.glob(f"{FOLDER}/*.arrows"))
+    )
+
+
+def read_events(folder: Path, notes: list[str]) -> tuple[dict[str, Any], ...]:
+    """Events and annotations in the order of time; lines that are no JSON object are counted in `notes`."""
+    events = _json_lines(folder / "events.jsonl", notes)
+    if not (folder / "events.jsonl").exists():
+        notes.append("events.jsonl: missing; states are taken from the telemetry")
+    later = _json_lines(folder / ANNOTATIONS_FILE, notes)
+    return tuple(sorted(events + later, key=event_s))
+
+
+def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
+    """`summary.json`; None with a note if it is missing or broken."""
+    path = folder / "summary.json"
+    try:
+        summary: Any = plain_json.loads(files.read_text(path))
+    except FileNotFoundError:
+        notes.append("summary.json: missing; the run is still going, or its recorder was killed")
+        return None
+    except (OSError, ValueError) as error:
+        notes.append(f"summary.json: cannot be read ({error})")
+        return None
+    if not isinstance(summary, dict) or summary.get("schema") != _SUMMARY_SCHEMA:
+        notes.append(f"summary.json: not of schema {_SUMMARY_SCHEMA}; its figures are not used")
+        return {} if not isinstance(summary, dict) else summary
+    if not take_checksum(summary):
+        notes.append("summary.json: does not fit its checksum (damaged or edited); it is not used")
+        return None
+    if not is_moment(summary.get("duration_s", 0.0) or 0.0):
+        notes.append("summary.json: duration_s is no time of a run; it is not used")
+        del summary["duration_s"]
+    return summary
+
+
+def read_config(folder: Path, notes: list[str]) -> Config:
+    """`config.toml`; keys that this version does not understand are at their defaults, with a note."""
+    path = folder / "config.toml"
+    notes += _config_damage(path)
+    try:
+        tables = read_toml(path, follow=False)
+    except errors.InputError as error:
+        notes.append(f"{error}; everything is taken at its default")
+        return Config()
+    try:
+        return parse(tables, Config, "config.toml")
+    except errors.InputError as error:
+        config, left_out = understood(tables)
+        named = ", ".join(left_out[:_NAMED_MAX]) + (
+            f" and {len(left_out) - _NAMED_MAX} more" * (len(left_out) > _NAMED_MAX)
+        )
+        notes.append(f"{error}; left out, or taken at its default: {named}")
+        return config
+
+
+def _config_damage(path: Path) -> list[str]:
+    try:
+        text = files.read_text(path)
+    except (OSError, ValueError):  # said by who reads it
+        return []
+    if not text:
+        return ["config.toml: empty; everything is taken at its default"]
+    right = comment_is_right(text)
+    return [] if right else ["config.toml: does not fit its checksum (damaged or edited); its values are doubtful"]
+
+
+def _json_lines(path: Path, notes: list[str]) -> list[dict[str, Any]]:
+    try:
+        text = files.read_text(path, EVENTS_BYTES_MAX, errors="replace")
+        if plain_json.elements(text) > plain_json.ELEMENTS_MAX:
+            raise OSError(errno.EFBIG, f"more than {plain_json.ELEMENTS_MAX} elements")
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        notes.append(f"{path.name}: cannot be read ({error.strerror})")
+        return []
+    found, broken = [], 0
+    for line in text.splitlines():
+        event = event_of(line)
+        if event is not None:
+            found.append(_mark(event))
+        else:
+            broken += 1
+    if broken:
+        notes.append(f"{path.name}: {broken} line{'s' * (broken > 1)} cannot be read, or not trusted: left out")
+    return found
+
+
+def event_of(line: str) -> dict[str, Any] | None:
+    """The event in a line, if it is one: an object that fits its checksum, of a known form and a time that can be."""
+    try:
+        event = plain_json.loads(line)
+    except ValueError:
+        return None
+    if not isinstance(event, dict) or not take_checksum(event) or not isinstance(event.get("kind", ""), str):
+        return None
+    moment_s = event.get("mono_s")
+    return event if moment_s is None or is_moment(moment_s) else None
+
+
+def is_moment(value: object) -> bool:
+    """Whether a value is a second that a run can have; what a damaged or forged file says need not be."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < _RUN_MAX_S
+
+
+def _mark(event: dict[str, Any]) -> dict[str, Any]:
+    """A mark made while the run went on (`ctl mark`) is recorded as a command; here it is what it means."""
+    if event.get("kind") == "command" and event.get("command") == MARK:
+        return event | {"kind": MARK, "text": event.get("text") or event.get("why") or ""}
+    return event
+
+
+def event_s(event: dict[str, Any]) -> float:
+    """Second of the run of an event; 0 of one that does not say."""
+    return float(event.get("mono_s") or 0.0)

@@ -1,0 +1,266 @@
+"""Arrow IPC streams whose messages carry their own CRC-32: a flipped byte takes its batch away, not its values.
+
+Any Arrow reader opens such a file. The seal is custom metadata of each message, text of fixed width: `seal:`, where
+in the message it stands, the message's length, and the CRC-32 of the message with that last number taken as zeros (as
+in the header of a tar file), all in hexadecimal. So whole messages are found, and found again behind damage,
+before Arrow sees a byte of them: its decoder trusts lengths and offsets.
+"""
+
+import io
+import re
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from membrane_ctrl.model.files import read_bytes
+
+# What an Arrow stream would take of memory, known before any is taken.
+#
+# A compressed buffer begins with the size that it says it inflates to, and Arrow takes that much at once: four
+# megabytes may become four gigabytes. So the sizes of a batch are added up first, out of its head (a flatbuffer,
+# `Message.fbs` of the format), and what no recorder writes is refused.
+
+
+# A recorder's batch is a minute of ticks at 200 Hz, or an hour of the coarsest level: 8 MB.
+BATCH_BYTES_MAX = 64_000_000
+# Six hours of ticks at 200 Hz are 0.3 GB on the disk.
+FILE_BYTES_MAX = 320_000_000
+_HEADER, _BUFFERS, _COMPRESSION = 2, 2, 3  # numbers of the fields in `Message` and in `RecordBatch`
+
+
+def require_bounded(data: bytes) -> None:
+    """Raise `pa.ArrowInvalid` if a batch would inflate to more than `BATCH_BYTES_MAX`, or is no batch of numbers."""
+    reader = pa.ipc.MessageReader.open_stream(data)
+    for message in _messages(reader):
+        if message.type == "schema":
+            continue
+        if message.type != "record batch":
+            raise pa.ArrowInvalid(f"a {message.type}, which no recorder writes")
+        try:
+            size = _inflated_bytes(memoryview(message.metadata), memoryview(message.body or b""))
+        except (struct.error, IndexError):
+            raise pa.ArrowInvalid("the head of a batch is damaged") from None
+        if size > BATCH_BYTES_MAX:
+            raise pa.ArrowInvalid(
+                f"a batch of {size / 1e6:.0f} MB; more than {BATCH_BYTES_MAX / 1e6:.0f} are not read"
+            )
+
+
+def _messages(reader: pa.ipc.MessageReader) -> Iterator[pa.ipc.Message]:
+    while True:
+        try:
+            yield reader.read_next_message()
+        except (StopIteration, pa.ArrowException, OSError):  # cut short: whoever reads the batches meets it, too
+            return
+
+
+def _inflated_bytes(head: memoryview, body: memoryview) -> int:
+    """Bytes of all buffers of a batch, inflated; a buffer that is stored as it is says -1."""
+    batch = _table(head, _field(head, _table(head, 0), _HEADER))
+    vector = _field(head, batch, _BUFFERS)
+    if not vector:
+        return 0
+    start = vector + _u32(head, vector)
+    count = _u32(head, start)
+    buffers = np.frombuffer(head[start + 4 : start + 4 + 16 * count], dtype="<i8").reshape(-1, 2)
+    if len(buffers) != count:
+        raise IndexError
+    if not _field(head, batch, _COMPRESSION):
+        return int(np.abs(buffers[:, 1]).sum())
+    total = 0
+    for offset, length in buffers.tolist():
+        if length:
+            (stated,) = struct.unpack_from("<q", body, offset)
+            total += length if stated == -1 else abs(stated)
+    return total
+
+
+def _table(head: memoryview, place: int) -> int:
+    """Where the table is that an offset at a place points to."""
+    return place + _u32(head, place)
+
+
+def _field(head: memoryview, table: int, number: int) -> int:
+    """Where a table's field is; 0 if it does not have it."""
+    (back,) = struct.unpack_from("<i", head, table)
+    vtable = table - back
+    (size,) = struct.unpack_from("<H", head, vtable)
+    if 4 + 2 * number >= size:
+        return 0
+    (offset,) = struct.unpack_from("<H", head, vtable + 4 + 2 * number)
+    return table + offset if offset else 0
+
+
+def _u32(head: memoryview, place: int) -> int:
+    (number,) = struct.unpack_from("<I", head, place)
+    return int(number)
+
+
+_KEY = b"seal"
+_BLANK = b"seal:" + 20 * b"0"
+_SEAL = re.compile(rb"seal:([0-9a-f]{4})([0-9a-f]{8})([0-9a-f]{8})")
+_NO_CRC = 8 * b"0"
+_END = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # Arrow's end of a stream
+
+
+class SealedStream:
+    """Writes one file, a message at a time.
+
+    Parameters
+    ----------
+    path : Path
+        A new file, or one to be replaced.
+    schema : pa.Schema
+        Of the batches.
+    compression : str, optional
+        Of the batches' buffers: `zstd`, `lz4`.
+
+    Raises
+    ------
+    OSError
+        The file cannot be made, or the disk does not take its head.
+    """
+
+    def __init__(self, path: Path, schema: pa.Schema, compression: str | None = None) -> None:
+        # one thread: compressing is not urgent, the tick beside it is
+        options = pa.ipc.IpcWriteOptions(compression=compression, use_threads=False)
+        self._message = io.BytesIO()
+        about = {**(schema.metadata or {}), _KEY: _BLANK}
+        schema = schema.with_metadata(about)
+        self._writer = pa.ipc.new_stream(self._message, schema, options=options)
+        self._writer.write_batch(pa.RecordBatch.from_pylist([], schema))
+        self._take()  # Arrow's head comes with the first batch, ours is on the disk before it
+        self._file = pa.OSFile(str(path), "wb")
+        self._file.write(_sealed(schema.serialize().to_pybytes()))
+
+    def write(self, batch: pa.RecordBatch) -> None:
+        """Append a batch. Raises OSError (full disk): half of it may be in the file, where readers pass over it."""
+        self._writer.write_batch(batch, custom_metadata={_KEY: _BLANK})
+        self._file.write(_sealed(self._take()))
+
+    def close(self) -> None:
+        """End the stream and close the file. Raises OSError; the file is closed all the same."""
+        with self._file:
+            self._writer.close()
+            self._file.write(self._take())
+
+    def abandon(self) -> None:
+        """Close the file without an end."""
+        self._file.close()
+
+    def _take(self) -> bytes:
+        message = self._message.getvalue()
+        self._message.seek(0)
+        self._message.truncate()
+        return message
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """A stretch of a file that is no whole message.
+
+    Attributes
+    ----------
+    batches : int
+        Whole batches in front of it.
+    size_bytes : int
+    at_end : bool
+        Nothing whole comes behind it.
+    """
+
+    batches: int
+    size_bytes: int
+    at_end: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Unsealed:
+    """What of a file may be given to Arrow.
+
+    Attributes
+    ----------
+    data : bytes
+        A stream of whole messages; empty if the file's head, without which no batch can be read, is not whole.
+    sealed : bool
+        False: a file of a version without seals, as it is.
+    ended : bool
+        It was closed, not left by a killed recorder or cut.
+    damage : tuple of Damage
+    """
+
+    data: bytes
+    sealed: bool
+    ended: bool
+    damage: tuple[Damage, ...]
+
+
+def unseal(data: bytes) -> Unsealed:
+    """Sort out what is whole of a file's content."""
+    ended = data.endswith(_END)
+    if _SEAL.search(data) is None:
+        return Unsealed(data, False, ended, ())
+    places = list(_whole(data))
+    if not places or places[0][0] != 0:
+        return Unsealed(b"", True, ended, (Damage(0, len(data), True),))
+    size = len(data) - len(_END) * ended
+    behind = [start for start, _ in places[1:]] + [size]
+    damage = tuple(
+        Damage(batches, start - end, batches == len(places) - 1)
+        for batches, ((_, end), start) in enumerate(zip(places, behind, strict=True))
+        if start > end
+    )
+    return Unsealed(b"".join(data[a:b] for a, b in places) if damage else data, True, ended, damage)
+
+
+def whole_batches(path: Path, names: list[str] | None = None) -> Iterator[pa.RecordBatch]:
+    """Batches of a file that are whole, with all columns or some.
+
+    Raises
+    ------
+    OSError, pa.ArrowException
+        If the file cannot be read; of one without seals, behind the last batch before damage.
+    """
+    data = unseal(read_bytes(path, FILE_BYTES_MAX)).data
+    if not data:
+        return
+    require_bounded(data)
+    schema = pa.ipc.open_stream(data).schema
+    fields = [schema.get_field_index(name) for name in names or schema.names]
+    yield from pa.ipc.open_stream(data, options=pa.ipc.IpcReadOptions(included_fields=fields, use_threads=False))
+
+
+def _sealed(message: bytes) -> bytes:
+    """The message with its blank seal filled in."""
+    place = message.index(_BLANK)
+    until = place + len(_BLANK)
+    text = b"seal:%04x%08x" % (place, len(message))
+    head, tail = message[:place] + text, message[until:]
+    crc = zlib.crc32(tail, zlib.crc32(_NO_CRC, zlib.crc32(head)))
+    return head + b"%08x" % crc + tail
+
+
+def _whole(data: bytes) -> Iterator[tuple[int, int]]:
+    """Start and end of each message whose seal is right."""
+    view = memoryview(data)
+    end = 0
+    in_vain = 0
+    place = _SEAL.search(data)
+    while place is not None:
+        offset, length, crc = (int(text, 16) for text in place.groups())
+        start = place.start() - offset
+        number = place.start(3)
+        if start >= end and place.end() <= start + length <= len(data):
+            if in_vain > 2 * len(data):  # seals over seals, each to be summed up anew: nobody's damage
+                return
+            found = zlib.crc32(_NO_CRC, zlib.crc32(view[start:number]))
+            if zlib.crc32(view[place.end() : start + length], found) == crc:
+                end = start + length
+                yield start, end
+            else:
+                in_vain += length
+        place = _SEAL.search(data, max(end, place.end()))

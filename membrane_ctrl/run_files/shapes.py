@@ -1,0 +1,227 @@
+"""The measured figure over a run: coefficients, their covariance, heights anywhere on the mirror."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.optics import zernike
+from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+
+Column = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Shapes:
+    """Cycles in their order; arrays (n,) unless said otherwise, NaN where nothing was recorded.
+
+    Attributes
+    ----------
+    time_s, sag_um, sag_sigma_um, displacement_um, slope_residual_urad, valid_fraction, latency_s, hencky_um : array
+        As in `ShapeEstimate`.
+    coeffs_um : (n, 36) array
+    verdict : (n,) array of str
+    covariance_time_s : (k,) array
+        Of the cycles whose covariance was recorded.
+    covariance_um2 : (k, 36, 36) array
+    """
+
+    time_s: Column
+    coeffs_um: Column
+    hencky_um: Column
+    sag_um: Column
+    sag_sigma_um: Column
+    displacement_um: Column
+    slope_residual_urad: Column
+    valid_fraction: Column
+    latency_s: Column
+    verdict: NDArray[np.str_]
+    covariance_time_s: Column
+    covariance_um2: Column
+
+    def __len__(self) -> int:
+        return int(self.time_s.size)
+
+    def select(self, wanted: NDArray[np.bool_]) -> Shapes:
+        """The cycles for which `wanted` (n,) is true; the covariances stay all."""
+        if wanted.all():
+            return self  # a month of coefficients is 190 MB
+        parts = {name: getattr(self, name)[wanted] for name in (*_NUMBERS, "coeffs_um", "verdict")}
+        return Shapes(**parts, covariance_time_s=self.covariance_time_s, covariance_um2=self.covariance_um2)
+
+    def heights_um(self, x: Column, y: Column) -> Column:
+        """(n, points) height above the vertex at points of the unit disc (mirror radius 1), um."""
+        return self.parameters_um() @ height_basis(x, y)
+
+    def parameters_um(self) -> Column:
+        """(n, 37): the 36 coefficients and the amplitude of the Hencky part beyond them."""
+        return np.column_stack((self.coeffs_um, self.hencky_um))
+
+    def covariance_near(self, time_s: float) -> Column | None:
+        """(36, 36) um^2 recorded nearest to a time; None if none was."""
+        if not self.covariance_time_s.size:
+            return None
+        return np.asarray(self.covariance_um2[np.argmin(np.abs(self.covariance_time_s - time_s))])
+
+
+_NUMBERS = (
+    "time_s", "hencky_um", "sag_um", "sag_sigma_um", "displacement_um", "slope_residual_urad", "valid_fraction",
+    "latency_s",
+)  # fmt: skip
+
+
+def height_basis(x: Column, y: Column) -> Column:
+    """(37, points): height of a unit of each parameter, from the vertex."""
+    units = np.eye(37)
+    return np.stack([Surface(unit[:36], unit[36], 1.0).height(x, y) for unit in units])
+
+
+def from_estimates(estimates: Sequence[ShapeEstimate]) -> Shapes:
+    """Shapes of estimates in memory, all covariances among them."""
+    numbers = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in _NUMBERS}
+    return Shapes(
+        **numbers,
+        coeffs_um=np.array([estimate.coeffs_um for estimate in estimates]).reshape(-1, 36),
+        verdict=np.array([estimate.verdict for estimate in estimates], dtype=np.str_),
+        covariance_time_s=numbers["time_s"],
+        covariance_um2=np.array([estimate.covariance_um2 for estimate in estimates]).reshape(-1, 36, 36),
+    )
+
+
+# Columns of the recorder's table that are read.
+TABLE_COLUMNS = (*_NUMBERS, "verdict", "coeffs_um", "covariance_um2")
+
+
+def from_table(table: pa.Table) -> Shapes:
+    """Shapes of the recorder's table, whatever columns it has."""
+    count = table.num_rows
+    kept, covariances = _covariances(table)
+    time_s = _numbers(table, "time_s")
+    coeffs = table.column("coeffs_um").combine_chunks() if "coeffs_um" in table.column_names else None
+    return Shapes(
+        **{name: _numbers(table, name) for name in _NUMBERS},
+        coeffs_um=np.full((count, 36), np.nan) if coeffs is None else _matrix(coeffs, count),
+        verdict=np.array(table.column("verdict").to_pylist() if "verdict" in table.column_names else ["ok"] * count),
+        covariance_time_s=time_s[kept],
+        covariance_um2=covariances,
+    )
+
+
+def from_columns(columns: Mapping[str, Column]) -> Shapes:
+    """Shapes of a Rerun segment (`rrd_reader.read_shapes`): the Hencky part and the covariance are not in there."""
+    count = columns["time_s"].size if columns else 0
+    numbers = {name: columns.get(name, np.full(count, np.nan)) for name in _NUMBERS}
+    return Shapes(
+        **{**numbers, "hencky_um": np.zeros(count)},
+        coeffs_um=columns.get("coeffs_um", np.empty((0, 36))),
+        verdict=np.array(["ok"] * count),
+        covariance_time_s=np.empty(0),
+        covariance_um2=np.empty((0, 36, 36)),
+    )
+
+
+def joined(parts: list[Shapes]) -> Shapes:
+    """One after the other, each cycle once."""
+    if not parts:
+        return from_columns({})
+    names = (*_NUMBERS, "coeffs_um", "verdict", "covariance_time_s", "covariance_um2")
+    whole = Shapes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+    # a journal may repeat what the recorder had just written when it was killed
+    until_s = np.maximum.accumulate(np.concatenate(([-np.inf], whole.time_s)))[:-1]
+    return whole.select(whole.time_s > until_s)
+
+
+def _numbers(table: pa.Table, name: str) -> Column:
+    if name not in table.column_names:
+        return np.full(table.num_rows, np.nan)
+    return np.asarray(table.column(name).to_numpy(), dtype=np.float64)
+
+
+def _matrix(cells: pa.Array, count: int) -> Column:
+    return np.asarray(cells.flatten().to_numpy(zero_copy_only=False), dtype=np.float64).reshape(count, 36)
+
+
+def _covariances(table: pa.Table) -> tuple[NDArray[np.int64], Column]:
+    """Rows that have one, and the (k, 36, 36) matrices."""
+    if "covariance_um2" not in table.column_names:
+        return np.empty(0, dtype=np.int64), np.empty((0, 36, 36))
+    cells = table.column("covariance_um2").combine_chunks()
+    lengths = np.diff(np.asarray(cells.offsets))
+    values = np.asarray(cells.flatten(), dtype=np.float64)
+    whole = lengths == 36 * 36
+    return np.flatnonzero(whole), values[np.repeat(whole, lengths)].reshape(-1, 36, 36)
+
+
+# Maps of a shape estimate for the timeline: height, difference to the first, 1-sigma uncertainty.
+
+
+Map = NDArray[np.float32]
+
+# 128 x 128 shows every one of the 36 terms (radial order 7) and is 66 kB a map.
+MAP_PX = 128
+
+
+def height_map_mm(estimate: ShapeEstimate) -> Map:
+    """Height over the mirror's disc, from the vertex.
+
+    Returns
+    -------
+    (MAP_PX, MAP_PX) float32
+        mm; row 0 on top (+y), NaN outside the disc.
+    """
+    return _spread(_surface(estimate).height(*_points()))
+
+
+def difference_map_um(estimate: ShapeEstimate, reference: ShapeEstimate) -> Map:
+    """Height now minus height of the reference, each from its own vertex; um, as `height_map_mm`."""
+    now, before = _surface(estimate), _surface(reference)
+    change = Surface(now.coeffs_mm - before.coeffs_mm, now.hencky_mm - before.hencky_mm, 1.0)
+    return _spread(change.height(*_points()) * 1e3)
+
+
+def uncertainty_map_um(covariance_um2: NDArray[np.float64]) -> Map:
+    """One standard deviation of the height, um: sqrt of z C z' with the row z of the 36 terms at each point."""
+    terms = zernike.values(*_points())
+    variance = np.einsum("jp,jp->p", terms, covariance_um2 @ terms)
+    return _spread(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def outside_disc() -> NDArray[np.uint8]:
+    """1 where a map has no value, (MAP_PX, MAP_PX)."""
+    return (~_inside()).astype(np.uint8)
+
+
+def _surface(estimate: ShapeEstimate) -> Surface:
+    """Over the unit disc: a map does not ask how large the mirror is."""
+    return Surface(estimate.coeffs_um * 1e-3, estimate.hencky_um * 1e-3, 1.0)
+
+
+def _spread(values: NDArray[np.float64]) -> Map:
+    picture = np.full((MAP_PX, MAP_PX), np.nan, dtype=np.float32)
+    picture[_inside()] = values
+    return picture
+
+
+@cache
+def _inside() -> NDArray[np.bool_]:
+    x, y = _grid()
+    return np.asarray(np.hypot(x, y) <= 1.0)
+
+
+@cache
+def _points() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    x, y = _grid()
+    return x[_inside()], y[_inside()]
+
+
+def _grid() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixel centres on the unit disc's square."""
+    axis = (np.arange(MAP_PX) + 0.5) * 2 / MAP_PX - 1
+    x, y = np.meshgrid(axis, -axis)
+    return x, y

@@ -1,1 +1,0 @@
-"""The live screen: what a person sees while the mirror is held."""

@@ -1,0 +1,1 @@
+"""What tuning and calibration sessions share: folder, link to a hold, progress."""

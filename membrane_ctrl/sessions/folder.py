@@ -1,0 +1,221 @@
+"""The folder of a session, `<logs>/tuning/<UTC>-<name>/`: what each step left, and which steps are done."""
+
+import json
+import math
+import re
+import types
+import typing
+from dataclasses import dataclass, fields, is_dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from pydantic import BaseModel, ValidationError
+
+from membrane_ctrl.config import toml_file as config_file
+from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.model import errors, files, plain_json
+
+# Results of steps as plain JSON and back: dataclasses, configuration sections, arrays, tuples and numbers.
+
+
+T = TypeVar("T")
+_PLAIN_BYTES_MAX = 64_000_000  # candidates with their curves are some megabytes
+
+
+def plain(value: Any) -> Any:
+    """What JSON can hold; numbers that are not finite become words."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value
+
+
+def built(kind: type[T], data: Any) -> T:
+    """The value of a type from its plain form. Raises TypeError, ValueError or KeyError if it is none."""
+    return cast(T, _built(kind, data))
+
+
+def _built(kind: Any, data: Any) -> Any:
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        return None if data is None else _built(next(a for a in arguments if a is not type(None)), data)
+    if origin is typing.Literal:
+        if data not in arguments:
+            raise ValueError(f"{data!r} is none of {arguments}")
+        return data
+    if origin is tuple:
+        inner = [arguments[0]] * len(data) if arguments[-1] is Ellipsis else arguments
+        return tuple(_built(a, item) for a, item in zip(inner, data, strict=True))
+    if origin is np.ndarray:
+        return np.array(data, dtype=float)
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        return kind.model_validate(data)
+    if is_dataclass(kind):
+        hints = typing.get_type_hints(kind)
+        return cast(Any, kind)(**{f.name: _built(hints[f.name], data[f.name]) for f in fields(kind)})
+    return kind(data)
+
+
+def write(path: Path, value: Any) -> None:
+    """Write a result in one step."""
+    files.write_text_atomic(files.users(path), json.dumps(plain(value), indent=1, allow_nan=False) + "\n")
+
+
+def read(path: Path, kind: type[T]) -> T:
+    """Read a result back. Raises InputError (one line) if it is not there or is no such result."""
+    try:
+        return built(kind, plain_json.loads(files.read_text(files.users(path), _PLAIN_BYTES_MAX)))
+    except FileNotFoundError:
+        raise errors.InputError(f"{path}: no such file") from None
+    except (OSError, ValueError, TypeError, KeyError, ValidationError) as error:
+        raise errors.InputError(
+            f"{path}: damaged ({str(error).splitlines()[0]}); repeat the step that wrote it"
+        ) from None
+
+
+FORMAT = "membrane-session/1"
+STEPS = ("characterise", "identify", "observe", "design", "preview", "apply", "verify")
+# What a step leaves; the first file is the sign that it is done.
+FILES: dict[str, tuple[str, ...]] = {
+    "characterise": ("experiments.json", "experiments.npz"),
+    "identify": ("identified.json",),
+    "observe": ("disturbance.json", "quiet.npz"),
+    "design": ("gains.toml", "proposal.json", "candidates.md"),
+    "preview": ("preview.json",),
+    "apply": ("applied.json",),
+    "verify": ("verified.json", "verify.npz"),
+}
+_BYTES_MAX = 16_000_000  # a picture is some 100 kB
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """`session.json`.
+
+    Attributes
+    ----------
+    format, name, author, source, created_utc : str
+        `source` is the run folder or the twin.
+    before : LoopConfig
+        The last good gains when the session began.
+    """
+
+    format: str
+    name: str
+    author: str
+    source: str
+    created_utc: str
+    before: LoopConfig
+
+
+@dataclass(frozen=True, slots=True)
+class SessionFolder:
+    """A session on disk."""
+
+    path: Path
+    head: Head
+    config: Config
+
+    def file(self, name: str) -> Path:
+        """A file in it."""
+        return self.path / name
+
+    def content(self, name: str) -> bytes:
+        """All of a file that people read. Raises InputError if it is no plain file."""
+        path = self.file(name)
+        try:
+            return files.read_bytes(files.users(path), _BYTES_MAX)
+        except OSError as error:
+            raise errors.InputError(f"{path}: {(error.strerror or str(error)).lower()}") from None
+
+    def candidates(self) -> str:
+        """The table of candidates, Markdown of at least a head, a rule and a row. Raises InputError."""
+        text = self.content("candidates.md").decode("utf-8", "replace")
+        if len(text.splitlines()) < 3:
+            raise errors.InputError(f"{self.file('candidates.md')}: damaged; repeat the step design")
+        return text
+
+    def done(self, step: str) -> bool:
+        """The step has left its result."""
+        return self.file(FILES[step][0]).exists()
+
+    def require(self, *steps: str) -> None:
+        """Raises InputError naming the first of the steps that is not done."""
+        for step in steps:
+            if not self.done(step):
+                raise errors.InputError(f"{self.path}: {step} is missing; run `membrane-ctrl tune {step}` first")
+
+    def begin(self, step: str) -> None:
+        """The step is about to be done (again): what it and the steps behind it left is gone."""
+        for later in STEPS[STEPS.index(step) :]:
+            for name in FILES[later]:
+                self.file(name).unlink(missing_ok=True)
+
+
+def fresh_folder(parent: Path, name: str, now: datetime) -> Path:
+    """Make `<UTC>-<name>` in a folder. Raises InputError for a bad name, DeviceError if it cannot be made."""
+    if not _NAME.fullmatch(name):
+        raise errors.InputError(
+            f"session name {name!r}: use letters, digits, '.', '-' and '_' (at most 64, no '.' in front)"
+        )
+    stem = f"{now:%Y%m%dT%H%M%SZ}-{name}"
+    for number in range(1, 1000):
+        path = parent / (stem if number == 1 else f"{stem}-{number}")
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise errors.DeviceError(
+                f"{parent}: cannot be written ({(error.strerror or str(error)).lower()})"
+            ) from None
+        return path
+    raise errors.DeviceError(f"{parent}: has a thousand sessions {stem} already")
+
+
+def create_session(
+    logs: Path, name: str, author: str, source: str, config: Config, before: LoopConfig
+) -> SessionFolder:
+    """Make a session's folder. Raises InputError for a bad name, DeviceError if it cannot be written."""
+    now = datetime.now(UTC)
+    path = fresh_folder(logs / "tuning", name, now)
+    head = Head(FORMAT, name, author, source, now.isoformat(timespec="seconds"), before)
+    try:
+        write(path / "session.json", head)
+        files.write_text_atomic(path / "config.toml", config_file.dump(config))
+    except OSError as error:
+        raise errors.DeviceError(f"{logs}: cannot be written ({(error.strerror or str(error)).lower()})") from None
+    return SessionFolder(path, head, config)
+
+
+def open_session(path: Path) -> SessionFolder:
+    """An existing session. Raises InputError if it is none."""
+    head = read(path / "session.json", Head)
+    if head.format != FORMAT:
+        raise errors.InputError(f"{path}/session.json: format {head.format!r}, {FORMAT!r} is known")
+    return SessionFolder(path, head, config_file.load(path / "config.toml", Config))
+
+
+def sessions_in(logs: Path) -> list[Path]:
+    """All session folders, oldest first."""
+    return sorted(path.parent for path in (logs / "tuning").glob("*/session.json"))
+
+
+def newest_session(logs: Path) -> SessionFolder:
+    """The one to go on with. Raises InputError if there is none."""
+    found = sessions_in(logs)
+    if not found:
+        raise errors.InputError(f"{logs / 'tuning'}: no session yet; begin with `membrane-ctrl tune characterise`")
+    return open_session(found[-1])

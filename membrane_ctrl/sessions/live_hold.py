@@ -1,0 +1,147 @@
+"""A running hold for a session: commands through its control port, ticks, events and shapes from its rings."""
+
+import contextlib
+import math
+import struct
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from membrane_ctrl.config import toml_file as config_file
+from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.control_port.client import PortClient
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.model import errors, shape_estimate
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
+from membrane_ctrl.processes.ring import attach
+from membrane_ctrl.run_files import events
+
+# A hold as a session sees it: commands in, ticks and events out. The twin and the control port each give one.
+
+
+class HoldError(Exception):
+    """The hold refuses, or has left its state; the message says which and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class News:
+    """What has come since the last call, each in its order."""
+
+    rows: tuple[TelemetryRow, ...]
+    events: tuple[Event, ...]
+    shapes: tuple[shape_estimate.ShapeEstimate, ...]
+
+
+class HoldLink(Protocol):
+    """What a session needs of a hold."""
+
+    @property
+    def config(self) -> Config:
+        """Of the run."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """Where the data come from: a run folder, or the twin."""
+        ...
+
+    def ask(self, command: Command) -> None:
+        """Hand a command to the next tick. Raises HoldError with the reason if it is refused."""
+        ...
+
+    def news(self) -> News:
+        """Wait a moment, then return what has come. Raises HoldError if the hold has ended."""
+        ...
+
+    def close(self) -> None:
+        """Let go."""
+        ...
+
+
+_NEWS_S = 0.2
+_SILENT_S = 5.0  # without a tick a run has ended, or is in worse trouble than a session can help with
+_ROW = struct.Struct(f"<{len(FIELDS)}d")
+
+
+class LiveHold:
+    """A `HoldLink` on a run of this machine.
+
+    Parameters
+    ----------
+    client : PortClient
+        Connected to it.
+    run_dir : Path
+        Its folder.
+    take_over : bool
+        Take the command from whoever has it, at the first command.
+
+    Raises
+    ------
+    InputError
+        If the folder is not that of the run the client talks to, or its rings are not there.
+    """
+
+    def __init__(self, client: PortClient, run_dir: Path, take_over: bool = False) -> None:
+        self._client, self._take_over = client, take_over
+        if client.greeting["run"] != run_dir.resolve().name:
+            raise errors.InputError(f"{run_dir}: is not running; {client.greeting['run']} is")
+        loop = LoopConfig.model_validate(client.ask(do="status")["loop"])
+        config = config_file.load(run_dir / "config.toml", Config)
+        self.config = config.model_copy(update={"loop": loop})
+        self.name, self.run_dir = run_dir.name, run_dir
+        try:
+            self._readers = attach(run_dir)
+        except (OSError, ValueError) as error:
+            raise errors.InputError(
+                f"{run_dir}: its rings cannot be read ({error}); is it on this machine?"
+            ) from None
+        self._heard_s = time.monotonic()
+
+    def ask(self, command: Command) -> None:
+        """Through the port; who asks is what the port makes of us."""
+        request: dict[str, object] = {"do": command.kind, "why": command.why, "take_over": self._take_over}
+        if math.isfinite(command.value):
+            request["value"] = command.value
+        if command.loop is not None:
+            request["loop"] = command.loop.model_dump(exclude={"setpoint_um"})
+        if command.experiment is not None:
+            request["experiment"] = command.experiment.model_dump()
+        try:
+            answer = self._client.ask(**request)
+        except errors.DeviceError as error:
+            raise HoldError(str(error)) from None
+        self._take_over = False
+        if not answer.get("ok"):
+            raise HoldError(f"refused: {answer.get('refused')}")
+
+    def news(self) -> News:
+        """What has come in a fifth of a second."""
+        time.sleep(_NEWS_S)
+        try:
+            found = self._read_rings()
+        except (struct.error, ValueError) as error:
+            raise HoldError(f"the rings of {self.name} hold what no hold writes ({error})") from None
+        now_s = time.monotonic()
+        if found.rows:
+            self._heard_s = now_s
+        elif now_s - self._heard_s > _SILENT_S:
+            raise HoldError(f"no tick for {_SILENT_S:g} s: has the hold {self.name} ended?")
+        return found
+
+    def _read_rings(self) -> News:
+        messages = {name: reader.drain() for name, reader in self._readers.items()}
+        return News(
+            rows=tuple(TelemetryRow(*_ROW.unpack(message)) for message in messages.get("telemetry", ())),
+            events=tuple(events.parse(message) for message in messages.get("events", ())),
+            shapes=tuple(shape_estimate.unpack_estimate(message) for message in messages.get("shapes", ())),
+        )
+
+    def close(self) -> None:
+        """Give the command back and hang up; the hold goes on."""
+        with contextlib.suppress(errors.DeviceError):  # the hold may have gone first
+            self._client.ask(do="release", why="tuning session over")
+        self._client.close()
+        for reader in self._readers.values():
+            reader.close()

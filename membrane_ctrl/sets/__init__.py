@@ -1,1 +1,0 @@
-"""Capture sets: from a folder of images to results, and from a known truth to a folder of images."""

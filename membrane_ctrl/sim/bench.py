@@ -1,0 +1,301 @@
+"""The simulated bench as a process: the plant in real time behind the pump board's own protocol."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+
+from firmware_iface.emulators import board_state, pump_board
+from membrane_ctrl.config.devices import DevicesConfig
+from membrane_ctrl.config.schema import Config, PumpConfig, TwinConfig
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.errors import DeviceError, Exit
+from membrane_ctrl.processes.child import STOP, Child, pipe, raise_priority
+from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
+from membrane_ctrl.sim.events import Event
+from membrane_ctrl.sim.lab import Lab
+from membrane_ctrl.sim.plant import STEP_S, Plant
+
+_PERIOD_S = 0.004  # below the sensors' 5 ms, so that each of their samples is out on time
+_STEPS_AT_ONCE = 4000  # some 10 ms of work: after a stall, clients are answered while the plant catches up
+
+
+@dataclass(frozen=True, slots=True)
+class BenchSpec:
+    """What a bench process needs to know; picklable.
+
+    Attributes
+    ----------
+    twin, pump : TwinConfig, PumpConfig
+        The plant.
+    clock : RunClock
+        The run's clock, on which the truth is stamped.
+    port : int
+        Where to listen; 0: any free port.
+    host : str
+        Address to listen on.
+    speed : float
+        Plant seconds a second.
+    truth : RingAddress or None
+        Where to publish `Truth.pack()` with every sample.
+    linger_s : float
+        How long the bench outlives the process that started it, so that the tripped watchdog can be seen.
+    events : tuple of Event
+        What happens when, in plant time (0 at the start).
+    lab : DevicesConfig or None
+        Serve these instruments in place of the pump board.
+    """
+
+    twin: TwinConfig
+    pump: PumpConfig
+    clock: RunClock
+    port: int
+    host: str = "127.0.0.1"
+    speed: float = 1.0
+    truth: RingAddress | None = None
+    linger_s: float = 5.0
+    events: tuple[Event, ...] = ()
+    lab: DevicesConfig | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class BenchReport:
+    """What a bench process says once: the devices it serves, or one line why it does not."""
+
+    port: int = 0
+    error: str = ""
+    lab: DevicesConfig | None = None
+
+
+def serve(spec: BenchSpec, ready: Connection) -> None:
+    """Serve the bench in a spawned process until `processes.STOP`, or until `linger_s` after the parent's end.
+
+    SIGINT is ignored: Ctrl-C goes to the whole terminal, and the bench must outlive the controller's safe stop.
+
+    Parameters
+    ----------
+    spec : BenchSpec
+        The bench.
+    ready : Connection
+        Gets one BenchReport; a bench that cannot be built or cannot listen says so there and ends.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if spec.speed <= 1.0:
+        raise_priority()  # it stands for devices with processors of their own; faster than that it may use up a core
+    asyncio.run(_serve(spec, ready))
+
+
+async def _serve(spec: BenchSpec, ready: Connection) -> None:
+    stop = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(STOP, stop.set)
+    with _truth_writer(spec.truth) as writer:
+        try:
+            bench = LiveBench(spec, writer)
+            served = (
+                pump_board.PumpBoardEmulator(bench, spec.host, spec.port)
+                if spec.lab is None
+                else Lab(bench, spec.lab)
+            )
+            started = await served.start()
+        except ValueError as error:
+            ready.send(BenchReport(error=str(error)))
+            return
+        except OSError as error:
+            reason = os.strerror(error.errno) if error.errno else str(error)
+            ready.send(BenchReport(error=f"twin.port = {spec.port} on {spec.host}: {reason}; 0 takes any free port"))
+            return
+        try:
+            ready.send(
+                BenchReport(served.port if isinstance(served, pump_board.PumpBoardEmulator) else 0, lab=started)
+            )
+            await _keep_running(bench, spec, stop)
+        finally:
+            await served.stop()
+
+
+async def _keep_running(bench: LiveBench, spec: BenchSpec, stop: asyncio.Event) -> None:
+    """Step the bench on absolute deadlines until told to stop."""
+    orphaned_s: float | None = None
+    deadline_s = time.monotonic()
+    while not stop.is_set():
+        bench.catch_up()
+        now_s = time.monotonic()
+        if orphaned_s is None and _orphaned():
+            orphaned_s = now_s
+        if orphaned_s is not None and now_s - orphaned_s > spec.linger_s:
+            return
+        deadline_s = max(deadline_s + _PERIOD_S, now_s)  # a missed deadline is not made up: catch_up has done it
+        await asyncio.sleep(deadline_s - now_s)
+
+
+def _orphaned() -> bool:
+    """The process that spawned this one is gone (then its number is no longer the parent's)."""
+    parent = multiprocessing.parent_process()
+    return parent is not None and os.getppid() != parent.pid
+
+
+@contextlib.contextmanager
+def _truth_writer(address: RingAddress | None) -> Iterator[RingWriter | None]:
+    if address is None:
+        yield None
+        return
+    writer = RingWriter(address)
+    try:
+        yield writer
+    finally:
+        writer.close()
+
+
+class LiveBench:
+    """The plant on the run's clock, sampled by its device every 5 ms of plant time.
+
+    Parameters
+    ----------
+    spec : BenchSpec
+        Plant, clock, speed.
+    truth : RingWriter or None
+        Where the truth of every sample goes.
+    """
+
+    def __init__(self, spec: BenchSpec, truth: RingWriter | None) -> None:
+        self._plant = Plant(spec.twin, spec.pump, spec.events)
+        self._now = spec.clock.now
+        self._start_s = spec.clock.now()
+        self._speed = spec.speed
+        self._truth = truth
+        self._sample = self._take_sample()
+
+    def sample(self) -> board_state.BoardSample:
+        """The device's newest sample."""
+        return self._sample
+
+    def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
+        """Drive pump and vent."""
+        self._plant.actuate(pump_fraction, vent_fraction)
+
+    def catch_up(self) -> None:
+        """Bring the plant to the clock, after a long stall in several calls.
+
+        Of several samples that are due, only the last could be seen by a client; the counter counts all.
+        """
+        due_s = (self._now() - self._start_s) * self._speed - self._plant.time_s
+        steps = min(int(due_s / STEP_S), _STEPS_AT_ONCE)
+        if steps > 0:
+            self._plant.advance(steps * STEP_S)
+            self._sample = self._take_sample()
+
+    def _take_sample(self) -> board_state.BoardSample:
+        plant = self._plant
+        if self._truth is not None:
+            truth = plant.truth()
+            self._truth.put(replace(truth, time_s=self._start_s + truth.time_s / self._speed).pack())
+        sample = plant.sample()
+        return board_state.BoardSample(
+            displacement_um=sample.displacement_um,
+            displacement_quality=sample.displacement_quality,
+            gauge_pressure_pa=sample.gauge_pressure_pa,
+            ambient_pressure_pa=sample.ambient_pressure_pa,
+            air_temperature_c=sample.air_temperature_c,
+            gas_temperature_c=sample.gas_temperature_c,
+            sample_counter=round(sample.device_time_s / STEP_S) + 1,
+            device_time_s=sample.device_time_s,
+        )
+
+
+# The twin as a process beside the hold: started, asked for its port, and its truth read for the record.
+
+
+_TRUTHS_KEPT = 64
+_READY_S = 60.0  # importing on a busy machine; a fresh one compiles first
+
+
+@dataclass(frozen=True, slots=True)
+class TwinProcess:
+    """A running simulated bench.
+
+    Attributes
+    ----------
+    config : Config
+        The run's configuration with the twin's own address as its device.
+    truth : RingAddress
+        Where the twin publishes what its mirror really does.
+    """
+
+    config: Config
+    truth: RingAddress
+
+    @classmethod
+    def started(cls, config: Config, clock: RunClock, stack: ExitStack, lab: bool = False) -> TwinProcess:
+        """Start the twin and wait until it listens; the stack ends it. Raises DeviceError, e.g. for a busy port.
+
+        With `lab` it answers as the instruments that the configuration names, else as the pump board.
+        """
+        pass
+        from membrane_ctrl.sim.sensors import TRUTH_BYTES
+
+        truth = stack.enter_context(ring(_TRUTHS_KEPT, TRUTH_BYTES))
+        spec = BenchSpec(
+            config.twin, config.pump, clock, config.twin.port, truth=truth, lab=config.devices if lab else None
+        )
+        ours, theirs = pipe()
+        child = Child("twin", "membrane_ctrl.sim.bench:serve", (spec, theirs), nice=0)
+        stack.callback(child.stop, 2.0)
+        child.start()
+        report = ours.recv() if ours.poll(_READY_S) else BenchReport(error="the twin did not start")
+        if report.error:
+            raise DeviceError(report.error)
+        watchdog = {} if config.devices is None else config.devices.model_dump(include={"timeout_s", "watchdog_s"})
+        devices = report.lab or DevicesConfig(board=f"tcp://127.0.0.1:{report.port}", **watchdog)
+        return cls(config.model_copy(update={"devices": devices}), truth)
+
+    def truth_reader(self) -> Callable[[], tuple[float, float]]:
+        """A function that returns the newest true displacement and laser bias, in um."""
+        from membrane_ctrl.sim.sensors import Truth
+
+        reader = RingReader(self.truth)
+
+        def newest() -> tuple[float, float]:
+            message = reader.latest()
+            if message is None:
+                return float("nan"), float("nan")
+            truth = Truth.unpack(message)
+            return truth.displacement_um, truth.laser_bias_um
+
+        return newest
+
+
+# `twin`: the simulated bench on its real protocol, for any client.
+
+
+_STOPS = {signal.SIGINT, signal.SIGTERM}
+
+
+def serve_twin(config: Config, speed: float) -> int:
+    """Serve until SIGINT or SIGTERM; says on stderr where it listens. Raises DeviceError, e.g. for a busy port."""
+    pass
+
+    ours, theirs = pipe()
+    spec = BenchSpec(config.twin, config.pump, RunClock.start(), config.twin.port, speed=speed, linger_s=0.0)
+    child = Child("twin", "membrane_ctrl.sim.bench:serve", (spec, theirs), nice=0)
+    child.start()
+    try:
+        report = ours.recv() if ours.poll(60.0) else BenchReport(error="the twin did not start")
+        if report.error:
+            raise DeviceError(report.error)
+        print(
+            f"the twin listens on tcp://127.0.0.1:{report.port}, Modbus unit 1; stop it with Ctrl-C", file=sys.stderr
+        )
+        signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
+        stopped = signal.sigwait(_STOPS)
+    finally:
+        child.stop(2.0)
+    return Exit.INTERRUPTED if stopped == signal.SIGINT else Exit.DONE

@@ -1,0 +1,208 @@
+"""The instruments that a configuration names, emulated in bytes over one plant: what a lab has instead of the board.
+
+Each serial port of the configuration becomes a pseudo-terminal, each Modbus TCP address a port of this machine; the
+drivers are given these in place of the real ones.
+"""
+
+import shutil
+import tempfile
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from firmware_iface.drivers.modbus_map import ValueMap, make_map, preset
+from firmware_iface.emulators import (
+    bronkhorst,
+    keyence_dl_rs1a,
+    modbus_map_device,
+    modbus_server,
+    optoncdt1420,
+    pump_board,
+    serial_device,
+    vaisala_ptb330,
+    ventus,
+)
+from firmware_iface.links import modbus_rtu, serial_port
+from membrane_ctrl.config import devices as table
+from membrane_ctrl.config.devices import AnyDriver, DevicesConfig
+from membrane_ctrl.instruments.bench import map_keys
+
+_GATEWAY_NO_RESPONSE = 11
+_PRESSURE_FULL_MBAR = 10.0  # an EL-PRESS of 1 kPa, as the mirror's 600 Pa wants
+_FLOW_FULL_MLN_MIN = 360.0  # 6 mL/s
+_VERSION = 100  # V1.00
+
+
+class Lab:
+    """Emulated instruments over a plant.
+
+    Parameters
+    ----------
+    plant : Plant
+        What they measure and drive.
+    devices : DevicesConfig
+        Which instruments, by role.
+
+    Attributes
+    ----------
+    serial : dict
+        By the configuration's port: the emulated device of a serial line, whose faults can be switched on.
+    wires : dict
+        By the configuration's port: its pseudo-terminal, which can be unplugged.
+    """
+
+    def __init__(self, plant: pump_board.Plant, devices: DevicesConfig) -> None:
+        self.serial: dict[str, serial_device.SerialDevice] = {}
+        self.wires: dict[str, serial_device.PtyWire] = {}
+        self._plant = plant
+        self._devices = devices
+        self._outputs = {"pump": 0.0, "vent": 0.0}
+        self._folder = Path()
+        self._servers: dict[str, modbus_server.ModbusTcpServer] = {}
+        self._tables: defaultdict[str, dict[int, modbus_server.RegisterTable]] = defaultdict(dict)
+        for role, section in devices.roles().items():
+            if isinstance(section, table.BronkhorstModbus):
+                self._tables[section.link][section.unit_id] = bronkhorst.BronkhorstRegisters(
+                    self._bronkhorst(role, section.serial)
+                )
+            elif not isinstance(section, table.ModbusMap):
+                self.serial[section.port] = self._device(role, section)
+        self._map_devices()
+        self._board: pump_board.PumpBoardEmulator | None = None
+        if devices.board is not None:
+            self._board = pump_board.PumpBoardEmulator(plant)
+            self._tables[devices.board][devices.unit_id] = self._board.state
+        for url, slaves in self._tables.items():
+            if url.startswith("rtu:"):
+                _, settings = modbus_rtu.parse_rtu_url(url)
+                handlers = {
+                    unit: partial(modbus_map_device.respond_to_input, table=found) for unit, found in slaves.items()
+                }
+                self.serial[url] = modbus_server.RtuBusEmulator(settings, handlers)
+
+    async def start(self) -> DevicesConfig:
+        """Plug everything in; the configuration with the addresses that now answer. Raises OSError."""
+        self._folder = Path(tempfile.mkdtemp(prefix="membrane-lab-"))
+        for number, (port, device) in enumerate(self.serial.items()):
+            self.wires[port] = serial_device.PtyWire(device, self._folder / f"tty{number}")
+            self.wires[port].plug()
+        for url, slaves in self._tables.items():
+            if url.startswith("tcp:"):
+                self._servers[url] = modbus_server.ModbusTcpServer(partial(_answer, slaves), "127.0.0.1", 0)
+                await self._servers[url].start()
+        if self._board is not None:
+            await self._board.start()
+            return self._devices.model_copy(update={"board": self._address(str(self._devices.board))})
+        return self._devices.model_copy(
+            update={role: self._moved(section) for role, section in self._devices.roles().items()}
+        )
+
+    async def stop(self) -> None:
+        """Unplug everything."""
+        for wire in self.wires.values():
+            wire.unplug()
+        for server in self._servers.values():
+            await server.stop()
+        if self._board is not None:
+            await self._board.stop()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _moved(self, section: AnyDriver) -> AnyDriver:
+        """The table with the emulator's address."""
+        if not isinstance(section, (table.ModbusMap, table.BronkhorstModbus)):
+            return section.model_copy(update={"port": str(self.wires[section.port].path)})
+        return section.model_copy(update={"link": self._address(section.link)})
+
+    def _address(self, url: str) -> str:
+        """Where the emulators of a Modbus URL answer."""
+        if url in self._servers:
+            return f"tcp://127.0.0.1:{self._servers[url].port}"
+        _, mark, options = url.partition("?")
+        return f"rtu://{self.wires[url].path}{mark}{options}"
+
+    def _device(self, role: str, section: AnyDriver) -> serial_device.SerialDevice:
+        match section:
+            case table.Optoncdt1420():
+                return optoncdt1420.Optoncdt1420Emulator(
+                    self._sensor("displacement"), round(section.range_mm or 50), section.direction, section.baud
+                )
+            case table.KeyenceDlRs1a():
+                return keyence_dl_rs1a.KeyenceDlRs1aEmulator(
+                    self._sensor("displacement"),
+                    section.direction,
+                    section.baud,
+                    section.parity,
+                    section.amplifier + 1,
+                )
+            case table.VaisalaPtb330():
+                return vaisala_ptb330.VaisalaPtb330Emulator(self._sensor("barometer"), section.baud)
+            case table.Ventus():
+                return ventus.VentusEmulator(self._actuator("pump"), section.power_max_mw)
+            case table.BronkhorstPropar():
+                return bronkhorst.ProparDevice(
+                    self._bronkhorst(role, section.serial), serial_port.SerialSettings(section.baud)
+                )
+            case _:
+                raise AssertionError(section)
+
+    def _map_devices(self) -> None:
+        """One device for all maps that name the same unit of the same link."""
+        units: defaultdict[tuple[str, int], list[tuple[str, table.ModbusMap]]] = defaultdict(list)
+        for role, section in self._devices.roles().items():
+            if isinstance(section, table.ModbusMap):
+                units[section.link, section.unit_id].append((role, section))
+        for (link, unit_id), members in units.items():
+            sensors: dict[ValueMap, Callable[[], float]] = {}
+            outputs: dict[ValueMap, Callable[[float], None]] = {}
+            constants: dict[int, int] = {}
+            raw_limits = (0, 0xFFFF)
+            for role, section in members:
+                value_map, _ = make_map(map_keys(section), section.preset)
+                if value_map.version_address is not None:
+                    constants[value_map.version_address] = _VERSION
+                if value_map.identity is not None:
+                    constants[value_map.identity[0]] = value_map.identity[1]
+                if role in self._outputs:
+                    outputs[value_map] = self._actuator(role)
+                else:
+                    sensors[value_map] = self._sensor(role)
+                if section.preset:
+                    low, high = preset(section.preset).get("raw_limits", raw_limits)
+                    raw_limits = (low, high)
+            self._tables[link][unit_id] = modbus_map_device.MapDevice(sensors, outputs, constants, raw_limits)
+
+    def _bronkhorst(self, role: str, serial: str) -> bronkhorst.Instrument:
+        if role == "pump":
+            return bronkhorst.Instrument(
+                "DMFC", serial or "M20000001A", _FLOW_FULL_MLN_MIN, "mln/min", None, self._actuator(role)
+            )
+        gauge_pa = self._sensor("gauge_pressure")
+        return bronkhorst.Instrument(
+            "DEPC", serial or "M20000002A", _PRESSURE_FULL_MBAR, "mbar(g)", lambda: gauge_pa() / 100
+        )
+
+    def _sensor(self, role: str) -> Callable[[], float]:
+        """What the sensor of a role sees now, in the role's unit."""
+        names: Mapping[str, str] = {
+            "displacement": "displacement_um",
+            "gauge_pressure": "gauge_pressure_pa",
+            "barometer": "ambient_pressure_pa",
+            "thermometer": "air_temperature_c",
+        }
+        name = names[role]
+        return lambda: float(getattr(self._plant.sample(), name))
+
+    def _actuator(self, role: str) -> Callable[[float], None]:
+        def drive(fraction: float) -> None:
+            self._outputs[role] = fraction
+            self._plant.actuate(self._outputs["pump"], self._outputs["vent"])
+
+        return drive
+
+
+def _answer(slaves: Mapping[int, Any], unit: int, pdu: bytes) -> modbus_server.Answer:
+    if unit not in slaves:
+        return modbus_server.Answer(modbus_server.exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
+    return modbus_server.Answer(modbus_map_device.respond_to_input(pdu, slaves[unit]))

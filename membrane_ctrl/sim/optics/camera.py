@@ -1,0 +1,321 @@
+"""Screen and camera of the twin: what the screen shows, seen in the film as it stands at the moment of exposure."""
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.roles import Frame, LinkError, Pattern
+from membrane_ctrl.config.schema import OpticsConfig, TwinConfig
+from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
+from membrane_ctrl.sim.optics.shade import Light, cubic_weights, level_table, node_positions, normal_quantiles, shade
+from membrane_ctrl.sim.optics.trace import ScreenError, Trace, camera_pose, pixel_directions, screen_pose, trace
+
+# Pictures that the camera takes of the screen in the moving film.
+
+
+FloatArray = NDArray[np.float64]
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+# Nodes this far apart on the mirror put a typical film's phase < 1e-4 rad off the exact trace (asserted in the tests)
+_NODE_MM = 4.6
+# Displacements traced; a parabola through three of them is exact to 1e-6 rad, a straight line only to 2e-5 rad
+_CELL_UM = 100.0
+_KEPT_TRACES = 8
+
+
+@dataclass
+class OpticsRenderer:
+    """Renders the camera's picture of any pattern at any displacement of the film.
+
+    The film is traced at nodes (see `shade`) and, unless `exact`, at displacements _CELL_UM apart: a parabola through
+    the three nearest gives the maps at any other, so that a moving film costs nothing until it leaves its cell.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The true geometry, camera, pattern and rim.
+    film : FilmShape
+        Its sag belongs to displacement 0.
+    light : Light
+        Screen and camera as light.
+    reference_um : float
+        Displacement at which the vertex stands at the origin of the geometry.
+    screen_error : ScreenError or None
+        What the screen does beside its pose.
+    exact : bool
+        Trace every pixel at every displacement: slow, for sets that must be true to the last bit.
+    seed : int
+        Of the pixel noise (`camera.noise_adu`); each picture has its own.
+
+    Raises
+    ------
+    ValueError
+        If the film's rim is not the configured one.
+    """
+
+    optics: OpticsConfig
+    film: FilmShape
+    light: Light = field(default_factory=Light)
+    reference_um: float = 0.0
+    screen_error: ScreenError | None = None
+    exact: bool = False
+    seed: int = 0
+    _traces: OrderedDict[float, FloatArray] = field(default_factory=OrderedDict, init=False, repr=False)
+    _pictures: int = field(default=0, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.film.radius_mm != self.optics.mirror.radius_mm:
+            raise ValueError(
+                f"film radius {self.film.radius_mm:g} mm is not mirror.radius_mm = {self.optics.mirror.radius_mm:g}"
+            )
+        camera = self.optics.camera
+        self._camera_pose = camera_pose(self.optics.geometry)
+        self._screen_pose = screen_pose(self.optics.geometry, self.screen_error)
+        pixel_mm = camera.pixel_um / 1000.0 / camera.focal_mm * float(np.linalg.norm(self._camera_pose.position_mm))
+        self._step = 1 if self.exact else max(1, int(_NODE_MM / pixel_mm + 0.5))
+        self._weights = cubic_weights(self._step)
+        self._columns = node_positions(camera.width_px, self._step)
+        self._rows = node_positions(camera.height_px, self._step)
+        columns, rows = np.meshgrid(self._columns, self._rows)
+        self._directions = pixel_directions(camera, self._camera_pose, columns.ravel(), rows.ravel())
+        self._loss = _vignetting(camera.width_px, camera.height_px, self.light.vignetting)
+
+    def blank(self) -> Pixels:
+        """An empty picture, (H, W): uint8 for an 8-bit camera, uint16 for any deeper one."""
+        shape = (self.optics.camera.height_px, self.optics.camera.width_px)
+        if self.optics.camera.bits == 8:
+            return np.empty(shape, np.uint8)
+        return np.empty(shape, np.uint16)
+
+    def render(
+        self, pattern: Pattern, displacement_um: float, out: Pixels | None = None, gain: float = 1.0
+    ) -> Pixels:
+        """The picture of one pattern, (H, W).
+
+        Parameters
+        ----------
+        pattern : Pattern
+            What the screen shows.
+        displacement_um : float
+            Where the film is at the moment of the exposure.
+        out : (H, W) array as of `blank`, optional
+            Filled and returned (frames in shared memory); otherwise a new one is made.
+        gain : float
+            Exposure against the nominal one.
+
+        Raises
+        ------
+        ValueError
+            If the pattern is unknown or `out` has another shape or type.
+        """
+        camera, config = self.optics.camera, self.optics.pattern
+        picture = self.blank() if out is None else out
+        depth = np.dtype(np.uint8 if camera.bits == 8 else np.uint16)
+        if picture.shape != (camera.height_px, camera.width_px) or picture.dtype != depth:
+            raise ValueError(
+                f"out is {picture.shape} {picture.dtype}, not ({camera.height_px}, {camera.width_px}) {depth}"
+            )
+        table = level_table(pattern, config, self.light)
+        full = float(2**camera.bits - 1)
+        dark = self.light.dark_fraction * full
+        self._pictures += 1
+        shade(
+            self._nodes(displacement_um),
+            self._weights,
+            1 if pattern.axis == "y" else 0,
+            self.film.radius_mm,
+            table.values,
+            table.cell_mm,
+            table.smooth,
+            config.periods * config.period_mm,
+            np.array([dark, gain * (self.light.white_fraction * full - dark), self.light.leak, full]),
+            self._loss,
+            (normal_quantiles(), camera.noise_adu, (self.seed << 32) + self._pictures),
+            picture,
+        )
+        return picture
+
+    def trace_pixels(self, displacement_um: float) -> Trace:
+        """Exact s_x, s_y and place on the film of every pixel, each (H * W,), row by row; nothing interpolated."""
+        camera = self.optics.camera
+        columns, rows = np.meshgrid(np.arange(float(camera.width_px)), np.arange(float(camera.height_px)))
+        directions = pixel_directions(camera, self._camera_pose, columns.ravel(), rows.ravel())
+        return self._trace(directions, displacement_um)
+
+    def _trace(self, directions: FloatArray, displacement_um: float) -> Trace:
+        vertex_z_mm = -(displacement_um - self.reference_um) / 1000.0
+        sag_mm = self.film.sag_at_mm(displacement_um)
+        return trace(self._camera_pose, directions, self.film.terms, sag_mm, vertex_z_mm, self._screen_pose)
+
+    def _nodes(self, displacement_um: float) -> FloatArray:
+        """Traced maps at the nodes, (3, rows, columns), at this displacement (Lagrange through the nearest three)."""
+        if self.exact:
+            return self._traced(displacement_um)
+        nearest = float(np.floor(displacement_um / _CELL_UM + 0.5))
+        f = displacement_um / _CELL_UM - nearest
+        below, here, above = (self._traced((nearest + k) * _CELL_UM) for k in (-1, 0, 1))
+        return 0.5 * f * (f - 1.0) * below + (1.0 - f) * (1.0 + f) * here + 0.5 * f * (f + 1.0) * above
+
+    def _traced(self, displacement_um: float) -> FloatArray:
+        if displacement_um in self._traces:
+            self._traces.move_to_end(displacement_um)
+            return self._traces[displacement_um]
+        found = self._trace(self._directions, displacement_um)
+        half_side_mm = self.optics.pattern.periods * self.optics.pattern.period_mm / 2.0
+        maps = np.stack([found.s_x_mm + half_side_mm, found.s_y_mm + half_side_mm, found.x_mm**2 + found.y_mm**2])
+        self._traces[displacement_um] = maps.reshape(3, len(self._rows), len(self._columns))
+        while len(self._traces) > (1 if self.exact else _KEPT_TRACES):
+            self._traces.popitem(last=False)
+        return self._traces[displacement_um]
+
+
+def _vignetting(width_px: int, height_px: int, corner_loss: float) -> tuple[FloatArray, FloatArray]:
+    """Loss by column and by row; their sum is corner_loss (distance from the middle / distance of the corner)^2."""
+    columns, rows = np.arange(width_px) - (width_px - 1) / 2.0, np.arange(height_px) - (height_px - 1) / 2.0
+    per_px2 = corner_loss / (columns[0] ** 2 + rows[0] ** 2)
+    return per_px2 * columns**2, per_px2 * rows**2
+
+
+class FilmPosition(Protocol):
+    """Where the film truly is; `membrane_ctrl.sim.sensors.Truth` is one."""
+
+    @property
+    def displacement_um(self) -> float:
+        """Of the centre, positive when the bowl is deeper."""
+        ...
+
+    @property
+    def sag_mm(self) -> float:
+        """Depth of the bowl."""
+        ...
+
+
+class Clock(Protocol):
+    """The run's clock."""
+
+    def now(self) -> float:
+        """Seconds since the run's start."""
+        ...
+
+
+class TwinOptics:
+    """The optical half of the simulated bench: one film, one screen, one camera.
+
+    The film is a Hencky bowl with the figure of `typical_film` drawn from the twin's seed, unless `film` is given.
+    Bowl and rim follow the truth: only the sag at displacement 0 is taken from it, once, at the first look.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The bench's optics, taken as true but for the geometry if `twin` has its own. Without a reference displacement
+        in the geometry, it holds for the film as it was at the first look.
+    twin : TwinConfig
+        For its seed and its true geometry.
+    truth : callable
+        Gives the film's true position now.
+    clock : Clock
+        Gives the time of exposure.
+    film : FilmShape, optional
+        Another film; its sag belongs to displacement 0.
+
+    Attributes
+    ----------
+    screen : TwinScreen
+    camera : TwinCamera
+    """
+
+    def __init__(
+        self,
+        optics: OpticsConfig,
+        twin: TwinConfig,
+        truth: Callable[[], FilmPosition],
+        clock: Clock,
+        film: FilmShape | None = None,
+    ) -> None:
+        self._optics = optics if twin.geometry is None else optics.model_copy(update={"geometry": twin.geometry})
+        self._seed = twin.seed
+        self._truth = truth
+        self._clock = clock
+        self._film = film
+        self._renderer: OpticsRenderer | None = None
+        self.screen = TwinScreen()
+        self.camera = TwinCamera(self)
+
+    def prepare(self) -> None:
+        """Trace the film where it is and take one picture, so that the first real one comes at the usual speed."""
+        self._expose(Pattern("black"), None)
+
+    @property
+    def film(self) -> FilmShape:
+        """The film; its sag belongs to displacement 0."""
+        return self._looked().film
+
+    def expose(self, out: Pixels | None) -> Frame:
+        """Take one picture of what the screen shows, now."""
+        if self.screen.shown is None:
+            raise LinkError("twin camera: the screen shows nothing: show a pattern first")
+        return self._expose(self.screen.shown, out)
+
+    def _expose(self, pattern: Pattern, out: Pixels | None) -> Frame:
+        renderer = self._looked()
+        time_s = self._clock.now()
+        return Frame(renderer.render(pattern, self._truth().displacement_um, out), time_s)
+
+    def _looked(self) -> OpticsRenderer:
+        if self._renderer is None:
+            position = self._truth()
+            sag_mm = position.sag_mm - position.displacement_um / 1000.0
+            film = self._film or typical_film(sag_mm, self._optics.mirror.radius_mm, self._seed)
+            stated = self._optics.geometry.reference_displacement_um
+            reference_um = position.displacement_um if stated is None else stated
+            self._renderer = OpticsRenderer(self._optics, film, reference_um=reference_um, seed=self._seed)
+        return self._renderer
+
+
+class TwinScreen:
+    """Role Screen: lit and settled at once.
+
+    Attributes
+    ----------
+    shown : Pattern or None
+        What it shows.
+    """
+
+    def __init__(self) -> None:
+        self.shown: Pattern | None = None
+
+    def show(self, pattern: Pattern) -> None:
+        """Show the pattern."""
+        self.shown = pattern
+
+    def close(self) -> None:
+        """Go dark."""
+        self.shown = None
+
+
+class TwinCamera:
+    """Role Camera: renders what a camera would have taken."""
+
+    def __init__(self, optics: TwinOptics) -> None:
+        self._optics = optics
+        self._open = True
+
+    def grab(self, out: Pixels | None = None) -> Frame:
+        """One exposure; the picture lands in `out` (H, W) if given, else in a new array.
+
+        Raises
+        ------
+        LinkError
+            If the camera is closed or the screen shows nothing.
+        """
+        if not self._open:
+            raise LinkError("twin camera: closed")
+        return self._optics.expose(out)
+
+    def close(self) -> None:
+        """No more pictures."""
+        self._open = False

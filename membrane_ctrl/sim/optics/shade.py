@@ -1,0 +1,280 @@
+"""From traced nodes to counts: one compiled pass over the picture, about ten nanoseconds a pixel.
+
+Nodes stand every `step` pixels, one before the first pixel and two after the last. Between them a cubic through four
+nodes (Lagrange) in each direction; with step 1 every pixel is a node and nothing is interpolated.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from math import ceil, pi
+from statistics import NormalDist
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from firmware_iface.roles import Pattern
+from membrane_ctrl.config.schema import PatternConfig
+
+FloatArray = NDArray[np.float64]
+_GOLDEN, _MIX_1, _MIX_2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_LOW_16 = np.uint64(0xFFFF)
+
+
+def node_positions(pixels: int, step: int) -> FloatArray:
+    """Pixel positions of the nodes along one side of the picture."""
+    return np.asarray(np.arange(-1, ceil(pixels / step) + 2) * step, dtype=np.float64)
+
+
+def cubic_weights(step: int) -> FloatArray:
+    """Weights (step, 4) of the nodes at -1, 0, 1, 2 for the places k / step, k = 0..step-1 (Lagrange)."""
+    f = np.arange(step) / step
+    return np.stack(
+        [
+            -f * (f - 1) * (f - 2) / 6,
+            (f + 1) * (f - 1) * (f - 2) / 2,
+            -(f + 1) * f * (f - 2) / 2,
+            (f + 1) * f * (f - 1) / 6,
+        ],
+        axis=1,
+    )
+
+
+@cache
+def normal_quantiles() -> NDArray[np.float32]:
+    """65536 equally likely values of a unit normal distribution: 16 random bits pick one."""
+    half = [NormalDist().inv_cdf((k + 0.5) / 65536) for k in range(32768)]
+    values = np.concatenate([half, -np.array(half[::-1])])
+    return np.asarray(values / values.std(), dtype=np.float32)
+
+
+@njit(cache=True)
+def _random_64(state: np.uint64) -> np.uint64:
+    """SplitMix64's output for a state that grows by `_GOLDEN` (Steele et al., 2014): four 16-bit numbers."""
+    z = (state ^ (state >> np.uint64(30))) * _MIX_1
+    z = (z ^ (z >> np.uint64(27))) * _MIX_2
+    return z ^ (z >> np.uint64(31))
+
+
+@njit(cache=True)
+def _level(s_mm: float, values: FloatArray, cell_mm: float, smooth: bool) -> float:
+    """Light of the screen at s from the region's low edge; the caller has made sure that 0 <= s < side."""
+    place = s_mm / cell_mm
+    cell = int(place)
+    if not smooth:
+        return float(values[min(cell, len(values) - 1)])
+    fraction = place - cell
+    cell %= len(values) - 1
+    return float(values[cell] + fraction * (values[cell + 1] - values[cell]))
+
+
+@njit(cache=True)
+def _between(line: FloatArray, cell: int, w: FloatArray, k: int) -> float:
+    """Value of a cubic through the nodes cell .. cell + 3, at the k-th of the places between."""
+    return float(
+        w[k, 0] * line[cell] + w[k, 1] * line[cell + 1] + w[k, 2] * line[cell + 2] + w[k, 3] * line[cell + 3]
+    )
+
+
+@njit(cache=True)
+def _row_of_nodes(nodes: FloatArray, k: int, node: int, w: FloatArray, line: FloatArray) -> None:
+    """Map k at one row of the picture, at the nodes' columns."""
+    for c in range(nodes.shape[2]):
+        line[c] = (
+            w[0] * nodes[k, node, c]
+            + w[1] * nodes[k, node + 1, c]
+            + w[2] * nodes[k, node + 2, c]
+            + w[3] * nodes[k, node + 3, c]
+        )
+
+
+@njit(cache=True)
+def shade(
+    nodes: FloatArray,
+    weights: FloatArray,
+    axis: int,
+    radius_mm: float,
+    values: FloatArray,
+    cell_mm: float,
+    smooth: bool,
+    side_mm: float,
+    scale: FloatArray,
+    loss: tuple[FloatArray, FloatArray],
+    noise: tuple[NDArray[np.float32], float, int],
+    out: NDArray[np.uint8] | NDArray[np.uint16],
+) -> None:
+    """Fill `out` (H, W) with the picture of one pattern.
+
+    Parameters
+    ----------
+    nodes : (3, rows, columns) array
+        s_x, s_y (from the region's low edges, mm) and the distance on the film from the vertex squared (mm^2).
+    weights : (step, 4) array
+        Of `cubic_weights`.
+    axis : int
+        0: the pattern runs along s_x, 1: along s_y.
+    radius_mm, side_mm : float
+        Rim of the film, side of the pattern region.
+    values, cell_mm, smooth
+        The light, a `LevelTable`.
+    scale : (4,) array
+        Counts without light, counts of a white screen above that, darkness outside the region (share), full scale.
+    loss : two arrays, (W,) and (H,)
+        Vignetting as a sum of a part of the column and a part of the row.
+    noise : tuple
+        `normal_quantiles()`, standard deviation in counts, seed of this picture.
+    """
+    step = weights.shape[0]
+    height, width = out.shape
+    dark, white, leak, full = scale
+    column_loss, row_loss = loss
+    quantiles, sigma, seed = noise
+    radius2_mm2 = radius_mm * radius_mm
+    # three arrays and not rows of one: a view taken per pixel costs more than the pixel
+    line_x, line_y, line_r2 = np.empty(nodes.shape[2]), np.empty(nodes.shape[2]), np.empty(nodes.shape[2])
+    state, bits = np.uint64(seed) * _MIX_1, np.uint64(0)
+    for row in range(height):
+        _row_of_nodes(nodes, 0, row // step, weights[row % step], line_x)
+        _row_of_nodes(nodes, 1, row // step, weights[row % step], line_y)
+        _row_of_nodes(nodes, 2, row // step, weights[row % step], line_r2)
+        for cell in range((width + step - 1) // step):
+            for k in range(min(step, width - cell * step)):
+                column = cell * step + k
+                counts = dark
+                if _between(line_r2, cell, weights, k) <= radius2_mm2:
+                    s_x_mm = _between(line_x, cell, weights, k)
+                    s_y_mm = _between(line_y, cell, weights, k)
+                    light = leak
+                    if 0.0 <= s_x_mm < side_mm and 0.0 <= s_y_mm < side_mm:
+                        light = _level(s_y_mm if axis == 1 else s_x_mm, values, cell_mm, smooth)
+                    counts += white * light * (1.0 - column_loss[column] - row_loss[row])
+                if sigma > 0.0:
+                    if column & 3 == 0:  # four 16-bit numbers from each 64-bit one
+                        state += _GOLDEN
+                        bits = _random_64(state)
+                    counts += sigma * quantiles[bits & _LOW_16]
+                    bits >>= np.uint64(16)
+                out[row, column] = min(max(counts + 0.5, 0.0), full)
+
+
+# What a pattern puts on the screen, as the light level (0..1) at each place along one axis.
+#
+# s is measured from the low edge of the pattern region, a square centred on O'; outside it the screen is dark.
+
+
+_GRAY_BITS = 4
+# linear interpolation of a cosine in this many cells is 2e-8 off at most: below a thousandth of a 16-bit count
+_SINE_CELLS = 16384
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """From the pattern's level to the camera's counts.
+
+    Attributes
+    ----------
+    dark_fraction : float
+        Counts without light, of full scale.
+    white_fraction : float
+        Counts of a white screen in the middle of the picture, of full scale.
+    leak : float
+        Light of a black screen, of a white one.
+    gamma : float
+        The screen's light is level**gamma; 1 is a linear screen.
+    vignetting : float
+        Loss of light at the picture's corner, growing with the square of the distance from its middle.
+
+    Raises
+    ------
+    ValueError
+        On construction, naming the field and what would be right.
+    """
+
+    dark_fraction: float = 0.02
+    white_fraction: float = 0.80
+    leak: float = 0.02
+    gamma: float = 1.0
+    vignetting: float = 0.15
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.dark_fraction < self.white_fraction <= 1:
+            raise ValueError(
+                f"dark_fraction = {self.dark_fraction} and white_fraction = {self.white_fraction} must be"
+                " 0 or more, at most 1, and the white above the dark"
+            )
+        for name, value in (("leak", self.leak), ("vignetting", self.vignetting)):
+            if not 0 <= value < 1:
+                raise ValueError(f"{name} = {value} must be 0 or more and below 1")
+        if not 0.1 <= self.gamma <= 10:
+            raise ValueError(f"gamma = {self.gamma} must be 0.1 .. 10; 1 is a linear screen")
+
+
+@dataclass(frozen=True, slots=True)
+class LevelTable:
+    """Light along an axis in cells `cell_mm` wide.
+
+    A smooth table is one period, repeated and interpolated, with one value more than cells so that the last cell has
+    an end; the other is one value a cell over the whole region.
+    """
+
+    values: NDArray[np.float64]
+    cell_mm: float
+    smooth: bool
+
+
+def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelTable:
+    """Light of a pattern along its axis.
+
+    - "sin": (1 + cos(phi + shift)) / 2 with phi = 2 pi s / T - pi, over one period, to be repeated;
+    - "gray": bit `index` (1 is the most significant of 4) of gray(V2), V2 = floor(2 s / T), over the region;
+    - "white" and "black": 1 and 0 over the region.
+
+    Raises
+    ------
+    ValueError
+        If the pattern's role or Gray bit is unknown.
+    """
+    if pattern.role == "sin":
+        phi = np.linspace(0.0, 2.0 * pi, _SINE_CELLS + 1) - pi
+        levels = 0.5 + 0.5 * np.cos(phi + pattern.shift_rad)
+        return LevelTable(_lit(levels, light), config.period_mm / _SINE_CELLS, smooth=True)
+    half_periods = np.arange(2 * config.periods)
+    if pattern.role == "gray" and 1 <= pattern.index <= _GRAY_BITS:
+        codes = half_periods ^ (half_periods >> 1)
+        levels = ((codes >> (_GRAY_BITS - pattern.index)) & 1).astype(np.float64)
+    elif pattern.role in ("white", "black"):
+        levels = np.full(half_periods.shape, 1.0 if pattern.role == "white" else 0.0)
+    else:
+        raise ValueError(f"pattern {pattern.name!r}: role must be sin, gray (bit 1..4), white or black")
+    return LevelTable(_lit(levels, light), config.period_mm / 2.0, smooth=False)
+
+
+def pattern_sequence(kind: str, config: PatternConfig, shifts_rad: tuple[float, ...] = ()) -> list[Pattern]:
+    """The patterns of a set in the order they are shown: x and y sinusoids and Gray bits, white, black.
+
+    Parameters
+    ----------
+    kind : str
+        "full" or "fringes" (sinusoids alone).
+    shifts_rad : tuple of floats
+        One a step; empty: 2 pi k / N.
+
+    Raises
+    ------
+    ValueError
+        If the kind is unknown.
+    """
+    if kind not in ("full", "fringes"):
+        raise ValueError(f"kind = {kind!r} must be full or fringes")
+    shifts = shifts_rad or tuple(2.0 * pi * k / config.steps for k in range(config.steps))
+    patterns: list[Pattern] = []
+    for axis in ("x", "y"):
+        patterns += [Pattern("sin", axis, k, shift) for k, shift in enumerate(shifts)]
+        if kind == "full":
+            patterns += [Pattern("gray", axis, bit) for bit in range(1, _GRAY_BITS + 1)]
+    return patterns + ([Pattern("white"), Pattern("black")] if kind == "full" else [])
+
+
+def _lit(levels: NDArray[np.float64], light: Light) -> NDArray[np.float64]:
+    """Share of a white screen's light: gamma, and what leaks through a black screen."""
+    return np.asarray(light.leak + (1.0 - light.leak) * np.clip(levels, 0.0, 1.0) ** light.gamma)

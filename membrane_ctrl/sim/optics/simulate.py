@@ -1,0 +1,256 @@
+"""Capture sets with known truth: the twin's pictures in the files that a real bench writes."""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from firmware_iface.roles import Pattern
+from membrane_ctrl.config.section import Section
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
+
+# The `capture.toml` of a simulated set, and the truth beside it.
+
+
+FloatArray = NDArray[np.float64]
+_GRID = 201  # odd, so that the vertex is a point of the truth's map
+
+
+def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, Any]:
+    """The content of `capture.toml` (schema membrane-capture/1).
+
+    Parameters
+    ----------
+    spec : SimulationSpec
+        The set.
+    readings_um : (frames,) array
+        What the laser said at each frame.
+    """
+    geometry = _written(spec.stated_geometry or spec.optics.geometry)
+    if spec.laser:
+        geometry["reference_displacement_um"] = spec.reference_um
+    camera = _written(spec.optics.camera)
+    if spec.optics.camera.bits == 8:
+        del camera["bits"]  # what a reader takes for granted
+    camera["principal_px"] = list(spec.optics.camera.principal)
+    table: dict[str, Any] = {"schema": "membrane-capture/1", "kind": spec.kind}
+    if spec.reference:
+        table["reference"] = spec.reference
+    table |= {
+        "pattern": _written(spec.optics.pattern),
+        "geometry": geometry,
+        "camera": camera,
+        "mirror": _written(spec.optics.mirror),
+        "frames": [_frame_row(spec, frame, float(readings_um[frame])) for frame in range(len(spec.patterns))],
+    }
+    return table
+
+
+def write_capture_toml(folder: Path, spec: SimulationSpec, readings_um: FloatArray) -> None:
+    """Write `capture.toml`."""
+    (folder / "capture.toml").write_bytes(tomli_w.dumps(capture_table(spec, readings_um)).encode())
+
+
+def write_truth(folder: Path, spec: SimulationSpec) -> None:
+    """Write what the set was made of.
+
+    `truth.npz`: `x_mm` (W,), `y_mm` (H,), `h_mm` (H, W) above the vertex, NaN outside the rim, at the mean
+    displacement of the sinusoids; `h_per_sag` (H, W), its change with sag; `displacement_um` (frames,); `coeffs_um`
+    (36,), Noll j = 1..36 with the surface 0 at the vertex, when the 36 terms carry the shape.
+    `truth.json`: the same numbers without the maps, and everything that was asked for.
+    """
+    displacement_um = np.array([spec.displacement_um(frame) for frame in range(len(spec.patterns))])
+    fringes = np.array([pattern.role == "sin" for pattern in spec.patterns])
+    mean_um = float(displacement_um[fringes].mean())
+    coeffs_um = spec.film.coeffs_um(mean_um)
+    radius_mm = spec.film.radius_mm
+    axis_mm = np.linspace(-radius_mm, radius_mm, _GRID)
+    x_mm, y_mm = np.meshgrid(axis_mm, axis_mm)
+    inside = x_mm**2 + y_mm**2 <= radius_mm**2
+    h_mm = np.where(inside, spec.film.height_mm(x_mm, y_mm, mean_um), np.nan)
+    deeper_mm = np.where(inside, spec.film.height_mm(x_mm, y_mm, mean_um + 1000.0), np.nan)
+    maps: dict[str, Any] = {"x_mm": axis_mm, "y_mm": axis_mm, "h_mm": h_mm, "h_per_sag": deeper_mm - h_mm}
+    if coeffs_um is not None:
+        maps["coeffs_um"] = coeffs_um
+    np.savez_compressed(folder / "truth.npz", displacement_um=displacement_um, **maps)
+    film = {name: value for name, value in asdict(spec.film).items() if name != "terms"}
+    truth = {
+        "schema": "membrane-simulation/1",
+        "displacement_um": mean_um,
+        "sag_mm": spec.film.sag_at_mm(mean_um),
+        "coeffs_um": None if coeffs_um is None else coeffs_um.tolist(),
+        "frame_displacement_um": displacement_um.tolist(),
+        "film": film,
+        "geometry": _written(spec.optics.geometry) | {"reference_displacement_um": spec.reference_um},
+        "light": asdict(spec.light),
+        "screen_error": None if spec.screen_error is None else asdict(spec.screen_error),
+        "faults": [asdict(fault) for fault in spec.faults],
+        "seed": spec.seed,
+    }
+    (folder / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
+
+
+def _written(section: Section) -> dict[str, Any]:
+    """A configuration table as written: without what is absent, and without lists that are empty."""
+    return {key: value for key, value in section.model_dump(mode="json", exclude_none=True).items() if value != []}
+
+
+def _frame_row(spec: SimulationSpec, frame: int, reading_um: float) -> dict[str, Any]:
+    pattern = spec.patterns[frame]
+    row: dict[str, Any] = {"file": f"{pattern.name}.png", "role": pattern.role}
+    if pattern.axis:
+        row |= {"axis": pattern.axis, "index": pattern.index}
+    if spec.shifts_rad and pattern.role == "sin":
+        row["shift_rad"] = pattern.shift_rad
+    row["time_s"] = spec.time_s(frame)
+    if spec.laser:
+        row["displacement_um"] = reading_um
+    return row
+
+
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+# noise does not compress: harder levels cost time and save nothing
+_PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
+
+
+@dataclass(frozen=True, slots=True)
+class _Exposure:
+    """What truly happened for one file."""
+
+    pattern: Pattern
+    displacement_um: float
+    gain: float = 1.0
+
+
+def simulate_set(folder: Path, spec: SimulationSpec) -> None:
+    """Write one capture set and its truth.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if it is not there.
+    spec : SimulationSpec
+        The set.
+
+    Raises
+    ------
+    OSError
+        If the folder or a file cannot be written.
+    """
+    _write_set(folder, spec, _renderer(spec))
+
+
+def simulate_run(
+    folder: Path,
+    spec: SimulationSpec,
+    sets: int,
+    interval_s: float = 4.0,
+    on_set: Callable[[int], None] | None = None,
+) -> None:
+    """Write a run: `0000` is the full set, the others are fringes that lean on it; one clock and one motion for all.
+
+    Parameters
+    ----------
+    folder : Path
+        Gets a folder a set.
+    spec : SimulationSpec
+        The first set; its motion runs on through the others, its faults stay its own.
+    sets : int
+        How many.
+    interval_s : float
+        From the start of one set to the start of the next.
+    on_set : callable, optional
+        Told the number of sets written, after each.
+
+    Raises
+    ------
+    ValueError
+        If the first set is not full, lists its displacements, or the sets overlap in time.
+    """
+    if spec.kind != "full" or spec.displacements_um:
+        raise ValueError("kind: the first set of a run must be full, and move by motion, not displacements_um")
+    if sets < 1:
+        raise ValueError(f"sets = {sets} must be 1 or more")
+    if interval_s < len(spec.patterns) * spec.frame_interval_s:
+        raise ValueError(
+            f"interval_s = {interval_s:g} is shorter than the {len(spec.patterns)} frames of the first set"
+        )
+    spec = _anchored(spec)
+    renderer = _renderer(spec)
+    for number in range(sets):
+        if number == 0:
+            this = spec
+        else:
+            start_s, seed = spec.start_s + number * interval_s, spec.seed + number
+            this = replace(spec, kind="fringes", reference="../0000", start_s=start_s, seed=seed, faults=())
+        _write_set(folder / f"{number:04d}", this, renderer)
+        if on_set is not None:
+            on_set(number + 1)
+
+
+def _anchored(spec: SimulationSpec) -> SimulationSpec:
+    """The same with the geometry's reference displacement written out, so that all sets of a run share it."""
+    stated = spec.stated_geometry or spec.optics.geometry
+    return replace(spec, stated_geometry=stated.model_copy(update={"reference_displacement_um": spec.reference_um}))
+
+
+def _renderer(spec: SimulationSpec) -> OpticsRenderer:
+    return OpticsRenderer(
+        spec.optics, spec.film, spec.light, spec.reference_um, spec.screen_error, exact=spec.exact, seed=spec.seed
+    )
+
+
+def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    noise = np.random.default_rng(spec.seed).normal(0.0, spec.laser_noise_um, len(spec.patterns))
+    readings_um = noise + [spec.displacement_um(frame) for frame in range(len(spec.patterns))]
+    faults = {(fault.kind, fault.frame) for fault in spec.faults}
+    before: Pixels | None = None
+    for pattern, exposure in zip(spec.patterns, _exposures(spec), strict=True):
+        if ("stale", pattern.name) in faults and before is not None:
+            picture = before
+        else:
+            picture = renderer.render(exposure.pattern, exposure.displacement_um, gain=exposure.gain)
+        before = picture
+        if ("wrong_size", pattern.name) in faults:
+            picture = picture[:-1]
+        if ("wrong_depth", pattern.name) in faults:
+            picture = _other_depth(picture)
+        if ("missing", pattern.name) not in faults:
+            _write_png(folder / f"{pattern.name}.png", picture)
+    write_capture_toml(folder, spec, readings_um)
+    write_truth(folder, spec)
+
+
+def _exposures(spec: SimulationSpec) -> list[_Exposure]:
+    """What was truly shown, where the film truly was and how long the exposure truly took, frame by frame."""
+    exposures = [_Exposure(pattern, spec.displacement_um(frame)) for frame, pattern in enumerate(spec.patterns)]
+    place = {pattern.name: frame for frame, pattern in enumerate(spec.patterns)}
+    for fault in spec.faults:
+        frame = place[fault.frame]
+        this = exposures[frame]
+        if fault.kind in ("saturated", "dark", "flicker"):
+            exposures[frame] = replace(this, gain=fault.strength)
+        elif fault.kind == "moved":
+            exposures[frame] = replace(this, displacement_um=this.displacement_um + fault.strength)
+        elif fault.kind == "swapped":
+            exposures[frame], exposures[frame + 1] = exposures[frame + 1], this
+    return exposures
+
+
+def _other_depth(picture: Pixels) -> Pixels:
+    if picture.dtype == np.uint8:
+        return picture.astype(np.uint16)
+    return picture.astype(np.uint8)
+
+
+def _write_png(path: Path, picture: Pixels) -> None:
+    if not cv2.imwrite(str(path), picture, _PNG_SPEED):
+        raise OSError(f"{path}: cannot be written")

@@ -1,0 +1,193 @@
+"""What a simulated capture set is made of, checked before anything is written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import isfinite, pi, sin
+from typing import Literal, get_args
+
+from firmware_iface.roles import Pattern
+from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
+from membrane_ctrl.sim.optics import film_shape, shade, trace
+
+# Faults that a simulated set can carry: what goes wrong with single frames on a real bench.
+
+
+FaultKind = Literal[
+    "stale", "swapped", "missing", "saturated", "dark", "flicker", "moved", "wrong_size", "wrong_depth"
+]
+
+# Strength of a fault that has one: exposure against nominal, or um of film displacement
+_DEFAULT_AMOUNT: dict[FaultKind, float] = {"saturated": 2.0, "dark": 0.05, "flicker": 0.8, "moved": 200.0}
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFault:
+    """One fault of one frame.
+
+    Attributes
+    ----------
+    kind : str
+        "stale" (the picture of the frame before, byte for byte), "swapped" (with the frame after), "missing" (listed
+        but not written), "saturated", "dark", "flicker" (wrong exposure), "moved" (the film stood elsewhere and the
+        laser did not say so), "wrong_size" (one row short), "wrong_depth" (8 for 16 bit and the reverse).
+    frame : str
+        The frame's name, as `x_sin_2`.
+    amount : float or None
+        Exposure against nominal, or um for "moved"; None: a usual one.
+    """
+
+    kind: FaultKind
+    frame: str
+    amount: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(FaultKind):
+            raise ValueError(f"faults: kind {self.kind!r} is not one of {', '.join(get_args(FaultKind))}")
+        if self.amount is not None and self.kind not in _DEFAULT_AMOUNT:
+            raise ValueError(f"faults: {self.kind} has no amount")
+
+    @property
+    def strength(self) -> float:
+        """The amount, or the usual one of this kind."""
+        return _DEFAULT_AMOUNT[self.kind] if self.amount is None else self.amount
+
+    @classmethod
+    def parse(cls, text: str) -> FrameFault:
+        """Read `kind:frame` or `kind:frame:amount`.
+
+        Raises
+        ------
+        ValueError
+            If the text has another form, names no known kind or its amount is not a number.
+        """
+        kind, _, rest = text.partition(":")
+        frame, _, amount = rest.partition(":")
+        if not frame:
+            raise ValueError(f"faults: {text!r} must read kind:frame or kind:frame:amount, as flicker:x_sin_2:0.8")
+        try:
+            return cls(kind, frame, float(amount) if amount else None)  # type: ignore[arg-type]  # checked above
+        except ValueError as error:
+            if str(error).startswith("faults"):
+                raise
+            raise ValueError(f"faults: amount {amount!r} of {text!r} is not a number") from None
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Where the film's centre is: start + drift t + amplitude sin(2 pi frequency t + phase)."""
+
+    start_um: float = 0.0
+    drift_um_per_s: float = 0.0
+    amplitude_um: float = 0.0
+    frequency_hz: float = 0.0
+    phase_rad: float = 0.0
+
+    def at_um(self, time_s: float) -> float:
+        """Displacement at a moment."""
+        swing = self.amplitude_um * sin(2.0 * pi * self.frequency_hz * time_s + self.phase_rad)
+        return self.start_um + self.drift_um_per_s * time_s + swing
+
+
+@dataclass(frozen=True, slots=True)
+class SimulationSpec:
+    """One simulated capture set.
+
+    Attributes
+    ----------
+    optics : OpticsConfig
+        The bench as it truly is, with the camera's depth (`bits`) and noise and the pattern's steps.
+    film : FilmShape
+        Its sag belongs to displacement 0.
+    kind : "full" or "fringes"
+        18 frames (for four steps), or the sinusoids alone.
+    reference : str
+        Of a fringes set: the full set whose fringe orders anchor it, as `../0000`.
+    shifts_rad : tuple of floats
+        One phase shift a step, written into each frame; empty: 2 pi k / N, not written.
+    motion : Motion
+        Of the film on the run's clock.
+    displacements_um : tuple of floats
+        Instead of `motion`: one a frame, in the order of `patterns`.
+    start_s, frame_interval_s : float
+        Start of the first exposure on the run's clock, and from one exposure to the next.
+    laser : bool
+        Whether the frames carry the laser's reading.
+    laser_noise_um : float
+        Standard deviation of that reading.
+    stated_geometry : GeometryConfig or None
+        What `capture.toml` says, when it is not the truth.
+    light, screen_error, exact, seed
+        See `OpticsRenderer`.
+    faults : tuple of FrameFault
+        What goes wrong with single frames.
+
+    Raises
+    ------
+    ValueError
+        On construction, naming the field and what would be right.
+    """
+
+    optics: OpticsConfig
+    film: film_shape.FilmShape
+    kind: Literal["full", "fringes"] = "full"
+    reference: str = ""
+    shifts_rad: tuple[float, ...] = ()
+    motion: Motion = Motion()
+    displacements_um: tuple[float, ...] = ()
+    start_s: float = 0.0
+    frame_interval_s: float = 0.1
+    laser: bool = True
+    laser_noise_um: float = 0.0
+    stated_geometry: GeometryConfig | None = None
+    light: shade.Light = field(default_factory=shade.Light)
+    screen_error: trace.ScreenError | None = None
+    exact: bool = False
+    seed: int = 1
+    faults: tuple[FrameFault, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.kind == "fringes" and not self.reference:
+            raise ValueError("reference: a fringes set needs the full set that anchors it, as ../0000")
+        if self.kind == "full" and self.reference:
+            raise ValueError("reference: only a fringes set has one")
+        if self.shifts_rad and len(self.shifts_rad) != self.optics.pattern.steps:
+            raise ValueError(f"shifts_rad: {len(self.shifts_rad)} shifts for steps = {self.optics.pattern.steps}")
+        if self.displacements_um and self.motion != Motion():
+            raise ValueError("displacements_um: give these or motion, not both")
+        names = [pattern.name for pattern in self.patterns]
+        if self.displacements_um and len(self.displacements_um) != len(names):
+            raise ValueError(f"displacements_um: {len(self.displacements_um)} values for {len(names)} frames")
+        if not all(isfinite(self.displacement_um(frame)) for frame in range(len(names))):
+            raise ValueError("motion, displacements_um: every value must be a number")
+        for name, value in (
+            ("frame_interval_s", self.frame_interval_s),
+            ("laser_noise_um", self.laser_noise_um),
+            ("seed", self.seed),
+        ):
+            if not (isfinite(value) and value >= 0):
+                raise ValueError(f"{name} = {value} must be 0 or more")
+        for fault in self.faults:
+            if fault.frame not in names:
+                raise ValueError(f"faults: no frame {fault.frame!r} in this set ({names[0]} .. {names[-1]})")
+            if (fault.kind, fault.frame) in (("stale", names[0]), ("swapped", names[-1])):
+                raise ValueError(f"faults: {fault.frame} has no neighbour to be {fault.kind} with")
+
+    @property
+    def patterns(self) -> list[Pattern]:
+        """What is shown, frame by frame."""
+        return shade.pattern_sequence(self.kind, self.optics.pattern, self.shifts_rad)
+
+    def time_s(self, frame: int) -> float:
+        """Start of exposure of a frame on the run's clock."""
+        return self.start_s + frame * self.frame_interval_s
+
+    def displacement_um(self, frame: int) -> float:
+        """Where the film truly is during a frame (faults aside)."""
+        return self.displacements_um[frame] if self.displacements_um else self.motion.at_um(self.time_s(frame))
+
+    @property
+    def reference_um(self) -> float:
+        """Displacement for which the geometry holds: as stated, or that of the first frame."""
+        stated = (self.stated_geometry or self.optics.geometry).reference_displacement_um
+        return self.displacement_um(0) if stated is None else stated

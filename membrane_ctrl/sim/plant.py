@@ -1,0 +1,296 @@
+"""The simulated bench: films, gas, pump, vent, leak, surroundings and sensors, advanced in fixed steps.
+
+Plain floats in a plain loop: a step is some 30 operations, which NumPy would make slower, and a compiled kernel
+would add its start-up to every process for a plant that is already 1000 times faster than real time.
+What does not depend on the state (surroundings, creep) is made with NumPy for a block of steps ahead.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from itertools import accumulate
+
+import numpy as np
+
+from membrane_ctrl.config.schema import PumpConfig, TwinConfig
+from membrane_ctrl.sim import film, sensors
+from membrane_ctrl.sim.events import Event, Series, Surroundings
+
+# The diaphragm pump: adds gas only, sticks at low command, answers late.
+
+
+LAG_S = 0.15  # motor and diaphragm
+TRANSPORT_S = 0.075  # gas in the tube
+
+
+class Pump:
+    """q = q_full (d - dead) / (1 - dead) once running; starts at `start_fraction`, stalls below `stall_fraction`.
+
+    Parameters
+    ----------
+    config : PumpConfig
+        Where it starts, stalls and begins to deliver.
+    flow_full_ml_per_s : float
+        Flow at command 1.
+    step_s : float
+        Time step.
+
+    Raises
+    ------
+    ValueError
+        If the pump delivers nothing at any command.
+    """
+
+    def __init__(self, config: PumpConfig, flow_full_ml_per_s: float, step_s: float) -> None:
+        if config.dead_fraction >= 1:
+            raise ValueError("pump.dead_fraction = 1: a pump that never delivers; it must be below 1")
+        self._dead = config.dead_fraction
+        self._start = config.start_fraction
+        self._stall = config.stall_fraction
+        self._ml_per_s_per_fraction = flow_full_ml_per_s / (1 - config.dead_fraction)
+        self._follow = -math.expm1(-step_s / LAG_S)
+        self._running = False
+        self._flow_ml_per_s = 0.0
+        self._tube = deque([0.0] * round(TRANSPORT_S / step_s))
+
+    def hold(self, flow_ml_per_s: float) -> float:
+        """Stand where the pump delivers this flow for ever, and return that command.
+
+        A flow so small that the pump would stall leaves it off.
+        """
+        command = self._dead + flow_ml_per_s / self._ml_per_s_per_fraction
+        self._running = self._stall <= command <= 1
+        self._flow_ml_per_s = flow_ml_per_s if self._running else 0.0
+        self._tube = deque([self._flow_ml_per_s] * len(self._tube))
+        return command if self._running else 0.0
+
+    def step(self, command: float) -> float:
+        """One time step with the command 0..1; the flow that reaches the films in it, mL/s."""
+        self._running = command >= (self._stall if self._running else self._start)
+        delivers = self._running and command > self._dead
+        target = self._ml_per_s_per_fraction * (command - self._dead) if delivers else 0.0
+        self._flow_ml_per_s += (target - self._flow_ml_per_s) * self._follow
+        self._tube.append(self._flow_ml_per_s)
+        return self._tube.popleft()
+
+
+# Air pressure and temperature of a scenario, and the events on top, a block of steps at a time.
+
+
+# scenario: (air pressure std Pa, correlation time s), (air temperature std K, correlation time s)
+SCENARIOS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
+    "calm": ((0.0, 30.0), (0.0, 300.0)),
+    "quiet": ((0.2, 30.0), (0.010, 300.0)),
+    "typical": ((1.2, 30.0), (0.050, 300.0)),
+    "gusty": ((4.0, 20.0), (0.100, 300.0)),
+}
+
+
+class OrnsteinUhlenbeck:
+    """Noise that forgets exponentially, exact at the steps, stationary from the first one.
+
+    x' = x exp(-dt/tau) + std sqrt(1 - exp(-2 dt/tau)) N(0, 1).
+    """
+
+    def __init__(self, std: float, correlation_s: float, step_s: float, rng: np.random.Generator) -> None:
+        self._decay = math.exp(-step_s / correlation_s)
+        self._kick = std * math.sqrt(-math.expm1(-2 * step_s / correlation_s))
+        self._rng = rng
+        self._value = std * float(rng.standard_normal())
+
+    def block(self, steps: int) -> Series:
+        """The next values, (steps,)."""
+        decay = self._decay
+        kicks = (self._kick * self._rng.standard_normal(steps)).tolist()
+        values = list(accumulate(kicks, lambda x, kick: decay * x + kick, initial=self._value))
+        self._value = values[-1]
+        return np.array(values[:-1])
+
+
+class Disturbance:
+    """What the surroundings do, in blocks of consecutive steps.
+
+    Parameters
+    ----------
+    config : TwinConfig
+        Scenario, laser mount drift.
+    events : sequence of Event
+        What happens besides.
+    step_s : float
+        Time step.
+    rng : numpy.random.Generator
+        Source of all chance here.
+    """
+
+    def __init__(self, config: TwinConfig, events: Sequence[Event], step_s: float, rng: np.random.Generator) -> None:
+        pressure, temperature = SCENARIOS[config.scenario]
+        pressure_rng, temperature_rng = rng.spawn(2)
+        self._pressure = OrnsteinUhlenbeck(*pressure, step_s, pressure_rng)
+        self._temperature = OrnsteinUhlenbeck(*temperature, step_s, temperature_rng)
+        self._drift_um_per_s = config.laser_drift_um_per_min / 60
+        self._events = tuple(events)
+        self._step_s = step_s
+        self._next = 0
+
+    def block(self, steps: int) -> Surroundings:
+        """The next `steps` steps."""
+        time_s: Series = np.arange(self._next, self._next + steps, dtype=np.float64) * self._step_s
+        self._next += steps
+        block = Surroundings(
+            time_s=time_s,
+            ambient_pa=film.STANDARD_AMBIENT_PA + self._pressure.block(steps),
+            air_k=film.REFERENCE_K + self._temperature.block(steps),
+            leak_factor=np.ones(steps),
+            laser_bias_um=np.multiply(self._drift_um_per_s, time_s),
+            laser_lost=np.zeros(steps),
+        )
+        for event in self._events:
+            event.apply(block)
+        return block
+
+
+STEP_S = 0.005  # a thirtieth of the pump's lag, a fifteenth of its transport
+ZERO_C_K = 273.15
+VENT_OPEN_UM_PER_S = 100.0  # fully open at the nominal pressure (assumed): down by the whole sag within minutes
+_BLOCK_STEPS = 2000
+
+_NOMINAL_VOLUME = float(
+    film.MIRROR_FILM.volume_m3_per_root_pa(film.SETTLED_S) + film.BACK_FILM.volume_m3_per_root_pa(film.SETTLED_S)
+)
+_NOMINAL_GAS = film.filled(film.NOMINAL_PRESSURE_PA, film.REFERENCE_K, film.STANDARD_AMBIENT_PA, _NOMINAL_VOLUME)
+NOMINAL_UM_PER_ML = (
+    1e3
+    * float(film.MIRROR_FILM.sag_mm_per_root_pa(film.SETTLED_S))
+    * _NOMINAL_GAS.root_pa_per_ml(film.STANDARD_AMBIENT_PA, _NOMINAL_VOLUME)
+)
+
+
+def gas_compliance_ml_per_pa() -> float:
+    """C = dV_gas/dp = V/(3p) + V/P of the nominal mirror: what the leak's time constant refers to."""
+    volume_ml = 1e6 * _NOMINAL_VOLUME * _NOMINAL_GAS.root_pa
+    return volume_ml / (3 * film.NOMINAL_PRESSURE_PA) + volume_ml / (
+        film.STANDARD_AMBIENT_PA + film.NOMINAL_PRESSURE_PA
+    )
+
+
+class Plant:
+    """The bench without its protocol; equal seeds and equal calls give equal samples.
+
+    It starts inflated, `start_error_um` off its nominal sag, films settled for a day and the pump just holding;
+    or flat and fresh, the pump off (`from_flat`). Commands hold until the next `actuate`. Truth does not depend
+    on how often it is sampled, nor on how time is cut into calls of `advance`.
+
+    Parameters
+    ----------
+    twin : TwinConfig
+        Scenario, seed, noise, start.
+    pump : PumpConfig
+        Flow against command.
+    events : sequence of Event
+        What happens when, in plant time.
+    """
+
+    def __init__(self, twin: TwinConfig, pump: PumpConfig, events: Sequence[Event] = ()) -> None:
+        chance, noise = np.random.default_rng(twin.seed).spawn(2)
+        self._sensors = sensors.Sensors(twin, noise)
+        self._disturbance = Disturbance(twin, events, STEP_S, chance)
+        self._leak_ml_per_s_per_pa = gas_compliance_ml_per_pa() / twin.leak_time_constant_s
+        self._vent_ml_per_s_per_pa = VENT_OPEN_UM_PER_S / NOMINAL_UM_PER_ML / film.NOMINAL_PRESSURE_PA
+        self._pump = Pump(pump, pump.flow_full_um_per_s / NOMINAL_UM_PER_ML, STEP_S)
+        self._loaded_s = 0.0 if twin.from_flat else film.SETTLED_S
+        self._steps = 0
+        self._rest = 0.0
+        self._pump_fraction = self._vent_fraction = self._inflow_ml_per_s = 0.0
+        self._load_block()
+        self._index = 0
+        if twin.from_flat:
+            self._gas = film.Gas(0.0, self._air_k[0], 0.0)
+            return
+        gauge_pa = ((film.NOMINAL_SAG_MM + 1e-3 * twin.start_error_um) / self._sag[0]) ** 3
+        self._gas = film.filled(gauge_pa, self._air_k[0], self._ambient_pa[0], self._volume[0])
+        self._inflow_ml_per_s = self._leak_ml_per_s_per_pa * self._leak[0] * gauge_pa
+        self._pump_fraction = self._pump.hold(self._inflow_ml_per_s)
+
+    @property
+    def time_s(self) -> float:
+        """Plant time."""
+        return self._steps * STEP_S
+
+    def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
+        """Set the commands. Raises ValueError unless both are 0..1."""
+        if not (0 <= pump_fraction <= 1 and 0 <= vent_fraction <= 1):
+            raise ValueError(f"pump {pump_fraction:g} and vent {vent_fraction:g} must be fractions 0..1")
+        self._pump_fraction = pump_fraction
+        self._vent_fraction = vent_fraction
+
+    def advance(self, duration_s: float) -> None:
+        """Let time pass, in whole steps; what is left of a step is kept for the next call."""
+        due = self._rest + duration_s / STEP_S
+        steps = math.floor(due + 1e-6)  # 0.02 s is four steps, whatever 0.02 is in binary
+        self._rest = due - steps
+        while steps > 0:
+            if self._index + 1 == _BLOCK_STEPS:
+                self._load_block()
+            now = min(steps, _BLOCK_STEPS - 1 - self._index)
+            self._run(self._index + 1, self._index + 1 + now)
+            steps -= now
+
+    def sample(self) -> sensors.PlantSample:
+        """What the sensors say now, with noise of its own in each call."""
+        return self.sample_of(self.truth())
+
+    def sample_of(self, truth: sensors.Truth) -> sensors.PlantSample:
+        """The same, for who has the truth of now already."""
+        return self._sensors.read(truth, self._pump_fraction, self._vent_fraction)
+
+    def truth(self) -> sensors.Truth:
+        """What really is."""
+        i = self._index
+        gas, ambient_pa = self._gas, self._ambient_pa[i]
+        gauge_pa = gas.gauge_pressure_pa
+        sag_mm = self._sag[i] * gas.root_pa
+        um_per_ml = 1e3 * self._sag[i] * gas.root_pa_per_ml(ambient_pa, self._volume[i])
+        return sensors.Truth(
+            time_s=self.time_s,
+            displacement_um=1e3 * (sag_mm - film.NOMINAL_SAG_MM),
+            sag_mm=sag_mm,
+            back_sag_mm=self._back_sag[i] * gas.root_pa,
+            gauge_pressure_pa=gauge_pa,
+            ambient_pressure_pa=ambient_pa,
+            air_temperature_c=self._air_k[i] - ZERO_C_K,
+            gas_temperature_c=gas.temperature_k - ZERO_C_K,
+            laser_bias_um=self._laser_bias_um[i],
+            laser_lost=self._laser_lost[i],
+            leak_um_per_s=um_per_ml * self._leak_ml_per_s_per_pa * self._leak[i] * gauge_pa,
+            pump_um_per_s=um_per_ml * self._inflow_ml_per_s,
+            vent_um_per_s=um_per_ml * self._vent_ml_per_s_per_pa * self._vent_fraction * gauge_pa,
+        )
+
+    def _run(self, start: int, stop: int) -> None:
+        """Steps `start` to `stop` of the block."""
+        gas_step, gas, pump_step, pump = self._gas.step, self._gas, self._pump.step, self._pump_fraction
+        leak, vent = self._leak_ml_per_s_per_pa, self._vent_ml_per_s_per_pa * self._vent_fraction
+        follow = -math.expm1(-STEP_S / film.GAS_FOLLOWS_AIR_S)
+        inflow = self._inflow_ml_per_s
+        for i in range(start, stop):
+            inflow = pump_step(pump)
+            outflow = (leak * self._leak[i] + vent) * gas.root_pa**3
+            gas_step((inflow - outflow) * STEP_S, follow, self._ambient_pa[i], self._air_k[i], self._volume[i])
+        self._inflow_ml_per_s = inflow
+        self._steps += stop - start
+        self._index = stop - 1
+
+    def _load_block(self) -> None:
+        """Surroundings and creep of the next block, as lists: indexing them gives plain floats."""
+        block = self._disturbance.block(_BLOCK_STEPS)
+        age_s = self._loaded_s + block.time_s
+        self._ambient_pa: list[float] = block.ambient_pa.tolist()
+        self._air_k: list[float] = block.air_k.tolist()
+        self._leak: list[float] = block.leak_factor.tolist()
+        self._laser_bias_um: list[float] = block.laser_bias_um.tolist()
+        self._laser_lost: list[float] = block.laser_lost.tolist()
+        self._sag: list[float] = film.MIRROR_FILM.sag_mm_per_root_pa(age_s).tolist()
+        self._back_sag: list[float] = film.BACK_FILM.sag_mm_per_root_pa(age_s).tolist()
+        volume = film.MIRROR_FILM.volume_m3_per_root_pa(age_s) + film.BACK_FILM.volume_m3_per_root_pa(age_s)
+        self._volume: list[float] = volume.tolist()
+        self._index = -1

@@ -1,0 +1,133 @@
+"""What the bench's sensors say of the truth."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import astuple, dataclass, fields
+
+import numpy as np
+
+from membrane_ctrl.config.schema import TwinConfig
+
+# What really is, beside what the sensors say: for the recording and the optics, never for the controller.
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """State of the simulated bench at one moment.
+
+    Attributes
+    ----------
+    time_s : float
+        Plant time; on the run's clock once the bench process has published it.
+    displacement_um : float
+        Mirror centre from its nominal sag (600 Pa, settled), positive when the bowl deepens.
+    sag_mm : float
+        Depth of the mirror film.
+    back_sag_mm : float
+        Depth of the other film.
+    gauge_pressure_pa, ambient_pressure_pa : float
+        Pressures.
+    air_temperature_c, gas_temperature_c : float
+        Temperatures.
+    laser_bias_um : float
+        What the laser reads too much, from its mount.
+    laser_lost : float
+        1 while the laser gets no light back.
+    leak_um_per_s : float
+        Speed at which the leak alone lets the centre down.
+    pump_um_per_s, vent_um_per_s : float
+        Speed at which the pump's flow lifts it and the vent's lets it down.
+    """
+
+    time_s: float
+    displacement_um: float
+    sag_mm: float
+    back_sag_mm: float
+    gauge_pressure_pa: float
+    ambient_pressure_pa: float
+    air_temperature_c: float
+    gas_temperature_c: float
+    laser_bias_um: float
+    laser_lost: float
+    leak_um_per_s: float
+    pump_um_per_s: float
+    vent_um_per_s: float
+
+    def pack(self) -> bytes:
+        """The fields as doubles in their order."""
+        return _STRUCT.pack(*astuple(self))
+
+    @classmethod
+    def unpack(cls, message: bytes) -> Truth:
+        """Inverse of `pack`. Raises struct.error on a message of another length."""
+        return cls(*_STRUCT.unpack(message))
+
+
+_STRUCT = struct.Struct(f"<{len(fields(Truth))}d")
+TRUTH_BYTES = _STRUCT.size
+
+
+GAUGE_NOISE_PA = 0.5  # a +-1 kPa differential sensor (assumed): 10 um of centre, so a monitor only
+LASER_GOOD = 0
+LASER_NO_LIGHT = 1
+
+
+@dataclass(frozen=True, slots=True)
+class PlantSample:
+    """One sample of all sensors, in the units of the roles.
+
+    Without light the laser has no reading: `displacement_um` is NaN and `displacement_quality` is not 0.
+    """
+
+    displacement_um: float
+    displacement_quality: int
+    gauge_pressure_pa: float
+    ambient_pressure_pa: float
+    air_temperature_c: float
+    gas_temperature_c: float
+    pump_fraction: float
+    vent_fraction: float
+    sample_counter: int
+    device_time_s: float
+
+
+class Sensors:
+    """Laser, barometer, gauge and thermometers with independent noise in each sample.
+
+    Parameters
+    ----------
+    config : TwinConfig
+        Noise and resolution.
+    rng : numpy.random.Generator
+        Source of the noise.
+    """
+
+    def __init__(self, config: TwinConfig, rng: np.random.Generator) -> None:
+        self._config = config
+        self._rng = rng
+        self._counter = 0
+
+    def read(self, truth: Truth, pump_fraction: float, vent_fraction: float) -> PlantSample:
+        """A new sample; the counter advances by one."""
+        config = self._config
+        laser, gauge, ambient, air, gas = self._rng.standard_normal(5).tolist()
+        lost = truth.laser_lost > 0
+        reading_um = truth.displacement_um + truth.laser_bias_um + config.laser_noise_um * laser
+        self._counter += 1
+        return PlantSample(
+            displacement_um=float("nan") if lost else _quantised(reading_um, config.laser_resolution_um),
+            displacement_quality=LASER_NO_LIGHT if lost else LASER_GOOD,
+            gauge_pressure_pa=truth.gauge_pressure_pa + GAUGE_NOISE_PA * gauge,
+            ambient_pressure_pa=truth.ambient_pressure_pa + config.barometer_noise_pa * ambient,
+            air_temperature_c=truth.air_temperature_c + config.thermometer_noise_k * air,
+            gas_temperature_c=truth.gas_temperature_c + config.thermometer_noise_k * gas,
+            pump_fraction=pump_fraction,
+            vent_fraction=vent_fraction,
+            sample_counter=self._counter,
+            device_time_s=truth.time_s,
+        )
+
+
+def _quantised(value: float, resolution: float) -> float:
+    return round(value / resolution) * resolution if resolution > 0 else value

@@ -1,0 +1,1 @@
+"""Runs in virtual time: the same controller on the twin's board."""

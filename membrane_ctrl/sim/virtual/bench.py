@@ -1,0 +1,264 @@
+"""The pump board in virtual time: its registers, its watchdog and its latches around the twin's plant, no wire.
+
+The driver is the one of a real bench; only its link ends in memory. What can go wrong with sensors, link, board and
+actuators is a set of switches (`Wrong`), so that a scenario or a campaign turns them while time runs.
+"""
+
+import contextlib
+import math
+from collections.abc import Coroutine, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+from firmware_iface import register_map, roles
+from firmware_iface.drivers.pump_board import PumpBoard
+from firmware_iface.emulators import board_state, modbus_server
+from firmware_iface.links.modbus_rules import exception_error
+from membrane_ctrl.sim.plant import Plant
+
+T = TypeVar("T")
+_LASER_NO_LIGHT = 1
+
+
+@dataclass(slots=True)
+class Wrong:
+    """What is wrong now; all off at first. Fractions and offsets are NaN or 0 when off.
+
+    Attributes
+    ----------
+    no_light : bool
+        The laser has no reading.
+    laser_offset_um : float
+        It reads this much too much.
+    laser_stuck : bool
+        It repeats its value, with samples that advance.
+    samples_frozen : bool
+        The board answers with the same sample again and again.
+    gauge_lost, barometer_lost, thermometer_lost : bool
+        No value.
+    gauge_offset_pa : float
+        The gauge reads this much too much.
+    gauge_stuck : bool
+        It repeats its value.
+    silent : bool
+        Requests are carried out and not answered.
+    unreachable : bool
+        There is no connection.
+    lost_every : int
+        Every n-th request gets no answer; 0: none is lost.
+    readback_fraction : float
+        What the pump says of itself, whatever it is given.
+    pump_share : float
+        How much of its flow the pump still gives.
+    pump_stuck_fraction, vent_stuck_fraction : float
+        Where the actuator stays, whatever the board wants.
+    stalled : bool
+        The control process does not run: stopped, hung, or starved.
+    late_ms : float
+        Every tick starts so late.
+    dead_task : bool
+        A task of the control process has ended.
+    camera_lost : bool
+        No shape arrives.
+    camera_offset_um : float
+        Shapes show this much more sag.
+    """
+
+    no_light: bool = False
+    laser_offset_um: float = 0.0
+    laser_stuck: bool = False
+    samples_frozen: bool = False
+    gauge_lost: bool = False
+    barometer_lost: bool = False
+    thermometer_lost: bool = False
+    gauge_offset_pa: float = 0.0
+    gauge_stuck: bool = False
+    silent: bool = False
+    unreachable: bool = False
+    lost_every: int = 0
+    readback_fraction: float = math.nan
+    pump_share: float = 1.0
+    pump_stuck_fraction: float = math.nan
+    vent_stuck_fraction: float = math.nan
+    stalled: bool = False
+    late_ms: float = 0.0
+    dead_task: bool = False
+    camera_lost: bool = False
+    camera_offset_um: float = 0.0
+
+
+class VirtualBench:
+    """Plant and board, advanced together; the methods of `roles.Bench`, without waiting.
+
+    Parameters
+    ----------
+    plant : Plant
+        The twin's physics.
+    watchdog_s : float
+        As `devices.watchdog_s`.
+
+    Attributes
+    ----------
+    wrong : Wrong
+        Switches.
+    board : BoardState
+        The board itself: what it gives to pump and vent, and what it has latched.
+    truth : Truth
+        What really was when the board last took its sample, or would have.
+    """
+
+    def __init__(self, plant: Plant, watchdog_s: float = 0.5) -> None:
+        self.plant = plant
+        self.wrong = Wrong()
+        self._sample = self._sampled(None)
+        self.board = board_state.BoardState(register_map.default_map(), self._sample)
+        self._driver = PumpBoard("", watchdog_s=watchdog_s, link=_MemoryLink(self))
+
+    def advance(self, duration_s: float) -> None:
+        """Let time pass: the plant moves, the board samples it, judges it and drives it."""
+        self.plant.advance(duration_s)
+        self._sample = self._sampled(self._sample)
+        self.board.advance(self.plant.time_s, self._sample)
+        self.drive()
+
+    def drive(self) -> None:
+        """Give the actuators what the board wants, as far as they follow."""
+        wrong = self.wrong
+        pump, vent = self.board.pump_fraction * wrong.pump_share, self.board.vent_fraction
+        self.plant.actuate(
+            pump if math.isnan(wrong.pump_stuck_fraction) else wrong.pump_stuck_fraction,
+            vent if math.isnan(wrong.vent_stuck_fraction) else wrong.vent_stuck_fraction,
+        )
+
+    def intrude(self, pump_fraction: float, watchdog_s: float = 10.0) -> str:
+        """Another program claims the board, clears its faults and pumps; what it is told, empty if it was obeyed."""
+        other = PumpBoard("", watchdog_s=watchdog_s, link=_MemoryLink(self))
+        try:
+            _at_once(other.open())
+            _at_once(other.clear_faults(roles.ALL_FAULTS))
+            _at_once(other.write(roles.BenchCommand(pump_fraction, 0.0)))
+        except roles.LinkError as error:
+            return str(error)
+        return ""
+
+    def power_cycle(self) -> None:
+        """The board restarts: outputs off, watchdog off, faults forgotten."""
+        self.board.restart()
+        self.drive()
+
+    def open(self) -> None:
+        """Connect and arm. Raises LinkError."""
+        _at_once(self._driver.open())
+
+    def read(self) -> roles.BenchReading:
+        """One sample. Raises LinkError."""
+        reading = _at_once(self._driver.read())
+        if math.isnan(self.wrong.readback_fraction):
+            return reading
+        return replace(reading, pump_fraction=self.wrong.readback_fraction)
+
+    def write(self, command: roles.BenchCommand) -> None:
+        """Write pump and vent, and feed the watchdog. Raises LinkError."""
+        _at_once(self._driver.write(command))
+
+    def clear_faults(self, mask: int) -> None:
+        """Clear these bits of what the board has latched. Raises LinkError."""
+        _at_once(self._driver.clear_faults(mask))
+
+    def close(self) -> None:
+        """Disarm if the board allows it, and go."""
+        _at_once(self._driver.close())
+
+    def _sampled(self, last: board_state.BoardSample | None) -> board_state.BoardSample:
+        wrong = self.wrong
+        self.truth = self.plant.truth()
+        if wrong.samples_frozen and last is not None:
+            return last
+        sample = self.plant.sample_of(self.truth)
+        displacement_um = sample.displacement_um + wrong.laser_offset_um
+        if wrong.laser_stuck and last is not None:
+            displacement_um = last.displacement_um
+        gauge_pa = sample.gauge_pressure_pa + wrong.gauge_offset_pa
+        if wrong.gauge_stuck and last is not None:
+            gauge_pa = last.gauge_pressure_pa
+        return board_state.BoardSample(
+            displacement_um=math.nan if wrong.no_light else displacement_um,
+            displacement_quality=_LASER_NO_LIGHT if wrong.no_light else sample.displacement_quality,
+            gauge_pressure_pa=math.nan if wrong.gauge_lost else gauge_pa,
+            ambient_pressure_pa=math.nan if wrong.barometer_lost else sample.ambient_pressure_pa,
+            air_temperature_c=math.nan if wrong.thermometer_lost else sample.air_temperature_c,
+            gas_temperature_c=sample.gas_temperature_c,
+            sample_counter=sample.sample_counter,
+            device_time_s=sample.device_time_s,
+        )
+
+
+class _MemoryLink:
+    """A `ModbusLink` that ends at a board in memory: requests take no time."""
+
+    name = "virtual board"
+    retry_in_s = 0.0
+
+    def __init__(self, bench: VirtualBench) -> None:
+        self._bench = bench
+        self._requests = 0
+        self.connected = False
+        self.reconnects = 0
+
+    async def connect(self) -> None:
+        if self._bench.wrong.unreachable:
+            raise roles.LinkDownError(f"{self.name}: no connection")
+        self.connected = True
+
+    async def read_holding(self, address: int, count: int) -> list[int]:
+        self._begin()
+        with _refusals(self.name):
+            words = self._bench.board.read(address, count)
+        self._answer()
+        return words
+
+    async def read_input(self, address: int, count: int) -> list[int]:
+        return await self.read_holding(address, count)
+
+    async def write_register(self, address: int, word: int) -> None:
+        await self.write_registers(address, [word])
+
+    async def write_registers(self, address: int, words: Sequence[int]) -> None:
+        self._begin()
+        with _refusals(self.name):
+            self._bench.board.write(address, words)
+        self._bench.drive()
+        self._answer()
+
+    async def close(self) -> None:
+        self.connected = False
+
+    def _begin(self) -> None:
+        if not self.connected or self._bench.wrong.unreachable:
+            self.connected = False
+            raise roles.LinkDownError(f"{self.name}: the connection is gone")
+
+    def _answer(self) -> None:
+        wrong = self._bench.wrong
+        self._requests += 1
+        if wrong.silent or (wrong.lost_every and self._requests % wrong.lost_every == 0):
+            raise roles.LinkError(f"{self.name}: no answer")
+
+
+@contextlib.contextmanager
+def _refusals(name: str) -> Iterator[None]:
+    """What the board refuses, as a link says it."""
+    try:
+        yield
+    except modbus_server.RegisterRefusal as refusal:
+        raise exception_error(name, refusal.code) from None
+
+
+def _at_once(coroutine: Coroutine[Any, Any, T]) -> T:
+    """The result of a coroutine that waits for nothing. Raises what it raises."""
+    try:
+        coroutine.send(None)
+    except StopIteration as end:
+        result: T = end.value
+        return result
+    raise AssertionError("a link in memory waited")

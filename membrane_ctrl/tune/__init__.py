@@ -1,1 +1,0 @@
-"""The command `tune`: sessions on a running hold or on the twin."""

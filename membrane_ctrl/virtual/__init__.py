@@ -1,1 +1,0 @@
-"""The controller in virtual time: the same tick over the twin, as fast as it goes."""

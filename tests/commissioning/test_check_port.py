@@ -1,0 +1,46 @@
+"""`check` says where a hold could be asked and who would be told, and refuses what a hold would refuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from membrane_ctrl.commissioning.check import check_config
+from membrane_ctrl.config.port import AlarmsConfig, PortConfig, TlsConfig
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.errors import InputError
+
+
+def would(config: Config, capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
+    check_config(config, "lab.toml", as_json=True)
+    found: dict[str, str] = json.loads(capsys.readouterr().out)["would"]
+    return found
+
+
+def test_the_defaults(capsys: pytest.CaptureFixture[str]) -> None:
+    said = would(Config(), capsys)
+    assert said["control port"] == "control.sock beside the run folders"
+    assert said["alarms"] == "nobody is told: no alarms.urls_file"
+
+
+def test_what_is_configured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)  # as if Apprise were installed
+    urls = tmp_path / "urls.txt"
+    urls.write_text("json://localhost\n")
+    port = PortConfig(socket="/run/m.sock", metrics_port=9464)
+    said = would(Config(port=port, alarms=AlarmsConfig(urls_file=str(urls))), capsys)
+    assert said["control port"] == "/run/m.sock, metrics on 127.0.0.1:9464"
+    assert said["alarms"] == f"2 rules besides faults, to those in {urls}"
+    assert would(Config(port=PortConfig(enabled=False)), capsys)["control port"] == "off"
+
+
+def test_files_that_are_not_there(tmp_path: Path) -> None:
+    missing = str(tmp_path / "missing")
+    tls = TlsConfig(certificate_file=missing, key_file=missing, client_ca_file=missing)
+    for config in (Config(port=PortConfig(tls=tls)), Config(alarms=AlarmsConfig(urls_file=missing))):
+        with pytest.raises(InputError, match="missing: no such file"):
+            check_config(config, "lab.toml", as_json=False)

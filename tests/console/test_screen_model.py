@@ -1,0 +1,160 @@
+"""What the screen remembers of what it is sent."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from screen_feed import FAULT, HOLDING, event, rows, shape
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.console.model import ScreenModel, Trend, text
+from membrane_ctrl.model.states import Rung, ShapeState, State
+
+
+def model(duration_s: float | None = None) -> ScreenModel:
+    return ScreenModel(Config(), duration_s)
+
+
+def test_trend_is_the_mean_of_each_second_with_gaps() -> None:
+    trend = Trend()
+    assert all(math.isnan(mean) for mean in trend.means())
+    for mono_s, value in ((1.0, 1.0), (1.5, 3.0), (2.0, math.nan), (3.9, 5.0)):
+        trend.add(mono_s, value)
+    means = trend.means()
+    assert len(means) == 60
+    assert means[-3] == 2.0
+    assert math.isnan(means[-2])
+    assert means[-1] == 5.0
+    assert trend.values() == [1.0, 3.0, 5.0]
+
+
+def test_trend_forgets_after_a_minute_even_across_a_gap() -> None:
+    trend = Trend()
+    trend.add(0.0, 1.0)
+    trend.add(70.0, 2.0)
+    assert trend.values() == [2.0]
+    assert [mean for mean in trend.means() if math.isfinite(mean)] == [2.0]
+
+
+def test_last_minute_of_the_error() -> None:
+    given = model()
+    for row in rows(90.0):
+        given.take_row(row)
+    view = given.view(90.0)
+    errors = [row.error_um for row in rows(90.0) if row.mono_s >= 30.0]
+    mean = sum(errors) / len(errors)
+    assert view.error_mean_um == pytest.approx(mean)
+    assert view.error_std_um == pytest.approx(math.sqrt(sum((e - mean) ** 2 for e in errors) / len(errors)))
+    assert view.in_band_fraction == 1.0
+    assert view.lateness_max_ms == max(row.lateness_ms for row in rows(90.0) if row.mono_s >= 30.0)
+
+
+def test_before_the_first_tick_it_waits() -> None:
+    view = model().view(0.5)
+    assert view.row is None
+    assert "not ticked yet" in view.why
+    assert math.isnan(view.error_mean_um)
+    assert math.isinf(view.left_s)
+
+
+def test_time_in_the_state_and_time_left() -> None:
+    given = model(duration_s=120.0)
+    given.take_row(replace(HOLDING, mono_s=3.0, state=State.SETTLE))
+    given.take_row(replace(HOLDING, mono_s=10.0))
+    given.take_row(replace(HOLDING, mono_s=15.0))
+    view = given.view(15.5)
+    # the run's 120 s count from its first tick
+    assert (view.state, view.state_age_s, view.left_s) == (State.HOLD, 5.5, 107.5)
+    assert given.view(130.0).left_s == 0.0
+
+
+def test_silent_control_loop_is_seen() -> None:
+    given = model()
+    given.take_row(replace(HOLDING, mono_s=3.0))
+    assert given.view(3.9).silent_s == 0.0
+    assert given.view(5.0).silent_s == 2.0
+
+
+def test_fault_stands_until_it_is_cleared_and_is_counted() -> None:
+    given = model()
+    given.take_row(replace(HOLDING, rung=Rung.HOLD_FLOW, fault=30.0))
+    given.take_event(event(0.0, "fault", **FAULT))
+    view = given.view(0.0)
+    assert view.fault == "link lost: the link to the pump board is down (link down)"
+    assert view.remedy.startswith("check cable")
+    assert view.why == f"pump keeps its last mean flow: {view.fault}"
+    given.take_event(event(1.0, "cleared", name="link_lost"))
+    view = given.view(1.0)
+    assert (view.fault, view.remedy, view.faults) == ("", "", 1)
+    assert view.last_fault == "link lost: the link to the pump board is down (link down) at 0 s"
+
+
+def test_told_reason_is_that_of_the_newest_state_or_why() -> None:
+    given = model()
+    given.take_row(replace(HOLDING, state=State.CHECK))
+    given.take_event(event(0.0, "state", state="check", why="entering"))
+    given.take_event(event(0.1, "why", why="checking the sensors: no gauge pressure"))
+    given.take_event(event(0.2, "command", command="hold", why="not a reason for the pump"))
+    assert given.view(0.2).why == "checking the sensors: no gauge pressure"
+
+
+def test_too_tight_is_judged_after_half_a_minute_of_hold() -> None:
+    given = model()
+    given.take_row(replace(HOLDING, leak_um_per_s=0.3))
+    assert not given.view(5.0).too_tight
+    assert given.view(31.0).too_tight
+    given.take_row(replace(HOLDING, leak_um_per_s=0.5))
+    assert not given.view(31.0).too_tight
+    given.take_row(replace(HOLDING, leak_um_per_s=math.nan))
+    assert not given.view(31.0).too_tight
+
+
+def test_sag_change_is_against_the_first_usable_shape_of_the_hold() -> None:
+    given = model()
+    given.take_row(replace(HOLDING, state=State.SETTLE))
+    given.take_shape(shape(sag_um=37000.0))
+    assert math.isnan(given.view(0.0).shape.sag_change_um)
+    given.take_row(HOLDING)
+    given.take_shape(shape(sag_um=30000.0, verdict="rejected", reason="tracking lost"))
+    given.take_shape(shape(sag_um=37100.0))
+    given.take_shape(shape(time_s=4.0, sag_um=37100.5))
+    seen = given.view(6.0).shape
+    assert seen.sag_change_um == pytest.approx(0.5)
+    assert (seen.cycles, seen.rejected, seen.age_s) == (4, 1, 2.0)
+
+
+def test_note_says_what_is_wrong_with_the_shape() -> None:
+    given = model()
+    given.take_row(HOLDING)
+    given.take_shape(shape(verdict="degraded", reason="12 % saturated"))
+    assert given.view(0.0).shape.note == "12 % saturated"
+    given.take_row(replace(HOLDING, shape_state=ShapeState.SUSPENDED))
+    given.take_event(event(0.0, "shape", state="suspended", reason="laser and shape disagree"))
+    assert given.view(0.0).shape.note == "laser and shape disagree"
+    given.take_event(event(0.0, "acquisition", state="retrying", message="camera: no trigger"))
+    assert given.view(0.0).shape.note == "retrying: camera: no trigger"
+    given.take_event(event(0.0, "acquisition", state="running", message="ok"))
+    assert given.view(0.0).shape.note == "laser and shape disagree"
+
+
+def test_end_event_ends() -> None:
+    given = model()
+    assert not given.ended
+    given.take_event(event(0.0, "end", exit=0))
+    assert given.ended
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (FAULT, "link lost: the link to the pump board is down (link down)"),
+        ({"why": "because"}, "because"),
+        ({"reason": "because", "message": "not this"}, "because"),
+        ({"name": "late"}, "late"),
+        ({"exit": 0}, ""),
+    ],
+)
+def test_words_of_an_event(given: dict[str, object], words: str) -> None:
+    assert text(given) == words

@@ -1,0 +1,192 @@
+"""The process on a terminal and off it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pty
+import select
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, redirect_stderr
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from screen_feed import FAULT, event, packed, rows, shape
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.console.process import ScreenSpec, give_back_terminal, screen_main
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.shape_estimate import pack_estimate
+from membrane_ctrl.model.telemetry import ROW_BYTES
+from membrane_ctrl.processes.child import ALIVE, STOP
+from membrane_ctrl.processes.ring import RingWriter, ring
+
+pytestmark = pytest.mark.real_time
+
+PATIENCE_S = 20.0
+
+
+class Run:
+    """Rings with a made-up run in them, and a screen process that shows it."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        telemetry = stack.enter_context(ring(256, ROW_BYTES))
+        events = stack.enter_context(ring(16, 4096))
+        shapes = stack.enter_context(ring(4, 1 << 16))
+        self.spec = ScreenSpec(RunClock.start(), telemetry, events, shapes, Path("logs/demo"), Config(), 60.0)
+        self._telemetry = stack.enter_context(closing(RingWriter(telemetry)))
+        self._events = stack.enter_context(closing(RingWriter(events)))
+        self._shapes = stack.enter_context(closing(RingWriter(shapes)))
+
+    def tick(self) -> None:
+        for row in rows(0.1, self.spec.clock.now()):
+            self._telemetry.put(row.pack())
+        self._shapes.put(pack_estimate(shape()))
+
+    def tell(self, kind: str, **more: object) -> None:
+        self._events.put(packed(event(self.spec.clock.now(), kind, **more)))
+
+    def start(self, stderr: int) -> multiprocessing.process.BaseProcess:
+        process = multiprocessing.get_context("spawn").Process(target=on_stderr, args=(self.spec, os.ttyname(stderr)))
+        process.start()
+        return process
+
+
+def on_stderr(spec: ScreenSpec, path: str) -> None:
+    """Give the screen process a stderr of its own."""
+    os.environ["TERM"] = "xterm-256color"
+    handle = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    os.dup2(handle, 2)
+    sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
+    screen_main(spec)
+
+
+@pytest.fixture
+def run() -> Iterator[Run]:
+    with ExitStack() as stack:
+        yield Run(stack)
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, int]]:
+    ours, theirs = pty.openpty()
+    yield ours, theirs
+    os.close(ours)
+    os.close(theirs)
+
+
+def read_until(handle: int, words: bytes, seen: bytes = b"") -> bytes:
+    while words not in seen:
+        assert select.select([handle], [], [], PATIENCE_S)[0], f"{words!r} never came: {seen[-300:]!r}"
+        seen += os.read(handle, 1 << 16)
+    return seen
+
+
+def finish(process: multiprocessing.process.BaseProcess, handle: int) -> bytes:
+    seen = read_until(handle, b"\x1b[?1049l")  # the first page of the terminal is back
+    process.join(PATIENCE_S)
+    assert process.exitcode == 0
+    return seen
+
+
+def test_terminal_shows_the_run_and_is_given_back_at_the_end(run: Run, terminal: tuple[int, int]) -> None:
+    ours, theirs = terminal
+    run.tick()
+    process = run.start(theirs)
+    read_until(ours, b"faults")
+    run.tell("end", exit=0)
+    assert b"\x1b[?25h" in finish(process, ours)  # the cursor too
+
+
+@pytest.mark.parametrize("number", [STOP, signal.SIGINT])
+def test_terminal_is_given_back_on_a_stop_and_sigint_is_not_for_us(
+    run: Run, terminal: tuple[int, int], number: signal.Signals
+) -> None:
+    ours, theirs = terminal
+    process = run.start(theirs)
+    read_until(ours, b"waiting for the first tick")
+    assert process.pid is not None
+    os.kill(process.pid, number)
+    if number == signal.SIGINT:
+        run.tick()
+        read_until(ours, b"faults")
+        run.tell("end", exit=0)
+    finish(process, ours)
+
+
+def test_plain_lines_and_faults_when_nobody_looks(
+    run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(signal, "signal", lambda number, handler: None)
+    run.tick()
+    run.tell("fault", **FAULT)
+    run.tell("command", command="hold")
+    run.tell("end", exit=5)
+    with redirect_stderr(sys.stdout):
+        screen_main(run.spec)
+    lines = capsys.readouterr().out.splitlines()
+    assert ["FAULT link lost" in lines[0], "END 5" in lines[1], "s  hold" in lines[2]] == [True] * 3
+    assert len(lines) == 3
+
+
+def test_dead_parent_ends_it(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(signal, "signal", lambda number, handler: None)
+    parents = iter([1000, 1000, 1])
+    monkeypatch.setattr(os, "getppid", lambda: next(parents))
+    screen_main(run.spec)
+    assert list(parents) == []
+
+
+def test_reader_that_went_away_is_no_error_and_none_for_who_watches_the_screen(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Gone:
+        def write(self, words: str) -> int:
+            run.tell("end", exit=0)
+            raise BrokenPipeError
+
+        def flush(self) -> None: ...
+
+        def isatty(self) -> bool:
+            return False
+
+    monkeypatch.setattr(signal, "signal", lambda number, handler: None)
+    monkeypatch.setattr(time, "sleep", lambda duration_s: None)
+    run.tick()
+    gone = Gone()
+    monkeypatch.setattr(sys, "stderr", gone)
+    ours, theirs = multiprocessing.Pipe()
+    with ours, theirs:
+        screen_main(run.spec, theirs)
+        assert sys.stderr is gone  # and no exception came out
+
+
+def test_a_screen_that_takes_the_place_of_another_does_not_tell_old_news_again(
+    run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(signal, "signal", lambda number, handler: None)
+    run.tell("fault", **FAULT)
+    time.sleep(0.002)
+    spec = replace(run.spec, since_s=run.spec.clock.now())
+    run.tell("end", exit=0)
+    ours, theirs = multiprocessing.Pipe()
+    with ours, theirs, redirect_stderr(sys.stdout):
+        screen_main(spec, theirs)
+        assert ours.recv()["kind"] == ALIVE
+    told = capsys.readouterr().out
+    assert "END 0" in told
+    assert "FAULT link lost" not in told
+
+
+def test_the_terminal_of_a_killed_screen_is_given_back(
+    terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours, theirs = terminal
+    with open(theirs, "w", closefd=False) as stderr:
+        monkeypatch.setattr(sys, "stderr", stderr)
+        give_back_terminal()
+    assert read_until(ours, b"\x1b[?25h").startswith(b"\x1b[?1049l")

@@ -1,0 +1,168 @@
+"""What is on the screen, and that it fits."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+from screen_feed import FAULT, HOLDING, NOTHING, event, rows, shape
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.console.model import ScreenModel
+from membrane_ctrl.console.process import at_once, event_line, line
+from membrane_ctrl.console.view import full_scale, level_bar, screen, signed_bars
+from membrane_ctrl.console.why import duration, number, percent
+from membrane_ctrl.model.states import Rung, ShapeState, State
+
+CONFIG = Config()
+
+
+def held(duration_s: float | None = 120.0) -> ScreenModel:
+    model = ScreenModel(CONFIG, duration_s)
+    for row in rows(75.0):
+        model.take_row(row)
+    model.take_shape(shape(1.0))
+    model.take_shape(shape(73.8, sag_um=37100.03, cycle=2))
+    return model
+
+
+def drawn(model: ScreenModel, now_s: float = 75.0, width: int = 80) -> list[str]:
+    console = Console(width=width, record=True, file=io.StringIO())
+    console.print(screen(model.view(now_s), CONFIG, "logs/20261121T031200Z-demo"))
+    return console.export_text().rstrip("\n").splitlines()
+
+
+def test_everything_a_person_wants_is_there() -> None:
+    page = "\n".join(drawn(held()))
+    for words in (
+        "hold for 1:15",
+        "pump gives 1.14 um/s: +1.24 leak, -0.11 feed-forward",
+        "within ±2",
+        "truth +0.03 um (laser +0.10)",
+        "29 %, 1.14 of 5.3 um/s",
+        "leak 1.24 um/s  gauge 600.0 Pa  air 1013.25 hPa 20.01 °C",
+        "tracking  trim +0.12 um  sag change +0.030 ± 0.012 um",
+        "ok  1 s ago, fringes, residual 3.1 urad, in 31 ms  0/2 rejected",
+        "worst of the minute",
+        "faults none",
+        "run 1:15, 45 s left · logs/20261121T031200Z-demo",
+    ):
+        assert words in page
+
+
+def test_real_bench_shows_no_truth_and_an_open_run_no_end() -> None:
+    model = held(duration_s=None)
+    model.take_row(replace(HOLDING, mono_s=75.0, truth_displacement_um=math.nan))
+    page = "\n".join(drawn(model))
+    assert "truth" not in page
+    assert "until stopped" in page
+
+
+def everything_wrong() -> ScreenModel:
+    model = held()
+    model.take_event(event(75.0, "fault", **FAULT))
+    model.take_event(
+        event(75.0, "shape", state="suspended", reason="no fresh estimate for 15 s: the last trim is held")
+    )
+    model.take_shape(shape(70.0, verdict="rejected", reason="tracking lost: the film moved by 5 mrad"))
+    model.take_event(event(75.0, "recorder_error", what="recording", message="events.jsonl: No space left " * 20))
+    row = replace(HOLDING, state=State.FAULT, shape_state=ShapeState.SUSPENDED, rung=Rung.VENT, fault=30.0)
+    model.take_row(replace(row, mono_s=75.0, tick=3e6, missed_ticks=12.0, vent_fraction=1.0, leak_um_per_s=0.1))
+    return model
+
+
+@pytest.mark.parametrize("width", [80, 100, 160])
+@pytest.mark.parametrize("wrong", [False, True])
+def test_it_fits(width: int, wrong: bool) -> None:
+    page = drawn(everything_wrong() if wrong else held(), width=width)
+    assert len(page) <= 24
+    assert all(len(row) == width for row in page)
+
+
+def test_fault_and_its_remedy_are_seen() -> None:
+    page = " ".join(" ".join(drawn(everything_wrong())).replace("│", " ").split())
+    assert "pump is off and the vent is open: link lost" in page
+    assert "link lost: the link to the pump board is down (link down); check cable, power and address" in page
+    assert "12 of 3000012 ticks missed" in page
+
+
+def test_trouble_with_the_recording_is_seen_until_it_is_over() -> None:
+    model = held()
+    model.take_event(event(75.0, "disk_low", what="disk", message="less than 500 MB free; delete old runs"))
+    assert any("recorder less than 500 MB free; delete old runs" in row for row in drawn(model))
+    assert line(model.view(75.0)).count("RECORDING less than 500 MB free; delete old runs") == 1
+    model.take_event(event(76.0, "recorder_recovered", what="disk", message="disk works again"))
+    assert not any("recorder" in row for row in drawn(model))
+    assert "RECORDING" not in line(model.view(75.0))
+
+
+def test_silence_is_the_headline() -> None:
+    assert any("the control loop has been silent for 4.0 s" in row for row in drawn(held(), now_s=78.98))
+
+
+def test_before_the_first_tick_and_with_nothing_known() -> None:
+    assert any("waiting for the first tick" in row for row in drawn(ScreenModel(CONFIG)))
+    model = ScreenModel(CONFIG)
+    model.take_row(replace(NOTHING, mono_s=0.0, tick=1.0, missed_ticks=0.0, state=0.0, shape_state=0.0, rung=0.0))
+    assert not any("nan" in row for row in drawn(model))
+    assert "nan" not in line(model.view(0.0))
+
+
+def test_plain_line_has_the_second_in_it() -> None:
+    said = line(held().view(75.0))
+    for words in ("75.0 s  hold", "error", "pump  29 %", "leak 1.24 um/s", "shape tracking ok 1 s", "45 s left"):
+        assert words in said
+    assert "\n" not in said
+    assert "control loop silent for 10.0 s" in line(held().view(84.98))
+    assert line(ScreenModel(CONFIG).view(0.0)).endswith("the control loop has not ticked yet")
+
+
+def test_plain_events() -> None:
+    assert event_line(event(12.345, "fault", **FAULT)) == (
+        "     12.3 s  FAULT link lost: the link to the pump board is down (link down); "
+        "check cable, power and address; the board's watchdog has stopped the pump"
+    )
+    assert event_line(event(1.0, "state", state="hold", why="settled")) == "      1.0 s  STATE hold settled"
+    assert event_line({"kind": "end", "exit": 5}) == "        – s  END 5"
+    assert event_line(event(1.0, "recorder_error", message="a\n  b")) == "      1.0 s  RECORDER_ERROR a b"
+
+
+def test_what_cannot_wait_a_second() -> None:
+    kinds = ("fault", "cleared", "state", "link", "child_ended", "end")
+    kinds += ("recorder_error", "disk_low", "recorder_recovered")
+    assert all(at_once({"kind": kind}) for kind in kinds)
+    assert not any(at_once({"kind": kind}) for kind in ("why", "shape", "command", "start"))
+    assert at_once({"kind": "acquisition", "state": "retrying"})
+    assert not at_once({"kind": "acquisition", "state": "running"})
+
+
+def test_bars_stand_and_hang() -> None:
+    upper, lower = signed_bars([2.0, 0.0, -1.0, math.nan, 3.0], full=2.0, band=2.0)
+    assert upper.plain == "█▁  █"
+    assert lower.plain == "  ▄  "  # the upper half is the bar: it is drawn in reverse
+    assert [span.style for span in upper.spans] == ["green", "green", "red"]
+
+
+@pytest.mark.parametrize(
+    ("largest", "full"), [(0.0, 0.5), (0.4, 0.5), (0.7, 1.0), (1.0, 1.0), (1.1, 2.0), (30.0, 50.0), (51.0, 100.0)]
+)
+def test_full_scale_is_a_round_figure(largest: float, full: float) -> None:
+    assert full_scale([math.nan, -largest], 0.5) == pytest.approx(full)
+
+
+@pytest.mark.parametrize(
+    ("fraction", "bar"), [(0.0, "░░░░"), (0.5, "██░░"), (1.0, "████"), (7.0, "████"), (math.nan, "░░░░")]
+)
+def test_level_bar(fraction: float, bar: str) -> None:
+    assert level_bar(fraction, 4).plain == bar
+
+
+def test_words() -> None:
+    spans_s = (0.9, 59.9, 60.0, 3599.0, 3600.0, 90061.0, math.nan)
+    assert [duration(s) for s in spans_s] == ["0 s", "59 s", "1:00", "59:59", "1:00:00", "1 d 01:01:01", "–"]
+    assert number(-0.125, 2, "um", sign=True) == "-0.12 um"
+    assert number(math.inf, 2, "um") == "–"
+    assert percent(0.254) == "25 %"

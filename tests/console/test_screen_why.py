@@ -1,0 +1,77 @@
+"""The one line."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from screen_feed import HOLDING
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.console.why import why
+from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.telemetry import TelemetryRow
+
+CONFIG = Config()
+
+
+def line(told: str = "", fault: str = "", **changes: float) -> str:
+    return why(replace(HOLDING, **changes), told, fault, CONFIG)
+
+
+def test_hold_names_what_the_flow_is_made_of_largest_first() -> None:
+    assert line() == "pump gives 1.14 um/s: +1.24 leak, -0.11 feed-forward"
+    assert line(p_um_per_s=-2.0, flow_um_per_s=0.0) == ("pump is at 0: -2.00 error, +1.24 leak, -0.11 feed-forward")
+
+
+def test_settle_says_so() -> None:
+    assert line(state=State.SETTLE).startswith("settling: pump gives 1.14 um/s")
+
+
+@pytest.mark.parametrize(
+    ("target_um", "flow_um_per_s", "said"),
+    [
+        (25.0, 5.3, "pump gives 5.30 um/s: filling, 24.9 um to go"),
+        (-25.0, 0.0, "pump is at 0: waiting for the leak, 25.1 um to go"),
+    ],
+)
+def test_inflate_says_how_far(target_um: float, flow_um_per_s: float, said: str) -> None:
+    assert line(state=State.INFLATE, target_um=target_um, flow_um_per_s=flow_um_per_s) == said
+
+
+def test_outside_the_band_says_which_way_and_what_is_done() -> None:
+    assert line(error_um=-6.9, flow_um_per_s=0.0) == (
+        "outside the band: bowl 6.9 um too deep, pump is at 0, only the leak lets it down"
+    )
+    assert line(error_um=6.9, flow_um_per_s=5.3, flow_wanted_um_per_s=9.0) == (
+        "outside the band: bowl 6.9 um too shallow, pump gives 5.30 um/s, all it may give"
+    )
+    assert line(error_um=2.0) == line(error_um=0.0)  # on the edge is inside
+
+
+def test_ladder_names_its_fault() -> None:
+    assert line(rung=Rung.VENT, fault="over pressure") == "pump is off and the vent is open: over pressure"
+    assert line(rung=Rung.HOLD_FLOW, told="laser is back soon").endswith("laser is back soon")
+    assert line(rung=Rung.PUMP_OFF) == "pump is off: a fault is not named"
+
+
+def test_without_a_reading_the_pump_keeps_its_flow() -> None:
+    said = "pump keeps its last mean flow: there is no valid laser reading"
+    assert line(displacement_um=math.nan) == said
+    assert line(state=State.INFLATE, filtered_um=math.nan) == said  # nothing has been filtered yet
+
+
+@pytest.mark.parametrize("state", [State.STANDBY, State.CHECK, State.LOWER, State.FAULT, State.MANUAL, State.TUNE])
+def test_other_states_say_what_the_controller_told_or_what_is_always_true(state: State) -> None:
+    assert line(state=state, told="waiting for the gauge") == "waiting for the gauge"
+    assert line(state=state).startswith("pump is ")
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("rung", Rung)
+def test_there_is_always_a_line(state: State, rung: Rung) -> None:
+    empty = replace(TelemetryRow(*[math.nan] * 35), state=state, rung=rung, flow_um_per_s=0.0)
+    said = why(empty, "", "", CONFIG)
+    assert "pump" in said
+    assert "nan" not in said

@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+from membrane_ctrl.control_port.door import Refusals
+from membrane_ctrl.control_port.session import Helm, Peer, may_not
+from membrane_ctrl.model.events import Event
+
+
+def test_the_first_to_command_has_it_and_the_second_is_told_who() -> None:
+    helm = Helm(600.0)
+    assert helm.holder(0.0) == ""
+    assert helm.claim("unix:ann", False, 0.0) == ""
+    assert "unix:ann" in helm.claim("unix:bob", False, 10.0)
+    assert helm.holder(10.0) == "unix:ann"
+
+
+def test_it_is_taken_over_given_back_or_lapses() -> None:
+    helm = Helm(600.0)
+    helm.claim("unix:ann", False, 0.0)
+    assert helm.claim("unix:bob", True, 1.0) == ""
+    assert helm.holder(1.0) == "unix:bob"
+    helm.release("unix:ann")
+    assert helm.holder(1.0) == "unix:bob", "only who has it gives it back"
+    helm.release("unix:bob")
+    assert helm.holder(1.0) == ""
+    helm.claim("unix:ann", False, 2.0)
+    assert helm.holder(602.0) == "unix:ann"
+    assert helm.holder(602.1) == ""
+    assert helm.claim("unix:bob", False, 602.1) == ""
+
+
+def test_each_command_keeps_it_from_lapsing() -> None:
+    helm = Helm(600.0)
+    for now_s in range(0, 6000, 500):
+        assert helm.claim("unix:ann", False, float(now_s)) == ""
+    assert helm.holder(6000.0) == "unix:ann"
+
+
+def test_roles_are_steps() -> None:
+    assert "takes the role tune; unix:ann has operate" in may_not(Peer("unix:ann", "operate"), "gains")
+    assert may_not(Peer("unix:ann", "operate"), "stop") == ""
+    assert may_not(Peer("unix:ann", "tune"), "stop") == ""
+    assert "takes the role operate" in may_not(Peer("unix:eve", "read"), "stop")
+
+
+def test_a_flood_of_refusals_is_counted_and_not_written() -> None:
+    now_s = 0.0
+    events: list[Event] = []
+    refusals = Refusals(events.append, lambda: now_s)
+    for _ in range(1000):
+        refusals.record("unix:eve", "stop", "no")
+    assert len(events) == 10
+    assert refusals.count == 1000
+    now_s = 10.0
+    refusals.record("unix:eve", "stop", "no")
+    assert events[-1]["and_unrecorded"] == 990
+    now_s = 1e6
+    for _ in range(11):
+        refusals.record("unix:eve", "stop", "no")
+    assert len(events) == 21, "a long silence buys no longer burst"
+    assert "and_unrecorded" not in events[-1]

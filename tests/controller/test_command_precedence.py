@@ -1,0 +1,217 @@
+"""Commands that come in one tick: the safest wins, in every order and in every state."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import itertools
+import math
+from dataclasses import replace
+
+import pytest
+
+from firmware_iface.roles import BenchReading
+from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, StatesConfig
+from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.controller.commands import DOWN, TABLE, Command, Kind, in_order
+from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.controller.safety import MOVING
+from membrane_ctrl.controller.tick import TickInputs, TickOutputs
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.states import Rung, State
+
+DT_S = 0.1
+CONFIG = Config(
+    loop=LoopConfig(rate_hz=1 / DT_S),
+    shape=ShapeConfig(enabled=False),
+    states=StatesConfig(
+        check_s=0.3, actuator_test=False, settle_s=0.3, ramp_down_s=1.0, stay_after_trip=True, vented_pressure_pa=0.0
+    ),
+)
+SPEC = ExperimentSpec.model_validate(
+    {"kind": "relay", "duration_s": 20.0, "holding_flow_um_per_s": 1.24, "laser_um": 1.0}
+)
+LIFTING: tuple[Kind, ...] = ("hold", "manual", "tune", "resume", "ack")
+RISKY: tuple[Kind, ...] = ("hold", "ack", "manual", "resume", "stop", "lower", "vent")
+
+
+def command(kind: Kind) -> Command:
+    values = {"manual": 2.0, "setpoint": 3.0}
+    return Command(
+        kind,
+        "tester",
+        value=values.get(kind, math.nan),
+        text="hands inside",
+        loop=CONFIG.loop if kind == "gains" else None,
+        experiment=SPEC if kind == "tune" else None,
+    )
+
+
+class Mirror:
+    """A controller with a bench on which all is well, unless it is told otherwise."""
+
+    def __init__(self) -> None:
+        self.controller = Controller(CONFIG, zernike_projection())
+        self.ticks = 0
+        self.last: TickOutputs | None = None
+
+    def tick(self, *kinds: Kind, **wrong: float) -> TickOutputs:
+        self.ticks += 1
+        pump = self.last.command.pump_fraction if self.last else 0.0
+        below_um = -1.5 + 1e-3 * (self.ticks % 7)  # inside the band, and so that the loop wants gas
+        reading = BenchReading(
+            below_um, 0, 600.0, 101325.0, 23.0, 23.0, pump, 0.0, self.ticks, DT_S * self.ticks, False, 0
+        )
+        reading = replace(reading, **wrong)  # type: ignore[arg-type]  # numbers all of them
+        inputs = TickInputs(self.ticks * DT_S, DT_S, reading, commands=tuple(command(kind) for kind in kinds))
+        self.last = self.controller.tick(inputs)
+        return self.last
+
+    def until(self, state: State) -> Mirror:
+        for _ in range(60):
+            if self.controller.state == state:
+                return self
+            self.tick()
+        raise AssertionError(f"never in {state.name}")
+
+
+@functools.cache
+def _in(state: State) -> Mirror:
+    mirror = Mirror()
+    mirror.tick()
+    if state == State.STANDBY:
+        return mirror
+    mirror.tick("hold")
+    if state in (State.CHECK, State.INFLATE, State.SETTLE, State.HOLD):
+        return mirror.until(state)
+    mirror.until(State.HOLD)
+    match state:
+        case State.MANUAL | State.TUNE:
+            mirror.tick("manual" if state == State.MANUAL else "tune")
+        case State.LOWER:
+            mirror.tick("vent")
+        case State.FAULT:
+            mirror.tick(latched_faults=4)
+            mirror.until(State.FAULT)
+            mirror.tick()
+    assert mirror.controller.state == state
+    return mirror
+
+
+def in_state(state: State) -> Mirror:
+    return copy.deepcopy(_in(state))
+
+
+def stays_down(mirror: Mirror) -> None:
+    """Whatever is asked for except `ack`, again and again, the pump stays off."""
+    assert mirror.last is not None
+    assert mirror.last.command.pump_fraction == 0.0
+    for kind in ("hold", "manual", "resume", "lower", "hold", "hold", "hold", "hold"):
+        assert mirror.tick(kind).command.pump_fraction == 0.0
+        assert mirror.controller.state not in MOVING | {State.CHECK}
+
+
+@pytest.mark.parametrize("state", State, ids=lambda state: state.name)
+def test_a_latch_wins_over_any_other_command_in_either_order(state: State) -> None:
+    for other in TABLE:
+        for batch in {("latch", other), (other, "latch")}:
+            mirror = in_state(state)
+            mirror.tick(*batch)
+            stays_down(mirror)
+
+
+@pytest.mark.parametrize("state", State, ids=lambda state: state.name)
+def test_a_latch_wins_over_any_two_others_in_every_order(state: State) -> None:
+    for batch in sorted({order for two in itertools.product(RISKY, repeat=2) for order in orders("latch", *two)}):
+        mirror = in_state(state)
+        mirror.tick(*batch)
+        stays_down(mirror)
+
+
+def orders(*kinds: Kind) -> set[tuple[Kind, ...]]:
+    return set(itertools.permutations(kinds))
+
+
+@pytest.mark.parametrize(
+    "state", [State.STANDBY, State.HOLD, State.MANUAL, State.FAULT], ids=lambda state: state.name
+)
+def test_after_a_latch_an_ack_of_its_own_tick_lets_the_mirror_be_held_again(state: State) -> None:
+    """What the tests above would not see: a controller that never inflates again."""
+    mirror = in_state(state)
+    mirror.tick("latch", "ack")
+    for _ in range(10):
+        mirror.tick()
+    mirror.tick("ack")
+    mirror.until(State.STANDBY)
+    mirror.tick("hold")
+    mirror.until(State.HOLD)
+    assert mirror.tick().command.pump_fraction > 0.0
+
+
+def test_a_latch_undoes_an_ack_that_is_still_waiting_for_the_pump_to_stand() -> None:
+    mirror = in_state(State.HOLD)
+    mirror.tick(latched_faults=4)
+    mirror.tick("ack", pump_fraction=0.5)
+    mirror.tick(pump_fraction=0.5)
+    assert mirror.controller.state == State.FAULT
+    mirror.tick("latch", pump_fraction=0.5)
+    for _ in range(5):
+        mirror.tick()
+    assert mirror.controller.state == State.FAULT
+
+
+def test_a_latch_ends_a_ramp_down_at_once() -> None:
+    mirror = in_state(State.HOLD)
+    for _ in range(12):
+        mirror.tick(gauge_pressure_pa=math.nan)
+    assert mirror.last is not None
+    assert mirror.last.row.rung == Rung.RAMP_DOWN
+    assert mirror.last.command.pump_fraction > 0.0
+    assert mirror.tick("latch").command.pump_fraction == 0.0
+
+
+@pytest.mark.parametrize("state", State, ids=lambda state: state.name)
+def test_what_goes_down_wins_over_what_lifts_in_either_order(state: State) -> None:
+    for down, lifting in itertools.product(("vent", "stop", "lower"), LIFTING):
+        answers = []
+        for batch in orders(down, lifting):  # type: ignore[arg-type]  # literals of the table
+            mirror = in_state(state)
+            outputs = mirror.tick(*batch)
+            told = {event["command"]: "refused" in event for event in outputs.events if event["kind"] == "command"}
+            answers.append(told)
+            assert told[lifting] or told[down], batch
+            if not told[down]:
+                assert mirror.controller.state not in MOVING | {State.CHECK}
+        assert answers[0] == answers[1]
+
+
+def test_vent_and_stop_in_one_tick_end_the_run_with_an_open_vent() -> None:
+    for batch in orders("vent", "stop"):
+        mirror = in_state(State.HOLD)
+        mirror.tick(*batch)
+        for _ in range(60):
+            outputs = mirror.tick()
+            assert outputs.command.vent_fraction == 1.0
+            if outputs.finished is not None:
+                break
+        assert outputs.finished is not None
+
+
+def test_a_stop_while_venting_leaves_the_vent_open() -> None:
+    mirror = in_state(State.LOWER)
+    assert mirror.tick("stop").command.vent_fraction == 1.0
+    assert mirror.tick().command.vent_fraction == 1.0
+
+
+def test_a_vent_in_the_tick_of_a_fault_opens_the_vent() -> None:
+    mirror = in_state(State.HOLD)
+    outputs = mirror.tick("vent", latched_faults=4)
+    assert mirror.controller.state == State.FAULT
+    assert outputs.command.vent_fraction == 1.0
+    assert mirror.tick().command.vent_fraction == 1.0
+
+
+def test_the_order_is_the_one_of_the_table_and_else_as_they_came() -> None:
+    kinds: tuple[Kind, ...] = ("hold", "lower", "mark", "stop", "vent", "latch", "ack")
+    ordered = [made.kind for made in in_order(command(kind) for kind in kinds)]
+    assert ordered == [*DOWN, "hold", "mark", "ack"]

@@ -1,0 +1,23 @@
+"""What a command is refused for, before anything is done."""
+
+from __future__ import annotations
+
+import pytest
+
+from membrane_ctrl.config.schema import Config, ShapeConfig
+from membrane_ctrl.controller.commands import TABLE, Command, refusal
+from membrane_ctrl.model.states import State
+
+WITHOUT_SHAPE = Config(shape=ShapeConfig(enabled=False))
+
+
+@pytest.mark.parametrize("state", sorted(TABLE["capture"].states))
+def test_no_picture_is_promised_where_nothing_measures(state: State) -> None:
+    capture = Command("capture", "tester")
+    assert "no camera measures" in refusal(capture, state, WITHOUT_SHAPE)
+    assert refusal(capture, state, Config()) == ""
+
+
+@pytest.mark.parametrize("state", sorted(set(State) - {State.STANDBY, State.FAULT}))
+def test_nothing_is_acknowledged_where_nothing_is_latched(state: State) -> None:
+    assert "ack makes no sense" in refusal(Command("ack", "anybody"), state, Config())

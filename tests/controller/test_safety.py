@@ -1,0 +1,192 @@
+"""Every row of the safety table: one tick short of its N of M nothing happens, at N the fault is there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD
+from membrane_ctrl.config.schema import LimitsConfig
+from membrane_ctrl.controller.safety import TABLE, Observation, Rule, SafetyTable
+from membrane_ctrl.model.states import Rung, State
+
+LIMITS = LimitsConfig()
+GOOD = Observation(
+    link_up=True,
+    reading_age_s=0.0,
+    advance_age_s=0.0,
+    displacement_um=0.0,
+    displacement_valid=True,
+    jumps=0,
+    error_um=0.0,
+    gauge_pressure_pa=600.0,
+    pump_mismatch=0.0,
+    watchdog_tripped=False,
+    board_faults=0,
+    lateness_ms=1.0,
+)
+BAD = {
+    "over_pressure": replace(GOOD, gauge_pressure_pa=LIMITS.gauge_pressure_max_pa + 0.1),
+    "over_displacement": replace(GOOD, displacement_um=LIMITS.displacement_max_um + 0.1),
+    "under_displacement": replace(GOOD, displacement_um=LIMITS.displacement_min_um - 0.1),
+    "tick_error": replace(GOOD, tick_error="ValueError: x"),
+    "dead_task": replace(GOOD, dead_tasks=("socket",)),
+    "link_lost": replace(GOOD, link_up=False),
+    "device_silent": replace(GOOD, reading_age_s=LIMITS.stale_s + 0.01),
+    "watchdog_tripped": replace(GOOD, watchdog_tripped=True),
+    "board_fault": replace(GOOD, board_faults=4),
+    "pump_mismatch": replace(GOOD, pump_mismatch=0.2),
+    "displacement_frozen": replace(GOOD, advance_age_s=LIMITS.stale_s + 0.01),
+    "laser_implausible": replace(GOOD, laser_lies="laser +30 um, camera 0 um, gauge 0 um"),
+    "displacement_stuck": replace(GOOD, same_s=LIMITS.stuck_s + 0.01),
+    "laser_gauge_apart": replace(GOOD, laser_gauge_apart="laser +0 um, gauge +40 um"),
+    "gauge_stuck": replace(GOOD, gauge_same_s=LIMITS.gauge_stuck_s + 0.01),
+    "gas_excess": replace(GOOD, gas_excess="3.2 um/s, before 1.2 um/s"),
+    "gauge_jump": replace(GOOD, gauge_jumps=1),
+    "displacement_jump": replace(GOOD, jumps=1),
+    "displacement_missing": replace(GOOD, displacement_valid=False),
+    "pressure_missing": replace(GOOD, gauge_pressure_pa=math.nan),
+    "following_error": replace(GOOD, error_um=-LIMITS.following_error_max_um - 0.1),
+    "overdue": replace(GOOD, overdue="waited too long"),
+    "actuator_test": replace(GOOD, unfit="the vent does nothing"),
+    "pump_runs_on": replace(GOOD, runs_on="read-back 100 %"),
+    "gas_comes_in": replace(GOOD, inflow="+40 um in 20 s"),
+    "board_taken": replace(GOOD, foreign=FOREIGN_PERIOD),
+    "locked": replace(GOOD, locked="hands inside"),
+    "late": replace(GOOD, lateness_ms=LIMITS.lateness_max_ms + 1),
+}
+
+
+def judge_alone(rule: Rule) -> SafetyTable:
+    return SafetyTable(LIMITS, (rule,))
+
+
+def test_every_rule_has_a_case_here() -> None:
+    assert {rule.name for rule in TABLE} == set(BAD)
+
+
+def test_codes_and_names_are_unique() -> None:
+    assert len({rule.code for rule in TABLE}) == len({rule.name for rule in TABLE}) == len(TABLE)
+
+
+@pytest.mark.parametrize("state", State)
+def test_a_good_observation_trips_nothing(state: State) -> None:
+    table = SafetyTable(LIMITS)
+    for _ in range(200):
+        assert table.judge(state, GOOD).rule is None
+
+
+@pytest.mark.parametrize("rule", TABLE, ids=lambda rule: rule.name)
+def test_one_less_than_needed_is_nothing_and_needed_is_the_fault(rule: Rule) -> None:
+    table = judge_alone(rule)
+    state = State.HOLD if State.HOLD in rule.states else next(iter(rule.states))
+    for _ in range(rule.needed - 1):
+        assert table.judge(state, BAD[rule.name]).rule is None
+    verdict = table.judge(state, BAD[rule.name])
+    assert verdict.rule is rule
+
+
+@pytest.mark.parametrize("rule", [r for r in TABLE if r.needed > 1], ids=lambda rule: rule.name)
+def test_bad_ticks_further_apart_than_the_window_are_nothing(rule: Rule) -> None:
+    table = judge_alone(rule)
+    for _ in range(3 * rule.needed):
+        assert table.judge(State.HOLD, BAD[rule.name]).rule is None
+        for _ in range(rule.window):
+            assert table.judge(State.HOLD, GOOD).rule is None
+
+
+@pytest.mark.parametrize("rule", TABLE, ids=lambda rule: rule.name)
+def test_a_state_where_a_rule_does_not_apply_forgets_its_history(rule: Rule) -> None:
+    elsewhere = next((s for s in State if s not in rule.states), None)
+    if elsewhere is None:
+        assert rule.rung == Rung.VENT  # only what vents is judged in every state
+        return
+    table = judge_alone(rule)
+    for _ in range(rule.window * 2):
+        assert table.judge(elsewhere, BAD[rule.name]).rule is None
+
+
+def test_the_first_row_of_the_table_wins() -> None:
+    table = SafetyTable(LIMITS)
+    both = replace(BAD["link_lost"], gauge_pressure_pa=2000.0)
+    table.judge(State.HOLD, both)
+    rule = table.judge(State.HOLD, both).rule
+    assert rule is not None
+    assert rule.name == "over_pressure"
+
+
+def test_not_a_number_is_never_fine() -> None:
+    table = SafetyTable(LIMITS)
+    lost = replace(GOOD, displacement_um=math.nan, displacement_valid=False)
+    rules = [table.judge(State.HOLD, lost).rule for _ in range(3)]
+    assert rules[-1] is not None
+    assert rules[-1].rung == Rung.HOLD_FLOW
+
+
+def test_what_the_operator_is_told_carries_the_value() -> None:
+    table = SafetyTable(LIMITS)
+    table.judge(State.HOLD, BAD["over_pressure"])
+    assert table.judge(State.HOLD, BAD["over_pressure"]).seen == "750.1 Pa"
+
+
+@pytest.mark.parametrize("state", [state for state in State if state != State.FAULT])
+@pytest.mark.parametrize(
+    ("foreign", "seen"),
+    [
+        (FOREIGN_CLAIM, "another claim is in force"),
+        (FOREIGN_PERIOD, "another watchdog period is in force"),
+        (FOREIGN_CLAIM | FOREIGN_PERIOD, "another claim is in force and another watchdog period is in force"),
+    ],
+)
+def test_a_board_that_is_not_as_it_was_set_is_a_fault_in_the_same_tick(state: State, foreign: int, seen: str) -> None:
+    verdict = SafetyTable(LIMITS).judge(state, replace(GOOD, foreign=foreign))
+    assert verdict.rule is not None
+    assert (verdict.rule.name, verdict.rule.may_resume, verdict.seen) == ("board_taken", False, seen)
+
+
+UNSEEN = {
+    "over_pressure": replace(GOOD, gauge_pressure_pa=math.nan),
+    "over_displacement": replace(GOOD, displacement_um=math.nan, displacement_valid=False),
+    "under_displacement": replace(GOOD, displacement_um=math.nan, displacement_valid=False),
+    "following_error": replace(GOOD, error_um=math.nan),
+    "pressure_missing": replace(GOOD, gauge_pressure_pa=math.nan, reading_age_s=0.02),
+}
+
+
+@pytest.mark.parametrize("name", UNSEEN)
+def test_ticks_that_show_nothing_are_left_out_of_the_window(name: str) -> None:
+    rule = next(rule for rule in TABLE if rule.name == name)
+    table = judge_alone(rule)
+    for _ in range(rule.needed - 1):
+        assert table.judge(State.HOLD, BAD[name]).rule is None
+        for _ in range(rule.window):
+            assert table.judge(State.HOLD, UNSEEN[name]).rule is None
+    assert table.judge(State.HOLD, BAD[name]).rule is rule
+
+
+def test_a_visit_to_another_state_forgets_what_was_seen_before() -> None:
+    table = SafetyTable(LIMITS)
+    rule = next(rule for rule in TABLE if rule.name == "following_error")
+    for _ in range(rule.needed - 1):
+        table.judge(State.HOLD, BAD[rule.name])
+    table.judge(State.STANDBY, GOOD)
+    assert table.judge(State.HOLD, BAD[rule.name]).rule is None
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("name", ["over_pressure", "over_displacement"])
+def test_what_must_never_be_passed_opens_the_vent_in_every_state(name: str, state: State) -> None:
+    table = SafetyTable(LIMITS)
+    table.judge(state, BAD[name])
+    rule = table.judge(state, BAD[name]).rule
+    assert rule is not None
+    assert (rule.name, rule.rung) == (name, Rung.VENT)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_mirror_may_be_far_from_its_setpoint_on_neither_side(side: float) -> None:
+    table = SafetyTable(LIMITS)
+    far = replace(GOOD, error_um=side * (LIMITS.following_error_max_um + 0.1))
+    assert any(table.judge(State.HOLD, far).rule is not None for _ in range(100))

@@ -1,0 +1,245 @@
+"""The controller's state `tune` on the twin in virtual time: experiments, their ends, and gains on trial."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, TwinConfig
+from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.controller.commands import Command, refusal
+from membrane_ctrl.controller.tick import RECORD, pack_tick, unpack_tick
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.states import State
+from membrane_ctrl.sim.events import AmbientChange
+from membrane_ctrl.sim.events import Event as TwinEvent
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.virtual.bench import VirtualBench
+from membrane_ctrl.sim.virtual.run import VirtualRun
+
+CONFIG = Config(twin=TwinConfig(scenario="quiet", start_error_um=-5.0), shape=ShapeConfig(enabled=False))
+BEGIN_S = 40.0
+
+
+def spec(**changed: Any) -> ExperimentSpec:
+    base: dict[str, Any] = {"kind": "relay", "duration_s": 20.0, "holding_flow_um_per_s": 1.24, "laser_um": 1.0}
+    return ExperimentSpec.model_validate(base | changed)
+
+
+def tune(**changed: Any) -> Command:
+    return Command("tune", "tester", experiment=spec(**changed), number=7)
+
+
+class Held:
+    """A twin in hold since a while."""
+
+    def __init__(self, config: Config = CONFIG, twin_events: tuple[TwinEvent, ...] = ()) -> None:
+        self.bench = VirtualBench(Plant(config.twin, config.pump, twin_events))
+        self._run = VirtualRun(config, self.bench, zernike_projection())
+        self.events: list[Event] = []
+        self.rows: list[Any] = []
+        self.go(BEGIN_S, Command("hold", "tester"))
+        assert self.state == State.HOLD
+
+    @property
+    def state(self) -> float:
+        return float(self.rows[-1].state)
+
+    def go(self, duration_s: float, *commands: Command) -> None:
+        for _ in range(round(duration_s * CONFIG.loop.rate_hz)):
+            tick = self._run.tick(commands)
+            commands = ()
+            if tick is not None:
+                self.rows.append(tick.row)
+                self.events += [{**event, "mono_s": tick.row.mono_s} for event in tick.events]
+
+    def until_hold(self, at_most_s: float) -> None:
+        self.go(0.02)
+        for _ in range(round(at_most_s)):
+            if self.state != State.TUNE:
+                return
+            self.go(1.0)
+        pytest.fail("the experiment did not end")
+
+    def of(self, kind: str) -> list[Mapping[str, Any]]:
+        return [event for event in self.events if event["kind"] == kind]
+
+    def furthest_um(self, since_s: float) -> float:
+        return float(max(abs(row.truth_displacement_um) for row in self.rows if row.mono_s >= since_s))
+
+
+@pytest.mark.parametrize("kind", ["relay", "steps", "doublets", "multisine"])
+def test_an_experiment_moves_the_mirror_within_its_limit_and_gives_it_back(kind: str) -> None:
+    held = Held()
+    held.go(0.1, tune(kind=kind))
+    assert held.state == State.TUNE
+    held.until_hold(40.0)
+    assert held.of("experiment")[-1] | {"mono_s": 0, "reason": ""} == {
+        "kind": "experiment", "experiment": kind, "completed": True, "reason": "", "mono_s": 0,
+    }  # fmt: skip
+    assert 1.0 < held.furthest_um(BEGIN_S) < 10.0
+    held.go(30.0)
+    assert held.state == State.HOLD
+    assert held.furthest_um(held.rows[-1].mono_s - 5.0) < 2.0
+
+
+def test_the_pump_map_comes_back_as_a_result() -> None:
+    held = Held()
+    held.go(0.1, tune(kind="pump_map", duration_s=900.0))
+    held.until_hold(900.0)
+    told = held.of("experiment")[-1]
+    assert told["completed"], told["reason"]
+    assert told["pump_map"]["start_fraction"] == pytest.approx(0.22, abs=0.03)
+    assert told["pump_map"]["leak_um_per_s"] == pytest.approx(1.24, abs=0.1)
+    held.go(30.0)
+    assert held.furthest_um(held.rows[-1].mono_s - 5.0) < 2.0
+
+
+def test_a_pump_map_that_takes_too_long_is_ended() -> None:
+    held = Held()
+    held.go(0.1, tune(kind="pump_map", duration_s=10.0))
+    held.until_hold(12.0)
+    assert "not done within 10 s" in held.of("experiment")[-1]["reason"]
+
+
+def test_a_door_ends_it_and_the_mirror_is_held() -> None:
+    held = Held(twin_events=(AmbientChange(BEGIN_S + 5.0, -30.0),))
+    held.go(0.1, tune())
+    held.until_hold(30.0)
+    assert "something else moved the mirror" in held.of("experiment")[-1]["reason"]
+    held.go(40.0)
+    assert held.state == State.HOLD
+    assert held.furthest_um(held.rows[-1].mono_s - 5.0) < 2.0
+
+
+def test_a_lost_laser_ends_it_at_the_holding_flow() -> None:
+    held = Held()
+    held.go(5.0, tune())
+    held.bench.wrong.no_light = True
+    held.go(3.0)
+    assert held.state == State.HOLD
+    assert not held.of("experiment")[-1]["completed"]
+    assert held.rows[-1].flow_um_per_s == pytest.approx(1.24, abs=0.3)  # less the weather
+    held.bench.wrong.no_light = False
+    held.go(30.0)
+    assert held.furthest_um(held.rows[-1].mono_s - 5.0) < 2.0
+
+
+def test_a_laser_that_is_distrusted_ends_it_although_it_reads() -> None:
+    held = Held()
+    held.go(5.0, tune(duration_s=60.0))
+    held.bench.wrong.laser_stuck = True
+    held.go(CONFIG.limits.stuck_s + 1.0)
+    assert held.state == State.HOLD
+    assert not held.of("experiment")[-1]["completed"]
+
+
+@pytest.mark.parametrize(("kind", "state"), [("hold", State.HOLD), ("lower", State.STANDBY), ("vent", State.LOWER)])
+def test_whoever_operates_ends_it(kind: Any, state: State) -> None:
+    held = Held()
+    held.go(4.0, tune())
+    held.go(3.0, Command(kind, "operator"))
+    assert held.state == state
+    assert "operator" in held.of("experiment")[-1]["reason"]
+    held.go(2.0)
+    assert held.state != State.TUNE  # it does not come back by itself
+
+
+def test_a_fault_ends_it_and_it_is_not_resumed() -> None:
+    held = Held()
+    held.go(4.0, tune())
+    held.bench.wrong.gauge_offset_pa = 500.0
+    held.go(1.0)
+    assert held.state == State.FAULT
+    assert "fault" in held.of("experiment")[-1]["reason"]  # the board's own limit is the first to see it
+
+
+def test_an_experiment_asked_for_in_the_tick_of_a_fault_never_runs() -> None:
+    held = Held()
+    held.bench.wrong.gauge_offset_pa = 500.0
+    held.go(0.02)
+    held.go(1.0, tune())
+    assert held.state == State.FAULT
+    assert not held.of("experiment")
+
+
+def test_it_runs_in_hold_only() -> None:
+    assert "in hold" in refusal(tune(), State.SETTLE, CONFIG)
+    assert refusal(tune(), State.HOLD, CONFIG) == ""
+    assert refusal(Command("tune", "tester"), State.HOLD, CONFIG) == "tune without an experiment"
+
+
+def test_without_room_for_it_the_command_is_refused_with_the_remedy() -> None:
+    held = Held()
+    held.go(0.1, tune(kind="doublets", holding_flow_um_per_s=0.1))
+    assert held.state == State.HOLD
+    assert "open the bleed" in held.of("command")[-1]["refused"]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"limit_um": 99.0}, {"limit_um": math.nan}, {"duration_s": 1e5}, {"kind": "jump"}, {"version": 2}],
+)
+def test_an_experiment_without_bounds_does_not_exist(changed: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        spec(**changed)
+
+
+def gains(kp_per_s: float, trial_s: float = float("nan")) -> Command:
+    return Command("gains", "tester", loop=CONFIG.loop.model_copy(update={"kp_per_s": kp_per_s}), value=trial_s)
+
+
+def kp_of(held: Held) -> float:
+    """P over the error that it answers: the gain that the loop really has."""
+    rows = [row for row in held.rows[-200:] if abs(row.error_um) > 0.02]
+    return float(np.median([row.p_um_per_s / row.error_um for row in rows]))
+
+
+def test_gains_on_trial_go_back_by_themselves() -> None:
+    held = Held()
+    held.go(10.0, gains(0.3, 12.0))
+    assert kp_of(held) == pytest.approx(0.3, rel=0.02)
+    held.go(8.0)
+    assert held.of("gains_reverted")[-1]["why"] == "nobody has kept them in time"
+    assert kp_of(held) == pytest.approx(CONFIG.loop.kp_per_s, rel=0.02)
+
+
+def test_gains_that_are_kept_stay_and_are_what_the_next_trial_goes_back_to() -> None:
+    held = Held()
+    held.go(5.0, gains(0.3, 6.0))
+    held.go(5.0, Command("keep", "tester"))
+    assert not held.of("gains_reverted")
+    held.go(10.0, gains(0.9, 4.0))
+    assert kp_of(held) == pytest.approx(0.3, rel=0.02)
+
+
+def test_a_fault_takes_gains_on_trial_back() -> None:
+    held = Held()
+    held.go(2.0, gains(0.3, 600.0))
+    held.bench.wrong.gauge_offset_pa = 500.0
+    held.go(1.0)
+    assert "fault" in held.of("gains_reverted")[-1]["why"]
+
+
+def test_a_trial_of_no_time_is_refused() -> None:
+    assert "on trial" in refusal(gains(0.3, 0.0), State.HOLD, CONFIG)
+
+
+def test_the_command_survives_its_record() -> None:
+    """A replay gets the experiment that the run got."""
+    held = Held()
+    run = held._run
+    inputs = replace(run._inputs(held.bench.read(), (tune(), gains(0.3, 5.0))), truth_displacement_um=0.0)
+    outputs = run._controller.tick(inputs)
+    messages = pack_tick(1, inputs, outputs, outputs.row.pack())
+    tail = b"".join(message[1:] for message in messages[:-1])
+    again = unpack_tick(np.frombuffer(messages[-1][1:], dtype=RECORD)[0], tail, {})
+    assert again.commands[0].experiment == inputs.commands[0].experiment
+    assert isinstance(again.commands[1].loop, LoopConfig)

@@ -1,0 +1,138 @@
+"""What the board itself has latched when a hold begins: refused, waited for, or cleared as the resume rule allows."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+import pytest_asyncio
+
+from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import PumpBoardEmulator
+from firmware_iface.register_map import default_map
+from membrane_ctrl.config.devices import DevicesConfig
+from membrane_ctrl.config.schema import Config, ResumeConfig
+from membrane_ctrl.hold.start import BoardAtStart, HoldOptions, _identify, _latched
+from membrane_ctrl.instruments.bench import connect, open_bench
+from membrane_ctrl.model.errors import DeviceError
+from membrane_ctrl.run_files.latched_fault import NAME, LatchedFile, ResumeLog
+
+WATCHDOG, OVER_PRESSURE = (default_map().fault_mask(name) for name in ("watchdog", "over_pressure"))
+
+
+class Still:
+    """A plant on which nothing happens."""
+
+    def sample(self) -> BoardSample:
+        return BoardSample(0.0, 0, 600.0, 101325.0, 23.0, 21.0, 1, 0.0)
+
+    def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
+        assert pump_fraction == 0.0
+
+
+@pytest_asyncio.fixture
+async def board() -> AsyncIterator[PumpBoardEmulator]:
+    emulator = PumpBoardEmulator(Still())
+    await emulator.start()
+    yield emulator
+    await emulator.stop()
+
+
+def options(standby: bool = False, clear_faults: bool = False) -> HoldOptions:
+    return HoldOptions(Config(), "lab.toml", False, None, "test", None, clear_faults, False, standby)
+
+
+async def identified(
+    board: PumpBoardEmulator, asked: HoldOptions, resumes: tuple[str, ...] = (), log: ResumeLog | None = None
+) -> BoardAtStart:
+    devices = DevicesConfig(board=f"tcp://127.0.0.1:{board.port}")
+    config = Config(devices=devices, resume=ResumeConfig(faults=resumes, most_per_day=2))
+    return await _identify(open_bench(devices), config, asked, log)
+
+
+async def test_a_board_without_faults_is_taken(board: PumpBoardEmulator) -> None:
+    assert await identified(board, options()) == BoardAtStart()
+
+
+async def test_a_latched_board_is_refused_and_in_standby_waited_for(board: PumpBoardEmulator) -> None:
+    board.state._latch(OVER_PRESSURE)
+    with pytest.raises(DeviceError, match=f"latched faults {OVER_PRESSURE:#x}.*--clear-faults"):
+        await identified(board, options())
+    assert f"{OVER_PRESSURE:#x}" in (await identified(board, options(standby=True))).latched
+    assert await identified(board, options(clear_faults=True)) == BoardAtStart()
+    assert await identified(board, options()) == BoardAtStart()
+
+
+async def test_the_watchdogs_own_trip_is_cleared_only_if_the_resume_rule_names_it(board: PumpBoardEmulator) -> None:
+    board.state._latch(WATCHDOG)
+    with pytest.raises(DeviceError, match="latched"):
+        await identified(board, options(), ("link_lost",))
+    found = await identified(board, options(), ("watchdog_tripped",))
+    assert (found.latched, "watchdog" in found.cleared) == ("", True)
+    assert await identified(board, options()) == BoardAtStart()
+
+
+@pytest.mark.parametrize("other", [OVER_PRESSURE, default_map().fault_mask("stopped")])
+async def test_the_watchdog_beside_another_fault_is_not_cleared(board: PumpBoardEmulator, other: int) -> None:
+    board.state._latch(WATCHDOG | other)
+    with pytest.raises(DeviceError, match="latched"):
+        await identified(board, options(), ("watchdog_tripped",))
+
+
+async def test_a_watchdog_that_stopped_a_venting_board_is_not_cleared(board: PumpBoardEmulator) -> None:
+    """The controller before this one was killed while it vented; the board leaves the vent as it was."""
+    board.state._settable["vent_command_fraction"] = 1.0
+    board.state._latch(WATCHDOG)
+    with pytest.raises(DeviceError, match="latched"):
+        await identified(board, options(), ("watchdog_tripped",))
+
+
+async def test_starts_that_clear_the_watchdog_use_up_the_number(board: PumpBoardEmulator, tmp_path: Path) -> None:
+    for _ in range(2):
+        board.state._latch(WATCHDOG)
+        assert (await identified(board, options(), ("watchdog_tripped",), ResumeLog(tmp_path))).cleared
+    board.state._latch(WATCHDOG)
+    with pytest.raises(DeviceError, match="latched"):
+        await identified(board, options(), ("watchdog_tripped",), ResumeLog(tmp_path))
+
+
+async def test_a_clearing_that_cannot_be_counted_is_not_done(board: PumpBoardEmulator, tmp_path: Path) -> None:
+    board.state._latch(WATCHDOG)
+    with pytest.raises(DeviceError, match="latched"):
+        await identified(board, options(), ("watchdog_tripped",), ResumeLog(tmp_path / "nowhere"))
+
+
+@pytest.mark.parametrize("standby", [False, True])
+def test_clear_faults_clears_the_file_in_standby_as_well(tmp_path: Path, standby: bool) -> None:
+    (tmp_path / NAME).write_text("{")
+    file = _latched(Config(), tmp_path, options(standby, clear_faults=True))
+    assert file is not None
+    assert LatchedFile(tmp_path).read() is None
+
+
+def test_a_latched_fault_that_cannot_be_cleared_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / NAME).mkdir()
+    with pytest.raises(DeviceError, match=r"cannot be cleared.*by hand"):
+        _latched(Config(), tmp_path, options(clear_faults=True))
+
+
+async def test_a_board_that_is_not_there_is_told_by_why_it_could_not_be_reached(
+    monkeypatch: pytest.MonkeyPatch, unused_tcp_port: int
+) -> None:
+    monkeypatch.setattr("membrane_ctrl.instruments.bench._PATIENCE_S", 0.05)
+    monkeypatch.setattr("membrane_ctrl.instruments.bench._PAUSE_S", 0.0)
+    devices = DevicesConfig(board=f"tcp://127.0.0.1:{unused_tcp_port}")
+    with pytest.raises(DeviceError) as caught:
+        await connect(open_bench(devices), devices)
+    reason = "no connection; is the device on, and is this its address?"
+    assert str(caught.value) == f"tcp://127.0.0.1:{unused_tcp_port}: {reason}"
+
+
+@pytest.mark.parametrize("content", ["{", '{"schema": "another"}'])
+def test_a_latched_fault_keeps_the_next_hold_down_and_standby_waits(tmp_path: Path, content: str) -> None:
+    (tmp_path / NAME).write_text(content)
+    with pytest.raises(DeviceError, match=r"a fault is latched.*--clear-faults"):
+        _latched(Config(), tmp_path, options())
+    assert _latched(Config(), tmp_path, options(standby=True)) is not None
+    assert (tmp_path / NAME).read_text() == content

@@ -1,0 +1,35 @@
+"""What `hold` says at its end of a run folder that is not what it was."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from membrane_ctrl.hold.start import _report
+
+
+def words(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    _report(run_dir, as_json=False)
+    return capsys.readouterr().err
+
+
+def test_a_folder_that_is_gone_is_not_offered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = words(tmp_path / "run", capsys)
+    assert "removed or moved" in said
+    assert "rerun" not in said
+    assert "still readable" not in said
+
+
+def test_a_folder_begun_anew_says_from_when(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "summary.json").write_text(json.dumps({"recorder": {"folder_anew_s": 13.44}}))
+    assert "begins at 13.4 s" in words(tmp_path, capsys)
+    (tmp_path / "summary.json").write_text(json.dumps({"recorder": {"folder_anew_s": None}}))
+    assert "begins at" not in words(tmp_path, capsys)
+
+
+def test_only_a_recording_that_is_there_is_offered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "open it" not in words(tmp_path, capsys)
+    (tmp_path / "hold-000.rrd").touch()
+    assert f"open it:    rerun {tmp_path}/*.rrd" in words(tmp_path, capsys)

@@ -1,0 +1,45 @@
+"""A latched fault in standby: no hold before somebody has acknowledged it."""
+
+from __future__ import annotations
+
+from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, TwinConfig
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.states import State
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.virtual.bench import VirtualBench
+from membrane_ctrl.sim.virtual.run import VirtualRun
+
+CONFIG = Config(
+    loop=LoopConfig(rate_hz=10.0), twin=TwinConfig(scenario="calm"), shape=ShapeConfig(enabled=False)
+)  # fmt: skip
+
+
+def refusals(run: VirtualRun, *commands: Command) -> list[str]:
+    tick = run.tick(commands)
+    assert tick is not None
+    return [str(event.get("refused", "")) for event in tick.events if event["kind"] == "command"]
+
+
+def test_hold_is_refused_until_the_fault_is_acknowledged() -> None:
+    run = VirtualRun(CONFIG, VirtualBench(Plant(CONFIG.twin, CONFIG.pump)), zernike_projection())
+    assert refusals(run, Command("latch", "command line", text="over_pressure: 801 Pa")) == [""]
+    (refused,) = refusals(run, Command("hold", "night shift"))
+    assert "over_pressure: 801 Pa" in refused
+    for _ in range(50):
+        tick = run.tick()
+        assert tick is not None
+        assert tick.row.state == State.STANDBY
+        assert tick.row.pump_fraction == 0.0
+    assert refusals(run, Command("ack", "engineer"), Command("hold", "engineer")) == ["", ""]
+    tick = run.tick()
+    assert tick is not None
+    assert tick.row.state == State.CHECK
+
+
+def test_a_person_can_lock_the_mirror() -> None:
+    run = VirtualRun(CONFIG, VirtualBench(Plant(CONFIG.twin, CONFIG.pump)), zernike_projection())
+    assert refusals(run, Command("latch", "engineer")) == [""]
+    (refused,) = refusals(run, Command("hold", "somebody"))
+    assert "locked by engineer" in refused
+    assert refusals(run, Command("ack", "engineer"), Command("hold", "engineer")) == ["", ""]

@@ -1,0 +1,145 @@
+"""A post is filled again: at once, then later and later, not for ever."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from typing import Any
+
+import pytest
+
+from membrane_ctrl.hold.child_processes import Post
+from membrane_ctrl.processes.child import alive
+
+
+class FakeChild:
+    """A child that ends when told to."""
+
+    name = "recorder"
+
+    def __init__(self) -> None:
+        self.alive = False
+        self.exit_code: int | None = None
+
+    def start(self) -> None:
+        self.alive = True
+
+    def kill(self) -> None:
+        self.alive, self.exit_code = False, -9
+
+
+class Agency:
+    """Makes fake children and keeps the other ends of their pipes."""
+
+    def __init__(self) -> None:
+        self.numbers: list[int] = []
+        self.theirs: list[Connection] = []
+
+    def make(self, number: int) -> Any:
+        ours, theirs = Pipe()
+        self.numbers.append(number)
+        self.theirs.append(theirs)
+        return FakeChild(), ours
+
+
+def kinds(events: list[dict[str, Any]]) -> list[str]:
+    return [event["kind"] for event in events]
+
+
+def make_post() -> tuple[Post, Agency]:
+    agency = Agency()
+    post = Post(agency.make)
+    post.start(0.0)
+    return post, agency
+
+
+def test_what_the_child_says_is_handed_on() -> None:
+    post, agency = make_post()
+    agency.theirs[0].send({"kind": "disk_low"})
+    assert post.look(0.0) == [{"kind": "disk_low"}]
+    assert post.look(0.5) == []
+
+
+def test_a_word_reaches_the_child_that_is_there_and_no_other() -> None:
+    post, agency = make_post()
+    assert post.send("capture")
+    assert agency.theirs[0].recv() == "capture"
+    post.child.kill()
+    assert not post.send("capture")
+
+
+def test_a_dead_child_is_replaced_at_once_and_told() -> None:
+    post, agency = make_post()
+    agency.theirs[0].send({"kind": "last words"})
+    post.child.kill()
+    assert kinds(post.look(3.0)) == ["last words", "child_ended", "child_restarted"]
+    assert agency.numbers == [0, 1]
+    assert post.child.alive
+    agency.theirs[1].send({"kind": "hello"})
+    assert kinds(post.look(3.5)) == ["hello"]
+
+
+def test_the_next_ones_come_later_and_later_and_no_more_than_ten_an_hour() -> None:
+    post, _ = make_post()
+    said: list[str] = []
+    restarted_s = []
+    for half_second in range(2 * 3600):
+        if post.child.alive:
+            post.child.kill()
+        events = kinds(post.look(0.5 * half_second))
+        said += events
+        if "child_restarted" in events:
+            restarted_s.append(0.5 * half_second)
+    waits = [later - before for before, later in pairwise(restarted_s)]
+    assert len(restarted_s) == 10
+    assert waits == sorted(waits)
+    assert waits[0] <= 2.0
+    assert waits[-1] >= 60.0
+    assert said.count("child_given_up") == 1
+    assert said.count("child_ended") == 11
+
+
+def test_after_an_hour_it_is_tried_again() -> None:
+    post, agency = make_post()
+    for second in range(3000):
+        if post.child.alive:
+            post.child.kill()
+        post.look(float(second))
+    assert agency.numbers[-1] == 10
+    assert kinds(post.look(3700.0)) == ["child_restarted"]
+
+
+def test_a_child_that_breaks_its_word_is_killed_and_replaced() -> None:
+    post, agency = make_post()
+    agency.theirs[0].send(alive(5.0))
+    assert post.look(10.0) == []
+    assert post.look(15.0) == []
+    (silent,) = post.look(15.5)
+    assert silent == {"kind": "child_silent", "child": "recorder", "overdue_s": 0.5, "killed": True}
+    assert kinds(post.look(16.0)) == ["child_ended", "child_restarted"]
+    agency.theirs[1].send(alive(5.0))
+    assert post.look(17.0) == []
+
+
+@pytest.mark.parametrize(("moment_s", "said"), [(59.0, []), (61.0, ["child_silent"])])
+def test_a_child_that_never_says_a_word_is_not_waited_for(moment_s: float, said: list[str]) -> None:
+    post, _ = make_post()
+    assert kinds(post.look(moment_s)) == said
+
+
+def test_who_cannot_be_replaced_any_more_is_not_killed_and_may_come_back() -> None:
+    post, agency = make_post()
+    for second in range(0, 1200, 2):
+        if len(agency.numbers) <= 10 and post.child.alive:
+            post.child.kill()
+        post.look(float(second))
+    agency.theirs[-1].send(alive(5.0))
+    assert post.look(1200.0) == []
+    (silent,) = post.look(1206.0)
+    assert silent["killed"] is False
+    assert post.child.alive
+    assert post.look(1207.0) == [], "said once"
+    agency.theirs[-1].send(alive(5.0))
+    post.look(1208.0)
+    assert kinds(post.look(1214.0)) == ["child_silent"]

@@ -1,0 +1,102 @@
+"""The supervisor writes the controller's memory down now and then, and a replay can begin with it."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+
+import pytest
+
+from firmware_iface.roles import BenchCommand, BenchIdentity, BenchReading
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.controller.memory import recall
+from membrane_ctrl.controller.tick import MESSAGE_BYTES, TickAssembler
+from membrane_ctrl.hold.supervisor import Supervisor, Wiring
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.model.telemetry import ROW_BYTES
+from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.virtual.bench import VirtualBench
+
+CONFIG = Config()
+
+
+class PromptBench:
+    """A bench whose board answers at once; its plant stands still."""
+
+    def __init__(self) -> None:
+        self._bench = VirtualBench(Plant(CONFIG.twin, CONFIG.pump))
+        self._bench.open()
+
+    async def open(self) -> BenchIdentity:
+        raise AssertionError("the link was never lost")
+
+    async def read(self) -> BenchReading:
+        return self._bench.read()
+
+    async def write(self, command: BenchCommand) -> None:
+        self._bench.write(command)
+
+    async def clear_faults(self, mask: int) -> None:
+        raise AssertionError("nothing is latched")
+
+    def dead_guards(self) -> tuple[str, ...]:
+        return ()
+
+    async def close(self) -> None:
+        self._bench.close()
+
+
+async def test_the_memory_is_the_one_before_its_tick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("membrane_ctrl.hold.supervisor.MEMORY_EVERY_S", 0.1)
+    with ExitStack() as stack:
+        sizes = {"telemetry": ROW_BYTES, "events": 4096, "inputs": MESSAGE_BYTES}
+        addresses = {name: stack.enter_context(ring(2000, size)) for name, size in sizes.items()}
+        writers = {name: RingWriter(address) for name, address in addresses.items()}
+        inputs = RingReader(addresses["inputs"])
+        for end in (*writers.values(), inputs):
+            stack.callback(end.close)
+        controller = Controller(CONFIG, zernike_projection())
+        supervisor = Supervisor(controller, Wiring(bench=PromptBench(), **writers), RunClock.start(), 50.0)
+        assert await supervisor.run(0.4) == Exit.DONE
+        batch = TickAssembler().take(inputs.drain())
+    assert batch.memories
+    for tick, memory in batch.memories.items():
+        assert recall(memory, Controller(CONFIG, zernike_projection()))._ticks == tick - 1
+
+
+def test_an_event_that_is_too_long_for_its_slot_is_cut() -> None:
+    with ExitStack() as stack:
+        address = stack.enter_context(ring(4, 4096))
+        writer, reader = RingWriter(address), RingReader(address)
+        for end in (writer, reader):
+            stack.callback(end.close)
+        wiring = Wiring(bench=PromptBench(), telemetry=writer, events=writer)
+        supervisor = Supervisor(Controller(CONFIG, zernike_projection()), wiring, RunClock.start(), 50.0)
+        texts = dict.fromkeys(("cause", "seen", "limit", "remedy"), "\N{LOUDLY CRYING FACE}" * 10_000)
+        supervisor.tell({"kind": "fault", "name": "tick_error", **texts})
+        (told,) = reader.drain()
+    assert json.loads(told)["name"] == "tick_error"
+
+
+async def test_a_shape_that_cannot_be_read_is_told_once_and_the_hold_goes_on() -> None:
+    with ExitStack() as stack:
+        addresses = {name: stack.enter_context(ring(64, 4096)) for name in ("telemetry", "events", "shapes")}
+        writers = {name: RingWriter(address) for name, address in addresses.items()}
+        shapes, events = RingReader(addresses["shapes"]), RingReader(addresses["events"])
+        for end in (*writers.values(), shapes, events):
+            stack.callback(end.close)
+
+        def truth() -> tuple[float, float]:
+            writers["shapes"].put(b"{}\nno shape")
+            return 0.0, 0.0
+
+        wiring = Wiring(PromptBench(), writers["telemetry"], writers["events"], shapes=shapes, truth=truth)
+        supervisor = Supervisor(Controller(CONFIG, zernike_projection()), wiring, RunClock.start(), 50.0)
+        assert await supervisor.run(0.2) == Exit.DONE
+        told = [event for event in map(json.loads, events.drain()) if event["kind"] == "shape_unreadable"]
+    assert supervisor.ticks > 3
+    assert [event["message"] for event in told] == ["shape estimate: not of 36 terms"]

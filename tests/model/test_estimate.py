@@ -1,0 +1,114 @@
+"""A shape estimate crosses in plain bytes: exact to the last bit, and nothing else is taken for one."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+import random
+from dataclasses import astuple, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.acquisition.worker import estimate_message
+from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
+from tests.support.synthetic_shape import shape_at
+
+ESTIMATE = unpack_estimate(estimate_message(shape_at(3.0)))
+BYTES = pack_estimate(ESTIMATE)
+LINE, _, ARRAYS = BYTES.partition(b"\n")
+
+
+def bits(estimate: ShapeEstimate) -> list[object]:
+    return [value.tobytes() if isinstance(value, np.ndarray) else repr(value) for value in astuple(estimate)]
+
+
+def with_head(**changed: object) -> bytes:
+    return json.dumps({**json.loads(LINE), **changed}).encode() + b"\n" + ARRAYS
+
+
+@pytest.mark.parametrize(
+    "estimate",
+    [
+        shape_at(1.0),
+        replace(shape_at(2.0), verdict="rejected", coeffs_um=np.full(36, np.nan), sag_um=math.nan, reason="dark: ü"),
+        replace(shape_at(3.0), covariance_um2=np.random.default_rng(1).normal(size=(36, 36)), time_s=-0.0),
+        replace(shape_at(4.0), covariance_um2=np.full((36, 36), np.nan), cycle=7),
+    ],
+)
+def test_an_estimate_comes_back_to_the_last_bit(estimate: ShapeEstimate) -> None:
+    assert bits(unpack_estimate(pack_estimate(estimate))) == bits(estimate)
+
+
+def test_the_covariance_crosses_in_singles_and_the_message_is_small() -> None:
+    sent = shape_at(3.0)
+    assert ESTIMATE.covariance_um2 == pytest.approx(sent.covariance_um2, rel=1e-7)
+    assert np.array_equal(ESTIMATE.covariance_um2, sent.covariance_um2.astype(np.float32))
+    assert len(BYTES) < 7000
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        b"",
+        pickle.dumps(ESTIMATE),
+        b"[" * 8000 + b"\n" + ARRAYS,
+        b"[]\n" + ARRAYS,
+        LINE,
+        BYTES[:-1],
+        BYTES + b"\0",
+        LINE + b" " * 10_000 + b"\n" + ARRAYS,
+        with_head(terms=1_000_000_000),
+        with_head(terms=-36),
+        with_head(symmetric=1),
+        with_head(single=True, symmetric=None),
+        with_head(covariance_um2=[1.0]),
+        with_head(__class__="x"),
+        with_head(sag_um="37000"),
+        with_head(sag_um=True),
+        with_head(sag_um=math.inf),
+        with_head(sag_um=10**400),
+        with_head(time_s=math.nan),
+        with_head(time_s=None),
+        with_head(verdict="fine"),
+        with_head(kind=["full"]),
+        with_head(cycle=1.5),
+        with_head(cycle=-1),
+        with_head(cycle=2**80),
+        with_head(reason=7),
+        LINE + b"\n" + np.full(36, np.inf).tobytes() + ARRAYS[288:],
+        LINE + b"\n" + ARRAYS[:288] + np.full((len(ARRAYS) - 288) // 4, np.inf, "<f4").tobytes(),
+    ],
+    ids=range(28),
+)
+def test_what_is_no_estimate_is_refused(message: bytes) -> None:
+    with pytest.raises(ValueError):  # JSON's own words are as good as ours
+        unpack_estimate(message)
+
+
+def test_what_an_earlier_version_did_not_send_is_nan() -> None:
+    head = json.loads(LINE)
+    del head["geometry_sag_sigma_um"]
+    assert math.isnan(unpack_estimate(json.dumps(head).encode() + b"\n" + ARRAYS).geometry_sag_sigma_um)
+
+
+def test_random_damage_is_refused_or_gives_an_estimate_of_the_right_kinds() -> None:
+    random_of = random.Random(15)
+    taken = 0
+    for _ in range(3000):
+        data = bytearray(BYTES)
+        for _ in range(random_of.randint(1, 3)):
+            place = random_of.randrange(len(LINE) if random_of.random() < 0.8 else len(data))
+            data[place] = random_of.randrange(256)
+        try:
+            found: Any = unpack_estimate(bytes(data))
+        except ValueError:
+            continue
+        taken += 1
+        assert found.coeffs_um.shape == (36,)
+        assert found.covariance_um2.shape == (36, 36)
+        assert isinstance(found.sag_um, float)
+        assert math.isfinite(found.time_s)
+    assert taken > 100

@@ -1,0 +1,304 @@
+"""A recorder whose disk or data goes bad: it says so, loses as little as it can, and goes on."""
+
+from __future__ import annotations
+
+import errno
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.config import toml_file as config_file
+from membrane_ctrl.config.schema import Config, RecordingConfig
+from membrane_ctrl.controller.tick import MESSAGE_BYTES, RECORD, TICK
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.plain_json import dumps_checked
+from membrane_ctrl.model.shape_estimate import pack_estimate
+from membrane_ctrl.model.telemetry import ROW_BYTES
+from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
+from membrane_ctrl.recorder import recorder as recorder_module
+from membrane_ctrl.recorder.recorder import Recorder
+from membrane_ctrl.recorder.rerun_output import RETRY_S
+from membrane_ctrl.recorder.sink import Recording, RecordingError
+from membrane_ctrl.run_files.inputs_file import InputsFile, InputsReader
+from membrane_ctrl.run_files.run_folder import write_config
+from membrane_ctrl.run_files.sealed_stream import whole_batches
+from tests.support.rrd_reading import scalars
+from tests.support.synthetic_run import STARTED_UTC, rows_of, shape_of
+
+
+class HandClock(RunClock):
+    """A clock moved by hand."""
+
+    moment_s = 0.0
+
+    def now(self) -> float:
+        return HandClock.moment_s
+
+
+class FlakyRecording(Recording):
+    """A recording on a disk that can be filled."""
+
+    full = False
+
+    def abandon(self) -> None:
+        """End of the test, whatever became of the file."""
+        self._stream.disconnect()
+
+    def next_segment(self) -> None:
+        if self.full:
+            raise RecordingError("no space left on device")
+        super().next_segment()
+
+    def flush(self) -> None:
+        if self.full:
+            raise RecordingError("writer thread is gone")
+        super().flush()
+
+
+@dataclass
+class Bench:
+    """A recorder in this process, its rings' writers and what it reported."""
+
+    run_dir: Path
+    recording: FlakyRecording
+    recorder: Recorder
+    writers: dict[str, RingWriter]
+    reports: list[dict[str, Any]] = field(default_factory=list)
+
+    def second(self, number: int) -> None:
+        """One second of rows at its place in the run, and the recorder's work for it."""
+        HandClock.moment_s = float(number)
+        for row in rows_of(number + 1.0)[-50:]:
+            self.writers["telemetry"].put(row.pack())
+        self.recorder.drain()
+        self.recorder.write()
+
+    def kinds(self) -> list[str]:
+        return [report["kind"] for report in self.reports]
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    yield from make_bench(tmp_path, Config())
+
+
+def make_bench(run_dir: Path, config: Config) -> Iterator[Bench]:
+    HandClock.moment_s = 0.0
+    clock = HandClock(0.0, STARTED_UTC)
+    with ExitStack() as stack:
+        sizes = {"telemetry": (2000, ROW_BYTES), "events": (64, 4000), "shapes": (8, 30_000)}
+        sizes["inputs"] = (2000, MESSAGE_BYTES)
+        addresses = {name: stack.enter_context(ring(*size)) for name, size in sizes.items()}
+        readers = {name: RingReader(address) for name, address in addresses.items()}
+        writers = {name: RingWriter(address) for name, address in addresses.items()}
+        recording = FlakyRecording(run_dir, "test", clock, config)
+        reports: list[dict[str, Any]] = []
+        yield Bench(
+            run_dir,
+            recording,
+            Recorder(run_dir, clock, config, readers, recording, None, reports.append),
+            writers,
+            reports,
+        )
+        recording.abandon()
+        for end in (*readers.values(), *writers.values()):
+            end.close()
+
+
+def times_s(bench: Bench) -> list[int]:
+    """Whole seconds found in all segments."""
+    found: set[int] = set()
+    for path in sorted(bench.run_dir.glob("*.rrd")):
+        found |= {int(moment + 1e-6) for moment in scalars(path, "/loop/error")[0]}
+    return sorted(found)
+
+
+def test_a_dead_writer_gets_a_new_file_and_no_row_is_lost(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.second(0)
+    real_flush, failures = FlakyRecording.flush, iter([True])
+
+    def flush(recording: FlakyRecording) -> None:
+        if next(failures, False):
+            raise RecordingError("writer thread is gone")
+        real_flush(recording)
+
+    monkeypatch.setattr(FlakyRecording, "flush", flush)
+    bench.second(1)
+    bench.second(2)
+    bench.recorder.finish()
+    assert bench.kinds() == ["recorder_error", "recorder_recovered", "recorder_done"]
+    assert bench.recording.segments == 2
+    assert times_s(bench) == [0, 1, 2]
+
+
+def test_a_full_disk_is_reported_once_counted_and_recovered_from(bench: Bench) -> None:
+    bench.second(0)
+    bench.recording.full = True
+    for number in range(1, 6):
+        bench.second(number)
+    assert bench.kinds().count("recorder_error") <= 2  # the flush, then the new file: not one a second
+    bench.recording.full = False
+    back_s = int(2 + 2 * RETRY_S)
+    bench.second(back_s)
+    bench.recorder.finish()
+    assert bench.kinds()[-2:] == ["recorder_recovered", "recorder_done"]
+    # second 1 was on its way when the disk was full: here it can still arrive, on a real disk it would not
+    assert set(times_s(bench)) - {1} == {0, back_s}
+    found = json.loads((bench.run_dir / "summary.json").read_text())
+    assert found["recorder"]["rows_lost"] == 5 * 50
+    assert found["ticks"] == 7 * 50  # the statistics lost nothing
+
+
+def test_a_file_that_was_not_closed_whole_is_reported(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.second(0)
+    monkeypatch.setattr(FlakyRecording, "sync", lambda _: None)
+    (bench.run_dir / "test-000.rrd").unlink()
+    bench.recorder.finish()
+    assert bench.kinds() == ["recorder_error", "recorder_done"]
+    assert "closed without its footer" in bench.reports[0]["message"]
+
+
+def test_a_segment_deleted_under_the_recorder_is_reported_and_another_begun(bench: Bench) -> None:
+    bench.second(0)
+    (bench.run_dir / "test-000.rrd").unlink()
+    bench.second(1)
+    bench.second(2)
+    bench.recorder.finish()
+    assert bench.kinds() == ["recorder_error", "recorder_recovered", "recorder_done"]
+    assert times_s(bench) == [2]
+
+
+def emptied(folder: Path) -> None:
+    """As an `rm -r` leaves it that met a file just written."""
+    shutil.rmtree(folder / "columns")
+    for path in folder.glob("*.*"):
+        path.unlink()
+
+
+def replaced(folder: Path) -> None:
+    """As by the acquisition, which makes the folder of its frames."""
+    shutil.rmtree(folder)
+    (folder / "raw").mkdir(parents=True)
+
+
+TAKEN_AWAY = {
+    "removed": shutil.rmtree,
+    "moved": lambda folder: folder.rename(folder.with_name("elsewhere")),
+    "emptied": emptied,
+    "replaced": replaced,
+}
+
+
+@pytest.mark.parametrize("how", TAKEN_AWAY)
+def test_a_run_folder_taken_away_is_begun_anew_and_said(tmp_path: Path, how: str) -> None:
+    run_dir = tmp_path / "run"
+    config = Config()
+    run_dir.mkdir()
+    write_config(run_dir, config)
+    for bench in make_bench(run_dir, config):
+        bench.writers["events"].put(b'{"kind": "start", "mono_s": 0.0}')
+        bench.second(0)
+        TAKEN_AWAY[how](run_dir)
+        bench.writers["events"].put(b'{"kind": "mark", "mono_s": 0.9}')
+        for number in (1, 2):
+            bench.second(number)
+        bench.recorder.finish()
+        said = [report["message"] for report in bench.reports if report["kind"] == "recorder_error"]
+        what = f"{run_dir} was removed or moved, and is begun anew at 1.0 s"
+        assert said == [f"{what}; what was recorded before is not in it"]
+        assert "recorder_recovered" not in bench.kinds()
+        assert times_s(bench) == [1, 2]
+    assert config_file.load(run_dir / "config.toml", Config) == config
+    assert json.loads((run_dir / "events.jsonl").read_text())["kind"] == "mark"
+    found = json.loads((run_dir / "summary.json").read_text())
+    assert (found["ticks"], found["recorder"]["folder_anew_s"]) == (150, 1.0)
+    rows = sum(batch.num_rows for batch in whole_batches(run_dir / "columns" / "ticks-000.arrows"))
+    assert rows == 150  # those of the first second still waited for a batch
+
+
+def test_segments_are_changed_in_time_without_losing_a_row(bench: Bench) -> None:
+    bench.second(0)
+    bench.second(1)
+    HandClock.moment_s = Config().recording.segment_s + 1
+    for row in rows_of(3.0)[-50:]:
+        bench.writers["telemetry"].put(row.pack())
+    bench.recorder.drain()
+    bench.recorder.write()
+    bench.recorder.finish()
+    assert sorted(path.name for path in bench.run_dir.glob("*.rrd")) == ["test-000.rrd", "test-001.rrd"]
+    assert times_s(bench) == [0, 1, 2]
+
+
+def test_a_broken_shape_is_reported_and_the_next_one_taken(bench: Bench) -> None:
+    bench.writers["shapes"].put(b"no shape")
+    bench.writers["shapes"].put(pack_estimate(shape_of(1.0, 1)))
+    bench.second(0)
+    bench.recorder.finish()
+    assert bench.kinds() == ["recorder_error", "recorder_recovered", "recorder_done"]
+    assert "shape estimate: JSONDecodeError" in bench.reports[0]["message"]
+    assert json.loads((bench.run_dir / "summary.json").read_text())["cycles"] == 1
+
+
+def test_events_that_cannot_be_written_are_reported_and_come_later(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real_open = recorder_module.events.os.open
+
+    def full(*_: Any) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(recorder_module.events.os, "open", full)
+    bench.writers["events"].put(b'{"kind": "fault", "mono_s": 0.5}')
+    bench.second(0)
+    assert "events.jsonl: [Errno 28] No space left on device" in bench.reports[0]["message"]
+    monkeypatch.setattr(recorder_module.events.os, "open", real_open)
+    bench.second(1)
+    bench.recorder.finish()
+    text = (bench.run_dir / "events.jsonl").read_text()
+    assert text == dumps_checked({"kind": "fault", "mono_s": 0.5}) + "\n"
+
+
+@pytest.mark.parametrize("room_again", [True, False])
+def test_inputs_that_met_a_full_disk_come_later_or_are_counted(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, room_again: bool
+) -> None:
+    def full(*_: Any) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def ticks_of(second: int) -> None:
+        for tick in range(50 * second + 1, 50 * second + 51):
+            record = np.zeros(1, dtype=RECORD)
+            record["tick"] = tick
+            bench.writers["inputs"].put(TICK + record.tobytes())
+        bench.second(second)
+
+    ticks_of(0)
+    with monkeypatch.context() as patch:
+        patch.setattr(InputsFile, "_write", full)
+        ticks_of(1)
+        ticks_of(2)
+        if not room_again:
+            bench.recorder.finish()
+    if room_again:
+        ticks_of(3)
+        bench.recorder.finish()
+    found = [int(tick) for frame in InputsReader(bench.run_dir) for tick in frame.records["tick"]]
+    assert found == list(range(1, 201 if room_again else 51))
+    account = json.loads((bench.run_dir / "summary.json").read_text())["recorder"]
+    assert account["input_ticks_lost"] == (0 if room_again else 100)
+
+
+def test_a_disk_that_runs_low_is_reported_once(tmp_path: Path) -> None:
+    config = Config(recording=RecordingConfig(min_free_mb=1e12))
+    for bench in make_bench(tmp_path, config):
+        for number in range(3):
+            bench.second(number)
+        assert bench.kinds() == ["disk_low"]
+        assert str(tmp_path) in bench.reports[0]["message"]

@@ -1,0 +1,16 @@
+"""What the recording says of a cycle in words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from membrane_ctrl.recorder.rerun_streams import _legend
+from tests.support.synthetic_run import shape_of
+
+
+def test_both_error_bars_of_the_sag_are_told_apart() -> None:
+    shape = shape_of(1.0, 3)
+    assert "± 0.100 um of noise\n" in _legend(shape, {})  # nothing is stated of the geometry
+    assert "± 0.100 um of noise, ± 21.8 um of the geometry\n" in _legend(
+        replace(shape, geometry_sag_sigma_um=21.84), {}
+    )

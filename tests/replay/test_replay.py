@@ -1,0 +1,345 @@
+"""Replay: what a tick was given comes back to the last bit, and so does what it decided."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.cli import run
+from membrane_ctrl.config import toml_file as config_file
+from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.controller.tick import (
+    MESSAGE_BYTES,
+    RECORD,
+    TickAssembler,
+    TickInputs,
+    TickOutputs,
+    pack_tick,
+    unpack_tick,
+)
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.model.plain_json import with_comment
+from membrane_ctrl.model.shape_estimate import pack_estimate, unpack_estimate
+from membrane_ctrl.model.telemetry import unpack
+from membrane_ctrl.recorder.rerun_streams import TelemetryStreams
+from membrane_ctrl.recorder.sink import Recording
+from membrane_ctrl.replay import replay as replay_module
+from membrane_ctrl.replay.incident import check_incident, read_incident
+from membrane_ctrl.replay.replay import Gap, RecordedTick, recorded_ticks, replay
+from membrane_ctrl.run_files.inputs_file import InputsFile, InputsReader
+from tests.support.synthetic_shape import shape_at
+from tests.support.virtual_record import CONFIG, kept_ticks, laser_lost, write_record
+
+TICKS = kept_ticks(20.0, laser_lost)
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Path:
+    folder = tmp_path / "20261121T010203Z-night"
+    folder.mkdir()
+    write_record(folder, TICKS)
+    return folder
+
+
+def report_of(capsys: pytest.CaptureFixture[str]) -> dict[str, object]:
+    return json.loads(capsys.readouterr().out)
+
+
+def bits(inputs: TickInputs) -> str:
+    """Every value of the inputs; two that differ in one bit give different texts (`repr` of a float is exact)."""
+    estimate = inputs.estimate
+    arrays = () if estimate is None else (estimate.coeffs_um.tobytes(), estimate.covariance_um2.tobytes())
+    return repr((replace(inputs, estimate=None), arrays, None if estimate is None else estimate.latency_s))
+
+
+def test_every_input_comes_back_to_the_last_bit(record: Path) -> None:
+    found = list(recorded_ticks(InputsReader(record)))
+    assert len(found) == len(TICKS) > 1000
+    for item, (inputs, _) in zip(found, TICKS, strict=True):
+        assert isinstance(item, RecordedTick)
+        assert bits(item.inputs) == bits(inputs)
+
+
+def test_the_same_code_decides_the_same_to_the_last_bit(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["replay", str(record), "--json"]) == Exit.DONE
+    report = report_of(capsys)
+    assert report["verdict"] == "identical"
+    assert report["ticks"] == report["compared"] == len(TICKS)
+    assert report["gaps"] == report["decisions"] == report["damage"] == []
+
+
+def test_the_record_of_the_run_has_what_it_should_show() -> None:
+    faults = [event for _, outputs in TICKS for event in outputs.events if event["kind"] == "fault"]
+    assert [fault["name"] for fault in faults] == ["displacement_missing"]
+    assert sum(inputs.estimate is not None for inputs, _ in TICKS) >= 9
+
+
+def changed_from(tick: int) -> type[Controller]:
+    """Today's code, with a change that shows from a tick on."""
+
+    class Changed(Controller):
+        def tick(self, inputs: TickInputs) -> TickOutputs:
+            outputs = super().tick(inputs)
+            if outputs.row.tick < tick:
+                return outputs
+            return replace(outputs, row=replace(outputs.row, pump_fraction=outputs.row.pump_fraction + 1e-12))
+
+    return Changed
+
+
+def test_a_difference_is_found_at_its_first_tick(
+    record: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(replay_module, "Controller", changed_from(700))
+    assert run(["replay", str(record)]) == Exit.REJECTED
+    said = capsys.readouterr().out
+    assert f"different  {len(TICKS) - 699} ticks, the first is tick 700 at 14.000 s" in said
+    assert "not in the *.rrd files" in said
+
+
+def test_a_changed_gain_shows_as_another_pump_but_the_same_states(record: Path) -> None:
+    config = CONFIG.model_copy(update={"loop": LoopConfig(kp_per_s=0.5)})
+    found = replay(config, recorded_ticks(InputsReader(record)), zernike_projection())
+    assert found.different > 100
+    assert [d.what for d in found.decisions if d.what.startswith("state")] == [
+        "state check", "state inflate", "state settle", "state hold", "state lower",
+    ]  # fmt: skip
+
+
+def test_another_configuration_than_the_run_had_is_named(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = with_comment(config_file.dump(CONFIG)).replace("kp_per_s = 0.61", "kp_per_s = 0.5")
+    (record / "config.toml").write_text(text)
+    assert run(["replay", str(record)]) == Exit.REJECTED
+    assert "config.toml: does not fit its checksum" in capsys.readouterr().out
+
+
+def test_only_what_is_asked_for_is_compared(
+    record: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["replay", str(record), "--from", "13s", "--to", "16s", "--json"]) == Exit.DONE
+    assert report_of(capsys)["compared"] == 151
+    monkeypatch.setattr(replay_module, "Controller", changed_from(900))
+    assert run(["replay", str(record), "--to", "17s", "--json"]) == Exit.DONE
+
+
+def test_missing_ticks_are_a_gap_and_nothing_is_claimed_behind_it(
+    record: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (record / "inputs-000.bin").unlink()
+    write_record(record, TICKS, range(510, 521))
+    assert run(["replay", str(record), "--json"]) == Exit.REJECTED
+    report = report_of(capsys)
+    assert report["verdict"] == "gaps"
+    assert report["compared"] == 509
+    assert report["gaps"] == [{"after_tick": 509, "time_s": 10.18, "ticks": 11, "why": "not recorded"}]
+    # behind the gap the loop commands another flow than the recorded read-back shows: said, and no verdict
+    times_s = [float(found) for line in report["decisions"] for found in re.findall(r"at ([\d.]+) s", line)]
+    assert all(time_s > 10.18 for time_s in times_s)
+
+
+@pytest.mark.parametrize("end", [0, 5, 40, 700, 2000, 20_000])
+def test_a_torn_file_is_read_up_to_the_tear(record: Path, end: int) -> None:
+    path = record / "inputs-000.bin"
+    path.write_bytes(path.read_bytes()[:end])
+    reader = InputsReader(record)
+    items = list(recorded_ticks(reader))
+    assert all(isinstance(item, RecordedTick) for item in items)
+    assert len(items) % 50 == 0
+    assert len(items) < len(TICKS)
+    assert reader.damage
+
+
+def test_a_bad_block_in_the_middle_costs_its_frames_only(record: Path) -> None:
+    path = record / "inputs-000.bin"
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 16] = bytes(16)
+    path.write_bytes(data)
+    reader = InputsReader(record)
+    items = list(recorded_ticks(reader))
+    gaps = [item for item in items if isinstance(item, Gap)]
+    assert sum(gap.ticks for gap in gaps if gap.reason == "not recorded") == 50
+    assert len(reader.damage) == 1
+
+
+def test_a_frame_that_was_written_twice_counts_once(record: Path) -> None:
+    (record / "inputs-001.bin").write_bytes((record / "inputs-000.bin").read_bytes())
+    assert len(list(recorded_ticks(InputsReader(record)))) == len(TICKS)
+
+
+def test_a_file_of_an_older_program_lacks_a_field(record: Path) -> None:
+    path = record / "inputs-000.bin"
+    line, _, rest = path.read_bytes().partition(b"\n")
+    head = json.loads(line)
+    assert [tuple(field) for field in head["fields"]] == RECORD.descr
+    renamed = [["other" if name == "truth_laser_bias_um" else name, code] for name, code in head["fields"]]
+    path.write_bytes(json.dumps({**head, "fields": renamed}).encode() + b"\n" + rest)
+    first = next(item for item in recorded_ticks(InputsReader(record)) if isinstance(item, RecordedTick))
+    assert math.isnan(first.inputs.truth_laser_bias_um)
+    assert first.inputs.reading == TICKS[0][0].reading
+
+
+def test_a_long_command_comes_in_pieces_and_whole_again() -> None:
+    inputs, outputs = TICKS[1]
+    commands = (
+        Command("mark", "someone", text="ä" * 3000),
+        Command("gains", "x", loop=LoopConfig(kp_per_s=0.1 + 0.2)),
+    )
+    inputs = replace(inputs, commands=commands, dead_tasks=("link",))
+    messages = pack_tick(1, inputs, outputs, outputs.row.pack())
+    assert len(messages) > 10
+    assert max(len(message) for message in messages) <= MESSAGE_BYTES
+    assembler = TickAssembler()
+    assert not len(assembler.take(messages[:4]).records)
+    batch = assembler.take(messages[4:])
+    back = unpack_tick(batch.records[0], batch.tails[1], {})
+    assert repr(back.commands) == repr(commands)
+    assert back.dead_tasks == ("link",)
+
+
+def test_a_command_whose_pieces_were_overwritten_is_a_gap_not_another_command() -> None:
+    inputs, outputs = TICKS[0]
+    messages = pack_tick(1, replace(inputs, commands=(Command("mark", "x", text="y" * 2000),)), outputs, b"")
+    batch = TickAssembler().take(messages[2:])
+    with pytest.raises(LookupError, match="commands of tick 1"):
+        unpack_tick(batch.records[0], batch.tails[1], {})
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_an_estimate_comes_back_to_the_last_bit(symmetric: bool) -> None:
+    estimate = shape_at(3.0)
+    if not symmetric:
+        estimate = replace(estimate, covariance_um2=np.random.default_rng(1).normal(size=(36, 36)))
+    else:
+        estimate = replace(estimate, covariance_um2=(estimate.covariance_um2 + estimate.covariance_um2.T) / 2)
+    back = unpack_estimate(pack_estimate(estimate))
+    assert back.covariance_um2.tobytes() == estimate.covariance_um2.tobytes()
+    assert back.coeffs_um.tobytes() == estimate.coeffs_um.tobytes()
+    assert struct.pack("<d", back.time_s) == struct.pack("<d", estimate.time_s)
+    assert (back.verdict, back.reason, back.cycle) == (estimate.verdict, estimate.reason, estimate.cycle)
+    assert len(pack_estimate(estimate)) < (6500 if symmetric else 11_500)
+
+
+def test_an_incident_becomes_a_test_that_fails_when_the_decision_changes(
+    record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tests" / "incidents").mkdir(parents=True)
+    assert run(["replay", str(record), "--to", "16s", "--to-test", "laser-lost"]) == Exit.DONE
+    folder = tmp_path / "tests" / "incidents" / "laser-lost"
+    assert check_incident(read_incident(folder)) == []
+    about = (folder / "incident.toml").read_text()
+    (folder / "incident.toml").write_text(about.replace("displacement_missing", "displacement_frozen", 1))
+    assert len(check_incident(read_incident(folder))) == 1
+    assert run(["replay", str(record), "--to-test", "laser-lost"]) == Exit.BAD_INPUT  # the name is taken
+    assert run(["replay", str(record), "--to-test", "../x"]) == Exit.BAD_INPUT
+
+
+def test_an_incident_too_large_for_a_repository_is_refused_and_leaves_nothing(
+    record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("membrane_ctrl.replay.incident._BYTES_MAX", 1000)
+    (tmp_path / "tests" / "incidents").mkdir(parents=True)
+    assert run(["replay", str(record), "--to-test", "long"]) == Exit.BAD_INPUT
+    assert "narrow it with --from and --to" in capsys.readouterr().err
+    assert not list((tmp_path / "tests" / "incidents").iterdir())
+
+
+@pytest.mark.parametrize("missing", ["config.toml", "inputs-000.bin"])
+def test_what_is_no_run_is_one_line(record: Path, missing: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (record / missing).unlink()
+    assert run(["replay", str(record)]) == Exit.BAD_INPUT
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert missing.split("-")[0] in said
+
+
+def packed(place: int) -> list[bytes]:
+    """Messages of a tick without its shape."""
+    inputs, outputs = TICKS[place]
+    return pack_tick(place + 1, replace(inputs, estimate=None), outputs, outputs.row.pack())
+
+
+def test_a_frame_that_met_a_full_disk_is_written_with_the_next_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from membrane_ctrl.run_files import inputs_file
+
+    file, assembler = InputsFile(tmp_path, "x"), TickAssembler()
+    batches = []
+    for first in (0, 50, 100):
+        messages = [m for n in range(first, first + 50) for m in packed(n)]
+        batches.append(assembler.take(messages))
+    file.append(batches[0], [])
+    real_write = inputs_file.os.write
+
+    def half(descriptor: int, data: bytes) -> int:
+        if len(data) < 2000:
+            raise OSError(28, "No space left on device")
+        return real_write(descriptor, data[: len(data) - 1000])
+
+    with monkeypatch.context() as patch:
+        patch.setattr(inputs_file.os, "write", half)
+        with pytest.raises(OSError, match="No space"):
+            file.append(batches[1], [])
+    assert file.lost_ticks == 50
+    file.append(batches[2], [])
+    file.close()
+    reader = InputsReader(tmp_path)
+    found = [item.tick for item in recorded_ticks(reader) if isinstance(item, RecordedTick)]
+    assert found == list(range(1, 151))
+    assert (reader.damage, file.lost_ticks) == ([], 0)
+
+
+def test_frames_that_waited_too_long_are_given_up_and_their_ticks_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from membrane_ctrl.run_files import inputs_file
+
+    monkeypatch.setattr(inputs_file, "WAITING_MAX", 2)
+    file, assembler = InputsFile(tmp_path, "x"), TickAssembler()
+
+    def full(descriptor: int, data: bytes) -> int:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(inputs_file.os, "write", full)
+        for first in (0, 10, 20):
+            with pytest.raises(OSError, match="No space"):
+                file.append(assembler.take([m for n in range(first, first + 10) for m in packed(n)]), [])
+    file.append(assembler.take(packed(30)), [])
+    file.close()
+    reader = InputsReader(tmp_path)
+    found = [item.tick for item in recorded_ticks(reader) if isinstance(item, RecordedTick)]
+    assert found == list(range(21, 32))  # of four frames two may wait
+    assert (reader.damage, file.lost_ticks) == ([], 20)
+
+
+def test_a_difference_is_shown_with_what_was_recorded(
+    record: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = unpack([outputs.row.pack() for _, outputs in TICKS])
+    recording = Recording(record, "night", RunClock.start(), CONFIG)
+    recording.next_segment()
+    TelemetryStreams(recording, CONFIG).send(rows)
+    recording.close()
+    monkeypatch.setattr(replay_module, "Controller", changed_from(720))
+    assert run(["replay", str(record), "--json"]) == Exit.REJECTED
+    report = report_of(capsys)
+    then = TICKS[719][1].row.pump_fraction
+    assert report["first_different"] == {"tick": 720, "time_s": TICKS[719][0].now_s}
+    assert report["fields"] == {"pump_fraction": [then, then + 1e-12]}
+    assert run(["replay", str(record)]) == Exit.REJECTED
+    assert f"pump_fraction: recorded {then!r}, today {then + 1e-12!r}" in capsys.readouterr().out

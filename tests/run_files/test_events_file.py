@@ -1,0 +1,78 @@
+"""events.jsonl: whole lines, also after a disk that was full for a while."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from membrane_ctrl.run_files import events
+from membrane_ctrl.run_files.events import EventsFile, parse
+
+
+def lines(path: Path) -> list[dict[str, object]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_events_are_lines_in_their_order(tmp_path: Path) -> None:
+    file = EventsFile(tmp_path / "events.jsonl")
+    file.append([{"kind": "state", "mono_s": 1.0}, {"kind": "fault", "value": float("nan")}])
+    file.append([{"kind": "end", "exit": 5}])
+    assert [line["kind"] for line in lines(tmp_path / "events.jsonl")] == ["state", "fault", "end"]
+    assert lines(tmp_path / "events.jsonl")[1]["value"] is None
+    file.close()
+
+
+def test_faults_and_the_end_are_synced_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[int] = []
+    monkeypatch.setattr(os, "fsync", synced.append)
+    file = EventsFile(tmp_path / "events.jsonl")
+    file.append([{"kind": "state"}])
+    assert len(synced) == 0
+    file.append([{"kind": "fault"}])
+    file.append([{"kind": "end"}])
+    assert len(synced) == 2
+    file.close()
+
+
+def test_a_disk_that_was_full_tears_no_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real_write = os.write
+    room = [25]
+
+    def write(descriptor: int, data: bytes) -> int:
+        if not room[0]:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written = real_write(descriptor, data[: room[0]])
+        room[0] -= written
+        return written
+
+    monkeypatch.setattr(events.os, "write", write)
+    file = EventsFile(tmp_path / "events.jsonl")
+    with pytest.raises(OSError):
+        file.append([{"kind": "state", "number": k} for k in range(3)])
+    with pytest.raises(OSError):
+        file.append([{"kind": "state", "number": 3}])
+    room[0] = 10_000
+    file.append([])
+    assert [line["number"] for line in lines(tmp_path / "events.jsonl")] == [0, 1, 2, 3]
+    file.close()
+
+
+def test_too_many_waiting_events_are_counted_as_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(events, "_WAITING_MAX", 5)
+    file = EventsFile(tmp_path / "missing" / "events.jsonl")
+    with pytest.raises(OSError):
+        file.append([{"number": k} for k in range(8)])
+    assert file.lost == 3
+    (tmp_path / "missing").mkdir()
+    file.append([])
+    assert [line["number"] for line in lines(tmp_path / "missing" / "events.jsonl")] == [0, 4, 5, 6, 7]
+    file.close()
+
+
+@pytest.mark.parametrize("message", [b"{half", b"\xff\xfe", b"[1, 2]", b""])
+def test_a_message_that_is_no_event_becomes_one_that_says_so(message: bytes) -> None:
+    assert parse(message)["kind"] == "unreadable_event"

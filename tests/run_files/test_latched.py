@@ -1,0 +1,221 @@
+"""The fault that outlives its run."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from firmware_iface.roles import BenchCommand
+from membrane_ctrl.controller.commands import AT_START
+from membrane_ctrl.controller.tick import TickOutputs
+from membrane_ctrl.hold.latched_fault import Latcher
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
+from membrane_ctrl.run_files.latched_fault import NAME, RESUMES_NAME, LatchedFault, LatchedFile, ResumeLog
+
+FAULT = LatchedFault("over_pressure", "too much", "801 Pa", "look", "2026-01-02T03:04:05+00:00", "run-1")
+TRIP: tuple[Event, ...] = (
+    {"kind": "fault", "name": "late", "cause": "ticks start too late", "seen": "150 ms", "remedy": "less work"},
+    {"kind": "state", "state": "fault", "from": "hold", "why": "late"},
+)
+
+
+def outputs(*events: Event) -> TickOutputs:
+    return TickOutputs(BenchCommand(0.0, 0.0), TelemetryRow(**dict.fromkeys(FIELDS, 1.0)), events, None)
+
+
+def test_it_comes_back_as_it_was_and_goes_when_cleared(tmp_path: Path) -> None:
+    file = LatchedFile(tmp_path)
+    assert file.read() is None
+    file.write(FAULT)
+    file.sync()
+    assert LatchedFile(tmp_path).read() == FAULT
+    assert "801 Pa" in str(FAULT)
+    file.clear()
+    file.clear()
+    assert file.read() is None
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{", b"\xff\xfe", b"[]", b'"x"', b"null", b'{"schema": "other"}', b"\0" * 300,
+     b'{"schema": "membrane-latched-fault/1"}', b'{"schema": "membrane-latched-fault/1", "name": 3}',
+     b"[" * 30_000, b" " * 70_000 + b"{}"],
+)  # fmt: skip
+def test_a_corrupt_file_counts_as_latched(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / NAME).write_bytes(content)
+    found = LatchedFile(tmp_path).read()
+    assert found is not None
+    assert found.name == "unreadable"
+    assert "\n" not in str(found)
+
+
+def test_a_torn_file_at_every_length_counts_as_latched(tmp_path: Path) -> None:
+    file = LatchedFile(tmp_path)
+    file.write(FAULT)
+    whole = file.path.read_bytes()
+    for length in range(len(whole) - 1):
+        file.path.write_bytes(whole[:length])
+        assert file.read() is not None, length
+
+
+def test_a_folder_or_no_permission_in_its_place_counts_as_latched(tmp_path: Path) -> None:
+    (tmp_path / NAME).mkdir()
+    assert LatchedFile(tmp_path).read() is not None
+
+
+def test_a_link_to_nowhere_or_a_pipe_in_its_place_counts_as_latched(tmp_path: Path) -> None:
+    (tmp_path / NAME).symlink_to(tmp_path / "not mounted")
+    assert LatchedFile(tmp_path).read() is not None
+    LatchedFile(tmp_path).clear()
+    os.mkfifo(tmp_path / NAME)
+    assert LatchedFile(tmp_path).read() is not None
+
+
+def test_a_fault_of_many_lines_is_told_in_one(tmp_path: Path) -> None:
+    file = LatchedFile(tmp_path)
+    file.write(replace(FAULT, seen="ValueError: first\nsecond"))
+    assert str(file.read()).count("first second") == 1
+
+
+def make(folder: Path, told: list[Event]) -> Latcher:
+    return Latcher(
+        LatchedFile(folder), ResumeLog(folder), "run-7", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), told.append
+    )
+
+
+def test_a_trip_is_latched_and_an_acknowledgement_clears_it(tmp_path: Path) -> None:
+    told: list[Event] = []
+    with make(tmp_path, told) as latcher:
+        latcher.heard(outputs(*TRIP))
+    found = LatchedFile(tmp_path).read()
+    assert found == LatchedFault(
+        "late", "ticks start too late", "150 ms", "less work", "2026-01-01T00:00:00+00:00", "run-7"
+    )
+    with make(tmp_path, told) as latcher:
+        latcher.heard(outputs({"kind": "command", "command": "ack", "refused": "not now"}))
+    assert LatchedFile(tmp_path).read() is not None
+    with make(tmp_path, told) as latcher:
+        latcher.heard(outputs({"kind": "command", "command": "ack"}))
+    assert LatchedFile(tmp_path).read() is None
+    assert not told
+
+
+LOCK: Event = {"kind": "command", "command": "latch", "who": "unix:ann", "why": "", "text": "hands inside"}
+
+
+def test_a_lock_outlives_its_run_and_does_not_hide_a_fault(tmp_path: Path) -> None:
+    with make(tmp_path, []) as latcher:
+        latcher.heard(outputs(LOCK | {"refused": "not now"}))
+        latcher.heard(outputs(LOCK | {"who": AT_START}))
+    assert LatchedFile(tmp_path).read() is None
+    with make(tmp_path, []) as latcher:
+        latcher.heard(outputs(LOCK))
+    assert "hands inside (by unix:ann)" in str(LatchedFile(tmp_path).read())
+    with make(tmp_path, []) as latcher:
+        latcher.heard(outputs({"kind": "command", "command": "ack"}, *TRIP))
+        latcher.heard(outputs(LOCK))
+    found = LatchedFile(tmp_path).read()
+    assert found is not None
+    assert found.name == "late"
+
+
+def test_a_resumed_fault_is_no_longer_latched(tmp_path: Path) -> None:
+    with make(tmp_path, []) as latcher:
+        latcher.heard(outputs(*TRIP))
+        latcher.heard(outputs({"kind": "state", "state": "standby", "from": "fault", "why": "resumes"}))
+    assert LatchedFile(tmp_path).read() is None
+
+
+def test_a_forgiven_fault_is_not_latched(tmp_path: Path) -> None:
+    with make(tmp_path, []) as latcher:
+        latcher.heard(outputs(TRIP[0]))
+    assert LatchedFile(tmp_path).read() is None
+
+
+def test_a_disk_that_fails_is_told(tmp_path: Path) -> None:
+    told: list[Event] = []
+    with make(tmp_path / "nowhere", told) as latcher:
+        latcher.heard(outputs(*TRIP))
+    assert [event["kind"] for event in told] == ["latch_failed"]
+
+
+def test_a_disk_that_takes_files_again_is_told_once(tmp_path: Path) -> None:
+    told: list[Event] = []
+    with make(tmp_path / "later", told) as latcher:
+        latcher.heard(outputs(*TRIP))
+        while not told:
+            latcher.heard(outputs())
+        (tmp_path / "later").mkdir()
+        latcher.heard(outputs(*TRIP))
+        latcher.heard(outputs(*TRIP))
+    assert [event["kind"] for event in told] == ["latch_failed", "latch_written"]
+
+
+def test_the_twin_latches_nothing(tmp_path: Path) -> None:
+    with Latcher(None, None, "run", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), lambda event: None) as latcher:
+        latcher.heard(outputs(*TRIP))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("aim", ["mine.txt", "nowhere.txt"])
+def test_a_link_in_place_of_the_reserve_takes_nothing_of_anybody(tmp_path: Path, aim: str) -> None:
+    """A folder of runs may have been unpacked: the fault is latched, and what the link leads to stays."""
+    (tmp_path / "mine.txt").write_text("mine")
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    (logs / f".{NAME}.reserve").symlink_to(tmp_path / aim)
+    file = LatchedFile(logs)
+    file.write(LatchedFault("over_pressure", "", "", "", "", ""))
+    latched = file.read()
+    assert latched is not None
+    assert latched.name == "over_pressure"
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir() if path.is_file()] == [("mine.txt", "mine")]
+
+
+def test_a_fault_on_a_full_disk_is_latched_in_the_room_that_was_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Event] = []
+
+    def full(self: LatchedFile) -> None:
+        raise OSError(28, "No space left on device")
+
+    with make(tmp_path, told) as latcher:
+        (reserve,) = tmp_path.iterdir()
+        monkeypatch.setattr(LatchedFile, "reserve", full)  # nothing new finds room from here on
+        latcher.heard(outputs(*TRIP))
+        latcher._disk.submit(lambda: None).result()
+        assert not reserve.exists()
+    assert told == []
+    latched = LatchedFile(tmp_path).read()
+    assert latched is not None
+    assert latched.name == TRIP[0]["name"]
+    assert [path.name for path in tmp_path.iterdir()] == [NAME]
+
+
+NOW = datetime(2026, 1, 2, 12, tzinfo=UTC)
+
+
+def test_resumes_are_counted_for_a_day_and_beyond_a_restart(tmp_path: Path) -> None:
+    assert ResumeLog(tmp_path).ages_s(NOW) == ()
+    for hours in (30.0, 5.0, -1.0):  # the last one after the clock was set back
+        ResumeLog(tmp_path).add(NOW - timedelta(hours=hours))
+    assert ResumeLog(tmp_path).ages_s(NOW) == (18_000.0, 0.0)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff", b"3", b"[3]", b'["tomorrow"]', b'["2026-01-02T11:00:00"]'])
+def test_a_count_of_resumes_that_cannot_be_read_is_full(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / RESUMES_NAME).write_bytes(content)
+    assert len(ResumeLog(tmp_path).ages_s(NOW)) == 1000
+
+
+def test_a_resume_of_the_run_is_counted_for_the_next_one(tmp_path: Path) -> None:
+    with make(tmp_path, []) as latcher:
+        assert latcher.resumes_s == ()
+        latcher.heard(outputs({"kind": "resumed", "name": "link_lost"}))
+    assert ResumeLog(tmp_path).ages_s(datetime(2026, 1, 1, 1, tzinfo=UTC)) == (3600.0,)

@@ -1,0 +1,197 @@
+"""Reading runs back: what was recorded, and what is left of runs that ended badly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.nights import night
+from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.telemetry import FIELDS, column
+from membrane_ctrl.review import open_run
+from membrane_ctrl.run_files.column_file import FILE_S
+from membrane_ctrl.run_files.tables import NAMES, SIGNALS, TICK_FIELDS, coarser_level, first_level
+from tests.support.review_runs import fields_recorded, same, segment, set_summary, tables, written
+
+
+def level_of(rows: np.ndarray) -> dict[str, np.ndarray]:
+    return first_level({name: column(rows, name) for name in TICK_FIELDS})
+
+
+def test_every_field_comes_back(tmp_path: Path) -> None:
+    rows, shapes = night(1, 0.1, "typical", [])
+    table = open_run(written(tmp_path, 0.1)).ticks()
+    assert table.column_names == list(FIELDS)
+    for name in FIELDS:
+        assert same(table.column(name).to_numpy(), column(rows, name), 1e-4), name
+    back = open_run(tmp_path / "20261121T180000Z-night").shapes()
+    np.testing.assert_allclose(back.coeffs_um, [shape.coeffs_um for shape in shapes])
+    np.testing.assert_allclose(back.covariance_um2[0], shapes[0].covariance_um2, rtol=1e-6)
+
+
+def test_a_part_of_a_run(tmp_path: Path) -> None:
+    table = open_run(written(tmp_path, 0.1)).ticks(["error_um"], 100.0, 110.0)
+    time_s = table.column("mono_s").to_numpy()
+    assert table.column_names == ["mono_s", "error_um"]
+    assert (time_s[0] >= 100, time_s[-1] < 110, table.num_rows) == (True, True, 100)
+
+
+def test_an_unknown_column_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="eror_um"):
+        open_run(written(tmp_path, 0.02)).ticks(["eror_um"])
+
+
+@pytest.mark.parametrize("window_s", [1.0, 10.0, 60.0])
+def test_levels_are_least_mean_and_greatest_of_their_windows(tmp_path: Path, window_s: float) -> None:
+    rows, _ = night(1, 0.1, "typical", [])
+    level = open_run(written(tmp_path, 0.1)).level(window_s)
+    number = np.floor(column(rows, "mono_s") / window_s)
+    pressure = column(rows, "ambient_pressure_pa")
+    for k in (0, level["time_s"].size // 2, level["time_s"].size - 1):
+        inside = pressure[number == level["time_s"][k] / window_s]
+        assert level["rows"][k] == inside.size
+        found = [level[f"{kind}_ambient_pressure_pa"][k] for kind in ("min", "mean", "max")]
+        np.testing.assert_allclose(found, [inside.min(), inside.mean(), inside.max()], atol=1e-5)
+
+
+def test_a_level_of_a_level_is_the_level_of_the_ticks() -> None:
+    rows, _ = night(2, 0.1, "typical", [])
+    fine = level_of(rows)
+    coarse = coarser_level(coarser_level(fine, 10.0), 60.0)
+    direct = coarser_level(fine, 60.0)
+    for name in NAMES:
+        assert same(coarse[name], direct[name], 1e-9), name
+
+
+def test_nothing_finite_gives_nan_and_no_warning() -> None:
+    rows, _ = night(2, 0.01, "typical", [])
+    rows[:, FIELDS.index("trim_um")] = np.nan
+    level = level_of(rows)
+    assert np.isnan(level["mean_trim_um"]).all()
+    assert np.isfinite(level["mean_error_um"]).all()
+    assert set(level) == set(NAMES)
+    assert len(SIGNALS) * 3 + 6 == len(NAMES)
+
+
+def test_a_killed_run_ends_in_its_rerun_segment(tmp_path: Path) -> None:
+    rows, shapes = night(3, 0.05, "typical", [])
+    tables(tmp_path, rows, shapes, close=False)
+    segment(tmp_path, rows)
+    for path in (tmp_path / "columns").glob("*-waiting.arrows"):
+        path.unlink()
+    run = open_run(tmp_path)
+    table = run.ticks(fields_recorded())
+    assert table.num_rows == len(rows)
+    assert same(table.column("displacement_um").to_numpy(), column(rows, "displacement_um"), 1e-4)
+    assert any("summary.json" in note for note in run.notes)
+    for window_s in (1.0, 10.0, 60.0):
+        level = run.level(window_s)
+        assert level["rows"].sum() == len(rows)
+        assert (np.diff(level["time_s"]) > 0).all()
+
+
+def test_a_killed_run_is_whole_in_its_tables(tmp_path: Path) -> None:
+    rows, shapes = night(3, 0.05, "typical", [])
+    tables(tmp_path, rows, shapes, close=False)
+    run = open_run(tmp_path)
+    assert run.ticks().num_rows == len(rows)
+    assert run.level(60.0)["rows"].sum() == len(rows)
+    assert len(run.shapes()) == len(shapes)
+    files = {path.name for path in (tmp_path / "columns").iterdir()}
+    assert {"ticks-waiting.arrows", "ticks-000.arrows", "levels_60s-waiting.arrows"} <= files
+
+
+def test_a_cycle_that_the_journal_repeats_counts_once(tmp_path: Path) -> None:
+    rows, shapes = night(3, 0.05, "typical", [])
+    tables(tmp_path, rows, shapes)
+    columns = tmp_path / "columns"
+    (columns / "shapes-waiting.arrows").write_bytes((columns / "shapes-000.arrows").read_bytes())
+    found = open_run(tmp_path).shapes()
+    assert len(found) == len(shapes)
+    assert (np.diff(found.time_s) > 0).all()
+
+
+@pytest.mark.parametrize("table", ["levels_1s", "shapes"])
+def test_a_missing_file_of_any_table_is_named(tmp_path: Path, table: str) -> None:
+    folder = written(tmp_path, 0.02)
+    (folder / "columns" / f"{table}-000.arrows").rename(folder / "columns" / f"{table}-001.arrows")
+    assert any(f"{table}-000.arrows: missing" in note for note in open_run(folder).notes)
+
+
+def test_a_run_without_tables_is_read_from_rerun(tmp_path: Path) -> None:
+    rows, _ = night(4, 0.02, "typical", [])
+    segment(tmp_path, rows)
+    (tmp_path / "summary.json").write_text('{"schema": "membrane-summary/1"}')
+    run = open_run(tmp_path)
+    assert run.ticks().num_rows == len(rows)
+    assert run.level(1.0)["rows"].sum() == len(rows)
+    assert len(run.shapes()) == 0
+    assert any("tables of ticks are missing" in note for note in run.notes)
+
+
+def test_a_torn_table_gives_what_is_whole(tmp_path: Path) -> None:
+    folder = written(tmp_path, 0.2)
+    path = folder / "columns" / "ticks-000.arrows"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    run = open_run(folder)
+    assert 2000 < run.ticks().num_rows < 6000
+    last_s = run.ticks(["mono_s"]).column("mono_s")[-1].as_py()
+    assert any("ticks-000.arrows: cut short" in note and f"behind {last_s:.2f} s" in note for note in run.notes)
+
+
+def test_a_damaged_file_is_named(tmp_path: Path) -> None:
+    folder = written(tmp_path, 0.05)
+    (folder / "columns" / "ticks-000.arrows").write_bytes(b"\xff" * 4000)
+    run = open_run(folder)
+    assert run.ticks().num_rows == 0
+    assert any("ticks-000.arrows: cannot be read" in note for note in run.notes)
+    assert run.level(1.0)["time_s"].size > 0
+
+
+def test_a_missing_file_is_named_and_the_rest_is_there(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    one, _ = night(5, 0.02, "typical", [])
+    parts = [one.copy() for _ in range(3)]
+    for number, part in enumerate(parts):
+        part[:, FIELDS.index("mono_s")] += 1.1 * FILE_S * number
+    rows = np.concatenate(parts)
+    tables(folder, rows, [])
+    assert len(list((folder / "columns").glob("ticks-*"))) == 3
+    (folder / "columns" / "ticks-001.arrows").unlink()
+    run = open_run(folder)
+    assert any("ticks-001.arrows: missing" in note for note in run.notes)
+    assert run.ticks(["error_um"]).num_rows == len(rows) * 2 // 3
+
+
+def test_broken_small_files_are_named(tmp_path: Path) -> None:
+    folder = written(tmp_path, 0.02)
+    with (folder / "events.jsonl").open("a") as file:
+        file.write('{"kind": "half')
+    (folder / "config.toml").write_text("[loop]\nrate_hz = 10.0\n[limits]\nband_um = 3.0\n[unheard_of]\nx = 1\n")
+    (folder / "summary.json").write_text("not json")
+    run = open_run(folder)
+    assert run.config.limits.band_um == 3.0
+    assert run.summary is None
+    assert {note.split(":")[0] for note in run.notes} >= {"events.jsonl", "config.toml", "summary.json"}
+
+
+def test_another_schema_is_said(tmp_path: Path) -> None:
+    folder = written(tmp_path, 0.02)
+    set_summary(folder, schema="membrane-summary/0")
+    assert any("membrane-summary/1" in note for note in open_run(folder).notes)
+
+
+@pytest.mark.parametrize("what", ["absent", "empty", "file"])
+def test_what_is_no_run_is_refused(tmp_path: Path, what: str) -> None:
+    path = tmp_path / what
+    if what == "empty":
+        path.mkdir()
+    if what == "file":
+        path = tmp_path / "sub" / "a.txt"
+        path.parent.mkdir()
+        path.write_text("x")
+    with pytest.raises(InputError, match=what if what != "file" else "not a run"):
+        open_run(path)

@@ -1,0 +1,76 @@
+"""Streaming estimators against NumPy on the same data."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.run_files.summary import LogHistogram, Moments, SecondMeans
+
+
+@pytest.mark.parametrize("batch", [1, 7, 50, 1000])
+def test_moments_agree_with_numpy_in_any_batches(batch: int) -> None:
+    # a mean a million times the deviation: a sum of squares would have lost all digits
+    values = 1e6 + np.random.default_rng(1).normal(size=1000)
+    moments = Moments()
+    for start in range(0, values.size, batch):
+        moments.add(values[start : start + batch])
+    assert moments.count == 1000
+    assert moments.mean == pytest.approx(values.mean(), rel=1e-14)
+    assert moments.std == pytest.approx(values.std(), rel=1e-9)
+
+
+def test_moments_leave_out_what_is_not_finite() -> None:
+    moments = Moments()
+    moments.add(np.array([np.nan, 1.0, 3.0, np.inf]))
+    assert (moments.count, moments.mean, moments.std) == (2, 2.0, 1.0)
+
+
+def test_moments_of_nothing_are_nan() -> None:
+    moments = Moments()
+    moments.add(np.array([]))
+    assert math.isnan(moments.std)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.5, 0.9, 0.99, 0.999])
+def test_quantiles_are_within_a_bin_of_numpys(share: float) -> None:
+    values = np.random.default_rng(2).lognormal(0.3, 1.0, 20_000)
+    histogram = LogHistogram(ratio=1.02)
+    for part in np.array_split(values, 37):
+        histogram.add(part)
+    assert histogram.quantile(share) == pytest.approx(np.quantile(values, share), rel=0.02)
+    assert histogram.largest == values.max()
+
+
+def test_values_out_of_range_are_counted_at_the_ends() -> None:
+    histogram = LogHistogram(low=1.0, high=10.0)
+    histogram.add(np.array([-5.0, 0.0, 1e9]))
+    assert histogram.count == 3
+    assert histogram.quantile(0.5) == pytest.approx(1.0, rel=0.02)
+    assert histogram.quantile(1.0) == pytest.approx(10.0, rel=0.03)
+    assert histogram.largest == 1e9
+
+
+def test_quantile_of_nothing_is_nan() -> None:
+    assert math.isnan(LogHistogram().quantile(0.5))
+
+
+def test_second_means_agree_with_numpy() -> None:
+    values = np.random.default_rng(3).normal(size=(20, 50))
+    means = SecondMeans(band=0.1)
+    for k, value in enumerate(values.ravel()):
+        means.add(k * 0.02, float(value))
+    expected = values.mean(axis=1)[:-1]  # the last second is not over yet
+    assert means.count == 19
+    assert means.inside == int((np.abs(expected) <= 0.1).sum())
+    assert (means.first, means.last) == pytest.approx((expected[0], expected[-1]))
+
+
+def test_a_second_with_a_gap_gives_no_mean() -> None:
+    means = SecondMeans(band=1.0)
+    times_s = [*np.arange(0, 0.8, 0.1), *np.arange(2.0, 3.35, 0.1)]
+    for time_s in times_s:
+        means.add(float(time_s), 1.0 if time_s >= 2 else 100.0)
+    assert (means.count, means.first, means.last) == (1, 1.0, 1.0)

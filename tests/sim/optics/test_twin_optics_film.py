@@ -1,0 +1,129 @@
+"""Shape of the film: Hencky's bowl, slopes, vertex, rim, and the coefficients of what 36 terms carry."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.polynomial.polynomial import polyder, polyval
+from scipy.integrate import quad
+
+from membrane_ctrl.sim import film as hencky
+from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple, Wrinkle, typical_film
+from membrane_ctrl.sim.optics.film_terms import height_and_slopes, hencky_series, noll_orders
+
+RICH = FilmShape(
+    37.1,
+    zernike_um=tuple(float(v) for v in np.random.default_rng(3).normal(0.0, 200.0, 36)),
+    ripples=(Ripple(5.0, 60.0, 30.0, 0.4), Ripple(2.0, 25.0)),
+    wrinkles=(Wrinkle(80.0, 24, 1.0),),
+    bumps=(Bump(30.0, 100.0, -50.0, 40.0),),
+)
+
+
+def _slope_over_rho(u: float) -> float:
+    """dW/drho / rho of the unit bowl as a function of u = rho^2."""
+    return float(2.0 * polyval(u, polyder(hencky_series())))
+
+
+def test_the_series_solves_henckys_equation() -> None:
+    # n = c / g with g = (dW/drho)/rho; c follows from the equation itself at the centre, then must hold everywhere
+    def n_over_c(rho: float) -> float:
+        return 1.0 / _slope_over_rho(rho * rho)
+
+    step = 1e-3
+
+    def operator(rho: float) -> float:
+        second = (n_over_c(rho + step) - 2 * n_over_c(rho) + n_over_c(rho - step)) / step**2
+        first = (n_over_c(rho + step) - n_over_c(rho - step)) / (2 * step)
+        return second + 3 * first / rho
+
+    c3 = [-1.0 / (8.0 * operator(rho) * n_over_c(rho) ** 2) for rho in (0.1, 0.3, 0.5, 0.7, 0.9)]
+    np.testing.assert_allclose(c3, c3[0], rtol=1e-5)
+
+
+def test_the_series_keeps_the_rims_condition() -> None:
+    g, step = _slope_over_rho, 1e-4
+    slope = (1.0 / g((1 + step) ** 2) - 1.0 / g((1 - step) ** 2)) / (2 * step)
+    assert slope + 0.7 / g(1.0) == pytest.approx(0.0, abs=1e-7)
+
+
+def test_the_bowl_holds_the_volume_that_the_gas_sees() -> None:
+    # volume between the film and the plane of the rim, over pi a^2 w0
+    volume = quad(lambda rho: 2.0 * rho * (1.0 - polyval(rho * rho, hencky_series())), 0.0, 1.0)[0]
+    assert volume == pytest.approx(hencky.solve().volume, rel=1e-9)
+
+
+@pytest.mark.parametrize("film", [RICH, FilmShape(37.1, bowl="paraboloid"), FilmShape(37.1)])
+def test_slopes_are_the_derivatives_of_the_height(film: FilmShape) -> None:
+    step = 1e-3
+    for x, y in ((0.0, 0.0), (120.0, -60.0), (-300.0, 350.0), (0.0, 499.0)):
+        _, hx, hy = height_and_slopes(film.terms, 37.0, x, y)
+        grid = film.height_mm(np.array([x + step, x - step, x, x]), np.array([y, y, y + step, y - step]), -100.0)
+        assert hx == pytest.approx((grid[0] - grid[1]) / (2 * step), abs=1e-9)
+        assert hy == pytest.approx((grid[2] - grid[3]) / (2 * step), abs=1e-9)
+
+
+def test_the_vertex_is_zero_at_any_displacement() -> None:
+    for displacement_um in (-500.0, 0.0, 300.0):
+        assert RICH.height_mm(np.zeros(1), np.zeros(1), displacement_um)[0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_rim_stays_where_it_is() -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 13)
+    x, y = 500.0 * np.cos(angle), 500.0 * np.sin(angle)
+    # the vertex falls by the displacement, so heights above it grow by as much
+    np.testing.assert_allclose(RICH.height_mm(x, y, 250.0) - RICH.height_mm(x, y), 0.250, atol=1e-11)
+
+
+def test_coefficients_of_a_shape_of_36_terms_give_its_heights() -> None:
+    film = FilmShape(37.1, bowl="paraboloid", zernike_um=RICH.zernike_um)
+    coeffs_um = film.coeffs_um(400.0)
+    assert coeffs_um is not None
+    flat = FilmShape(0.0, bowl="paraboloid", zernike_um=tuple(coeffs_um))
+    x, y = np.random.default_rng(5).uniform(-350.0, 350.0, (2, 40))
+    np.testing.assert_allclose(flat.height_mm(x, y), film.height_mm(x, y, 400.0), atol=1e-11)
+    # piston included: the sum of the terms is 0 at the vertex, where only the rotationally symmetric ones are not
+    at_vertex = {0: 1.0, 2: -np.sqrt(3.0), 4: np.sqrt(5.0), 6: -np.sqrt(7.0)}
+    total = sum(c * at_vertex[noll_orders(j)[0]] for j, c in enumerate(coeffs_um, 1) if noll_orders(j)[1] == 0)
+    assert total == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_36_terms_cannot_carry_has_no_coefficients() -> None:
+    assert FilmShape(37.1).coeffs_um() is None
+    assert FilmShape(37.1, bowl="paraboloid", ripples=(Ripple(1.0, 50.0),)).coeffs_um() is None
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: FilmShape(37.1, zernike_um=(0.0,) * 37), "zernike_um holds 37"),
+        (lambda: FilmShape(37.1, zernike_um=(float("nan"),)), "zernike_um: every value"),
+        (lambda: FilmShape(float("inf")), "sag_mm = inf"),
+        (lambda: FilmShape(37.1, radius_mm=0.0), "radius_mm = 0"),
+        (lambda: FilmShape(37.1, bowl="cone"), "bowl = 'cone' must be hencky or paraboloid"),  # type: ignore[arg-type]
+        (lambda: Ripple(1.0, 0.0), "wavelength_mm = 0"),
+        (lambda: Wrinkle(1.0, 0), "lobes = 0"),
+        (lambda: Bump(1.0, 0.0, 0.0, -1.0), "sigma_mm = -1"),
+    ],
+)
+def test_films_that_cannot_be_are_refused_by_their_field(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_a_typical_film_is_drawn_from_its_seed() -> None:
+    one, again, other = (typical_film(37.1, 500.0, seed) for seed in (1, 1, 2))
+    assert one == again
+    assert one != other
+    astigmatism = np.hypot(one.zernike_um[4], one.zernike_um[5])
+    assert astigmatism == pytest.approx(300.0)
+
+
+def test_films_cross_to_another_process() -> None:
+    there = pickle.loads(pickle.dumps(RICH))
+    x, y = np.array([200.0]), np.array([-100.0])
+    assert there == RICH
+    assert there.height_mm(x, y) == RICH.height_mm(x, y)

@@ -1,0 +1,207 @@
+"""A virtual run is the supervisor's run: on equal plants, in equal time, both give the same rows to the bit."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import cast
+
+import pytest
+
+from firmware_iface.roles import BenchCommand, BenchIdentity, BenchReading
+from membrane_ctrl.config.schema import Config, LoopConfig, TwinConfig
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.controller.tick import TickOutputs
+from membrane_ctrl.hold.supervisor import Supervisor, Wiring
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.model.shape_estimate import pack_estimate
+from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES
+from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.virtual.bench import VirtualBench
+from membrane_ctrl.sim.virtual.run import TruthShape, VirtualRun
+from tests.support.virtual_time import run_virtual as in_virtual_time
+
+# a power of two, so that the supervisor's sum of periods is exact and both tick at the same instants to the bit
+RATE_HZ = 64.0
+CONFIG = Config(loop=LoopConfig(rate_hz=RATE_HZ), twin=TwinConfig(seed=11))
+LASTS_S = 60.0
+FAULT_S, OVER_S = 30.0, 33.0
+
+Upset = Callable[[VirtualBench, bool], None]
+HOLD, STOP = Command("hold", "test"), Command("stop", "duration")
+
+
+def switched(name: str, on: object, off: object) -> Upset:
+    """A switch that is on while the fault lasts."""
+    return lambda bench, lasts: setattr(bench.wrong, name, on if lasts else off)
+
+
+def restarts(bench: VirtualBench, lasts: bool) -> None:
+    """The board restarts when the fault sets in."""
+    if lasts:
+        bench.power_cycle()
+
+
+def restarts_and_loses_answers(bench: VirtualBench, lasts: bool) -> None:
+    """The board restarts, so that it must be opened again, and every other answer is lost."""
+    restarts(bench, lasts)
+    bench.wrong.lost_every = 2 if lasts else 0
+
+
+UPSETS: dict[str, Upset] = {
+    "nothing": lambda bench, lasts: None,
+    "no light": switched("no_light", True, False),
+    "unreachable": switched("unreachable", True, False),
+    "no answer": switched("silent", True, False),
+    "every third answer lost": switched("lost_every", 3, 0),
+    "board restarts": restarts,
+    "board restarts and loses answers": restarts_and_loses_answers,
+    "gauge too high": switched("gauge_offset_pa", 400.0, 0.0),
+    "no shapes": switched("camera_lost", True, False),
+}
+
+
+@dataclass
+class Timed:
+    """Plant and board, brought to any later moment, with the upset in between."""
+
+    bench: VirtualBench
+    upset: Upset
+    now_s: float = 0.0
+
+    def upset_before(self, now_s: float) -> None:
+        """Turn the switches as they stand during the period that ends now."""
+        for at_s, lasts in ((FAULT_S, True), (OVER_S, False)):
+            if self.now_s < at_s <= now_s:
+                self.upset(self.bench, lasts)
+        self.now_s = now_s
+
+
+class LoopClock:
+    """A `RunClock` that reads the event loop's time."""
+
+    def now(self) -> float:
+        return asyncio.get_running_loop().time()
+
+    def utc(self, mono_s: float) -> datetime:
+        return datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=mono_s)
+
+
+class WaitingBench:
+    """The virtual bench as the supervisor's: whoever asks it something finds it at the event loop's time."""
+
+    def __init__(self, timed: Timed) -> None:
+        self._timed = timed
+        self._at_s = 0.0
+        self._shape = TruthShape(timed.bench, CONFIG, 5)
+        self._shape_due_s = 0.0
+        self.shapes: RingWriter | None = None
+
+    def _now(self) -> VirtualBench:
+        now_s = asyncio.get_running_loop().time()
+        if now_s > self._at_s:
+            self._timed.upset_before(now_s)
+            self._timed.bench.advance(now_s - self._at_s)
+            self._at_s = now_s
+        return self._timed.bench
+
+    def truth(self) -> tuple[float, float]:
+        truth = self._now().truth
+        if self._at_s >= self._shape_due_s:
+            self._shape_due_s += CONFIG.shape.period_s
+            estimate = self._shape(self._at_s)
+            if estimate is not None and self.shapes is not None:
+                self.shapes.put(pack_estimate(estimate))
+        return truth.displacement_um, truth.laser_bias_um
+
+    async def open(self) -> BenchIdentity:
+        self._now().open()
+        return cast(BenchIdentity, None)  # nobody asks who it is
+
+    async def read(self) -> BenchReading:
+        return self._now().read()
+
+    async def write(self, command: BenchCommand) -> None:
+        self._now().write(command)
+
+    async def clear_faults(self, mask: int) -> None:
+        self._now().clear_faults(mask)
+
+    def dead_guards(self) -> tuple[str, ...]:
+        return ()
+
+    async def close(self) -> None:
+        self._now().close()
+
+
+def made(upset: Upset) -> Timed:
+    return Timed(VirtualBench(Plant(CONFIG.twin, CONFIG.pump)), upset)
+
+
+def supervised(upset: Upset) -> tuple[list[TickOutputs], Exit]:
+    """The run of a supervisor with rings and event loop, but without processes."""
+    heard: list[TickOutputs] = []
+
+    async def hold() -> Exit:
+        with ExitStack() as stack:
+            sizes = {"telemetry": ROW_BYTES, "events": 4096, "shapes": 1 << 15}
+            addresses = {name: stack.enter_context(ring(16, size)) for name, size in sizes.items()}
+            telemetry, events, shapes = (RingWriter(addresses[name]) for name in sizes)
+            reader = RingReader(addresses["shapes"])
+            for end in (telemetry, events, shapes, reader):
+                stack.callback(end.close)
+            bench = WaitingBench(made(upset))
+            bench.shapes = shapes
+            wiring = Wiring(bench, telemetry, events, shapes=reader, truth=bench.truth, heard={"test": heard.append})
+            controller = Controller(CONFIG, zernike_projection())
+            await bench.open()
+            supervisor = Supervisor(controller, wiring, cast(RunClock, LoopClock()), RATE_HZ)
+            supervisor.ask(HOLD)
+            return await supervisor.run(LASTS_S)
+
+    return heard, in_virtual_time(hold())
+
+
+def virtual(upset: Upset) -> tuple[list[TickOutputs], Exit | None]:
+    """The same without them."""
+    timed = made(upset)
+    run = VirtualRun(CONFIG, timed.bench, zernike_projection(), TruthShape(timed.bench, CONFIG, 5))
+    outputs: list[TickOutputs] = []
+    while run.finished is None:
+        next_s = run.now_s + 1.0 / RATE_HZ
+        timed.upset_before(next_s)
+        tick = run.tick((HOLD,) * (next_s == 1.0 / RATE_HZ) + (STOP,) * (next_s == LASTS_S))
+        assert tick is not None
+        outputs.append(tick.outputs)
+    return outputs, run.finished
+
+
+@pytest.mark.parametrize("name", UPSETS)
+def test_a_virtual_run_is_the_supervisors(name: str) -> None:
+    theirs, their_exit = supervised(UPSETS[name])
+    ours, our_exit = virtual(UPSETS[name])
+    assert len(theirs) > FAULT_S * RATE_HZ
+    for their, our in zip(theirs, ours, strict=False):
+        differs = {
+            field: (a, b)
+            for field in FIELDS
+            for a, b in [(getattr(their.row, field), getattr(our.row, field))]
+            if a != b and not (math.isnan(a) and math.isnan(b))
+        }
+        assert not differs, f"{our.row.mono_s} s"
+        assert their.events == our.events
+    assert (len(theirs), their_exit) == (len(ours), our_exit)
+
+
+def test_the_upsets_do_upset() -> None:
+    quiet = [output.row.pack() for output in virtual(UPSETS["nothing"])[0]]
+    for name in UPSETS.keys() - {"nothing"}:
+        assert [output.row.pack() for output in virtual(UPSETS[name])[0]] != quiet, name

@@ -1,0 +1,68 @@
+"""Every scenario file, and what the loader says of files that are none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from membrane_ctrl.model.errors import InputError
+from tests.support.scenario import complaints, load_scenario, play
+
+FOLDER = Path(__file__).parents[2] / "scenarios"
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.toml")), ids=lambda path: path.stem)
+def test_scenario(path: Path) -> None:
+    scenario = load_scenario(path)
+    outcome = play(scenario)
+    assert not list(complaints(scenario.expect, outcome))
+    assert outcome.bench.board.pump_fraction == 0.0  # however it ended
+
+
+GOOD = 'title = "x"\nduration_s = 20.0\n[config.loop]\nrate_hz = 10.0\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('[[at]]\ntime_s = 1.0\nwrong = "gremlins"\n[expect]\n', ["at.0", "gremlins", "no_light"]),
+        ('[[at]]\ntime_s = 1.0\nwrong = "pump_share"\nvalue = 1.5\n[expect]\n', ["at.0", "pump_share", "0 to 1"]),
+        ('[[at]]\ntime_s = 1.0\nwrong = "silent"\ncommand = "stop"\n[expect]\n', ["at.0", "exactly one"]),
+        ('[[at]]\ntime_s = 1.0\ncommand = "explode"\n[expect]\n', ["at.0", "explode", "lower"]),
+        ('[[at]]\ntime_s = 1.0\nevent = "laser_dropout"\nfor_s = 9.0\n[expect]\n', ["at.0", "for_s", "over_s"]),
+        ('[[at]]\ntime_s = 1.0\nwrong = "silent"\nover_s = 9.0\n[expect]\n', ["at.0", "over_s", "for_s"]),
+        ('[[at]]\ntime_s = 20.0\nwrong = "silent"\n[expect]\n', ["at.0", "20", "duration_s"]),
+        ('[[expect.bounds]]\nfield = "height"\nlow = 1.0\n', ["expect.bounds.0", "height"]),
+        ('[[expect.bounds]]\nfield = "trim_um"\n', ["expect.bounds.0", "low, high"]),
+        ('[expect]\nexit = "well"\n', ["expect.exit", "safety_trip"]),
+        ("[expect]\nfault = []\n", ["expect.fault", "did you mean faults"]),
+        ("", ["expect", "required"]),
+    ],
+)
+def test_a_bad_file_is_one_line(tmp_path: Path, text: str, words: list[str]) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text(GOOD + text)
+    with pytest.raises(InputError) as caught:
+        load_scenario(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(path) in message
+    assert all(word in message for word in words), message
+
+
+def test_what_does_not_come_is_complained_of(tmp_path: Path) -> None:
+    path = tmp_path / "wrong.toml"
+    bounds = '[[expect.bounds]]\nfield = "truth_displacement_um"\nhigh = -1e3\n'
+    expect = '[expect]\nexit = "safety_trip"\nstates = []\nfaults = ["late"]\nevents = ["party"]\n'
+    path.write_text(GOOD + expect + 'shape_reasons = ["bored"]\n' + bounds)
+    scenario = load_scenario(path)
+    found = "\n".join(complaints(scenario.expect, play(scenario)))
+    assert all(word in found for word in ("exit", "states", "faults", "party", "bored", "truth_displacement_um"))
+
+
+def test_a_process_that_never_runs_is_complained_of(tmp_path: Path) -> None:
+    path = tmp_path / "stalled.toml"
+    path.write_text(GOOD + '[[at]]\ntime_s = 0.0\nwrong = "stalled"\n[expect]\nexit = "done"\n')
+    scenario = load_scenario(path)
+    assert list(complaints(scenario.expect, play(scenario))) == ["exit: none, not done"]

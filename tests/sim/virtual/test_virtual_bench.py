@@ -1,0 +1,124 @@
+"""The board in virtual time does what the board does: watchdog, restart, latches, and nothing without a link."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from firmware_iface.register_map import default_map
+from firmware_iface.roles import ALL_FAULTS, BenchCommand, LinkDownError, LinkError
+from membrane_ctrl.config.schema import Config, TwinConfig
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.virtual.bench import VirtualBench
+
+CONFIG = Config(twin=TwinConfig(scenario="calm"))
+WATCHDOG, OVER_PRESSURE = (default_map().fault_mask(name) for name in ("watchdog", "over_pressure"))
+
+
+@pytest.fixture
+def bench() -> VirtualBench:
+    made = VirtualBench(Plant(CONFIG.twin, CONFIG.pump), watchdog_s=0.5)
+    made.open()
+    return made
+
+
+def test_without_a_write_the_pump_stands_after_the_watchdog_period(bench: VirtualBench) -> None:
+    bench.advance(0.02)
+    bench.write(BenchCommand(0.5, 0.0))
+    for _ in range(24):
+        bench.advance(0.02)
+        assert bench.board.pump_fraction == pytest.approx(0.5, abs=1e-4)
+    bench.advance(0.04)
+    assert bench.board.pump_fraction == 0.0
+    assert bench.read().watchdog_tripped
+    bench.write(BenchCommand(0.5, 0.0))
+    assert bench.board.pump_fraction == 0.0  # latched
+    bench.clear_faults(ALL_FAULTS)
+    bench.write(BenchCommand(0.5, 0.0))
+    assert bench.board.pump_fraction > 0.0
+
+
+def test_a_board_that_restarted_must_be_opened_again(bench: VirtualBench) -> None:
+    bench.write(BenchCommand(0.5, 0.0))
+    bench.power_cycle()
+    assert bench.board.pump_fraction == 0.0
+    with pytest.raises(LinkDownError, match="restarted"):
+        bench.read()
+    bench.open()
+    assert bench.read().latched_faults == 0
+
+
+def test_the_boards_own_pressure_limit_vents(bench: VirtualBench) -> None:
+    bench.write(BenchCommand(0.5, 0.0))
+    bench.wrong.gauge_offset_pa = 300.0
+    bench.advance(0.02)
+    assert (bench.board.pump_fraction, bench.board.vent_fraction) == (0.0, 1.0)
+
+
+def test_switches_of_the_link(bench: VirtualBench) -> None:
+    bench.wrong.silent = True
+    with pytest.raises(LinkError, match="no answer"):
+        bench.write(BenchCommand(0.4, 0.0))
+    assert bench.board.pump_fraction > 0.3  # carried out all the same
+    bench.wrong.silent, bench.wrong.unreachable = False, True
+    with pytest.raises(LinkDownError):
+        bench.read()
+    bench.wrong.unreachable = False
+    with pytest.raises(LinkDownError):
+        bench.read()  # not connected again by itself
+    bench.open()
+    assert math.isfinite(bench.read().displacement_um)
+
+
+def test_switches_of_the_sensors(bench: VirtualBench) -> None:
+    bench.advance(0.1)
+    before = bench.read()
+    bench.wrong.laser_stuck = True
+    bench.advance(0.1)
+    stuck = bench.read()
+    assert stuck.displacement_um == before.displacement_um
+    assert stuck.sample_counter > before.sample_counter
+    bench.wrong.samples_frozen = True
+    bench.advance(0.1)
+    assert bench.read().sample_counter == stuck.sample_counter
+    bench.wrong.samples_frozen = bench.wrong.laser_stuck = False
+    bench.wrong.no_light = bench.wrong.gauge_lost = bench.wrong.barometer_lost = True
+    bench.advance(0.1)
+    lost = bench.read()
+    assert lost.displacement_quality != 0
+    assert math.isnan(lost.displacement_um)
+    assert math.isnan(lost.gauge_pressure_pa)
+    assert math.isnan(lost.ambient_pressure_pa)
+
+
+def test_actuators_that_do_not_follow(bench: VirtualBench) -> None:
+    bench.wrong.pump_stuck_fraction = 1.0
+    bench.write(BenchCommand(0.0, 0.0))
+    start_um = bench.plant.truth().displacement_um
+    for _ in range(100):
+        bench.advance(0.05)
+        bench.write(BenchCommand(0.0, 0.0))
+    assert bench.plant.truth().displacement_um > start_um + 10.0
+    assert bench.read().pump_fraction == 0.0  # the board knows nothing of it
+
+
+def test_only_the_bits_of_the_mask_are_cleared(bench: VirtualBench) -> None:
+    bench.write(BenchCommand(0.5, 0.0))
+    bench.wrong.gauge_offset_pa = 300.0
+    bench.advance(1.0)
+    assert bench.read().latched_faults == WATCHDOG | OVER_PRESSURE
+    bench.wrong.gauge_offset_pa = 0.0
+    bench.clear_faults(WATCHDOG)
+    bench.advance(0.02)
+    assert bench.read().latched_faults == OVER_PRESSURE
+    assert (bench.board.pump_fraction, bench.board.vent_fraction) == (0.0, 1.0)
+
+
+def test_the_heartbeat_goes_round_and_keeps_the_watchdog_fed(bench: VirtualBench) -> None:
+    bench._driver._heartbeat = 0xFFFD  # after 22 minutes at 50 Hz
+    for _ in range(6):
+        bench.write(BenchCommand(0.5, 0.0))
+        bench.advance(0.4)
+        assert not bench.read().watchdog_tripped
+    assert bench.board.pump_fraction == pytest.approx(0.5, abs=1e-4)

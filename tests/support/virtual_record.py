@@ -1,0 +1,70 @@
+"""A virtual run of the twin with its record, as supervisor and recorder would have written it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from firmware_iface.roles import BenchReading
+from membrane_ctrl import __version__
+from membrane_ctrl.config import toml_file as config_file
+from membrane_ctrl.config.schema import Config, TwinConfig
+from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.controller.memory import remember
+from membrane_ctrl.controller.tick import TickAssembler, TickInputs, TickOutputs, pack_tick
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.run_files.inputs_file import InputsFile
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.virtual.run import Alter, run_virtual
+from tests.support.synthetic_shape import shape_at
+
+CONFIG = Config(twin=TwinConfig(laser_noise_um=0.5))
+
+
+def kept_ticks(duration_s: float, alter: Alter | None = None) -> list[tuple[TickInputs, TickOutputs]]:
+    """Inputs and outputs of every tick of a hold of the twin."""
+    run = run_virtual(CONFIG, Plant(CONFIG.twin, CONFIG.pump), duration_s, zernike_projection(), shape_at, alter)
+    return [(tick.inputs, tick.outputs) for tick in run]
+
+
+def memory_at(ticks: list[tuple[TickInputs, TickOutputs]], tick: int) -> bytes:
+    """What the run's controller remembered before a tick."""
+    controller = Controller(CONFIG, zernike_projection())
+    for inputs, _ in ticks[: tick - 1]:
+        controller.tick(inputs)
+    return remember(controller)
+
+
+def write_record(
+    folder: Path,
+    ticks: list[tuple[TickInputs, TickOutputs]],
+    lost: range = range(0),
+    memories: Mapping[int, bytes] | None = None,
+) -> None:
+    """The run's folder: configuration, inputs a frame a second, events; ticks of `lost` are not in it."""
+    (folder / "config.toml").write_text(config_file.dump(CONFIG))
+    file, assembler = InputsFile(folder, __version__), TickAssembler()
+    lines = []
+    for first in range(0, len(ticks), 50):
+        messages: list[bytes] = []
+        shapes = []
+        for place, (inputs, outputs) in enumerate(ticks[first : first + 50], start=first + 1):
+            if place not in lost:
+                messages += pack_tick(place, inputs, outputs, outputs.row.pack(), (memories or {}).get(place, b""))
+            if inputs.estimate is not None:
+                shapes.append(inputs.estimate)
+            lines += [json.dumps({"mono_s": inputs.now_s + 1e-4, **event}) for event in outputs.events]
+        file.append(assembler.take(messages), shapes)
+    file.close()
+    lines.append(json.dumps({"mono_s": ticks[-1][0].now_s + 1e-3, "kind": "end", "exit": "done"}))
+    (folder / "events.jsonl").write_text("\n".join(lines) + "\n")
+
+
+def laser_lost(now_s: float, reading: BenchReading) -> BenchReading:
+    """The laser sees nothing for a second of the hold."""
+    from dataclasses import replace
+
+    return replace(reading, displacement_um=np.nan, displacement_quality=1) if 14.3 <= now_s < 15.3 else reading

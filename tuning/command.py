@@ -1,0 +1,326 @@
+"""`tune`: sessions on a running hold or on the twin, step by step or all at once."""
+
+import contextlib
+import getpass
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.control.film_health import TOO_TIGHT_UM_PER_S
+from membrane_ctrl.control_port.client import PortClient
+from membrane_ctrl.control_port.ctl import Where, socket_path
+from membrane_ctrl.model.errors import DeviceError, Exit, InputError, RejectedError
+from membrane_ctrl.sessions import folder as plain
+from membrane_ctrl.sessions.folder import STEPS, SessionFolder, create_session, newest_session, open_session
+from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, LiveHold
+from membrane_ctrl.sessions.progress import Progress
+from tuning import gains_file, report, session, twin_hold
+from tuning import gains_file as journal
+from tuning.identification.characterise import TYPICAL_S
+from tuning.proposal.verify import SETTLE_LEAST_S, STAGES, Stage
+from tuning.rig import HoldRig
+
+_TOO_TIGHT = "the mirror is too tight to be held within its band: open the bleed (loop.bleed_fraction)"
+_MOVES = frozenset({"characterise", "observe", "apply", "verify"})
+
+
+@dataclass(frozen=True, slots=True)
+class TuneOptions:
+    """What the command line asked for."""
+
+    config: Config
+    twin: bool
+    where: Where
+    logs: Path
+    session: Path | None
+    name: str
+    author: str
+    reason: str
+    limit_um: float
+    observe_s: float
+    verify_s: float
+    take_over: bool
+    json: bool
+
+    @property
+    def stages(self) -> tuple[tuple[float, float], ...]:
+        """Of the verification, in the time there is for it."""
+        share = self.verify_s / STAGES[-1][0]
+        return tuple((share * until_s, growth) for until_s, growth in STAGES)
+
+
+def author_name() -> str:
+    """Who is logged in."""
+    with contextlib.suppress(OSError, KeyError):
+        return getpass.getuser()
+    return "unknown"
+
+
+def run_session(options: TuneOptions) -> int:
+    """All steps that are not done yet. Returns the exit code; see `one_step` for what is raised."""
+    with _session(options) as (folder, rig, progress):
+        todo = [step for step in STEPS if not folder.done(step)]
+        for number, step in enumerate(todo):
+            _begin(progress, options, step, todo[number + 1 :])
+            _do(step, folder, rig, options, progress)
+    return _concluded(folder, options)
+
+
+def one_step(step: str, options: TuneOptions) -> int:
+    """One step of the newest session, or of the one named; `characterise` begins one.
+
+    Raises
+    ------
+    InputError, DeviceError, RejectedError
+        One line each; the mirror is held with the last good gains then.
+    """
+    if step not in _MOVES:
+        folder = _folder(options, None)
+        _do(step, folder, None, options, Progress())
+    else:
+        with _session(options, fresh=step == "characterise" and options.session is None) as (folder, rig, progress):
+            _begin(progress, options, step, [])
+            _do(step, folder, rig, options, progress)
+    return _concluded(folder, options)
+
+
+def map_pump(options: TuneOptions) -> int:
+    """Measure the pump; the later steps of the session use it."""
+    with _session(options) as (folder, rig, progress):
+        progress.begin("pump map", 700.0, 0.0)
+        found = session.map_pump(folder, rig)
+        progress.say(
+            f"starts at {found.start_fraction:.3f}, stalls at {found.stall_fraction:.3f} (sticks by "
+            f"{found.sticks_by:.3f}), full flow {found.flow_full_um_per_s:.2f} um/s, leak {found.leak_um_per_s:.2f} "
+            f"+- {found.leak_sigma_um_per_s:.2f} um/s; [pump] for the configuration: {folder.file('pump.toml')}"
+        )
+        if found.too_tight:
+            progress.say(_TOO_TIGHT)
+    return _concluded(folder, options)
+
+
+def outer(options: TuneOptions) -> int:
+    """Sag sensitivity, noise and drift of the figure; the outer loop's time constant."""
+    from membrane_ctrl.metrology.optics.hencky import zernike_projection
+    from tuning.identification.outer_loop import TYPICAL_S as OUTER_S
+    from tuning.identification.outer_loop import evaluate, step_experiment
+
+    with _session(options) as (folder, rig, progress):
+        progress.begin("outer loop", OUTER_S + options.observe_s, 0.0)
+        rig.hold(options.observe_s)
+        steady = [shape for shape in rig.shapes if shape.verdict != "rejected"]
+        levels = step_experiment(rig, rig.loop.setpoint_um, folder.config.shape.enabled)
+        try:
+            found = evaluate(levels, steady, zernike_projection())
+        except ValueError as error:
+            raise RejectedError(f"outer loop: {error}") from None
+        plain.write(folder.file("outer.json"), found)
+        progress.say(
+            f"sag seen per um of the laser's {found.scale:.3f}, noise {found.sigma_um:.2f} um a cycle of "
+            f"{found.cycle_s:.1f} s, drift {'' if found.drift_seen else 'below '}"
+            f"{found.drift_um_per_sqrt_h:.2f} um/sqrt(h): shape.time_constant_s = {found.time_constant_s:.0f}"
+        )
+    return _concluded(folder, options)
+
+
+def watch(options: TuneOptions) -> int:
+    """Look at a hold for the observation time and say whether a session is due (exit 3)."""
+    from tuning.proposal.verify import health
+
+    folder = _folder(options, None)
+    folder.require("design")
+    made = gains_file.load_gains(folder.file("gains.toml"))
+    with _link(options) as link:
+        progress = Progress()
+        rig = HoldRig(link, options.author, progress)
+        progress.begin("watch", options.observe_s, 0.0)
+        try:
+            found = health(*rig.hold_about(options.observe_s), rig.loop, made)
+        except HoldError as error:
+            raise DeviceError(str(error)) from None
+        except ValueError as error:
+            raise InputError(f"watch: {error}") from None
+    if options.json:
+        print(json.dumps(plain.plain(found)))
+    progress.say(
+        f"std {found.std_um:.3f} um, {found.ratio:.2f} of the least possible ({found.ratio_designed:.2f} expected); "
+        f"k {found.gain:.2f} +- {found.gain_sigma:.2f}; leak {found.leak_um_per_s:.2f} um/s"
+    )
+    for suggestion in found.suggestions:
+        progress.say(f"a tuning session is due: {suggestion}")
+    return Exit.REJECTED if found.suggestions else Exit.DONE
+
+
+def rollback(options: TuneOptions) -> int:
+    """Back to the gains before those that were kept last."""
+    kept = journal.to_roll_back(options.logs)
+    progress = Progress()
+    with _link(options) as link:
+        rig = HoldRig(link, options.author, progress)
+        try:
+            rig.set_gains(kept.before, f"rollback of {kept.session}: {options.reason}"[:250])
+        except HoldError as error:
+            raise DeviceError(str(error)) from None
+    told = journal.entry("rolled_back", kept.session, options.author, options.reason, kept.before, kept.after)
+    journal.note(options.logs, told)
+    progress.say(
+        f"back to the gains before {kept.session}: K {kept.before.kp_per_s:g} 1/s, Ti {kept.before.ti_s:g} s"
+    )
+    return Exit.DONE
+
+
+def _do(step: str, folder: SessionFolder, rig: HoldRig | None, options: TuneOptions, progress: Progress) -> None:
+    """One step; what it found is said in a line."""
+
+    def told(stage: Stage) -> None:
+        progress.say(
+            f"  after {stage.time_s:.0f} s: std {stage.std_um:.3f} um, {stage.growth:.2f} of the gains before"
+        )
+
+    moving: dict[str, Callable[[HoldRig], object]] = {
+        "characterise": lambda r: session.characterise_step(folder, r, options.limit_um),
+        "observe": lambda r: session.observe_step(folder, r, options.observe_s),
+        "apply": lambda r: session.apply_step(folder, r),
+        "verify": lambda r: _verify(folder, r, options, told),
+    }
+    if step in moving:
+        assert rig is not None
+        moving[step](rig)
+    elif step == "identify":
+        session.identify_step(folder)
+    elif step == "design":
+        session.design_step(folder, options.reason)
+    else:
+        session.preview_step(folder)
+    report.write_report(folder)
+    progress.say(f"{step}: {_in_a_line(step, folder)}")
+
+
+def _verify(folder: SessionFolder, rig: HoldRig, options: TuneOptions, told: Callable[[Stage], None]) -> None:
+    done = session.verify_step(folder, rig, told, options.stages)
+    what: journal.What = "kept" if done.kept else "taken_back"
+    reason = options.reason if done.kept else done.reason
+    author = folder.head.author
+    journal.note(options.logs, journal.entry(what, folder.path.name, author, reason, done.before, done.after))
+
+
+def _in_a_line(step: str, folder: SessionFolder) -> str:
+    match step:
+        case "identify":
+            found = session.found_of(folder)
+            model, sigma = found.identified.model, found.identified.sigma
+            reasons = "".join(f"; {reason}" for reason in found.quality.reasons)
+            tight = f"; {_TOO_TIGHT}" if model.leak_um_per_s < TOO_TIGHT_UM_PER_S else ""
+            return (
+                f"k {model.gain:.3f} +- {sigma.gain:.3f}, delay {model.delay_s:.3f} +- {sigma.delay_s:.3f} s "
+                f"(dead time {model.dead_time_s:.3f} +- {sigma.dead_time_s:.3f} s), "
+                f"leak {model.leak_um_per_s:.2f} um/s: {found.quality.verdict}{reasons}{tight}"
+            )
+        case "observe":
+            weather = session.disturbance_of(folder)
+            return f"laser noise {weather.laser_um:.2f} um a reading"
+        case "design":
+            gains = gains_file.load_gains(folder.file("gains.toml"))
+            return (
+                f"K {gains.loop.kp_per_s:.3f} 1/s, Ti {gains.loop.ti_s:.2f} s, filter "
+                f"{gains.loop.measurement_filter_s:.2f} s: {gains.predicted_std_um:.3f} um predicted, "
+                f"{gains.predicted_std_um / gains.least_std_um:.2f} of the least possible"
+            )
+        case "preview":
+            shown = session.preview_of(folder)
+            present, proposed = (sum(p.std_um for p in row) / len(row) for row in (shown.present, shown.proposed))
+            return f"on the fitted twin {present:.3f} um with the present gains, {proposed:.3f} um with the new ones"
+        case "verify":
+            done = session.verified_of(folder)
+            return "kept" if done.kept else f"the old gains are back: {done.reason}"
+        case _:
+            return "done"
+
+
+def _begin(progress: Progress, options: TuneOptions, step: str, after: list[str]) -> None:
+    planned = {
+        "characterise": TYPICAL_S,
+        "observe": options.observe_s,
+        "verify": SETTLE_LEAST_S + options.verify_s,
+    }
+    progress.begin(step, planned.get(step, 0.0), sum(planned.get(later, 0.0) for later in after))
+
+
+@contextmanager
+def _session(options: TuneOptions, fresh: bool = False) -> Iterator[tuple[SessionFolder, HoldRig, Progress]]:
+    """Folder and hold of a session; whatever ends it early, the mirror gets the last good gains back."""
+    progress = Progress()
+    with _link(options) as link:
+        folder = _folder(options, link, fresh)
+        rig = HoldRig(link, options.author, progress)
+        with progress.catching():
+            try:
+                yield folder, rig, progress
+            except BaseException as error:
+                _go_back(rig, folder.head.before, progress)
+                if isinstance(error, HoldError):
+                    raise DeviceError(str(error)) from None
+                raise
+
+
+def _go_back(rig: HoldRig, before: LoopConfig, progress: Progress) -> None:
+    progress.interrupted = False
+    try:
+        rig.go_back(before)
+    except HoldError as error:
+        progress.say(f"the last good gains could not be set ({error}); gains on trial go back by themselves")
+        return
+    progress.say("the mirror is held with the last good gains")
+
+
+@contextmanager
+def _link(options: TuneOptions) -> Iterator[HoldLink]:
+    if options.twin:
+        config = open_session(options.session).config if options.session is not None else options.config
+        link: HoldLink = _asked(lambda: twin_hold.TwinHold(config))
+    else:
+        socket = socket_path(options.where)
+        client = PortClient.unix(socket, lambda text: print(f"notice: {text}", file=sys.stderr))
+        run_dir = options.where.run or socket.parent / str(client.greeting["run"])
+        try:
+            link = LiveHold(client, run_dir, options.take_over)
+        except BaseException:
+            client.close()
+            raise
+    with contextlib.closing(link):
+        yield link
+
+
+def _asked(make: Callable[[], HoldLink]) -> HoldLink:
+    try:
+        return make()
+    except HoldError as error:
+        raise DeviceError(str(error)) from None
+
+
+def _folder(options: TuneOptions, link: HoldLink | None, fresh: bool = False) -> SessionFolder:
+    """The session that was named; without a name the newest, or a new one where there is a hold to begin it on."""
+    if options.session is not None:
+        return open_session(options.session)
+    if link is None:
+        return newest_session(options.logs)
+    if not fresh:
+        with contextlib.suppress(InputError):
+            newest = newest_session(options.logs)
+            if (newest.head.source, newest.head.name) == (link.name, options.name) and not newest.done("verify"):
+                return newest
+    return create_session(options.logs, options.name, options.author, link.name, link.config, link.config.loop)
+
+
+def _concluded(folder: SessionFolder, options: TuneOptions) -> int:
+    if options.json:
+        done = [step for step in STEPS if folder.done(step)]
+        print(json.dumps({"session": str(folder.path), "done": done}))
+    else:
+        print(f"session: {folder.path}", file=sys.stderr)
+    refused = folder.done("verify") and not session.verified_of(folder).kept
+    return Exit.REJECTED if refused else Exit.DONE

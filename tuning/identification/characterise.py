@@ -1,0 +1,288 @@
+"""The first step of a session: relay until the gain is known, doublets until the dead time is, all within bounds."""
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from membrane_ctrl.control.experiments import machine, patterns, trial
+from tuning.identification.identify import Identified, identify, independence, prediction_errors, two_gains, whiteness
+from tuning.identification.records import Record
+
+# Whether the data carry a proposal; if not, what was wrong with them and which experiment would help.
+
+
+_LOST_MAX = 0.01
+_GAIN_SIGMA_MAX = 0.10  # k beyond +-20 % (2 sigma) moves Ms and the variance by more than designs differ
+_GAIN_SIGMA_GOOD = 0.03
+_DELAY_SIGMA_MAX_S = 0.1
+_UNANSWERED = 5.0  # k below this many standard errors: the pump did nothing that could be told from the weather
+_JUMP_SIGMAS = 8.0  # of 10^4 residuals none is beyond 5
+_P_MIN = 1e-4
+_BENT_SIGMAS = 5.0  # sound benches show up to 2.7 in 192 sessions, pumps that saturate at 0.6 of the command 9
+_BENT_SHARE = 0.2  # of k; less than that the margins bear
+_WORSE_MAX = 1.5  # innovation on new data over that of the fit
+
+
+@dataclass(frozen=True, slots=True)
+class Quality:
+    """Verdict on data and fit.
+
+    Attributes
+    ----------
+    verdict : str
+        "ok"; "degraded": usable, the uncertainty is larger than it should be; "refused": no proposal.
+    reasons : tuple of str
+        What was found, each with what would help.
+    """
+
+    verdict: Literal["ok", "degraded", "refused"]
+    reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Validation:
+    """A fit on data that were not used for it.
+
+    Attributes
+    ----------
+    innovation_ratio : float
+        One-step prediction error there over that of the fit.
+    whiteness_p, independence_p : float
+        As in `Identified`.
+    """
+
+    innovation_ratio: float
+    whiteness_p: float
+    independence_p: float
+
+
+def validate(identified: Identified, fresh: Record, settle_s: float = 2.0) -> Validation:
+    """Predict a fresh record with a fitted model; the noise filter's start is left out."""
+    errors = prediction_errors(
+        fresh, identified.model, identified.noise, identified.pressure_gain_um_per_pa if fresh.has_barometer else 0.0
+    )[round(settle_s / fresh.dt_s) :]
+    change = np.diff(fresh.flow_um_per_s)[-errors.size :]
+    return Validation(float(errors.std() / identified.innovation_um), whiteness(errors), independence(errors, change))
+
+
+def judge(record: Record, identified: Identified, validation: Validation | None = None) -> Quality:
+    """Verdict on a record and its fit."""
+    refused, degraded = _faults(record, identified)
+    if validation is not None and validation.innovation_ratio > _WORSE_MAX:
+        degraded.append(
+            f"new data are predicted {validation.innovation_ratio:.1f} times worse than those of the fit: "
+            "the bench changed in between; repeat the relay in steadier weather"
+        )
+    if validation is not None and validation.independence_p < _P_MIN:
+        degraded.append("the model leaves something of the flow in new data: repeat with the doublets experiment")
+    verdict: Literal["ok", "degraded", "refused"] = "refused" if refused else "degraded" if degraded else "ok"
+    return Quality(verdict, (*refused, *degraded))
+
+
+def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str]]:
+    """What forbids a proposal, and what only widens its error bars."""
+    model, sigma = identified.model, identified.sigma
+    refused: list[str] = []
+    degraded: list[str] = []
+    if record.lost_fraction > _LOST_MAX:
+        refused.append(f"{record.lost_fraction:.0%} of the laser's readings were lost: check the laser, repeat")
+    if model.gain < _UNANSWERED * sigma.gain:
+        refused.append(
+            f"the mirror did not answer the pump (k = {model.gain:.2f} +- {sigma.gain:.2f}): run the pump map"
+        )
+        return refused, degraded
+    if identified.largest_residual > _JUMP_SIGMAS:
+        at_s = float(np.argmax(np.abs(identified.residual_um))) * record.dt_s
+        refused.append(f"the mirror jumped at {at_s:.1f} s (a door?): repeat the relay")
+    if sigma.gain > _GAIN_SIGMA_MAX * model.gain:
+        refused.append(f"k is known to {sigma.gain / model.gain:.0%} only: run the relay for longer")
+    elif sigma.gain > _GAIN_SIGMA_GOOD * model.gain:
+        degraded.append(f"k is known to {sigma.gain / model.gain:.0%}: a longer relay would make it 3 %")
+    if sigma.delay_s > _DELAY_SIGMA_MAX_S:
+        refused.append(f"the delay is known to {sigma.delay_s:.2f} s only: run the doublets")
+    refused.extend(_bent(record, identified))
+    if identified.independence_p < _P_MIN:
+        degraded.append("the residuals know the flow (a saturating or sticking pump?): run the pump map")
+    if identified.whiteness_p < _P_MIN:
+        degraded.append("the residuals are coloured: something periodic moves the mirror or the reading")
+    return refused, degraded
+
+
+def _bent(record: Record, identified: Identified) -> list[str]:
+    """What is wrong if one gain does not do for both halves of the pump."""
+    found = two_gains(record, identified)
+    least = max(_BENT_SIGMAS * found.difference_sigma, _BENT_SHARE * identified.model.gain)
+    if abs(found.above - found.below) < least:
+        return []
+    what = "the pump saturates" if found.above < found.below else "the pump stalls at small flows"
+    gains = f"k = {found.below:.2f} below the holding flow and {found.above:.2f} above"
+    return [f"{what} ({gains}): run the pump map and set [pump] from it"]
+
+
+_RELAYS_MAX, _DOUBLETS_MAX = 4, 4
+_GAIN_SIGMA = 0.025  # k within 5 % at 2 sigma
+_DEAD_TIME_SIGMA_S = 0.025  # within 0.05 s at 2 sigma
+_SETTLE_S, _QUIET_S, _BETWEEN_S = 20.0, 40.0, 15.0
+_RELAY_S, _DOUBLETS_S = 120.0, 60.0
+_VALIDATE_LEAST_S = 10.0
+
+# One relay and one round of doublets, with the holds between: what most benches take.
+TYPICAL_S = _SETTLE_S + _QUIET_S + _RELAY_S + _DOUBLETS_S + 2 * _BETWEEN_S
+
+
+class ExperimentRig(Protocol):
+    """What characterising needs: `rig.Rig` on a bench, or `hold_rig.HoldRig` on a running hold."""
+
+    def hold(self, duration_s: float) -> Record:
+        """Hold for a time."""
+        ...
+
+    def around(self, held: Record, limit_um: float) -> machine.Around:
+        """The frame of an experiment."""
+        ...
+
+    def perform(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished]:
+        """Run an experiment."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Experiments:
+    """What the experiments left, raw.
+
+    Attributes
+    ----------
+    around : Around
+        Holding flow, laser noise, limits.
+    record : Record
+        Relays, the holds between, doublets, without a gap.
+    relays_s : float
+        How much of it is relays with the holds behind them.
+    pulses_s : tuple of float
+        Start and end of the longest doublets in it.
+    finished : Finished
+        How the last relay ended.
+    """
+
+    around: machine.Around
+    record: Record
+    relays_s: float
+    pulses_s: tuple[float, float]
+    finished: machine.Finished
+
+
+@dataclass(frozen=True, slots=True)
+class Characterised:
+    """What the experiments gave.
+
+    Attributes
+    ----------
+    experiments : Experiments
+    identified : Identified
+        Fit to all of it.
+    quality : Quality
+        Verdict; the doublets are predicted with a fit to the relays alone.
+    """
+
+    experiments: Experiments
+    identified: Identified
+    quality: Quality
+
+    @property
+    def around(self) -> machine.Around:
+        """Holding flow, laser noise, limits."""
+        return self.experiments.around
+
+    @property
+    def record(self) -> Record:
+        """All that was recorded."""
+        return self.experiments.record
+
+    @property
+    def finished(self) -> machine.Finished:
+        """How the last relay ended."""
+        return self.experiments.finished
+
+
+class ExperimentError(Exception):
+    """No relay could be completed; the message is the last one's reason."""
+
+
+def spec_of(
+    kind: trial.ExperimentKind, around: machine.Around, duration_s: float, gain: float = 1.0
+) -> trial.ExperimentSpec:
+    """The specification of an experiment in a frame. Raises pydantic.ValidationError outside its bounds."""
+    return trial.ExperimentSpec(
+        kind=kind,
+        duration_s=duration_s,
+        limit_um=around.limit_um,
+        holding_flow_um_per_s=around.holding_flow_um_per_s,
+        laser_um=around.laser_um,
+        gain=gain,
+    )
+
+
+def characterise(rig: ExperimentRig, limit_um: float = 10.0) -> Characterised:
+    """Experiments and fit in one; see `experiment` for what is raised."""
+    return fitted(experiment(rig, limit_um))
+
+
+def experiment(rig: ExperimentRig, limit_um: float = 10.0) -> Experiments:
+    """Hold, relay, doublets on a rig that holds its mirror.
+
+    A relay that was stopped is thrown away and repeated: whatever stopped it is no disturbance of the kind that the
+    fit knows. Doublets that were stopped are kept.
+
+    Raises
+    ------
+    ExperimentError
+        If no relay could be completed.
+    ValueError
+        If the pump has no room about the holding flow: the mirror is too tight or too leaky.
+    """
+    rig.hold(_SETTLE_S)
+    around = rig.around(rig.hold(_QUIET_S), limit_um)
+    patterns.room(around)  # a relay without it would only say that it was stopped
+    relays, finished = _relays(rig, around)
+    gain = identify(relays).model.gain
+    whole = relays
+    longest_s = (relays.duration_s, relays.duration_s)
+    for _ in range(_DOUBLETS_MAX):
+        latest, _ = rig.perform(spec_of("doublets", around, _DOUBLETS_S, gain))
+        if latest.duration_s > longest_s[1] - longest_s[0]:
+            longest_s = (whole.duration_s, whole.duration_s + latest.duration_s)
+        whole = whole.followed_by(latest, rig.hold(_BETWEEN_S))
+        if identify(whole).sigma.dead_time_s <= _DEAD_TIME_SIGMA_S:
+            break
+    return Experiments(around, whole, relays.duration_s, longest_s, finished)
+
+
+def fitted(done: Experiments) -> Characterised:
+    """The fit to all experiments, judged on doublets that a fit to the relays alone has to predict."""
+    found = identify(done.record)
+    start_s, stop_s = done.pulses_s
+    checked = None
+    if stop_s - start_s > _VALIDATE_LEAST_S:
+        relays = done.record.part(0.0, done.relays_s)
+        checked = validate(identify(relays), done.record.part(start_s, stop_s))
+    return Characterised(done, found, judge(done.record, found, checked))
+
+
+def _relays(rig: ExperimentRig, around: machine.Around) -> tuple[Record, machine.Finished]:
+    """Relays until the gain is known, each followed by a hold."""
+    done: Record | None = None
+    finished = machine.Finished(False, "")
+    for _ in range(_RELAYS_MAX):
+        relay, finished = rig.perform(spec_of("relay", around, _RELAY_S))
+        between = rig.hold(_BETWEEN_S)
+        if not finished.completed:
+            done = None
+            continue
+        done = relay.followed_by(between) if done is None else done.followed_by(relay, between)
+        found = identify(done)
+        if found.sigma.gain <= _GAIN_SIGMA * found.model.gain:
+            break
+    if done is None:
+        raise ExperimentError(finished.reason)
+    return done, finished

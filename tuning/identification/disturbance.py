@@ -1,0 +1,311 @@
+"""What moves the mirror and what only moves the reading: intensities from a quiet hold.
+
+The flow's share is taken out of the readings, z = y - k int v(t - theta) dt, whatever loop made the flow. What is
+left is the weather and the laser's noise. Its increments have the spectrum (per sample, dt S)
+
+    |1 - e^(-j w dt)|^2 r  +  q_fast dt  +  q_slow dt / (1 + w^2 tau^2)
+
+r: laser noise (um^2 a sample), q_fast: a random walk (air pressure), q_slow: a random walk that reaches the gas
+through the film, tau = 12 s (air temperature). Without the last term this is the IMA(1,1) process. The
+intensities maximise Whittle's likelihood, sum of log S + I / S over the periodogram I of the tapered increments.
+Source: Percival and Walden, Spectral Analysis for Univariate Time Series (2020), sections 6.3 and 9.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize, minimize_scalar
+from scipy.signal import lfilter
+from scipy.signal.windows import hann
+
+from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.control.filters import smoothing
+from tuning.identification import loop_model, records
+
+# Slower than this the loop does not care, and a random walk is no longer what weather does.
+_SLOWEST_S = 100.0
+_FLOOR = 1e-12  # um^2: an intensity that is not there
+_HANN_LOSS = 35.0 / 18.0  # neighbouring frequencies of a Hann taper share this much
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """White noise on a reading and the walk of what it reads.
+
+    Attributes
+    ----------
+    white : float
+        Standard deviation of a sample.
+    fast, slow : float
+        Intensities of the walks: variance per second.
+    slow_s : float
+        Lag behind which the slow walk comes.
+    white_sigma, fast_sigma, slow_sigma : float
+        Relative standard errors of the variance of each.
+    dt_s : float
+        Sample time that `white` belongs to.
+    """
+
+    white: float
+    fast: float
+    slow: float
+    slow_s: float
+    white_sigma: float
+    fast_sigma: float
+    slow_sigma: float
+    dt_s: float
+
+    def moving_psd(self, w_rad_per_s: records.Series) -> records.Series:
+        """Two-sided spectrum of the true movement, unit^2 s."""
+        return (self.fast + self.slow / (1 + (w_rad_per_s * self.slow_s) ** 2)) / w_rad_per_s**2
+
+    @property
+    def white_psd(self) -> float:
+        """Two-sided spectrum of the reading's noise, unit^2 s."""
+        return self.white**2 * self.dt_s
+
+
+def undriven_um(record: records.Record, model: loop_model.PlantModel) -> records.Series:
+    """z: the readings without what the pump and the mean leak did, (n,) um."""
+    driven = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
+    return record.filled_displacement_um() - model.gain * driven
+
+
+def fit_noise(series: records.Series, dt_s: float, slow_s: float) -> Noise:
+    """Intensities of white noise and walks in a series; a straight trend does not matter.
+
+    Parameters
+    ----------
+    series : (n,) array
+    dt_s : float
+    slow_s : float
+        Lag of the slow walk; 0 leaves it out.
+
+    Raises
+    ------
+    ValueError
+        If the series is shorter than two of the slowest periods looked at.
+    """
+    if series.size * dt_s < 2 * _SLOWEST_S:
+        raise ValueError(f"{series.size * dt_s:.0f} s of hold are too short: {2 * _SLOWEST_S:.0f} s at least")
+    w, power = _periodogram(np.diff(series), dt_s)
+    shapes = [np.abs(1 - np.exp(-1j * w * dt_s)) ** 2, np.full(w.size, dt_s)]
+    if slow_s > 0:
+        shapes.append(dt_s / (1 + (w * slow_s) ** 2))
+    basis = np.array(shapes)
+
+    def cost(logs: records.Series) -> tuple[float, records.Series]:
+        parts = (np.exp(logs) + _FLOOR)[:, None] * basis
+        spectrum = parts.sum(axis=0)
+        slope = parts / spectrum * (1 - power / spectrum)
+        return float(np.sum(np.log(spectrum) + power / spectrum)), slope.sum(axis=1)
+
+    fast_guess = float(np.mean(power[: max(8, w.size // 1000)])) / dt_s
+    start = np.log(np.array([float(np.mean(power)) / 2, fast_guess, fast_guess][: len(basis)]))
+    fit = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(math.log(_FLOOR), 20.0)] * len(basis))
+    intensities = np.exp(fit.x)
+    shares = intensities[:, None] * basis / (intensities @ basis)
+    errors = np.sqrt(np.diag(np.linalg.pinv(shares @ shares.T)) * _HANN_LOSS)
+    white, fast, slow = (*intensities, 0.0, 0.0)[:3]
+    white_error, fast_error, slow_error = (*errors, 0.0, 0.0)[:3]
+    return Noise(
+        math.sqrt(white),
+        float(fast),
+        float(slow),
+        slow_s,
+        float(white_error),
+        float(fast_error),
+        float(slow_error),
+        dt_s,
+    )
+
+
+def _periodogram(increments: records.Series, dt_s: float) -> tuple[records.Series, records.Series]:
+    """Angular frequencies from the slowest that matters to Nyquist, and tapered power a sample."""
+    taper = hann(increments.size, sym=False)
+    taper /= math.sqrt(float(taper @ taper))
+    power = np.abs(np.fft.rfft((increments - increments.mean()) * taper)) ** 2
+    w = 2 * np.pi * np.fft.rfftfreq(increments.size, dt_s)
+    used = slice(int(np.searchsorted(w, 2 * np.pi / _SLOWEST_S)), w.size - 1)
+    return np.asarray(w[used], dtype=float), np.asarray(power[used], dtype=float)
+
+
+# Gains of the weather on the centre: regression of the undriven readings on barometer and lagged air temperature.
+#
+#     z = c t + g_p p + g_T lag(T_air) + n,    n = IMA(1,1)
+#
+# All columns are differenced and prewhitened with 1 / (1 - beta B), on means over blocks. A noisy sensor makes its
+# gain too small (errors in variables): white noise of variance r has the variance 2 r / (1 + beta) after the
+# filter, which is taken off the diagonal of the normal equations.
+# Source: Fuller, Measurement Error Models (1987), section 2.2.
+
+
+_BLOCK_S = 0.5  # below a second a barometer's noise hides its signal; above, its events blur
+
+
+@dataclass(frozen=True, slots=True)
+class WeatherGain:
+    """A gain, its standard error, and how the sensor's quantity wanders.
+
+    Attributes
+    ----------
+    gain, sigma : float
+        um per Pa or um per K.
+    walk : float
+        Variance per second of the quantity's random walk, Pa^2/s or K^2/s.
+    noise : float
+        Standard deviation of a reading.
+    lag_s : float
+        Lag behind which the quantity reaches the centre.
+    """
+
+    gain: float
+    sigma: float
+    walk: float
+    noise: float
+    lag_s: float
+
+    def agreed(self, configured: float) -> float:
+        """Gain to use: the fitted one where the record knows it to 10 %, else the configured one if they agree.
+
+        Weather that does not move says nothing about its gain; the physics of the bench then knows better.
+        """
+        if self.sigma <= 0.1 * abs(self.gain):
+            return self.gain
+        return configured if abs(self.gain - configured) <= 3 * self.sigma else self.gain
+
+
+@dataclass(frozen=True, slots=True)
+class WeatherFit:
+    """Both gains (None without the sensor), and the readings without the weather."""
+
+    barometer: WeatherGain | None
+    air: WeatherGain | None
+    rest_um: records.Series
+
+
+def lagged(series: records.Series, lag_s: float, dt_s: float) -> records.Series:
+    """First-order lag that starts at its first input."""
+    share = smoothing(dt_s, lag_s)
+    followed = np.asarray(lfilter([share], [1.0, share - 1.0], series - series[0]), dtype=float)
+    return followed + float(series[0])
+
+
+def fit_weather(record: records.Record, model: loop_model.PlantModel, gas_follows_air_s: float) -> WeatherFit:
+    """Regress what the pump did not do on the weather.
+
+    Parameters
+    ----------
+    record : Record
+        A quiet hold of some minutes.
+    model : PlantModel
+    gas_follows_air_s : float
+        Lag of the gas behind the air.
+    """
+    z = undriven_um(record, model)
+    channels: list[tuple[records.Series, float]] = []
+    if record.has_barometer:
+        channels.append((record.ambient_pressure_pa, 0.0))
+    if record.has_thermometer:
+        channels.append((record.air_temperature_c, gas_follows_air_s))
+    if not channels:
+        return WeatherFit(None, None, z)
+    noises = [fit_noise(series, record.dt_s, 0.0) for series, _ in channels]
+    columns = [lagged(series, lag_s, record.dt_s) for series, lag_s in channels]
+    # only noise that passes the lag is left of a lagged sensor's: dt / (2 T) of its variance
+    shares = [1.0 if lag_s == 0 else record.dt_s / (2 * lag_s) for _, lag_s in channels]
+    per_block = max(1, round(_BLOCK_S / record.dt_s))
+    variances = np.array([n.white**2 * share / per_block for n, share in zip(noises, shares, strict=True)])
+    gains, sigmas = _regress(z, columns, variances, per_block)
+    found = [
+        WeatherGain(float(g), float(s), noise.fast, noise.white, lag_s)
+        for g, s, noise, (_, lag_s) in zip(gains, sigmas, noises, channels, strict=True)
+    ]
+    rest = z - sum(g * (column - column[0]) for g, column in zip(gains, columns, strict=True))
+    return WeatherFit(
+        found[0] if record.has_barometer else None,
+        found[-1] if record.has_thermometer else None,
+        np.asarray(rest, dtype=float),
+    )
+
+
+def _regress(
+    z: records.Series, columns: list[records.Series], variances: records.Series, per_block: int
+) -> tuple[records.Series, records.Series]:
+    """Gains and their standard errors, with the noise's beta that fits best."""
+    used = z.size // per_block * per_block
+    blocks = np.array([column[:used].reshape(-1, per_block).mean(axis=1) for column in (z, *columns)])
+    moved = np.diff(blocks, axis=1)
+    moved -= moved.mean(axis=1, keepdims=True)
+
+    def fit(beta: float) -> tuple[records.Series, records.Series, float]:
+        white = lfilter([1.0], [1.0, -beta], moved, axis=1)
+        target, given = white[0], white[1:]
+        normal = given @ given.T
+        # a sensor that shows nothing but noise must not turn the matrix singular
+        noise = np.minimum(2 * variances / (1 + beta) * target.size, 0.9 * np.diag(normal))
+        inverse = np.linalg.inv(normal - np.diag(noise))
+        gains = inverse @ given @ target
+        rest = target - gains @ given
+        variance = float(rest @ rest) / (target.size - len(gains) - 1)
+        return gains, np.sqrt(np.diag(inverse @ normal @ inverse) * variance), variance
+
+    best = minimize_scalar(lambda beta: math.log(fit(beta)[2]), bounds=(0.0, 0.99), method="bounded")
+    gains, sigmas, _ = fit(float(best.x))
+    return gains, sigmas
+
+
+# All that moves the mirror, as spectra: what is explained by the weather's sensors and what is not.
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbance:
+    """What moves the centre, and what the laser adds.
+
+    Attributes
+    ----------
+    rest : Noise
+        The laser's noise and the walks that no weather sensor explains.
+    barometer, air : WeatherGain or None
+        What the sensors explain.
+    """
+
+    rest: Noise
+    barometer: WeatherGain | None
+    air: WeatherGain | None
+
+    @property
+    def laser_um(self) -> float:
+        """Standard deviation of a reading."""
+        return self.rest.white
+
+    def psd(self, w_rad_per_s: records.Series, model: loop_model.PlantModel, loop: LoopConfig) -> records.Series:
+        """Two-sided spectrum of the centre without feedback but with the loop's feed-forward, um^2 s.
+
+        The feed-forward takes a channel's movement x away as far as the pump is in time: x (1 - H), with H the pump
+        behind the feed-forward's filter; the sensor's noise comes in through H.
+        """
+        dt_s = self.rest.dt_s
+        pump = loop_model.pump_response(model, w_rad_per_s, dt_s)
+        total = self.rest.moving_psd(w_rad_per_s)
+        channels = (
+            (self.barometer, loop.feedforward_barometer, loop.barometer_gain_um_per_pa, loop.feedforward_filter_s),
+            (self.air, loop.feedforward_temperature, loop.temperature_gain_um_per_k, loop.gas_follows_air_s),
+        )
+        for weather, used, gain, filter_s in channels:
+            if weather is None:
+                continue
+            lag = 1 / (1 + 1j * w_rad_per_s * weather.lag_s)
+            reaction = gain * pump / (1 + 1j * w_rad_per_s * filter_s) if used else np.zeros_like(pump)
+            total = total + weather.walk / w_rad_per_s**2 * np.abs(weather.gain * lag - reaction) ** 2
+            total = total + weather.noise**2 * dt_s * np.abs(reaction) ** 2
+        return np.asarray(total, dtype=float)
+
+
+def observe(record: records.Record, model: loop_model.PlantModel, loop: LoopConfig) -> Disturbance:
+    """Weather gains and noise from a quiet hold under any loop. Raises ValueError if it is too short."""
+    weather = fit_weather(record, model, loop.gas_follows_air_s)
+    return Disturbance(
+        fit_noise(weather.rest_um, record.dt_s, loop.gas_follows_air_s), weather.barometer, weather.air
+    )

@@ -1,0 +1,266 @@
+"""Gain and dead time from a record, by prediction error with a noise model.
+
+The reading is y = k x - leak t + g_p p + n, with x the way a mirror of gain 1 would have gone (`driven_um`). Weather
+wanders and the laser is noisy: n is a random walk plus white noise, which is an IMA(1,1) process
+
+    n[i] - n[i-1] = (1 - beta B) e[i],    e white, B one sample back.
+
+Weather that reaches the gas through the film (air temperature, 12 s) is a walk with a memory of its own. Left out,
+it makes k too small wherever the flow answers the readings (by 3 % in gusty weather): so the increments get a pole,
+
+    n[i] - n[i-1] = (1 - beta B) (1 - gamma B) / (1 - phi B) e[i],    phi = exp(-dt / 12 s),
+
+which is IMA(1,1) for gamma = phi. Minimising the sum of e^2 over (k, leak, theta, T, beta, gamma) weights what the
+record knows with what disturbs it. Plain output error takes n for white and is biased; the describing function of a
+relay knows only one frequency.
+Source: Ljung, System Identification (1999), sections 7.2 and 9.4 (covariance from the gradient of e).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import OptimizeResult, least_squares
+from scipy.signal import lfilter
+from scipy.stats import chi2
+
+from tuning.identification import loop_model, records
+
+_FILM_S = 12.0  # how the gas follows the air (estimate; a factor of 2 does not matter)
+_BETA_MAX = 0.9999  # 1 would be a reading without any disturbance
+_LAG_MIN_S, _LAG_MAX_S = 0.01, 2.0  # a film pump answers within seconds, and a faster lag than a tick is none
+_DEAD_TIME_MAX_S = 3.0
+_STARTS_S = (0.03, 0.1, 0.3, 0.6, 1.0, 1.6)
+_LAG_START_S = 0.1
+_BETA_START = 0.95
+_GAMMA_MIN, _GAMMA_START = 0.9, 0.99
+_LAGS = 25  # half a second at 50 Hz: twice the dead time, where a wrong delay would show
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseModel:
+    """The two zeros of the noise: `beta` is near 1 when the laser's noise covers the weather."""
+
+    beta: float
+    gamma: float
+
+    def whitened(self, moved_um: records.Series, dt_s: float) -> records.Series:
+        """Prediction errors from the increments of the noise."""
+        phi = math.exp(-dt_s / _FILM_S)
+        zeros = [1.0, -(self.beta + self.gamma), self.beta * self.gamma]
+        return np.asarray(lfilter([1.0, -phi], zeros, moved_um), dtype=float)
+
+
+@dataclass(frozen=True, slots=True)
+class Sigma:
+    """Standard errors of the identified numbers."""
+
+    gain: float
+    dead_time_s: float
+    lag_s: float
+    delay_s: float
+    leak_um_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """A fitted model and how far it can be trusted.
+
+    Attributes
+    ----------
+    model : PlantModel
+    sigma : Sigma
+        Standard errors.
+    covariance : (4, 4) array
+        Of gain, dead time, lag, leak.
+    noise : NoiseModel
+    pressure_gain_um_per_pa : float
+        Of the barometer, 0 without one. Its noise makes it a little small: a nuisance here, `feedforward_fit` has it.
+    innovation_um : float
+        Standard deviation of the one-step prediction error.
+    whiteness_p, independence_p : float
+        Probability of residuals at least as coloured, and as correlated with past flow, if the model were true.
+    largest_residual : float
+        In standard deviations.
+    residual_um : (n,) array
+        Prediction errors.
+    """
+
+    model: loop_model.PlantModel
+    sigma: Sigma
+    covariance: records.Series
+    noise: NoiseModel
+    pressure_gain_um_per_pa: float
+    innovation_um: float
+    whiteness_p: float
+    independence_p: float
+    largest_residual: float
+    residual_um: records.Series
+
+
+def prediction_errors(
+    record: records.Record, model: loop_model.PlantModel, noise: NoiseModel, pressure_gain_um_per_pa: float = 0.0
+) -> records.Series:
+    """One-step prediction errors of a model on a record, (n - 1,) um; the first are the filter's start.
+
+    Parameters
+    ----------
+    record : Record
+    model : PlantModel
+    noise : NoiseModel
+    pressure_gain_um_per_pa : float
+        How the barometer moves the centre; 0 leaves it out.
+    """
+    x = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
+    moved = np.diff(record.filled_displacement_um()) - model.gain * np.diff(x) + model.leak_um_per_s * record.dt_s
+    if pressure_gain_um_per_pa != 0.0:
+        moved -= pressure_gain_um_per_pa * np.diff(record.ambient_pressure_pa)
+    return noise.whitened(moved, record.dt_s)
+
+
+def identify(record: records.Record) -> Identified:
+    """Fit the model; the barometer, if there is one, takes its share out of the noise.
+
+    Raises
+    ------
+    ValueError
+        If the record is too short, has no reading, or the flow never changed.
+    """
+    if len(record) < 10 * _LAGS:
+        raise ValueError(f"{record.duration_s:.1f} s is too short to identify anything")
+    if np.ptp(record.flow_um_per_s) <= 0:
+        raise ValueError("the flow never changed: run the relay experiment")
+
+    def errors(q: records.Series) -> records.Series:
+        model = loop_model.PlantModel(q[0], q[1], q[2], q[3])
+        return prediction_errors(record, model, NoiseModel(q[4], q[5]), q[6] if q.size > 6 else 0.0)
+
+    best = _best_fit(errors, record)
+    q = best.x
+    residual = errors(q)
+    innovation_um = float(np.sqrt(np.sum(residual**2) / (residual.size - q.size)))
+    covariance = innovation_um**2 * np.linalg.pinv(best.jac.T @ best.jac)
+    # Within a sample the model knows no time: where command and reading fall in it is as good as anywhere, and with
+    # little noise the fit is surer of the dead time than the sample allows.
+    covariance[1, 1] += record.dt_s**2 / 12
+    return Identified(
+        model=loop_model.PlantModel(*(float(v) for v in q[:4])),
+        sigma=_sigma(covariance),
+        covariance=covariance[:4, :4],
+        noise=NoiseModel(float(q[4]), float(q[5])),
+        pressure_gain_um_per_pa=float(q[6]) if q.size > 6 else 0.0,
+        innovation_um=innovation_um,
+        whiteness_p=whiteness(residual, fitted=2),
+        independence_p=independence(residual, np.diff(record.flow_um_per_s)),
+        largest_residual=float(np.max(np.abs(residual)) / np.median(np.abs(residual)) * 0.6745),
+        residual_um=residual,
+    )
+
+
+def _best_fit(errors: Callable[[records.Series], records.Series], record: records.Record) -> OptimizeResult:
+    """Least squares from the most promising dead time: the criterion has more than one valley in it."""
+    extra = [-0.3] if record.has_barometer and np.ptp(record.ambient_pressure_pa) > 0 else []
+    low = [-np.inf, 0.0, _LAG_MIN_S, -np.inf, 0.0, _GAMMA_MIN] + [-np.inf] * len(extra)
+    high = [np.inf, _DEAD_TIME_MAX_S, _LAG_MAX_S, np.inf, _BETA_MAX, _BETA_MAX] + [np.inf] * len(extra)
+    starts = [_start(record, dead_time_s, extra) for dead_time_s in _STARTS_S]
+    return least_squares(
+        errors,
+        min(starts, key=lambda start: float(np.sum(errors(start) ** 2))),
+        bounds=(low, high),
+        xtol=1e-5,  # a thousandth of a standard error
+        ftol=1e-7,
+        x_scale=np.array([0.1, 0.05, 0.05, 0.1, 0.02, 0.01] + [0.1] * len(extra)),
+    )
+
+
+def _start(record: records.Record, dead_time_s: float, extra: list[float]) -> records.Series:
+    """Gain and leak that go best with a dead time, by linear least squares on the prefiltered record."""
+    unit = loop_model.PlantModel(1.0, dead_time_s, _LAG_START_S, 0.0)
+    x = np.diff(loop_model.driven_um(record.flow_um_per_s, unit.dead_time_s, unit.lag_s, record.dt_s))
+    columns = np.array([x, np.full(x.size, -record.dt_s), np.diff(record.filled_displacement_um())])
+    columns = lfilter([1.0], [1.0, -_BETA_START], columns, axis=1)
+    gain, leak = np.linalg.lstsq(columns[:2].T, columns[2], rcond=None)[0]
+    return np.array([gain, dead_time_s, _LAG_START_S, leak, _BETA_START, _GAMMA_START, *extra])
+
+
+def _sigma(covariance: records.Series) -> Sigma:
+    total = covariance[1, 1] + covariance[2, 2] + 2 * covariance[1, 2]
+    gain, dead, lag, leak, delay = np.sqrt(np.maximum([*np.diag(covariance)[:4], total], 0.0))
+    return Sigma(float(gain), float(dead), float(lag), float(delay), float(leak))
+
+
+def whiteness(residual: records.Series, fitted: int = 0) -> float:
+    """Ljung-Box: probability of correlations this large in white noise."""
+    e = residual - residual.mean()
+    n = e.size
+    r = np.array([e[lag:] @ e[: n - lag] for lag in range(1, _LAGS + 1)]) / (e @ e)
+    q = n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, _LAGS + 1))))
+    return float(chi2.sf(q, _LAGS - fitted))
+
+
+def independence(residual: records.Series, change: records.Series) -> float:
+    """Probability of residuals this correlated with earlier changes of the flow, had the model left nothing."""
+    e = (residual - residual.mean()) / residual.std()
+    u = change - change.mean()
+    n = e.size
+    # from lag 1 on: the flow of a tick may well answer the reading of that tick
+    past = np.array([u[_LAGS - lag : n - lag] for lag in range(1, _LAGS + 1)])
+    cross = past @ e[_LAGS:]
+    return float(chi2.sf(cross @ np.linalg.pinv(past @ past.T) @ cross, _LAGS))
+
+
+# Whether the pump is as strong above the holding flow as below it: one that saturates or stalls is not.
+#
+# A relay has two flows, and a straight line goes through any two points; the holds about it are the third. A pump
+# that saturates is then a weak one to a fit with a single gain, and gains made for that are too high for what the
+# loop does every second about the holding flow. So the record is fitted once more with a difference d between two
+# gains,
+#
+#     y = k x + d x_above - leak t + n,    x_above: the way by max(v - mean v, 0),
+#
+# with dead time, lag and noise of the fit. What is left of x_above when x and t have taken their share (r) decides:
+# d = r y / r r, with the standard error sigma / |r| (Frisch and Waugh, Econometrica 1 (1933) 387).
+
+
+_SAME = 1e-6  # with two flows in the whole record, x_above is x and t but for rounding
+
+
+@dataclass(frozen=True, slots=True)
+class TwoGains:
+    """The pump above and below the holding flow.
+
+    Attributes
+    ----------
+    below, above : float
+        Gain of either part.
+    difference_sigma : float
+        Standard error of `above - below`; infinite if the flow had two values only.
+    """
+
+    below: float
+    above: float
+    difference_sigma: float
+
+
+def two_gains(record: records.Record, identified: Identified) -> TwoGains:
+    """Gains below and above the mean flow of a record, which is the flow that holds."""
+    model, dt_s = identified.model, record.dt_s
+
+    def whitened_way(flow_um_per_s: records.Series) -> records.Series:
+        way_um = loop_model.driven_um(flow_um_per_s, model.dead_time_s, model.lag_s, dt_s)
+        return identified.noise.whitened(np.diff(way_um), dt_s)
+
+    moved_um = np.diff(record.filled_displacement_um())
+    if identified.pressure_gain_um_per_pa != 0.0:
+        moved_um -= identified.pressure_gain_um_per_pa * np.diff(record.ambient_pressure_pa)
+    moved_um = identified.noise.whitened(moved_um, dt_s)
+    above_um = whitened_way(np.maximum(record.flow_um_per_s - record.flow_um_per_s.mean(), 0.0))
+    leak_um = identified.noise.whitened(np.full(moved_um.size, -dt_s), dt_s)
+    straight = np.column_stack([whitened_way(record.flow_um_per_s), leak_um])
+    rest_um = above_um - straight @ np.linalg.lstsq(straight, above_um, rcond=None)[0]
+    if np.linalg.norm(rest_um) < _SAME * np.linalg.norm(above_um):
+        return TwoGains(model.gain, model.gain, math.inf)
+    difference = float(rest_um @ moved_um / (rest_um @ rest_um))
+    below = float(np.linalg.lstsq(straight, moved_um - difference * above_um, rcond=None)[0][0])
+    return TwoGains(below, below + difference, identified.innovation_um / float(np.linalg.norm(rest_um)))

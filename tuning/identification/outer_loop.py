@@ -1,0 +1,205 @@
+"""The outer loop: how the figure answers to sag, how noisy and how steady its measurement is, and the time constant.
+
+A small step of the setpoint moves the sag by a known amount: the change of the Zernike vector over it is the
+sensitivity. Sag by deflectometry less the laser's reading is, while the mirror is held, the deflectometry's noise and
+the drift between the two: white noise of sigma a cycle of length T, and a random walk of q um/sqrt(s). The best
+time constant between them is (docs/physics.md, outer loop)
+
+    tau = sigma sqrt(T) / q.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.control.shape_loop import sag_change
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.sessions.live_hold import HoldError
+from tuning.identification.records import Series
+from tuning.rig import HoldRig
+
+# White noise on a random walk, at any times: how much of each, and how much walk the data still permit.
+#
+# The likelihood of the local level model by its Kalman filter, with the noise's variance concentrated out, over the
+# ratio of walk to noise. Source: Durbin and Koopman, Time Series Analysis by State Space Methods (2012), chapter 2.
+
+
+_RATIOS = np.geomspace(1e-9, 10.0, 61)  # variance of the walk in a cycle over that of the noise
+_DROP = 2.0  # of the log likelihood: 95 % on one side, and some for the grid
+
+
+@dataclass(frozen=True, slots=True)
+class LocalLevel:
+    """What was found.
+
+    Attributes
+    ----------
+    white : float
+        Standard deviation of the noise.
+    walk : float
+        Variance of the walk a second; where no walk is seen, the most that the data permit.
+    seen : bool
+        The data are much less likely without a walk.
+    """
+
+    white: float
+    walk: float
+    seen: bool
+
+
+def fit_local_level(values: NDArray[np.float64], times_s: NDArray[np.float64]) -> LocalLevel:
+    """Fit the model. Raises ValueError for fewer than 20 values."""
+    if values.size < 20:
+        raise ValueError(f"{values.size} values are too few to tell noise from drift: 20 at least")
+    steps_s = np.diff(times_s)
+    cycle_s = float(np.median(steps_s))
+    fits = [_likelihood(values, steps_s / cycle_s, float(ratio)) for ratio in _RATIOS]
+    likely = np.array([fit[0] for fit in fits])
+    best = int(np.argmax(likely))
+    seen = bool(likely[best] - likely[0] > _DROP)
+    chosen = best if seen else int(np.flatnonzero(likely > likely[best] - _DROP)[-1])
+    variance = fits[best][1]
+    return LocalLevel(math.sqrt(variance), float(_RATIOS[chosen]) * variance / cycle_s, seen)
+
+
+def _likelihood(values: NDArray[np.float64], steps: NDArray[np.float64], ratio: float) -> tuple[float, float]:
+    """Log likelihood and the noise's variance for a ratio; the first value only starts the filter."""
+    level, spread = float(values[0]), 1.0
+    squares = logs = 0.0
+    for value, step in zip(values[1:].tolist(), steps.tolist(), strict=True):
+        spread += ratio * step
+        expected = spread + 1.0
+        off = value - level
+        squares += off * off / expected
+        logs += math.log(expected)
+        gain = spread / expected
+        level += gain * off
+        spread *= 1.0 - gain
+    count = values.size - 1
+    variance = squares / count
+    return -0.5 * (count * math.log(variance) + logs), variance
+
+
+STEP_UM = 5.0
+_LEVEL_S, _SETTLE_S = 60.0, 12.0  # of each level; the ramp, the loop's recovery, and a cycle begun before it
+TYPICAL_S = 3 * (_LEVEL_S + _SETTLE_S)
+_LEAST_CYCLES = 8
+# Shorter than ten cycles it would follow the noise; longer than an hour nobody has seen the drift.
+_CYCLES_MIN, _TAU_MAX_S = 10.0, 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class OuterLoop:
+    """What was found.
+
+    Attributes
+    ----------
+    sensitivity, sensitivity_sigma : (36,) array
+        Change of the coefficients per um of sag, and standard errors.
+    agreement : float
+        Cosine between it and the one assumed, piston left out; 1 is the same direction.
+    scale : float
+        Sag seen by deflectometry per um of the laser's.
+    sigma_um : float
+        Noise of a cycle.
+    cycle_s : float
+        From result to result.
+    drift_um_per_sqrt_h : float
+        Between laser and deflectometry.
+    drift_seen : bool
+        Otherwise no drift was seen, and the figure is the most that there may be.
+    time_constant_s : float
+        Proposed for `shape.time_constant_s`.
+    """
+
+    sensitivity: Series
+    sensitivity_sigma: Series
+    agreement: float
+    scale: float
+    sigma_um: float
+    cycle_s: float
+    drift_um_per_sqrt_h: float
+    drift_seen: bool
+    time_constant_s: float
+
+
+def step_experiment(rig: HoldRig, setpoint_um: float, restore: bool) -> list[list[ShapeEstimate]]:
+    """Hold low, high, low with the shape loop off; the shapes of each level.
+
+    Parameters
+    ----------
+    rig : HoldRig
+    setpoint_um : float
+        The hold's own, which it ends at.
+    restore : bool
+        The shape loop is switched on again.
+    """
+    levels: list[list[ShapeEstimate]] = []
+    rig.shape_loop(False, "outer loop: the step is the session's")
+    try:
+        for target_um in (setpoint_um, setpoint_um + STEP_UM, setpoint_um):
+            rig.setpoint(target_um, "outer loop: sag sensitivity")
+            rig.hold(_SETTLE_S)
+            before = len(rig.shapes)
+            rig.hold(_LEVEL_S)
+            levels.append([shape for shape in rig.shapes[before:] if shape.verdict != "rejected"])
+    finally:
+        rig.setpoint(setpoint_um, "outer loop: back")
+        if restore:
+            rig.shape_loop(True, "outer loop: the step is over")
+    if min(len(level) for level in levels) < _LEAST_CYCLES:
+        raise HoldError(
+            f"fewer than {_LEAST_CYCLES} shapes a level: is the shape measured at all, and every few seconds?"
+        )
+    return levels
+
+
+def evaluate(
+    levels: Sequence[Sequence[ShapeEstimate]], steady: Sequence[ShapeEstimate], assumed: Series
+) -> OuterLoop:
+    """Sensitivity from the levels, noise and drift from all shapes of a steady hold.
+
+    Parameters
+    ----------
+    levels : three sequences of ShapeEstimate
+        Low, high, low.
+    steady : sequence of ShapeEstimate
+        In a hold; those of the levels count too, for the laser's reading is taken off.
+    assumed : (36,) array
+        Sensitivity the controller works with.
+
+    Raises
+    ------
+    ValueError
+        If there are too few shapes to tell noise from drift.
+    """
+    means = [np.mean([shape.coeffs_um for shape in level], axis=0) for level in levels]
+    laser_um = [float(np.mean([shape.displacement_um for shape in level])) for level in levels]
+    step_um = laser_um[1] - (laser_um[0] + laser_um[2]) / 2
+    sensitivity = (means[1] - (means[0] + means[2]) / 2) / step_um
+    scatter = np.mean([np.var([s.coeffs_um for s in level], axis=0, ddof=1) / len(level) for level in levels], axis=0)
+    shapes = sorted((*steady, *(s for level in levels for s in level)), key=lambda shape: shape.time_s)
+    reference = shapes[0]
+    gaps_um = np.array([_sag_um(shape, reference, assumed) - shape.displacement_um for shape in shapes])
+    cycle_s = float(np.median(np.diff([shape.time_s for shape in shapes])))
+    noise = fit_local_level(gaps_um, np.array([shape.time_s for shape in shapes]))
+    best_s = noise.white * math.sqrt(cycle_s / noise.walk)
+    kept, wanted = sensitivity[1:], assumed[1:]
+    return OuterLoop(
+        sensitivity=sensitivity,
+        sensitivity_sigma=np.sqrt(1.5 * scatter) / abs(step_um),
+        agreement=float(kept @ wanted / (np.linalg.norm(kept) * np.linalg.norm(wanted))),
+        scale=float(kept @ wanted / (wanted @ wanted)),
+        sigma_um=noise.white,
+        cycle_s=cycle_s,
+        drift_um_per_sqrt_h=math.sqrt(3600 * noise.walk),
+        drift_seen=noise.seen,
+        time_constant_s=min(max(best_s, _CYCLES_MIN * cycle_s), _TAU_MAX_S),
+    )
+
+
+def _sag_um(shape: ShapeEstimate, reference: ShapeEstimate, sensitivity: Series) -> float:
+    return sag_change(shape.coeffs_um, reference.coeffs_um, shape.covariance_um2, sensitivity).change_um

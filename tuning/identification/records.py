@@ -1,0 +1,145 @@
+"""What a tuning step works on: evenly sampled columns of what was commanded and what was read."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.control.experiments.machine import Measurement
+from membrane_ctrl.model import errors, files
+
+Series = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Evenly sampled readings and the flow that was commanded right after each of them.
+
+    Attributes
+    ----------
+    dt_s : float
+        Sample time.
+    flow_um_per_s : (n,) array
+        Commanded flow as the pump's nominal curve has it, from each reading until the next.
+    displacement_um : (n,) array
+        Laser readings; NaN where one was lost.
+    ambient_pressure_pa, air_temperature_c : (n,) array
+        All NaN without the sensor.
+    """
+
+    dt_s: float
+    flow_um_per_s: Series
+    displacement_um: Series
+    ambient_pressure_pa: Series
+    air_temperature_c: Series
+
+    @classmethod
+    def from_samples(cls, dt_s: float, flows_um_per_s: Sequence[float], samples: Sequence[Measurement]) -> Record:
+        """Columns of samples and of the flows that followed them."""
+        columns = [[getattr(sample, field.name) for sample in samples] for field in fields(Measurement)]
+        return cls(dt_s, np.array(flows_um_per_s, dtype=float), *(np.array(c, dtype=float) for c in columns))
+
+    def __len__(self) -> int:
+        return int(self.displacement_um.size)
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the record."""
+        return len(self) * self.dt_s
+
+    @property
+    def has_barometer(self) -> bool:
+        """Air pressure was read throughout."""
+        return bool(np.isfinite(self.ambient_pressure_pa).all())
+
+    @property
+    def has_thermometer(self) -> bool:
+        """Air temperature was read throughout."""
+        return bool(np.isfinite(self.air_temperature_c).all())
+
+    @property
+    def lost_fraction(self) -> float:
+        """Share of laser readings that were lost."""
+        return float(np.mean(~np.isfinite(self.displacement_um)))
+
+    def part(self, start_s: float, stop_s: float) -> Record:
+        """The samples from `start_s` until before `stop_s`."""
+        cut = slice(round(start_s / self.dt_s), round(stop_s / self.dt_s))
+        return Record(
+            self.dt_s,
+            self.flow_um_per_s[cut],
+            self.displacement_um[cut],
+            self.ambient_pressure_pa[cut],
+            self.air_temperature_c[cut],
+        )
+
+    def followed_by(self, *later: Record) -> Record:
+        """This and what came right after it, as one record. Raises ValueError for different sample times."""
+        parts = (self, *later)
+        if any(part.dt_s != self.dt_s for part in later):
+            raise ValueError("records of different sample times cannot be joined")
+        return Record(
+            self.dt_s,
+            np.concatenate([part.flow_um_per_s for part in parts]),
+            np.concatenate([part.displacement_um for part in parts]),
+            np.concatenate([part.ambient_pressure_pa for part in parts]),
+            np.concatenate([part.air_temperature_c for part in parts]),
+        )
+
+    def filled_displacement_um(self) -> Series:
+        """Readings with lost ones interpolated. Raises ValueError if all are lost."""
+        good = np.isfinite(self.displacement_um)
+        if not good.any():
+            raise ValueError("no laser reading in the record")
+        return np.interp(np.arange(len(self)), np.flatnonzero(good), self.displacement_um[good])
+
+    def sha256(self) -> str:
+        """Hash of the data, to say what gains were made from."""
+        digest = hashlib.sha256(np.float64(self.dt_s).tobytes())
+        for column in (
+            self.flow_um_per_s,
+            self.displacement_um,
+            self.ambient_pressure_pa,
+            self.air_temperature_c,
+        ):
+            digest.update(np.ascontiguousarray(column).tobytes())
+        return digest.hexdigest()
+
+
+# Raw data of a session: one compressed file a record, checked by its hash when it is read back.
+
+
+_BYTES_MAX = 200_000_000  # four columns of a day at 50 Hz are 140 MB
+_COLUMNS = ("flow_um_per_s", "displacement_um", "ambient_pressure_pa", "air_temperature_c")
+
+
+def save_record(path: Path, record: Record) -> None:
+    """Write a record in one step."""
+    file = io.BytesIO()
+    columns = {name: getattr(record, name) for name in _COLUMNS}
+    np.savez_compressed(file, dt_s=np.float64(record.dt_s), sha256=np.array(record.sha256()), **columns)
+    files.write_bytes_atomic(files.users(path), file.getvalue())
+
+
+def load_record(path: Path) -> Record:
+    """Read a record. Raises InputError if it is not there, damaged, or not what was written."""
+    try:
+        with files.open_plain(files.users(path)) as file, np.load(file, allow_pickle=False) as found:
+            if sum(member.file_size for member in found.zip.infolist()) > _BYTES_MAX:
+                raise ValueError("more than a record holds")
+            record = Record(float(found["dt_s"]), *(found[name] for name in _COLUMNS))
+            hashed = str(found["sha256"])
+    except FileNotFoundError:
+        raise errors.InputError(f"{path}: no such file") from None
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, MemoryError, zipfile.BadZipFile) as error:
+        raise errors.InputError(f"{path}: damaged ({error}); repeat the step that wrote it") from None
+    if record.sha256() != hashed:
+        raise errors.InputError(f"{path}: the data are not those that were written (hash differs)")
+    return record

@@ -1,0 +1,192 @@
+"""Gains from a model, by the rules people know and by searching.
+
+All take lags as dead time (delay = theta + T + filter + half a sample): an integrator with delay is
+what the rules are made for, and the pump's lag of a tenth of the loop's time constant does not earn a D term.
+"""
+
+import cmath
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from membrane_ctrl.config.schema import LoopConfig
+from tuning.identification import loop_model, records
+from tuning.identification.disturbance import Disturbance
+from tuning.proposal.prediction import predict
+
+# Filters tried by the search: none costs more phase than the loop has.
+_FILTERS_S = (0.03, 0.05, 0.1, 0.2, 0.4)
+# Bounds of the search in K times delay and Ti over delay.
+_GAIN_RANGE = (0.01, 1.0)
+_TI_RANGE = (2.0, 400.0)
+RECOVERED_UM = 0.5  # a load step is over when the centre stays this near: the most a mean of 60 s may be off
+_LONGEST_S, _LOOK_S = 600.0, 0.02  # a recovery is looked for this long, this finely
+_STEEP = 1e3  # a loop that breaks a demand costs more than any variance
+
+
+@dataclass(frozen=True, slots=True)
+class Demands:
+    """What every proposal must keep, whatever it does to the variance.
+
+    Attributes
+    ----------
+    ms : float
+        Largest sensitivity.
+    load_step_um_per_s, load_peak_um : float
+        A change of the leak this large must move the centre no further: half the leak of a sound mirror, and the
+        band. Without it a mirror that the weather leaves alone would get no gain at all.
+    recovery_s : float
+        Three integral times at most.
+    pump_sigmas : float
+        Standard deviations of the feedback's flow between the holding flow and none, and of its change in a tick
+        within the rate limit: beyond, the limits cut the noise on one side and a bias is left.
+    activity_weight : float
+        Price of the feedback's flow (share of the holding flow, squared) in the logarithm of the standard deviation.
+        A pump that stalls and starts spoils what the last per cent of prediction promises: 0.3 is what the
+        simulated pump showed.
+    """
+
+    ms: float = 1.4
+    load_step_um_per_s: float = 0.6
+    load_peak_um: float = 2.0
+    recovery_s: float = 60.0
+    pump_sigmas: float = 1.7
+    activity_weight: float = 0.3
+
+
+def load_peak_um(gains: loop_model.Gains, model: loop_model.PlantModel, step_um_per_s: float) -> float:
+    """Largest excursion after a step of the leak; the loop's delay as time in which nothing answers.
+
+    y'' + k K y' + k K / Ti y = D delta(t): a step D of the speed peaks at
+    D / w0 exp(-zeta w0 t), with w0 = sqrt(k K / Ti) and zeta = sqrt(k K Ti) / 2, where the speed is back to 0.
+    """
+    natural = math.sqrt(model.gain * gains.kp_per_s / gains.ti_s)
+    zeta = math.sqrt(model.gain * gains.kp_per_s * gains.ti_s) / 2
+    if zeta < 1:
+        angle = math.acos(zeta)
+        peak = math.exp(-zeta / math.sin(angle) * angle)
+    else:
+        angle = math.acosh(max(zeta, 1 + 1e-9))
+        peak = math.exp(-zeta / math.sinh(angle) * angle)
+    return step_um_per_s * (peak / natural + model.delay_s + gains.filter_s)
+
+
+def load_recovery_s(gains: loop_model.Gains, model: loop_model.PlantModel, step_um_per_s: float) -> float:
+    """Time after a step of the leak until the centre stays within `RECOVERED_UM`; infinite if it never does.
+
+    The answer to the equation of `load_peak_um`, D (exp(r1 t) - exp(r2 t)) / (r1 - r2) with its roots r1 and r2,
+    begun after the loop's delay.
+    """
+    speed_per_s, stiffness = model.gain * gains.kp_per_s, model.gain * gains.kp_per_s / gains.ti_s
+    root = cmath.sqrt(speed_per_s**2 - 4 * stiffness) or 1e-9  # of a double root the limit, to nine digits
+    time_s = np.arange(0.0, _LONGEST_S, _LOOK_S)
+    slow, fast = (np.exp((sign * root - speed_per_s) / 2 * time_s) for sign in (1, -1))
+    away_um = step_um_per_s * ((slow - fast) / root).real
+    away = np.flatnonzero(np.abs(away_um) > RECOVERED_UM)
+    if away.size == 0:
+        return 0.0
+    over_s = float(time_s[away[-1]]) + _LOOK_S + model.delay_s + gains.filter_s
+    return over_s if over_s < _LONGEST_S else math.inf
+
+
+def effective_delay_s(model: loop_model.PlantModel, dt_s: float, filter_s: float) -> float:
+    """Delay of the integrator-with-delay that stands for the loop."""
+    return model.delay_s + dt_s / 2 + filter_s
+
+
+def simc(
+    model: loop_model.PlantModel, dt_s: float, filter_s: float, closed_loop_s: float | None = None
+) -> loop_model.Gains:
+    """SIMC PI: K = 1 / (k (tc + d)), Ti = 4 (tc + d), tc = d unless given (Skogestad 2003)."""
+    delay_s = effective_delay_s(model, dt_s, filter_s)
+    slowed_s = (delay_s if closed_loop_s is None else closed_loop_s) + delay_s
+    return loop_model.Gains(1 / (model.gain * slowed_s), 4 * slowed_s, 0.0, filter_s)
+
+
+def amigo(model: loop_model.PlantModel, dt_s: float, filter_s: float) -> loop_model.Gains:
+    """AMIGO PI for an integrating process: K = 0.35 / (k d), Ti = 13.4 d (Astrom and Hagglund 2006, eq. 7.3)."""
+    delay_s = effective_delay_s(model, dt_s, filter_s)
+    return loop_model.Gains(0.35 / (model.gain * delay_s), 13.4 * delay_s, 0.0, filter_s)
+
+
+def lambda_tuned(model: loop_model.PlantModel, dt_s: float, filter_s: float, factor: float = 3.0) -> loop_model.Gains:
+    """Lambda PI, lambda = factor x delay: Ti = 2 lambda + d, K = Ti / (k (lambda + d)^2)."""
+    delay_s = effective_delay_s(model, dt_s, filter_s)
+    lambda_s = factor * delay_s
+    ti_s = 2 * lambda_s + delay_s
+    return loop_model.Gains(ti_s / (model.gain * (lambda_s + delay_s) ** 2), ti_s, 0.0, filter_s)
+
+
+def ziegler_nichols(ultimate_gain_per_s: float, ultimate_period_s: float) -> loop_model.Gains:
+    """The hobby tuners' PID from a relay: K = 0.6 Ku, Ti = Tu / 2, Td = Tu / 8, no filter on D."""
+    return loop_model.Gains(0.6 * ultimate_gain_per_s, ultimate_period_s / 2, ultimate_period_s / 8, 0.0)
+
+
+def max_ki(model: loop_model.PlantModel, dt_s: float, filter_s: float, ms: float) -> loop_model.Gains:
+    """PI with the largest K / Ti that keeps the sensitivity below `ms`: best against a step of the leak."""
+    start = simc(model, dt_s, filter_s)
+    return _search(model, dt_s, start, ms, lambda gains: -math.log(gains.kp_per_s / gains.ti_s))
+
+
+def least_variance(
+    model: loop_model.PlantModel, disturbance: Disturbance, loop: LoopConfig, demands: Demands
+) -> loop_model.Gains:
+    """PI and filter with the least predicted variance of the true centre, within the demands.
+
+    No D: at best it takes 1 % off the prediction, for twice the pump's activity, which then costs more than that.
+
+    Parameters
+    ----------
+    model : PlantModel
+    disturbance : Disturbance
+    loop : LoopConfig
+        Its feed-forward counts; its gains do not.
+    demands : Demands
+    """
+    dt_s = disturbance.rest.dt_s
+
+    def cost(gains: loop_model.Gains) -> float:
+        found = predict(gains, model, disturbance, loop)
+        activity = found.flow_std_um_per_s / model.holding_flow_um_per_s
+        jump = demands.pump_sigmas * found.flow_step_std_um_per_s / (loop.flow_rate_limit_um_per_s2 * dt_s)
+        peak = load_peak_um(gains, model, demands.load_step_um_per_s) / demands.load_peak_um
+        slow = 3 * gains.ti_s / demands.recovery_s
+        broken = sum(max(0.0, share - 1) for share in (demands.pump_sigmas * activity, jump, peak, slow))
+        return math.log(found.std_um) + demands.activity_weight * activity**2 + 10 * broken
+
+    starts = (simc(model, dt_s, filter_s, 1.2) for filter_s in _FILTERS_S if filter_s >= dt_s)
+    return min((_search(model, dt_s, start, demands.ms, cost) for start in starts), key=cost)
+
+
+def _search(
+    model: loop_model.PlantModel,
+    dt_s: float,
+    start: loop_model.Gains,
+    ms: float,
+    cost: Callable[[loop_model.Gains], float],
+) -> loop_model.Gains:
+    """PI with the least cost at the filter of `start`, the sensitivity kept below `ms`; in logarithms."""
+    delay_s = effective_delay_s(model, dt_s, start.filter_s)
+    low = np.log([_GAIN_RANGE[0] / (model.gain * delay_s), _TI_RANGE[0] * delay_s])
+    high = np.log([_GAIN_RANGE[1] / (model.gain * delay_s), _TI_RANGE[1] * delay_s])
+
+    def gains_at(logs: records.Series) -> loop_model.Gains:
+        kp_per_s, ti_s = np.exp(np.clip(logs, low, high)).tolist()
+        return loop_model.Gains(kp_per_s, ti_s, 0.0, start.filter_s)
+
+    def penalised(logs: records.Series) -> float:
+        gains = gains_at(logs)
+        outside = float(np.sum(np.maximum(0.0, low - logs) + np.maximum(0.0, logs - high)))
+        peak = loop_model.sensitivity_peak(gains, model, dt_s)
+        if not math.isfinite(peak):
+            return _STEEP * (10.0 + float(logs[0]))
+        return cost(gains) + _STEEP * max(0.0, peak - ms) + outside
+
+    first = np.clip(np.log([start.kp_per_s, start.ti_s]), low, high)
+    while not math.isfinite(loop_model.sensitivity_peak(gains_at(first), model, dt_s)) and first[0] > low[0]:
+        first[0] = max(low[0], first[0] - 0.5)
+    fit = minimize(penalised, first, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-5, "maxiter": 300})
+    return gains_at(fit.x)

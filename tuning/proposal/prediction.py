@@ -1,0 +1,142 @@
+"""Standard deviations: what a design will give, and the least that any controller could.
+
+Predicted: the true centre is S d - T n for a disturbance d and laser noise n; its variance is the integral of its
+spectrum. Least: nobody acts sooner than the dead time, so the error is at least that of the best prediction of the
+disturbance over it (Astrom, Introduction to Stochastic Control Theory, 1970, chapter 6). The pump's lag is no limit
+of its own: it can be inverted.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm, solve_discrete_are
+
+from membrane_ctrl.config.schema import LoopConfig
+from tuning.identification import identify, loop_model
+from tuning.identification.disturbance import Disturbance
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Predicted:
+    """Standard deviations: of the true centre, of the feedback's flow, and of its change from tick to tick."""
+
+    std_um: float
+    flow_std_um_per_s: float
+    flow_step_std_um_per_s: float
+
+
+def predict(
+    gains: loop_model.Gains, model: loop_model.PlantModel, disturbance: Disturbance, loop: LoopConfig
+) -> Predicted:
+    """Linear prediction for a stable loop; a pump at its limit is the preview's to see."""
+    dt_s = disturbance.rest.dt_s
+    w = loop_model.frequencies(dt_s)
+    response = loop_model.loop_response(gains, model, w, dt_s)
+    sensitivity = 1 / (1 + response)
+    moving, noise = disturbance.psd(w, model, loop), disturbance.rest.white_psd
+    centre = np.abs(sensitivity) ** 2 * moving + np.abs(1 - sensitivity) ** 2 * noise
+    flow = np.abs(loop_model.controller_response(gains, w) * sensitivity) ** 2 * (moving + noise)
+    change = flow * np.abs(2 * np.sin(w * dt_s / 2)) ** 2
+    return Predicted(*(math.sqrt(float(np.trapezoid(s * w, np.log(w))) / math.pi) for s in (centre, flow, change)))
+
+
+def least_std_um(
+    model: loop_model.PlantModel, disturbance: Disturbance, loop: LoopConfig, write_s: float = 0.0
+) -> float:
+    """Bound for the sensors that the loop's feed-forward uses; a weather it does not use is disturbance only.
+
+    Parameters
+    ----------
+    model : PlantModel
+    disturbance : Disturbance
+    loop : LoopConfig
+    write_s : float
+        Time from a reading to its command, if the model's dead time does not hold it.
+    """
+    drift, diffusion, centre = _walks(disturbance)
+    readings, noises = [centre], [disturbance.rest.white**2]
+    for index, weather, used in (
+        (0, disturbance.barometer, loop.feedforward_barometer),
+        (1, disturbance.air, loop.feedforward_temperature),
+    ):
+        if weather is not None and used:
+            readings.append(np.eye(len(drift))[index])
+            noises.append(weather.noise**2)
+    c, r = np.array(readings), np.diag(noises)
+    transition, kicks = _discrete(drift, diffusion, disturbance.rest.dt_s)
+    before = solve_discrete_are(transition.T, c.T, kicks, r)
+    after = before - before @ c.T @ np.linalg.solve(c @ before @ c.T + r, c @ before)
+    transition, kicks = _discrete(drift, diffusion, model.dead_time_s + write_s + disturbance.rest.dt_s / 2)
+    return float(np.sqrt(centre @ (transition @ after @ transition.T + kicks) @ centre))
+
+
+# A walk that returns after an hour is one for the loop, and keeps what the laser cannot tell apart bounded.
+_RETURN_S = 3600.0
+# Intensity of a walk that was not seen, um^2/s: 1 nm in a second; zero would leave the filter without a solution.
+_UNSEEN = 1e-6
+
+
+def _walks(disturbance: Disturbance) -> tuple[Matrix, Matrix, Matrix]:
+    """States: barometer, air, gas, fast rest, slow rest, what it reaches; their drift, diffusion, and the centre."""
+    barometer, air, rest = disturbance.barometer, disturbance.air, disturbance.rest
+    drift = -np.eye(6) / _RETURN_S
+    air_s = air.lag_s if air is not None else rest.slow_s
+    drift[2, 1:3] = 1 / air_s, -1 / air_s
+    drift[5, 4:6] = 1 / rest.slow_s, -1 / rest.slow_s
+    walks = (barometer.walk if barometer else _UNSEEN, air.walk if air else _UNSEEN)
+    diffusion = np.diag([walks[0], walks[1], 0.0, max(rest.fast, _UNSEEN), max(rest.slow, _UNSEEN), 0.0])
+    centre = np.array([barometer.gain if barometer else 0.0, 0.0, air.gain if air else 0.0, 1.0, 0.0, 1.0])
+    return drift, diffusion, centre
+
+
+def _discrete(drift: Matrix, diffusion: Matrix, step_s: float) -> tuple[Matrix, Matrix]:
+    """Transition and noise covariance over a step (Van Loan 1978)."""
+    n = len(drift)
+    block = expm(np.block([[-drift, diffusion], [np.zeros((n, n)), drift.T]]) * step_s)
+    transition = block[n:, n:].T
+    return transition, transition @ block[:n, n:]
+
+
+# What a proposal does on the plants that the data allow: draws from the covariance of the fit.
+
+
+@dataclass(frozen=True, slots=True)
+class Robustness:
+    """Over the sampled plants: 95 % quantiles of sensitivity and standard deviation, and share of stable loops."""
+
+    ms_p95: float
+    std_p95_um: float
+    stable_fraction: float
+
+
+def sampled_plants(identified: identify.Identified, count: int, seed: int = 1) -> list[loop_model.PlantModel]:
+    """Plants drawn from the fit's covariance; times and gain stay positive."""
+    model = identified.model
+    centre = np.array([model.gain, model.dead_time_s, model.lag_s, model.leak_um_per_s])
+    draws = np.random.default_rng(seed).multivariate_normal(centre, identified.covariance, count)
+    floor = np.array([0.05 * model.gain, 0.0, 1e-3, 0.0])
+    return [loop_model.PlantModel(*row) for row in np.maximum(draws, floor).tolist()]
+
+
+def robustness(
+    gains: loop_model.Gains,
+    identified: identify.Identified,
+    disturbance: Disturbance,
+    loop: LoopConfig,
+    count: int = 60,
+) -> Robustness:
+    """Evaluate gains on sampled plants; an unstable one counts as infinitely bad."""
+    plants = sampled_plants(identified, count)
+    dt_s = disturbance.rest.dt_s
+    peaks = np.array([loop_model.sensitivity_peak(gains, plant, dt_s) for plant in plants])
+    stable = np.isfinite(peaks)
+    stds = np.array(
+        [predict(gains, p, disturbance, loop).std_um if ok else np.inf for p, ok in zip(plants, stable, strict=True)]
+    )
+    # the next value above: a quantile between a number and infinity would be neither
+    peak_p95, std_p95 = (float(np.quantile(values, 0.95, method="higher")) for values in (peaks, stds))
+    return Robustness(peak_p95, std_p95, float(stable.mean()))
