@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: hold test lint types unit bench campaign fuzz mutants generate clean
+.PHONY: hold test lint types unit docs bench campaign fuzz mutants generate clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml requirements.lock
@@ -22,6 +22,10 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/python -m benchmarks.house
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+docs: $(STAMP)  ## the documentation as a site, on http://127.0.0.1:8000
+	$(BIN)/mkdocs serve
 
 types: $(STAMP)
 	$(BIN)/mypy
