@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from membrane_ctrl.cli.ctl import ctl_app
 from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, configured
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import clock, errors
@@ -21,7 +22,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command()(hold)
     app.command()(twin)
     app.command()(safe)
-    app.command(context_settings={"ignore_unknown_options": True})(ctl)  # a negative setpoint is no option
+    app.add_typer(ctl_app, name="ctl")
     app.add_typer(alarm_app, name="alarm")
 
 
@@ -30,7 +31,7 @@ def hold(
     twin: Annotated[bool, typer.Option("--twin", help="Hold the simulated bench instead of devices.")] = False,
     devices: Annotated[
         Path | None,
-        typer.Option(help="With --twin: emulate the instruments of this configuration's [devices], in bytes."),
+        typer.Option(help="With --twin: emulate the instruments that this configuration names, byte for byte."),
     ] = None,
     duration: Annotated[str | None, typer.Option(help="Stop after this long, e.g. 90s, 3m, 2h30m.")] = None,
     name: Annotated[str, typer.Option(help="Name of the run folder.")] = "hold",
@@ -84,36 +85,6 @@ def safe(
     from membrane_ctrl.commissioning.safe import make_safe
 
     return make_safe(configured(config), str(config), logs, latch)
-
-
-def ctl(
-    action: Annotated[
-        str,
-        typer.Argument(
-            metavar="ACTION",
-            help="status, watch, setpoint UM, hold, pause, resume, manual FLOW, gains FILE, keep, shape on|off, "
-            'mark "text", ack, lower, vent, stop, release, quiet, latch "text", capture.',
-        ),
-    ],
-    argument: Annotated[str | None, typer.Argument(metavar="[VALUE]")] = None,
-    why: Annotated[str, typer.Option(help="Recorded with the command.")] = "",
-    take_over: Annotated[bool, typer.Option("--take-over", help="Take the command from who has it.")] = False,
-    every: Annotated[str, typer.Option(help="watch: a line this often.")] = "1s",
-    trial: Annotated[str, typer.Option(help="gains: back to the old ones after this, unless `keep` comes.")] = "",
-    run: Annotated[Path | None, typer.Option(help="The run's folder.")] = None,
-    socket: Annotated[Path | None, typer.Option(help="The hold's socket; logs/control.sock by default.")] = None,
-    tls: Annotated[str, typer.Option(metavar="HOST:PORT", help="By TCP, with the certificate below.")] = "",
-    certificate: Annotated[Path | None, typer.Option(help="With --tls: the own certificate.")] = None,
-    key: Annotated[Path | None, typer.Option(help="With --tls: its key.")] = None,
-    authority: Annotated[Path | None, typer.Option(help="With --tls: who signed the hold's certificate.")] = None,
-    json: JsonOption = False,
-) -> int:
-    """Talk to a running hold: ask how it is, or tell it what to do."""
-    from membrane_ctrl.control_port.ctl import CtlOptions, Where
-    from membrane_ctrl.control_port.ctl import ctl as ask
-
-    where = Where(socket, run, tls, certificate, key, authority)
-    return ask(CtlOptions(action, argument, why, take_over, every, trial, json, where))
 
 
 @alarm_app.callback()

@@ -1,7 +1,6 @@
 """`ctl`: one request to a running hold, and its answer."""
 
 import json
-import math
 import sys
 import tomllib
 from dataclasses import dataclass
@@ -9,21 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.config.toml_file import read_toml
-from membrane_ctrl.control_port import protocol, unix
+from membrane_ctrl.control_port import unix
 from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.model import clock, errors
-
-_SHAPE = {"on": "shape_on", "off": "shape_off"}
-_NUMBERS = {"setpoint": "um", "manual": "um/s of the centre"}
-# `tune` takes more than a word: `membrane-ctrl tune` asks for it
-_PLAIN = (
-    "status",
-    "watch",
-    "release",
-    "quiet",
-    *(k for k in protocol.KINDS if not k.startswith("shape_") and k != "tune"),
-)
-ACTIONS = (*_PLAIN, "shape")
+from membrane_ctrl.model import errors
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,68 +25,25 @@ class Where:
     authority: Path | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class CtlOptions:
-    """What the command line asked for."""
-
-    action: str
-    argument: str | None
-    why: str
-    take_over: bool
-    every: str
-    trial: str
-    json: bool
-    where: Where
-
-
-def ctl(options: CtlOptions) -> int:
+def ctl(request: dict[str, Any], where: Where, as_json: bool) -> int:
     """Ask a running hold. Raises InputError for a refusal, DeviceError if nobody answers."""
-    request = request_for(options)
-    with _connect(options.where) as client:
+    action = request["do"]
+    with _connect(where) as client:
         answer = client.ask(**request)
         if not answer.get("ok"):
-            if options.json:
+            if as_json:
                 print(json.dumps(answer))
             raise errors.InputError(f"refused: {answer.get('refused')}")
-        if options.action == "watch":
-            return _watch(client, answer["status"], options)
-        if options.json:
+        if action == "watch":
+            return _watch(client, answer["status"], request["period_s"], as_json)
+        if as_json:
             print(json.dumps(answer))
-        elif options.action == "status":
+        elif action == "status":
             print("\n".join(status_lines(answer["status"])))
         else:
             state = f"; the state was {answer['state']}" if "state" in answer else ""
-            print(f"{options.action}: done{state}", file=sys.stderr)
+            print(f"{action}: done{state}", file=sys.stderr)
     return errors.Exit.DONE
-
-
-def request_for(options: CtlOptions) -> dict[str, Any]:
-    """The request a command line means. Raises InputError."""
-    action, argument = options.action, options.argument
-    request: dict[str, Any] = {"do": action, "why": options.why, "take_over": options.take_over}
-    if action not in ACTIONS:
-        raise errors.InputError(f"ctl {action}: unknown; known are {', '.join(ACTIONS)}")
-    if action == "watch":
-        request["period_s"] = clock.parse_duration_s(options.every)
-    if action in _NUMBERS:
-        request["value"] = _number(action, argument)
-    elif action == "shape":
-        if argument not in _SHAPE:
-            raise errors.InputError("ctl shape: on or off?")
-        request["do"] = _SHAPE[argument]
-    elif action == "mark":
-        if not argument:
-            raise errors.InputError('ctl mark: what? ctl mark "door opened"')
-        request["text"] = argument
-    elif action == "latch":
-        request["text"] = argument or ""
-    elif action == "gains":
-        request["loop"] = _gains(argument)
-        if options.trial:
-            request["value"] = clock.parse_duration_s(options.trial)
-    elif argument is not None:
-        raise errors.InputError(f"ctl {action} takes no argument (it is {argument!r})")
-    return request
 
 
 def status_lines(status: dict[str, Any]) -> list[str]:
@@ -135,12 +79,12 @@ def _geometry(geometry: dict[str, Any] | None) -> str:
     return geometry["message"] or f"{made} (hash {geometry['hash']})"
 
 
-def _watch(client: PortClient, first: dict[str, Any], options: CtlOptions) -> int:
-    client.patience(clock.parse_duration_s(options.every) + 10.0)
-    _print_watched(first, options.json)
+def _watch(client: PortClient, first: dict[str, Any], period_s: float, as_json: bool) -> int:
+    client.patience(period_s + 10.0)
+    _print_watched(first, as_json)
     for message in client.messages():
         if "status" in message:
-            _print_watched(message["status"], options.json)
+            _print_watched(message["status"], as_json)
     print("the run is over", file=sys.stderr)
     return errors.Exit.DONE
 
@@ -161,20 +105,8 @@ def _shown(value: float | None) -> str:
     return f"{value:10.3f}" if value is not None else f"{'-':>10}"
 
 
-def _number(action: str, argument: str | None) -> float:
-    try:
-        value = float(argument or "")
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise errors.InputError(f"ctl {action}: a number in {_NUMBERS[action]} is needed")
-    return value
-
-
-def _gains(argument: str | None) -> dict[str, Any]:
-    """Loop keys of a TOML or JSON file, or of the text itself; a [loop] table is looked into."""
-    if not argument:
-        raise errors.InputError("ctl gains: give a TOML or JSON file with loop keys, or the keys: 'kp_per_s = 0.5'")
+def loop_keys(argument: str) -> dict[str, Any]:
+    """Loop keys of a TOML or JSON file, or of the text itself; a [loop] table is looked into. Raises InputError."""
     path = Path(argument)
     if path.suffix == ".json":
         try:
@@ -187,11 +119,11 @@ def _gains(argument: str | None) -> dict[str, Any]:
         try:
             tables = tomllib.loads(argument)
         except tomllib.TOMLDecodeError as error:
-            raise errors.InputError(f"ctl gains: neither a .toml or .json file nor keys: {error}") from None
+            raise errors.InputError(f"ctl gains: neither a .toml or .json file nor loop keys: {error}") from None
     if isinstance(tables, dict) and isinstance(tables.get("loop"), dict):
         tables = tables["loop"]
     if not isinstance(tables, dict) or not all(isinstance(value, (bool, int, float)) for value in tables.values()):
-        raise errors.InputError(f"{argument}: loop keys with numbers are needed")
+        raise errors.InputError(f"{argument}: not a table of loop keys with numbers")
     return tables
 
 
@@ -213,7 +145,7 @@ def _connect_tls(where: Where, notice: Any) -> PortClient:
 
     host, _, port = where.tls.rpartition(":")
     if not host or not port.isdigit():
-        raise errors.InputError(f"--tls {where.tls}: HOST:PORT is needed")
+        raise errors.InputError(f"--tls {where.tls}: expected HOST:PORT")
     if where.certificate is None or where.key is None or where.authority is None:
         raise errors.InputError("--tls needs --certificate, --key and --authority")
     return PortClient.tls(host, int(port), client_context(where.certificate, where.key, where.authority), notice)

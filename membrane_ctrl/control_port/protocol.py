@@ -16,7 +16,7 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from membrane_ctrl.config.section import Section
 from membrane_ctrl.config.toml_file import describe
-from membrane_ctrl.controller.commands import Kind
+from membrane_ctrl.controller.commands import TABLE, Kind
 
 VERSION = 1
 
@@ -31,10 +31,6 @@ Action = Literal[Kind, Errand]
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
 ACTIONS: tuple[str, ...] = (*KINDS, *get_args(Errand))
-
-
-_NEEDED = {"value": ("setpoint", "manual"), "text": ("mark",), "loop": ("gains",), "experiment": ("tune",)}
-_OPTIONAL = {"value": ("gains",), "text": ("latch",)}
 
 
 class RequestError(ValueError):
@@ -94,11 +90,13 @@ class Request(Section):
 
     @model_validator(mode="after")
     def _complete(self) -> Request:
-        for name, kinds in _NEEDED.items():
+        rule = TABLE.get(self.do)  # type: ignore[arg-type]
+        needs, takes = (rule.needs, rule.takes) if rule else ((), ())
+        for name in ("value", "text", "loop", "experiment"):
             given = getattr(self, name) not in (None, "")
-            if given and self.do not in (*kinds, *_OPTIONAL.get(name, ())):
+            if given and name not in (*needs, *takes):
                 raise ValueError(f"{self.do} takes no {name}")
-            if not given and self.do in kinds:
+            if not given and name in needs:
                 raise ValueError(f"{self.do}: {name} missing")
         return self
 

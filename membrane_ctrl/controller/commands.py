@@ -67,31 +67,53 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
-    """One row: the role it takes, the states where it makes sense."""
+class CommandRule:
+    """One row.
+
+    Attributes
+    ----------
+    role : str
+        Who may ask for it.
+    states : collection of State
+        Where it is allowed.
+    does : str
+        For the help.
+    needs, takes : tuple of str
+        Fields of a request that must come with it, and that may.
+    """
 
     role: Role
     states: Collection[State]
+    does: str
+    needs: tuple[str, ...] = ()
+    takes: tuple[str, ...] = ()
 
 
-TABLE: dict[Kind, Rule] = {
-    "hold": Rule("operate", {State.STANDBY, State.MANUAL, State.TUNE}),
-    "stop": Rule("operate", ANY),
-    "pause": Rule("operate", {State.HOLD}),
-    "resume": Rule("operate", {State.HOLD}),
-    "manual": Rule("operate", {State.SETTLE, State.HOLD, State.MANUAL}),
-    "setpoint": Rule("operate", RUNNING),
-    "gains": Rule("tune", RUNNING),
-    "keep": Rule("tune", RUNNING),
-    "tune": Rule("tune", {State.HOLD}),
-    "shape_on": Rule("operate", ANY),
-    "shape_off": Rule("operate", ANY),
-    "mark": Rule("operate", ANY),
-    "ack": Rule("operate", {State.STANDBY, State.FAULT}),
-    "latch": Rule("operate", ANY),  # a fault of an earlier run, or a person's lock: no hold before `ack`
-    "lower": Rule("operate", RUNNING),
-    "vent": Rule("operate", ANY),
-    "capture": Rule("operate", {State.HOLD}),  # a full set, written by the acquisition
+_HOLD, _PARKED, _FLOW = (
+    {State.HOLD},
+    {State.STANDBY, State.MANUAL, State.TUNE},
+    {State.SETTLE, State.HOLD, State.MANUAL},
+)
+
+TABLE: dict[Kind, CommandRule] = {
+    "setpoint": CommandRule("operate", RUNNING, "Ramp to a setpoint of the laser, in um.", needs=("value",)),
+    "hold": CommandRule("operate", _PARKED, "Hold, or go back to holding."),
+    "pause": CommandRule("operate", _HOLD, "Pause the loop: the pump keeps its mean flow."),
+    "resume": CommandRule("operate", _HOLD, "Resume the loop after a pause."),
+    "manual": CommandRule("operate", _FLOW, "Hold a flow by hand, in um/s of the centre.", needs=("value",)),
+    "gains": CommandRule("tune", RUNNING, "Set loop gains, on trial or for good.", needs=("loop",), takes=("value",)),
+    "keep": CommandRule("tune", RUNNING, "Keep the gains that are on trial."),
+    "tune": CommandRule("tune", _HOLD, "Run a tuning experiment.", needs=("experiment",)),
+    "shape_on": CommandRule("operate", ANY, "Switch the shape loop on."),
+    "shape_off": CommandRule("operate", ANY, "Switch the shape loop off."),
+    "mark": CommandRule("operate", ANY, "Write a line on the timeline.", needs=("text",)),
+    "capture": CommandRule("operate", _HOLD, "Take a full set into the run's raw/ folder."),
+    "ack": CommandRule("operate", {State.STANDBY, State.FAULT}, "Clear a latched fault and acknowledge the alarms."),
+    "lower": CommandRule("operate", RUNNING, "Lower the mirror through the leak, pump off."),
+    "vent": CommandRule("operate", ANY, "Open the vent."),
+    "stop": CommandRule("operate", ANY, "End the run safely; always obeyed."),
+    # a fault of an earlier run, or a person's lock
+    "latch": CommandRule("operate", ANY, "Lock the mirror: pump off, no hold before `ack`.", takes=("text",)),
 }
 
 
@@ -111,11 +133,11 @@ def overruled(command: Command, obeyed: Collection[str]) -> str:
 def refusal(command: Command, state: State, config: Config) -> str:
     """Why a command cannot be obeyed now; empty if it can."""
     if command.kind == "resumed":
-        return "" if command.who == AT_START else "only the start of a run tells of resumes"
+        return "" if command.who == AT_START else "only the start of a run may report earlier resumes"
     rule = TABLE[command.kind]
     if state not in rule.states:
         where = ", ".join(sorted(s.name.lower() for s in rule.states))
-        return f"{command.kind} makes no sense in state {state.name.lower()}; it does in {where}"
+        return f"{command.kind} is not allowed in state {state.name.lower()}; allowed in {where}"
     if command.kind == "setpoint":
         low, high = config.limits.displacement_min_um, config.limits.displacement_max_um
         if not low < command.value < high:
@@ -123,15 +145,15 @@ def refusal(command: Command, state: State, config: Config) -> str:
     if command.kind == "manual" and not 0.0 <= command.value <= config.loop.flow_max_um_per_s:
         return f"flow {command.value:g} um/s is outside 0 .. {config.loop.flow_max_um_per_s:g} um/s"
     if command.kind == "tune" and command.experiment is None:
-        return "tune without an experiment"
+        return "tune: experiment missing"
     if command.kind == "gains" and command.loop is None:
-        return "gains without gains"
+        return "gains: no gains given"
     if command.kind == "gains" and not (math.isnan(command.value) or 1.0 <= command.value <= TRIAL_MAX_S):
-        return f"gains on trial for {command.value:g} s: 1 .. {TRIAL_MAX_S:g} s are possible"
+        return f"gains on trial for {command.value:g} s: a trial lasts 1 .. {TRIAL_MAX_S:g} s"
     if command.kind == "gains" and command.loop is not None and command.loop.rate_hz != config.loop.rate_hz:
-        return "the tick rate cannot be changed while it ticks"
+        return "the tick rate cannot be changed during a run"
     if command.kind == "capture" and not config.shape.enabled:
-        return "no camera measures in this run: [shape] enabled = false"
+        return "no shape measurement in this run: [shape] enabled = false"
     return ""
 
 

@@ -219,7 +219,7 @@ class Crew:
     def capture(self) -> Event | None:
         """Have the acquisition take a full set to disk, which its own event names; an event if that cannot be."""
         if self._acquisition is None:
-            return {"kind": "capture", "failed": "no camera measures in this run"}
+            return {"kind": "capture", "failed": "no shape measurement in this run"}
         if not self._acquisition.send("capture"):
             return {"kind": "capture", "failed": "the acquisition does not answer; is it being replaced?"}
         return None

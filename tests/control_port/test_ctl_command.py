@@ -10,64 +10,96 @@ from port_run import ROW
 
 from firmware_iface.roles import BenchCommand
 from membrane_ctrl.cli import run
-from membrane_ctrl.control_port.ctl import ACTIONS, CtlOptions, Where, request_for, socket_path, status_lines
-from membrane_ctrl.control_port.protocol import parse
+from membrane_ctrl.cli.ctl import ctl_app
+from membrane_ctrl.control_port import ctl as port_ctl
+from membrane_ctrl.control_port import protocol
+from membrane_ctrl.control_port.ctl import Where, socket_path, status_lines
 from membrane_ctrl.control_port.status import Picture
 from membrane_ctrl.controller.tick import TickOutputs
-from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.states import State
 
 ARGUMENTS = {"setpoint": "-12.5", "manual": "0.5", "mark": "door", "gains": "kp_per_s = 0.5", "shape": "on"}
+ACTIONS = [command.name or "" for command in ctl_app.registered_commands]
+Asked = list[dict[str, Any]]
 
 
-def options(action: str, argument: str | None = None, **more: Any) -> CtlOptions:
-    words: dict[str, Any] = {"why": "", "take_over": False, "every": "1s", "trial": ""} | more
-    return CtlOptions(action, argument, **words, json=False, where=Where())
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
+    """The requests that a command line makes."""
+    requests: Asked = []
+    monkeypatch.setattr(port_ctl, "ctl", lambda request, *_: requests.append(request))
+    return requests
+
+
+def test_there_is_an_action_for_every_command_but_tune() -> None:
+    shape = {"shape_on", "shape_off"}
+    assert {*ACTIONS, *shape} == {*protocol.ACTIONS, "shape"} - {"tune"}
 
 
 @pytest.mark.parametrize("action", ACTIONS)
-def test_every_action_is_a_request_that_the_port_reads(action: str) -> None:
-    request = request_for(options(action, ARGUMENTS.get(action), why="test"))
-    assert parse(json.dumps(request).encode()).why == "test"
+def test_every_action_is_a_request_that_the_port_reads(action: str, asked: Asked) -> None:
+    given = [ARGUMENTS[action]] if action in ARGUMENTS else []
+    assert run(["ctl", action, *given, "--why", "test"]) == 0
+    assert protocol.parse(json.dumps(asked[0]).encode()).why == "test"
 
 
-def test_a_lock_may_say_why() -> None:
-    request = request_for(options("latch", "hands inside"))
-    assert parse(json.dumps(request).encode()).text == "hands inside"
+def test_a_lock_may_say_why(asked: Asked) -> None:
+    assert run(["ctl", "latch", "hands inside"]) == 0
+    assert protocol.parse(json.dumps(asked[0]).encode()).text == "hands inside"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--socket", "stop", "setpoint", "-1", "--why", "x"],
+        ["--json", "setpoint", "-1", "--why", "x"],
+        ["--why=x", "setpoint", "-1"],
+        ["setpoint", "--why", "x", "-1"],
+    ],
+)
+def test_options_stand_anywhere(words: list[str], asked: Asked) -> None:
+    assert run(["ctl", *words]) == 0
+    assert [(r["do"], r["value"], r["why"]) for r in asked] == [("setpoint", -1.0, "x")]
 
 
 @pytest.mark.parametrize(
     ("action", "argument", "says"),
     [
-        ("explode", None, "unknown; known are status"),
-        ("tune", None, "unknown"),
-        ("setpoint", None, "a number in um is needed"),
-        ("setpoint", "high", "a number in um is needed"),
-        ("setpoint", "nan", "a number in um is needed"),
-        ("manual", "inf", "a number in um/s"),
-        ("shape", "perhaps", "on or off"),
-        ("mark", "", "what?"),
-        ("stop", "now", "takes no argument"),
-        ("gains", None, "TOML or JSON"),
+        ("explode", None, "No such command 'explode'"),
+        ("tune", None, "No such command 'tune'"),
+        ("setpoint", None, "Missing argument 'UM'"),
+        ("setpoint", "high", "valid number"),
+        ("setpoint", "nan", "not a finite number"),
+        ("manual", "inf", "not a finite number"),
+        ("shape", "perhaps", "on|off"),
+        ("mark", None, "Missing argument 'TEXT'"),
+        ("stop", "now", "unexpected extra argument"),
+        ("gains", None, "Missing argument 'FILE'"),
         ("gains", "kp_per_s : 1", "neither"),
         ("gains", "kp_per_s = 'much'", "numbers"),
         ("gains", "nowhere.toml", "no such file"),
         ("gains", "nowhere.json", "nowhere.json"),
     ],
 )
-def test_what_cannot_be_meant_is_one_line(action: str, argument: str | None, says: str) -> None:
-    with pytest.raises(InputError, match=says):
-        request_for(options(action, argument))
+def test_what_cannot_be_meant_is_one_line(
+    action: str, argument: str | None, says: str, asked: Asked, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["ctl", action, *([] if argument is None else [argument])]) == 2
+    printed = capsys.readouterr().err
+    assert says in printed
+    assert len(printed.splitlines()) == 1
+    assert asked == []
 
 
-def test_gains_from_files(tmp_path: Path) -> None:
+def test_gains_from_files(tmp_path: Path, asked: Asked) -> None:
     toml = tmp_path / "gains.toml"
     toml.write_text("[loop]\nkp_per_s = 0.5\nfeedforward_barometer = false\n")
     plain = tmp_path / "gains.json"
     plain.write_text('{"kp_per_s": 0.25}')
-    loop = request_for(options("gains", str(toml), trial="2m"))
-    assert (loop["loop"], loop["value"]) == ({"kp_per_s": 0.5, "feedforward_barometer": False}, 120.0)
-    assert request_for(options("gains", str(plain)))["loop"] == {"kp_per_s": 0.25}
+    assert run(["ctl", "gains", str(toml), "--trial", "2m"]) == run(["ctl", "gains", str(plain)]) == 0
+    first, second = asked
+    assert (first["loop"], first["value"]) == ({"kp_per_s": 0.5, "feedforward_barometer": False}, 120.0)
+    assert (second["loop"], "value" in second) == ({"kp_per_s": 0.25}, False)
 
 
 def test_the_socket_is_found(tmp_path: Path) -> None:

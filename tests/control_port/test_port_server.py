@@ -56,7 +56,7 @@ async def test_what_the_controller_refuses_is_said(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run, client(run, ANN) as ann:
         run.state = State.INFLATE
         answer = await ann.ask(do="pause")
-        assert answer["refused"] == "pause makes no sense in state inflate; it does in hold"
+        assert answer["refused"] == "pause is not allowed in state inflate; allowed in hold"
         answer = await ann.ask(do="setpoint", value=1e9)
         assert "outside the limits" in answer["refused"]
         assert run.of_kind("refused") == [], "the controller records these"

@@ -14,10 +14,10 @@ WITHOUT_SHAPE = Config(shape=ShapeConfig(enabled=False))
 @pytest.mark.parametrize("state", sorted(TABLE["capture"].states))
 def test_no_picture_is_promised_where_nothing_measures(state: State) -> None:
     capture = Command("capture", "tester")
-    assert "no camera measures" in refusal(capture, state, WITHOUT_SHAPE)
+    assert "no shape measurement" in refusal(capture, state, WITHOUT_SHAPE)
     assert refusal(capture, state, Config()) == ""
 
 
 @pytest.mark.parametrize("state", sorted(set(State) - {State.STANDBY, State.FAULT}))
 def test_nothing_is_acknowledged_where_nothing_is_latched(state: State) -> None:
-    assert "ack makes no sense" in refusal(Command("ack", "anybody"), state, Config())
+    assert "ack is not allowed" in refusal(Command("ack", "anybody"), state, Config())

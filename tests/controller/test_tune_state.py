@@ -173,7 +173,7 @@ def test_an_experiment_asked_for_in_the_tick_of_a_fault_never_runs() -> None:
 def test_it_runs_in_hold_only() -> None:
     assert "in hold" in refusal(tune(), State.SETTLE, CONFIG)
     assert refusal(tune(), State.HOLD, CONFIG) == ""
-    assert refusal(Command("tune", "tester"), State.HOLD, CONFIG) == "tune without an experiment"
+    assert refusal(Command("tune", "tester"), State.HOLD, CONFIG) == "tune: experiment missing"
 
 
 def test_without_room_for_it_the_command_is_refused_with_the_remedy() -> None:

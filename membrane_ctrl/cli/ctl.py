@@ -1,0 +1,155 @@
+"""The commands of `ctl`: one for each that a running hold takes, with its own value and the common options."""
+
+import inspect
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from membrane_ctrl.cli.options import JsonOption
+from membrane_ctrl.controller.commands import TABLE
+from membrane_ctrl.model import clock
+
+WhyOption = Annotated[str, typer.Option(help="Reason, recorded with the command.")]
+TakeOverOption = Annotated[bool, typer.Option("--take-over", help="Take the command from whoever has it.")]
+RunOption = Annotated[Path | None, typer.Option(help="The run's folder.")]
+SocketOption = Annotated[Path | None, typer.Option(help="The hold's socket; logs/control.sock by default.")]
+TlsOption = Annotated[str, typer.Option(metavar="HOST:PORT", help="Connect by TCP, with the certificate below.")]
+CertificateOption = Annotated[Path | None, typer.Option(help="With --tls: your certificate.")]
+KeyOption = Annotated[Path | None, typer.Option(help="With --tls: its key.")]
+AuthorityOption = Annotated[Path | None, typer.Option(help="With --tls: who signed the hold's certificate.")]
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is not a finite number")
+    return value
+
+
+SetpointArgument = Annotated[float, typer.Argument(metavar="UM", help="Setpoint, um.", callback=_finite)]
+FlowArgument = Annotated[float, typer.Argument(metavar="FLOW", help="Flow, um/s of the centre.", callback=_finite)]
+OnArgument = Annotated[bool, typer.Argument(metavar="on|off")]
+TextArgument = Annotated[str, typer.Argument(metavar="TEXT", help="What to write.")]
+ReasonArgument = Annotated[str, typer.Argument(metavar="[TEXT]", help="Why the mirror is locked.")]
+GainsArgument = Annotated[
+    str, typer.Argument(metavar="FILE", help="TOML or JSON file with loop keys, or the keys: 'kp_per_s = 0.5'.")
+]
+TrialOption = Annotated[
+    str, typer.Option(help="Go back to the old gains after this, e.g. 2m, unless `ctl keep` comes.")
+]
+EveryOption = Annotated[str, typer.Option(help="Time between two lines, e.g. 500ms.")]
+
+
+def _has_value_next(word: str) -> bool:
+    return word.startswith("--") and "=" not in word and word not in ("--json", "--take-over")
+
+
+class ActionFirst(TyperGroup):
+    """Options may stand before the action, too."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the first word that is an action, and no option's value, in front."""
+        words = zip(["", *args], args, strict=False)
+        at = next(
+            (n for n, (last, word) in enumerate(words) if word in self.commands and not _has_value_next(last)), 0
+        )
+        return super().parse_args(ctx, [*args[at : at + 1], *args[:at], *args[at + 1 :]])
+
+
+ctl_app = typer.Typer(
+    cls=ActionFirst, no_args_is_help=True, help="Talk to a running hold: ask for its status, or tell it what to do."
+)
+
+
+def _common(
+    why: WhyOption = "",
+    take_over: TakeOverOption = False,
+    run: RunOption = None,
+    socket: SocketOption = None,
+    tls: TlsOption = "",
+    certificate: CertificateOption = None,
+    key: KeyOption = None,
+    authority: AuthorityOption = None,
+    json: JsonOption = False,
+) -> tuple[dict[str, Any], Any, bool]:
+    """Fields of every request, which hold is meant, and whether the answer is printed as JSON."""
+    from membrane_ctrl.control_port.ctl import Where
+
+    return {"why": why, "take_over": take_over}, Where(socket, run, tls, certificate, key, authority), json
+
+
+def _add(action: str, does: str, own: Callable[..., dict[str, Any]]) -> None:
+    """Add a command with the parameters of `own`, which makes its part of the request, and the common options."""
+    parameters = inspect.signature(own).parameters
+
+    def command(**given: Any) -> int:
+        from membrane_ctrl.control_port.ctl import ctl
+
+        part = own(**{name: given.pop(name) for name in parameters})
+        fields, where, as_json = _common(**given)
+        return ctl({"do": action, **fields, **part}, where, as_json)
+
+    command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [
+            parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+            for parameter in (*parameters.values(), *inspect.signature(_common).parameters.values())
+        ]
+    )
+    # a negative setpoint, and a text that begins with a dash, are no options
+    settings = {"ignore_unknown_options": bool(parameters)}
+    ctl_app.command(action, help=does, context_settings=settings)(command)
+
+
+def _plain() -> dict[str, Any]:
+    return {}
+
+
+def _setpoint(um: SetpointArgument) -> dict[str, Any]:
+    return {"value": um}
+
+
+def _manual(flow: FlowArgument) -> dict[str, Any]:
+    return {"value": flow}
+
+
+def _gains(loop: GainsArgument, trial: TrialOption = "") -> dict[str, Any]:
+    from membrane_ctrl.control_port.ctl import loop_keys
+
+    return {"loop": loop_keys(loop)} | ({"value": clock.parse_duration_s(trial)} if trial else {})
+
+
+def _mark(text: TextArgument) -> dict[str, Any]:
+    return {"text": text}
+
+
+def _latch(text: ReasonArgument = "") -> dict[str, Any]:
+    return {"text": text}
+
+
+def _shape(on: OnArgument) -> dict[str, Any]:
+    return {"do": "shape_on" if on else "shape_off"}
+
+
+def _watch(every: EveryOption = "1s") -> dict[str, Any]:
+    return {"period_s": clock.parse_duration_s(every)}
+
+
+_OWN: dict[str, Callable[..., dict[str, Any]]] = {
+    "setpoint": _setpoint,
+    "manual": _manual,
+    "gains": _gains,
+    "mark": _mark,
+    "latch": _latch,
+}
+
+_add("status", "Show the status once.", _plain)
+_add("watch", "Print a line of status again and again, until the run ends.", _watch)
+for _kind, _rule in TABLE.items():
+    if _kind in _OWN or not (_rule.needs or _kind.startswith("shape_")):  # `tune` has a command of its own
+        _add(_kind, _rule.does, _OWN.get(_kind, _plain))
+_add("shape", "Switch the shape loop on or off.", _shape)
+_add("quiet", "Acknowledge the alarms: no reminders, no escalation.", _plain)
+_add("release", "Release the command, so that another may take it.", _plain)
