@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: hold test lint types unit docs bench campaign fuzz mutants generate clean
+.PHONY: hold test lint types unit shake docs bench campaign fuzz mutants generate clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml requirements.lock
@@ -33,6 +33,9 @@ types: $(STAMP)
 unit: $(STAMP)
 	$(BIN)/pytest -m "not campaign and not real_time" -n 2 --dist loadfile
 	$(BIN)/pytest -m "real_time and not campaign"
+
+shake: $(STAMP)  ## the same tests on a machine that stands still for a second, again and again; SEED=2 for other moments
+	$(BIN)/python tests/shake.py --seed $(or $(SEED),1) $(MAKE) unit
 
 bench: $(STAMP)  ## measured figures, each against a reference of the same run
 	$(BIN)/python -m benchmarks

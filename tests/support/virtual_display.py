@@ -23,9 +23,9 @@ def virtual_display(folder: Path, width_px: int, height_px: int) -> Iterator[Pat
     pytest.importorskip("pygame", reason="pip install 'membrane-ctrl[screen]'")
     number_end, server_end = os.pipe()
     command = ["Xvfb", "-displayfd", str(server_end), "-screen", "0", f"{width_px}x{height_px}x24"]
-    server = subprocess.Popen(
-        [*command, "-fbdir", str(folder), "-nolisten", "tcp"], pass_fds=[server_end], stderr=subprocess.DEVNULL
-    )
+    # without -noreset it starts anew when its last client has left, and the next may come too early for it
+    options = ["-fbdir", str(folder), "-nolisten", "tcp", "-noreset"]
+    server = subprocess.Popen([*command, *options], pass_fds=[server_end], stderr=subprocess.DEVNULL)
     os.close(server_end)
     before = {name: os.environ.get(name) for name in ("DISPLAY", "SDL_VIDEODRIVER")}
     try:
