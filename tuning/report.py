@@ -63,7 +63,7 @@ def draw_weather(
     axes.loglog(frequency_hz[1:], 2 * weather.rest.moving_psd(w), label="movement that no weather sensor explains")
     axes.axhline(2 * weather.rest.white_psd, color="tab:red", linestyle="--", label="laser noise")
     axes.set(xlabel="frequency (Hz)", ylabel="um^2/Hz", ylim=(1e-4 * weather.rest.white_psd, None))
-    axes.legend()
+    axes.legend(loc="best")
     _save(path, figure)
 
 
@@ -95,7 +95,7 @@ def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt
         size = np.abs(1 / (1 + loop_model.loop_response(row.gains, model, w, dt_s)))
         e.semilogx(w, size, linewidth=2 if row is rows[0] else 0.8, label=row.name)
     e.set(xlim=(0.05, w[-1]), xlabel="rad/s", title="|S|")
-    e.legend(fontsize=6)
+    e.legend(loc="best", fontsize=6)
     _save(path, figure)
 
 
@@ -126,13 +126,13 @@ def draw_verification(
         )
         left.loglog(f[1:], power[1:], linewidth=0.8, label=f"{name}, Ms {ms:.2f}")
     left.set(xlabel="frequency (Hz)", ylabel="readings (um^2/Hz)")
-    left.legend()
+    left.legend(loc="best")
     times = [stage.time_s for stage in done.stages]
     right.plot(times, [stage.growth for stage in done.stages], "o-", label="std over that of the gains before")
     right.plot(times, [stage.growth_max for stage in done.stages], "r--", label="most that passes")
     right.set(xlabel="time (s)", title="kept" if done.kept else f"taken back: {done.reason}"[:90])
     right.title.set_fontsize(8)
-    right.legend()
+    right.legend(loc="best")
     _save(path, figure)
 
 

@@ -145,7 +145,7 @@ def _profile(profile: surface.RadialProfile) -> Figure:
     upper.plot(profile.radius_mm, profile.mean_mm, label="measured, mean over azimuth")
     upper.plot(profile.radius_mm, profile.hencky_mm, "--", label=f"Hencky, sag {profile.sag_mm:.3f} mm")
     upper.set(ylabel="height (mm)", title=f"radial profile; pressure equivalent {profile.pressure_pa:.0f} Pa")
-    upper.legend()
+    upper.legend(loc="best")
     low, mean, high = (1e3 * (row - profile.hencky_mm) for row in (profile.low_mm, profile.mean_mm, profile.high_mm))
     lower.fill_between(profile.radius_mm, low, high, alpha=0.4)
     lower.plot(profile.radius_mm, mean)

@@ -128,7 +128,7 @@ def draw_zernike(path: Path, time_s: FloatArray, coeffs_um: FloatArray) -> None:
     for j in 1 + np.argsort(-change[:, 1:].std(axis=0))[:8]:
         axes.plot(time_s, change[:, j], linewidth=0.9, label=f"Z{j + 1}")
     axes.set(xlabel="time (s)", ylabel="change (um RMS)", title="Zernike terms that move most")
-    axes.legend(ncols=4)
+    axes.legend(loc="best", ncols=4)
     write_figure(path, figure)
 
 

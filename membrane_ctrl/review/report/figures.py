@@ -239,7 +239,7 @@ def distributions(analysis: Analysis) -> str:
         spectrum.set(title="Amplitude spectral density", xlabel="Hz", ylabel="µm/√Hz")
         for plot in (allan, spectrum):
             if plot.lines:
-                plot.legend()
+                plot.legend(loc="best")
         return svg(figure)
 
 
