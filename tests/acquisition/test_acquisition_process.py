@@ -28,7 +28,7 @@ from membrane_ctrl.sim.sensors import TRUTH_BYTES, Truth
 
 pytestmark = pytest.mark.real_time
 
-PATIENCE_S = 60.0  # the kernels may have to be compiled
+PATIENCE_S = 300.0  # the kernels may have to be compiled
 CONFIG = Config(
     shape=ShapeConfig(period_s=0.3, frame_interval_s=0.0),
     optics=OpticsConfig(camera=CameraConfig(width_px=306, height_px=256, pixel_um=27.6)),

@@ -31,7 +31,7 @@ from tests.support.virtual_display import screenshot, virtual_display
 
 pytestmark = pytest.mark.real_time
 
-PATIENCE_S = 60.0  # the kernels may have to be compiled
+PATIENCE_S = 300.0  # the kernels may have to be compiled
 SCREEN = {"width_px": 420, "height_px": 300, "pixel_mm": 1.6}
 SCREEN_TABLE = "[devices.screen]\nwidth_px = 420\nheight_px = 300\npixel_mm = 1.6\n"
 CONFIG = Config.model_validate(

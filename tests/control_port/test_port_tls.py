@@ -143,7 +143,7 @@ async def test_without_a_certificate_or_without_tls(tmp_path: Path, lab: Authori
     naked.load_verify_locations(lab.own)
 
     def plain() -> bytes:
-        with socket.create_connection(address_of(run), timeout=5) as connection:
+        with socket.create_connection(address_of(run), timeout=60) as connection:
             connection.sendall(b'{"do": "stop"}\n')
             try:
                 return connection.recv(1000)
