@@ -13,7 +13,7 @@ $(STAMP): pyproject.toml requirements.lock
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint requirements.lock --editable '.[dev]'
 	touch $@
 
-hold: $(STAMP)  ## hold the simulated mirror for two minutes, with the live screen
+hold: $(STAMP)  ## hold the simulated mirror for two minutes, with the console
 	$(BIN)/membrane-ctrl hold --twin --duration 2m --name demo
 
 test: lint types unit  ## everything CI runs
