@@ -25,10 +25,10 @@ _STATES: tuple[tuple[str, Collection[State]], ...] = (
     ("standby, check, lower, fault", ALWAYS - MOVING),
 )
 _RUNGS = {
-    Rung.HOLD_FLOW: "the pump gives its last mean flow; over when the cause is",
-    Rung.RAMP_DOWN: "the pump slows down to nothing",
-    Rung.PUMP_OFF: "the pump stands, the leak lets the mirror down",
-    Rung.VENT: "the pump stands, the vent is open",
+    Rung.HOLD_FLOW: "the pump keeps its last mean flow, until the cause is gone",
+    Rung.RAMP_DOWN: "the flow ramps down to zero",
+    Rung.PUMP_OFF: "the pump is off, the leak lowers the mirror",
+    Rung.VENT: "the pump is off, the vent is open",
 }
 
 
@@ -37,26 +37,26 @@ def faults_page() -> str:
     lines = [
         "# Faults",
         "",
-        "Generated from `membrane_ctrl/controller/safety.py` (`make generate`). What was tried of it, and what came",
-        "of it, is in the [fault matrix](fault-matrix.md), of sensors that lie in [sensor faults](sensor-faults.md);",
-        "what to do is in [operations](operations.md).",
+        "Generated from `membrane_ctrl/controller/safety.py` (`make generate`). The tests of these rules are in the",
+        "[fault matrix](fault-matrix.md) and, for faulty sensors, in [sensor faults](sensor-faults.md); the remedies",
+        "are in [operations](operations.md).",
         "",
-        "A rule trips when `needed` of the last `window` ticks show its cause. Ticks without the value that a",
-        "rule judges are left out of its window. Of rules that trip together the one that enters deepest wins;",
-        "the first cause of a fault is the one that is told. Everything below `hold_flow`",
-        "latches: the state is `fault` until a person acknowledges it, or until the cause has stayed away for",
-        "`resume.wait_s`, the rule's name is in `resume.faults`, and the day's `resume.most_per_day` is not used up.",
-        "What has vented never resumes by itself, nor what the board has latched but its watchdog's trip, nor what a",
-        "person has latched; seen once during a fault, they decide for the whole of it. `resume.faults` takes only",
+        "A rule trips when `needed` of the last `window` ticks show its cause; ticks without the value that the",
+        "rule judges do not count. If several rules trip together, the one with the deepest safe level wins; the",
+        "first cause of a fault is the one reported. Every level below `hold_flow` latches: the state is `fault`",
+        "until a person acknowledges it, or until the cause has been absent for `resume.wait_s`, provided that",
+        "the rule's name is in `resume.faults` and the day's `resume.most_per_day` is not used up. A fault that",
+        "vented the mirror, a board fault other than its watchdog's trip, and the operator lock never resume",
+        "automatically; one of them seen during a fault decides for the whole fault. `resume.faults` accepts only",
         "the names of faults that may resume.",
         "",
-        "## Ladder of safe actions",
+        "## Safe levels",
         "",
-        "| rung | does | gives way to the next after |",
+        "| level | action | next level after |",
         "|---|---|---|",
     ]
     after = {
-        Rung.HOLD_FLOW: "`states.hold_flow_max_s`; what is used of it comes back at the same pace",
+        Rung.HOLD_FLOW: "`states.hold_flow_max_s`; used time recovers at the same rate",
         Rung.RAMP_DOWN: "`states.ramp_down_s`",
         Rung.PUMP_OFF: "`states.pump_off_max_s`",
     }
@@ -69,7 +69,7 @@ def faults_page() -> str:
     ]
     lines += ["|---|---|---|---|---|---|---|---|---|"]
     lines += [_row(rule) for rule in sorted(TABLE, key=lambda rule: rule.code)]
-    lines += ["", "## What the board does by itself", "", "| bit | name | meaning |", "|---|---|---|"]
+    lines += ["", "## Faults of the board", "", "| bit | name | meaning |", "|---|---|---|"]
     lines += [f"| {fault.bit} | {fault.name} | {fault.meaning} |" for fault in default_map().faults]
     return "\n".join([*lines, ""])
 
