@@ -141,7 +141,7 @@ def prune_runs(
     keep_gb: Annotated[
         float | None, typer.Option(min=0, max=1e6, help="Then the oldest, until all are at most this.")
     ] = None,
-    delete: Annotated[bool, typer.Option("--delete", help="Do it; otherwise it is only said.")] = False,
+    delete: Annotated[bool, typer.Option("--delete", help="Actually delete; the default is a dry run.")] = False,
     json: JsonOption = False,
 ) -> int:
     """Give up old runs by the recorder's rule: never the newest three for their age, nor one with a file `.keep`."""
