@@ -318,7 +318,7 @@ def test_no_shared_memory_is_left_behind(tmp_path: Path) -> None:
     )
     assert done.returncode == 0
     assert "leaked" not in done.stderr
-    assert not nobodys_shared_memory() - before
+    wait_for(lambda: not nobodys_shared_memory() - before)
 
 
 def test_sigterm_while_the_processes_start_cleans_up(running: subprocess.Popen[str]) -> None:
