@@ -90,11 +90,11 @@ def test_an_experiment_and_gains_on_a_live_hold(logs: Path) -> None:
 def test_the_hold_ends_the_experiment_of_a_session_that_has_gone(logs: Path) -> None:
     link = connected(logs)
     rig = HoldRig(link, "tester")
-    spec = steps(rig, 5.0)
+    spec = steps(rig, 8.0)
     link._client.ask(do="tune", experiment=spec.model_dump())
     link._client.close()  # killed: nothing is released
     watcher = HoldRig(connected_in_any_state(logs), "watcher")
-    states = [watcher._next_held().state for _ in range(330)]
+    states = [watcher._next_held().state for _ in range(480)]
     assert states[0] == State.TUNE
     assert states[-1] == State.HOLD
     watcher._link.close()

@@ -6,6 +6,7 @@ import os
 import socket
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -32,26 +33,28 @@ def start(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+def told_until_it_stops(systemd: socket.socket) -> list[list[str]]:
+    messages: list[list[str]] = []
+    while messages[-1:] != [["STOPPING=1"]]:
+        messages.append(systemd.recv(4096).decode().splitlines())
+    return messages
+
+
 def test_standby_is_told_to_systemd_and_a_corrupt_latched_file_keeps_the_hold_down(tmp_path: Path) -> None:
     (tmp_path / "logs").mkdir()
     (tmp_path / "logs" / NAME).write_text("{")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as systemd:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd, ThreadPoolExecutor(1) as beside:
         systemd.bind(str(tmp_path / "notify"))
+        systemd.settimeout(120)
         refused = start(tmp_path)
         assert refused.returncode == Exit.DEVICE_FAILED
         (line,) = refused.stderr.strip().splitlines()
         assert NAME in line
         assert "--clear-faults" in line
-        waited = start(tmp_path, "--standby", "--duration", "2s")
+        said = beside.submit(told_until_it_stops, systemd)
+        waited = start(tmp_path, "--standby", "--duration", "6s")
         assert waited.returncode == Exit.DONE, waited.stderr
-        first = systemd.recv(4096).decode().splitlines()
-        messages = [first]
-        while True:
-            try:
-                messages.append(systemd.recv(4096).decode().splitlines())
-            except BlockingIOError:
-                break
-    assert first == ["READY=1", "WATCHDOG=1", "STATUS=standby"]
-    assert messages[-1] == ["STOPPING=1"]
+        messages = said.result()
+    assert messages[0] == ["READY=1", "WATCHDOG=1", "STATUS=standby"]
     assert sum("WATCHDOG=1" in message for message in messages) >= 4
     assert (tmp_path / "logs" / NAME).read_text() == "{"  # nobody has acknowledged it
