@@ -12,8 +12,9 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.telemetry import column
 from membrane_ctrl.review.events.found import find_events
 from membrane_ctrl.review.events.steps import Found
-from membrane_ctrl.run_files.shapes import Shapes, from_estimates
+from membrane_ctrl.run_files.shapes import Shapes
 from membrane_ctrl.run_files.tables import TICK_FIELDS, first_level
+from tests.support.synthetic_shape import from_estimates
 
 HOURS = 8.0
 # How far from the truth an event may be found, s: leaks are judged on minutes.

@@ -16,8 +16,6 @@ from membrane_ctrl.model.states import State
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink
 from tuning.identification.records import Record, Series
 
-Tick = Callable[[inner_loop.LoopOutput], None]
-
 
 class Bench(Protocol):
     """What a rig drives: the twin, a fitted model, or a live hold in its `tune` state."""

@@ -23,16 +23,6 @@ from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, Displacemen
 
 MANUAL = "optoNCDT 1420 instruction manual, 7.5.2 and appendix A 3"
 RATES_KHZ = (0.25, 0.5, 1.0, 2.0, 4.0)
-# manual, page 66
-ERROR_CODES = {
-    262_075: "more data than the baud rate carries",
-    262_076: "no peak: nothing in range, or too dark",
-    262_077: "peak before the measuring range",
-    262_078: "peak behind the measuring range",
-    262_080: "value cannot be calculated",
-    262_081: "peak too large",
-    262_082: "laser is off",
-}
 _IN_RANGE = (643, 64_877)  # page 65: below and above are reserves, measured but not specified
 _PROMPT = b"->"
 _ERROR = re.compile(r"E(\d{3})([^\r\n]*)")

@@ -8,7 +8,6 @@ from firmware_iface.emulators.serial_device import LineDevice
 from firmware_iface.links.serial_port import SerialSettings
 
 NO_PEAK = 262_076
-RANGES_MM = (10, 25, 50, 100, 200, 500)
 _PERIOD_S = 0.0025  # between two portions of the stream, as an adapter hands them over
 # what the sensor has after power-up, unless it was stored otherwise
 _DEFAULTS = {

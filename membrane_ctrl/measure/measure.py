@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from membrane_ctrl.geometry.file import read_geometry
 from membrane_ctrl.measure.measurement import Measurement, measure_set
 from membrane_ctrl.measure.results import ErrorBars, details_table, error_bars, result_table, write_result
-from membrane_ctrl.metrology.facet.sofast import SofastMeasurement, lit_pixels, read_measurement, series_of
+from membrane_ctrl.measure.sofast import SofastMeasurement, lit_pixels, read_measurement, series_of
 from membrane_ctrl.metrology.frames.series_integrity import SeriesFlag, check_series
 from membrane_ctrl.metrology.optics.geometry import Outline, find_outline
 from membrane_ctrl.metrology.optics.surface import RadialProfile, radial_profile

@@ -283,16 +283,6 @@ def parabola(sag_mm: float, radius_mm: float) -> HeightFunction:
     return lambda x, y: sag_mm * (x * x + y * y) / radius_mm**2
 
 
-def cone(sag_mm: float, radius_mm: float) -> HeightFunction:
-    """The paper's conical starting shape."""
-    return lambda x, y: sag_mm * np.hypot(x, y) / radius_mm
-
-
-def v_fold(sag_mm: float, radius_mm: float) -> HeightFunction:
-    """The paper's V-fold: two planes that meet in the y axis."""
-    return lambda x, y: sag_mm * np.abs(x) / radius_mm + 0 * y
-
-
 def solve(
     tracer: Tracer,
     points: Points,

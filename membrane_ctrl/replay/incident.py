@@ -7,7 +7,6 @@ test then fails until it does.
 
 import math
 import re
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,17 +18,12 @@ from membrane_ctrl import __version__
 from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import load
-from membrane_ctrl.controller.memory import UnknownMemoryError
 from membrane_ctrl.controller.tick import TickBatch
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model import errors, files, plain_json, shape_estimate, telemetry
 from membrane_ctrl.replay.replay import (
     Decision,
     Replay,
     decisions_of,
-    recorded_ticks,
-    replay,
-    unmatched,
     without_repeats,
 )
 from membrane_ctrl.run_files import inputs_file, run_folder
@@ -88,19 +82,8 @@ def open_run(folder: Path) -> RecordedRun:
 SCHEMA = "membrane-incident/1"
 INCIDENTS = Path("tests/incidents")
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
-# A decision may come this much earlier or later after a change of the control code, and still be the same one.
-_SLACK_S = 1.0
 # An incident lives in the repository: what is larger than this is a recording.
 _BYTES_MAX = 4_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Incident:
-    """What `incident.toml` says."""
-
-    folder: Path
-    what: str
-    expected: list[Decision]
 
 
 def write_incident(
@@ -173,25 +156,3 @@ def _between(frames: inputs_file.InputsReader, begin: int, to_s: float) -> Itera
         if ticks:
             yield inputs_file.Frame(frame.records[wanted], tails, memories, before | frame.estimates)
         before = {} if ticks else frame.estimates
-
-
-def read_incident(folder: Path) -> Incident:
-    """Read an incident. Raises InputError."""
-    try:
-        about = tomllib.loads((folder / "incident.toml").read_text(encoding="utf-8"))
-        expected = [Decision(float(item["time_s"]), str(item["what"])) for item in about["decisions"]]
-        return Incident(folder, str(about["what"]), expected)
-    except (OSError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError) as error:
-        raise errors.InputError(f"{folder}/incident.toml: {error}") from None
-
-
-def check_incident(incident: Incident) -> list[str]:
-    """Replay an incident; where today's decisions are not the expected ones, as sentences."""
-    inputs = inputs_file.InputsReader(incident.folder)
-    config = config_file.load(incident.folder / "config.toml", Config)
-    begin = next((int(frame.records["tick"][0]) for frame in inputs if len(frame.records)), 1)
-    try:
-        found = replay(config, recorded_ticks(inputs, begin), zernike_projection(), 0.0, math.inf)
-    except UnknownMemoryError as error:
-        return [f"{error}: make the incident again from its run"]
-    return [*inputs.damage, *unmatched(incident.expected, found.decisions, _SLACK_S)]

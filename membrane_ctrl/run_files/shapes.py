@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 
@@ -52,7 +52,7 @@ class Shapes:
         """The cycles for which `wanted` (n,) is true; the covariances stay all."""
         if wanted.all():
             return self  # a month of coefficients is 190 MB
-        parts = {name: getattr(self, name)[wanted] for name in (*_NUMBERS, "coeffs_um", "verdict")}
+        parts = {name: getattr(self, name)[wanted] for name in (*NUMBERS, "coeffs_um", "verdict")}
         return Shapes(**parts, covariance_time_s=self.covariance_time_s, covariance_um2=self.covariance_um2)
 
     def heights_um(self, x: Column, y: Column) -> Column:
@@ -70,7 +70,7 @@ class Shapes:
         return np.asarray(self.covariance_um2[np.argmin(np.abs(self.covariance_time_s - time_s))])
 
 
-_NUMBERS = (
+NUMBERS = (
     "time_s", "hencky_um", "sag_um", "sag_sigma_um", "displacement_um", "slope_residual_urad", "valid_fraction",
     "latency_s",
 )  # fmt: skip
@@ -82,20 +82,8 @@ def height_basis(x: Column, y: Column) -> Column:
     return np.stack([Surface(unit[:36], unit[36], 1.0).height(x, y) for unit in units])
 
 
-def from_estimates(estimates: Sequence[ShapeEstimate]) -> Shapes:
-    """Shapes of estimates in memory, all covariances among them."""
-    numbers = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in _NUMBERS}
-    return Shapes(
-        **numbers,
-        coeffs_um=np.array([estimate.coeffs_um for estimate in estimates]).reshape(-1, 36),
-        verdict=np.array([estimate.verdict for estimate in estimates], dtype=np.str_),
-        covariance_time_s=numbers["time_s"],
-        covariance_um2=np.array([estimate.covariance_um2 for estimate in estimates]).reshape(-1, 36, 36),
-    )
-
-
 # Columns of the recorder's table that are read.
-TABLE_COLUMNS = (*_NUMBERS, "verdict", "coeffs_um", "covariance_um2")
+TABLE_COLUMNS = (*NUMBERS, "verdict", "coeffs_um", "covariance_um2")
 
 
 def from_table(table: pa.Table) -> Shapes:
@@ -105,7 +93,7 @@ def from_table(table: pa.Table) -> Shapes:
     time_s = _numbers(table, "time_s")
     coeffs = table.column("coeffs_um").combine_chunks() if "coeffs_um" in table.column_names else None
     return Shapes(
-        **{name: _numbers(table, name) for name in _NUMBERS},
+        **{name: _numbers(table, name) for name in NUMBERS},
         coeffs_um=np.full((count, 36), np.nan) if coeffs is None else _matrix(coeffs, count),
         verdict=np.array(table.column("verdict").to_pylist() if "verdict" in table.column_names else ["ok"] * count),
         covariance_time_s=time_s[kept],
@@ -116,7 +104,7 @@ def from_table(table: pa.Table) -> Shapes:
 def from_columns(columns: Mapping[str, Column]) -> Shapes:
     """Shapes of a Rerun segment (`rrd_reader.read_shapes`): the Hencky part and the covariance are not in there."""
     count = columns["time_s"].size if columns else 0
-    numbers = {name: columns.get(name, np.full(count, np.nan)) for name in _NUMBERS}
+    numbers = {name: columns.get(name, np.full(count, np.nan)) for name in NUMBERS}
     return Shapes(
         **{**numbers, "hencky_um": np.zeros(count)},
         coeffs_um=columns.get("coeffs_um", np.empty((0, 36))),
@@ -130,7 +118,7 @@ def joined(parts: list[Shapes]) -> Shapes:
     """One after the other, each cycle once."""
     if not parts:
         return from_columns({})
-    names = (*_NUMBERS, "coeffs_um", "verdict", "covariance_time_s", "covariance_um2")
+    names = (*NUMBERS, "coeffs_um", "verdict", "covariance_time_s", "covariance_um2")
     whole = Shapes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
     # a journal may repeat what the recorder had just written when it was killed
     until_s = np.maximum.accumulate(np.concatenate(([-np.inf], whole.time_s)))[:-1]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.replay.incident import check_incident, read_incident
+from tests.support.incidents import check_incident, read_incident
 
 HERE = Path(__file__).parent
 FOLDERS = sorted(path.parent for path in HERE.glob("*/incident.toml"))

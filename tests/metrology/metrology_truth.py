@@ -16,6 +16,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
+from membrane_ctrl.metrology.reconstruct import HeightFunction
 
 FloatArray = NDArray[np.float64]
 RADIUS_MM = 500.0
@@ -134,3 +135,13 @@ def fringe_frames(screen_mm: FloatArray, shifts_rad: FloatArray, period_mm: floa
     """Intensities (N, ...) of the sinusoids at places on the screen, mean 100 and amplitude 80."""
     phase = 2 * np.pi * (screen_mm + periods * period_mm / 2) / period_mm - np.pi
     return 100 + 80 * np.cos(phase + np.asarray(shifts_rad).reshape(-1, *[1] * screen_mm.ndim))
+
+
+def cone(sag_mm: float, radius_mm: float) -> HeightFunction:
+    """The paper's conical starting shape."""
+    return lambda x, y: sag_mm * np.hypot(x, y) / radius_mm
+
+
+def v_fold(sag_mm: float, radius_mm: float) -> HeightFunction:
+    """The paper's V-fold: two planes that meet in the y axis."""
+    return lambda x, y: sag_mm * np.abs(x) / radius_mm + 0 * y

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.optics.screen_face import DisplayResponse, MeasuredScreen, RectangularScreen
+from tests.support.sofast_facet import DisplayResponse, MeasuredScreen, RectangularScreen
 
 
 def test_a_rectangle_has_its_origin_in_the_middle_and_an_edge():

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from metrology_truth import cone, v_fold
 from rendered_sets import FILM, bench, good_set
 
 from membrane_ctrl.config.schema import OpticsConfig
@@ -13,7 +14,7 @@ from membrane_ctrl.metrology.checked import check
 from membrane_ctrl.metrology.frames.frame_stack import FrameStack
 from membrane_ctrl.metrology.full import FullResult, measure_pixels, reconstruct_full, tukey
 from membrane_ctrl.metrology.optics.surface import Surface
-from membrane_ctrl.metrology.reconstruct import HeightFunction, cone, parabola, v_fold
+from membrane_ctrl.metrology.reconstruct import HeightFunction, parabola
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple
 

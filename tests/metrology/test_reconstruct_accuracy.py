@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from metrology_truth import OPTICS, RADIUS_MM, SMALL, Seen, TrueFilm, look, pixel_grid
+from metrology_truth import OPTICS, RADIUS_MM, SMALL, Seen, TrueFilm, cone, look, pixel_grid, v_fold
 
 from membrane_ctrl.config.optics import ScreenPoseConfig
 from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, OpticsConfig
@@ -15,7 +15,7 @@ from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.kernels import invert
 from membrane_ctrl.metrology.optics.surface import Surface, sag_gradient
 from membrane_ctrl.metrology.optics.zernike import gradients
-from membrane_ctrl.metrology.reconstruct import Fit, NormalMatrix, Points, Tracer, cone, parabola, solve, v_fold
+from membrane_ctrl.metrology.reconstruct import Fit, NormalMatrix, Points, Tracer, parabola, solve
 
 GEOMETRY = Geometry.from_config(OPTICS)
 TRACER = Tracer(GEOMETRY, RADIUS_MM)

@@ -6,12 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.facet import sofast
-from membrane_ctrl.metrology.facet.facet import measure_on, solve_facet
-from membrane_ctrl.metrology.facet.sofast import SHIFTS_RAD, decode, lit_pixels, series_of, sight, wrapped_phases
+from membrane_ctrl.measure import sofast
+from membrane_ctrl.measure.sofast import SHIFTS_RAD, lit_pixels, series_of
 from membrane_ctrl.metrology.frames.closure import closure, closure_with_level, closure_with_phase
 from membrane_ctrl.metrology.frames.series_integrity import check_series, predicted_phase, unwrap
 from membrane_ctrl.metrology.phase import modulation, phasors
+from tests.support import sofast_facet
+from tests.support.facet import measure_on, solve_facet
+from tests.support.sofast_facet import decode, sight, wrapped_phases
 
 pytest.importorskip("h5py")
 DATA = Path(__file__).parents[2].parent / "shared" / "data" / "sofast"
@@ -30,19 +32,19 @@ def measurement():
 
 @pytest.fixture(scope="module")
 def response():
-    return sofast.read_response(DATA / "image_calibration.h5")
+    return sofast_facet.read_response(DATA / "image_calibration.h5")
 
 
 @pytest.fixture(scope="module")
 def camera():
-    return sofast.read_camera(DATA / "camera_sofast_downsampled.h5")
+    return sofast_facet.read_camera(DATA / "camera_sofast_downsampled.h5")
 
 
 @pytest.fixture(scope="module", params=SCREENS)
 def golden(request):
     """Screen as measured or as a rectangle, with the tool's result for it."""
     screen, result = SCREENS[request.param]
-    return sofast.read_screen(DATA / f"{screen}.h5"), sofast.read_result(DATA / f"{result}.h5")
+    return sofast_facet.read_screen(DATA / f"{screen}.h5"), sofast_facet.read_result(DATA / f"{result}.h5")
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +55,7 @@ def seen(golden, measurement, response, camera):
 
 @pytest.fixture(scope="module")
 def mask():
-    return sofast.read_result(DATA / "expected_facet.h5").mask
+    return sofast_facet.read_result(DATA / "expected_facet.h5").mask
 
 
 def golden_focal_mm(result):

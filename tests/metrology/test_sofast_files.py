@@ -5,7 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.facet import sofast
+from membrane_ctrl.measure import sofast
+from tests.support import sofast_facet
 
 h5py = pytest.importorskip("h5py")
 
@@ -44,12 +45,12 @@ def test_a_missing_frame_is_counted(tmp_path):
 
 def test_a_missing_item_a_missing_file_and_a_wrong_file_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"e\.h5: Camera/intrinsic_mat is missing"):
-        sofast.read_camera(write(tmp_path / "e.h5", other=1))
+        sofast_facet.read_camera(write(tmp_path / "e.h5", other=1))
     with pytest.raises(FileNotFoundError, match="no such file"):
-        sofast.read_camera(tmp_path / "none.h5")
+        sofast_facet.read_camera(tmp_path / "none.h5")
     (tmp_path / "text.h5").write_text("not HDF5")
     with pytest.raises(ValueError, match=r"text\.h5: not an HDF5 file"):
-        sofast.read_camera(tmp_path / "text.h5")
+        sofast_facet.read_camera(tmp_path / "text.h5")
 
 
 def test_screens_of_both_models_in_mm_and_no_other(tmp_path):
@@ -59,7 +60,7 @@ def test_screens_of_both_models_in_mm_and_no_other(tmp_path):
         DisplayShape__screen_x=8.0,
         DisplayShape__screen_y=3.0,
     )
-    assert sofast.read_screen(screen).screen_mm(np.array([[1.0], [0.0]])).tolist() == [[4000], [-1500]]
+    assert sofast_facet.read_screen(screen).screen_mm(np.array([[1.0], [0.0]])).tolist() == [[4000], [-1500]]
     corners = np.array([[0.0, 1, 0, 1], [0, 0, 1, 1]])
     screen = write(
         tmp_path / "d.h5",
@@ -67,9 +68,9 @@ def test_screens_of_both_models_in_mm_and_no_other(tmp_path):
         DisplayShape__xy_screen_fraction=corners,
         DisplayShape__xy_screen_coords=2 * corners,
     )
-    np.testing.assert_allclose(sofast.read_screen(screen).screen_mm(np.array([[0.5], [0.25]])), [[1000], [500]])
+    np.testing.assert_allclose(sofast_facet.read_screen(screen).screen_mm(np.array([[0.5], [0.25]])), [[1000], [500]])
     with pytest.raises(ValueError, match="distorted3D"):
-        sofast.read_screen(write(tmp_path / "3.h5", DisplayShape__screen_model="distorted3D"))
+        sofast_facet.read_screen(write(tmp_path / "3.h5", DisplayShape__screen_model="distorted3D"))
 
 
 def test_oblong_pixels_become_square_ones_of_the_same_rays(tmp_path):
@@ -78,14 +79,14 @@ def test_oblong_pixels_become_square_ones_of_the_same_rays(tmp_path):
         Camera__intrinsic_mat=np.array([[700.0, 0, 100], [0, 350, 75], [0, 0, 0.125]]),
         Camera__distortion_coef=np.zeros(5),
     )
-    camera = sofast.read_camera(path)
+    camera = sofast_facet.read_camera(path)
     assert (camera.square_rows(np.array([85.0])) - 75) / camera.focal_px[0] == pytest.approx(10 / 350)
 
 
 def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(ImportError, match=r"membrane-ctrl\[sofast\]"):
-        sofast.read_camera(tmp_path / "c.h5")
+        sofast_facet.read_camera(tmp_path / "c.h5")
 
 
 def test_what_leads_out_of_the_file_or_is_too_large_is_refused(tmp_path):
@@ -94,20 +95,20 @@ def test_what_leads_out_of_the_file_or_is_too_large_is_refused(tmp_path):
     with h5py.File(path, "w") as file:
         file["Camera/intrinsic_mat"] = h5py.ExternalLink(other.name, "Camera/intrinsic_mat")
     with pytest.raises(ValueError, match="intrinsic_mat is a link, and links are not followed here"):
-        sofast.read_camera(path)
+        sofast_facet.read_camera(path)
     with h5py.File(path, "w") as file:
         file["Camera"] = h5py.ExternalLink(other.name, "Camera")
     with pytest.raises(ValueError, match="is a link"):
-        sofast.read_camera(path)
+        sofast_facet.read_camera(path)
     with h5py.File(path, "w") as file:
         file.create_dataset("Camera/intrinsic_mat", (2**38,), "f8", chunks=(2**16,))  # 2 TB of nothing, in 1 kB
     with pytest.raises(ValueError, match="more than are read"):
-        sofast.read_camera(path)
+        sofast_facet.read_camera(path)
     with h5py.File(path, "w") as file:
         file.create_group("Camera/intrinsic_mat")
     with pytest.raises(ValueError, match="not a data set"):
-        sofast.read_camera(path)
+        sofast_facet.read_camera(path)
     with h5py.File(path, "w") as file:
         file.create_dataset("Camera/intrinsic_mat", (3, 3), "f8", external=[(str(other), 0, 72)])
     with pytest.raises(ValueError, match="not a data set of this file"):
-        sofast.read_camera(path)
+        sofast_facet.read_camera(path)

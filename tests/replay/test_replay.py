@@ -35,9 +35,9 @@ from membrane_ctrl.model.telemetry import unpack
 from membrane_ctrl.recorder.rerun_streams import TelemetryStreams
 from membrane_ctrl.recorder.sink import Recording
 from membrane_ctrl.replay import replay as replay_module
-from membrane_ctrl.replay.incident import check_incident, read_incident
 from membrane_ctrl.replay.replay import Gap, RecordedTick, recorded_ticks, replay
 from membrane_ctrl.run_files.inputs_file import InputsFile, InputsReader
+from tests.support.incidents import check_incident, read_incident
 from tests.support.synthetic_shape import shape_at
 from tests.support.virtual_record import CONFIG, kept_ticks, laser_lost, write_record
 

@@ -14,8 +14,8 @@ from membrane_ctrl.model.states import State
 from membrane_ctrl.model.telemetry import COLUMN, Rows, column
 from membrane_ctrl.review.events.found import find_events, noise_changes, weather_losses
 from membrane_ctrl.review.events.steps import Found, confidence, steps
-from membrane_ctrl.run_files.shapes import from_estimates
 from membrane_ctrl.run_files.tables import TICK_FIELDS, Columns, first_level
+from tests.support.synthetic_shape import from_estimates
 
 HOURS = 2.0
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.run_files.shapes import NUMBERS, Shapes
 
 
 def shape_at(time_s: float) -> ShapeEstimate:
@@ -31,4 +34,16 @@ def shape_at(time_s: float) -> ShapeEstimate:
         reason="as good as it gets: 100 %",
         latency_s=0.05 * rng.random(),
         cycle=round(time_s),
+    )
+
+
+def from_estimates(estimates: Sequence[ShapeEstimate]) -> Shapes:
+    """Shapes of estimates in memory, all covariances among them."""
+    numbers = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in NUMBERS}
+    return Shapes(
+        **numbers,
+        coeffs_um=np.array([estimate.coeffs_um for estimate in estimates]).reshape(-1, 36),
+        verdict=np.array([estimate.verdict for estimate in estimates], dtype=np.str_),
+        covariance_time_s=numbers["time_s"],
+        covariance_um2=np.array([estimate.covariance_um2 for estimate in estimates]).reshape(-1, 36, 36),
     )

@@ -149,8 +149,6 @@ class HoldPass:
         Settled seconds whose ticks are not all there: their means are those of the level.
     uncovered_s : float
         Those whose means the level has not either: no statistics cover them.
-    grid_s : float
-        Time of the first place of the grids.
     reading_um, true_um : (n,) float32
         Setpoint minus laser reading and target minus true centre on a grid of ticks, NaN where not settled.
     seconds : tuple
@@ -175,7 +173,6 @@ class HoldPass:
     settled_s: float
     thin_s: float
     uncovered_s: float
-    grid_s: float
     reading_um: Single
     true_um: Single
     seconds: tuple[windows.SecondsOf, windows.SecondsOf]
@@ -295,7 +292,6 @@ class _Collector:
             settled_s=self._calm.result_s(self._period_s),
             thin_s=0.0,
             uncovered_s=0.0,
-            grid_s=self._grid_s,
             reading_um=self._reading,
             true_um=self._true,
             seconds=(reading, true),

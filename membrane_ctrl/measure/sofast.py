@@ -1,0 +1,131 @@
+"""Frames of a measurement by SOFAST (OpenCSP, Sandia), from its HDF5 file; lengths become mm here."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.frames.series_integrity import Series
+from membrane_ctrl.metrology.phase import equal_shifts, phasors
+
+FloatArray = NDArray[np.float64]
+
+STEPS = 4  # SOFAST always takes four
+MM_PER_M = 1e3
+_ELEMENTS_MAX = 100_000_000  # 24 frames of 4 megapixels; each takes eight bytes once it is read
+
+
+@dataclass(frozen=True)
+class SofastMeasurement:
+    """Frames of a measurement.
+
+    Attributes
+    ----------
+    frames_x, frames_y : (F, 4, H, W) arrays
+        Fringes that vary along the screen's x and y: frequency, step, row, column.
+    periods_x, periods_y : (F,) arrays
+        Periods a screen.
+    black, white : (H, W) arrays
+    distance_mm : float
+        Facet's measure point to the screen's origin.
+    """
+
+    frames_x: FloatArray
+    frames_y: FloatArray
+    periods_x: FloatArray
+    periods_y: FloatArray
+    black: FloatArray
+    white: FloatArray
+    distance_mm: float
+
+
+def read_measurement(path: Path) -> SofastMeasurement:
+    """Frames and what belongs to them. Raises ValueError, FileNotFoundError or ImportError in one line."""
+    with open_file(path) as file:
+        group = "MeasurementSofastFringe"
+        frames = np.moveaxis(floats(file, f"{group}/fringe_images"), 2, 0)
+        black, white = np.moveaxis(floats(file, f"{group}/mask_images"), 2, 0)
+        periods_x, periods_y = (floats(file, f"{group}/fringe_periods_{axis}") for axis in "xy")
+        distance_m = float(floats(file, f"{group}/dist_optic_screen").item())
+    count_y = STEPS * len(periods_y)
+    if len(frames) != count_y + STEPS * len(periods_x):
+        raise ValueError(
+            f"{path}: {group}/fringe_images has {len(frames)} frames, not {STEPS} for each of "
+            f"{len(periods_y)} + {len(periods_x)} frequencies"
+        )
+    size = black.shape
+    return SofastMeasurement(
+        frames_x=frames[count_y:].reshape(-1, STEPS, *size),
+        frames_y=frames[:count_y].reshape(-1, STEPS, *size),  # y comes first in the file
+        periods_x=periods_x,
+        periods_y=periods_y,
+        black=black,
+        white=white,
+        distance_mm=distance_m * MM_PER_M,
+    )
+
+
+def open_file(path: Path) -> Any:
+    """The file as h5py gives it (untyped). h5py is an optional extra: only this reader needs it."""
+    try:
+        import h5py
+    except ImportError:
+        raise ImportError("SOFAST files need h5py: pip install 'membrane-ctrl[sofast]'") from None
+    try:
+        return h5py.File(path, "r")
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path}: no such file") from None
+    except OSError as error:
+        raise ValueError(f"{path}: not an HDF5 file ({error})") from None
+
+
+def item(file: Any, name: str) -> Any:
+    """A data set of the file itself: none behind a link to another file, and none of more than is ever measured."""
+    import h5py
+
+    try:
+        parts = name.split("/")
+        for end in range(1, len(parts) + 1):
+            link = file.get("/".join(parts[:end]), getlink=True)
+            if link is None:
+                raise ValueError(f"{file.filename}: {name} is missing")
+            if not isinstance(link, h5py.HardLink):
+                raise ValueError(f"{file.filename}: {name} is a link, and links are not followed here")
+        found = file[name]
+        if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
+            raise ValueError(f"{file.filename}: {name} is not a data set of this file")
+        if found.size is None or found.size > _ELEMENTS_MAX:
+            raise ValueError(f"{file.filename}: {name} has {found.shape} elements, more than are read")
+        return found[()]
+    except (OSError, RuntimeError, KeyError, TypeError) as error:  # what a damaged file makes of HDF5
+        raise ValueError(f"{file.filename}: {name} cannot be read ({error})") from None
+
+
+def floats(file: Any, name: str) -> FloatArray:
+    try:
+        return np.asarray(item(file, name), float)
+    except TypeError:
+        raise ValueError(f"{file.filename}: {name} holds no numbers") from None
+
+
+# SOFAST shows cos(2 pi p s - k pi / 2), s from 1 at column 0 to 0 at the last column, and from 1 at row 0 to 0 at the
+# last row; its screen coordinates have y the other way round, so the y fraction is 1 - s.
+SHIFTS_RAD = -equal_shifts(STEPS)
+_LIT_SHARE = 0.3  # of the swing of the bright pixels
+
+
+def lit_pixels(measurement: SofastMeasurement) -> NDArray[np.bool_]:
+    """Pixels (H, W) that see fringes: the median over the series of their swing, which no single frame can spoil."""
+    series = (*measurement.frames_y, *measurement.frames_x)
+    swing = np.median([np.abs(phasors(steps, SHIFTS_RAD)) for steps in series], axis=0)
+    return np.asarray(swing > _LIT_SHARE * np.percentile(swing, 95))
+
+
+def series_of(measurement: SofastMeasurement, mask: NDArray[np.bool_]) -> tuple[Series, Series]:
+    """The axes of a measurement at the pixels in `mask`, in the order in which they were taken."""
+    return (
+        Series("y", measurement.frames_y[..., mask], measurement.periods_y, SHIFTS_RAD),
+        Series("x", measurement.frames_x[..., mask], measurement.periods_x, SHIFTS_RAD),
+    )

@@ -1,1 +1,0 @@
-"""Facets of a concentrator, from other programs' measured sets."""
