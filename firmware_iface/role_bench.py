@@ -19,22 +19,7 @@ from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from firmware_iface.roles import (
-    Barometer,
-    BenchCommand,
-    BenchIdentity,
-    BenchReading,
-    Device,
-    DeviceIdentity,
-    DisplacementSample,
-    DisplacementSensor,
-    LinkDownError,
-    LinkError,
-    PressureSensor,
-    Pump,
-    Thermometer,
-    Vent,
-)
+from firmware_iface import roles
 
 T = TypeVar("T")
 WATCHDOG_BIT = 0  # in latched_faults, as on the pump board
@@ -46,16 +31,16 @@ _RETRY_S = 0.1  # between two attempts to open a lost sensor; its link has the l
 class RoleDevices:
     """Which device fills which role; None where the bench has none."""
 
-    displacement: DisplacementSensor
-    pump: Pump
-    gauge_pressure: PressureSensor
-    vent: Vent | None = None
-    barometer: Barometer | None = None
-    thermometer: Thermometer | None = None
+    displacement: roles.DisplacementSensor
+    pump: roles.Pump
+    gauge_pressure: roles.PressureSensor
+    vent: roles.Vent | None = None
+    barometer: roles.Barometer | None = None
+    thermometer: roles.Thermometer | None = None
 
-    def by_role(self) -> dict[str, Device]:
-        """The filled roles, the actuators last: nothing may move gas before the sensors are there."""
-        roles: dict[str, Device | None] = {
+    def by_role(self) -> dict[str, roles.Device]:
+        """The filled ones, the actuators last: nothing may move gas before the sensors are there."""
+        filled: dict[str, roles.Device | None] = {
             "displacement": self.displacement,
             "gauge_pressure": self.gauge_pressure,
             "barometer": self.barometer,
@@ -63,7 +48,7 @@ class RoleDevices:
             "vent": self.vent,
             "pump": self.pump,
         }
-        return {role: device for role, device in roles.items() if device is not None}
+        return {role: device for role, device in filled.items() if device is not None}
 
 
 class RoleBench:
@@ -87,13 +72,13 @@ class RoleBench:
         self._clock = clock
         self._tasks: dict[str, asyncio.Task[None]] = {}  # which open a lost sensor again, by its role
         self._watchdog: asyncio.Task[None] | None = None
-        self._last_sample = DisplacementSample(math.nan, NO_ANSWER, 0, 0.0)
+        self._last_sample = roles.DisplacementSample(math.nan, NO_ANSWER, 0, 0.0)
         self._fed_s = math.inf
         self._commanded = 0.0
         self._tripped = False
-        self.identities: dict[str, DeviceIdentity] = {}
+        self.identities: dict[str, roles.DeviceIdentity] = {}
 
-    async def open(self) -> BenchIdentity:
+    async def open(self) -> roles.BenchIdentity:
         """Open every device, sensors first, and start the watchdog; what it has latched stays.
 
         Raises
@@ -110,7 +95,7 @@ class RoleBench:
         for role, device in self._devices.by_role().items():
             try:
                 self.identities[role] = await _answer(role, device.open())
-            except LinkError as error:
+            except roles.LinkError as error:
                 await self.close()
                 raise type(error)(f"{role}: {error}") from error
         await self._stop_watchdog()
@@ -118,7 +103,7 @@ class RoleBench:
         self._watchdog = asyncio.create_task(self._watch(), name="software watchdog")
         kinds = ", ".join(f"{role} {identity.kind}" for role, identity in self.identities.items())
         firmware = ", ".join(dict.fromkeys(i.firmware for i in self.identities.values() if i.firmware))
-        return BenchIdentity(
+        return roles.BenchIdentity(
             f"composed of {kinds}",
             0,
             firmware,
@@ -127,7 +112,7 @@ class RoleBench:
             gauge_range_pa=self.identities["gauge_pressure"].shows,
         )
 
-    async def read(self) -> BenchReading:
+    async def read(self) -> roles.BenchReading:
         """All sensors at once; what a sensor cannot say is NaN.
 
         Raises
@@ -141,7 +126,7 @@ class RoleBench:
             pump, vent = await self._actuators()
         finally:
             sample, gauge_pa, ambient_pa, air_c = await sensors
-        return BenchReading(
+        return roles.BenchReading(
             displacement_um=sample.displacement_um,
             displacement_quality=sample.quality,
             gauge_pressure_pa=gauge_pa,
@@ -156,7 +141,7 @@ class RoleBench:
             latched_faults=int(self._tripped) << WATCHDOG_BIT,
         )
 
-    async def write(self, command: BenchCommand) -> None:
+    async def write(self, command: roles.BenchCommand) -> None:
         """Command pump and vent at once, and feed the watchdog; after a trip the pump stays off.
 
         Raises
@@ -196,7 +181,7 @@ class RoleBench:
         for device in reversed(self._devices.by_role().values()):
             await device.close()
 
-    async def _sensors(self) -> tuple[DisplacementSample, float, float, float]:
+    async def _sensors(self) -> tuple[roles.DisplacementSample, float, float, float]:
         devices = self._devices
         return await asyncio.gather(
             self._sample(),
@@ -216,14 +201,14 @@ class RoleBench:
         pump_fraction, vent_fraction = (value for value in found if isinstance(value, float))
         return pump_fraction, vent_fraction
 
-    async def _sample(self) -> DisplacementSample:
+    async def _sample(self) -> roles.DisplacementSample:
         """The newest sample; without one the last counter and time, which then stand still."""
         last = self._last_sample
         self._last_sample = replace(last, displacement_um=math.nan, quality=NO_ANSWER)
         if "displacement" not in self._tasks:
             try:
                 self._last_sample = await _answer("displacement", self._devices.displacement.displacement())
-            except LinkError as error:
+            except roles.LinkError as error:
                 self._failed("displacement", error)
         return self._last_sample
 
@@ -232,19 +217,19 @@ class RoleBench:
             return math.nan
         try:
             return await _answer(role, read())
-        except LinkError as error:
+        except roles.LinkError as error:
             self._failed(role, error)
             return math.nan
 
-    def _failed(self, role: str, error: LinkError) -> None:
-        if isinstance(error, LinkDownError) and role not in self._tasks:
+    def _failed(self, role: str, error: roles.LinkError) -> None:
+        if isinstance(error, roles.LinkDownError) and role not in self._tasks:
             self._tasks[role] = asyncio.create_task(self._reopen(role), name=f"open {role} again")
 
     async def _reopen(self, role: str) -> None:
         """Open a lost sensor again, until the same one is back; another in its place is a person's to put right."""
         device = self._devices.by_role()[role]
         while True:
-            with contextlib.suppress(LinkError):
+            with contextlib.suppress(roles.LinkError):
                 if await _answer(role, device.open()) == self.identities[role]:
                     break
             await asyncio.sleep(_RETRY_S)
@@ -272,7 +257,7 @@ class RoleBench:
         self._tripped = True
         with contextlib.suppress(Exception):
             await self._devices.pump.set_pump(0.0)
-        raise LinkDownError(f"the software watchdog {error}; the pump was set to 0, open the devices again")
+        raise roles.LinkDownError(f"the software watchdog {error}; the pump was set to 0, open the devices again")
 
     async def _stop_watchdog(self) -> None:
         task, self._watchdog = self._watchdog, None
@@ -299,10 +284,10 @@ async def _answer(role: str, asked: Awaitable[T]) -> T:
     """A device's answer; what it raises that no driver should is a fault of that device, not the end of the run."""
     try:
         return await asked
-    except LinkError:
+    except roles.LinkError:
         raise
     except Exception as error:
-        raise LinkError(f"{role}: {type(error).__name__}: {error}") from error
+        raise roles.LinkError(f"{role}: {type(error).__name__}: {error}") from error
 
 
 def _raise_first(results: Iterable[object]) -> None:

@@ -1,7 +1,5 @@
 """The subcommands of `membrane-ctrl tune`: thin, and quick to import."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern, Screen
 from membrane_ctrl.acquisition import exposures
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.processes.frames import FrameWriter, Pixels
@@ -33,15 +33,11 @@ TRACKING_LOST = "tracking lost"
 class Reconstructor(Protocol):
     """From frames to the figure; keeps the last absolute phase between calls."""
 
-    def full(
-        self, frames: Sequence[Pixels], time_s: NDArray[np.float64], displacement_um: NDArray[np.float64]
-    ) -> ShapeEstimate:
+    def full(self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray) -> ShapeEstimate:
         """Figure from sinusoids, Gray codes, white and black, in the order of the full sequence."""
         ...
 
-    def fringes(
-        self, frames: Sequence[Pixels], time_s: NDArray[np.float64], displacement_um: NDArray[np.float64]
-    ) -> ShapeEstimate:
+    def fringes(self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray) -> ShapeEstimate:
         """Figure from the sinusoids alone, tracked against the last absolute phase."""
         ...
 

@@ -3,7 +3,6 @@
 import json
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_iface.display.measures import Settling
 from firmware_iface.display.response import DisplayResponse
@@ -13,8 +12,6 @@ from membrane_ctrl.config.schema import Config, PatternConfig
 from membrane_ctrl.metrology.phase import mm_per_rad
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
-
-FloatArray = NDArray[np.float64]
 
 _PHASES = 720  # of a period, for the worst of it to be met
 

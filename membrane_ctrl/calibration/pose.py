@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.geometry import file, prior_file
 from membrane_ctrl.measure import capture_set, measurement
@@ -17,9 +16,8 @@ from membrane_ctrl.metrology.calibrate.parameters import usual_sigma
 from membrane_ctrl.metrology.calibrate.ring_pose import POSE_NAMES, RingPose, ring_pose
 from membrane_ctrl.metrology.checked import RejectedSetError, check
 from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.errors import Exit, InputError, RejectedError
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from membrane_ctrl.measure.results import write_figure
 from membrane_ctrl.metrology.calibrate import diagnose, parameters, solve, verdict
 from membrane_ctrl.metrology.calibrate.propagate import condition_number, propagate, weak_combinations
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import users
 
 _SOME_LASER = 0.5  # sigma of the laser's scale without any reading: 1
@@ -115,9 +115,6 @@ def lines_of(report: dict[str, Any]) -> list[str]:
 
 
 # What a calibration leaves of the seen screen points, set by set: noise if the model is right, a pattern if not.
-
-
-FloatArray = NDArray[np.float64]
 
 _INCHES = 2.6  # a panel
 _DPI = 110

@@ -14,11 +14,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import ShapeConfig
 from membrane_ctrl.control.filters import DriftTracker
 from membrane_ctrl.model import shape_estimate, states
+from membrane_ctrl.model.arrays import FloatArray
 
 # The reference of the shape loop: the mean of the first shapes.
 
@@ -33,7 +33,7 @@ class ReferenceMean:
 
     def __init__(self) -> None:
         self._taken: list[shape_estimate.ShapeEstimate] = []
-        self.coeffs_um: NDArray[np.float64] = np.empty(0)
+        self.coeffs_um: FloatArray = np.empty(0)
         self.displacement_um = self.time_s = math.nan
 
     @property
@@ -87,10 +87,10 @@ class SagChange:
 
 
 def sag_change(
-    coeffs_um: NDArray[np.float64],
-    reference_um: NDArray[np.float64],
-    covariance_um2: NDArray[np.float64],
-    sensitivity: NDArray[np.float64],
+    coeffs_um: FloatArray,
+    reference_um: FloatArray,
+    covariance_um2: FloatArray,
+    sensitivity: FloatArray,
 ) -> SagChange:
     """Sag now minus sag at the reference.
 
@@ -145,7 +145,7 @@ class ShapeLoop:
         Change of the Zernike coefficients per um of sag.
     """
 
-    def __init__(self, config: ShapeConfig, sensitivity: NDArray[np.float64]) -> None:
+    def __init__(self, config: ShapeConfig, sensitivity: FloatArray) -> None:
         self._config = config
         self._sensitivity = sensitivity
         self._state = states.ShapeState.OFF

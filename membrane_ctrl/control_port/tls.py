@@ -4,8 +4,6 @@ The name is the certificate's common name (CN), the role its organisational unit
 one of these it is `read`.
 """
 
-from __future__ import annotations
-
 import socket
 import ssl
 import time

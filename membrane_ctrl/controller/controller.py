@@ -7,9 +7,6 @@ handler runs, and what it wants is overruled wherever the ladder says so. Every 
 import math
 from collections.abc import Collection
 
-import numpy as np
-from numpy.typing import NDArray
-
 from firmware_iface.roles import ALL_FAULTS, BenchCommand, BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control import inner_loop, shape_loop
@@ -19,6 +16,7 @@ from membrane_ctrl.controller import commands, pump_obeys, safe_levels, safety, 
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.model import errors, telemetry
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.states import Rung, State
 
@@ -59,7 +57,7 @@ class Controller:
         Zernike coefficients of a Hencky bowl per sag, in um per um, for the outer loop.
     """
 
-    def __init__(self, config: Config, sag_sensitivity: NDArray[np.float64]) -> None:
+    def __init__(self, config: Config, sag_sensitivity: FloatArray) -> None:
         self._config = config
         self._safety = safety.SafetyTable(config.limits)
         self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity)

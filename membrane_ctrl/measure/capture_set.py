@@ -24,10 +24,10 @@ from membrane_ctrl.config.toml_file import parse, prune, read_toml, with_height_
 from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, origin_of
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
 from membrane_ctrl.metrology.phase import AXES, GRAY_BITS
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.files import read_bytes
 
-FloatArray = NDArray[np.float64]
 Frames = NDArray[np.uint8] | NDArray[np.uint16]
 
 _DEPTHS = (10, 12, 14, 16)  # bits of a sensor in 16-bit files, when the set does not say

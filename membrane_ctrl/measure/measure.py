@@ -6,7 +6,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.geometry.file import read_geometry
 from membrane_ctrl.measure.measurement import Measurement, measure_set
@@ -15,9 +14,8 @@ from membrane_ctrl.measure.sofast import SofastMeasurement, lit_pixels, read_mea
 from membrane_ctrl.metrology.frames.series_integrity import SeriesFlag, check_series
 from membrane_ctrl.metrology.optics.geometry import Outline, find_outline
 from membrane_ctrl.metrology.optics.surface import RadialProfile, radial_profile
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.errors import Exit, InputError
-
-FloatArray = NDArray[np.float64]
 
 # A good pose leaves 0.4 mm and 0.0007 (simulated, a fifth of the sensor's pixels); a ring is round to 1 mm or so.
 _RIM_OFF_MM, _RIM_SIZE = 3.0, 0.005

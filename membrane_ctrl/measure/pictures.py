@@ -9,16 +9,14 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from membrane_ctrl.measure.measurement import Measurement
 from membrane_ctrl.measure.results import ErrorBars, write_figure
 from membrane_ctrl.metrology.full import FullResult
 from membrane_ctrl.metrology.optics import geometry, surface
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import move, scratch_folder
 from membrane_ctrl.model.terminal import plain
-
-FloatArray = NDArray[np.float64]
 
 _SHOWN_PX = 600  # a side, of maps of pixels
 

@@ -1,7 +1,5 @@
 """What `measure` leaves in a folder: `result.json` and `height.npz` (INTERFACES section 5), and `details.json`."""
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -10,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
@@ -19,6 +16,7 @@ from membrane_ctrl.metrology.full import FullResult
 from membrane_ctrl.metrology.optics.geometry import Outline
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, RadialProfile, sag_gradient
 from membrane_ctrl.metrology.uncertainty import monte_carlo
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import make_folder, write_bytes_atomic, write_text_atomic
 
 if TYPE_CHECKING:  # matplotlib takes a second to load
@@ -29,9 +27,6 @@ if TYPE_CHECKING:  # matplotlib takes a second to load
 #
 # Both are linear (`metrology.uncertainty`): a few dozen solutions of thinned points, 50 ms. The Monte Carlo of the
 # `uncertainty` command agrees within 10 %.
-
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -215,7 +210,7 @@ def write_json(path: Path, table: dict[str, Any]) -> None:
     write_text_atomic(path, json.dumps(table, indent=1, allow_nan=False) + "\n")
 
 
-def write_arrays(path: Path, **arrays: NDArray[np.float64]) -> None:
+def write_arrays(path: Path, **arrays: FloatArray) -> None:
     """Write an `.npz`. Raises OSError."""
     file = io.BytesIO()
     np.savez(file, allow_pickle=False, **arrays)

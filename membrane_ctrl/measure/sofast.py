@@ -5,12 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.frames.series_integrity import Series
 from membrane_ctrl.metrology.phase import equal_shifts, phasors
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 STEPS = 4  # SOFAST always takes four
 MM_PER_M = 1e3
@@ -116,14 +114,14 @@ SHIFTS_RAD = -equal_shifts(STEPS)
 _LIT_SHARE = 0.3  # of the swing of the bright pixels
 
 
-def lit_pixels(measurement: SofastMeasurement) -> NDArray[np.bool_]:
+def lit_pixels(measurement: SofastMeasurement) -> BoolArray:
     """Pixels (H, W) that see fringes: the median over the series of their swing, which no single frame can spoil."""
     series = (*measurement.frames_y, *measurement.frames_x)
     swing = np.median([np.abs(phasors(steps, SHIFTS_RAD)) for steps in series], axis=0)
     return np.asarray(swing > _LIT_SHARE * np.percentile(swing, 95))
 
 
-def series_of(measurement: SofastMeasurement, mask: NDArray[np.bool_]) -> tuple[Series, Series]:
+def series_of(measurement: SofastMeasurement, mask: BoolArray) -> tuple[Series, Series]:
     """The axes of a measurement at the pixels in `mask`, in the order in which they were taken."""
     return (
         Series("y", measurement.frames_y[..., mask], measurement.periods_y, SHIFTS_RAD),

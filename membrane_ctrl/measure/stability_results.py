@@ -12,13 +12,11 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from membrane_ctrl.measure.pictures import log_pictures, result_recording
 from membrane_ctrl.measure.results import write_figure
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import fresh_text
-
-FloatArray = NDArray[np.float64]
 
 _HEAD = ("set", "verdict", "reason")
 _NUMBERS = ("time_s", "displacement_um", "sag_um", "slope_residual_urad", "rmse_mean_um")

@@ -10,15 +10,13 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.measure import measurement, results, stability_results
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, parameter_to_coeffs
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo, stability
 from membrane_ctrl.model import errors, files
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 SERIES = "series.csv"  # also what tells a folder of results from a set
 _NAMED_BAD = 100  # bad sets listed in the table; all of them are in series.csv

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
@@ -25,11 +24,9 @@ from membrane_ctrl.measure.results import write_arrays, write_json
 from membrane_ctrl.metrology.optics.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
 from membrane_ctrl.model import errors, files
+from membrane_ctrl.model.arrays import FloatArray
 
 # Runs Monte Carlo trials: here, over the cores, or on a Dask cluster; the numbers are the same wherever they run.
-
-
-FloatArray = NDArray[np.float64]
 
 _BATCH = 100  # trials a job: a tenth of a second each, so that the bar moves and no worker waits for long
 # A process takes some two seconds to start (imports, compiled loops): less work than this is done here.

@@ -3,14 +3,12 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import CameraConfig
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.reconstruct import Fit, Points, Tracer
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 
 class BinGrid:
@@ -37,20 +35,18 @@ class BinGrid:
         offsets = ((h, 0.0), (-h, 0.0), (0.0, h), (0.0, -h)) if bin_px > 1 else ()
         self._around = [geometry.rays(self.column_px + right, self.row_px + down) for right, down in offsets]
 
-    def near_mirror(self, radius_mm: float) -> NDArray[np.bool_]:
+    def near_mirror(self, radius_mm: float) -> BoolArray:
         """Bins whose ray meets the plane z = 0 within a radius."""
         f = self._geometry.pinhole_mm
         t = -f[2] / self.rays[2]
         return np.asarray((f[0] + t * self.rays[0]) ** 2 + (f[1] + t * self.rays[1]) ** 2 <= radius_mm**2)
 
-    def solid_angle(self, index: NDArray[np.int64]) -> FloatArray:
+    def solid_angle(self, index: IntArray) -> FloatArray:
         """Solid angle of bins: (side / focal length)^2 cos^3 of the angle to the axis."""
         cosine = self._geometry.rotation[2] @ self.rays[:, index]
         return np.asarray((self._bin_px / self._geometry.focal_px) ** 2 * cosine**3)
 
-    def averaging_bias_mm(
-        self, tracer: Tracer, points: Points, surface: Surface, index: NDArray[np.int64]
-    ) -> FloatArray:
+    def averaging_bias_mm(self, tracer: Tracer, points: Points, surface: Surface, index: IntArray) -> FloatArray:
         """Mean of s over a bin's pixels minus s at its centre, (2, n).
 
         A bin's phase is the mean over its pixels: s + sigma^2 / 2 (s_uu + s_vv), sigma^2 = (m^2 - 1) / 12. That is

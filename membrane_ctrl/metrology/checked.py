@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, motion, reconstruct
@@ -18,9 +17,8 @@ from membrane_ctrl.metrology.frames import evidence, frame_stack, integrity
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.orders import Orders, gray_bit, orders
 from membrane_ctrl.metrology.phase import AXES, centre_phase_rad, mm_per_rad
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.shape_estimate import RESIDUAL_REJECTED_URAD, Verdict
-
-FloatArray = NDArray[np.float64]
 
 _ROUNDS = 8
 _MANY_BLAMED = 3
@@ -77,7 +75,7 @@ class Checked:
     binned: frame_stack.Binned
     view: evidence.View
     phase_rad: FloatArray
-    near: NDArray[np.bool_]
+    near: BoolArray
     tracer: reconstruct.Tracer
     state: motion.TrackedPoints
     flags: tuple[integrity.Flag, ...]
@@ -236,7 +234,7 @@ def _attempt(
     optics: OpticsConfig,
     geometry: Geometry,
     grid: bins.BinGrid,
-    near: NDArray[np.bool_],
+    near: BoolArray,
     excluded: set[int],
     anchor: Anchor | None,
 ) -> _Attempt:
@@ -340,7 +338,7 @@ def _confirm_orders(
             raise RejectedSetError(f"the {axis} fringe orders are not certain without all Gray frames", flags)
 
 
-def _explains(phase_rad: FloatArray, bits: dict[int, NDArray[np.bool_]]) -> bool:
+def _explains(phase_rad: FloatArray, bits: dict[int, BoolArray]) -> bool:
     """Whether these orders lie in the pattern and show these bits, away from the bits' edges."""
     if np.min(phase_rad) < -1.5 * math.pi or np.max(phase_rad) > 15.5 * math.pi:
         return False

@@ -13,9 +13,8 @@ from membrane_ctrl.metrology.frames.frame_stack import PixelPhases, pixel_phases
 from membrane_ctrl.metrology.motion import combine_steps, sensitivity_mm_per_um, worth_correcting
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import Quality
-
-FloatArray = NDArray[np.float64]
 
 LASER_NOISE_UM = 1.0  # repeatability of the bench's laser; motion below twice that is not taken out
 _START_SAG_MM = 40.0  # the paper's starting parabola

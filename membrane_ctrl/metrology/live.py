@@ -10,15 +10,15 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, motion, phase, phasor, reconstruct
 from membrane_ctrl.metrology.optics import geometry, hencky, surface, zernike
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.shape_estimate import Quality, ShapeEstimate, judge
 
-FloatArray = NDArray[np.float64]
 Kind = Literal["full", "fringes"]
 
 # Beyond this change of phase a point may have been taken for its neighbour a period away. 0.9 of half a period, so
@@ -228,7 +228,7 @@ class LiveReconstructor:
             combined.append(motion.combine_steps(self._weights[axis], self._shifts_rad[axis], self._bin_px, part))
         phasor.track(sums, state.index, combined, state.sensitivity_rad_per_um, state.accepted, state.fresh)
 
-    def _fit(self, state: motion.TrackedPoints, usable: NDArray[np.bool_], readings: FloatArray) -> reconstruct.Fit:
+    def _fit(self, state: motion.TrackedPoints, usable: BoolArray, readings: FloatArray) -> reconstruct.Fit:
         """One or two steps from the last surface; the full cycle's normal matrix while its points are there."""
         state.points.weights[:] = usable
         np.multiply(state.fresh[:, 0], self._mm_per_rad, out=state.points.screen_mm)
@@ -279,7 +279,7 @@ def _per_frame(
     return times, readings
 
 
-def _lost(change_rad: FloatArray, usable: NDArray[np.bool_]) -> str:
+def _lost(change_rad: FloatArray, usable: BoolArray) -> str:
     """Why the phases (2, n) cannot be followed; empty if they can."""
     seen = max(1, int(np.count_nonzero(usable)))
     beyond = int(np.count_nonzero(usable & (np.abs(change_rad).max(axis=0) > GUARD_RAD)))

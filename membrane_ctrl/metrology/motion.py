@@ -15,13 +15,11 @@ of phase. Counting e from one d0 for both axes therefore also brings x and y, ta
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import PatternConfig
 from membrane_ctrl.metrology import bins, phase, phasor, reconstruct
 from membrane_ctrl.metrology.optics.surface import Surface
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 
 def combine_steps(
@@ -103,7 +101,7 @@ class TrackedPoints:
         Rows of `phasor.track` for x and y: of the last accepted cycle, and memory for the next.
     """
 
-    index: NDArray[np.int64]
+    index: IntArray
     points: reconstruct.Points
     offset_mm: FloatArray
     sensitivity_rad_per_um: FloatArray
@@ -113,7 +111,7 @@ class TrackedPoints:
     accepted: FloatArray
     fresh: FloatArray
 
-    def accept(self, surface: Surface, usable: NDArray[np.bool_]) -> None:
+    def accept(self, surface: Surface, usable: BoolArray) -> None:
         """Make the fresh phases the reference; points that gave none keep theirs."""
         blind = np.flatnonzero(~usable)
         self.fresh[:, :, blind] = self.accepted[:, :, blind]
@@ -124,7 +122,7 @@ class TrackedPoints:
 def establish(
     grid: bins.BinGrid,
     tracer: reconstruct.Tracer,
-    candidates: NDArray[np.int64],
+    candidates: IntArray,
     phase_rad: FloatArray,
     pattern: PatternConfig,
     analysis_radius_mm: float,
@@ -179,14 +177,14 @@ def establish(
 
 def _inside_radius(
     tracer: reconstruct.Tracer, points: reconstruct.Points, _surface: Surface, radius_mm: float
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     x, y = tracer.position_mm(points)
     return np.asarray(x**2 + y**2 <= radius_mm**2)
 
 
 def _without_outliers(
     tracer: reconstruct.Tracer, points: reconstruct.Points, surface: Surface, _radius_mm: float
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Slopes within some robust sigmas of the fit, in both directions."""
     field = tracer.slope_field(points, surface)
     residual = np.hypot(field[2] - field[4], field[3] - field[5])

@@ -9,15 +9,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.optics.compiled import kernel
 from membrane_ctrl.metrology.phase import absolute_phase
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 # Wrapped phase made continuous over a mask by walking from neighbour to neighbour.
-
-
-FloatArray = NDArray[np.float64]
 
 
 @kernel
@@ -49,7 +46,7 @@ def _flood(phase, mask, out, region, queue):  # type: ignore[no-untyped-def]
     return count
 
 
-def unwrap_regions(wrapped_rad: FloatArray, mask: NDArray[np.bool_]) -> tuple[FloatArray, NDArray[np.int64]]:
+def unwrap_regions(wrapped_rad: FloatArray, mask: BoolArray) -> tuple[FloatArray, IntArray]:
     """Continuous phase of each connected region, up to whole periods.
 
     Parameters
@@ -79,8 +76,6 @@ def tear_share(phase_rad: FloatArray) -> float:
     steps = steps[np.isfinite(steps)]
     return float(np.mean(np.abs(steps) > math.pi)) if steps.size else 0.0
 
-
-BoolArray = NDArray[np.bool_]
 
 # A phase that is not torn has no tears at all but for dust; a stale frame of three tears at every quarter period.
 _TORN_SHARE = 0.003

@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import PatternConfig
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 
 def step_weights(shifts_rad: Sequence[float] | FloatArray) -> FloatArray:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.optics.compiled import kernel, split, step
+from membrane_ctrl.model.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 _BLOCK = 512

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.optics import compiled, hencky, kernels, zernike
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 # Normal equations of the slope fit, made from moments (the paper's eqs. for D, G and A).
 #
@@ -27,9 +27,6 @@ from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_p
 # of the 36 Zernike terms are polynomials of degree 6 in x and y, so D^T g and D^T D follow exactly from sums of
 # monomials over the points; no 2N x 36 matrix is ever built. As printed, D^T D is singular: piston has no slope. Here
 # piston's column is left out and its place is taken by the Hencky excess, scaled to unit RMS like the others.
-
-
-FloatArray = NDArray[np.float64]
 
 _M = kernels.SLOPE_MONOMIALS
 _POWERS = [(p, q) for p in range(zernike.DEGREE) for q in range(zernike.DEGREE - p)]  # in the kernels' order
@@ -45,7 +42,7 @@ def slope_tables() -> tuple[FloatArray, FloatArray]:
 
 
 @cache
-def _product_index() -> NDArray[np.int64]:
+def _product_index() -> IntArray:
     """Where the product of monomials k and l stands among the product moments, (28, 28)."""
     place = {power: k for k, power in enumerate(_PRODUCT_POWERS)}
     return np.array([[place[a[0] + b[0], a[1] + b[1]] for b in _POWERS] for a in _POWERS])
@@ -161,7 +158,7 @@ class Points:
         weights = np.ones(count) if weights is None else weights
         return cls(np.ascontiguousarray(rays), np.ascontiguousarray(screen_mm), weights, np.zeros(count))
 
-    def subset(self, keep: NDArray[np.bool_]) -> Points:
+    def subset(self, keep: BoolArray) -> Points:
         """Those points where `keep` is set."""
         return Points(
             np.ascontiguousarray(self.rays[:, keep]),

@@ -9,14 +9,13 @@ still over the length of the window.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import live, phasor
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-
-FloatArray = NDArray[np.float64]
 
 
 class SlidingWindow(live.LiveReconstructor):

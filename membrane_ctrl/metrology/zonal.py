@@ -9,10 +9,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from membrane_ctrl.metrology.optics.compiled import kernel, split
+from membrane_ctrl.model.arrays import FloatArray
 
 # Height from differences between neighbours on a masked grid: least squares by conjugate gradients and multigrid.
 #
@@ -22,9 +22,6 @@ from membrane_ctrl.metrology.optics.compiled import kernel, split
 # preconditioner. The cost is linear in the number of cells.
 #
 # Source: R. Southwell's model of slopes, J. Opt. Soc. Am. 70, 998 (1980); A. Brandt, Math. Comp. 31, 333 (1977).
-
-
-FloatArray = NDArray[np.float64]
 
 _COARSEST = 8
 # Constants joined 2 x 2 interpolate a slope as a staircase, which makes the coarse correction too small by about half

@@ -11,7 +11,8 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+
+from membrane_ctrl.model.arrays import FloatArray
 
 Kind = Literal["full", "fringes"]
 Verdict = Literal["ok", "degraded", "rejected"]
@@ -60,9 +61,9 @@ class ShapeEstimate:
 
     time_s: float
     kind: Kind
-    coeffs_um: NDArray[np.float64]
+    coeffs_um: FloatArray
     hencky_um: float
-    covariance_um2: NDArray[np.float64]
+    covariance_um2: FloatArray
     sag_um: float
     sag_sigma_um: float
     displacement_um: float

@@ -10,7 +10,8 @@ from dataclasses import dataclass, fields
 from operator import attrgetter
 
 import numpy as np
-from numpy.typing import NDArray
+
+from membrane_ctrl.model.arrays import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,7 @@ ROW_BYTES = _STRUCT.size
 # Telemetry rows as a table: messages of the telemetry ring in, one NumPy column a field out.
 
 
-Rows = NDArray[np.float64]
+Rows = FloatArray
 COLUMN: dict[str, int] = {name: place for place, name in enumerate(FIELDS)}
 
 
@@ -76,12 +77,12 @@ def unpack(messages: Sequence[bytes]) -> Rows:
     return np.frombuffer(b"".join(messages), dtype="<f8").reshape(-1, len(FIELDS))
 
 
-def column(rows: Rows, name: str) -> NDArray[np.float64]:
+def column(rows: Rows, name: str) -> FloatArray:
     """One field of all rows, (n,)."""
     return rows[:, COLUMN[name]]
 
 
-def changes(codes: NDArray[np.float64], before: float) -> list[tuple[int, int]]:
+def changes(codes: FloatArray, before: float) -> list[tuple[int, int]]:
     """Where a code changes: (row, new code) for each, the first row compared with `before` (NaN: nothing before)."""
     previous = np.concatenate(([before], codes[:-1]))
     return [(int(row), int(codes[row])) for row in np.flatnonzero((codes != previous) & np.isfinite(codes))]

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.files import sync_data
 from membrane_ctrl.recorder.blueprint import LANES, run_blueprint
@@ -130,7 +130,7 @@ class Recording:
         for kind in ("height", "difference", "uncertainty"):
             stream.log(f"/shape/map/{kind}/outside", outside, static=True)
 
-    def columns(self, path: str, time_s: NDArray[np.float64], columns: Iterable[rr.ComponentColumn]) -> None:
+    def columns(self, path: str, time_s: FloatArray, columns: Iterable[rr.ComponentColumn]) -> None:
         """Send rows of one entity at (n,) times of the run."""
         nanoseconds = np.round(time_s * 1e9).astype("timedelta64[ns]")
         indexes = [
@@ -139,7 +139,7 @@ class Recording:
         ]
         self._stream.send_columns(path, indexes=indexes, columns=columns)
 
-    def scalars(self, path: str, time_s: NDArray[np.float64], values: NDArray[np.float64]) -> None:
+    def scalars(self, path: str, time_s: FloatArray, values: FloatArray) -> None:
         """Send (n, m) values of one entity at (n,) times of the run."""
         self.columns(path, time_s, rr.Scalars.columns(scalars=values))
 

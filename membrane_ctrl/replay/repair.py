@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from membrane_ctrl.model import errors, files, plain_json, telemetry
+from membrane_ctrl.model.arrays import IntArray
 from membrane_ctrl.model.plain_json import take_checksum
 from membrane_ctrl.recorder import housekeeping, sink
 from membrane_ctrl.run_files import column_reader, inputs_file, run, run_folder, streams, tables
@@ -47,7 +47,7 @@ def read_rows(path: Path) -> telemetry.Rows:
         Rerun's ways to say that nothing can be read.
     """
     where = {stream.path: [telemetry.COLUMN[line.field] for line in stream.lines] for stream in streams.STREAMS}
-    found: dict[str, tuple[list[NDArray[np.int64]], list[telemetry.Rows]]] = {path: ([], []) for path in where}
+    found: dict[str, tuple[list[IntArray], list[telemetry.Rows]]] = {path: ([], []) for path in where}
     require_bounded(path)
     with warnings.catch_warnings(), panics_are_faults():
         warnings.simplefilter("ignore")  # a segment without its footer is what this is for

@@ -13,13 +13,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import UnknownMemoryError, recall
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs, output_crc, unpack_tick
 from membrane_ctrl.model import errors, shape_estimate, telemetry
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.run_files.inputs_file import Frame
 
@@ -96,7 +96,7 @@ class Replay:
 def replay(
     config: Config,
     record: Iterable[RecordedTick | Gap],
-    sag_sensitivity: NDArray[np.float64],
+    sag_sensitivity: FloatArray,
     from_s: float = 0.0,
     to_s: float = math.inf,
 ) -> Replay:

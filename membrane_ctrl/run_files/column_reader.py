@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.files import open_plain, read_bytes
 from membrane_ctrl.run_files import sealed_stream, tables
 from membrane_ctrl.run_files.column_file import FOLDER, SUFFIX
@@ -24,7 +24,7 @@ from membrane_ctrl.run_files.column_file import FOLDER, SUFFIX
 _FILE_MAX_S = 86_400.0
 
 
-def possible_times(time_s: NDArray[np.float64]) -> NDArray[np.bool_]:
+def possible_times(time_s: FloatArray) -> BoolArray:
     """Which of a file's (n,) times are finite and within a day of most others."""
     finite = np.isfinite(time_s)
     if not finite.any():
@@ -195,7 +195,7 @@ def first_s(path: Path, time_name: str) -> float | None:
     return float(times_s[0]) if times_s.size else None
 
 
-def first_column(path: Path, name: str) -> NDArray[np.float64]:
+def first_column(path: Path, name: str) -> FloatArray:
     """A column of the first batch; empty if the file's beginning does not give it."""
     try:
         with open_plain(path) as file:
@@ -284,7 +284,7 @@ def recorded_rate_hz(folder: Path) -> float | None:
     return None
 
 
-def _spacing_s(path: Path) -> NDArray[np.float64]:
+def _spacing_s(path: Path) -> FloatArray:
     """From when one of a file's first ticks was due to when the next was: `dt_s` is that and the jitter of both."""
     dt_s, late_ms = (first_column(path, name) for name in ("dt_s", "lateness_ms"))
     return dt_s[1:] - 1e-3 * np.diff(np.nan_to_num(late_ms)) if late_ms.size == dt_s.size else dt_s

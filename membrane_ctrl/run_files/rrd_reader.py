@@ -7,13 +7,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
+from membrane_ctrl.model.arrays import Column, IntArray
 from membrane_ctrl.run_files import column_reader, streams
 from membrane_ctrl.run_files.segments import FAULTS, read_chunks, salvage
 
-Column = NDArray[np.float64]
 REPAIRED = "repaired"  # below the run: what `repair` made of damaged files
 _VALUES = "Scalars:scalars"
 _TIME = "run_time"
@@ -83,13 +82,13 @@ def read_shapes(path: Path, notes: list[str]) -> dict[str, Column]:
     }
 
 
-def _seconds(clock_ns: NDArray[np.int64]) -> Column:
+def _seconds(clock_ns: IntArray) -> Column:
     return np.asarray(clock_ns * 1e-9, dtype=np.float64)
 
 
-def _scalars(path: Path, entities: set[str], notes: list[str]) -> dict[str, tuple[NDArray[np.int64], Column]]:
+def _scalars(path: Path, entities: set[str], notes: list[str]) -> dict[str, tuple[IntArray, Column]]:
     """(times in ns, (n, m) values) of each entity with scalars, sorted by time."""
-    parts: dict[str, list[tuple[NDArray[np.int64], Column]]] = {}
+    parts: dict[str, list[tuple[IntArray, Column]]] = {}
     for entity, times, values in _chunks(path, entities, notes):
         parts.setdefault(entity, []).append((times, values))
     joined = {}
@@ -105,7 +104,7 @@ def _scalars(path: Path, entities: set[str], notes: list[str]) -> dict[str, tupl
     return joined
 
 
-def _chunks(path: Path, entities: set[str], notes: list[str]) -> Iterator[tuple[str, NDArray[np.int64], Column]]:
+def _chunks(path: Path, entities: set[str], notes: list[str]) -> Iterator[tuple[str, IntArray, Column]]:
     for chunk in _readable(path, entities, notes):
         batch = chunk.to_record_batch()
         if _VALUES not in batch.schema.names or _TIME not in batch.schema.names:

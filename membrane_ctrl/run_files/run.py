@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.run_files import column_reader, rrd_reader, run_folder, shapes
 from membrane_ctrl.run_files.column_file import SUFFIX
@@ -30,7 +30,6 @@ from membrane_ctrl.run_files.tables import (
     level_table,
 )
 
-Column = NDArray[np.float64]
 Block = dict[str, Column]
 # Rerun rounds the time of a tick to the nanosecond; the next one is milliseconds away
 _SAME_TICK_S = 1e-6

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-
-Column = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,8 @@ are set once, with `SeriesLines`.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.telemetry import Rows, column
 
 Colour = tuple[int, int, int]
@@ -41,7 +41,7 @@ class Stream:
     path: str
     lines: tuple[Line, ...]
 
-    def values(self, rows: Rows) -> NDArray[np.float64]:
+    def values(self, rows: Rows) -> FloatArray:
         """(n, lines) block of the stream."""
         return np.stack([column(rows, line.field) for line in self.lines], axis=1)
 
@@ -151,12 +151,12 @@ LATENCY = Stream("/shape/latency", (Line("", "last frame to result ms", BLUE),))
 SHAPE_STREAMS: tuple[Stream, ...] = (ZERNIKE, CHANGE, SAG, RESIDUAL, QUALITY, MODULATION, LATENCY)
 
 
-def true_error_um(rows: Rows) -> NDArray[np.float64]:
+def true_error_um(rows: Rows) -> FloatArray:
     """(n, 1) true centre minus target; NaN on a real bench."""
     return (column(rows, "truth_displacement_um") - column(rows, "target_um"))[:, np.newaxis]
 
 
-def overview_um(rows: Rows) -> NDArray[np.float64]:
+def overview_um(rows: Rows) -> FloatArray:
     """(1, 3) least, mean and greatest error of the rows; NaN when none of them has an error."""
     error = column(rows, "error_um")
     error = error[np.isfinite(error)]

@@ -5,16 +5,16 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import shape_estimate, states, telemetry
+from membrane_ctrl.model.arrays import BoolArray, Column, FloatArray
 from membrane_ctrl.run_files.events import Event
 
 # Statistics of a run of any length in a fixed amount of memory.
 
 
-Values = NDArray[np.float64]
+Values = FloatArray
 
 
 class Moments:
@@ -286,9 +286,6 @@ def _quantiles(histogram: LogHistogram) -> dict[str, float]:
 
 # Which ticks count as held: in `hold`, the setpoint ramp at its target, and that for some seconds.
 
-
-Column = NDArray[np.float64]
-
 FIELDS = ("mono_s", "state", "setpoint_um", "trim_um", "target_um")
 
 
@@ -298,7 +295,7 @@ class Settled:
     def __init__(self) -> None:
         self._since_s = math.nan  # last moment that was not settled; NaN: not in hold
 
-    def mask(self, block: Mapping[str, Column]) -> NDArray[np.bool_]:
+    def mask(self, block: Mapping[str, Column]) -> BoolArray:
         """(n,) true where the ticks of the next block are settled."""
         time_s = block["mono_s"]
         hold = block["state"] == states.State.HOLD
@@ -315,7 +312,7 @@ class Settled:
         return np.asarray(settled)
 
 
-def held_at(level: Mapping[str, Column], time_s: Column) -> NDArray[np.bool_]:
+def held_at(level: Mapping[str, Column], time_s: Column) -> BoolArray:
     """(n,) whether the window of a level that holds each time, and the one before, were in `hold`."""
     if not level["time_s"].size:
         return np.zeros(time_s.size, dtype=bool)

@@ -11,15 +11,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from membrane_ctrl.model import shape_estimate, telemetry
+from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.run_files.column_file import ColumnFile
 
 # Overview levels: least, mean and greatest of each signal per 1 s, 10 s and 60 s, so that a month opens in seconds.
 #
 # A level is a dict of columns: `time_s` (start of the window, a multiple of its length), `rows` (ticks in it), the
 # codes of `CODES` at its end (`fault`: the greatest) and `min_<signal>`, `mean_<signal>`, `max_<signal>`.
-
-
-Column = NDArray[np.float64]
 Columns = dict[str, Column]
 
 WINDOWS_S: tuple[float, ...] = (1.0, 10.0, 60.0)

@@ -4,9 +4,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Series = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
+
+Series = FloatArray
 _DAY_S = 86_400.0
 
 

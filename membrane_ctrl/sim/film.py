@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
+
+from membrane_ctrl.model.arrays import FloatArray
 
 # Hencky's clamped round membrane under uniform pressure, solved from its differential equation.
 #
@@ -56,11 +57,11 @@ def solve(poisson: float = POISSON_PET) -> Hencky:
     if not 0 <= poisson <= 0.5:
         raise ValueError(f"poisson = {poisson:g} is outside 0 .. 0.5")
 
-    def slope(r: float, y: NDArray[np.float64]) -> list[float]:
+    def slope(r: float, y: FloatArray) -> list[float]:
         m, dm = y[0], y[1]
         return [dm, -3 * dm / r - 1 / (8 * m * m), r / (2 * m), r**3 / (2 * m)]
 
-    def rim(r: float, y: NDArray[np.float64]) -> float:
+    def rim(r: float, y: FloatArray) -> float:
         return float(r * y[1] + (1 - poisson) * y[0])
 
     rim.terminal = True  # type: ignore[attr-defined]  # scipy reads the flag from the function
@@ -99,16 +100,16 @@ class Film:
     creep_per_decade: float
     modulus_pa: float = MODULUS_PA
 
-    def sag_mm_per_root_pa(self, age_s: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    def sag_mm_per_root_pa(self, age_s: float | FloatArray) -> FloatArray:
         """Sag over the cube root of the pressure: w = c a (p a / (E t))^(1/3); age is time under load."""
         settled = solve().sag * RADIUS_MM * (RADIUS_MM / (self.modulus_pa * self.thickness_um * 1e-3)) ** (1 / 3)
         return np.asarray(settled * np.cbrt(self._creep(age_s) / self._creep(SETTLED_S)))
 
-    def volume_m3_per_root_pa(self, age_s: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    def volume_m3_per_root_pa(self, age_s: float | FloatArray) -> FloatArray:
         """Volume under the film over the cube root of the pressure: V = 0.5214 pi a^2 w."""
         return solve().volume * math.pi * RADIUS_MM**2 * 1e-9 * self.sag_mm_per_root_pa(age_s)
 
-    def _creep(self, age_s: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    def _creep(self, age_s: float | FloatArray) -> FloatArray:
         return np.asarray(1 + self.creep_per_decade * np.log10(1 + np.asarray(age_s) / CREEP_START_S))
 
 

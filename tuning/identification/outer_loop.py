@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.control.shape_loop import sag_change
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.sessions.live_hold import HoldError
 from tuning.identification.records import Series
@@ -50,7 +50,7 @@ class LocalLevel:
     seen: bool
 
 
-def fit_local_level(values: NDArray[np.float64], times_s: NDArray[np.float64]) -> LocalLevel:
+def fit_local_level(values: FloatArray, times_s: FloatArray) -> LocalLevel:
     """Fit the model. Raises ValueError for fewer than 20 values."""
     if values.size < 20:
         raise ValueError(f"{values.size} values are too few to tell noise from drift: 20 at least")
@@ -65,7 +65,7 @@ def fit_local_level(values: NDArray[np.float64], times_s: NDArray[np.float64]) -
     return LocalLevel(math.sqrt(variance), float(_RATIOS[chosen]) * variance / cycle_s, seen)
 
 
-def _likelihood(values: NDArray[np.float64], steps: NDArray[np.float64], ratio: float) -> tuple[float, float]:
+def _likelihood(values: FloatArray, steps: FloatArray, ratio: float) -> tuple[float, float]:
     """Log likelihood and the noise's variance for a ratio; the first value only starts the filter."""
     level, spread = float(values[0]), 1.0
     squares = logs = 0.0

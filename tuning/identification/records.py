@@ -10,12 +10,12 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.control.experiments.machine import Measurement
 from membrane_ctrl.model import errors, files
+from membrane_ctrl.model.arrays import FloatArray
 
-Series = NDArray[np.float64]
+Series = FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,14 +10,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
 from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.model.arrays import FloatArray
 from tuning.identification import identify, loop_model
 from tuning.identification.disturbance import Disturbance
 
-Matrix = NDArray[np.float64]
+Matrix = FloatArray
 
 
 @dataclass(frozen=True, slots=True)

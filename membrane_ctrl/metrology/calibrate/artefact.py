@@ -11,16 +11,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.optics import ScreenPoseConfig
 from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, OpticsConfig, Vector3
 from membrane_ctrl.metrology.calibrate import parameters, solve
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.screen_face import BOW_RADIUS_MM
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.plain_json import SCHEMA, content_hash
-
-FloatArray = NDArray[np.float64]
 
 _LENS = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1", "p2")
 

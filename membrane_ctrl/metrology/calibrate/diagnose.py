@@ -9,12 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from membrane_ctrl.metrology.calibrate import parameters, propagate, separable, solve
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray, IntArray
 
 SURE = 1e-6  # probability that good data look as bad
 _CAMERA = tuple(parameters.NAMES.index(name) for name in ("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg"))
@@ -219,7 +217,7 @@ def _with_bump(sums: FloatArray, bumped: bool) -> FloatArray:
     return np.asarray(out)
 
 
-def _solved(sums: FloatArray, free: NDArray[np.int64]) -> tuple[FloatArray, float]:
+def _solved(sums: FloatArray, free: IntArray) -> tuple[FloatArray, float]:
     matrix, right = sums[np.ix_(free, free)], sums[free, -1]
     scale = 1 / np.sqrt(np.diag(matrix))
     found = scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * right)

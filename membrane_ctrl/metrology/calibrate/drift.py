@@ -14,14 +14,12 @@ from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.bins import slope_per_screen
 from membrane_ctrl.metrology.calibrate.separable import rim_harmonics
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import Surface
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 CYCLES = 60  # two minutes of cycles
 GROWN = 1.25  # times what is expected: 0.75 of it more, added in squares

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from membrane_ctrl.config.schema import CameraConfig
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 LEAST_VIEWS = 4  # each has a pose of its own; with fewer the lens hides in the poses
 LEAST_CORNERS = 12  # of a view

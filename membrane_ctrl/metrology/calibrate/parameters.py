@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.screen_face import BOW_RADIUS_MM
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 _COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
 

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, phase
@@ -16,8 +15,7 @@ from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, solve
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, parameter_to_coeffs, sag_gradient
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -142,7 +140,7 @@ def weak_combinations(solution: Solution, index: int, analysis_radius_mm: float)
     return tuple(out)
 
 
-def _scaled(solution: Solution) -> tuple[FloatArray, NDArray[np.int64]]:
+def _scaled(solution: Solution) -> tuple[FloatArray, IntArray]:
     free = np.flatnonzero(solution.problem.sigmas > 0)
     scale = solution.problem.sigmas[free]
     return solution.covariance[np.ix_(free, free)] / np.outer(scale, scale), free
@@ -154,7 +152,7 @@ def _described(
     radius_mm: float,
     left: float,
     parts: tuple[tuple[str, float], ...],
-    free: NDArray[np.int64],
+    free: IntArray,
     amounts: FloatArray,
 ) -> Combination:
     optical = free < parameters.OPTICAL

@@ -20,7 +20,6 @@ from functools import cache
 
 import numpy as np
 from numpy.polynomial import polynomial as series
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.calibrate.parameters import OPTICAL, POSE, Bench, Poses
 from membrane_ctrl.metrology.optics import hencky, zernike
@@ -30,6 +29,7 @@ from membrane_ctrl.metrology.optics.kernels import FACE_STEPS
 from membrane_ctrl.metrology.optics.screen_face import BOW_RADIUS_MM
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer
+from membrane_ctrl.model.arrays import FloatArray
 
 # Small matrix products as plain loops.
 #
@@ -71,8 +71,6 @@ def multiply(table, rows):  # type: ignore[no-untyped-def]
                     out[i, k] += factor * rows[j, k]
     return out
 
-
-FloatArray = NDArray[np.float64]
 
 LOCAL = PARAMETERS + 1  # of one set: its surface, and the height of its vertex
 COLUMNS = LOCAL + OPTICAL

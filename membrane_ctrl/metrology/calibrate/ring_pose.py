@@ -7,15 +7,13 @@ distance to the ring of the points where the rim's rays meet its plane, over a, 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, usual_sigma
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.reconstruct import HeightFunction
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 POSE_NAMES = ("a_mm", "alpha_deg", "camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg")
 _PLACES = [NAMES.index(name) for name in POSE_NAMES]

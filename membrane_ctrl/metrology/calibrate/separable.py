@@ -16,13 +16,11 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.calibrate import parameters, residuals
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.optics.zernike import DEGREE
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 RING = 2 * DEGREE + 1  # harmonics of the rim: a constant, seven cosines, seven sines
 COMMON = len(parameters.NAMES) + RING  # parameters of `NAMES`, then the ring

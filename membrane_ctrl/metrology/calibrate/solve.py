@@ -4,14 +4,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology import reconstruct
 from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 MAX_ITERATIONS = 25
 _SETTLED = 1e-2  # of each parameter's own standard deviation: no reader of the result sees less

@@ -17,13 +17,11 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.frames.frame_stack import Binned, FrameStack
 from membrane_ctrl.metrology.orders import gray_bit
 from membrane_ctrl.metrology.phase import AXES, CONTRAST_SHARE, FRINGE_SHARE, step_weights
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 _SAMPLE = 20_000
 # Distance from a Gray bit's edge, rad: blur, and the film's motion by up to some hundred um, stay inside
@@ -46,7 +44,7 @@ class Scene:
         Change of phase per um of displacement.
     """
 
-    index: NDArray[np.int64]
+    index: IntArray
     light: FloatArray
     phase_rad: FloatArray
     sensitivity_rad_per_um: FloatArray
@@ -115,7 +113,7 @@ class _Template:
 
     role: str
     columns: FloatArray
-    sure: NDArray[np.bool_]
+    sure: BoolArray
 
 
 def _template(stack: FrameStack, scene: Scene, frame: int, reading_um: float) -> _Template:
@@ -215,7 +213,7 @@ class View:
     phase_rad: FloatArray
     swing_adu: FloatArray
     light: FloatArray
-    mask: NDArray[np.bool_]
+    mask: BoolArray
 
 
 def look(stack: FrameStack, binned: Binned, excluded: Collection[int], witness: FloatArray | None = None) -> View:
@@ -264,7 +262,7 @@ def _third_witness(stack: FrameStack, binned: Binned, excluded: Collection[int])
     return np.asarray(binned.means[white].astype(float) - binned.means[black])
 
 
-def _middle(maps: list[FloatArray], where: NDArray[np.bool_] | None = None) -> FloatArray:
+def _middle(maps: list[FloatArray], where: BoolArray | None = None) -> FloatArray:
     """Median of two or three maps, each scaled to the median of the first (over its brighter half by default)."""
     if where is None or not where.any():
         where = maps[0] >= np.median(maps[0])

@@ -12,8 +12,8 @@ from firmware_iface.roles import Pattern
 from membrane_ctrl.metrology.optics.compiled import kernel, split
 from membrane_ctrl.metrology.phase import AXES, step_weights
 from membrane_ctrl.metrology.phasor import Binner, StepCombination, arctan2
+from membrane_ctrl.model.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 Frames = NDArray[np.uint8] | NDArray[np.uint16]
 
 _ENOUGH_BINS = 50_000  # for 36 terms and for the checks of the frames; more only cost time

@@ -9,13 +9,10 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.frames.evidence import Evidence, Scene, gather
 from membrane_ctrl.metrology.frames.frame_stack import Binned, FrameStack
 from membrane_ctrl.metrology.phase import AXES
-
-FloatArray = NDArray[np.float64]
 
 # Floors. Good frames of simulated sets (gamma 2.2, a rippled film, 20 um of motion) differ by up to 0.005 rad of step
 # and 0.005 of swing. A twentieth of the frame before left in one by a slow display is 0.05 rad, and 4 um of figure.

@@ -20,10 +20,10 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.frames.closure import Closure, closure, closure_with_level, closure_with_phase
 from membrane_ctrl.metrology.phase import phasors, wrapped_phase
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.shape_estimate import Verdict
 
 # Absolute phase in time: fringes of several frequencies, coarse to fine, each pixel by itself.
@@ -36,9 +36,6 @@ from membrane_ctrl.model.shape_estimate import Verdict
 #
 # The distance before rounding, e = (x_f - x_(f-1)) p_f in periods, is at most 1/2 by construction and should be near
 # 0: it is the coarser phase's error seen through the finer fringe. Near 1/2 the order is a toss-up.
-
-
-FloatArray = NDArray[np.float64]
 
 # A wrong order begins at half a period; a pixel half way there is within one more error of its size of being wrong.
 CONSISTENT_PERIODS = 0.25
@@ -60,7 +57,7 @@ class Unwrapped:
 
     screens: FloatArray
     step_periods: FloatArray
-    consistent: NDArray[np.bool_]
+    consistent: BoolArray
 
 
 def unwrap(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray) -> Unwrapped:

@@ -12,13 +12,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
 from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
 from membrane_ctrl.metrology.optics.screen_face import Face
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 _UNDONE = 1e-9  # of a tangent: 5e-6 of a pixel of the paper's lens
 

@@ -15,12 +15,10 @@ from functools import cache
 
 import numpy as np
 from numpy.polynomial import Chebyshev, Legendre, Polynomial
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from membrane_ctrl.metrology.optics.zernike import TERMS
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 POISSON_RATIO = 0.3
 _SERIES_TERMS = 80  # the nearest singularity is beyond v = 2: the last term is below 1e-24

@@ -11,13 +11,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from membrane_ctrl.config.optics import HeightMapConfig, ScreenPoseConfig
 from membrane_ctrl.metrology.optics.compiled import kernel, step
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 BOW_RADIUS_MM = 200.0  # where `bow_mm` is counted: half the paper's pattern, rounded
 _ORDER = 4  # coefficients of a cubic

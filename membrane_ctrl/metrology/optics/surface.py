@@ -10,11 +10,9 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.optics import hencky, zernike
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 PARAMETERS = 36  # j = 2..36 and the excess; piston follows from h(0) = 0
 

@@ -10,9 +10,8 @@ import math
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 TERMS = 36
 DEGREE = 7

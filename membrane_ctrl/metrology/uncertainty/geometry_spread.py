@@ -9,12 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, Vector3
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 SHORT_NAMES = ("a_mm", "b_mm", "alpha_deg")
 GENERAL_NAMES = tuple(

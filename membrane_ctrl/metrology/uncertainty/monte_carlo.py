@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, full, reconstruct
@@ -26,8 +25,7 @@ from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, parameter_to_coeffs
 from membrane_ctrl.metrology.optics.zernike import values
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread, changed
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 # 170 a parameter: errors of a geometry are smooth and need fewer; a trial then takes about a millisecond
 TRIAL_POINTS = 6000
@@ -133,7 +131,7 @@ class TrialBench:
         return np.asarray(gain @ np.mean(np.square(self.sigma_mm), axis=1))
 
 
-def _spread_evenly(size: int, count: int) -> NDArray[np.bool_]:
+def _spread_evenly(size: int, count: int) -> BoolArray:
     """About `count` of `size` points by a golden-ratio sequence: even along rows and columns alike."""
     if size <= count:
         return np.ones(size, bool)
@@ -201,7 +199,7 @@ class HeightMap:
     """
 
     axis_mm: FloatArray
-    inside: NDArray[np.bool_]
+    inside: BoolArray
     matrix: FloatArray
 
     @classmethod

@@ -10,11 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.uncertainty.monte_carlo import trial_covariance
-
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 # Where the film is watched, as (radius in analysis radii, azimuth in degrees): a third of a turn apart and inside,
 # halfway and near the rim, so that a tilt, a bend and a wave of the rim look different in the three.

@@ -3,8 +3,8 @@
 from collections.abc import Callable, Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from membrane_ctrl.model.arrays import BoolArray
 from membrane_ctrl.model.states import State
 from membrane_ctrl.review.events.laser_and_door import door_steps, glitches, looked_at, update_s
 from membrane_ctrl.review.events.steps import (
@@ -136,7 +136,7 @@ def weather_losses(level: Level) -> list[Found]:
     return found
 
 
-def _losses(kind: str, lost: NDArray[np.bool_], level: Level, join: int) -> list[Found]:
+def _losses(kind: str, lost: BoolArray, level: Level, join: int) -> list[Found]:
     time_s = level["time_s"]
     return [Found(kind, float(time_s[a]), time_s[a] - 5, time_s[b] + 6, b - a + 1.0, "s", 1.0)
             for a, b in runs(lost, join)]  # fmt: skip

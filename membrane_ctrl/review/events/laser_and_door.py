@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from membrane_ctrl.review.events.steps import Column, Step, differences, local_sigma
+from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.review.events.steps import Step, differences, local_sigma
 
 # A laser's noise is 1 um; the film makes no spike of a single tick.
 GLITCH_LEAST_UM = 4.0

@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage, special
 
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.arrays import BoolArray, Column, FloatArray
 from membrane_ctrl.model.states import State
 from membrane_ctrl.run_files.shapes import Shapes
-
-Column = NDArray[np.float64]
 
 # The noise is judged over stretches of this many values: weather changes over a night.
 _STRETCH = 3600
@@ -108,7 +106,7 @@ def confidence(sigmas: float, looked_at: int) -> float:
 # One event found by machine, and what its finders share.
 
 
-Level = dict[str, NDArray[np.float64]]
+Level = dict[str, FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,12 +144,12 @@ def event_around(kind: str, table: Level, row: int, half_s: float, size: float, 
     return Found(kind, time_s, time_s - 30 * half_s**0.5, time_s + 30 * half_s**0.5, size, unit, sure)
 
 
-def widened(flags: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:
+def widened(flags: BoolArray, rows: int) -> BoolArray:
     """True rows and so many on each side of them."""
     return np.asarray(ndimage.maximum_filter1d(flags, 2 * rows + 1, mode="constant", cval=0), dtype=bool)
 
 
-def runs(flags: NDArray[np.bool_], join: int) -> list[tuple[int, int]]:
+def runs(flags: BoolArray, join: int) -> list[tuple[int, int]]:
     """First and last row of each stretch of true rows; those `join` or fewer apart are one."""
     rows = np.flatnonzero(flags)
     if not rows.size:
@@ -205,7 +203,7 @@ JUMP_STILL_UM = 2.0
 _SIGMA_OVER_MAD = 1.4826
 
 
-def shape_jumps(shapes: Shapes, held: NDArray[np.bool_]) -> list[Found]:
+def shape_jumps(shapes: Shapes, held: BoolArray) -> list[Found]:
     """The figure beside its sag (terms 5 to 11, without what a deeper bowl has of them) steps between cycles."""
     moved_um = np.abs(np.diff(shapes.displacement_um, prepend=np.nan, append=np.nan))
     still = ~(np.fmax(moved_um[:-1], moved_um[1:]) > JUMP_STILL_UM)

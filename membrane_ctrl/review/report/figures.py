@@ -10,8 +10,8 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.states import State
 from membrane_ctrl.review.report.json import timeline
 from membrane_ctrl.review.statistics import shape_review, spectra
@@ -73,9 +73,6 @@ def svg(figure: Figure) -> str:
 
 
 # Where nothing was measured, no line is drawn.
-
-
-Column = NDArray[np.float64]
 
 # A cycle or a second that is left out now and then is no gap.
 _STEPS = 3.0

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from membrane_ctrl.model import errors, states
+from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.steps import Found
 from membrane_ctrl.review.statistics import shape_review, spectra
@@ -17,8 +18,6 @@ from membrane_ctrl.review.statistics.hold_pass import ERROR, KEPT_AWAY, READING,
 from membrane_ctrl.review.statistics.windows import WindowStatistics, describe, window_means
 from membrane_ctrl.run_files.run import Block, Run
 from membrane_ctrl.run_files.summary import held_at
-
-Column = NDArray[np.float64]
 
 WINDOWS_S = (1, 4, 60)
 # A level with about this many rows makes a picture.

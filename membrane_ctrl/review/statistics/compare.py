@@ -4,15 +4,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from membrane_ctrl.control.shape_loop import SHAPES
+from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.states import ShapeState, State
 from membrane_ctrl.review.statistics.analysis import Analysis, Series
 from membrane_ctrl.review.statistics.drift import Slope, mean_p, spread_p, windowed
-
-Column = NDArray[np.float64]
 
 _SIGNIFICANT = 0.01
 _SHORT = "no test: too short for blocks"

@@ -4,10 +4,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special, stats
 
-Column = NDArray[np.float64]
+from membrane_ctrl.model.arrays import Column
 
 # Rounds of g and of the variance that the line took up: the coverage of short records is right after three, and
 # more leave the shortest no degree of freedom, whose interval then says nothing.

@@ -7,15 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.states import State
 from membrane_ctrl.review.statistics import windows
 from membrane_ctrl.run_files import summary, tables
 from membrane_ctrl.run_files.run import Block, Run
 
 # Seconds of which the ticks are not all there (segments while nothing happens): their means are in the 1 s level.
-
-
-Column = NDArray[np.float64]
 
 LEVEL_COLUMNS = ("state", "mean_displacement_um", "mean_true_error_um")
 

@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from membrane_ctrl.model.arrays import BoolArray, Column
 from membrane_ctrl.review.statistics.drift import Slope, slope
 from membrane_ctrl.run_files.shapes import MAP_PX, Shapes, height_basis
-
-Column = NDArray[np.float64]
 
 # Monitored points on the unit disc: within the analysis area, at three radii and azimuths (the paper's A, B and C
 # are given in a figure only).
@@ -86,7 +84,7 @@ class ShapeReview:
     pairs: tuple[Pair, ...]
 
 
-def review_shapes(shapes: Shapes, held: NDArray[np.bool_], analysis_share: float) -> ShapeReview | None:
+def review_shapes(shapes: Shapes, held: BoolArray, analysis_share: float) -> ShapeReview | None:
     """Review of the cycles; None when fewer than three held ones are good.
 
     Parameters

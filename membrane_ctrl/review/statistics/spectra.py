@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import signal
 
-Column = NDArray[np.float64]
+from membrane_ctrl.model.arrays import Column
 
 # Enough segments for an estimate that is good to a third, and no segment longer than shows one more decade.
 _SEGMENTS = 8

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-Column = NDArray[np.float64]
+from membrane_ctrl.model.arrays import Column
+
 # Of a month there are millions: single precision, which counts ticks exactly.
 Seconds = NDArray[np.int32]
 Counts = NDArray[np.float32]

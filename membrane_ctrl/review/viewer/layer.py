@@ -12,6 +12,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import FIELDS, changes
 from membrane_ctrl.recorder.blueprint import TELEMETRY_LANES
 from membrane_ctrl.recorder.rerun_streams import event_text, event_time_s
@@ -21,8 +22,6 @@ from membrane_ctrl.review.report.figures import broken_at_gaps
 from membrane_ctrl.run_files import run_folder, streams, summary
 from membrane_ctrl.run_files.run import Block, Run
 from membrane_ctrl.run_files.shapes import Shapes, height_basis
-
-Column = NDArray[np.float64]
 
 APPLICATION = "membrane_review"
 # The viewer draws about this many rows of a dozen signals without stutter in software.

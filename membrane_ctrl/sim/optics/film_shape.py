@@ -11,11 +11,10 @@ from math import cos, isfinite, pi, radians, sin, sqrt
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics import film_terms
 
-FloatArray = NDArray[np.float64]
 MAX_ZERNIKE = 36  # all terms of radial order 7 or less
 
 

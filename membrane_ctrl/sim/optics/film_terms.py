@@ -6,10 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-FloatArray = NDArray[np.float64]
+from membrane_ctrl.model.arrays import FloatArray
 
 
 class FilmTerms(NamedTuple):
@@ -103,7 +102,7 @@ _TERMS = 40
 _POISSON = 0.3  # PET
 
 
-def _reciprocal(series: NDArray[np.float64]) -> NDArray[np.float64]:
+def _reciprocal(series: FloatArray) -> FloatArray:
     """Power series of 1 / series, to the same length."""
     inverse = np.zeros_like(series)
     inverse[0] = 1.0 / series[0]
@@ -112,7 +111,7 @@ def _reciprocal(series: NDArray[np.float64]) -> NDArray[np.float64]:
     return inverse
 
 
-def _force_series(b0: float) -> NDArray[np.float64]:
+def _force_series(b0: float) -> FloatArray:
     """b_k of the radial force n, given its value at the centre."""
     b = np.zeros(_TERMS)
     b[0] = b0
@@ -135,12 +134,12 @@ def _hencky_terms() -> tuple[float, ...]:
     return tuple(profile / profile.sum())
 
 
-def hencky_series() -> NDArray[np.float64]:
+def hencky_series() -> FloatArray:
     """Height of a Hencky bowl of unit sag above its vertex: element k multiplies rho^(2k); nu = 0.3."""
     return np.array(_hencky_terms())
 
 
-def paraboloid_series() -> NDArray[np.float64]:
+def paraboloid_series() -> FloatArray:
     """Height of a paraboloid of unit sag: rho^2."""
     return np.array([0.0, 1.0])
 
@@ -194,7 +193,7 @@ def _monomials(j: int) -> dict[tuple[int, int], float]:
     return terms
 
 
-def polynomial(coeffs: NDArray[np.float64]) -> NDArray[np.float64]:
+def polynomial(coeffs: FloatArray) -> FloatArray:
     """Sum of Zernike terms as a polynomial of the unit disc's x and y.
 
     Parameters

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import PatternConfig
+from membrane_ctrl.model.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 _GOLDEN, _MIX_1, _MIX_2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _LOW_16 = np.uint64(0xFFFF)
 

@@ -13,13 +13,11 @@ from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.section import Section
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
 
 # The `capture.toml` of a simulated set, and the truth beside it.
-
-
-FloatArray = NDArray[np.float64]
 _GRID = 201  # odd, so that the vertex is a point of the truth's map
 
 

@@ -5,19 +5,16 @@ from math import cos, radians, sin
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from membrane_ctrl.config.optics import HeightMapConfig, ScreenPoseConfig
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.sim.optics.film_terms import FilmTerms, height_and_slopes
 
 # Camera and screen of the twin as exact poses: rays out of the pinhole, and the plane they end on.
 #
 # World: origin at the mirror's vertex, x horizontal, y up, z out of the reflective side; mm.
-
-
-FloatArray = NDArray[np.float64]
 _UNDISTORT_STEPS = 200  # each gains a digit or so on a usual lens
 _UNDISTORT_TOLERANCE = 1e-14  # tangent of the ray's angle
 
@@ -179,7 +176,7 @@ class Trace:
     s_x_mm: FloatArray
     s_y_mm: FloatArray
 
-    def on_film(self, radius_mm: float) -> NDArray[np.bool_]:
+    def on_film(self, radius_mm: float) -> BoolArray:
         """Which rays met the film inside its rim, (N,)."""
         return self.x_mm**2 + self.y_mm**2 <= radius_mm**2
 

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_iface.roles import BenchCommand, BenchReading, LinkDownError, LinkError
 from membrane_ctrl.config.schema import Config
@@ -19,6 +18,7 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model import errors, shape_estimate, telemetry
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual.bench import VirtualBench
@@ -73,7 +73,7 @@ class VirtualRun:
         self,
         config: Config,
         bench: VirtualBench,
-        sag_sensitivity: NDArray[np.float64],
+        sag_sensitivity: FloatArray,
         shape: ShapeSource | None = None,
         alter: Alter | None = None,
     ) -> None:
@@ -168,7 +168,7 @@ def run_virtual(
     config: Config,
     plant: Plant,
     duration_s: float,
-    sag_sensitivity: NDArray[np.float64],
+    sag_sensitivity: FloatArray,
     shape: ShapeSource | None = None,
     alter: Alter | None = None,
 ) -> Iterator[VirtualTick]:
