@@ -13,4 +13,6 @@ _.frame_rms_adu, _.step_periods, _.white_sigma, _.fast_sigma, _.slow_sigma, _.se
 _.trace_pixels, _.on_film, _.back_sag_mm, _.pump_um_per_s  # the twin's truth, which tests compare with
 _.power_cycle, _.intrude, _.set_double  # faults that scenarios and tests bring about
 MemoryWire, run_virtual  # a device without a wire, a hold without a clock: tests and benchmarks
+ACTIONS  # every action of the port: a test asks each role for each
+_.__signature__  # Typer reads a command's options from it
 _.failing  # state of an outbox, which tests look at

@@ -8,14 +8,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_iface.display import response
 from firmware_iface.display.measures import Settling, checkerboard_problem, exposure_problem, settling, share_left
-from firmware_iface.display.response import (
-    RAMP_LEVELS,
-    DisplayResponse,
-    ScreenRaster,
-    checkerboard,
-    measured_response,
-)
 from firmware_iface.drivers import camera_aravis, camera_folder, camera_uvc, screen_pygame
 from firmware_iface.roles import Frame, LinkError
 from membrane_ctrl.acquisition.exposures import CycleClock
@@ -82,7 +76,7 @@ class DisplayTest:
     def checkerboard(self) -> str:
         """Whether the screen shows pixel for pixel; empty when it does."""
         white, black = self._still(self._grey(255)), self._still(self._grey(0))
-        return checkerboard_problem(self._still(checkerboard(self._size[1], self._size[0])), white, black)
+        return checkerboard_problem(self._still(response.checkerboard(self._size[1], self._size[0])), white, black)
 
     def settling(self) -> Settling:
         """Time from a command to the light, over steps both ways between black, white and two greys.
@@ -110,12 +104,12 @@ class DisplayTest:
         self.settle_s = found.settle_s
         return found
 
-    def response(self) -> DisplayResponse:
+    def response(self) -> response.DisplayResponse:
         """Light against level. Raises ValueError if the camera sees no ramp."""
-        frames = [self._still(self._grey(level)) for level in RAMP_LEVELS]
+        frames = [self._still(self._grey(level)) for level in response.RAMP_LEVELS]
         swing = frames[-1].astype(np.float64) - frames[0]
         lit = swing > 0.5 * np.quantile(swing, 0.99)
-        return measured_response(RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames])
+        return response.measured_response(response.RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames])
 
     def _still(self, levels: Levels) -> Frames:
         self._screen.show_levels(levels)
@@ -177,7 +171,7 @@ def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
         return OpticalBench(camera, camera)  # a folder of frames is both
     screen, pattern = devices.screen, config.optics.pattern
     try:
-        raster = ScreenRaster(
+        raster = response.ScreenRaster(
             screen.width_px, screen.height_px, screen.pixel_mm, pattern.periods, pattern.period_mm, screen.centre_px
         )
     except ValueError as error:
@@ -275,7 +269,7 @@ def _settle(screen: screen_pygame.PygameScreen, test: DisplayTest, measured: lis
 
 
 def _linearise(screen: screen_pygame.PygameScreen, test: DisplayTest, measured: list[str]) -> str:
-    response = test.response()
-    screen.linearise(response)
-    measured.append(f"screen's response corrected (gamma {response.gamma:.2f})")
+    curve = test.response()
+    screen.linearise(curve)
+    measured.append(f"screen's response corrected (gamma {curve.gamma:.2f})")
     return ""

@@ -8,15 +8,7 @@ from pydantic import Field
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.config.section import Section
-from membrane_ctrl.control.experiments import patterns, pump_map
-from membrane_ctrl.control.experiments.machine import (
-    Around,
-    ExcursionGuard,
-    Experiment,
-    Finished,
-    Measurement,
-    Patterned,
-)
+from membrane_ctrl.control.experiments import machine, patterns, pump_map
 from membrane_ctrl.control.gas import PumpCurve
 
 # What may be asked of an experiment: plain data with bounds, so that it can come over a wire.
@@ -65,18 +57,18 @@ class Trial:
     def __init__(self, spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre_um: float) -> None:
         self.spec = spec
         self._mapper: pump_map.PumpMapper | None = None
-        around = Around(
+        around = machine.Around(
             holding_flow_um_per_s=spec.holding_flow_um_per_s,
             least_flow_um_per_s=PumpCurve(pump).least_flow_um_per_s,
             full_flow_um_per_s=min(pump.flow_full_um_per_s, loop.flow_max_um_per_s),
             laser_um=spec.laser_um,
             limit_um=spec.limit_um,
         )
-        machine = self._machine(around, pump, centre_um)
-        self._guard = ExcursionGuard(machine, around, centre_um, loop.rate_hz)
+        experiment = self._machine(around, pump, centre_um)
+        self._guard = machine.ExcursionGuard(experiment, around, centre_um, loop.rate_hz)
         self._left_s = spec.duration_s
 
-    def _machine(self, around: Around, pump: PumpConfig, centre_um: float) -> Experiment:
+    def _machine(self, around: machine.Around, pump: PumpConfig, centre_um: float) -> machine.Experiment:
         spec = self.spec
         if spec.kind == "relay":
             return patterns.Relay(around, centre_um, spec.duration_s)
@@ -85,18 +77,20 @@ class Trial:
             fraction = pump.dead_fraction + (1 - pump.dead_fraction) * share
             self._mapper = pump_map.PumpMapper(centre_um, fraction, spec.holding_flow_um_per_s)
             return self._mapper
-        return Patterned(around, _PATTERNS[spec.kind](around, spec.gain), spec.duration_s, centre_um)
+        return machine.Patterned(around, _PATTERNS[spec.kind](around, spec.gain), spec.duration_s, centre_um)
 
     @property
     def raw(self) -> bool:
         """Its answers are pump commands (0..1), not flows."""
         return self.spec.kind == "pump_map"
 
-    def step(self, measurement: Measurement, dt_s: float) -> float | Finished:
+    def step(self, measurement: machine.Measurement, dt_s: float) -> float | machine.Finished:
         """One tick: what to put out until the next reading, or the end."""
         self._left_s -= dt_s
         if self.raw and self._left_s < 0:
-            return Finished(False, f"not done within {self.spec.duration_s:g} s: allow more time, or check the pump")
+            return machine.Finished(
+                False, f"not done within {self.spec.duration_s:g} s: allow more time, or check the pump"
+            )
         return self._guard.step(measurement, dt_s)
 
     def result(self) -> dict[str, Any]:
