@@ -1,4 +1,4 @@
-"""The laser's mount drifts 2 um/min for ten minutes: with the outer loop on rendered full-size frames, and without.
+"""The laser's mount drifts 2 um/min for ten minutes: with the shape loop on rendered full-size frames, and without.
 
 Virtual time: the same controller, the same camera frames, the same reconstruction; only nobody waits.
 """
@@ -42,6 +42,6 @@ def run() -> list[Figure]:
     """Both cases; the reference is the drift itself."""
     drift_um = DRIFT_UM_PER_MIN * MINUTES
     return [
-        at_most("true sag moved, outer loop on", true_sag_moved_um(True), "um", 1.0, "laser drift", drift_um),
-        at_most("true sag moved, outer loop off", true_sag_moved_um(False), "um", None, "laser drift", drift_um),
+        at_most("true sag moved, shape loop on", true_sag_moved_um(True), "um", 1.0, "laser drift", drift_um),
+        at_most("true sag moved, shape loop off", true_sag_moved_um(False), "um", None, "laser drift", drift_um),
     ]

@@ -2,7 +2,7 @@
 
 python -m benchmarks memory [the whole takes about ten minutes]
 
-Recorder, live screen and alarms are the real processes on the real rings. They get a week of a hold at 10 Hz as fast
+Recorder, console and alarms are the real processes on the real rings. They get a week of a hold at 10 Hz as fast
 as the recorder takes it. The hours that are compared, the first and the last two, are written second by second, as in
 a run: Rerun's index of an open segment grows with every write. The days between come in a minute a write. The run's
 clock is a number in shared memory. Shapes come once a minute of run. The acquisition measures frames of its twin
@@ -81,7 +81,7 @@ def hurried_recorder(spec: RecorderSpec, status: Connection) -> None:
 
 
 def quiet_screen(spec: ScreenSpec) -> None:
-    """The live screen without a terminal, and without anybody who reads it."""
+    """The console without a terminal, and without anybody who reads it."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     screen_main(spec)
 
@@ -145,7 +145,7 @@ def _children(
     alarms = AlarmsSpec(clock, rings["telemetry"], rings["events"], config.alarms, "week")
     return [
         Child("recorder", "benchmarks.memory:hurried_recorder", (spec, theirs), nice=5),
-        Child("live screen", "benchmarks.memory:quiet_screen", (screen,), nice=5),
+        Child("console", "benchmarks.memory:quiet_screen", (screen,), nice=5),
         Child("alarms", "benchmarks.memory:mute_alarms", (alarms,), nice=5),
     ], ours
 

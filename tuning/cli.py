@@ -45,7 +45,7 @@ _STEPS = {
     "verify": "Ten minutes of hold with the new gains, judged in stages: kept, or taken back (exit 3).",
     "run": "All steps that are not done yet.",
     "pump": "Map the pump (start, stall, gain, leak); later steps of the session use it.",
-    "outer": "Sag sensitivity, noise and drift of the figure; time constant of the outer loop.",
+    "outer": "Sag sensitivity, noise and drift of the figure; time constant of the shape loop.",
     "watch": "Look at a hold without touching it, and say whether a session is due (exit 3).",
     "rollback": "Back to the gains before those that were kept last.",
 }

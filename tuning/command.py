@@ -104,20 +104,20 @@ def map_pump(options: TuneOptions) -> int:
 
 
 def outer(options: TuneOptions) -> int:
-    """Sag sensitivity, noise and drift of the figure; the outer loop's time constant."""
+    """Sag sensitivity, noise and drift of the figure; the shape loop's time constant."""
     from membrane_ctrl.metrology.optics.hencky import zernike_projection
     from tuning.identification.outer_loop import TYPICAL_S as OUTER_S
     from tuning.identification.outer_loop import evaluate, step_experiment
 
     with _session(options) as (folder, rig, progress):
-        progress.begin("outer loop", OUTER_S + options.observe_s, 0.0)
+        progress.begin("shape loop", OUTER_S + options.observe_s, 0.0)
         rig.hold(options.observe_s)
         steady = [shape for shape in rig.shapes if shape.verdict != "rejected"]
         levels = step_experiment(rig, rig.loop.setpoint_um, folder.config.shape.enabled)
         try:
             found = evaluate(levels, steady, zernike_projection())
         except ValueError as error:
-            raise RejectedError(f"outer loop: {error}") from None
+            raise RejectedError(f"shape loop: {error}") from None
         plain.write(folder.file("outer.json"), found)
         progress.say(
             f"sag seen per um of the laser's {found.scale:.3f}, noise {found.sigma_um:.2f} um a cycle of "

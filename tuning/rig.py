@@ -164,7 +164,7 @@ class HoldRig:
         return self.record([self._next_held() for _ in range(round(duration_s / self.dt_s))])
 
     def hold_about(self, duration_s: float) -> tuple[Record, Series]:
-        """As `hold`, with the setpoint of each sample in um: the outer loop moves it, and the mirror with it."""
+        """As `hold`, with the setpoint of each sample in um: the shape loop moves it, and the mirror with it."""
         rows = [self._next_held() for _ in range(round(duration_s / self.dt_s))]
         record = self.record(rows)
         ticks = np.array([row.tick + row.missed_ticks for row in rows])
@@ -210,7 +210,7 @@ class HoldRig:
         self._link.ask(Command("setpoint", self._who, why, value=setpoint_um))
 
     def shape_loop(self, on: bool, why: str) -> None:
-        """Switch the outer loop."""
+        """Switch the shape loop."""
         self._link.ask(Command("shape_on" if on else "shape_off", self._who, why))
 
     def go_back(self, loop: LoopConfig) -> None:

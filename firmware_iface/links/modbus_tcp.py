@@ -17,7 +17,7 @@ from pymodbus.pdu import ExceptionResponse, ModbusPDU
 from firmware_iface.links import modbus_rules, serial_port
 from firmware_iface.roles import LinkDownError, LinkError, LinkWaitsError
 
-# the library reports in its log what is raised here as well; without a handler it would write into the live screen
+# the library reports in its log what is raised here as well; without a handler it would write into the console
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 # a peer that lost its power sends no end of connection: after this many unanswered requests in a row, and one more

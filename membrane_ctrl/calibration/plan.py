@@ -37,7 +37,7 @@ class Held:
     swing_adu : float
         Amplitude of the fringes.
     shape_on : bool
-        Whether the outer loop is on.
+        Whether the shape loop is on.
     """
 
     setpoint_um: float

@@ -29,7 +29,7 @@ class Head:
     start_um : float
         Setpoint to come back to; what was measured by hand is taken to hold for a mirror that stands there.
     shape_on : bool
-        Whether the outer loop was on.
+        Whether the shape loop was on.
     setpoints_um : tuple of float
         Of the sets, in their order.
     """

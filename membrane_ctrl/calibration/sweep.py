@@ -139,7 +139,7 @@ class Sweep:
         return event
 
     def shape_loop(self, on: bool) -> None:
-        """Switch the outer loop."""
+        """Switch the shape loop."""
         self._ask("shape_on" if on else "shape_off")
 
     def _capture(self) -> events.Event:

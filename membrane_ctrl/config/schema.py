@@ -118,7 +118,7 @@ class ResumeConfig(Section):
 
 
 class ShapeConfig(Section):
-    """The measurement cycle and the outer loop."""
+    """The measurement cycle and the shape loop."""
 
     enabled: bool = True
     period_s: Annotated[float, Field(ge=0.2, le=3600)] = 2.0

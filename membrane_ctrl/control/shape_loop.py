@@ -1,4 +1,4 @@
-"""The outer loop: moves the setpoint so that the figure stays although the laser's mount drifts. Pure.
+"""The shape loop: moves the setpoint so that the figure stays although the laser's mount drifts. Pure.
 
 The laser reads y = d + b: the mirror's centre d and the drift b of its mount. The camera sees the sag, and the ring
 stays where it is, so the change of sag is the change of d. Against a reference taken at lock

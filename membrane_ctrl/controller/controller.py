@@ -54,7 +54,7 @@ class Controller:
     config : Config
         The run's configuration.
     sag_sensitivity : (36,) array
-        Zernike coefficients of a Hencky bowl per sag, in um per um, for the outer loop.
+        Zernike coefficients of a Hencky bowl per sag, in um per um, for the shape loop.
     """
 
     def __init__(self, config: Config, sag_sensitivity: FloatArray) -> None:

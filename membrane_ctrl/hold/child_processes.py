@@ -184,7 +184,7 @@ def _frames(config: Config, stack: ExitStack) -> FrameAddress:
 
 
 class Crew:
-    """Recorder, live screen, acquisition and alarms of one run. The hold goes on without any of them, and says so."""
+    """Recorder, console, acquisition and alarms of one run. The hold goes on without any of them, and says so."""
 
     def __init__(
         self, config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str, duration_s: float | None

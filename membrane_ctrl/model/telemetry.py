@@ -1,4 +1,4 @@
-"""One row of telemetry a tick: what the recorder stores and the live screen shows.
+"""One row of telemetry a tick: what the recorder stores and the console shows.
 
 A row crosses to the other processes as plain doubles, so that writing it costs the tick a few microseconds.
 Codes (state, shape state, fault, rung) are small integers; their names are in `states.py`.

@@ -89,7 +89,7 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
     # ctrl-C reaches the whole terminal group: the supervisor decides when the run is over, with the "end" event
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(STOP, lambda *_: asked.set())
-    os.environ["RUST_LOG"] = "off"  # Rerun's own log would write over the live screen; its errors come as exceptions
+    os.environ["RUST_LOG"] = "off"  # Rerun's own log would write over the console; its errors come as exceptions
     # read when Rerun is imported: its allocator gives back at once what a closed segment leaves, or 30 MB would stay
     os.environ["MIMALLOC_PURGE_DELAY"] = "0"
     if not _record(spec, reporter(status), asked.is_set, parent_died):

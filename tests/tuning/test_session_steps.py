@@ -1,4 +1,4 @@
-"""Verification, outer loop, watch and files of a session, each by itself on made-up data."""
+"""Verification, shape loop, watch and files of a session, each by itself on made-up data."""
 
 from __future__ import annotations
 

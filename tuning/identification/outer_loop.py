@@ -1,9 +1,9 @@
-"""The outer loop: how the figure answers to sag, how noisy and how steady its measurement is, and the time constant.
+"""The shape loop: how the figure answers to sag, how noisy and how steady its measurement is, and the time constant.
 
 A small step of the setpoint moves the sag by a known amount: the change of the Zernike vector over it is the
 sensitivity. Sag by deflectometry less the laser's reading is, while the mirror is held, the deflectometry's noise and
 the drift between the two: white noise of sigma a cycle of length T, and a random walk of q um/sqrt(s). The best
-time constant between them is (docs/physics.md, outer loop)
+time constant between them is (docs/physics.md, shape loop)
 
     tau = sigma sqrt(T) / q.
 """
@@ -138,18 +138,18 @@ def step_experiment(rig: HoldRig, setpoint_um: float, restore: bool) -> list[lis
         The shape loop is switched on again.
     """
     levels: list[list[ShapeEstimate]] = []
-    rig.shape_loop(False, "outer loop: the step is the session's")
+    rig.shape_loop(False, "shape loop: the step is the session's")
     try:
         for target_um in (setpoint_um, setpoint_um + STEP_UM, setpoint_um):
-            rig.setpoint(target_um, "outer loop: sag sensitivity")
+            rig.setpoint(target_um, "shape loop: sag sensitivity")
             rig.hold(_SETTLE_S)
             before = len(rig.shapes)
             rig.hold(_LEVEL_S)
             levels.append([shape for shape in rig.shapes[before:] if shape.verdict != "rejected"])
     finally:
-        rig.setpoint(setpoint_um, "outer loop: back")
+        rig.setpoint(setpoint_um, "shape loop: back")
         if restore:
-            rig.shape_loop(True, "outer loop: the step is over")
+            rig.shape_loop(True, "shape loop: the step is over")
     if min(len(level) for level in levels) < _LEAST_CYCLES:
         raise HoldError(
             f"fewer than {_LEAST_CYCLES} shapes a level: is the shape measured at all, and every few seconds?"
