@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from campaign import DOCUMENT, STORIES, document, run_all, run_story
+from campaign import DOCUMENT, SEEDS, STORIES, document, run_all, run_story
 from campaign_cases import CASES, SITUATIONS, Case, Situation
 from campaign_rooms import ROOMS
 from campaign_run import run_case
 
 from membrane_ctrl.controller.safe_levels import Ladder
-from membrane_ctrl.controller.safety import Observation, SafetyTable, Verdict
+from membrane_ctrl.controller.safety import TABLE, Observation, SafetyTable, Verdict
 from membrane_ctrl.model.states import Rung, State
 
 
@@ -69,9 +69,19 @@ def test_the_watch_sees_a_board_without_a_watchdog(monkeypatch: pytest.MonkeyPat
     assert run_case(case_called("process stopped for ever"), at("hold"), 1).violations
 
 
-def test_the_committed_matrix_is_of_these_faults() -> None:
+def test_the_committed_matrix_is_of_these_faults_stories_and_rules() -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
-    assert ", 0 violations of an invariant.**" in text
+    lines = text.partition("## With real processes")[0].splitlines()
+    runs, stories = len(CASES) * len(SITUATIONS) * len(SEEDS), (*STORIES, *ROOMS)
+    assert f"**{runs} runs and {len(stories)} stories, 0 violations of an invariant.**" in lines
+    firsts = [line.split(" | ")[0].removeprefix("| ") for line in lines]
+    assert "| fault | " + " | ".join(at.name for at in SITUATIONS) + " |" in lines
+    for name in [*(case.name for case in CASES), *(story.__name__.replace("_", " ") for story in stories)]:
+        assert firsts.count(name) == 1, name
+    for rule in TABLE:
+        assert firsts.count(f"{rule.code} `{rule.name}`") == 1, rule.name
+    assert "**nowhere**" not in text
+    assert "bad**" not in text
 
 
 @pytest.mark.campaign
