@@ -1,5 +1,7 @@
 """The subcommands of `membrane-ctrl tune`: thin, and quick to import."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
