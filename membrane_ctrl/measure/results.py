@@ -1,5 +1,7 @@
 """What `measure` leaves in a folder: `result.json` and `height.npz` (INTERFACES section 5), and `details.json`."""
 
+from __future__ import annotations
+
 import io
 import json
 import math
