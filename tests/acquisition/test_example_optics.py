@@ -84,11 +84,12 @@ def camera(tmp_path: Path) -> Iterator[GigeCameraEmulator]:
 async def check(config: Config, path: Path) -> tuple[int, dict[str, Any], str]:
     """Exit code, the camera's probe, standard error."""
     path.write_text(dump(config), encoding="utf-8")  # noqa: ASYNC240
-    patient = Path(__file__).parents[2] / "patience.py"
+    patient = Path(__file__).parents[1] / "patience.py"
     command = [sys.executable, str(patient), "check", str(path), "--json"]
     pipe = asyncio.subprocess.PIPE
     process = await asyncio.create_subprocess_exec(*command, stdout=pipe, stderr=pipe)
     out, err = await process.communicate()
+    assert out, err
     probes = {probe["role"]: probe for probe in json.loads(out)["devices"]}
     assert process.returncode is not None
     return process.returncode, probes["camera"], err.decode()
