@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Event as Flag
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import rerun as rr
 from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import Config
@@ -24,7 +23,9 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.processes.child import STOP, alive, reporter
 from membrane_ctrl.processes.frames import FrameHead, FrameReader, Pixels
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
-from membrane_ctrl.recorder.sink import Recording
+
+if TYPE_CHECKING:
+    from membrane_ctrl.recorder.sink import Recording
 
 # Rings are emptied this often: the telemetry ring has to hold a few of these.
 POLL_S = 0.25
@@ -164,7 +165,7 @@ _JPEG_QUALITY = 80
 class Thumbnails:
     """Takes the newest frame of each pattern from the shared frames, at most one set each `THUMBNAIL_INTERVAL_S`."""
 
-    def __init__(self, recording: Recording, address: FrameAddress) -> None:
+    def __init__(self, recording: "Recording", address: FrameAddress) -> None:
         self._recording = recording
         self._reader = FrameReader(address)
         self._step = max(1, address.height_px // THUMBNAIL_HEIGHT_PX)
@@ -173,6 +174,8 @@ class Thumbnails:
 
     def send(self, now_s: float) -> None:
         """Send a set if one is due and there are new frames."""
+        import rerun as rr
+
         if now_s < self._next_s:
             return
         newest: dict[str, FrameHead] = {head.pattern: head for head in self._reader.heads()}
