@@ -31,7 +31,7 @@ def load(path: Path, model: type[Model], follow: bool = True) -> Model:
     model : type
         What it must hold (`config.Config` for a run).
     follow : bool
-        The file is the user's own; False for one in a folder that may come from anywhere (`recording.atomic`).
+        The file is the user's own; False for one in a folder from an untrusted source (`model.files`).
 
     Raises
     ------

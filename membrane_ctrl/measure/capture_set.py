@@ -1,4 +1,4 @@
-"""Capture sets on disk (INTERFACES section 3): `capture.toml` and one image a frame, read and checked.
+"""Capture sets on disk (docs/interfaces.md, section 3): `capture.toml` and one image per frame, read and checked.
 
 What is wrong with the description of a set is an InputError. What is wrong with single frames (missing, unreadable,
 of another size or depth than the rest) is kept beside the frames: the measurement decides whether it can do without.

@@ -1,4 +1,4 @@
-"""One capture set on disk to its full result: what `measure` and every analysis of many sets call."""
+"""One capture set on disk to its full result; `measure` and every analysis of many sets use it."""
 
 import math
 import time
@@ -19,14 +19,14 @@ from membrane_ctrl.model import errors, shape_estimate
 
 @dataclass(frozen=True)
 class Measurement:
-    """What became of a set.
+    """Result of a capture set.
 
     Attributes
     ----------
     head : CaptureHead
         The set.
     verdict : "ok", "degraded" or "rejected"
-        The worst that was found; `reason` says it.
+        The worst finding; `reason` names it.
     flags : tuple of Flag
         Frames that do not belong to the set.
     checked, full : Checked, FullResult or None
@@ -73,7 +73,7 @@ def measure_set(
     Raises
     ------
     InputError
-        If the set or its reference is not one.
+        If the set or its reference is invalid.
     """
     begin = time.perf_counter()
     capture = read_set(folder, geometry)
@@ -156,13 +156,13 @@ class SetFigure:
     Attributes
     ----------
     head : CaptureHead
-        What the set says of itself.
+        The set's own description.
     checked, figure : Checked, BinFigure
         Its frames and its surface.
     verdict : "ok" or "degraded"
         With its reason.
     time_s, displacement_um : float
-        Means over the sinusoids; NaN where the set says nothing.
+        Means over the sinusoids; NaN where the set states none.
     """
 
     head: CaptureHead
@@ -179,7 +179,7 @@ class SetFigure:
 
 
 class Figures:
-    """Figures of sets, one after the other; remembers the last reference, which most sets of a run share.
+    """Figures of sets, one after the other; caches the last reference, which most sets of a run share.
 
     Parameters
     ----------
@@ -198,9 +198,9 @@ class Figures:
         Raises
         ------
         InputError
-            If the set or its reference is not one.
+            If the set or its reference is invalid.
         RejectedError
-            If its frames give no figure that may be used.
+            If its frames give no usable figure.
         """
         capture = read_set(folder, self._geometry)
         anchor = None

@@ -94,14 +94,14 @@ class LiveReconstructor:
         Parameters
         ----------
         frames : sequence of (height, width) uint8 or uint16 arrays
-            In the order of `patterns.full_sequence`.
+            In the order of `phase.full_sequence`.
         time_s, displacement_um : (frames,) arrays
             Of each exposure; NaN where there is no laser reading.
 
         Returns
         -------
         ShapeEstimate
-            Verdict "rejected" with the reason when the images do not carry a figure.
+            Verdict "rejected" with the reason when the images give no figure.
 
         Raises
         ------
@@ -130,7 +130,7 @@ class LiveReconstructor:
         return self._follow("full", state, times, readings)
 
     def fringes(self, frames: Sequence[phasor.Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
-        """One fringes-only cycle of 2 N frames, in the order of `patterns.fringe_sequence`; else as `full`.
+        """One fringes-only cycle of 2 N frames, in the order of `phase.fringe_sequence`; else as `full`.
 
         Verdict "rejected" with a reason that starts with "tracking lost" asks for a full cycle.
         """
@@ -156,7 +156,7 @@ class LiveReconstructor:
     def geometry_covariance_um2(self) -> FloatArray:
         """Covariance (36, 36) of the coefficients from how well the geometry is known, as of the last full cycle.
 
-        It is common to all cycles: to be added to a cycle's own for a figure that stands alone, and not for changes.
+        It is common to all cycles: to be added to a cycle's own for a single figure, not for changes.
         NaN before the first full cycle and without a spread.
         """
         to_coeffs = surface.parameter_to_coeffs()

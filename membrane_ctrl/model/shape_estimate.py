@@ -33,7 +33,7 @@ class ShapeEstimate:
         Noll j = 1..36, orthonormal over `mirror.radius_mm`, of the height measured from the vertex;
         piston makes the surface 0 at the vertex.
     hencky_um : float
-        Amplitude of the part of a Hencky bowl that the 36 terms cannot carry, as the sag of that bowl.
+        Amplitude of the part of a Hencky bowl that the 36 terms cannot represent, as the sag of that bowl.
     covariance_um2 : (36, 36) array
         Of `coeffs_um`, from pixel noise and the residual of the fit.
     sag_um : float

@@ -61,7 +61,7 @@ class Run:
     ----------
     folder : Path
     config : Config
-        As run; of a version that is not ours, what of it can be read, the rest at its default.
+        As run; of another version, the keys that can be read, the rest at their defaults.
     events : tuple of dict
         `events.jsonl` and the annotations made later, in the order of time.
     summary : dict or None
@@ -69,7 +69,7 @@ class Run:
     origin_utc : datetime
         UTC at 0 s of the run.
     notes : list of str
-        What is missing or damaged, a line each; reading may add to it.
+        What is missing or damaged, one line each; reading may add to it.
     """
 
     folder: Path
@@ -85,7 +85,7 @@ class Run:
         return self.folder.name
 
     def utc(self, mono_s: float) -> datetime:
-        """UTC of a second of the run; of one that is none, as damaged tables may have, of its start."""
+        """UTC of a second of the run; for an impossible one, as in damaged tables, of its start."""
         return self.origin_utc + timedelta(seconds=mono_s if abs(mono_s) < _RUN_MAX_S else 0.0)
 
     def events_between(self, start_s: float, end_s: float) -> tuple[dict[str, Any], ...]:
@@ -135,7 +135,7 @@ class Run:
         end_s: float = np.inf,
         names: Sequence[str] = LEVEL_NAMES,
     ) -> Block:
-        """Overview: least, mean and greatest of each signal in windows of 1, 10 or 60 s (`recording.levels`).
+        """Overview: least, mean and greatest of each signal in windows of 1, 10 or 60 s (`run_files.tables`).
 
         What is not in the table of the level is made from the next finer one, in the end from the ticks.
         """
@@ -175,7 +175,7 @@ class Run:
         return shapes.joined(found)
 
     def look_through(self) -> None:
-        """See that every table and segment is whole, so that `notes` names what is damaged.
+        """Check that every table and segment is whole, so that `notes` names the damage.
 
         A segment whose messages follow one another is not decoded: that would take minutes for a month.
         """
@@ -230,7 +230,7 @@ def _listed(blocks: Generator[Block, None, _Reach]) -> tuple[list[Block], _Reach
 
 
 def open_run(path: Path | str) -> Run:
-    """Open a run folder, also one that is still going, was killed, or lacks parts.
+    """Open a run folder, also of a run that is in progress, was killed, or lacks parts.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ def open_run(path: Path | str) -> Run:
     Raises
     ------
     InputError
-        If there is no such folder, or nothing in it is of a run.
+        If there is no such folder, or it holds nothing of a run.
     """
     folder = run_folder.find_folder(Path(path))
     notes: list[str] = []

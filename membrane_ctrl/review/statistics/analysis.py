@@ -1,4 +1,4 @@
-"""Everything a report says of a run, computed once; `report_json` and `report_html` only write it down."""
+"""All figures of a run's report, computed once; `review/report/json.py` and `html.py` only write them."""
 
 import math
 from dataclasses import dataclass
