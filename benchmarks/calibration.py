@@ -20,7 +20,7 @@ from membrane_ctrl.config.schema import CameraConfig, CameraPoseConfig, Geometry
 from membrane_ctrl.metrology.calibrate.diagnose import suspects
 from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, Bench, bench_at, sigmas
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
-from membrane_ctrl.metrology.calibrate.separable import Witness
+from membrane_ctrl.metrology.calibrate.separable import References
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, solve, surface_of
 from membrane_ctrl.metrology.checked import check
 from membrane_ctrl.metrology.frames.frame_stack import FrameStack
@@ -96,7 +96,7 @@ def _config(geometry: Geometry) -> GeometryConfig:
 
 def _problem(sets: tuple[SetPhases, ...], free: dict[str, float] | None = None) -> Problem:
     stated = Geometry.from_config(OpticsConfig(geometry=STATED, camera=_camera(4)))
-    return Problem(stated, sets, sigmas(free), Witness(0.0), 500.0)
+    return Problem(stated, sets, sigmas(free), References(0.0), 500.0)
 
 
 def _plain(problem: Problem) -> Problem:
@@ -116,7 +116,7 @@ def _plain(problem: Problem) -> Problem:
                 few.displacement_um,
             )
         )
-    return Problem(problem.stated, tuple(sets), sigmas(held), Witness(0.0, 1.0, 1e6), problem.radius_mm)
+    return Problem(problem.stated, tuple(sets), sigmas(held), References(0.0, 1.0, 1e6), problem.radius_mm)
 
 
 def _errors_um(surface: Surface, film: FilmShape, moved_um: float) -> tuple[float, float]:

@@ -134,7 +134,7 @@ class KeyenceDlRs1a(LinkedDevice):
             _refuse(self._link.name, errors[2])
         if bits := int(errors[1] or 0):
             raise DeviceRefusedError(f"{self._link.name}: amplifier in error (state {bits:016b}); see its manual")
-        await self._reading()  # the witness of the first one
+        await self._reading()  # the first one is confirmed by a second
         detail = f"amplifier {self._amplifier} of {len(values)}, steps of {_STEPS_UM[self._decimals]:g} um"
         return DeviceIdentity("Keyence DL-RS1A", "", "", detail)
 

@@ -41,7 +41,7 @@ class StepGate:
     """Passes a value within `step` of either of the last two, passed or not.
 
     A hit reading is alone and is stopped; the good one after it still has the good one before. A true step is stopped
-    once and passes with its second reading. The first value of all has no witness and is stopped.
+    once and passes with its second reading. The first value of all has nothing to confirm it and is stopped.
     """
 
     def __init__(self, step: float) -> None:

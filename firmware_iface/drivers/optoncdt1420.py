@@ -186,7 +186,7 @@ class Optoncdt1420(linked_device.LinkedDevice):
         return text
 
     async def _first_readings(self) -> None:
-        """The gate wants a witness: the first reading is its own."""
+        """The gate wants a second reading to confirm the first."""
         for _ in range(2):
             await self._wait_for_values()
             values = self._taken()

@@ -231,10 +231,10 @@ def problem_of(bundle: Bundle, free: dict[str, float], laser_sigma_um: float) ->
         geometry = Geometry.from_config(bundle.optics)
     except ValueError as error:
         raise InputError(str(error)) from None
-    witness = separable.Witness(bundle.reference_um, laser_sigma_um)
+    references = separable.References(bundle.reference_um, laser_sigma_um)
     if sum(math.isfinite(phases.displacement_um) for phases in bundle.sets) < 2:
         own[LASER.name] = 0.0  # a scale of nothing
-    return Problem(geometry, bundle.sets, sigmas({**own, **free}), witness, bundle.optics.mirror.radius_mm)
+    return Problem(geometry, bundle.sets, sigmas({**own, **free}), references, bundle.optics.mirror.radius_mm)
 
 
 def _write(

@@ -122,7 +122,7 @@ class LeakGrowth:
         return f"the film takes {takes_um_per_s:.1f} um/s of gas, before {usual_um_per_s:.1f} um/s"
 
 
-class FilmWitness:
+class FilmMonitor:
     """Compares laser and gauge on every tick in which the pump may run.
 
     Parameters

@@ -79,7 +79,7 @@ _PRESSURE_PA = (50e3, 110e3)
 _TEMPERATURE_C = (-20.0, 60.0)
 
 
-def weather_complaint(ambient_pressure_pa: float, air_temperature_c: float) -> str:
+def weather_fault(ambient_pressure_pa: float, air_temperature_c: float) -> str:
     """Which of the two cannot be what it is said to be; a sensor that is not there (NaN) is none."""
     if not _believed(ambient_pressure_pa, _PRESSURE_PA):
         return f"the barometer reads {ambient_pressure_pa:g} Pa: check its unit; the feed-forward does without it"

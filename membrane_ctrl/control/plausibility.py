@@ -1,4 +1,4 @@
-"""Laser against optics, with the gauge pressure as third witness: who of them lies? Pure.
+"""Laser against optics, with the gauge pressure as arbiter: which one is wrong? Pure.
 
 All three see the sag of the mirror film change: the laser as d, the camera as sag, the gauge as pressure, which for a
 Hencky film (w ~ p^(1/3)) is dw = w / (3 p) dp. The gauge is too noisy to hold a mirror with (0.5 Pa are 10 um) but as
@@ -21,7 +21,7 @@ SMOOTH_S = 10.0
 REFERENCE_S = 120.0
 # A reference is good once the smoothing has settled.
 WARM_S = 3 * SMOOTH_S
-# The witness must be nearer to one of them by this factor to speak.
+# The gauge must be nearer to one of them by this factor to speak.
 CLEARER = 2.0
 
 
@@ -48,7 +48,7 @@ class Changes:
 
 
 class Plausibility:
-    """Judges on every tick; says NOBODY without a camera, for two witnesses can only disagree.
+    """Judges on every tick; says NOBODY without a camera, for two sensors can only disagree.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from membrane_ctrl.model.errors import DeviceError
 
 Message = dict[str, Any]
 _ANSWER_S = 10.0
-_TURN = struct.pack("ll", 10, 0)  # to wait at the door: s and us, as the kernel takes a time-out
+_TURN = struct.pack("ll", 10, 0)  # to wait for one's turn: s and us, as the kernel takes a time-out
 
 
 class PortClient:
@@ -60,7 +60,7 @@ class PortClient:
     def unix(cls, path: Path, notice: Callable[[str], None]) -> PortClient:
         """Connect to a socket file."""
         connection = socket.socket(socket.AF_UNIX)
-        # While others crowd the door, connecting waits its turn only if it blocks; with Python's own time-out it
+        # While others crowd the endpoint, connecting waits its turn only if it blocks; with Python's own time-out it
         # would be refused at once.
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TURN)
         try:

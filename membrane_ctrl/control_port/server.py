@@ -1,8 +1,8 @@
 """The port as the run sees it: hears what every tick decided, asks the next one.
 
 The control process has one thread and one loop: what is done here is done between two ticks, and all of it is
-bounded: connections, messages, their rate, what waits to be sent. A door that fails opens again by itself
-(`door.Door`): a hold that cannot be asked is no reason to let the mirror down, and signals still stop it.
+bounded: connections, messages, their rate, what waits to be sent. An endpoint that fails opens again by itself
+(`endpoint.Endpoint`): a hold that cannot be asked is no reason to let the mirror down, and signals still stop it.
 """
 
 import asyncio
@@ -18,9 +18,9 @@ from membrane_ctrl.config.port import PortConfig
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.config.toml_file import parse
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
-from membrane_ctrl.control_port.door import Door, LetIn, Refusals, Welcome
+from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
 from membrane_ctrl.control_port.protocol import KINDS, VERSION, Request, Wire
-from membrane_ctrl.control_port.session import FREE, Helm, Peer, Session, may_not
+from membrane_ctrl.control_port.session import FREE, Commander, Peer, Session, may_not
 from membrane_ctrl.control_port.status import Picture, metrics_text, serve_metrics
 from membrane_ctrl.control_port.tls import Listeners
 from membrane_ctrl.controller import commands, tick
@@ -74,7 +74,7 @@ class Port:
     def __init__(self, config: PortConfig, listeners: Listeners, run: str, hooks: RunHooks) -> None:
         self._listeners, self._run, self._hooks = listeners, run, hooks
         self._tell, self._now = hooks.tell, hooks.now
-        self._helm = Helm(config.commander_lapses_s)
+        self._commander = Commander(config.commander_lapses_s)
         self._refusals = Refusals(hooks.tell, hooks.now)
         self._picture = Picture()
         self._numbers = itertools.count(1)
@@ -110,10 +110,10 @@ class Port:
             asked.append(("tls", listeners.tls.socket, self._welcome_tls))
         if listeners.metrics is not None:
             asked.append(("metrics", listeners.metrics, self._welcome_metrics))
-        doors = [Door(*each, self._tell, self._turned_away) for each in asked]
-        for door in doors:
-            door.open()
-        if doors:
+        endpoints = [Endpoint(*each, self._tell, self._turned_away) for each in asked]
+        for endpoint in endpoints:
+            endpoint.open()
+        if endpoints:
             self._tell({"kind": "port", **listeners.addresses})
         try:
             yield
@@ -124,15 +124,15 @@ class Port:
                     future.set_result(_OVER)
             while self._waiting:  # noqa: ASYNC110  an answer is sent in the same step that takes it from here
                 await asyncio.sleep(0.0)
-            for door in doors:
-                await door.close()
+            for endpoint in endpoints:
+                await endpoint.close()
 
     def status(self) -> dict[str, Any]:
         """What `status` answers and `watch` streams."""
         return {
             "run": self._run,
             **self._picture.status(),
-            "commander": self._helm.holder(self._now()) or None,
+            "commander": self._commander.holder(self._now()) or None,
             "clients": len(self._sessions),
         }
 
@@ -174,7 +174,7 @@ class Port:
             "run": self._run,
             "you": peer.who,
             "role": peer.role,
-            "commander": self._helm.holder(self._now()) or None,
+            "commander": self._commander.holder(self._now()) or None,
         }
         try:
             await session.run(greeting, self._answer, self._refusals.record)
@@ -196,7 +196,7 @@ class Port:
     async def _answer(self, session: Session, request: Request) -> dict[str, Any]:
         """Do what is asked, or say why not. What the controller refuses, it records itself."""
         peer = session.peer
-        refusal = may_not(peer, request.do) or self._take_helm(peer, request)
+        refusal = may_not(peer, request.do) or self._claim_command(peer, request)
         if not refusal and request.do not in commands.TABLE:
             return self._run_errand(session, request)
         try:
@@ -211,11 +211,11 @@ class Port:
             return {"ok": False, "refused": refusal}
         return {"ok": True, "state": self._picture.status()["state"]}
 
-    def _take_helm(self, peer: Peer, request: Request) -> str:
+    def _claim_command(self, peer: Peer, request: Request) -> str:
         if request.do in FREE:
             return ""
-        former = self._helm.holder(self._now())
-        refusal = self._helm.claim(peer.who, request.take_over, self._now())
+        former = self._commander.holder(self._now())
+        refusal = self._commander.claim(peer.who, request.take_over, self._now())
         if not refusal and former != peer.who:
             self._tell({"kind": "commander", "who": peer.who, "former": former or None, "why": request.why})
             for session in self._sessions:
@@ -231,7 +231,7 @@ class Port:
             case "watch":
                 session.watch(request.period_s)
             case "release":
-                self._helm.release(who)
+                self._commander.release(who)
                 self._tell({"kind": "commander", "who": None, "former": who, "why": request.why})
             case "quiet":
                 self._tell({"kind": "alarms_acknowledged", "who": who, "why": request.why})

@@ -37,7 +37,7 @@ def may_not(peer: Peer, do: Action) -> str:
     return f"{do} takes the role {needed}; {peer.who} has {peer.role}"
 
 
-class Helm:
+class Commander:
     """One commander at a time; the first to command has it until it is given back, taken over, or lapses.
 
     Parameters

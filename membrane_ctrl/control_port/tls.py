@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from membrane_ctrl.config.port import PortConfig, TlsConfig
-from membrane_ctrl.control_port import door, protocol, session
+from membrane_ctrl.control_port import endpoint, protocol, session
 from membrane_ctrl.control_port.unix import SOCKET_NAME, UnixListener
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model.errors import DeviceError, InputError
@@ -106,7 +106,7 @@ def load_authority(context: ssl.SSLContext, authority: Path) -> None:
 def listen_tcp(host: str, port: int, field: str) -> socket.socket:
     """A listening socket. Raises DeviceError naming the configuration's field."""
     try:
-        listener = socket.create_server((host, port), backlog=door.BACKLOG)
+        listener = socket.create_server((host, port), backlog=endpoint.BACKLOG)
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise DeviceError(f"{field}: cannot listen on {host}:{port} ({reason})") from None

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from membrane_ctrl.control_port import door, session
+from membrane_ctrl.control_port import endpoint, session
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model.errors import DeviceError, InputError
 
@@ -100,7 +100,7 @@ def _bound(path: Path, group: str | None) -> socket.socket:
             listener.bind(address)
         if group is not None:
             os.chown(path, -1, grp.getgrnam(group).gr_gid)
-        listener.listen(door.BACKLOG)
+        listener.listen(endpoint.BACKLOG)
     except KeyError:
         listener.close()
         path.unlink()

@@ -1,7 +1,7 @@
 """One tick of control: observe, judge, act. Pure of I/O and clock, so that a run, a replay and a test are the same.
 
 The order is fixed: what the bench shows becomes an observation; the safety table judges it; only then the state's
-handler runs, and what it wants is overruled wherever the ladder says so. Every path through a tick ends here.
+handler runs, and what it wants is overruled wherever a safe level is in force. Every path through a tick ends here.
 """
 
 import math
@@ -63,11 +63,11 @@ class Controller:
         self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity)
         observer = Observer(config.limits)
         loop = inner_loop.InnerLoop(config.loop, config.pump)
-        ladder, standstill = safe_levels.Ladder(config.states), pump_obeys.Standstill(config.loop, config.states)
-        self._scene = states.Scene(config, config.loop, loop, observer, ladder, standstill, config.loop.setpoint_um)
+        levels, standstill = safe_levels.SafeLevels(config.states), pump_obeys.Standstill(config.loop, config.states)
+        self._scene = states.Scene(config, config.loop, loop, observer, levels, standstill, config.loop.setpoint_um)
         self._resume = safe_levels.ResumeRule(config.resume, config.limits)
         self._gains = commands.GainsTrial(config.loop)
-        self._witnesses = sensor_consistency.Witnesses(config)
+        self._consistency = sensor_consistency.SensorConsistency(config)
         self._answers: list[tuple[int, str]] = []
         self._clear_mask = 0
         self._tick_error = ""
@@ -103,8 +103,8 @@ class Controller:
             flow_um_per_s=last.flow_um_per_s,
             bleed_fraction=scene.loop_config.bleed_fraction,
         )
-        witnesses = self._witnesses
-        events += witnesses.ask(inputs, self.state, scene.dt_s, held)
+        consistency = self._consistency
+        events += consistency.ask(inputs, self.state, scene.dt_s, held)
         stand = scene.standstill
         stand.look(inputs.now_s, inputs.reading, scene.observer.commanded, inputs.link_up)
         observation = scene.observer.observe(
@@ -113,12 +113,12 @@ class Controller:
             self._tick_error,
             scene.overdue,
             scene.unfit,
-            witnesses.laser_lies,
+            consistency.laser_lies,
             runs_on=stand.runs_on,
             inflow=stand.inflow,
             locked=scene.latched,
-            laser_gauge_apart=witnesses.laser_gauge_apart,
-            gas_excess=witnesses.gas_excess,
+            laser_gauge_apart=consistency.laser_gauge_apart,
+            gas_excess=consistency.gas_excess,
         )
         verdict = self._safety.judge(self.state, observation)
         self._apply(verdict, events)
@@ -214,7 +214,7 @@ class Controller:
                 scene.way_down = "stop"
                 scene.stop_exit = errors.Exit.DONE if command.who == "duration" else errors.Exit.INTERRUPTED
             case "vent" if self.state == State.FAULT:
-                scene.ladder.enter(Rung.VENT, scene.now_s)
+                scene.levels.enter(Rung.VENT, scene.now_s)
             case "lower" | "vent":
                 scene.way_down = scene.way_down or "lower"
                 scene.venting |= command.kind == "vent"
@@ -226,7 +226,7 @@ class Controller:
         scene, spec = self._scene, command.experiment
         if command.kind == "hold" and scene.latched:
             return f"a fault is latched: {scene.latched}; acknowledge it first"
-        if command.kind in ("manual", "tune") and scene.ladder.rung != Rung.NONE:
+        if command.kind in ("manual", "tune") and scene.levels.rung != Rung.NONE:
             return "the safety table holds the mean flow"
         if command.kind != "tune" or spec is None:
             return ""
@@ -253,37 +253,37 @@ class Controller:
             resume.forget()
             scene.may_resume = scene.resume_possible = False
             return
-        scene.may_resume = resume.due(self.fault, scene.ladder, observation, scene.now_s)
+        scene.may_resume = resume.due(self.fault, scene.levels, observation, scene.now_s)
         scene.resume_possible = resume.possible
         self._clear_mask |= resume.clear_mask
 
     def _apply(self, verdict: safety.Verdict, events: list[Event]) -> None:
-        """Put the verdict on the ladder; whatever goes below HOLD_FLOW latches as the run's fault."""
-        scene, ladder = self._scene, self._scene.ladder
+        """Enter the safe level of the verdict; whatever goes below HOLD_FLOW latches as the run's fault."""
+        scene, levels = self._scene, self._scene.levels
         rule = verdict.rule
         if rule is None:
-            if ladder.rung == Rung.HOLD_FLOW:
-                ladder.clear(scene.now_s)
+            if levels.rung == Rung.HOLD_FLOW:
+                levels.clear(scene.now_s)
                 events.append({"kind": "cleared", "name": self.fault.name if self.fault else ""})
                 self.fault = None
             return
-        if self.fault is None or (rule.rung > Rung.HOLD_FLOW >= ladder.rung):
+        if self.fault is None or (rule.rung > Rung.HOLD_FLOW >= levels.rung):
             self.fault = rule
             events.append(_fault_event(verdict))
-        ladder.enter(rule.rung, scene.now_s)
-        if ladder.step(scene.now_s) > Rung.HOLD_FLOW and self.state != State.FAULT:
+        levels.enter(rule.rung, scene.now_s)
+        if levels.step(scene.now_s) > Rung.HOLD_FLOW and self.state != State.FAULT:
             self._go(State.FAULT, f"{self.fault.name}: {self.fault.cause}", events)
 
     def _step_shape(self, inputs: TickInputs, events: list[Event]) -> shape_loop.ShapeOutput:
         scene = self._scene
-        settled = self.state == State.HOLD and scene.ladder.rung == Rung.NONE
+        settled = self.state == State.HOLD and scene.levels.rung == Rung.NONE
         shape = self._shape.step(
             inputs.now_s,
             scene.dt_s,
             inputs.estimate,
             scene.observer.displacement_um,
             settled,
-            self._witnesses.camera_lies,
+            self._consistency.camera_lies,
         )
         scene.trim_um = shape.trim_um if self.state in safety.MOVING else 0.0
         words = shape.reason.translate(_NO_DIGITS)  # numbers that change are no news
@@ -301,7 +301,7 @@ class Controller:
         except Exception as error:
             self._tick_error = f"{type(error).__name__}: {error}"
             # a mirror that is being vented is not shut up by an error
-            vents = scene.venting or scene.ladder.rung == Rung.VENT
+            vents = scene.venting or scene.levels.rung == Rung.VENT
             scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, float(vents)
             if self.state == State.FAULT:  # nothing is left that could judge it
                 scene.finished = errors.Exit.SAFETY_TRIP
@@ -327,7 +327,7 @@ class Controller:
                 self._resume.resumed(scene.now_s)
                 events.append({"kind": "resumed", "name": self.fault.name})
             self.fault, self._tick_error = None, ""
-            scene.ladder.leave()
+            scene.levels.leave()
             scene.acknowledged = False
         if state == State.STANDBY:
             scene.venting = False
@@ -369,7 +369,7 @@ class Controller:
             missed_ticks=inputs.missed_ticks,
             state=self.state,
             shape_state=shape.state,
-            rung=scene.ladder.rung,
+            rung=scene.levels.rung,
             fault=self.fault.code if self.fault else 0,
             target_um=scene.setpoint_um,
             setpoint_um=out.setpoint_um,

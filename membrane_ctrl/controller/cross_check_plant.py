@@ -237,7 +237,7 @@ def judge_alarms(config: Config, say: Findings) -> None:
 
 
 def judge_gauge(config: Config, say: Findings) -> None:
-    """The gauge as a guard, and as a witness against the laser."""
+    """The gauge as a guard, and as a check of the laser."""
     limits, pressure_pa = config.limits, config.optics.mirror.pressure_pa
     above_um = limits.displacement_max_um - config.loop.setpoint_um
     room_pa = limits.gauge_pressure_max_pa - pressure_pa

@@ -21,7 +21,7 @@ _BLOCK_S = 0.5
 # lose no gas, the mirror rose by at most 11.4 um (0.74 Pa); a pump at half of its range lifts it by 44 um (3.6 Pa)
 _WINDOW_S = 20.0
 _RISE_MAX_UM = 30.0
-_PA_PER_UM = 0.05  # 3p/s is 0.065 Pa/um at the working point; less makes the gauge the slower witness
+_PA_PER_UM = 0.05  # 3p/s is 0.065 Pa/um at the working point; less makes the gauge the slower check
 # The gas follows the air within 12 s: a change up to 40 s before the window still moves the mirror in it
 _WEATHER_BLOCKS = 120
 # The end of a run waits for so many blocks that show no rise as steep as a pump's: 3 um/s (weather: 2.2 um/s)
@@ -141,8 +141,8 @@ class Standstill:
             + abs(self._loop.barometer_gain_um_per_pa) * _range(block[3] for block in self._blocks)
             + abs(self._loop.temperature_gain_um_per_k) * _range(block[4] for block in self._blocks)
         )
-        witnesses = ((rise_um, most_um), (rise_pa, _PA_PER_UM * most_um))
-        rises = [rise > most for rise, most in witnesses if math.isfinite(rise)]
+        checks = ((rise_um, most_um), (rise_pa, _PA_PER_UM * most_um))
+        rises = [rise > most for rise, most in checks if math.isfinite(rise)]
         if not rises or not all(rises):
             return ""
         return f"{rise_um:+.0f} um, {rise_pa:+.1f} Pa in {over_s:.0f} s with the pump commanded off"
@@ -254,7 +254,7 @@ class ActuatorTest:
         """How fast the mirror sank with the pump off and the vent closed."""
         return max(0.0, -self._speeds["off"].per_s)
 
-    def complaint(self) -> str:
+    def failure(self) -> str:
         """What did not answer as it should, the first time what did not do so clearly; empty when all did."""
         speeds = {name: slope.per_s for name, slope in self._speeds.items()}
         unclear = self._judged(speeds, _VENT_CLEAR_UM_PER_S, _PUMP_CLEAR_SHARE)

@@ -1,4 +1,4 @@
-"""The ladder of safe actions: hold the last mean flow -> ramp down -> pump off -> vent.
+"""The safe levels: hold the last mean flow -> ramp down -> pump off -> vent.
 
 A fault chooses the rung to enter at; each rung times out into the next; nothing but a clear observation on the
 first rung leads back up. The time that the first rung lasts is a store that fills again only as fast as it is used:
@@ -14,7 +14,7 @@ from membrane_ctrl.controller.safety import Observation, Rule
 from membrane_ctrl.model.states import Rung
 
 
-class Ladder:
+class SafeLevels:
     """Which safe action is in force, and since when."""
 
     def __init__(self, config: StatesConfig) -> None:
@@ -35,13 +35,13 @@ class Ladder:
             self._since_s = now_s - used_s
 
     def clear(self, now_s: float) -> None:
-        """Leave the ladder; only from HOLD_FLOW, as everything below is latched."""
+        """Leave the safe levels; only from HOLD_FLOW, as everything below is latched."""
         assert self.rung == Rung.HOLD_FLOW, self.rung
         self._used_s, self._cleared_s = self.age_s(now_s), now_s
         self.rung = Rung.NONE
 
     def leave(self) -> None:
-        """Leave the ladder from wherever it is: a person has acknowledged, or the resume rule allows it."""
+        """Leave the safe levels from any of them: a person has acknowledged, or the resume rule allows it."""
         self.rung, self._used_s = Rung.NONE, 0.0
 
     def age_s(self, now_s: float) -> float:
@@ -89,13 +89,13 @@ class ResumeRule:
         """There is no fault: what was seen in an earlier one does not count in the next."""
         self._clear_since_s, self._never, self.possible, self.clear_mask = math.nan, False, False, 0
 
-    def due(self, fault: Rule, ladder: Ladder, observation: Observation, now_s: float) -> bool:
+    def due(self, fault: Rule, levels: SafeLevels, observation: Observation, now_s: float) -> bool:
         """Look at a tick of a fault; True once the cause has stayed away for long enough.
 
         Afterwards `possible` says whether the fault may still clear by itself, and `clear_mask` which of the board's
         latches have to be cleared for it: the watchdog's own, or none.
         """
-        self._never |= _decides(ladder, observation)
+        self._never |= _decides(levels, observation)
         listed = fault.may_resume and fault.name in self._config.faults
         self.possible = listed and not self._never and self._left(now_s)
         self.clear_mask = observation.board_faults if self.possible else 0
@@ -123,10 +123,10 @@ class ResumeRule:
         return now_s - self._clear_since_s >= self._config.wait_s
 
 
-def _decides(ladder: Ladder, observation: Observation) -> bool:
+def _decides(levels: SafeLevels, observation: Observation) -> bool:
     """Something that only a person may clear."""
     return (
-        ladder.rung == Rung.VENT
+        levels.rung == Rung.VENT
         or bool(observation.board_faults & ~WATCHDOG_MASK)
         or observation.vent_fraction > VENTED_FRACTION
         or bool(observation.locked)

@@ -1,6 +1,6 @@
 """The safety table: a tick's observation in, a verdict out. No I/O, no clock.
 
-Each rule names a cause, how many of the last ticks must show it (N of M), the limit, the rung of the ladder of
+Each rule names a cause, how many of the last ticks must show it (N of M), the limit, the rung among the
 safe actions where it enters, and whether it latches. Every rule is judged on every tick in the states where it
 applies. Of rules that trip together the one that enters deepest wins; the first cause of a fault is what the
 operator is told. `docs/faults.md` is made from this table.
@@ -68,7 +68,7 @@ class Observation:
     vent_fraction : float
         The vent's read-back; NaN without one.
     laser_lies : str
-        What the three witnesses of the sag have seen, if it is the laser that does not fit.
+        What laser, gauge and camera show, if it is the laser that does not fit.
     gauge_same_s : float
         Since the readings of a taut film's gauge have been equal to the last bit.
     gauge_jumps : int

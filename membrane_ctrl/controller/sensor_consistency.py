@@ -44,13 +44,13 @@ class Held:
     bleed_fraction: float
 
 
-class Witnesses:
+class SensorConsistency:
     """Asked on every tick, before safety judges.
 
     Attributes
     ----------
     laser_lies : str
-        What the three witnesses of the sag have seen, if it is the laser that does not fit.
+        What laser, gauge and camera show, if it is the laser that does not fit.
     camera_lies : str
         The same of the camera, as a reason for the shape loop.
     laser_gauge_apart : str
@@ -63,7 +63,7 @@ class Witnesses:
         self._plausibility = plausibility.Plausibility(config.shape.disagreement_max_um)
         self._far_um = config.shape.disagreement_max_um
         self._health = film_health.FilmHealth(min(config.loop.flow_max_um_per_s, config.pump.flow_full_um_per_s))
-        self._film = film.FilmWitness(config.limits, config.optics.mirror)
+        self._film = film.FilmMonitor(config.limits, config.optics.mirror)
         self._growth = film.LeakGrowth()
         self._leak_growth_max = config.limits.leak_growth_max
         self._fresh_s = config.shape.fresh_s
@@ -144,13 +144,13 @@ class Witnesses:
         reading = inputs.reading
         if reading is None:
             return []
-        complaint = gas.weather_complaint(reading.ambient_pressure_pa, reading.air_temperature_c)
-        self._weather_s = self._weather_s + dt_s if bool(complaint) != self._weather_told else 0.0
+        failure = gas.weather_fault(reading.ambient_pressure_pa, reading.air_temperature_c)
+        self._weather_s = self._weather_s + dt_s if bool(failure) != self._weather_told else 0.0
         if self._weather_s < _WEATHER_STANDS_S:
             return []
-        self._weather_told, self._weather_s = bool(complaint), 0.0
-        kind = "maintenance" if complaint else "maintenance_over"
-        return [{"kind": kind, "name": "weather_sensor", "message": complaint or "no longer so"}]
+        self._weather_told, self._weather_s = bool(failure), 0.0
+        kind = "maintenance" if failure else "maintenance_over"
+        return [{"kind": kind, "name": "weather_sensor", "message": failure or "no longer so"}]
 
     def _judge(self, liar: plausibility.Liar) -> list[Event]:
         repeats = self._repeats >= _REPEATS

@@ -34,7 +34,7 @@ class Scene:
     loop_config: LoopConfig  # as it is now, after `gains`
     loop: inner_loop.InnerLoop
     observer: Observer
-    ladder: safe_levels.Ladder
+    levels: safe_levels.SafeLevels
     standstill: pump_obeys.Standstill
     setpoint_um: float
     # this tick
@@ -204,7 +204,7 @@ def tune(scene: Scene) -> State:
     wanted: float | Finished
     if scene.hold_wanted:
         wanted = Finished(False, f"ended by {scene.asked_by}")
-    elif scene.ladder.rung != Rung.NONE:
+    elif scene.levels.rung != Rung.NONE:
         wanted = Finished(False, "the safety table holds the mean flow")
     else:
         wanted = trial.step(measurement, scene.dt_s)
@@ -254,15 +254,15 @@ def lower(scene: Scene) -> State:
 
 
 def fault(scene: Scene) -> State:
-    """Down the ladder, latched; a person clears it, or the resume rule does for a cause that has gone."""
-    rung = scene.ladder.step(scene.now_s)
+    """Down the safe levels, latched; a person clears it, or the resume rule does for a cause that has gone."""
+    rung = scene.levels.step(scene.now_s)
     scene.why = f"fault: {rung.name.lower().replace('_', ' ')}"
     scene.hold_wanted = False
     scene.vent_fraction = float(scene.venting or rung == Rung.VENT)
     if rung == Rung.RAMP_DOWN:
         if scene.state_age_s == 0:
             scene.ramp_from_fraction = scene.last_pump_fraction
-        left = max(0.0, 1.0 - scene.ladder.age_s(scene.now_s) / scene.config.states.ramp_down_s)
+        left = max(0.0, 1.0 - scene.levels.age_s(scene.now_s) / scene.config.states.ramp_down_s)
         scene.pump_fraction = left * scene.ramp_from_fraction
         return State.FAULT
     stops = scene.way_down == "stop"
@@ -288,7 +288,7 @@ def _nothing_left_to_do(scene: Scene, rung: Rung) -> bool:
     """
     if rung != Rung.VENT:
         return False
-    reading, vented_s = scene.observer.reading, scene.ladder.age_s(scene.now_s)
+    reading, vented_s = scene.observer.reading, scene.levels.age_s(scene.now_s)
     empty = reading is not None and reading.gauge_pressure_pa < scene.config.states.vented_pressure_pa
     return vented_s > (_STOP_GIVES_UP_S if empty or scene.way_down == "stop" else _VENTED_S)
 
@@ -324,7 +324,7 @@ def _strayed(scene: Scene) -> bool:
 def _manual_over(scene: Scene) -> str:
     """Why the loop takes the mirror back from whoever set the flow; empty if it does not."""
     states = scene.config.states
-    if scene.ladder.rung != Rung.NONE:
+    if scene.levels.rung != Rung.NONE:
         return "the safety table holds the mean flow"
     if _strayed(scene):
         return f"more than {states.manual_range_um:g} um from the setpoint"
@@ -370,11 +370,11 @@ def _test_actuators(scene: Scene) -> State:
         return State.CHECK
     if _missing(scene):
         return State.CHECK  # the loop begins at a reading
-    complaint = scene.test.complaint()
-    if complaint:
+    failure = scene.test.failure()
+    if failure:
         if scene.test.is_second:
-            scene.unfit = complaint
-        scene.why = f"the film does not answer{'' if scene.unfit else ' clearly'}: {complaint}"
+            scene.unfit = failure
+        scene.why = f"the film does not answer{'' if scene.unfit else ' clearly'}: {failure}"
         scene.test.again()
         return State.CHECK
     return _begin(scene, scene.test.leak_um_per_s)
@@ -390,7 +390,7 @@ def _begin(scene: Scene, leak_um_per_s: float) -> State:
 
 def _drive(scene: Scene, target_um: float) -> inner_loop.LoopOutput:
     """Let the loop drive the pump: automatic with a reading to trust, the held mean flow without one."""
-    if math.isfinite(scene.observer.displacement_um) and scene.ladder.rung == Rung.NONE:
+    if math.isfinite(scene.observer.displacement_um) and scene.levels.rung == Rung.NONE:
         output = scene.loop.step(_given(scene, target_um), scene.dt_s)
     else:
         output = scene.loop.stale(scene.dt_s)
@@ -425,7 +425,7 @@ def _missing(scene: Scene) -> str:
 
 
 def _why_hold(scene: Scene, output: inner_loop.LoopOutput) -> str:
-    if scene.ladder.rung == Rung.HOLD_FLOW:
+    if scene.levels.rung == Rung.HOLD_FLOW:
         return "holding the last mean flow until the laser is back"
     if output.too_tight:
         return "holding, but the mirror is too tight: open a bleed (loop.bleed_fraction)"

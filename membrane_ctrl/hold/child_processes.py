@@ -17,7 +17,7 @@ from membrane_ctrl.model.telemetry import ROW_BYTES
 from membrane_ctrl.processes.child import ALIVE, Child, pipe
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, ring
 
-# A post that is kept filled: a child process that ends or falls silent is replaced, but not for ever.
+# A child process that ends or falls silent is replaced, but not for ever.
 #
 # A child says each second or so that it is alive, and for how long it may now be silent (`child_report.alive`). A
 # process that was stopped, or that hangs, is still there but does not keep its word: it is killed, and the next one
@@ -36,8 +36,8 @@ _STARTS_S = 60.0
 Make = Callable[[int], tuple[Child, Connection]]
 
 
-class Post:
-    """One such post.
+class ManagedChild:
+    """A child process that is replaced when it ends or falls silent.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Post:
     Attributes
     ----------
     child : Child
-        Who fills it now, or did last.
+        The one that runs, or ran last.
     """
 
     def __init__(self, make: Make) -> None:
@@ -183,38 +183,38 @@ def _frames(config: Config, stack: ExitStack) -> FrameAddress:
     return owner.address
 
 
-class Crew:
-    """Recorder, console, acquisition and alarms of one run. The hold goes on without any of them, and says so."""
+class ChildProcesses:
+    """Recorder, live screen, acquisition and alarms of one run. The hold goes on without any of them, and says so."""
 
     def __init__(
         self, config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str, duration_s: float | None
     ) -> None:
         self._clock = clock
         self._summary = run_dir / "summary.json"
-        self._screen = Post(_screen(config, clock, rings, run_dir, duration_s))
-        self._recorder = Post(_recorder(config, clock, rings, run_dir, name))
+        self._screen = ManagedChild(_screen(config, clock, rings, run_dir, duration_s))
+        self._recorder = ManagedChild(_recorder(config, clock, rings, run_dir, name))
         self._acquisition = None
         if rings.shapes is not None and rings.frames is not None:
-            self._acquisition = Post(_acquisition(config, clock, rings, rings.shapes, rings.frames, run_dir))
-        self._alarms = Post(_alarms(config, clock, rings, run_dir.name)) if config.alarms.urls_file else None
+            self._acquisition = ManagedChild(_acquisition(config, clock, rings, rings.shapes, rings.frames, run_dir))
+        self._alarms = ManagedChild(_alarms(config, clock, rings, run_dir.name)) if config.alarms.urls_file else None
 
     @property
-    def _posts(self) -> list[Post]:
-        return [post for post in (self._recorder, self._acquisition, self._alarms, self._screen) if post is not None]
+    def _managed(self) -> list[ManagedChild]:
+        return [each for each in (self._recorder, self._acquisition, self._alarms, self._screen) if each is not None]
 
     def start(self, stack: ExitStack) -> None:
         """Start all; the stack ends whatever `take_down` has not."""
         stack.callback(self._stop)
-        for post in self._posts:
-            post.start(self._clock.now())
+        for managed in self._managed:
+            managed.start(self._clock.now())
 
     def _stop(self) -> None:
-        for post in self._posts:
-            post.child.stop(_CHILD_STOPS_S)
+        for managed in self._managed:
+            managed.child.stop(_CHILD_STOPS_S)
 
     def reports(self) -> list[Event]:
         """What the children have said since the last call, and who was replaced; never waits."""
-        return [event for post in self._posts for event in post.look(self._clock.now())]
+        return [event for managed in self._managed for event in managed.look(self._clock.now())]
 
     def capture(self) -> Event | None:
         """Have the acquisition take a full set to disk, which its own event names; an event if that cannot be."""

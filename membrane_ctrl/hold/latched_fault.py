@@ -15,7 +15,7 @@ from membrane_ctrl.model.events import Event
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile, ResumeLog
 
 
-class Latcher:
+class FaultLatch:
     """A listener to ticks; a context manager that waits for the disk at the end, when the pump is off.
 
     Parameters
@@ -59,7 +59,7 @@ class Latcher:
         """How long ago the resumes of the last day were, oldest first."""
         return () if self._resumes is None else self._resumes.ages_s(datetime.now(UTC))
 
-    def __enter__(self) -> Latcher:
+    def __enter__(self) -> FaultLatch:
         if self._file is not None:
             with contextlib.suppress(OSError):  # then it is tried without when it matters, and a failure is told
                 self._file.reserve()

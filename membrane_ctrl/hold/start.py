@@ -85,13 +85,13 @@ def hold_mirror(options: HoldOptions) -> int:
         geometry.keep(run_dir)
         rings = child_processes.rings_for(config, twin.truth if twin else None, stack)
         publish(run_dir, {"telemetry": rings.telemetry, "events": rings.events, "shapes": rings.shapes})
-        crew = child_processes.Crew(config, clock, rings, run_dir, options.name, options.duration_s)
-        crew.start(stack)
+        children = child_processes.ChildProcesses(config, clock, rings, run_dir, options.name, options.duration_s)
+        children.start(stack)
         bench = open_bench(config.devices)  # a link belongs to the event loop that opened it
         port = partial(server.Port, config.port, listeners, run_dir.name)
-        latcher = partial(latched_fault.Latcher, latched, resumes, run_dir.name, clock.utc)
-        exit_code = asyncio.run(_run(bench, config, options, clock, rings, crew, twin, port, latcher, board))
-        crew.take_down()
+        fault_latch = partial(latched_fault.FaultLatch, latched, resumes, run_dir.name, clock.utc)
+        exit_code = asyncio.run(_run(bench, config, options, clock, rings, children, twin, port, fault_latch, board))
+        children.take_down()
     with contextlib.suppress(OSError):  # the terminal was closed, or nobody reads any more
         _report(run_dir, options.json)
     return exit_code
@@ -177,26 +177,26 @@ async def _run(
     options: HoldOptions,
     clock: RunClock,
     rings: child_processes.Rings,
-    crew: child_processes.Crew,
+    children: child_processes.ChildProcesses,
     twin: TwinProcess | None,
     port_for: Callable[[server.RunHooks], server.Port],
-    latcher_for: Callable[[Callable[[Event], None]], latched_fault.Latcher],
+    latch_for: Callable[[Callable[[Event], None]], latched_fault.FaultLatch],
     board: BoardAtStart,
 ) -> errors.Exit:
     from membrane_ctrl.metrology.optics.hencky import zernike_projection
 
     with _open(rings) as (telemetry, events, inputs, shapes):
         truth = twin.truth_reader() if twin else None
-        wiring = Wiring(bench, telemetry, events, inputs, shapes, truth, crew.reports)
+        wiring = Wiring(bench, telemetry, events, inputs, shapes, truth, children.reports)
         controller = Controller(config, zernike_projection())
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         port = port_for(server.RunHooks(supervisor.ask, supervisor.tell, clock.now, lambda: controller.loop_config))
-        latcher, systemd = latcher_for(supervisor.tell), SystemdNotify()
+        fault_latch, systemd = latch_for(supervisor.tell), SystemdNotify()
         wiring.heard = {
             "control port": port.heard,
-            "latched-fault file": latcher.heard,
+            "latched-fault file": fault_latch.heard,
             "systemd": systemd.heard,
-            "capture": partial(_capture, crew, supervisor.tell),
+            "capture": partial(_capture, children, supervisor.tell),
         }
         wiring.told = {"control port": port.told, "systemd": systemd.told}
         devices = config.devices.name if config.devices else ""
@@ -205,14 +205,14 @@ async def _run(
         try:
             if not options.standby:
                 supervisor.ask(commands.Command("hold", commands.AT_START))
-            elif latched := "; ".join(part for part in (latcher.latched, board.latched) if part):
+            elif latched := "; ".join(part for part in (fault_latch.latched, board.latched) if part):
                 supervisor.ask(commands.Command("latch", commands.AT_START, text=latched))
-            for age_s in latcher.resumes_s:
+            for age_s in fault_latch.resumes_s:
                 supervisor.ask(commands.Command("resumed", commands.AT_START, value=age_s))
             gc.collect()
             gc.freeze()  # what lives for the whole run need not be looked at again between two ticks
             async with port.open():
-                with _signals(supervisor), latcher, systemd:
+                with _signals(supervisor), fault_latch, systemd:
                     assert config.devices is not None
                     # last: the board's watchdog runs from here on
                     if (await connect(bench, config.devices)).map_version == 1:
@@ -235,11 +235,13 @@ async def _run(
     return exit_code
 
 
-def _capture(crew: child_processes.Crew, tell: Callable[[Event], None], outputs: tick.TickOutputs) -> None:
+def _capture(
+    children: child_processes.ChildProcesses, tell: Callable[[Event], None], outputs: tick.TickOutputs
+) -> None:
     """A set that was asked for, and not refused, is the acquisition's to take."""
     for event in outputs.events:
         asked = event["kind"] == "command" and event["command"] == "capture" and "refused" not in event
-        if asked and (failed := crew.capture()) is not None:
+        if asked and (failed := children.capture()) is not None:
             tell(failed)
 
 

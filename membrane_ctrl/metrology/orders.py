@@ -1,4 +1,4 @@
-"""Fringe orders from the Gray code and from the phase's own continuity, each the other's witness.
+"""Fringe orders from the Gray code and from the phase's own continuity, each checked by the other.
 
 The paper's eq. 2 trusts every Gray bit of every pixel. Continuity gives the orders of a connected region up to one
 number, which all of its pixels vote for: one wrong Gray frame scatters its votes and is outvoted, and the frame that

@@ -27,7 +27,7 @@ class ShapeState(IntEnum):
 
 
 class Rung(IntEnum):
-    """The ladder of safe actions; each rung times out into the next."""
+    """The safe levels, by the name that telemetry has for them; each times out into the next."""
 
     NONE = 0
     HOLD_FLOW = 1

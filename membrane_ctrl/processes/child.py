@@ -130,7 +130,7 @@ ALIVE = "alive"
 
 
 def alive(for_s: float) -> events.Event:
-    """It is at work, and will say so again within `for_s` seconds (`post.Post` sees that it does)."""
+    """It is at work, and will say so again within `for_s` seconds (`ManagedChild` sees that it does)."""
     return {"kind": ALIVE, "for_s": for_s}
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from membrane_ctrl.config.schema import Config, RecordingConfig
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.recorder.sink import LAYOUT, Complaints, is_whole
+from membrane_ctrl.recorder.sink import LAYOUT, RecorderErrors, is_whole
 from membrane_ctrl.run_files import disk_budget, run_folder
 
 # Whether the run's folder is still the one that was begun, and another in its place if it is not.
@@ -67,7 +67,7 @@ def _opened(folder: Path) -> int | None:
 # Closed segments through `rerun rrd optimize`, one at a time, in a process that steps back behind everything.
 #
 # It takes a third off a segment and the wait off opening it. The original is replaced in one step, and only by a
-# file that has its footer and was made without a complaint.
+# file that has its footer and was made without an error.
 
 
 _PACKAGE = importlib.util.find_spec("rerun_cli")
@@ -166,51 +166,51 @@ class Housekeeping:
 
     Attributes
     ----------
-    thrift : Thrift
+    detail : DetailLevel
         What has to be left out.
     """
 
-    def __init__(self, run_dir: Path, clock: RunClock, config: RecordingConfig, complaints: Complaints) -> None:
+    def __init__(self, run_dir: Path, clock: RunClock, config: RecordingConfig, errors: RecorderErrors) -> None:
         self._run_dir = run_dir
         self._clock = clock
         self._config = config
-        self._complaints = complaints
+        self._errors = errors
         self._optimizer = Optimizer(run_dir)
         self._retention_due_s = 0.0
-        self.thrift = disk_budget.Thrift.ALL
+        self.detail = disk_budget.DetailLevel.ALL
 
     def finish(self, closed: list[Path]) -> None:
         """The run is over: optimise what is closed; what takes too long stays as it is."""
         give_up_s = time.monotonic() + _OPTIMISE_LAST_S
         self._take(closed)
         while True:
-            self._complaints.guarded("optimise", self._optimizer.poll)
+            self._errors.guarded("optimise", self._optimizer.poll)
             if not self._optimizer.busy or time.monotonic() > give_up_s:
                 return
             time.sleep(_LOOK_S)
 
     def _take(self, closed: list[Path]) -> None:
-        if self.thrift == disk_budget.Thrift.ALL:  # a second copy of a segment needs room
+        if self.detail == disk_budget.DetailLevel.ALL:  # a second copy of a segment needs room
             for path in closed:
                 self._optimizer.add(path)
 
     def look(self, now_s: float, closed: list[Path]) -> None:
         """Watch the disk, go on with what is under way; `closed` are segments to optimise."""
-        self._complaints.guarded("disk check", self._watch_disk)
+        self._errors.guarded("disk check", self._watch_disk)
         self._take(closed)
-        self._complaints.guarded("optimise", self._optimizer.poll)
+        self._errors.guarded("optimise", self._optimizer.poll)
         if now_s >= self._retention_due_s:
             self._retention_due_s = now_s + RETENTION_INTERVAL_S
-            self._complaints.guarded("retention", self._delete_old)
+            self._errors.guarded("retention", self._delete_old)
 
     def _watch_disk(self) -> None:
         left_mb, least_mb = run_folder.free_mb(self._run_dir), self._config.min_free_mb
-        self.thrift = disk_budget.thrift(left_mb, least_mb, self.thrift)
+        self.detail = disk_budget.detail_level(left_mb, least_mb, self.detail)
         if left_mb < least_mb:
             limit = f"less than recording.min_free_mb = {least_mb:g} MB free"
-            self._complaints.complain("disk", f"{self._run_dir}: {limit}; delete old runs", kind="disk_low")
+            self._errors.report_error("disk", f"{self._run_dir}: {limit}; delete old runs", kind="disk_low")
         else:
-            self._complaints.recovered("disk")
+            self._errors.recovered("disk")
 
     def _delete_old(self) -> None:
         config = self._config
@@ -224,13 +224,13 @@ class Housekeeping:
             runs, disk_budget.size_bytes(self._run_dir), config.keep_gb, config.keep_days, now_utc
         )
         # a folder that a person has moved away by hand is no trouble any more
-        self._complaints.forget(_RUN, but={_RUN + run.folder.name for run, _ in gone})
+        self._errors.forget(_RUN, but={_RUN + run.folder.name for run, _ in gone})
         for run, why in gone:  # one by one: a folder that cannot go must not keep the others
-            self._complaints.guarded(_RUN + run.folder.name, partial(self._delete, run, why))
+            self._errors.guarded(_RUN + run.folder.name, partial(self._delete, run, why))
 
     def _delete(self, run: disk_budget.OldRun, why: str) -> None:
         disk_budget.delete_run(run)
-        self._complaints.report({"kind": "run_deleted", "run": run.folder.name, "message": why})
+        self._errors.report({"kind": "run_deleted", "run": run.folder.name, "message": why})
 
     def close(self) -> None:
         """End what is under way."""

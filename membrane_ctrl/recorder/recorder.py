@@ -190,9 +190,9 @@ class Recorder:
             name: Feed(ring, before.positions.get(name, 0), before.dropped.get(name, 0))
             for name, ring in rings.items()
         }
-        self._complaints = sink.Complaints(report, before.errors)
-        self._housekeeping = housekeeping.Housekeeping(run_dir, clock, config.recording, self._complaints)
-        self._rerun = rerun_output.RerunOutput(recording, config, thumbnails, self._complaints)
+        self._errors = sink.RecorderErrors(report, before.errors)
+        self._housekeeping = housekeeping.Housekeeping(run_dir, clock, config.recording, self._errors)
+        self._rerun = rerun_output.RerunOutput(recording, config, thumbnails, self._errors)
         self._rerun.shapes.reference, self._rerun.state = before.reference, before.state
         self._events_file = EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
         self._events_lost = before.events_lost
@@ -217,7 +217,7 @@ class Recorder:
             self._input_messages += self._feeds["inputs"].drain()
         if "shapes" in self._feeds:
             for message in self._feeds["shapes"].drain():
-                self._complaints.guarded("shape estimate", partial(self._take_shape, message))
+                self._errors.guarded("shape estimate", partial(self._take_shape, message))
         self.take_events([events.parse(message) for message in self._feeds["events"].drain()])
 
     def take_events(self, new: list[Event]) -> None:
@@ -227,30 +227,30 @@ class Recorder:
             self.urgent |= event.get("kind") in _URGENT
             self.ended |= event.get("kind") == "end"
         self._events += new
-        self._complaints.guarded("events.jsonl", lambda: self._events_file.append(new))
+        self._errors.guarded("events.jsonl", lambda: self._events_file.append(new))
 
     def _take_shape(self, message: bytes) -> None:
         estimate = shape_estimate.unpack_estimate(message)
         self._summary.add_shape(estimate)
         self._shapes.append(estimate)
-        self._complaints.guarded("shape columns", lambda: self._columns.add_shape(estimate))
+        self._errors.guarded("shape columns", lambda: self._columns.add_shape(estimate))
 
     def write(self) -> None:
         """Bring what came since the last call to the disk, and see that it got there."""
         now_s = self._clock.now()
-        self._complaints.guarded("new run folder", lambda: self._see_folder(now_s))
+        self._errors.guarded("new run folder", lambda: self._see_folder(now_s))
         rows = telemetry.unpack(self._messages)
         shapes, new_events = self._shapes, self._events
         self._messages, self._shapes, self._events = [], [], []
         self.urgent = False
-        guarded = self._complaints.guarded
+        guarded = self._errors.guarded
         guarded("inputs file", lambda: self._write_inputs(now_s, shapes))
         guarded("summary", lambda: self._summary.add_rows(rows))
         guarded("tick columns", lambda: self._columns.add_rows(rows))
         guarded("columns", self._columns.sync)
         closed, self._rerun.closed = self._rerun.closed, []
         self._housekeeping.look(now_s, closed)
-        if not self._rerun.send(now_s, rows, new_events, shapes, self._housekeeping.thrift):
+        if not self._rerun.send(now_s, rows, new_events, shapes, self._housekeeping.detail):
             self._rows_lost += len(rows)
         guarded("state file", self._hand_on)
 
@@ -262,7 +262,7 @@ class Recorder:
         self._folder_anew_s = now_s
         # never taken back: what is missing stays missing
         what = f"{self._run_dir} was removed or moved, and is begun anew at {now_s:.1f} s"
-        self._complaints.complain("run folder", f"{what}; what was recorded before is not in it")
+        self._errors.report_error("run folder", f"{what}; what was recorded before is not in it")
         self._inputs_file.close()
         self._columns.leave_folder()
         self._rerun.leave_folder()
@@ -283,7 +283,7 @@ class Recorder:
             self._rerun.shapes.reference,
             self._rerun.state,
             self._columns.open_windows,
-            self._complaints.errors,
+            self._errors.errors,
             self._rows_lost,
             self._events_lost + self._events_file.lost,
             self._input_ticks_lost + self._inputs_file.lost_ticks,
@@ -298,13 +298,13 @@ class Recorder:
         """Last drain, close the recording with its footer, write `summary.json`, optimise unless `in_haste`."""
         self.drain()
         self.write()
-        guarded = self._complaints.guarded
+        guarded = self._errors.guarded
         guarded("recording", self._rerun.close)
         guarded("columns", self._columns.close)
         account = {
             "segments": self._rerun.segments,
             "tables": self._columns.files,
-            "errors": self._complaints.errors,
+            "errors": self._errors.errors,
             "rows_lost": self._rows_lost,
             "column_rows_lost": self._columns.lost,
             "events_lost": self._events_lost + self._events_file.lost,
@@ -326,4 +326,4 @@ class Recorder:
             self._housekeeping.finish(closed)
         self._housekeeping.close()
         done: dict[str, Any] = {"kind": "recorder_done", "dropped": self._dropped(), **account}
-        self._complaints.report(done)
+        self._errors.report(done)

@@ -7,7 +7,7 @@ from typing import Protocol
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import shape_estimate, states, telemetry
 from membrane_ctrl.recorder import rerun_streams, sink
-from membrane_ctrl.run_files.disk_budget import Thrift
+from membrane_ctrl.run_files.disk_budget import DetailLevel
 from membrane_ctrl.run_files.events import Event
 
 # A full disk is tried again this often: a person who made room sees the recording go on.
@@ -32,7 +32,7 @@ class RerunOutput:
         The run's configuration.
     thumbnails : FrameSource or None
         Thumbnails of frames.
-    complaints : Complaints
+    errors : RecorderErrors
         Where trouble goes.
 
     Attributes
@@ -45,12 +45,16 @@ class RerunOutput:
     """
 
     def __init__(
-        self, recording: sink.Recording, config: Config, thumbnails: FrameSource | None, complaints: sink.Complaints
+        self,
+        recording: sink.Recording,
+        config: Config,
+        thumbnails: FrameSource | None,
+        errors: sink.RecorderErrors,
     ) -> None:
         self._recording = recording
         self._segment_s = config.recording.segment_s
         self._thumbnails = thumbnails
-        self._complaints = complaints
+        self._errors = errors
         self._telemetry = rerun_streams.TelemetryStreams(recording, config)
         self.shapes = rerun_streams.ShapeStreams(recording)
         self.state = math.nan
@@ -70,28 +74,28 @@ class RerunOutput:
         rows: telemetry.Rows,
         events: list[Event],
         shapes: list[shape_estimate.ShapeEstimate],
-        thrift: Thrift,
+        detail: DetailLevel,
     ) -> bool:
         """One second's worth, until it is on the disk; False if it is lost to Rerun."""
-        self._complaints.guarded("shape reference", lambda: self._watch_hold(rows))
-        if thrift == Thrift.ESSENTIAL:
+        self._errors.guarded("shape reference", lambda: self._watch_hold(rows))
+        if detail == DetailLevel.ESSENTIAL:
             self._stop()
             return False
-        self.shapes.pictures = thrift == Thrift.ALL
+        self.shapes.pictures = detail == DetailLevel.ALL
         for _ in range(2):
             if (not self._alive or now_s >= self._segment_until_s) and not self._begin_segment(now_s):
                 return False
-            self._complaints.guarded("telemetry streams", lambda: self._telemetry.send(rows))
-            self._complaints.guarded("event streams", lambda: rerun_streams.send_events(self._recording, events))
-            self._complaints.guarded("shape streams", lambda: self._send_shapes(now_s, shapes, thrift))
+            self._errors.guarded("telemetry streams", lambda: self._telemetry.send(rows))
+            self._errors.guarded("event streams", lambda: rerun_streams.send_events(self._recording, events))
+            self._errors.guarded("shape streams", lambda: self._send_shapes(now_s, shapes, detail))
             try:
                 self._recording.flush()
             except sink.RecordingError as error:
                 self._alive = False
-                self._complaints.complain("recording", str(error))
+                self._errors.report_error("recording", str(error))
             else:
-                self._complaints.recovered("recording")
-                self._complaints.guarded("disk sync", self._sync)
+                self._errors.recovered("recording")
+                self._errors.guarded("disk sync", self._sync)
                 return True
         self._retry_s = now_s + RETRY_S
         return False
@@ -103,10 +107,10 @@ class RerunOutput:
             self._alive = False
             raise
 
-    def _send_shapes(self, now_s: float, shapes: list[shape_estimate.ShapeEstimate], thrift: Thrift) -> None:
+    def _send_shapes(self, now_s: float, shapes: list[shape_estimate.ShapeEstimate], detail: DetailLevel) -> None:
         for estimate in shapes:
             self.shapes.send(estimate)
-        if self._thumbnails is not None and thrift == Thrift.ALL:
+        if self._thumbnails is not None and detail == DetailLevel.ALL:
             self._thumbnails.send(now_s)
 
     def _begin_segment(self, now_s: float) -> bool:
@@ -118,7 +122,7 @@ class RerunOutput:
         except sink.RecordingError as error:
             self._alive = False
             self._retry_s = now_s + RETRY_S
-            self._complaints.complain("recording", str(error))
+            self._errors.report_error("recording", str(error))
             return False
         if self._alive and before is not None:
             self.closed.append(before)
@@ -132,7 +136,7 @@ class RerunOutput:
         """Close the file while there is room for its footer; with room again another is begun."""
         if self._alive:
             self._alive = False
-            self._complaints.guarded("recording", self._recording.pause)
+            self._errors.guarded("recording", self._recording.pause)
 
     def leave_folder(self) -> None:
         """The run's folder was taken away, and another is in its place: go on there, at once."""

@@ -214,7 +214,7 @@ def _style(stream: streams.Stream) -> rr.SeriesLines:
 Report = Callable[[dict[str, Any]], None]
 
 
-class Complaints:
+class RecorderErrors:
     """Runs what may fail, and reports what did.
 
     Parameters
@@ -240,16 +240,16 @@ class Complaints:
         try:
             action()
         except (OSError, RecordingError) as error:
-            self.complain(what, f"{what}: {error}")
+            self.report_error(what, f"{what}: {error}")
         except Exception as error:
             place = traceback.extract_tb(error.__traceback__)[-1]
-            self.complain(
+            self.report_error(
                 what, f"{what}: {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"
             )
         else:
             self.recovered(what)
 
-    def complain(self, what: str, message: str, kind: str = "recorder_error") -> None:
+    def report_error(self, what: str, message: str, kind: str = "recorder_error") -> None:
         """Report trouble once for as long as it is the same; the report says in `what` whose end to wait for."""
         if self._trouble.get(what) != message:
             self._trouble[what] = message

@@ -119,8 +119,8 @@ def delete_remains(logs_dir: Path) -> None:
 # What is still recorded when the disk runs low: pictures go first, numbers last.
 
 
-class Thrift(IntEnum):
-    """How much is left out."""
+class DetailLevel(IntEnum):
+    """How much detail is recorded."""
 
     ALL = 0
     NO_PICTURES = 1  # thumbnails and maps are half of a recording
@@ -133,8 +133,8 @@ PICTURES_FROM, _RERUN_FROM = 2.0, 0.2
 _HYSTERESIS = 1.1
 
 
-def thrift(free_mb: float, min_free_mb: float, before: Thrift) -> Thrift:
-    """What to leave out with this much space left.
+def detail_level(free_mb: float, min_free_mb: float, before: DetailLevel) -> DetailLevel:
+    """How much to record with this much space left.
 
     Parameters
     ----------
@@ -142,14 +142,14 @@ def thrift(free_mb: float, min_free_mb: float, before: Thrift) -> Thrift:
         Space left.
     min_free_mb : float
         `recording.min_free_mb`.
-    before : Thrift
+    before : DetailLevel
         As it was.
     """
     level = _level(free_mb, min_free_mb)
     return max(level, min(before, _level(free_mb / _HYSTERESIS, min_free_mb)))
 
 
-def _level(free_mb: float, min_free_mb: float) -> Thrift:
+def _level(free_mb: float, min_free_mb: float) -> DetailLevel:
     if free_mb < _RERUN_FROM * min_free_mb:
-        return Thrift.ESSENTIAL
-    return Thrift.NO_PICTURES if free_mb < PICTURES_FROM * min_free_mb else Thrift.ALL
+        return DetailLevel.ESSENTIAL
+    return DetailLevel.NO_PICTURES if free_mb < PICTURES_FROM * min_free_mb else DetailLevel.ALL

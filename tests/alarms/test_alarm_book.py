@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from membrane_ctrl.alarms.book import AlarmBook, Notice, Sign, signs_of
 from membrane_ctrl.config.port import AlarmsConfig
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.recorder.sink import Complaints
+from membrane_ctrl.recorder.sink import RecorderErrors
 
 CONFIG = AlarmsConfig(escalate_after_s=900, remind_every_s=3600, clear_after_s=30)
 BAD, GOOD = Sign("leak", True, "warning", "it leaks", for_s=10.0), Sign("leak", False)
@@ -113,11 +113,11 @@ def test_alarms_stand_beside_each_other(name: str) -> None:
 
 
 class Disk:
-    """The recorder's complaints as the alarms hear of them, at a time set by hand."""
+    """The recorder's recorder_errors as the alarms hear of them, at a time set by hand."""
 
     def __init__(self) -> None:
         self.book = AlarmBook(CONFIG)
-        self.complaints = Complaints(self.hear)
+        self.recorder_errors = RecorderErrors(self.hear)
         self.now_s = 0.0
 
     def hear(self, event: Event) -> None:
@@ -131,35 +131,35 @@ class Disk:
 
 def test_trouble_with_the_disk_is_over_with_the_last_of_it_and_not_with_the_first() -> None:
     disk = Disk()
-    disk.complaints.complain("disk", "less than 500 MB free", kind="disk_low")
+    disk.recorder_errors.report_error("disk", "less than 500 MB free", kind="disk_low")
     assert disk.step(0.0) == [("raised", "less than 500 MB free")]
     disk.step(5.0)
-    disk.complaints.complain("state file", "state file: x")
+    disk.recorder_errors.report_error("state file", "state file: x")
     disk.step(6.0)
-    disk.complaints.recovered("state file")
+    disk.recorder_errors.recovered("state file")
     assert disk.step(37.0) == []
     assert disk.book.standing("recorder")
     assert disk.step(910.0) == [("escalated", "less than 500 MB free")]
-    disk.complaints.recovered("disk")
+    disk.recorder_errors.recovered("disk")
     assert disk.step(940.0) == [("cleared", "less than 500 MB free")]
 
 
 def test_a_reminder_names_what_still_stands() -> None:
     disk = Disk()
-    disk.complaints.complain("disk", "less than 500 MB free", kind="disk_low")
-    disk.complaints.complain("state file", "state file: x")
+    disk.recorder_errors.report_error("disk", "less than 500 MB free", kind="disk_low")
+    disk.recorder_errors.report_error("state file", "state file: x")
     disk.step(0.0)
-    disk.complaints.recovered("disk")
+    disk.recorder_errors.recovered("disk")
     assert disk.step(900.0) == [("escalated", "state file: x")]
 
 
 def test_another_recorder_begins_without_the_formers_trouble_and_tells_its_own() -> None:
     disk = Disk()
-    disk.complaints.complain("state file", "state file: x")
+    disk.recorder_errors.report_error("state file", "state file: x")
     disk.step(0.0)
     disk.hear({"kind": "child_restarted", "child": "recorder"})
     disk.step(1.0)
     assert not disk.book.standing("recorder")
-    Complaints(disk.hear).complain("disk", "less than 500 MB free", kind="disk_low")
+    RecorderErrors(disk.hear).report_error("disk", "less than 500 MB free", kind="disk_low")
     assert disk.step(40.0) == [], "the same alarm, not told off and told again"
     assert disk.step(900.0) == [("escalated", "less than 500 MB free")]

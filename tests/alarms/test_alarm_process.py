@@ -29,7 +29,7 @@ ROW = TelemetryRow(*(0.0 for _ in FIELDS))
 TEST = Notice("raised", "test", "warning", "text")
 
 
-class Post:
+class FakeSender:
     """Takes notices, unless the network is down."""
 
     def __init__(self) -> None:
@@ -48,25 +48,25 @@ def message(**event: object) -> bytes:
     return json.dumps(event).encode()
 
 
-def told(post: Post) -> list[tuple[str, str]]:
-    return [(notice.name, notice.kind) for notice in post.through]
+def told(sender: FakeSender) -> list[tuple[str, str]]:
+    return [(notice.name, notice.kind) for notice in sender.through]
 
 
 def test_a_fault_that_was_held_for_too_long_is_told_as_latched() -> None:
-    post = Post()
-    watcher = Watcher(CONFIG, [Outbox(post)], 0.0)
+    sender = FakeSender()
+    watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
     watcher.look([ROW.pack()], [message(kind="fault", name="displacement_missing", latching=False)], 1.0)
     watcher.look([ROW.pack()], [message(kind="state", state="fault", **{"from": "hold"})], 31.0)
-    assert [(notice.name, notice.severity) for notice in post.through] == [
+    assert [(notice.name, notice.severity) for notice in sender.through] == [
         ("glitch", "warning"),
         ("fault", "critical"),
     ]
-    assert post.through[1].text.startswith("displacement_missing")
+    assert sender.through[1].text.startswith("displacement_missing")
 
 
 def test_the_next_fault_is_told_however_soon_it_comes_after_an_acknowledgement() -> None:
-    post = Post()
-    watcher = Watcher(CONFIG, [Outbox(post)], 0.0)
+    sender = FakeSender()
+    watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
     watcher.look([ROW.pack()], [message(kind="fault", name="late", latching=True)], 1.0)
     acknowledged = [
         message(kind="command", command="ack"),
@@ -75,54 +75,54 @@ def test_the_next_fault_is_told_however_soon_it_comes_after_an_acknowledgement()
     watcher.look([ROW.pack()], acknowledged, 2.0)
     watcher.look([ROW.pack()], [message(kind="fault", name="over_pressure", latching=True)], 10.0)
     watcher.look([ROW.pack()], [], 10.0 + CONFIG.escalate_after_s)
-    assert told(post) == [("fault", "raised"), ("fault", "raised"), ("fault", "escalated")]
-    assert post.through[-1].text.startswith("over_pressure")
+    assert told(sender) == [("fault", "raised"), ("fault", "raised"), ("fault", "escalated")]
+    assert sender.through[-1].text.startswith("over_pressure")
 
 
 def test_a_fault_is_told_at_once_and_its_end_too() -> None:
-    post = Post()
-    watcher = Watcher(CONFIG, [Outbox(post)], 0.0)
+    sender = FakeSender()
+    watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
     watcher.look([ROW.pack()], [message(kind="fault", name="late", latching=True)], 1.0)
     watcher.look([ROW.pack()], [message(kind="state", state="standby", **{"from": "fault"})], 2.0)
     watcher.look([ROW.pack()], [], 33.0)
-    assert told(post) == [("fault", "raised"), ("fault", "cleared")]
+    assert told(sender) == [("fault", "raised"), ("fault", "cleared")]
 
 
 def test_a_value_out_of_its_limits() -> None:
-    post = Post()
-    watcher = Watcher(CONFIG, [Outbox(post)], 0.0)
+    sender = FakeSender()
+    watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
     bad, good = replace(ROW, error_um=-20.0).pack(), ROW.pack()
     for now_s in range(30):
         watcher.look([bad], [], float(now_s))
-    assert told(post) == []
+    assert told(sender) == []
     watcher.look([bad], [], 30.0)
-    assert told(post) == [("out_of_band", "raised")]
+    assert told(sender) == [("out_of_band", "raised")]
     watcher.look([good], [], 31.0)
     watcher.look([good], [], 61.0)
-    assert told(post)[1:] == [("out_of_band", "cleared")]
+    assert told(sender)[1:] == [("out_of_band", "cleared")]
 
 
 def test_a_loop_that_falls_silent_is_told_and_a_slow_start_is_not() -> None:
-    post = Post()
-    watcher = Watcher(CONFIG, [Outbox(post)], 0.0)
+    sender = FakeSender()
+    watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
     watcher.look([], [], 30.0)
     watcher.look([ROW.pack()], [], 31.0)
     watcher.look([], [], 35.9)
-    assert told(post) == []
+    assert told(sender) == []
     watcher.look([], [], 36.0)
-    assert told(post) == [("silent", "raised")]
+    assert told(sender) == [("silent", "raised")]
 
 
 def test_an_escalation_is_tried_until_it_is_through_and_keeps_nobody_else_waiting() -> None:
-    post, behind = Post(), Post()
+    sender, behind = FakeSender(), FakeSender()
     behind.down = True
-    watcher = Watcher(CONFIG, [Outbox(post), Outbox(behind)], 0.0)
+    watcher = Watcher(CONFIG, [Outbox(sender), Outbox(behind)], 0.0)
     watcher.look([ROW.pack()], [message(kind="fault", latching=True)], 0.0)
     late_s = CONFIG.escalate_after_s
     watcher.look([ROW.pack()], [], late_s)
     watcher.look([ROW.pack()], [message(kind="link", message="lost")], late_s + 1.0)
     watcher.look([ROW.pack()], [], late_s + 7.0)
-    assert told(post) == [("fault", "raised"), ("fault", "escalated"), ("link", "raised")]
+    assert told(sender) == [("fault", "raised"), ("fault", "escalated"), ("link", "raised")]
     assert told(behind) == []
     behind.down = False
     watcher.look([ROW.pack()], [], late_s + 11.0)
@@ -131,28 +131,28 @@ def test_an_escalation_is_tried_until_it_is_through_and_keeps_nobody_else_waitin
 
 @pytest.mark.parametrize("event", [{"kind": "alarms_acknowledged"}, {"kind": "command", "command": "ack"}])
 def test_an_acknowledgement_keeps_the_others_asleep(event: Event) -> None:
-    post = Post()
-    watcher = Watcher(CONFIG, [Outbox(post)], 0.0)
+    sender = FakeSender()
+    watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
     watcher.look([ROW.pack()], [message(kind="fault", latching=True)], 0.0)
     watcher.look([ROW.pack()], [message(**event)], 1.0)
     watcher.look([ROW.pack()], [], 10_000.0)
-    assert told(post) == [("fault", "raised")]
+    assert told(sender) == [("fault", "raised")]
 
 
 def test_a_network_that_is_down_is_tried_later_and_later_in_order() -> None:
-    post = Post()
-    post.down = True
-    outbox = Outbox(post)
+    sender = FakeSender()
+    sender.down = True
+    outbox = Outbox(sender)
     for number in range(60):
         outbox.post(replace(TEST, name=str(number)))
     assert outbox.dropped == 10
     for now_s in range(100):
         outbox.step(float(now_s))
-    assert post.tried == 4, "at 0, 10, 30 and 70 s"
+    assert sender.tried == 4, "at 0, 10, 30 and 70 s"
     assert outbox.failing
-    post.down = False
+    sender.down = False
     outbox.step(150.0)
-    assert [notice.name for notice in post.through] == [str(n) for n in range(10, 60)]
+    assert [notice.name for notice in sender.through] == [str(n) for n in range(10, 60)]
     assert outbox.empty
     assert not outbox.failing
 
@@ -162,26 +162,26 @@ def spec(telemetry: object, events: object) -> AlarmsSpec:
 
 
 def test_the_process_ends_with_the_run_and_says_why_it_ended() -> None:
-    post, reports = Post(), list[Event]()
+    sender, reports = FakeSender(), list[Event]()
     with ring(16, ROW_BYTES) as telemetry, ring(16, 4096) as events:
         writer = RingWriter(events)
         writer.put(message(kind="end", exit="safety_trip"))
-        watch(spec(telemetry, events), [post], reports.append, lambda: True)
+        watch(spec(telemetry, events), [sender], reports.append, lambda: True)
         writer.close()
-    assert told(post) == [("run_ended", "raised")]
+    assert told(sender) == [("run_ended", "raised")]
     assert [(r["kind"], r["alarm"], r["sent"]) for r in reports if r["kind"] != "alive"] == [
         ("alarm", "run_ended", True)
     ]
 
 
 def test_a_control_process_that_vanishes_is_told() -> None:
-    post = Post()
+    sender = FakeSender()
 
     theirs, ours = Pipe()
     theirs.close()
     with ring(16, ROW_BYTES) as telemetry, ring(16, 4096) as events:
-        watch(spec(telemetry, events), [post], reporter(ours), lambda: False)
-    assert told(post) == [("control_gone", "raised")]
+        watch(spec(telemetry, events), [sender], reporter(ours), lambda: False)
+    assert told(sender) == [("control_gone", "raised")]
 
 
 class Target:

@@ -145,7 +145,7 @@ def document(results: list[Result], told: list[Told]) -> str:
         "",
         f"**{len(results)} runs and {len(told)} stories, {len(violations)} violations of an invariant.**",
         "",
-        "A cell shows the deepest rung of the ladder of safe actions, the first cause that was named, and the "
+        "A cell shows the deepest safe level, the first cause that was named, and the "
         "longest time from the fault to the first safe rung; `-` where nothing tripped. In `fault` the first cause "
         "is another one (late ticks) and stays. A process that is stopped shows no tick: what counts there is the "
         "board, whose pump must stand after its watchdog period (0.5 s).",
@@ -181,7 +181,7 @@ _INVARIANTS = (
     "- Out of `fault` leads only the resume rule where it lists the cause, once it has been away for its time, at "
     "most twice a day, and never after a vent was open, the board's included.",
     "- The mean flow of HOLD_FLOW is steady. Code that raises leaves the pump off in the same tick.",
-    "- The ladder is only ever climbed from HOLD_FLOW; a rung always has a cause; the first one stays.",
+    "- The safe levels are only left from HOLD_FLOW; a level always has a cause; the first one stays.",
     "- What is harmless trips nothing, and the mirror is at its setpoint in the end.",
     "- Without ticks the board's pump stands after its watchdog period, whoever reads meanwhile.",
     "- A stop ends; one that the pump does not obey is no success, and opens the vent.",

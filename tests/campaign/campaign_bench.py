@@ -1,4 +1,4 @@
-"""A bench for the campaign with real processes: the emulated board on its own clock, and a witness of its output."""
+"""A bench for the campaign with real processes: the emulated board on its own clock, and a monitor of its output."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from firmware_iface.roles import (
 )
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import TickOutputs
-from membrane_ctrl.hold.latched_fault import Latcher
+from membrane_ctrl.hold.latched_fault import FaultLatch
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.states import State
@@ -148,8 +148,8 @@ async def faults_that_outlive_the_run() -> list[str]:
             return False
 
         async with a_room(on_board) as room:
-            with Latcher(file, None, "run", LoopClock().utc, room.events.append) as latcher:
-                room.listeners.append(latcher.heard)
+            with FaultLatch(file, None, "run", LoopClock().utc, room.events.append) as fault_latch:
+                room.listeners.append(fault_latch.heard)
                 board_of(room).virtual.wrong.late_ms = 0.0
                 board_of(room).virtual.wrong.gauge_offset_pa = 60.0
                 await room.until(State.FAULT)
@@ -157,11 +157,11 @@ async def faults_that_outlive_the_run() -> list[str]:
             first = file.read()
             room.must(first is not None and first.name == "over_pressure", f"in the file: {first}")
             room.must(refused(), "the next hold starts over a latched fault")
-            with Latcher(file, None, "run", LoopClock().utc, room.events.append) as latcher:
+            with FaultLatch(file, None, "run", LoopClock().utc, room.events.append) as fault_latch:
                 locked = {"kind": "command", "command": "latch", "who": "somebody", "text": "later"}
                 denied = {"kind": "command", "command": "ack", "who": "somebody", "refused": "not now"}
                 for event in (locked, denied):
-                    latcher.heard(cast(TickOutputs, _Told(room.heard[-1], (event,))))
+                    fault_latch.heard(cast(TickOutputs, _Told(room.heard[-1], (event,))))
             room.must(file.read() == first, "the first cause was replaced, or cleared by a refused acknowledgement")
             for content in ("", "{", "[]", '{"schema": "other"}', "null"):
                 (Path(folder) / NAME).write_text(content)

@@ -1,6 +1,6 @@
 """One run of the campaign: bring the controller somewhere, let something go wrong, watch to the end of the story.
 
-The end: 45 s after the fault, in which every rung of the ladder has had its time, somebody asks for a stop.
+The end: 45 s after the fault, in which every safe level has had its time, somebody asks for a stop.
 """
 
 from __future__ import annotations

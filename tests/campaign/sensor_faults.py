@@ -341,7 +341,7 @@ def _speaks(event: dict[str, object]) -> str:
         case "fault":
             return str(event["name"])
         case "plausibility" if event["liar"] != "nobody":
-            return f"witnesses: {event['liar']}"
+            return f"sensors: {event['liar']}"
         case "shape" if "limit" in str(event["reason"]):
             return "shape: trim at its limit"
         case "shape" if "repeats" in str(event["reason"]):

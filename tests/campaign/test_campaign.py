@@ -10,7 +10,7 @@ from campaign_cases import CASES, SITUATIONS, Case, Situation
 from campaign_rooms import ROOMS
 from campaign_run import run_case
 
-from membrane_ctrl.controller.safe_levels import Ladder
+from membrane_ctrl.controller.safe_levels import SafeLevels
 from membrane_ctrl.controller.safety import TABLE, Observation, SafetyTable, Verdict
 from membrane_ctrl.model.states import Rung, State
 
@@ -54,10 +54,10 @@ def test_the_watch_sees_a_blind_safety_table(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_watch_sees_a_ladder_that_stays_on_its_first_rung(monkeypatch: pytest.MonkeyPatch) -> None:
-    def stay(self: Ladder, rung: Rung, now_s: float) -> None:
+    def stay(self: SafeLevels, rung: Rung, now_s: float) -> None:
         self.rung = Rung.HOLD_FLOW
 
-    monkeypatch.setattr(Ladder, "enter", stay)
+    monkeypatch.setattr(SafeLevels, "enter", stay)
     for name in ("network cut", "gauge lost", "pump runs at full"):
         assert run_case(case_called(name), at("hold"), 1).violations, name
 

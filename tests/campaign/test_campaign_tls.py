@@ -33,7 +33,7 @@ from port_certificates import Authority
 pytestmark = [pytest.mark.real_time, pytest.mark.campaign, pytest.mark.timeout(400)]
 
 CYCLES, WARM_S, PHASE_S = 5, 4.0, 12.0  # attackers need some seconds until all of them are there
-CROWD = 1000  # who stand in the door; 98 others do worse
+CROWD = 1000  # who never shake hands; 98 others do worse
 
 
 @dataclass
@@ -183,7 +183,7 @@ async def test_strangers_disturb_neither_ticks_nor_operators(tmp_path: Path, cer
     assert len(refused) <= 40 * CYCLES
     assert local.failed == []
     assert len(local.served_s) >= 10
-    if how == "lone":  # a thousand addresses fill the queue in front of the door: then the socket file is the way
+    if how == "lone":  # a thousand addresses fill the queue of the kernel: then the socket file is the way
         assert remote.failed == []
         assert len(remote.served_s) >= 10
 

@@ -103,7 +103,7 @@ def contexts(folder: Path) -> dict[str, ssl.SSLContext]:
 
 
 async def everything(port: int, folder: Path, crowd: int, lone: bool) -> None:
-    """A crowd that stands in the door, and some of each of the others."""
+    """A crowd that never shakes hands, and some of each of the others."""
     known = contexts(folder)
     plans: list[tuple[Deed, ssl.SSLContext | None]] = [(stand, None)] * crowd
     plans += [(deed, None) for deed in (dribble, junk, come_and_go) for _ in range(20)]

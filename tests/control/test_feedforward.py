@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import LoopConfig
-from membrane_ctrl.control.gas import FeedForward, weather_complaint
+from membrane_ctrl.control.gas import FeedForward, weather_fault
 
 DT_S = 0.02
 
@@ -80,13 +80,13 @@ def test_switching_at_run_time_is_no_bump() -> None:
 @pytest.mark.parametrize(("pressure_pa", "air_c"), [(1013.25, 20.0), (101_325.0, 293.15), (14.7, math.nan)])
 def test_a_weather_sensor_in_another_unit_moves_nothing_and_is_named(pressure_pa: float, air_c: float) -> None:
     wave = np.sin(np.arange(200) / 10)
-    wrong_pressure = weather_complaint(pressure_pa, 20.0) != ""
+    wrong_pressure = weather_fault(pressure_pa, 20.0) != ""
     pressure = pressure_pa + (wave if wrong_pressure else 0.0 * wave)
     air = air_c + (0.0 * wave if wrong_pressure else wave)
     assert not answered(LoopConfig(), pressure, air).any()
-    assert "check its unit" in weather_complaint(pressure_pa, air_c)
+    assert "check its unit" in weather_fault(pressure_pa, air_c)
 
 
 @pytest.mark.parametrize(("pressure_pa", "air_c"), [(101_325.0, 20.0), (54_000.0, -5.0), (math.nan, math.nan)])
 def test_weather_of_places_where_people_work_is_believed(pressure_pa: float, air_c: float) -> None:
-    assert weather_complaint(pressure_pa, air_c) == ""
+    assert weather_fault(pressure_pa, air_c) == ""

@@ -1,4 +1,4 @@
-"""Who lies is found by the third witness, in a time and from a size that are stated; nobody is accused in peace."""
+"""Who lies is found by the third sensor, in a time and from a size that are stated; nobody is accused in peace."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_slow_drifts_are_no_lies() -> None:
     assert set(told(lambda t: (0.0, 0.0, 0.0), 900.0, gauge_drift_pa_per_s=0.01)) == {Liar.NOBODY}
 
 
-def test_a_witness_that_drifts_off_accuses_nobody_falsely() -> None:
+def test_a_gauge_that_drifts_off_accuses_nobody_falsely() -> None:
     # 0.1 Pa a minute, far more than a gauge's zero moves
     said = told(lambda t: (0.0, after(200.0, 30.0)(t), 0.0), gauge_drift_pa_per_s=0.1 / 60)
     assert Liar.LASER in said
@@ -92,7 +92,7 @@ def test_without_a_camera_or_a_gauge_nothing_is_said() -> None:
         judge.reset()
 
 
-def test_a_rejected_shape_is_no_witness() -> None:
+def test_a_rejected_shape_is_no_evidence() -> None:
     judge = Plausibility(10.0)
     for tick in range(3000):
         bad = estimate(tick * 0.1, SAG_UM + 500.0, "rejected") if tick % 20 == 10 else None

@@ -1,4 +1,4 @@
-"""Command for a flow, against the twin's pump as the witness."""
+"""Command for a flow, against the twin's pump as the reference."""
 
 from __future__ import annotations
 

@@ -1,38 +1,38 @@
 from __future__ import annotations
 
-from membrane_ctrl.control_port.door import Refusals
-from membrane_ctrl.control_port.session import Helm, Peer, may_not
+from membrane_ctrl.control_port.endpoint import Refusals
+from membrane_ctrl.control_port.session import Commander, Peer, may_not
 from membrane_ctrl.model.events import Event
 
 
 def test_the_first_to_command_has_it_and_the_second_is_told_who() -> None:
-    helm = Helm(600.0)
-    assert helm.holder(0.0) == ""
-    assert helm.claim("unix:ann", False, 0.0) == ""
-    assert "unix:ann" in helm.claim("unix:bob", False, 10.0)
-    assert helm.holder(10.0) == "unix:ann"
+    commander = Commander(600.0)
+    assert commander.holder(0.0) == ""
+    assert commander.claim("unix:ann", False, 0.0) == ""
+    assert "unix:ann" in commander.claim("unix:bob", False, 10.0)
+    assert commander.holder(10.0) == "unix:ann"
 
 
 def test_it_is_taken_over_given_back_or_lapses() -> None:
-    helm = Helm(600.0)
-    helm.claim("unix:ann", False, 0.0)
-    assert helm.claim("unix:bob", True, 1.0) == ""
-    assert helm.holder(1.0) == "unix:bob"
-    helm.release("unix:ann")
-    assert helm.holder(1.0) == "unix:bob", "only who has it gives it back"
-    helm.release("unix:bob")
-    assert helm.holder(1.0) == ""
-    helm.claim("unix:ann", False, 2.0)
-    assert helm.holder(602.0) == "unix:ann"
-    assert helm.holder(602.1) == ""
-    assert helm.claim("unix:bob", False, 602.1) == ""
+    commander = Commander(600.0)
+    commander.claim("unix:ann", False, 0.0)
+    assert commander.claim("unix:bob", True, 1.0) == ""
+    assert commander.holder(1.0) == "unix:bob"
+    commander.release("unix:ann")
+    assert commander.holder(1.0) == "unix:bob", "only who has it gives it back"
+    commander.release("unix:bob")
+    assert commander.holder(1.0) == ""
+    commander.claim("unix:ann", False, 2.0)
+    assert commander.holder(602.0) == "unix:ann"
+    assert commander.holder(602.1) == ""
+    assert commander.claim("unix:bob", False, 602.1) == ""
 
 
 def test_each_command_keeps_it_from_lapsing() -> None:
-    helm = Helm(600.0)
+    commander = Commander(600.0)
     for now_s in range(0, 6000, 500):
-        assert helm.claim("unix:ann", False, float(now_s)) == ""
-    assert helm.holder(6000.0) == "unix:ann"
+        assert commander.claim("unix:ann", False, float(now_s)) == ""
+    assert commander.holder(6000.0) == "unix:ann"
 
 
 def test_roles_are_steps() -> None:

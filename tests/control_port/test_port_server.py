@@ -238,8 +238,8 @@ async def test_too_many_peers_cost_the_one_silent_longest(tmp_path: Path, monkey
             assert (await eve.ask(do="status"))["ok"]
 
 
-async def test_a_door_that_fails_opens_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("membrane_ctrl.control_port.door._AGAIN_S", 0.01)
+async def test_an_endpoint_that_fails_opens_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("membrane_ctrl.control_port.endpoint._AGAIN_S", 0.01)
     run = PortRun(tmp_path)
     loop = asyncio.get_running_loop()
     accept, failures = loop.sock_accept, [OSError(24, "too many open files"), RuntimeError("bug")]
@@ -322,23 +322,23 @@ def test_a_client_of_something_else(tmp_path: Path) -> None:
 
 def test_a_client_waits_its_turn_at_a_crowded_door(tmp_path: Path) -> None:
     path = tmp_path / "control.sock"
-    with socket.socket(socket.AF_UNIX) as door, socket.socket(socket.AF_UNIX) as first:
-        door.bind(str(path))
-        door.listen(0)
+    with socket.socket(socket.AF_UNIX) as endpoint, socket.socket(socket.AF_UNIX) as first:
+        endpoint.bind(str(path))
+        endpoint.listen(0)
         first.connect(str(path))  # nobody else fits
         with ThreadPoolExecutor(1) as elsewhere:
             second = elsewhere.submit(PortClient.unix, path, print)
-            with door.accept()[0], door.accept()[0] as accepted:
+            with endpoint.accept()[0], endpoint.accept()[0] as accepted:
                 accepted.sendall(b'{"membrane_ctrl": 1}\n')
                 with second.result() as client:
                     assert client.greeting == {"membrane_ctrl": 1}
 
 
-def test_a_door_that_stays_crowded_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_endpoint_that_is_flooded_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("membrane_ctrl.control_port.client._TURN", struct.pack("ll", 0, 50_000))
-    with socket.socket(socket.AF_UNIX) as door, socket.socket(socket.AF_UNIX) as first:
-        door.bind(str(tmp_path / "control.sock"))
-        door.listen(0)
+    with socket.socket(socket.AF_UNIX) as endpoint, socket.socket(socket.AF_UNIX) as first:
+        endpoint.bind(str(tmp_path / "control.sock"))
+        endpoint.listen(0)
         first.connect(str(tmp_path / "control.sock"))
         with pytest.raises(DeviceError, match="too many wait"):
             PortClient.unix(tmp_path / "control.sock", print)

@@ -1,22 +1,22 @@
 from __future__ import annotations
 
 from membrane_ctrl.control_port.status import RecorderTrouble
-from membrane_ctrl.recorder.sink import Complaints
+from membrane_ctrl.recorder.sink import RecorderErrors
 
 
 def test_each_trouble_stands_until_its_own_end() -> None:
     trouble = RecorderTrouble()
-    complaints = Complaints(trouble.take)
+    recorder_errors = RecorderErrors(trouble.take)
     assert trouble.words == ""
-    complaints.complain("disk", "less than 500 MB free", kind="disk_low")
-    complaints.complain("state file", "state file: x")
-    complaints.complain("state file", "state file:\n  y")
+    recorder_errors.report_error("disk", "less than 500 MB free", kind="disk_low")
+    recorder_errors.report_error("state file", "state file: x")
+    recorder_errors.report_error("state file", "state file:\n  y")
     assert trouble.words == "less than 500 MB free; state file: y"
-    complaints.recovered("state file")
+    recorder_errors.recovered("state file")
     assert trouble.words == "less than 500 MB free"
-    complaints.recovered("disk")
+    recorder_errors.recovered("disk")
     assert trouble.words == ""
-    complaints.complain("recording", "x" * 5000)
+    recorder_errors.report_error("recording", "x" * 5000)
     assert trouble.words == "x" * 300, "it is in every line of the log"
 
 

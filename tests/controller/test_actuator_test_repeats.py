@@ -53,7 +53,7 @@ def noisy_test(rate_hz: float, seed: int, pump_share: float = 1.0, vent_um_per_s
             flow = max(0.0, part.pump_fraction * pump_share - pump.dead_fraction) / (1 - pump.dead_fraction)
             height_um += dt_s * (pump.flow_full_um_per_s * flow - vent_um_per_s * part.vent_fraction - 1.2)
             test.step(height_um + rng.standard_normal(), dt_s)
-        if test.is_second or not test.complaint():
+        if test.is_second or not test.failure():
             break
         test.again()
     return test
@@ -62,7 +62,7 @@ def noisy_test(rate_hz: float, seed: int, pump_share: float = 1.0, vent_um_per_s
 @pytest.mark.parametrize("rate_hz", [10.0, 50.0])
 def test_noise_alone_complains_hardly_ever_and_asks_twice_rarely(rate_hz: float) -> None:
     tests = [noisy_test(rate_hz, seed) for seed in range(300)]
-    assert not [test for test in tests if test.complaint()]
+    assert not [test for test in tests if test.failure()]
     assert sum(test.is_second for test in tests) <= 9  # 3 %
 
 
@@ -71,7 +71,7 @@ def test_noise_alone_complains_hardly_ever_and_asks_twice_rarely(rate_hz: float)
 def test_noise_alone_hides_a_dead_actuator_hardly_ever(
     rate_hz: float, pump_share: float, vent_um_per_s: float
 ) -> None:
-    passed = sum(not noisy_test(rate_hz, seed, pump_share, vent_um_per_s).complaint() for seed in range(300))
+    passed = sum(not noisy_test(rate_hz, seed, pump_share, vent_um_per_s).failure() for seed in range(300))
     assert passed <= 5  # two in a thousand of a pump, six of a vent, are to be expected
 
 
@@ -87,6 +87,6 @@ def test_something_in_the_beam_during_the_first_does_not_spoil_the_second() -> N
             seen += part.name == "pump"
             test.step(height_um + error_um * (seen > 65), 0.02)
         if not test.is_second:
-            assert "pump" in test.complaint()
+            assert "pump" in test.failure()
             test.again()
-    assert test.complaint() == ""
+    assert test.failure() == ""

@@ -124,7 +124,7 @@ def tell(config: Config, event: str) -> Story:
     return story
 
 
-def complaints(config: Config, event: str) -> Iterator[str]:
+def failures(config: Config, event: str) -> Iterator[str]:
     story = tell(config, event)
     if not story.held:
         yield f"never held: {story.faults_before}"
@@ -152,7 +152,7 @@ def judged(seeds: range, passing: bool = True) -> tuple[int, int, list[str]]:
             continue
         looked_at += 1
         changed = config.model_dump(exclude_defaults=True)
-        found += [f"{seed}: {complaint}: {changed}" for complaint in complaints(config, event)]
+        found += [f"{seed}: {complaint}: {changed}" for complaint in failures(config, event)]
     return drawn, looked_at, found
 
 
@@ -172,5 +172,5 @@ def test_the_onlooker_is_not_blind() -> None:
 @pytest.mark.timeout(1200)
 def test_what_passes_of_five_hundred_holds_and_ends_safely() -> None:
     drawn, passed, found = judged(range(1000, 1500))
-    print(f"{drawn} configurations drawn, {passed} let pass, {len(found)} complaints")
+    print(f"{drawn} configurations drawn, {passed} let pass, {len(found)} failures")
     assert found == []

@@ -31,8 +31,8 @@ from membrane_ctrl.control_port.server import Port
 from membrane_ctrl.control_port.tls import Listeners
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
-from membrane_ctrl.hold.child_processes import Crew, rings_for
-from membrane_ctrl.hold.latched_fault import Latcher
+from membrane_ctrl.hold.child_processes import ChildProcesses, rings_for
+from membrane_ctrl.hold.latched_fault import FaultLatch
 from membrane_ctrl.hold.start import BoardAtStart, HoldOptions, _run
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
 from membrane_ctrl.hold.systemd import SystemdNotify
@@ -98,12 +98,12 @@ class Bench:
         self.folder = folder
         self.events: list[Event] = []
         self.reports: Callable[[], list[Event]] = list
-        self.crew = SimpleNamespace(reports=lambda: self.reports())
+        self.children = SimpleNamespace(reports=lambda: self.reports())
 
     def hold(self, breaks: Callable[[Bench], None]) -> Exit:
         """Hold in standby until something breaks after three seconds, and a stop after twenty."""
         options = HoldOptions(CONFIG, "lab.toml", False, 20.0, "test", self.folder, False, False, standby=True)
-        latched = partial(Latcher, LatchedFile(self.folder), ResumeLog(self.folder), "run", LoopClock().utc)
+        latched = partial(FaultLatch, LatchedFile(self.folder), ResumeLog(self.folder), "run", LoopClock().utc)
         port = partial(Port, CONFIG.port, Listeners(), "run")
         with ExitStack() as stack:
             rings = rings_for(CONFIG, None, stack)
@@ -112,9 +112,9 @@ class Bench:
 
             async def run() -> Exit:
                 asyncio.get_running_loop().call_later(BREAKS_S, breaks, self)
-                crew, clock = cast(Crew, self.crew), cast(RunClock, LoopClock())
+                children, clock = cast(ChildProcesses, self.children), cast(RunClock, LoopClock())
                 return await _run(
-                    self.bench, CONFIG, options, clock, rings, crew, None, port, latched, BoardAtStart()
+                    self.bench, CONFIG, options, clock, rings, children, None, port, latched, BoardAtStart()
                 )
 
             exit_code = run_virtual(run())
@@ -183,7 +183,7 @@ def test_a_software_watchdog_that_ended_is_a_fault(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "name"), [(Port, "control port"), (Latcher, "latched-fault file"), (SystemdNotify, "systemd")]
+    ("kind", "name"), [(Port, "control port"), (FaultLatch, "latched-fault file"), (SystemdNotify, "systemd")]
 )
 def test_a_listener_that_raises_is_a_fault(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, kind: type, name: str
@@ -230,8 +230,8 @@ def test_whatever_ends_the_run_the_last_command_is_pump_off_with_the_vent_as_it_
 def test_a_thread_that_raises_tells_of_it(tmp_path: Path) -> None:
     """What a thread raises is seen by nobody: anything is told as what a disk refuses is."""
     told: list[Event] = []
-    with Latcher(LatchedFile(tmp_path), None, "run", LoopClock().utc, told.append) as latcher:
-        latcher._disk.submit(latcher._try, raises)
+    with FaultLatch(LatchedFile(tmp_path), None, "run", LoopClock().utc, told.append) as fault_latch:
+        fault_latch._disk.submit(fault_latch._try, raises)
     assert told[0] == {"kind": "latch_failed", "message": "broken"}
 
 

@@ -63,7 +63,7 @@ def test_a_gauge_that_jumps_is_believed_after_ten_refusals() -> None:
     assert jumps == [*range(1, 11), 0, 0]
 
 
-def test_a_gauge_that_jumps_is_no_witness_and_is_judged_by_its_limits_nevertheless() -> None:
+def test_a_gauge_that_jumps_is_no_evidence_and_is_judged_by_its_limits_nevertheless() -> None:
     observer = Observer(LimitsConfig())
     gauge(observer, 1, 600.0)
     seen = gauge(observer, 2, 2000.0)

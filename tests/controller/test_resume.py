@@ -9,7 +9,7 @@ import pytest
 from firmware_iface.register_map import default_map
 from membrane_ctrl.config.schema import Config, LimitsConfig, LoopConfig, ResumeConfig, ShapeConfig, StatesConfig
 from membrane_ctrl.controller.commands import AT_START, Command
-from membrane_ctrl.controller.safe_levels import Ladder, ResumeRule
+from membrane_ctrl.controller.safe_levels import ResumeRule, SafeLevels
 from membrane_ctrl.controller.safety import TABLE, Observation
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.states import Rung, State
@@ -45,11 +45,11 @@ class Fault:
 
     def __init__(self, name: str = "link_lost", config: ResumeConfig = CONFIG, rung: Rung = Rung.PUMP_OFF) -> None:
         self.rule = ResumeRule(config, LimitsConfig())
-        self.fault, self.ladder = RULES[name], Ladder(StatesConfig())
-        self.ladder.enter(rung, 0.0)
+        self.fault, self.levels = RULES[name], SafeLevels(StatesConfig())
+        self.levels.enter(rung, 0.0)
 
     def due(self, now_s: float, observation: Observation = GONE) -> bool:
-        return self.rule.due(self.fault, self.ladder, observation, now_s)
+        return self.rule.due(self.fault, self.levels, observation, now_s)
 
 
 def test_only_what_is_listed_is_possible() -> None:

@@ -94,7 +94,7 @@ def test_the_middle_of_many_ignores_a_quarter() -> None:
     assert middle(np.array([1, 2, 60_000])) == 2.0
 
 
-def test_the_gate_wants_a_witness() -> None:
+def test_the_gate_wants_a_second_reading() -> None:
     gate = StepGate(10.0)
     assert [gate.passes(v) for v in (0, 3, 500, 5, 8, 300, 303, 301)] == [
         False, True, False, True, True, False, True, True,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, Bench, bench_at, sigmas
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
-from membrane_ctrl.metrology.calibrate.separable import Witness
+from membrane_ctrl.metrology.calibrate.separable import References
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, surface_of
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import Surface
@@ -38,7 +38,7 @@ class Truth:
 
     def problem(self, sigmas: FloatArray, sets: tuple[SetPhases, ...] | None = None) -> Problem:
         """To be solved."""
-        return Problem(STATED, self.sets if sets is None else sets, sigmas, Witness(0.0), 500.0)
+        return Problem(STATED, self.sets if sets is None else sets, sigmas, References(0.0), 500.0)
 
 
 def plain(truth: Truth) -> Problem:
@@ -51,7 +51,7 @@ def plain(truth: Truth) -> Problem:
         for phases, state in zip(problem.sets, first_states(problem), strict=True)
     ]
     sets = [replace(p, sigma_mm=np.full_like(p.sigma_mm, own)) for p, own in zip(problem.sets, left, strict=True)]
-    return replace(problem, sets=tuple(sets), witness=Witness(0.0, 1.0, 1e6))
+    return replace(problem, sets=tuple(sets), references=References(0.0, 1.0, 1e6))
 
 
 def make(
@@ -109,7 +109,7 @@ def errors_um(surface: Surface, truth: Truth, index: int) -> tuple[float, float]
 def calibrated_errors_um(solution: Solution, truth: Truth, index: int = 2) -> tuple[float, float]:
     """Of a set measured with the calibrated geometry, the vertex where the laser says, as `measure` does."""
     phases = solution.problem.sets[index]
-    vertex_z_mm = -1e-3 * (phases.displacement_um - solution.problem.witness.reference_um)
+    vertex_z_mm = -1e-3 * (phases.displacement_um - solution.problem.references.reference_um)
     return errors_um(surface_of(solution.bench, phases, 500.0, vertex_z_mm), truth, index)
 
 

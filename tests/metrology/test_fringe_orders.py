@@ -1,4 +1,4 @@
-"""Continuity of the phase and the Gray code, each the other's witness."""
+"""Continuity of the phase and the Gray code, each checked by the other."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Wrong code on purpose: what do the fast tests notice, what the campaign alone? Writes docs/mutants.md.
 
 python tests/mutants/mutants.py                       # all, 2 at a time, and the document
-python tests/mutants/mutants.py --only "no wait" "ladder"     # those whose words contain one of these; no document
+python tests/mutants/mutants.py --only "no wait" "levels"     # those whose words contain one of these; no document
 python tests/mutants/mutants.py --sample 80           # so many, drawn at random, and the document
 """
 

@@ -21,7 +21,7 @@ from membrane_ctrl.recorder.housekeeping import Optimizer
 from membrane_ctrl.recorder.recorder import Recorder, load_state, save_state
 from membrane_ctrl.recorder.sink import Recording, is_whole
 from membrane_ctrl.replay.repair import read_rows
-from membrane_ctrl.run_files.disk_budget import Thrift
+from membrane_ctrl.run_files.disk_budget import DetailLevel
 from membrane_ctrl.run_files.events import EventsFile
 from tests.support.rrd_reading import has_footer, reader, scalars
 from tests.support.synthetic_run import STARTED_UTC, rows_of, shape_of
@@ -221,7 +221,7 @@ def test_with_little_room_maps_are_left_out(
     run.writers["shapes"].put(pack_estimate(shape_of(0.5, 0)))
     run.second(recorder, 0)
     recorder.finish()
-    assert recorder._housekeeping.thrift == Thrift.NO_PICTURES
+    assert recorder._housekeeping.detail == DetailLevel.NO_PICTURES
     data = (tmp_path / "test-000.rrd").read_bytes()
     assert len(scalars(tmp_path / "test-000.rrd", "/shape/zernike")[0]) == 1
     assert b"DepthImage:buffer" not in data

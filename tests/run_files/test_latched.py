@@ -12,7 +12,7 @@ import pytest
 from firmware_iface.roles import BenchCommand
 from membrane_ctrl.controller.commands import AT_START
 from membrane_ctrl.controller.tick import TickOutputs
-from membrane_ctrl.hold.latched_fault import Latcher
+from membrane_ctrl.hold.latched_fault import FaultLatch
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.run_files.latched_fault import NAME, RESUMES_NAME, LatchedFault, LatchedFile, ResumeLog
@@ -82,25 +82,25 @@ def test_a_fault_of_many_lines_is_told_in_one(tmp_path: Path) -> None:
     assert str(file.read()).count("first second") == 1
 
 
-def make(folder: Path, told: list[Event]) -> Latcher:
-    return Latcher(
+def make(folder: Path, told: list[Event]) -> FaultLatch:
+    return FaultLatch(
         LatchedFile(folder), ResumeLog(folder), "run-7", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), told.append
     )
 
 
 def test_a_trip_is_latched_and_an_acknowledgement_clears_it(tmp_path: Path) -> None:
     told: list[Event] = []
-    with make(tmp_path, told) as latcher:
-        latcher.heard(outputs(*TRIP))
+    with make(tmp_path, told) as fault_latch:
+        fault_latch.heard(outputs(*TRIP))
     found = LatchedFile(tmp_path).read()
     assert found == LatchedFault(
         "late", "ticks start too late", "150 ms", "less work", "2026-01-01T00:00:00+00:00", "run-7"
     )
-    with make(tmp_path, told) as latcher:
-        latcher.heard(outputs({"kind": "command", "command": "ack", "refused": "not now"}))
+    with make(tmp_path, told) as fault_latch:
+        fault_latch.heard(outputs({"kind": "command", "command": "ack", "refused": "not now"}))
     assert LatchedFile(tmp_path).read() is not None
-    with make(tmp_path, told) as latcher:
-        latcher.heard(outputs({"kind": "command", "command": "ack"}))
+    with make(tmp_path, told) as fault_latch:
+        fault_latch.heard(outputs({"kind": "command", "command": "ack"}))
     assert LatchedFile(tmp_path).read() is None
     assert not told
 
@@ -109,56 +109,58 @@ LOCK: Event = {"kind": "command", "command": "latch", "who": "unix:ann", "why": 
 
 
 def test_a_lock_outlives_its_run_and_does_not_hide_a_fault(tmp_path: Path) -> None:
-    with make(tmp_path, []) as latcher:
-        latcher.heard(outputs(LOCK | {"refused": "not now"}))
-        latcher.heard(outputs(LOCK | {"who": AT_START}))
+    with make(tmp_path, []) as fault_latch:
+        fault_latch.heard(outputs(LOCK | {"refused": "not now"}))
+        fault_latch.heard(outputs(LOCK | {"who": AT_START}))
     assert LatchedFile(tmp_path).read() is None
-    with make(tmp_path, []) as latcher:
-        latcher.heard(outputs(LOCK))
+    with make(tmp_path, []) as fault_latch:
+        fault_latch.heard(outputs(LOCK))
     assert "hands inside (by unix:ann)" in str(LatchedFile(tmp_path).read())
-    with make(tmp_path, []) as latcher:
-        latcher.heard(outputs({"kind": "command", "command": "ack"}, *TRIP))
-        latcher.heard(outputs(LOCK))
+    with make(tmp_path, []) as fault_latch:
+        fault_latch.heard(outputs({"kind": "command", "command": "ack"}, *TRIP))
+        fault_latch.heard(outputs(LOCK))
     found = LatchedFile(tmp_path).read()
     assert found is not None
     assert found.name == "late"
 
 
 def test_a_resumed_fault_is_no_longer_latched(tmp_path: Path) -> None:
-    with make(tmp_path, []) as latcher:
-        latcher.heard(outputs(*TRIP))
-        latcher.heard(outputs({"kind": "state", "state": "standby", "from": "fault", "why": "resumes"}))
+    with make(tmp_path, []) as fault_latch:
+        fault_latch.heard(outputs(*TRIP))
+        fault_latch.heard(outputs({"kind": "state", "state": "standby", "from": "fault", "why": "resumes"}))
     assert LatchedFile(tmp_path).read() is None
 
 
 def test_a_forgiven_fault_is_not_latched(tmp_path: Path) -> None:
-    with make(tmp_path, []) as latcher:
-        latcher.heard(outputs(TRIP[0]))
+    with make(tmp_path, []) as fault_latch:
+        fault_latch.heard(outputs(TRIP[0]))
     assert LatchedFile(tmp_path).read() is None
 
 
 def test_a_disk_that_fails_is_told(tmp_path: Path) -> None:
     told: list[Event] = []
-    with make(tmp_path / "nowhere", told) as latcher:
-        latcher.heard(outputs(*TRIP))
+    with make(tmp_path / "nowhere", told) as fault_latch:
+        fault_latch.heard(outputs(*TRIP))
     assert [event["kind"] for event in told] == ["latch_failed"]
 
 
 def test_a_disk_that_takes_files_again_is_told_once(tmp_path: Path) -> None:
     told: list[Event] = []
-    with make(tmp_path / "later", told) as latcher:
-        latcher.heard(outputs(*TRIP))
+    with make(tmp_path / "later", told) as fault_latch:
+        fault_latch.heard(outputs(*TRIP))
         while not told:
-            latcher.heard(outputs())
+            fault_latch.heard(outputs())
         (tmp_path / "later").mkdir()
-        latcher.heard(outputs(*TRIP))
-        latcher.heard(outputs(*TRIP))
+        fault_latch.heard(outputs(*TRIP))
+        fault_latch.heard(outputs(*TRIP))
     assert [event["kind"] for event in told] == ["latch_failed", "latch_written"]
 
 
 def test_the_twin_latches_nothing(tmp_path: Path) -> None:
-    with Latcher(None, None, "run", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), lambda event: None) as latcher:
-        latcher.heard(outputs(*TRIP))
+    with FaultLatch(
+        None, None, "run", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), lambda event: None
+    ) as fault_latch:
+        fault_latch.heard(outputs(*TRIP))
     assert not list(tmp_path.iterdir())
 
 
@@ -185,11 +187,11 @@ def test_a_fault_on_a_full_disk_is_latched_in_the_room_that_was_kept(
     def full(self: LatchedFile) -> None:
         raise OSError(28, "No space left on device")
 
-    with make(tmp_path, told) as latcher:
+    with make(tmp_path, told) as fault_latch:
         (reserve,) = tmp_path.iterdir()
         monkeypatch.setattr(LatchedFile, "reserve", full)  # nothing new finds room from here on
-        latcher.heard(outputs(*TRIP))
-        latcher._disk.submit(lambda: None).result()
+        fault_latch.heard(outputs(*TRIP))
+        fault_latch._disk.submit(lambda: None).result()
         assert not reserve.exists()
     assert told == []
     latched = LatchedFile(tmp_path).read()
@@ -215,7 +217,7 @@ def test_a_count_of_resumes_that_cannot_be_read_is_full(tmp_path: Path, content:
 
 
 def test_a_resume_of_the_run_is_counted_for_the_next_one(tmp_path: Path) -> None:
-    with make(tmp_path, []) as latcher:
-        assert latcher.resumes_s == ()
-        latcher.heard(outputs({"kind": "resumed", "name": "link_lost"}))
+    with make(tmp_path, []) as fault_latch:
+        assert fault_latch.resumes_s == ()
+        fault_latch.heard(outputs({"kind": "resumed", "name": "link_lost"}))
     assert ResumeLog(tmp_path).ages_s(datetime(2026, 1, 1, 1, tzinfo=UTC)) == (3600.0,)

@@ -204,7 +204,7 @@ def play(scenario: Scenario) -> Outcome:
     return Outcome(tuple(ticks), events, bench)
 
 
-def complaints(expect: Expectation, outcome: Outcome) -> Iterator[str]:
+def failures(expect: Expectation, outcome: Outcome) -> Iterator[str]:
     """What did not come as expected, a line each."""
     finished = outcome.ticks[-1].outputs.finished if outcome.ticks else None
     exit_name = "none" if finished is None else finished.name.lower()

@@ -100,7 +100,7 @@ def tables_of(solution: solve.Solution, optics: OpticsConfig, origin: Origin) ->
 
 def geometry_of(solution: solve.Solution, optics: OpticsConfig) -> GeometryConfig:
     """The calibrated geometry in the general form; the screen's height map is the stated bench's."""
-    reference = {"reference_displacement_um": solution.problem.witness.reference_um}
+    reference = {"reference_displacement_um": solution.problem.references.reference_um}
     return general_form(solution.bench.geometry, optics).model_copy(update=reference)
 
 

@@ -54,7 +54,7 @@ def surface_covariance(solution: Solution, index: int) -> FloatArray:
     """Covariance (36, 36) in mm^2 of the parameters of one set's surface."""
     response = surface_response(solution, index)
     geometry = solution.covariance[: parameters.OPTICAL, : parameters.OPTICAL]
-    vertex = response[:, -1] * solution.problem.witness.laser_sigma_um * 1e-3
+    vertex = response[:, -1] * solution.problem.references.laser_sigma_um * 1e-3
     return np.asarray(response[:, :-1] @ geometry @ response[:, :-1].T + np.outer(vertex, vertex))
 
 
@@ -236,7 +236,9 @@ def foresee(
     """
     geometry, middle_mm = Geometry.from_config(optics), sags_mm[len(sags_mm) // 2]
     sets = [_set(geometry, optics, sag_mm, sag_mm - middle_mm, swing_adu) for sag_mm in sags_mm]
-    problem = Problem(geometry, tuple(sets), sigmas, separable.Witness(0.0, laser_sigma_um), optics.mirror.radius_mm)
+    problem = Problem(
+        geometry, tuple(sets), sigmas, separable.References(0.0, laser_sigma_um), optics.mirror.radius_mm
+    )
     return propagate(solve(problem), len(sets) // 2, optics.mirror.analysis_radius_mm)
 
 

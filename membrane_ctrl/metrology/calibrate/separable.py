@@ -36,7 +36,7 @@ class SetState:
 
 
 @dataclass(frozen=True)
-class Witness:
+class References:
     """What is known beside the fringes.
 
     Attributes
@@ -123,7 +123,7 @@ def equations(
     phases: residuals.SetPhases,
     state: SetState,
     common: FloatArray,
-    witness: Witness,
+    references: References,
     trust: Trust,
 ) -> Equations:
     """Linearise one set; `common` (COMMON,) are parameters and ring."""
@@ -135,13 +135,15 @@ def equations(
         residual[:, part.place] = part.residual_mm
         for derivatives, left in zip(part.derivatives, part.residual_mm, strict=True):
             sums[np.ix_(keep, keep)] += residuals.gram(np.vstack([derivatives, left]) * root[part.place])
-    rows = _witness_rows(phases, state, common, witness)
+    rows = _reference_rows(phases, state, common, references)
     weights = trust.weights / phases.sigma_mm**2
     rms = float(np.sqrt(np.mean(residual**2 @ weights) / np.sum(weights)))
     return Equations(sums + rows.T @ rows, residual, trust, rms)
 
 
-def _witness_rows(phases: residuals.SetPhases, state: SetState, common: FloatArray, witness: Witness) -> FloatArray:
+def _reference_rows(
+    phases: residuals.SetPhases, state: SetState, common: FloatArray, references: References
+) -> FloatArray:
     """Ring and laser as weighted rows [derivatives, miss]."""
     rows = np.zeros((RING + 1, residuals.LOCAL + COMMON + 1))
     ring = rows[:RING]
@@ -149,14 +151,14 @@ def _witness_rows(phases: residuals.SetPhases, state: SetState, common: FloatArr
     ring[0, PARAMETERS] = 1.0
     ring[:, residuals.LOCAL + len(parameters.NAMES) : -1] = -np.eye(RING)
     ring[:, -1] = common[len(parameters.NAMES) :] - rim_of(state)
-    ring /= witness.ring_sigma_um * 1e-3
+    ring /= references.ring_sigma_um * 1e-3
     if np.isfinite(phases.displacement_um):
-        moved_mm = (phases.displacement_um - witness.reference_um) * 1e-3
+        moved_mm = (phases.displacement_um - references.reference_um) * 1e-3
         laser = rows[RING]
         laser[PARAMETERS] = 1.0
         laser[residuals.LOCAL + parameters.OPTICAL] = moved_mm
         laser[-1] = -(1 + common[parameters.OPTICAL]) * moved_mm - state.vertex_z_mm
-        laser /= witness.laser_sigma_um * 1e-3
+        laser /= references.laser_sigma_um * 1e-3
     return rows
 
 

@@ -32,7 +32,7 @@ class Problem:
         At different sags.
     sigmas : (len(NAMES),) array
         Of the hand's measurements; 0 holds a parameter.
-    witness : Witness
+    references : References
         Laser and ring.
     radius_mm : float
         Of the ring.
@@ -41,7 +41,7 @@ class Problem:
     stated: Geometry
     sets: tuple[residuals.SetPhases, ...]
     sigmas: FloatArray
-    witness: separable.Witness
+    references: separable.References
     radius_mm: float
 
 
@@ -199,7 +199,7 @@ def _linearise(
     values = common[: len(parameters.NAMES)]
     bench, turns = parameters.bench_at(problem.stated, values), parameters.pose_derivatives(problem.stated, values)
     return tuple(
-        separable.equations(bench, turns, phases, state, common, problem.witness, believed)
+        separable.equations(bench, turns, phases, state, common, problem.references, believed)
         for phases, state, believed in zip(problem.sets, states, trust, strict=True)
     )
 
@@ -216,7 +216,7 @@ def first_states(problem: Problem) -> tuple[separable.SetState, ...]:
 
 
 def _first(problem: Problem, phases: residuals.SetPhases) -> separable.SetState:
-    moved_um = phases.displacement_um - problem.witness.reference_um
+    moved_um = phases.displacement_um - problem.references.reference_um
     vertex_z_mm = -moved_um * 1e-3 if np.isfinite(moved_um) else 0.0
     return separable.SetState(
         surface_of(parameters.Bench(problem.stated), phases, problem.radius_mm, vertex_z_mm), vertex_z_mm

@@ -131,9 +131,9 @@ def _why(solution: Solution, index: int) -> str:
     vertex_um = 1e3 * (
         rest.common[len(parameters.NAMES)] - separable.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
     )
-    moved_um = phases.displacement_um - solution.problem.witness.reference_um
+    moved_um = phases.displacement_um - solution.problem.references.reference_um
     miss_um = moved_um + vertex_um / (1 + rest.values[parameters.NAMES.index(parameters.LASER.name)])
-    if abs(miss_um) > _LASER_SIGMAS * solution.problem.witness.laser_sigma_um:
+    if abs(miss_um) > _LASER_SIGMAS * solution.problem.references.laser_sigma_um:
         return f"its laser reads {miss_um:+.1f} um against the optics"
     return "its fringes show another bench"
 

@@ -181,7 +181,7 @@ def _best(seen: FloatArray, templates: dict[int, _Template], light: FloatArray, 
 
 # What the usable frames say of each bin: light, fringes, wrapped phase, and where the pattern is seen.
 #
-# The light of a bin has three witnesses, the mean of the x fringes, that of the y fringes, and white minus black; the
+# The light of a bin has three estimates, the mean of the x fringes, that of the y fringes, and white minus black; the
 # fringes' swing likewise. The median of three is right when one of them is wrong, so that one bad frame, whichever it
 # is, does not spoil the picture that all frames are compared with.
 
@@ -216,13 +216,13 @@ class View:
     mask: BoolArray
 
 
-def look(stack: FrameStack, binned: Binned, excluded: Collection[int], witness: FloatArray | None = None) -> View:
+def look(stack: FrameStack, binned: Binned, excluded: Collection[int], estimate: FloatArray | None = None) -> View:
     """Combine the frames that are not excluded.
 
     Parameters
     ----------
-    witness : (rows, columns) array, optional
-        The light as another set saw it: the third witness of a set without white and black.
+    estimate : (rows, columns) array, optional
+        The light as another set saw it: the third estimate of a set without white and black.
 
     Raises
     ------
@@ -243,7 +243,7 @@ def look(stack: FrameStack, binned: Binned, excluded: Collection[int], witness: 
         swing.append(np.hypot(cosine, sine))
         phase.append(np.arctan2(sine, cosine))
         saturated |= binned.saturated[frames].any(axis=0)
-    third = _third_witness(stack, binned, excluded) if witness is None else witness
+    third = _third_estimate(stack, binned, excluded) if estimate is None else estimate
     seen = _middle([*swing] if third is None else [*swing, third])
     brightest = float(np.percentile(seen, 95))
     if not brightest > _LEAST_SWING_ADU:
@@ -255,7 +255,7 @@ def look(stack: FrameStack, binned: Binned, excluded: Collection[int], witness: 
     return View((used[0], used[1]), np.stack(phase), np.stack(swing), _middle(every, mask), mask)
 
 
-def _third_witness(stack: FrameStack, binned: Binned, excluded: Collection[int]) -> FloatArray | None:
+def _third_estimate(stack: FrameStack, binned: Binned, excluded: Collection[int]) -> FloatArray | None:
     white, black = stack.single("white"), stack.single("black")
     if white is None or black is None or {white, black} & set(excluded):
         return None

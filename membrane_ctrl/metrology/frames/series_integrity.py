@@ -2,7 +2,7 @@
 
 A set is two axes of some frequencies of four steps, and white and black. It is judged against itself: how large a
 disagreement is too large follows from the other series of the set, so that a display's gamma, which all share, is
-nobody's fault. Three witnesses:
+nobody's fault. Three closures:
 
 - two pictures that are the same: no two frames of a set should be (a stale frame, whatever it is worth);
 - the closure I0 - I1 + I2 - I3 of each series, and with the phase or the level known, whose fault it is (`closure`);
@@ -236,8 +236,8 @@ def _mend(axis: Series, index: int, limit: float, axes: tuple[Series, ...]) -> t
         return flags, better
     if not disagree:
         return [], axis
-    witnesses = _witnesses(axis, index)
-    clearest = max(witnesses, key=lambda found: found.gain)
+    closures = _closures(axis, index)
+    clearest = max(closures, key=lambda found: found.gain)
     step, reason = clearest.suspect, "does not agree with the other steps"
     twin = _twin(axis, index, axes)
     if twin is not None:
@@ -246,7 +246,7 @@ def _mend(axis: Series, index: int, limit: float, axes: tuple[Series, ...]) -> t
         return [], axis
     flags = [SeriesFlag(axis.axis, index, step, reason)]
     if index + 1 == len(axis.periods):  # a coarser one that is still wrong makes the next disagree; this has none
-        left = min(float(found.without_rms_adu[step]) for found in witnesses)
+        left = min(float(found.without_rms_adu[step]) for found in closures)
         if left > LEFT_TIMES * limit * _amplitude(axis.frames[index], axis.shifts_rad):
             return flags, axis  # it is not the only one
     steps = axis.frames[index].copy()
@@ -255,7 +255,7 @@ def _mend(axis: Series, index: int, limit: float, axes: tuple[Series, ...]) -> t
     return flags, axis.with_frames(index, steps)
 
 
-def _witnesses(axis: Series, index: int) -> tuple[Closure, Closure]:
+def _closures(axis: Series, index: int) -> tuple[Closure, Closure]:
     """Closures that can name a frame: with the other frequencies' phase known, and with the level of the next."""
     neighbour = index - 1 if index + 1 == len(axis.periods) else index + 1
     steps, near = axis.frames[index], axis.frames[neighbour]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.model.errors import InputError
-from tests.support.scenario import complaints, load_scenario, play
+from tests.support.scenario import failures, load_scenario, play
 
 FOLDER = Path(__file__).parents[2] / "scenarios"
 
@@ -16,7 +16,7 @@ FOLDER = Path(__file__).parents[2] / "scenarios"
 def test_scenario(path: Path) -> None:
     scenario = load_scenario(path)
     outcome = play(scenario)
-    assert not list(complaints(scenario.expect, outcome))
+    assert not list(failures(scenario.expect, outcome))
     assert outcome.bench.board.pump_fraction == 0.0  # however it ended
 
 
@@ -57,7 +57,7 @@ def test_what_does_not_come_is_complained_of(tmp_path: Path) -> None:
     expect = '[expect]\nexit = "safety_trip"\nstates = []\nfaults = ["late"]\nevents = ["party"]\n'
     path.write_text(GOOD + expect + 'shape_reasons = ["bored"]\n' + bounds)
     scenario = load_scenario(path)
-    found = "\n".join(complaints(scenario.expect, play(scenario)))
+    found = "\n".join(failures(scenario.expect, play(scenario)))
     assert all(word in found for word in ("exit", "states", "faults", "party", "bored", "truth_displacement_um"))
 
 
@@ -65,4 +65,4 @@ def test_a_process_that_never_runs_is_complained_of(tmp_path: Path) -> None:
     path = tmp_path / "stalled.toml"
     path.write_text(GOOD + '[[at]]\ntime_s = 0.0\nwrong = "stalled"\n[expect]\nexit = "done"\n')
     scenario = load_scenario(path)
-    assert list(complaints(scenario.expect, play(scenario))) == ["exit: none, not done"]
+    assert list(failures(scenario.expect, play(scenario))) == ["exit: none, not done"]

@@ -1,4 +1,4 @@
-"""Who stands in the door: half a handshake, a crowd, a flood. Another address gets in all the same."""
+"""Who does not come in: half a handshake, a crowd, a flood. Another address gets in all the same."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from test_port_tls import address_of, greet
 
 from membrane_ctrl.config.port import PortConfig, TlsConfig
 from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.control_port.door import Door, LetIn, Turns
+from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Turns
 from membrane_ctrl.control_port.tls import client_context, listen_tcp
 
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Authority:
-    return Authority.new(tmp_path_factory.mktemp("door") / "lab")
+    return Authority.new(tmp_path_factory.mktemp("endpoint") / "lab")
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ async def dropped(crowd: Crowd, at_least: int) -> None:
     [["127.0.0.2"] * 40, [f"127.0.{n}.2" for n in range(40)]],
     ids=["one address", "forty addresses"],
 )
-async def test_who_stands_in_the_door_keeps_nobody_out(
+async def test_who_does_not_shake_hands_keeps_nobody_out(
     addresses: list[str], tmp_path: Path, lab: Authority, config: PortConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("membrane_ctrl.control_port.protocol._HANDSHAKE_S", 60.0)  # none of them goes by itself
@@ -123,15 +123,15 @@ async def test_a_flood_of_one_address_is_turned_away_unheard() -> None:
             all_seen.set()
 
     listener = listen_tcp("127.0.0.1", 0, "test")
-    door = Door("tls", listener, welcome, lambda event: None, lambda who, why: refused.append((who, why)))
-    door.open()
+    endpoint = Endpoint("tls", listener, welcome, lambda event: None, lambda who, why: refused.append((who, why)))
+    endpoint.open()
     for address in ["127.0.0.3"] * 40 + ["127.0.0.4"]:
         with contextlib.suppress(ConnectionError):
             _, writer = await asyncio.open_connection(*listener.getsockname(), local_addr=(address, 0))
             writer.close()
             await writer.wait_closed()
     await asyncio.wait_for(all_seen.wait(), 10)
-    await door.close()
+    await endpoint.close()
     assert heard.count("127.0.0.4") == 1
     assert 10 <= heard.count("127.0.0.3") <= 35
     assert refused == [("tls:127.0.0.3", "comes too often")] * (40 - heard.count("127.0.0.3"))

@@ -6,7 +6,7 @@ import numpy as np
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.sensor_consistency import Held, Witnesses
+from membrane_ctrl.controller.sensor_consistency import Held, SensorConsistency
 from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
@@ -19,7 +19,7 @@ class Seconds:
     """A held mirror, a tick a second."""
 
     def __init__(self) -> None:
-        self.witnesses = Witnesses(Config())
+        self.consistency = SensorConsistency(Config())
         self.now_s = 0.0
         self.camera_stuck = False
         self.events: list[Event] = []
@@ -38,7 +38,7 @@ class Seconds:
             self.now_s += 1.0
             reading = BenchReading(0.0, 0, gauge_pa, ambient_pa, 20.0, 20.0, 0.3, 0.0, 1, self.now_s, False, 0)
             inputs = TickInputs(self.now_s, 1.0, reading, estimate=self._shape() if camera else None)
-            self.events += self.witnesses.ask(
+            self.events += self.consistency.ask(
                 inputs, state, 1.0, Held(0.0, gauge_pa, 0.0, 0.0, 0.0, leak_um_per_s, leak_um_per_s, bleed)
             )
 
@@ -54,27 +54,27 @@ def test_gas_that_nobody_explains_is_told_and_forgotten_with_the_hold() -> None:
     mirror = Seconds()
     mirror.pass_by(600)
     mirror.pass_by(90, leak_um_per_s=3.0)
-    assert "3.0 um/s of gas, before 1.2 um/s" in mirror.witnesses.gas_excess
+    assert "3.0 um/s of gas, before 1.2 um/s" in mirror.consistency.gas_excess
     mirror.pass_by(1, leak_um_per_s=3.0, state=State.FAULT)
-    assert mirror.witnesses.gas_excess == ""
+    assert mirror.consistency.gas_excess == ""
     mirror.pass_by(600, leak_um_per_s=3.0)
-    assert mirror.witnesses.gas_excess == ""
+    assert mirror.consistency.gas_excess == ""
 
 
 def test_a_bleed_that_somebody_opens_explains_the_gas() -> None:
     mirror = Seconds()
     mirror.pass_by(600)
     mirror.pass_by(600, leak_um_per_s=3.0, bleed=0.02)
-    assert mirror.witnesses.gas_excess == ""
+    assert mirror.consistency.gas_excess == ""
 
 
 def test_a_camera_that_sees_the_film_stand_still_explains_it_until_it_is_gone() -> None:
     mirror = Seconds()
     mirror.pass_by(600)
     mirror.pass_by(300, leak_um_per_s=3.0, camera=True)
-    assert mirror.witnesses.gas_excess == ""
+    assert mirror.consistency.gas_excess == ""
     mirror.pass_by(100, leak_um_per_s=6.7)
-    assert mirror.witnesses.gas_excess != ""
+    assert mirror.consistency.gas_excess != ""
 
 
 def test_laser_and_gauge_are_compared_wherever_the_pump_may_run() -> None:
@@ -82,9 +82,9 @@ def test_laser_and_gauge_are_compared_wherever_the_pump_may_run() -> None:
     for state in (State.CHECK, State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.TUNE):
         mirror.pass_by(60, state=state)
         mirror.pass_by(40, state=state, gauge_pa=605.0)
-        assert mirror.witnesses.laser_gauge_apart != "", state
+        assert mirror.consistency.laser_gauge_apart != "", state
         mirror.pass_by(1, state=State.STANDBY, gauge_pa=605.0)
-        assert mirror.witnesses.laser_gauge_apart == ""
+        assert mirror.consistency.laser_gauge_apart == ""
 
 
 def test_a_barometer_in_another_unit_is_told_once_and_taken_back_once() -> None:
@@ -99,11 +99,11 @@ def test_a_barometer_in_another_unit_is_told_once_and_taken_back_once() -> None:
 def test_a_camera_that_repeats_one_shape_is_believed_neither_in_the_shape_nor_in_the_gas() -> None:
     mirror = Seconds()
     mirror.pass_by(600, camera=True)
-    assert mirror.witnesses.camera_lies == ""
+    assert mirror.consistency.camera_lies == ""
     mirror.camera_stuck = True
     mirror.pass_by(100, leak_um_per_s=6.7, camera=True)
-    assert "repeats" in mirror.witnesses.camera_lies
-    assert mirror.witnesses.gas_excess != ""
+    assert "repeats" in mirror.consistency.camera_lies
+    assert mirror.consistency.gas_excess != ""
     mirror.camera_stuck = False
     mirror.pass_by(2, camera=True)
-    assert mirror.witnesses.camera_lies == ""
+    assert mirror.consistency.camera_lies == ""

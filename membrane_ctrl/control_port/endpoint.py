@@ -4,7 +4,7 @@
 one before. A flood of connections so costs the tick no more than twenty handshakes a second.
 
 Who has not shown yet who it is (no handshake, no request) is a stranger. Strangers are few, and of one address fewer:
-for a newcomer the one that has dawdled longest goes, so that nobody keeps the door shut by standing in it. An
+for a newcomer the one that has dawdled longest goes, so that nobody can block the queue. An
 address that comes too often is turned away unheard, which makes room in the queue for the others.
 """
 
@@ -16,11 +16,11 @@ from collections.abc import Awaitable, Callable
 
 from membrane_ctrl.model.events import Event
 
-BACKLOG = 64  # who waits at the door while another comes in; the kernel turns away the rest
+BACKLOG = 64  # who waits while another comes in; the kernel turns away the rest
 _INSIDE_MOST = 32
 _STRANGERS_MOST, _STRANGERS_EACH = 16, 4
 _PAUSE_S = 0.05
-# Of one address: a person's terminal and a script or two; a flood gets the tenth of the door that is left
+# Of one address: a person's terminal and a script or two; a flood gets a tenth of the handshakes
 _BURST, _PER_S = 10.0, 2.0
 _TURN_AWAY_S = 0.005  # costs 50 us: a hundredth of a processor
 _ADDRESSES_MOST = 1024  # remembered
@@ -57,7 +57,7 @@ class Turns:
         return may
 
 
-class Door:
+class Endpoint:
     """Accepts connections and welcomes each in a task of its own.
 
     Parameters
@@ -65,7 +65,7 @@ class Door:
     name : str
         For messages.
     listener : socket
-        Bound, listening, not blocking; the door closes it.
+        Bound, listening, not blocking; the endpoint closes it.
     welcome : callable
         Looks after one connection to its end; calls its second argument when it knows who has come.
     tell : callable
@@ -96,7 +96,7 @@ class Door:
         self._task = asyncio.create_task(self._keep(), name=f"port {self._name}")
 
     async def close(self) -> None:
-        """End everything behind the door."""
+        """End everything behind the endpoint."""
         tasks = [*self._inside, *([self._task] if self._task else [])]
         for task in tasks:
             task.cancel()

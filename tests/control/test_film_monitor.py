@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import LimitsConfig, MirrorConfig
-from membrane_ctrl.control.film import CONTRADICTED_MOST, FilmWitness, LeakGrowth
+from membrane_ctrl.control.film import CONTRADICTED_MOST, FilmMonitor, LeakGrowth
 
 RATE_HZ = 10.0
 SAG_UM, PRESSURE_PA = 37_100.0, 600.0
@@ -38,13 +38,13 @@ def told(
 ) -> tuple[str, float]:
     """What is said first, and when; noise 1 um and 0.5 Pa."""
     rng = np.random.default_rng(seed)
-    witness = FilmWitness(LimitsConfig(), mirror or MirrorConfig())
+    monitor = FilmMonitor(LimitsConfig(), mirror or MirrorConfig())
     for tick in range(round(duration_s * rate_hz)):
         time_s = tick / rate_hz
         film_um, laser_um, gauge_pa, trim_um = story(time_s)
         true_pa = PRESSURE_PA * law(1 + film_um / SAG_UM)
         noise = rng.standard_normal(2)
-        said = witness.step(1 / rate_hz, film_um + laser_um + noise[0], trim_um, true_pa + gauge_pa + 0.5 * noise[1])
+        said = monitor.step(1 / rate_hz, film_um + laser_um + noise[0], trim_um, true_pa + gauge_pa + 0.5 * noise[1])
         if said:
             return said, time_s
     return "", math.nan

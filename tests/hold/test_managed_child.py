@@ -1,4 +1,4 @@
-"""A post is filled again: at once, then later and later, not for ever."""
+"""A child process is replaced: at once, then later and later, not for ever."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from membrane_ctrl.hold.child_processes import Post
+from membrane_ctrl.hold.child_processes import ManagedChild
 from membrane_ctrl.processes.child import alive
 
 
@@ -47,47 +47,47 @@ def kinds(events: list[dict[str, Any]]) -> list[str]:
     return [event["kind"] for event in events]
 
 
-def make_post() -> tuple[Post, Agency]:
+def make_managed() -> tuple[ManagedChild, Agency]:
     agency = Agency()
-    post = Post(agency.make)
-    post.start(0.0)
-    return post, agency
+    managed = ManagedChild(agency.make)
+    managed.start(0.0)
+    return managed, agency
 
 
 def test_what_the_child_says_is_handed_on() -> None:
-    post, agency = make_post()
+    managed, agency = make_managed()
     agency.theirs[0].send({"kind": "disk_low"})
-    assert post.look(0.0) == [{"kind": "disk_low"}]
-    assert post.look(0.5) == []
+    assert managed.look(0.0) == [{"kind": "disk_low"}]
+    assert managed.look(0.5) == []
 
 
 def test_a_word_reaches_the_child_that_is_there_and_no_other() -> None:
-    post, agency = make_post()
-    assert post.send("capture")
+    managed, agency = make_managed()
+    assert managed.send("capture")
     assert agency.theirs[0].recv() == "capture"
-    post.child.kill()
-    assert not post.send("capture")
+    managed.child.kill()
+    assert not managed.send("capture")
 
 
 def test_a_dead_child_is_replaced_at_once_and_told() -> None:
-    post, agency = make_post()
+    managed, agency = make_managed()
     agency.theirs[0].send({"kind": "last words"})
-    post.child.kill()
-    assert kinds(post.look(3.0)) == ["last words", "child_ended", "child_restarted"]
+    managed.child.kill()
+    assert kinds(managed.look(3.0)) == ["last words", "child_ended", "child_restarted"]
     assert agency.numbers == [0, 1]
-    assert post.child.alive
+    assert managed.child.alive
     agency.theirs[1].send({"kind": "hello"})
-    assert kinds(post.look(3.5)) == ["hello"]
+    assert kinds(managed.look(3.5)) == ["hello"]
 
 
 def test_the_next_ones_come_later_and_later_and_no_more_than_ten_an_hour() -> None:
-    post, _ = make_post()
+    managed, _ = make_managed()
     said: list[str] = []
     restarted_s = []
     for half_second in range(2 * 3600):
-        if post.child.alive:
-            post.child.kill()
-        events = kinds(post.look(0.5 * half_second))
+        if managed.child.alive:
+            managed.child.kill()
+        events = kinds(managed.look(0.5 * half_second))
         said += events
         if "child_restarted" in events:
             restarted_s.append(0.5 * half_second)
@@ -101,45 +101,45 @@ def test_the_next_ones_come_later_and_later_and_no_more_than_ten_an_hour() -> No
 
 
 def test_after_an_hour_it_is_tried_again() -> None:
-    post, agency = make_post()
+    managed, agency = make_managed()
     for second in range(3000):
-        if post.child.alive:
-            post.child.kill()
-        post.look(float(second))
+        if managed.child.alive:
+            managed.child.kill()
+        managed.look(float(second))
     assert agency.numbers[-1] == 10
-    assert kinds(post.look(3700.0)) == ["child_restarted"]
+    assert kinds(managed.look(3700.0)) == ["child_restarted"]
 
 
 def test_a_child_that_breaks_its_word_is_killed_and_replaced() -> None:
-    post, agency = make_post()
+    managed, agency = make_managed()
     agency.theirs[0].send(alive(5.0))
-    assert post.look(10.0) == []
-    assert post.look(15.0) == []
-    (silent,) = post.look(15.5)
+    assert managed.look(10.0) == []
+    assert managed.look(15.0) == []
+    (silent,) = managed.look(15.5)
     assert silent == {"kind": "child_silent", "child": "recorder", "overdue_s": 0.5, "killed": True}
-    assert kinds(post.look(16.0)) == ["child_ended", "child_restarted"]
+    assert kinds(managed.look(16.0)) == ["child_ended", "child_restarted"]
     agency.theirs[1].send(alive(5.0))
-    assert post.look(17.0) == []
+    assert managed.look(17.0) == []
 
 
 @pytest.mark.parametrize(("moment_s", "said"), [(59.0, []), (61.0, ["child_silent"])])
 def test_a_child_that_never_says_a_word_is_not_waited_for(moment_s: float, said: list[str]) -> None:
-    post, _ = make_post()
-    assert kinds(post.look(moment_s)) == said
+    managed, _ = make_managed()
+    assert kinds(managed.look(moment_s)) == said
 
 
 def test_who_cannot_be_replaced_any_more_is_not_killed_and_may_come_back() -> None:
-    post, agency = make_post()
+    managed, agency = make_managed()
     for second in range(0, 1200, 2):
-        if len(agency.numbers) <= 10 and post.child.alive:
-            post.child.kill()
-        post.look(float(second))
+        if len(agency.numbers) <= 10 and managed.child.alive:
+            managed.child.kill()
+        managed.look(float(second))
     agency.theirs[-1].send(alive(5.0))
-    assert post.look(1200.0) == []
-    (silent,) = post.look(1206.0)
+    assert managed.look(1200.0) == []
+    (silent,) = managed.look(1206.0)
     assert silent["killed"] is False
-    assert post.child.alive
-    assert post.look(1207.0) == [], "said once"
+    assert managed.child.alive
+    assert managed.look(1207.0) == [], "said once"
     agency.theirs[-1].send(alive(5.0))
-    post.look(1208.0)
-    assert kinds(post.look(1214.0)) == ["child_silent"]
+    managed.look(1208.0)
+    assert kinds(managed.look(1214.0)) == ["child_silent"]

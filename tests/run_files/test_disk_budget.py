@@ -11,26 +11,26 @@ import pytest
 from membrane_ctrl.config.schema import RecordingConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.recorder.housekeeping import RETENTION_INTERVAL_S, Housekeeping
-from membrane_ctrl.recorder.sink import Complaints
-from membrane_ctrl.run_files.disk_budget import OldRun, Thrift, deletable_runs, delete_run, expired, thrift
+from membrane_ctrl.recorder.sink import RecorderErrors
+from membrane_ctrl.run_files.disk_budget import DetailLevel, OldRun, deletable_runs, delete_run, detail_level, expired
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 
 
 @pytest.mark.parametrize(
     ("free_mb", "level"),
-    [(5000, Thrift.ALL), (1000, Thrift.ALL), (999, Thrift.NO_PICTURES), (100, Thrift.NO_PICTURES),
-     (99, Thrift.ESSENTIAL), (0, Thrift.ESSENTIAL)],
+    [(5000, DetailLevel.ALL), (1000, DetailLevel.ALL), (999, DetailLevel.NO_PICTURES), (100, DetailLevel.NO_PICTURES),
+     (99, DetailLevel.ESSENTIAL), (0, DetailLevel.ESSENTIAL)],
 )  # fmt: skip
-def test_pictures_go_first_and_numbers_last(free_mb: float, level: Thrift) -> None:
-    assert thrift(free_mb, 500.0, Thrift.ALL) == level
+def test_pictures_go_first_and_numbers_last(free_mb: float, level: DetailLevel) -> None:
+    assert detail_level(free_mb, 500.0, DetailLevel.ALL) == level
 
 
 def test_a_level_is_left_only_with_room_to_spare() -> None:
-    assert thrift(1050, 500.0, Thrift.NO_PICTURES) == Thrift.NO_PICTURES
-    assert thrift(1101, 500.0, Thrift.NO_PICTURES) == Thrift.ALL
-    assert thrift(105, 500.0, Thrift.ESSENTIAL) == Thrift.ESSENTIAL
-    assert thrift(120, 500.0, Thrift.ESSENTIAL) == Thrift.NO_PICTURES
+    assert detail_level(1050, 500.0, DetailLevel.NO_PICTURES) == DetailLevel.NO_PICTURES
+    assert detail_level(1101, 500.0, DetailLevel.NO_PICTURES) == DetailLevel.ALL
+    assert detail_level(105, 500.0, DetailLevel.ESSENTIAL) == DetailLevel.ESSENTIAL
+    assert detail_level(120, 500.0, DetailLevel.ESSENTIAL) == DetailLevel.NO_PICTURES
 
 
 def old_run(days: float, size_gb: float) -> OldRun:
@@ -107,7 +107,7 @@ def test_the_recorder_deletes_old_runs_at_its_start_and_each_hour_and_says_which
         make_run(logs, f"202610{day:02d}T110000Z-old")
     reports: list[dict[str, object]] = []
     config = RecordingConfig(keep_days=30.0, min_free_mb=1.0)
-    keeping = Housekeeping(present, HandClock(0.0, NOW), config, Complaints(reports.append))
+    keeping = Housekeeping(present, HandClock(0.0, NOW), config, RecorderErrors(reports.append))
     keeping.look(0.0, [])
     assert [report["run"] for report in reports] == ["20261001T110000Z-old", "20261002T110000Z-old"]
     make_run(logs, "20260901T110000Z-brought")
@@ -137,7 +137,7 @@ def test_one_run_that_cannot_go_keeps_no_other_and_remains_of_a_crash_go_too(
     monkeypatch.setattr(os, "rename", guarded)
     reports: list[dict[str, object]] = []
     config = RecordingConfig(keep_days=30.0, min_free_mb=1.0)
-    keeping = Housekeeping(present, HandClock(0.0, NOW), config, Complaints(reports.append))
+    keeping = Housekeeping(present, HandClock(0.0, NOW), config, RecorderErrors(reports.append))
     keeping.look(0.0, [])
     assert [report["kind"] for report in reports] == ["recorder_error", "run_deleted"]
     keeping.look(RETENTION_INTERVAL_S, [])
