@@ -31,7 +31,7 @@ from benchmarks.memory_acquisition import acquisition_figures
 from benchmarks.recorded_hold import Part, parts_of
 from membrane_ctrl.alarms.process import AlarmsSpec, watch
 from membrane_ctrl.config.schema import Config, LoopConfig, RecordingConfig, ShapeConfig
-from membrane_ctrl.console.process import ScreenSpec, screen_main
+from membrane_ctrl.console.process import ConsoleSpec, console_main
 from membrane_ctrl.controller.tick import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import pack_estimate, unpack_estimate
@@ -80,10 +80,10 @@ def hurried_recorder(spec: RecorderSpec, status: Connection) -> None:
     process.recorder_main(spec, status)
 
 
-def quiet_screen(spec: ScreenSpec) -> None:
+def quiet_console(spec: ConsoleSpec) -> None:
     """The console without a terminal, and without anybody who reads it."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-    screen_main(spec)
+    console_main(spec)
 
 
 def mute_alarms(spec: AlarmsSpec) -> None:
@@ -141,11 +141,11 @@ def _children(
         run_dir, "week", clock, config, rings["telemetry"], rings["events"], rings["shapes"], None, rings["inputs"],
         flush_s=0.0,
     )  # fmt: skip
-    screen = ScreenSpec(clock, rings["telemetry"], rings["events"], rings["shapes"], run_dir, config)
+    screen = ConsoleSpec(clock, rings["telemetry"], rings["events"], rings["shapes"], run_dir, config)
     alarms = AlarmsSpec(clock, rings["telemetry"], rings["events"], config.alarms, "week")
     return [
         Child("recorder", "benchmarks.memory:hurried_recorder", (spec, theirs), nice=5),
-        Child("console", "benchmarks.memory:quiet_screen", (screen,), nice=5),
+        Child("console", "benchmarks.memory:quiet_console", (screen,), nice=5),
         Child("alarms", "benchmarks.memory:mute_alarms", (alarms,), nice=5),
     ], ours
 

@@ -106,8 +106,8 @@ def map_pump(options: TuneOptions) -> int:
 def outer(options: TuneOptions) -> int:
     """Sag sensitivity, noise and drift of the figure; the shape loop's time constant."""
     from membrane_ctrl.metrology.optics.hencky import zernike_projection
-    from tuning.identification.outer_loop import TYPICAL_S as OUTER_S
-    from tuning.identification.outer_loop import evaluate, step_experiment
+    from tuning.identification.shape_loop import TYPICAL_S as OUTER_S
+    from tuning.identification.shape_loop import evaluate, step_experiment
 
     with _session(options) as (folder, rig, progress):
         progress.begin("shape loop", OUTER_S + options.observe_s, 0.0)

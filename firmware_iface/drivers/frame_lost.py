@@ -1,6 +1,6 @@
 """A frame that did not come whole, and taking it again."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ class FrameLostError(LinkError):
     """One exposure gave no whole frame; the camera is there and may be asked again."""
 
 
+@runtime_checkable
 class ExposingCamera(Protocol):
     """A camera whose transfer may overlap with the next pattern."""
 

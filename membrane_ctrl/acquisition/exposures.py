@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Literal, Protocol, runtime_checkable
 
-from firmware_iface.drivers.frame_lost import TRIES, FrameLostError
+from firmware_iface.drivers.frame_lost import TRIES, ExposingCamera, FrameLostError
 from firmware_iface.roles import Frame, Pattern, Screen
 from membrane_ctrl.processes.frames import FrameSlot, FrameWriter, Pixels
 
@@ -57,19 +57,6 @@ class CycleCamera(Protocol):
 
     def grab(self, out: Pixels | None = None) -> Frame:
         """One exposure, in `out` if the camera is able to. Raises LinkError."""
-        ...
-
-
-@runtime_checkable
-class ExposingCamera(Protocol):
-    """A camera whose transfer may overlap with the next pattern (`firmware_iface.drivers.camera_aravis`)."""
-
-    def expose(self, out: Pixels | None = None) -> None:
-        """Trigger, and return when the exposure is over. Raises LinkError."""
-        ...
-
-    def fetch(self) -> Frame:
-        """The frame of the last `expose`. Raises FrameLostError, LinkError."""
         ...
 
 

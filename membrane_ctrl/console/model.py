@@ -1,4 +1,4 @@
-"""From telemetry rows, events and shapes to what the screen shows. No I/O, no terminal, no clock."""
+"""From telemetry rows, events and shapes to what the console shows. No I/O, no terminal, no clock."""
 
 import math
 from collections import deque
@@ -48,7 +48,7 @@ class Trend:
         return [value for second, values in self._seconds if second >= oldest for value in values]
 
 
-# The tick runs at 50 Hz, the screen at 5: a row this old means that the control process stands still.
+# The tick runs at 50 Hz, the console at 5: a row this old means that the control process stands still.
 SILENT_S = 1.0
 
 Event = dict[str, Any]
@@ -73,7 +73,7 @@ class ShapeView:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Everything on the screen, still as numbers.
+    """Everything on the console, still as numbers.
 
     Attributes
     ----------
@@ -124,8 +124,8 @@ class View:
     shape: ShapeView
 
 
-class ScreenModel:
-    """Takes what arrives and remembers what the screen needs of it.
+class ConsoleModel:
+    """Takes what arrives and remembers what the console needs of it.
 
     Attributes
     ----------

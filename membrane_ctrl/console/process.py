@@ -21,8 +21,8 @@ from rich.console import Console
 from rich.live import Live
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.model import Event, ScreenModel, View, text
-from membrane_ctrl.console.view import screen
+from membrane_ctrl.console.model import ConsoleModel, Event, View, text
+from membrane_ctrl.console.view import console_panel
 from membrane_ctrl.console.why import duration, number, percent
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import unpack_estimate
@@ -92,8 +92,8 @@ _ROW = struct.Struct(f"<{len(FIELDS)}d")
 
 
 @dataclass(frozen=True, slots=True)
-class ScreenSpec:
-    """What the screen needs to know of the run.
+class ConsoleSpec:
+    """What the console needs to know of the run.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class ScreenSpec:
     duration_s : float or None
         How long the run shall take.
     since_s : float
-        What was told before this is not told again: there was another screen then.
+        What was told before this is not told again: there was another console then.
     """
 
     clock: RunClock
@@ -121,7 +121,7 @@ class ScreenSpec:
     since_s: float = -math.inf
 
 
-def screen_main(spec: ScreenSpec, status: Connection | None = None) -> None:
+def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
     """Show the run on stderr until its "end" event, `processes.STOP`, or the death of the parent.
 
     Target of a `spawn`ed process; over `status` it says that it is alive. SIGINT is left to the control process; the
@@ -146,7 +146,7 @@ def screen_main(spec: ScreenSpec, status: Connection | None = None) -> None:
             rounds(feed.update)
 
 
-def _draw(spec: ScreenSpec, feed: _Feed, rounds: Callable[[Callable[[], object]], None]) -> None:
+def _draw(spec: ConsoleSpec, feed: _Feed, rounds: Callable[[Callable[[], object]], None]) -> None:
     """Go on drawing as what stderr is can be drawn on. Raises OSError when it is closed."""
     console = Console(stderr=True)
     drawable = console.is_terminal and not console.is_dumb_terminal
@@ -155,7 +155,7 @@ def _draw(spec: ScreenSpec, feed: _Feed, rounds: Callable[[Callable[[], object]]
 
 
 def give_back_terminal() -> None:
-    """For a screen that was killed: the first page of the terminal, and its cursor. Nothing without a terminal."""
+    """For a console that was killed: the first page of the terminal, and its cursor. Nothing without a terminal."""
     with suppress(OSError):
         terminal = getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # this once, control bytes are ours
         if terminal.isatty():
@@ -166,8 +166,8 @@ def give_back_terminal() -> None:
 class _Feed:
     """The rings, poured into the model."""
 
-    def __init__(self, spec: ScreenSpec) -> None:
-        self.model = ScreenModel(spec.config, spec.duration_s)
+    def __init__(self, spec: ConsoleSpec) -> None:
+        self.model = ConsoleModel(spec.config, spec.duration_s)
         self._telemetry = ring.RingReader(spec.telemetry)
         self._events = ring.RingReader(spec.events)
         self._shapes = ring.RingReader(spec.shapes) if spec.shapes else None
@@ -190,13 +190,13 @@ class _Feed:
 
 
 @contextmanager
-def _live(console: Console, spec: ScreenSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
-    """The screen on a terminal's other page; what was on the terminal is there again afterwards."""
+def _live(console: Console, spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
+    """The console on a terminal's other page; what was on the terminal is there again afterwards."""
     run = str(spec.run_dir)
 
     def show() -> None:
         feed.update()
-        live.update(Plain(screen(feed.model.view(spec.clock.now()), spec.config, run)), refresh=True)
+        live.update(Plain(console_panel(feed.model.view(spec.clock.now()), spec.config, run)), refresh=True)
 
     with Live(console=console, screen=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False) as live:
         yield show
@@ -204,7 +204,7 @@ def _live(console: Console, spec: ScreenSpec, feed: _Feed) -> Iterator[Callable[
 
 
 @contextmanager
-def _plain(spec: ScreenSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
+def _plain(spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
     """A line a second; important events at once."""
     due_s = spec.clock.now()
 

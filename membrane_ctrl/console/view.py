@@ -1,4 +1,4 @@
-"""The screen on a terminal. 80 x 24 holds all of it; a wider one gets longer lines, not more things to look at."""
+"""The console on a terminal. 80 x 24 holds all of it; a wider one gets longer lines, not more things to look at."""
 
 import math
 from collections.abc import Sequence
@@ -76,8 +76,8 @@ _BAR_WIDTH = 10
 _CALM = 0.25  # of the band: a finer scale than this would make noise look like trouble
 
 
-def screen(view: View, config: Config, run: str) -> Panel:
-    """The whole screen.
+def console_panel(view: View, config: Config, run: str) -> Panel:
+    """the whole console.
 
     Parameters
     ----------

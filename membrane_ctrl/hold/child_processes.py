@@ -184,14 +184,14 @@ def _frames(config: Config, stack: ExitStack) -> FrameAddress:
 
 
 class ChildProcesses:
-    """Recorder, live screen, acquisition and alarms of one run. The hold goes on without any of them, and says so."""
+    """Recorder, console, acquisition and alarms of one run. The hold goes on without any of them, and says so."""
 
     def __init__(
         self, config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str, duration_s: float | None
     ) -> None:
         self._clock = clock
         self._summary = run_dir / "summary.json"
-        self._screen = ManagedChild(_screen(config, clock, rings, run_dir, duration_s))
+        self._console = ManagedChild(_console(config, clock, rings, run_dir, duration_s))
         self._recorder = ManagedChild(_recorder(config, clock, rings, run_dir, name))
         self._acquisition = None
         if rings.shapes is not None and rings.frames is not None:
@@ -200,7 +200,7 @@ class ChildProcesses:
 
     @property
     def _managed(self) -> list[ManagedChild]:
-        return [each for each in (self._recorder, self._acquisition, self._alarms, self._screen) if each is not None]
+        return [each for each in (self._recorder, self._acquisition, self._alarms, self._console) if each is not None]
 
     def start(self, stack: ExitStack) -> None:
         """Start all; the stack ends whatever `take_down` has not."""
@@ -225,7 +225,7 @@ class ChildProcesses:
         return None
 
     def take_down(self) -> None:
-        """Stop the acquisition, then let recorder and screen finish by themselves: the "end" event is their sign."""
+        """Stop the acquisition, then let recorder and console finish by themselves: the "end" event is their sign."""
         if self._acquisition is not None:
             self._acquisition.child.stop(_CHILD_STOPS_S)
         recorder = self._recorder.child
@@ -234,30 +234,30 @@ class ChildProcesses:
         if recorder.exit_code != 0 and not self._summary.exists():  # another writes the end down
             self._recorder.replace(self._clock.now())
             self._recorder.child.join(_RECORDER_CLOSES_S)
-        self._end_screen()
+        self._end_console()
         if self._alarms is not None:
             self._alarms.child.join(_ALARMS_LEAVE_S)
 
-    def _end_screen(self) -> None:
+    def _end_console(self) -> None:
         """The terminal is a person's again, whatever has become of who drew on it."""
         from membrane_ctrl.console.process import give_back_terminal
 
-        screen = self._screen.child
-        if not screen.join(_CHILD_STOPS_S):
-            screen.stop(0.0)
-        if screen.exit_code != 0:
+        console = self._console.child
+        if not console.join(_CHILD_STOPS_S):
+            console.stop(0.0)
+        if console.exit_code != 0:
             give_back_terminal()
 
 
-def _screen(config: Config, clock: RunClock, rings: Rings, run_dir: Path, duration_s: float | None) -> Make:
-    from membrane_ctrl.console.process import ScreenSpec
+def _console(config: Config, clock: RunClock, rings: Rings, run_dir: Path, duration_s: float | None) -> Make:
+    from membrane_ctrl.console.process import ConsoleSpec
 
-    spec = ScreenSpec(clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s)
+    spec = ConsoleSpec(clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s)
 
     def make(count: int) -> tuple[Child, Connection]:
         ours, theirs = pipe()
         arguments = (replace(spec, since_s=clock.now()) if count else spec, theirs)
-        return Child("screen", "membrane_ctrl.console.process:screen_main", arguments, nice=5), ours
+        return Child("screen", "membrane_ctrl.console.process:console_main", arguments, nice=5), ours
 
     return make
 

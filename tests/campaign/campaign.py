@@ -24,7 +24,7 @@ import campaign_board_stories
 import campaign_sensor_stories
 import campaign_stories
 from campaign_cases import CASES, SITUATIONS, Case, Situation
-from campaign_rooms import ROOMS, tell
+from campaign_holds import HOLDS, tell
 from campaign_run import Result, run_case
 from campaign_times import RATE_HZ
 from process_run import ProcessResult, process_table
@@ -39,7 +39,7 @@ _BY_NAME = {case.name: case for case in CASES}
 _AT = {at.name: at for at in SITUATIONS}
 STORIES = (*campaign_board_stories.STORIES, *campaign_sensor_stories.STORIES, *campaign_stories.STORIES)
 _STORIES = {story.__name__: story for story in STORIES}
-_ROOMS = {room.__name__: room for room in ROOMS}
+_HOLDS = {story.__name__: story for story in HOLDS}
 SHORT_SEEDS = (3, 4)  # mirrors that are drawn; the one may resume, the other may not
 
 
@@ -85,11 +85,11 @@ def run_row(name: str, seeds: Iterable[int], situations: Iterable[Situation] = S
 
 def run_story(name: str) -> Told:
     """One story; what it raises is a violation."""
-    story = _STORIES.get(name) or _ROOMS[name]
+    story = _STORIES.get(name) or _HOLDS[name]
     about = (story.__doc__ or "").strip().splitlines()[0]
     with listening() as tripped:
         try:
-            found = _STORIES[name]() if name in _STORIES else tell(_ROOMS[name])
+            found = _STORIES[name]() if name in _STORIES else tell(_HOLDS[name])
         except Exception as error:
             found = [f"raised {type(error).__name__}: {error}"]
     return Told(name, about, tuple(found), tuple(sorted(tripped)))
@@ -98,7 +98,7 @@ def run_story(name: str) -> Told:
 def run_all(processes: int) -> tuple[list[Result], list[Told]]:
     """Every fault in every situation with every seed, and every story."""
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        told = pool.map(run_story, [*_STORIES, *_ROOMS])
+        told = pool.map(run_story, [*_STORIES, *_HOLDS])
         rows = pool.map(run_row, _BY_NAME, [tuple(SEEDS)] * len(_BY_NAME))
         return [result for row in rows for result in row], list(told)
 
@@ -106,7 +106,7 @@ def run_all(processes: int) -> tuple[list[Result], list[Told]]:
 def run_short(first: str = "") -> Iterator[tuple[str, tuple[str, ...]]]:
     """The stories, and every fault in two situations, some of them first: what each is called, and its violations."""
     parts = {
-        "rooms": _tell_short(_ROOMS),
+        "holds": _tell_short(_HOLDS),
         "board": _tell_short([story.__name__ for story in campaign_board_stories.STORIES]),
         "orders": _tell_short([story.__name__ for story in campaign_stories.STORIES]),
         "matrix": _run_short_matrix(),
@@ -251,7 +251,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int)
     parser.add_argument("--story", metavar="WORD")
     parser.add_argument("--short", action="store_true")
-    parser.add_argument("--first", default="", help="with --short: rooms, board, orders, matrix or sensors")
+    parser.add_argument("--first", default="", help="with --short: holds, board, orders, matrix or sensors")
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args(arguments)
     if options.short:
@@ -259,7 +259,7 @@ def main(arguments: list[str] | None = None) -> int:
     results: list[Result] = []
     told: list[Told] = []
     if options.story:
-        told = [run_story(name) for name in chain(_STORIES, _ROOMS) if options.story in name]
+        told = [run_story(name) for name in chain(_STORIES, _HOLDS) if options.story in name]
     elif options.only:
         results = [run_case(*cell) for cell in _chosen(options.only, options.situation, options.seed)]
     else:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from sensor_faults import CAMERA, FAULTS, PAIRS, SensorFault, Story, tell
-from sensor_peace import Peace, peace
+from sensor_quiet import QuietHours, quiet_hours
 
 from membrane_ctrl.model.states import State
 
@@ -99,14 +99,14 @@ def jobs() -> Iterator[_Job]:
         yield "pair", number, False, False
         yield "pair", number, True, False
     for seed in range(1, NIGHTS + 1):
-        yield "peace", seed, False, seed % 8 >= 4  # the last one: the other world
+        yield "quiet_hours", seed, False, seed % 8 >= 4  # the last one: the other world
 
 
 def run(job: _Job) -> tuple[_Job, dict[str, Any]]:
     """One of them."""
     what, number, camera, flag = job
-    if what == "peace":
-        return job, asdict(peace(number, flag, HOURS))
+    if what == "quiet_hours":
+        return job, asdict(quiet_hours(number, flag, HOURS))
     faults = (FAULTS[number],) if what == "fault" else PAIRS[number]
     return job, asdict(tell(faults, SEED, camera, flag))
 
@@ -131,7 +131,7 @@ def page(found: dict[_Job, dict[str, Any]]) -> str:
         told = [_cell(Story(**found["pair", number, camera, False])) for camera in (False, True)]
         words = " and ".join(f"{fault.sensor} {fault.failure}" for fault in pair)
         lines.append(f"| {words} | {' | '.join(told)} |")
-    return "\n".join([*lines, *_peace_lines(found), FOOT])
+    return "\n".join([*lines, *_quiet_lines(found), FOOT])
 
 
 def _wrapped(text: str) -> list[str]:
@@ -156,12 +156,12 @@ def _note(fault: SensorFault) -> str:
     return next((why for who, how, why in NOTES if who == fault.sensor and fault.failure.startswith(how)), "")
 
 
-def _peace_lines(found: dict[_Job, dict[str, Any]]) -> list[str]:
+def _quiet_lines(found: dict[_Job, dict[str, Any]]) -> list[str]:
     """How often the guards cry without a cause."""
-    nights: defaultdict[bool, list[Peace]] = defaultdict(list)
+    nights: defaultdict[bool, list[QuietHours]] = defaultdict(list)
     for (what, _, _, other), cell in found.items():
-        if what == "peace":
-            nights[other].append(Peace(cell["hours"], tuple(cell["alarms"])))
+        if what == "quiet_hours":
+            nights[other].append(QuietHours(cell["hours"], tuple(cell["alarms"])))
     lines = [
         "",
         "## False alarms",

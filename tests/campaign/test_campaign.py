@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from campaign import DOCUMENT, SEEDS, STORIES, document, run_all, run_story
 from campaign_cases import CASES, SITUATIONS, Case, Situation
-from campaign_rooms import ROOMS
+from campaign_holds import HOLDS
 from campaign_run import run_case
 
 from membrane_ctrl.controller.safe_levels import SafeLevels
@@ -34,7 +34,7 @@ def test_every_fault_in_two_situations(case: Case) -> None:
     assert not [violation for result in found for violation in result.violations]
 
 
-@pytest.mark.parametrize("name", [story.__name__ for story in (*STORIES, *ROOMS)])
+@pytest.mark.parametrize("name", [story.__name__ for story in (*STORIES, *HOLDS)])
 def test_every_story(name: str) -> None:
     assert not run_story(name).violations
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 from sensor_faults import FAULTS, PAIRS, SensorFault, blocked, drift, scaled, stuck, tell
-from sensor_peace import peace
+from sensor_quiet import quiet_hours
 
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.model.states import State
@@ -52,7 +52,7 @@ def test_a_gauge_in_another_unit_keeps_the_mirror_down_from_the_start(by: float)
 
 @pytest.mark.parametrize("other_world", [False, True])
 def test_an_hour_of_everything_that_is_no_fault_of_a_sensor_is_held(other_world: bool) -> None:
-    assert peace(4, other_world, 0.5).alarms == ()
+    assert quiet_hours(4, other_world, 0.5).alarms == ()
 
 
 @pytest.mark.campaign
@@ -82,4 +82,4 @@ def test_two_at_once_are_found_before_the_limits(faults: Sequence[SensorFault], 
 @pytest.mark.parametrize("seed", range(60, 64))
 @pytest.mark.parametrize("other_world", [False, True])
 def test_a_night_without_a_fault_of_a_sensor_is_held(seed: int, other_world: bool) -> None:
-    assert peace(seed, other_world, 3.0).alarms == ()
+    assert quiet_hours(seed, other_world, 3.0).alarms == ()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.outer_loop import SENSITIVITY, estimate_of
+from benchmarks.shape_loop import SENSITIVITY, estimate_of
 from membrane_ctrl.config.schema import ShapeConfig
 from membrane_ctrl.control.shape_loop import SHAPES, ShapeLoop, ShapeOutput
 from membrane_ctrl.model.shape_estimate import ShapeEstimate

@@ -18,8 +18,8 @@ from tuning import gains_file as journal
 from tuning.gains_file import GainsFile, PlantSection
 from tuning.identification.disturbance import Disturbance, Noise, WeatherGain
 from tuning.identification.loop_model import PlantModel
-from tuning.identification.outer_loop import STEP_UM, evaluate
 from tuning.identification.records import Record
+from tuning.identification.shape_loop import STEP_UM, evaluate
 from tuning.proposal.preview import ModelBench
 from tuning.proposal.verify import SETTLE_LEAST_S, Trial, centre_std_um, health, look, settle_s
 from tuning.rig import Rig
@@ -99,7 +99,7 @@ def shapes(count: int, start_s: float, sag_um: float, sigma_um: float, drift_um:
     return made
 
 
-def test_the_outer_loop_s_sensitivity_noise_and_time_constant() -> None:
+def test_the_shape_loop_s_sensitivity_noise_and_time_constant() -> None:
     still = np.zeros(2000)
     levels = [shapes(60, 10_000.0 + 200 * k, 37_100.0 + at, 0.3, still) for k, at in enumerate((0.0, STEP_UM, 0.0))]
     drift = np.cumsum(np.random.default_rng(5).standard_normal(2000)) * 0.05 * math.sqrt(2.0)  # 0.05 um/sqrt(s)

@@ -1,4 +1,4 @@
-"""What is on the screen, and that it fits."""
+"""What is on the console, and that it fits."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import math
 from dataclasses import replace
 
 import pytest
+from console_feed import FAULT, HOLDING, NOTHING, event, rows, shape
 from rich.console import Console
-from screen_feed import FAULT, HOLDING, NOTHING, event, rows, shape
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.model import ScreenModel
+from membrane_ctrl.console.model import ConsoleModel
 from membrane_ctrl.console.process import at_once, event_line, line
-from membrane_ctrl.console.view import full_scale, level_bar, screen, signed_bars
+from membrane_ctrl.console.view import console_panel, full_scale, level_bar, signed_bars
 from membrane_ctrl.console.why import duration, number, percent
 from membrane_ctrl.model.states import Rung, ShapeState, State
 
 CONFIG = Config()
 
 
-def held(duration_s: float | None = 120.0) -> ScreenModel:
-    model = ScreenModel(CONFIG, duration_s)
+def held(duration_s: float | None = 120.0) -> ConsoleModel:
+    model = ConsoleModel(CONFIG, duration_s)
     for row in rows(75.0):
         model.take_row(row)
     model.take_shape(shape(1.0))
@@ -29,9 +29,9 @@ def held(duration_s: float | None = 120.0) -> ScreenModel:
     return model
 
 
-def drawn(model: ScreenModel, now_s: float = 75.0, width: int = 80) -> list[str]:
+def drawn(model: ConsoleModel, now_s: float = 75.0, width: int = 80) -> list[str]:
     console = Console(width=width, record=True, file=io.StringIO())
-    console.print(screen(model.view(now_s), CONFIG, "logs/20261121T031200Z-demo"))
+    console.print(console_panel(model.view(now_s), CONFIG, "logs/20261121T031200Z-demo"))
     return console.export_text().rstrip("\n").splitlines()
 
 
@@ -61,7 +61,7 @@ def test_real_bench_shows_no_truth_and_an_open_run_no_end() -> None:
     assert "until stopped" in page
 
 
-def everything_wrong() -> ScreenModel:
+def everything_wrong() -> ConsoleModel:
     model = held()
     model.take_event(event(75.0, "fault", **FAULT))
     model.take_event(
@@ -104,8 +104,8 @@ def test_silence_is_the_headline() -> None:
 
 
 def test_before_the_first_tick_and_with_nothing_known() -> None:
-    assert any("waiting for the first tick" in row for row in drawn(ScreenModel(CONFIG)))
-    model = ScreenModel(CONFIG)
+    assert any("waiting for the first tick" in row for row in drawn(ConsoleModel(CONFIG)))
+    model = ConsoleModel(CONFIG)
     model.take_row(replace(NOTHING, mono_s=0.0, tick=1.0, missed_ticks=0.0, state=0.0, shape_state=0.0, rung=0.0))
     assert not any("nan" in row for row in drawn(model))
     assert "nan" not in line(model.view(0.0))
@@ -117,7 +117,7 @@ def test_plain_line_has_the_second_in_it() -> None:
         assert words in said
     assert "\n" not in said
     assert "control loop silent for 10.0 s" in line(held().view(84.98))
-    assert line(ScreenModel(CONFIG).view(0.0)).endswith("the control loop has not ticked yet")
+    assert line(ConsoleModel(CONFIG).view(0.0)).endswith("the control loop has not ticked yet")
 
 
 def test_plain_events() -> None:

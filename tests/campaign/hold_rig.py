@@ -92,7 +92,7 @@ class BoardBench:
 
 
 @dataclass
-class Room:
+class HoldRig:
     """A supervisor at work, and what is seen from outside; `violations` is what was not as it had to be."""
 
     plant: WatchedPlant
@@ -149,38 +149,38 @@ class Room:
 
 
 @contextlib.asynccontextmanager
-async def a_room(make: Callable[[WatchedPlant], tuple[Bench, Callable[[], object]]]) -> AsyncIterator[Room]:
+async def a_hold(make: Callable[[WatchedPlant], tuple[Bench, Callable[[], object]]]) -> AsyncIterator[HoldRig]:
     """A supervisor that is about to hold a mirror."""
     config = config_of(1, World(), False)
     plant = WatchedPlant(World(), config.twin, config.pump)
     bench, now = make(plant)
-    room = Room(plant, bench, now, config)
+    rig = HoldRig(plant, bench, now, config)
     with ExitStack() as stack:
         rings = {name: stack.enter_context(ring(16, size)) for name, size in (("t", ROW_BYTES), ("e", 4096))}
         telemetry, events = (RingWriter(rings[name]) for name in ("t", "e"))
         stack.callback(telemetry.close)
         stack.callback(events.close)
         wiring = Wiring(bench, telemetry, events)
-        wiring.heard = {"rows": room.heard.append, "listeners": lambda outputs: _tell_all(room, outputs)}
-        room.supervisor = Supervisor(
+        wiring.heard = {"rows": rig.heard.append, "listeners": lambda outputs: _tell_all(rig, outputs)}
+        rig.supervisor = Supervisor(
             Controller(config, zernike_projection()), wiring, cast(RunClock, LoopClock()), RATE_HZ
         )
         await bench.open()
-        room.ask("hold")
-        room.task = asyncio.create_task(room.supervisor.run(None))
+        rig.ask("hold")
+        rig.task = asyncio.create_task(rig.supervisor.run(None))
         try:
-            await room.until(State.HOLD)
-            yield room
+            await rig.until(State.HOLD)
+            yield rig
         finally:
             await asyncio.sleep(0.37 * TICK_S)  # not in the middle of an exchange
-            room.task.cancel()
+            rig.task.cancel()
             with contextlib.suppress(asyncio.CancelledError, LinkError, ZeroDivisionError):
-                await room.task
+                await rig.task
             await bench.close()
 
 
-def _tell_all(room: Room, outputs: TickOutputs) -> None:
-    for listener in room.listeners:
+def _tell_all(rig: HoldRig, outputs: TickOutputs) -> None:
+    for listener in rig.listeners:
         listener(outputs)
 
 
@@ -190,7 +190,7 @@ def on_board(plant: WatchedPlant) -> tuple[Bench, Callable[[], object]]:
     return bench, bench.now
 
 
-def board_of(room: Room) -> BoardBench:
-    """The room's board."""
-    assert isinstance(room.bench, BoardBench)
-    return room.bench
+def board_of(rig: HoldRig) -> BoardBench:
+    """The rig's board."""
+    assert isinstance(rig.bench, BoardBench)
+    return rig.bench

@@ -92,7 +92,7 @@ _CYCLES_MIN, _TAU_MAX_S = 10.0, 3600.0
 
 
 @dataclass(frozen=True, slots=True)
-class OuterLoop:
+class ShapeLoopFit:
     """What was found.
 
     Attributes
@@ -159,7 +159,7 @@ def step_experiment(rig: HoldRig, setpoint_um: float, restore: bool) -> list[lis
 
 def evaluate(
     levels: Sequence[Sequence[ShapeEstimate]], steady: Sequence[ShapeEstimate], assumed: Series
-) -> OuterLoop:
+) -> ShapeLoopFit:
     """Sensitivity from the levels, noise and drift from all shapes of a steady hold.
 
     Parameters
@@ -188,7 +188,7 @@ def evaluate(
     noise = fit_local_level(gaps_um, np.array([shape.time_s for shape in shapes]))
     best_s = noise.white * math.sqrt(cycle_s / noise.walk)
     kept, wanted = sensitivity[1:], assumed[1:]
-    return OuterLoop(
+    return ShapeLoopFit(
         sensitivity=sensitivity,
         sensitivity_sigma=np.sqrt(1.5 * scatter) / abs(step_um),
         agreement=float(kept @ wanted / (np.linalg.norm(kept) * np.linalg.norm(wanted))),

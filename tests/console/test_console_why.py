@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from screen_feed import HOLDING
+from console_feed import HOLDING
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.why import why

@@ -30,7 +30,7 @@ _DROPOUT = "displacement_missing"  # five seconds without light are no fault of 
 
 
 @dataclass(frozen=True)
-class Peace:
+class QuietHours:
     """A day in which no sensor fails, and much happens.
 
     Attributes
@@ -44,21 +44,23 @@ class Peace:
     alarms: tuple[str, ...]
 
 
-def peace(seed: int, other_world: bool, hours: float, rate_hz: float = 5.0) -> Peace:
+def quiet_hours(seed: int, other_world: bool, hours: float, rate_hz: float = 5.0) -> QuietHours:
     """Weather, doors, a leak that doubles, setpoints, inflations, a laser that drifts, with and without a camera.
 
     The other world has another film (thinner, and stretched before it was inflated), a leak twice as large, a pump
     that gives a quarter more than the configuration says, and sensors with twice the noise.
     """
     if not other_world:
-        return _peace(seed, hours, rate_hz, PumpConfig(), TwinConfig(seed=seed), 0.0)
+        return _quiet_hours(seed, hours, rate_hz, PumpConfig(), TwinConfig(seed=seed), 0.0)
     twin = TwinConfig(seed=seed, leak_time_constant_s=5000.0, barometer_noise_pa=0.1)
     thin = Film(thickness_um=42.0, creep_per_decade=0.02)
     with patch.object(film_module, "MIRROR_FILM", thin), patch.object(sensors_module, "GAUGE_NOISE_PA", 1.0):
-        return _peace(seed, hours, rate_hz, PumpConfig(flow_full_um_per_s=5.3 * 1.25), twin, 0.3)
+        return _quiet_hours(seed, hours, rate_hz, PumpConfig(flow_full_um_per_s=5.3 * 1.25), twin, 0.3)
 
 
-def _peace(seed: int, hours: float, rate_hz: float, pump: PumpConfig, twin: TwinConfig, linear: float) -> Peace:
+def _quiet_hours(
+    seed: int, hours: float, rate_hz: float, pump: PumpConfig, twin: TwinConfig, linear: float
+) -> QuietHours:
     chance = np.random.default_rng(seed)
     end_s = 3600.0 * hours
     twin = twin.model_copy(update={"scenario": "gusty" if seed % 2 else "typical"})
@@ -92,7 +94,7 @@ def _peace(seed: int, hours: float, rate_hz: float, pump: PumpConfig, twin: Twin
         tick = run.tick(due)
         faults = [event for event in tick.events if event["kind"] == "fault"] if tick is not None else []
         alarms += [f"{event['name']}: {event['seen']}" for event in faults if event["name"] != _DROPOUT]
-    return Peace(run.now_s / 3600.0, tuple(alarms))
+    return QuietHours(run.now_s / 3600.0, tuple(alarms))
 
 
 def _moments(chance: np.random.Generator, end_s: float, every_s: float) -> list[float]:

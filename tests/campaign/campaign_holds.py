@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from campaign_lab import Instruments, TableLink
-from campaign_room import BoardBench, LoopClock, Room, a_room, board_of, on_board
 from campaign_times import HOLD_FLOW_S, RAMP_S, RATE_HZ, TICK_S, WATCHDOG_S
 from campaign_world import WatchedPlant, World
+from hold_rig import BoardBench, HoldRig, LoopClock, a_hold, board_of, on_board
 
 from firmware_iface.drivers.bronkhorst import BronkhorstFlow, ModbusParameters
 from firmware_iface.emulators.bronkhorst import BronkhorstRegisters, Instrument
@@ -41,15 +41,15 @@ async def the_program_ends_in_a_hold() -> list[str]:
     """The program ends by whatever way: the last write is pump 0, at once and not by the watchdog."""
     violations = []
     for way in ("cancelled", "a driver raises"):
-        async with a_room(on_board) as room:
+        async with a_hold(on_board) as rig:
             if way == "cancelled":
-                room.task.cancel()
-            board_of(room).raises = way != "cancelled"
+                rig.task.cancel()
+            board_of(rig).raises = way != "cancelled"
             await asyncio.sleep(2.5 * TICK_S)
-            room.now()
-            room.must(room.task.done(), "the run goes on")
-            room.must(not room.still(), "the program ended and left the pump running")
-            violations += [f"{way}: {what}" for what in room.violations]
+            rig.now()
+            rig.must(rig.task.done(), "the run goes on")
+            rig.must(not rig.still(), "the program ended and left the pump running")
+            violations += [f"{way}: {what}" for what in rig.violations]
     return violations
 
 
@@ -59,77 +59,77 @@ def _raise(outputs: TickOutputs) -> None:
 
 async def cancelled_while_it_vents() -> list[str]:
     """The end of the program does not shut the vent of a mirror that is being vented."""
-    async with a_room(on_board) as room:
-        board_of(room).virtual.wrong.gauge_offset_pa = 60.0
-        await room.until(State.FAULT)
-        await room.wait(1.0)
-        room.task.cancel()
-        await room.wait(1.0, room.still)
-        room.must(room.plant.vent_given == 1.0, "the program ended and shut the vent")
-        return room.violations
+    async with a_hold(on_board) as rig:
+        board_of(rig).virtual.wrong.gauge_offset_pa = 60.0
+        await rig.until(State.FAULT)
+        await rig.wait(1.0)
+        rig.task.cancel()
+        await rig.wait(1.0, rig.still)
+        rig.must(rig.plant.vent_given == 1.0, "the program ended and shut the vent")
+        return rig.violations
 
 
 async def a_guard_ends() -> list[str]:
     """A guard of the bench, or whoever listens to the ticks, has come to an end: the pump stands."""
     violations = []
     for what in ("guard", "listener"):
-        async with a_room(on_board) as room:
-            board_of(room).guards = ("software watchdog",) if what == "guard" else ()
-            room.listeners += [_raise] if what == "listener" else []
-            await room.wait(4 * TICK_S)
-            await room.wait(5.0, room.still)
-            room.must(room.state == State.FAULT, "no fault")
-            violations += [f"{what}: {found}" for found in room.violations]
+        async with a_hold(on_board) as rig:
+            board_of(rig).guards = ("software watchdog",) if what == "guard" else ()
+            rig.listeners += [_raise] if what == "listener" else []
+            await rig.wait(4 * TICK_S)
+            await rig.wait(5.0, rig.still)
+            rig.must(rig.state == State.FAULT, "no fault")
+            violations += [f"{what}: {found}" for found in rig.violations]
     return violations
 
 
 async def a_slow_board() -> list[str]:
     """Every answer takes 0.2 s: no control loop, the pump ramps down; one answer of 0.4 s makes no burst of ticks."""
-    async with a_room(on_board) as room:
-        board_of(room).slow_s = 0.4
+    async with a_hold(on_board) as rig:
+        board_of(rig).slow_s = 0.4
         await asyncio.sleep(0.4)
-        board_of(room).slow_s = 0.0
+        board_of(rig).slow_s = 0.0
         await asyncio.sleep(0.5)
-        before = room.supervisor.ticks
+        before = rig.supervisor.ticks
         await asyncio.sleep(1.0)
-        room.must(room.supervisor.ticks - before < RATE_HZ * 1.1, "missed ticks are made up in a burst")
-        writes = [b.row.mono_s - a.row.mono_s for a, b in zip(room.heard, room.heard[1:], strict=False)]
-        room.must(min(writes) > 0.2 * TICK_S, f"two ticks {1e3 * min(writes):.1f} ms apart")
-    async with a_room(on_board) as slow:
+        rig.must(rig.supervisor.ticks - before < RATE_HZ * 1.1, "missed ticks are made up in a burst")
+        writes = [b.row.mono_s - a.row.mono_s for a, b in zip(rig.heard, rig.heard[1:], strict=False)]
+        rig.must(min(writes) > 0.2 * TICK_S, f"two ticks {1e3 * min(writes):.1f} ms apart")
+    async with a_hold(on_board) as slow:
         board_of(slow).slow_s = 0.2
         await slow.wait(RAMP_S + 6.0)
         await slow.wait(3.0, slow.still)
-        return room.violations + slow.violations
+        return rig.violations + slow.violations
 
 
 async def a_board_that_latched_stays_latched() -> list[str]:
     """Nobody has acknowledged: the board's over-pressure stays latched whatever the supervisor does."""
-    async with a_room(on_board) as room:
-        board_of(room).virtual.wrong.gauge_offset_pa = 300.0
-        await room.wait(1.0)
-        board_of(room).virtual.wrong.gauge_offset_pa = 0.0
-        await room.wait(20.0, room.still)
-        room.must(board_of(room).virtual.read().latched_faults & 2 != 0, "the board's latch is gone")
-        room.must(room.plant.vent_given == 1.0, "the vent is shut")
-        return room.violations
+    async with a_hold(on_board) as rig:
+        board_of(rig).virtual.wrong.gauge_offset_pa = 300.0
+        await rig.wait(1.0)
+        board_of(rig).virtual.wrong.gauge_offset_pa = 0.0
+        await rig.wait(20.0, rig.still)
+        rig.must(board_of(rig).virtual.read().latched_faults & 2 != 0, "the board's latch is gone")
+        rig.must(rig.plant.vent_given == 1.0, "the vent is shut")
+        return rig.violations
 
 
 async def the_network_comes_back() -> list[str]:
     """A cut network: the fault comes, the link is opened again, and the next hold works."""
-    async with a_room(on_board) as room:
-        wrong = board_of(room).virtual.wrong
+    async with a_hold(on_board) as rig:
+        wrong = board_of(rig).virtual.wrong
         wrong.unreachable = True
-        await room.wait(3.0)
-        room.must(room.state == State.FAULT, "no fault without a network")
+        await rig.wait(3.0)
+        rig.must(rig.state == State.FAULT, "no fault without a network")
         wrong.unreachable = False
-        await room.wait(5.0, room.still)
-        room.must(math.isfinite(room.heard[-1].row.gauge_pressure_pa), "the link was not opened again")
-        room.ask("ack")
-        await room.until(State.STANDBY, 10.0)
-        room.ask("hold")
-        await room.until(State.HOLD)
-        room.near()
-        return room.violations
+        await rig.wait(5.0, rig.still)
+        rig.must(math.isfinite(rig.heard[-1].row.gauge_pressure_pa), "the link was not opened again")
+        rig.ask("ack")
+        await rig.until(State.STANDBY, 10.0)
+        rig.ask("hold")
+        await rig.until(State.HOLD)
+        rig.near()
+        return rig.violations
 
 
 async def faults_that_outlive_the_run() -> list[str]:
@@ -147,26 +147,26 @@ async def faults_that_outlive_the_run() -> list[str]:
                 return True
             return False
 
-        async with a_room(on_board) as room:
-            with FaultLatch(file, None, "run", LoopClock().utc, room.events.append) as fault_latch:
-                room.listeners.append(fault_latch.heard)
-                board_of(room).virtual.wrong.late_ms = 0.0
-                board_of(room).virtual.wrong.gauge_offset_pa = 60.0
-                await room.until(State.FAULT)
-                await room.wait(1.0)
+        async with a_hold(on_board) as rig:
+            with FaultLatch(file, None, "run", LoopClock().utc, rig.events.append) as fault_latch:
+                rig.listeners.append(fault_latch.heard)
+                board_of(rig).virtual.wrong.late_ms = 0.0
+                board_of(rig).virtual.wrong.gauge_offset_pa = 60.0
+                await rig.until(State.FAULT)
+                await rig.wait(1.0)
             first = file.read()
-            room.must(first is not None and first.name == "over_pressure", f"in the file: {first}")
-            room.must(refused(), "the next hold starts over a latched fault")
-            with FaultLatch(file, None, "run", LoopClock().utc, room.events.append) as fault_latch:
+            rig.must(first is not None and first.name == "over_pressure", f"in the file: {first}")
+            rig.must(refused(), "the next hold starts over a latched fault")
+            with FaultLatch(file, None, "run", LoopClock().utc, rig.events.append) as fault_latch:
                 locked = {"kind": "command", "command": "latch", "who": "somebody", "text": "later"}
                 denied = {"kind": "command", "command": "ack", "who": "somebody", "refused": "not now"}
                 for event in (locked, denied):
-                    fault_latch.heard(cast(TickOutputs, _Told(room.heard[-1], (event,))))
-            room.must(file.read() == first, "the first cause was replaced, or cleared by a refused acknowledgement")
+                    fault_latch.heard(cast(TickOutputs, _Told(rig.heard[-1], (event,))))
+            rig.must(file.read() == first, "the first cause was replaced, or cleared by a refused acknowledgement")
             for content in ("", "{", "[]", '{"schema": "other"}', "null"):
                 (Path(folder) / NAME).write_text(content)
-                room.must(refused(), f"a file that holds {content!r} is no fault")
-            return room.violations
+                rig.must(refused(), f"a file that holds {content!r} is no fault")
+            return rig.violations
 
 
 @dataclass
@@ -214,39 +214,39 @@ def _composed(
 
 
 @contextlib.asynccontextmanager
-async def instruments(bronkhorst: bool) -> AsyncIterator[tuple[Room, Instruments]]:
+async def instruments(bronkhorst: bool) -> AsyncIterator[tuple[HoldRig, Instruments]]:
     """A supervisor over single instruments."""
     made: list[Instruments] = []
-    async with a_room(_composed(bronkhorst, made)) as room:
-        yield room, made[-1]
+    async with a_hold(_composed(bronkhorst, made)) as rig:
+        yield rig, made[-1]
 
 
-async def _both(story: Callable[[Room, Instruments], Awaitable[None]]) -> list[str]:
+async def _both(story: Callable[[HoldRig, Instruments], Awaitable[None]]) -> list[str]:
     violations = []
     for bronkhorst in (False, True):
-        async with instruments(bronkhorst) as (room, lab):
-            await story(room, lab)
-            violations += [f"{'Bronkhorst' if bronkhorst else 'Modbus'}: {what}" for what in room.violations]
+        async with instruments(bronkhorst) as (rig, lab):
+            await story(rig, lab)
+            violations += [f"{'Bronkhorst' if bronkhorst else 'Modbus'}: {what}" for what in rig.violations]
     return violations
 
 
 async def instruments_hold_a_mirror() -> list[str]:
     """What is commanded arrives, what is measured is told, and the mirror is held."""
 
-    async def story(room: Room, lab: Instruments) -> None:
-        await room.wait(10.0)
-        room.near()
+    async def story(rig: HoldRig, lab: Instruments) -> None:
+        await rig.wait(10.0)
+        rig.near()
         for _ in range(50):
             await asyncio.sleep(TICK_S)
             lab.now()
-            row, truth = room.heard[-1].row, room.plant.truth()
-            off = room.plant.pump_given - row.pump_fraction
-            room.must(abs(off) < 2e-3, f"commanded {row.pump_fraction:.3f}, given {room.plant.pump_given:.3f}")
-            room.must(
+            row, truth = rig.heard[-1].row, rig.plant.truth()
+            off = rig.plant.pump_given - row.pump_fraction
+            rig.must(abs(off) < 2e-3, f"commanded {row.pump_fraction:.3f}, given {rig.plant.pump_given:.3f}")
+            rig.must(
                 abs(row.gauge_pressure_pa - truth.gauge_pressure_pa) < 4.0, "the pressure told is not the true one"
             )
             readback = row.pump_readback_fraction
-            room.must(abs(readback - room.plant.pump_given) < 0.2, f"read-back {readback:.2f}")
+            rig.must(abs(readback - rig.plant.pump_given) < 0.2, f"read-back {readback:.2f}")
 
     return await _both(story)
 
@@ -254,11 +254,11 @@ async def instruments_hold_a_mirror() -> list[str]:
 async def over_pressure_of_instruments() -> list[str]:
     """Too much pressure: the pump stands and the vent is open."""
 
-    async def story(room: Room, lab: Instruments) -> None:
+    async def story(rig: HoldRig, lab: Instruments) -> None:
         lab.offset_pa = 60.0
-        await room.wait(5 * TICK_S)
-        await room.wait(3.0, room.still)
-        room.must(room.plant.vent_given > 0.99, "over-pressure, and the vent is shut")
+        await rig.wait(5 * TICK_S)
+        await rig.wait(3.0, rig.still)
+        rig.must(rig.plant.vent_given > 0.99, "over-pressure, and the vent is shut")
 
     return await _both(story)
 
@@ -266,10 +266,10 @@ async def over_pressure_of_instruments() -> list[str]:
 async def a_gauge_out_of_its_range() -> list[str]:
     """A gauge that shows what it cannot show is no gauge."""
 
-    async def story(room: Room, lab: Instruments) -> None:
+    async def story(rig: HoldRig, lab: Instruments) -> None:
         lab.offset_pa = -900.0
-        await room.wait(RAMP_S + 1.5)
-        await room.wait(3.0, room.still)
+        await rig.wait(RAMP_S + 1.5)
+        await rig.wait(3.0, rig.still)
 
     return await _both(story)
 
@@ -277,13 +277,13 @@ async def a_gauge_out_of_its_range() -> list[str]:
 async def a_laser_is_unplugged() -> list[str]:
     """The mean flow is held for its time, and then the pump stands."""
 
-    async def story(room: Room, lab: Instruments) -> None:
+    async def story(rig: HoldRig, lab: Instruments) -> None:
         lab.laser.plugged = False
         before_um = lab.now().truth().displacement_um
-        await room.wait(HOLD_FLOW_S + RAMP_S + 1.0)
+        await rig.wait(HOLD_FLOW_S + RAMP_S + 1.0)
         went_um = lab.now().truth().displacement_um - before_um
-        room.must(went_um < 30.0, f"blind, and the bowl went {went_um:.0f} um deeper")
-        await room.wait(5.0, room.still)
+        rig.must(went_um < 30.0, f"blind, and the bowl went {went_um:.0f} um deeper")
+        await rig.wait(5.0, rig.still)
 
     return await _both(story)
 
@@ -291,7 +291,7 @@ async def a_laser_is_unplugged() -> list[str]:
 async def the_supervisor_hangs() -> list[str]:
     """No tick any more: the software watchdog stops the pump, and nobody starts it again but a person."""
 
-    async def story(room: Room, lab: Instruments) -> None:
+    async def story(rig: HoldRig, lab: Instruments) -> None:
         hung = asyncio.Event()
         write = lab.bench.write
 
@@ -300,13 +300,13 @@ async def the_supervisor_hangs() -> list[str]:
             await write(command)  # what was under way when it hung
 
         lab.bench.write = hang  # type: ignore[method-assign]
-        await room.wait(WATCHDOG_S * 1.5 + 2 * TICK_S)
-        await room.wait(3.0, room.still)
+        await rig.wait(WATCHDOG_S * 1.5 + 2 * TICK_S)
+        await rig.wait(3.0, rig.still)
         lab.bench.write = write  # type: ignore[method-assign]
         hung.set()
-        await room.wait(4 * TICK_S, room.still)
-        room.must(room.state == State.FAULT, "a trip of the software watchdog is no fault")
-        await room.wait(20.0, room.still)
+        await rig.wait(4 * TICK_S, rig.still)
+        rig.must(rig.state == State.FAULT, "a trip of the software watchdog is no fault")
+        await rig.wait(20.0, rig.still)
 
     return await _both(story)
 
@@ -314,11 +314,11 @@ async def the_supervisor_hangs() -> list[str]:
 async def the_software_watchdog_ends() -> list[str]:
     """The software watchdog itself comes to an end: the pump stands."""
 
-    async def story(room: Room, lab: Instruments) -> None:
+    async def story(rig: HoldRig, lab: Instruments) -> None:
         next(task for task in asyncio.all_tasks() if task.get_name() == "software watchdog").cancel()
-        await room.wait(4 * TICK_S)
-        await room.wait(5.0, room.still)
-        room.must(room.state == State.FAULT, "a bench without its watchdog is no fault")
+        await rig.wait(4 * TICK_S)
+        await rig.wait(5.0, rig.still)
+        rig.must(rig.state == State.FAULT, "a bench without its watchdog is no fault")
 
     return await _both(story)
 
@@ -326,13 +326,13 @@ async def the_software_watchdog_ends() -> list[str]:
 async def a_pump_that_gives_no_answer() -> list[str]:
     """The pump's line is dead: a fault, and 0 as soon as it lives."""
 
-    async def story(room: Room, lab: Instruments) -> None:
+    async def story(rig: HoldRig, lab: Instruments) -> None:
         lab.pump.lose = 10**9
-        await room.wait(3.0)
-        room.must(room.state == State.FAULT, "a pump that does not answer is no fault")
+        await rig.wait(3.0)
+        rig.must(rig.state == State.FAULT, "a pump that does not answer is no fault")
         lab.pump.lose = 0
-        await room.wait(1.0)
-        await room.wait(5.0, room.still)
+        await rig.wait(1.0)
+        await rig.wait(5.0, rig.still)
 
     return await _both(story)
 
@@ -340,13 +340,13 @@ async def a_pump_that_gives_no_answer() -> list[str]:
 async def a_pump_that_hears_nothing() -> list[str]:
     """The pump is read well, and takes no command any more: a fault at once, not at the next stop."""
 
-    async def story(room: Room, lab: Instruments) -> None:
+    async def story(rig: HoldRig, lab: Instruments) -> None:
         lab.pump.deaf = True
-        await room.wait(2.0)
-        room.must(room.state == State.FAULT, "a pump that takes no command is no fault")
+        await rig.wait(2.0)
+        rig.must(rig.state == State.FAULT, "a pump that takes no command is no fault")
         lab.pump.deaf = False
-        await room.wait(1.0)
-        await room.wait(5.0, room.still)
+        await rig.wait(1.0)
+        await rig.wait(5.0, rig.still)
 
     return await _both(story)
 
@@ -354,30 +354,30 @@ async def a_pump_that_hears_nothing() -> list[str]:
 async def the_pump_does_not_hear_the_last_write() -> list[str]:
     """The last write is lost: closing the bench puts the pump to rest."""
 
-    async def story(room: Room, lab: Instruments) -> None:
+    async def story(rig: HoldRig, lab: Instruments) -> None:
         await asyncio.sleep(0.37 * TICK_S)
         lab.pump.lose = 1
-        room.task.cancel()
+        rig.task.cancel()
         await asyncio.sleep(0)
         await asyncio.sleep(0)
         await lab.bench.close()
-        room.must(not room.still(), "the bench is closed and the pump runs")
+        rig.must(not rig.still(), "the bench is closed and the pump runs")
 
     return await _both(story)
 
 
 async def another_instrument_in_its_place() -> list[str]:
     """A gauge is unplugged and another one plugged in: it is not believed."""
-    async with instruments(True) as (room, lab):
+    async with instruments(True) as (rig, lab):
         other = Instrument("DEPC", "M9", 10.0, "mbar(g)", lambda: 1.0)
         lab.gauge.plugged = False
-        await room.wait(0.2)
+        await rig.wait(0.2)
         lab.gauge.table, lab.gauge.plugged = BronkhorstRegisters(other), True
-        await room.wait(2.0)
-        room.must(math.isnan(room.heard[-1].row.gauge_pressure_pa), "another gauge is believed")
-        await room.wait(RAMP_S)
-        await room.wait(3.0, room.still)
-        return room.violations
+        await rig.wait(2.0)
+        rig.must(math.isnan(rig.heard[-1].row.gauge_pressure_pa), "another gauge is believed")
+        await rig.wait(RAMP_S)
+        await rig.wait(3.0, rig.still)
+        return rig.violations
 
 
 async def a_lab_with_another_serial_number() -> list[str]:
@@ -392,11 +392,11 @@ async def a_lab_with_another_serial_number() -> list[str]:
 
 
 def tell(story: Callable[[], Awaitable[list[str]]]) -> list[str]:
-    """Run a story of a room."""
+    """Run a story of a rig."""
     return in_virtual_time(cast(Any, story()))
 
 
-ROOMS: Sequence[Callable[[], Awaitable[list[str]]]] = (
+HOLDS: Sequence[Callable[[], Awaitable[list[str]]]] = (
     the_program_ends_in_a_hold,
     cancelled_while_it_vents,
     a_guard_ends,

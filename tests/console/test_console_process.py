@@ -15,10 +15,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from screen_feed import FAULT, event, packed, rows, shape
+from console_feed import FAULT, event, packed, rows, shape
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.process import ScreenSpec, give_back_terminal, screen_main
+from membrane_ctrl.console.process import ConsoleSpec, console_main, give_back_terminal
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.model.telemetry import ROW_BYTES
@@ -31,13 +31,13 @@ PATIENCE_S = 20.0
 
 
 class Run:
-    """Rings with a made-up run in them, and a screen process that shows it."""
+    """Rings with a made-up run in them, and a console process that shows it."""
 
     def __init__(self, stack: ExitStack) -> None:
         telemetry = stack.enter_context(ring(256, ROW_BYTES))
         events = stack.enter_context(ring(16, 4096))
         shapes = stack.enter_context(ring(4, 1 << 16))
-        self.spec = ScreenSpec(RunClock.start(), telemetry, events, shapes, Path("logs/demo"), Config(), 60.0)
+        self.spec = ConsoleSpec(RunClock.start(), telemetry, events, shapes, Path("logs/demo"), Config(), 60.0)
         self._telemetry = stack.enter_context(closing(RingWriter(telemetry)))
         self._events = stack.enter_context(closing(RingWriter(events)))
         self._shapes = stack.enter_context(closing(RingWriter(shapes)))
@@ -56,13 +56,13 @@ class Run:
         return process
 
 
-def on_stderr(spec: ScreenSpec, path: str) -> None:
-    """Give the screen process a stderr of its own."""
+def on_stderr(spec: ConsoleSpec, path: str) -> None:
+    """Give the console process a stderr of its own."""
     os.environ["TERM"] = "xterm-256color"
     handle = os.open(path, os.O_RDWR | os.O_NOCTTY)
     os.dup2(handle, 2)
     sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
-    screen_main(spec)
+    console_main(spec)
 
 
 @pytest.fixture
@@ -127,7 +127,7 @@ def test_plain_lines_and_faults_when_nobody_looks(
     run.tell("command", command="hold")
     run.tell("end", exit=5)
     with redirect_stderr(sys.stdout):
-        screen_main(run.spec)
+        console_main(run.spec)
     lines = capsys.readouterr().out.splitlines()
     assert ["FAULT link lost" in lines[0], "END 5" in lines[1], "s  hold" in lines[2]] == [True] * 3
     assert len(lines) == 3
@@ -137,11 +137,11 @@ def test_dead_parent_ends_it(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(signal, "signal", lambda number, handler: None)
     parents = iter([1000, 1000, 1])
     monkeypatch.setattr(os, "getppid", lambda: next(parents))
-    screen_main(run.spec)
+    console_main(run.spec)
     assert list(parents) == []
 
 
-def test_reader_that_went_away_is_no_error_and_none_for_who_watches_the_screen(
+def test_reader_that_went_away_is_no_error_and_none_for_who_watches_the_console(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Gone:
@@ -161,11 +161,11 @@ def test_reader_that_went_away_is_no_error_and_none_for_who_watches_the_screen(
     monkeypatch.setattr(sys, "stderr", gone)
     ours, theirs = multiprocessing.Pipe()
     with ours, theirs:
-        screen_main(run.spec, theirs)
+        console_main(run.spec, theirs)
         assert sys.stderr is gone  # and no exception came out
 
 
-def test_a_screen_that_takes_the_place_of_another_does_not_tell_old_news_again(
+def test_a_console_that_takes_the_place_of_another_does_not_tell_old_news_again(
     run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(signal, "signal", lambda number, handler: None)
@@ -175,14 +175,14 @@ def test_a_screen_that_takes_the_place_of_another_does_not_tell_old_news_again(
     run.tell("end", exit=0)
     ours, theirs = multiprocessing.Pipe()
     with ours, theirs, redirect_stderr(sys.stdout):
-        screen_main(spec, theirs)
+        console_main(spec, theirs)
         assert ours.recv()["kind"] == ALIVE
     told = capsys.readouterr().out
     assert "END 0" in told
     assert "FAULT link lost" not in told
 
 
-def test_the_terminal_of_a_killed_screen_is_given_back(
+def test_the_terminal_of_a_killed_console_is_given_back(
     terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ours, theirs = terminal

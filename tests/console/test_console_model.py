@@ -1,4 +1,4 @@
-"""What the screen remembers of what it is sent."""
+"""What the console remembers of what it is sent."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import math
 from dataclasses import replace
 
 import pytest
-from screen_feed import FAULT, HOLDING, event, rows, shape
+from console_feed import FAULT, HOLDING, event, rows, shape
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.model import ScreenModel, Trend, text
+from membrane_ctrl.console.model import ConsoleModel, Trend, text
 from membrane_ctrl.model.states import Rung, ShapeState, State
 
 
-def model(duration_s: float | None = None) -> ScreenModel:
-    return ScreenModel(Config(), duration_s)
+def model(duration_s: float | None = None) -> ConsoleModel:
+    return ConsoleModel(Config(), duration_s)
 
 
 def test_trend_is_the_mean_of_each_second_with_gaps() -> None:

@@ -1,6 +1,6 @@
 """The shape loop on the simulated bench, in virtual time, with shape estimates made from the truth and noise.
 
-`run()` gives the figures, `python -m benchmarks.outer_loop` prints them.
+`run()` gives the figures, `python -m benchmarks.shape_loop` prints them.
 """
 
 from __future__ import annotations
@@ -86,9 +86,9 @@ class EstimateMaker:
 
 
 def track(twin: TwinConfig, duration_s: float, sag_noise_um: float = 0.2, shape: ShapeConfig = SHAPE) -> Tracked:
-    """Hold the mirror with both loops, for `duration_s` from when the outer one is switched on (if it is enabled)."""
+    """Hold the mirror with both loops, for `duration_s` from when the shape loop is switched on, if enabled."""
     plant, inner = Plant(twin, PumpConfig()), InnerLoop(LOOP, PumpConfig())
-    outer, maker = ShapeLoop(shape, SENSITIVITY), EstimateMaker(shape.period_s, sag_noise_um, twin.seed)
+    shape_loop, maker = ShapeLoop(shape, SENSITIVITY), EstimateMaker(shape.period_s, sag_noise_um, twin.seed)
     dt_s = 1 / LOOP.rate_hz
     inner.start(plant.sample().displacement_um, plant.truth().leak_um_per_s)
     out = ShapeOutput(ShapeState.OFF, "", 0.0, np.nan, np.nan, np.nan)
@@ -96,9 +96,9 @@ def track(twin: TwinConfig, duration_s: float, sag_noise_um: float = 0.2, shape:
     for _ in range(round((ON_S + duration_s) * LOOP.rate_hz)):
         now_s, sample, truth = plant.time_s, plant.sample(), plant.truth()
         settled = now_s >= ON_S
-        outer.switch(shape.enabled and settled, now_s)
+        shape_loop.switch(shape.enabled and settled, now_s)
         estimate = maker.tick(now_s, truth.displacement_um, sample.displacement_um)
-        out = outer.step(now_s, dt_s, estimate, sample.displacement_um, settled)
+        out = shape_loop.step(now_s, dt_s, estimate, sample.displacement_um, settled)
         reading = sample.displacement_um, sample.ambient_pressure_pa, sample.air_temperature_c
         command = inner.step(LoopInput(0.0, out.trim_um, *reading), dt_s)
         rows.append((now_s, truth.displacement_um, out.trim_um, truth.laser_bias_um))
