@@ -72,7 +72,7 @@ def test_the_watch_sees_a_board_without_a_watchdog(monkeypatch: pytest.MonkeyPat
 def test_the_committed_matrix_is_of_these_faults_stories_and_rules() -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     lines = text.partition("## With real processes")[0].splitlines()
-    runs, stories = len(CASES) * len(SITUATIONS) * len(SEEDS), (*STORIES, *ROOMS)
+    runs, stories = len(CASES) * len(SITUATIONS) * len(SEEDS), (*STORIES, *HOLDS)
     assert f"**{runs} runs and {len(stories)} stories, 0 violations of an invariant.**" in lines
     firsts = [line.split(" | ")[0].removeprefix("| ") for line in lines]
     assert "| fault | " + " | ".join(at.name for at in SITUATIONS) + " |" in lines
