@@ -1,1 +1,1 @@
-"""Who is told when nobody looks at the screen (docs/control-port.md, alarms)."""
+"""Alarms: which are sent, to whom, and when they are repeated (docs/control-port.md, alarms)."""

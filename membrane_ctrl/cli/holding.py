@@ -89,7 +89,7 @@ def safe(
 
 @alarm_app.callback()
 def alarm() -> None:
-    """Who is told when nobody looks."""
+    """Alarm messages: `alarm test` sends one."""
 
 
 @alarm_app.command("test")

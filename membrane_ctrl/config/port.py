@@ -66,7 +66,7 @@ _RULES = (
 
 
 class AlarmsConfig(Section):
-    """Who is told what, when nobody looks at the screen. No `urls_file`: nobody is."""
+    """Which alarms go to whom. Without `urls_file` none are sent."""
 
     urls_file: str | None = None  # one Apprise URL a line; in a file, as the configuration is copied into every run
     escalation_urls_file: str | None = None  # told when nobody has acknowledged

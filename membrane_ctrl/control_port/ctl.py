@@ -74,7 +74,7 @@ def status_lines(status: dict[str, Any]) -> list[str]:
 
 def _geometry(geometry: dict[str, Any] | None) -> str:
     if geometry is None:
-        return "nothing measures with one yet"
+        return "none in use yet"
     made = f"{geometry['file']}, calibrated {geometry['calibrated_utc']}" if geometry["file"] else "as configured"
     return geometry["message"] or f"{made} (hash {geometry['hash']})"
 

@@ -206,7 +206,7 @@ class ColumnFile:
             stream.close()
 
     def leave_folder(self) -> None:
-        """The folder was taken away: what waits goes to the one in its place, what is written is not there."""
+        """The folder was removed: waiting rows go to its successor, written ones are not there."""
         with contextlib.suppress(OSError):
             self.close_file()
         self._journal.drop()

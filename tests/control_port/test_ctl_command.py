@@ -138,7 +138,7 @@ def test_what_stands_until_it_is_over_is_shown() -> None:
     picture.take(TickOutputs(BenchCommand(0.0, 0.0), ROW, (maintenance,), None))
     lines = status_lines({"run": "r", **picture.status()})
     assert any(line.split(maxsplit=1) == ["maintenance", maintenance["message"]] for line in lines)
-    assert any("nothing measures with one yet" in line for line in lines)
+    assert any("none in use yet" in line for line in lines)
     picture.note({"kind": "disk_low", "what": "disk", "message": "less than 500 MB free"})
     lines = status_lines({"run": "r", **picture.status()})
     assert any(line.split(maxsplit=1) == ["recording", "less than 500 MB free"] for line in lines)
