@@ -10,26 +10,25 @@ from pathlib import Path
 
 from benchmarks.figures import Figure, at_least, at_most
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig
+from membrane_ctrl.hold.virtual_run import VirtualRun, run_virtual
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.virtual.bench import VirtualBench
-from membrane_ctrl.sim.virtual.run import TruthShape, VirtualRun, run_virtual
+from membrane_ctrl.sim.truth_shape import TruthShape
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 RATE_HZ = 10.0
 VIRTUAL_S = 3600.0
-_SHARES = {
-    "plant": ("twin/",),
-    "board, registers, driver": ("firmware_iface/", "virtual_bench.py"),
-    "safety and states": (
-        "safety.py",
-        "states.py",
-        "observer.py",
-        "safe_levels.py",
-        "safe_levels.py",
-        "sensor_consistency.py",
+_SHARES = {  # the first that a file's path contains
+    "board, registers, driver": ("firmware_iface/", "sim/virtual_bench.py"),
+    "plant": ("membrane_ctrl/sim/",),
+    "loops": ("membrane_ctrl/control/",),
+    "tick, telemetry": (
+        "controller/controller.py",
+        "controller/tick.py",
+        "model/telemetry.py",
+        "membrane_ctrl/hold/",
     ),
-    "loops": ("control/",),
-    "tick, telemetry": ("controller.py", "telemetry.py", "tick.py", "virtual_run.py"),
+    "safety and states": ("membrane_ctrl/controller/",),
 }
 
 

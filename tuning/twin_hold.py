@@ -4,13 +4,15 @@ from collections.abc import Sequence
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model import shape_estimate, states, telemetry
-from membrane_ctrl.model.events import CommandTaken, Event
+from membrane_ctrl.model.events import Event
 from membrane_ctrl.sessions.live_hold import HoldError, News
 from membrane_ctrl.sim.events import Event as TwinEvent
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.virtual import bench, run
+from membrane_ctrl.sim.truth_shape import TruthShape
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 _NEWS_S = 0.5
 _HELD_WITHIN_S = 120.0
@@ -38,8 +40,8 @@ class TwinHold:
 
     def __init__(self, config: Config, events: Sequence[TwinEvent] = ()) -> None:
         self.config = config
-        self.bench = bench.VirtualBench(Plant(config.twin, config.pump, events))
-        source = run.TruthShape(self.bench, config, config.twin.seed) if config.shape.enabled else None
+        self.bench = VirtualBench(Plant(config.twin, config.pump, events))
+        source = TruthShape(self.bench, config, config.twin.seed) if config.shape.enabled else None
         self._shapes: list[shape_estimate.ShapeEstimate] = []
 
         def shape(now_s: float) -> shape_estimate.ShapeEstimate | None:
@@ -48,7 +50,7 @@ class TwinHold:
                 self._shapes.append(estimate)
             return estimate
 
-        self._run = run.VirtualRun(config, self.bench, zernike_projection(), shape)
+        self._run = VirtualRun(config, self.bench, zernike_projection(), shape)
         self._pending: tuple[Command, ...] = (Command("hold", "tuning session"),)
         self._early = News((), (), ())
         self.rows: list[telemetry.TelemetryRow] = []
@@ -63,8 +65,8 @@ class TwinHold:
         answer = self._advance(1)
         self._early = _joined(self._early, answer)
         for event in answer.events:
-            if isinstance(event, CommandTaken) and event.refused:
-                raise HoldError(f"refused: {event.refused}")
+            if event["kind"] == "command" and event.get("refused"):
+                raise HoldError(f"refused: {event['refused']}")
 
     def news(self) -> News:
         """Half a second of the twin's time."""

@@ -21,12 +21,10 @@ from rich.console import Console
 from rich.live import Live
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.model import ConsoleModel, View, text
+from membrane_ctrl.console.model import ConsoleModel, Event, View, text
 from membrane_ctrl.console.view import console_panel
 from membrane_ctrl.console.why import duration, number, percent
-from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.shape_estimate import unpack_estimate
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.model.terminal import Plain
@@ -35,12 +33,10 @@ from membrane_ctrl.processes import child, ring
 # The same for a log file: a line a second, and faults at once.
 
 
-_AT_ONCE = (
-    events.Fault | events.Cleared | events.StateEntered | run_events.Link | run_events.Ended
-    | run_events.ChildEnded | run_events.ChildSilent | run_events.ChildRestarted | run_events.ChildGivenUp
-    # a disk that takes nothing does not take the event either
-    | run_events.RecorderError | run_events.DiskLow | run_events.RecorderRecovered
-)  # fmt: skip
+_AT_ONCE = frozenset(
+    {"fault", "cleared", "state", "link", "child_ended", "child_silent", "child_restarted", "child_given_up", "end"}
+    | {"recorder_error", "disk_low", "recorder_recovered"}  # a disk that takes nothing does not take the event either
+)
 
 
 def line(view: View) -> str:
@@ -66,15 +62,13 @@ def line(view: View) -> str:
     return "  ".join(parts)
 
 
-def at_once(line: EventLine) -> bool:
+def at_once(event: Event) -> bool:
     """Whether nobody should have to wait a second for the event."""
-    event = run_events.from_dict(line)
-    if isinstance(event, run_events.AcquisitionState):
-        return event.state != "running"
-    return isinstance(event, _AT_ONCE)
+    kind = event.get("kind")
+    return kind in _AT_ONCE or (kind == "acquisition" and event.get("state") != "running")
 
 
-def event_line(event: EventLine) -> str:
+def event_line(event: Event) -> str:
     """An event in one line."""
     mono_s = event.get("mono_s", math.nan)
     what = " ".join(str(event[key]) for key in ("state", "child", "exit") if key in event)
@@ -178,16 +172,16 @@ class _Feed:
         self._events = ring.RingReader(spec.events)
         self._shapes = ring.RingReader(spec.shapes) if spec.shapes else None
 
-    def update(self) -> list[EventLine]:
+    def update(self) -> list[Event]:
         """Take what has come; returns the events among it."""
         for message in self._telemetry.drain():
             self.model.take_row(TelemetryRow(*_ROW.unpack(message)))
         for message in self._shapes.drain() if self._shapes else ():
             self.model.take_shape(unpack_estimate(message))
-        lines: list[EventLine] = [json.loads(message) for message in self._events.drain()]
-        for line in lines:
-            self.model.take_event(line)
-        return lines
+        events: list[Event] = [json.loads(message) for message in self._events.drain()]
+        for event in events:
+            self.model.take_event(event)
+        return events
 
     def close(self) -> None:
         for reader in (self._telemetry, self._events, self._shapes):

@@ -14,7 +14,6 @@ import struct
 from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Callable
 
-from membrane_ctrl.model import run_events
 from membrane_ctrl.model.events import Event
 
 BACKLOG = 64  # who waits while another comes in; the kernel turns away the rest
@@ -114,12 +113,12 @@ class Endpoint:
                 came_in = await self._accept(turns)
             except Exception as error:
                 again_s = min(max(2.0 * again_s, _AGAIN_S), _AGAIN_MOST_S)
-                self._tell(run_events.PortFailed(self._name, str(error), again_s))
+                self._tell({"kind": "port_failed", "port": self._name, "message": str(error), "again_s": again_s})
                 await asyncio.sleep(again_s)
                 continue
             if again_s:
                 again_s = 0.0
-                self._tell(run_events.PortOpen(self._name))
+                self._tell({"kind": "port_open", "port": self._name})
             await asyncio.sleep(_PAUSE_S if came_in else _TURN_AWAY_S)
 
     async def _accept(self, turns: Turns) -> bool:
@@ -166,7 +165,7 @@ class Endpoint:
         try:
             await self._welcome(connection, lambda: self._strangers.pop(task, None))
         except Exception as error:  # one client's trouble is nobody else's
-            self._tell(run_events.PortFailed(self._name, f"{type(error).__name__}: {error}"))
+            self._tell({"kind": "port_failed", "port": self._name, "message": f"{type(error).__name__}: {error}"})
         finally:
             connection.close()
 
@@ -211,5 +210,8 @@ class Refusals:
             self._unsaid += 1
             return
         self._left -= 1.0
-        self._tell(run_events.Refused(who, command, why, reason, and_unrecorded=self._unsaid or None))
+        event: Event = {"kind": "refused", "who": who, "command": command, "why": why, "reason": reason}
+        if self._unsaid:
+            event["and_unrecorded"] = self._unsaid
+        self._tell(event)
         self._unsaid = 0

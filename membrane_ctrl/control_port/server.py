@@ -21,11 +21,10 @@ from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
 from membrane_ctrl.control_port.protocol import KINDS, VERSION, Request, Wire
 from membrane_ctrl.control_port.session import FREE, Commander, Peer, Session, may_not
-from membrane_ctrl.control_port.status import metrics_text, serve_metrics, status_table
+from membrane_ctrl.control_port.status import Picture, metrics_text, serve_metrics
 from membrane_ctrl.control_port.tls import Listeners
 from membrane_ctrl.controller import commands, tick
-from membrane_ctrl.model import errors, events, run_events
-from membrane_ctrl.model.run_status import RunStatus
+from membrane_ctrl.model import errors, events
 
 # Beyond these the connection that has been silent longest goes: one person's terminals cannot lock out another's stop
 _SESSIONS_MOST, _SESSIONS_EACH = 16, 4
@@ -77,7 +76,7 @@ class Port:
         self._tell, self._now = hooks.tell, hooks.now
         self._commander = Commander(config.commander_lapses_s)
         self._refusals = Refusals(hooks.tell, hooks.now)
-        self._status = RunStatus()
+        self._picture = Picture()
         self._numbers = itertools.count(1)
         self._waiting: dict[int, asyncio.Future[str]] = {}
         self._sessions: list[Session] = []
@@ -85,9 +84,8 @@ class Port:
 
     def heard(self, outputs: tick.TickOutputs) -> None:
         """Take in what a tick decided; those who asked for it get their answer."""
-        self._status = self._status.after_row(outputs.row)
+        self._picture.take(outputs)
         for event in outputs.events:
-            self._status = self._status.after_event(event)
             for session in self._sessions:
                 session.event(event)
         for number, refusal in outputs.answers:
@@ -97,7 +95,7 @@ class Port:
 
     def told(self, event: events.Event) -> None:
         """Take in what a child process reports."""
-        self._status = self._status.after_event(event)
+        self._picture.note(event)
         for session in self._sessions:
             session.event(event)
 
@@ -116,7 +114,7 @@ class Port:
         for endpoint in endpoints:
             endpoint.open()
         if endpoints:
-            self._tell(run_events.PortAddresses(**listeners.addresses))
+            self._tell({"kind": "port", **listeners.addresses})
         try:
             yield
         finally:
@@ -133,14 +131,15 @@ class Port:
         """What `status` answers and `watch` streams."""
         return {
             "run": self._run,
-            **status_table(self._status),
+            **self._picture.status(),
             "commander": self._commander.holder(self._now()) or None,
             "clients": len(self._sessions),
         }
 
     def metrics(self) -> str:
         """The same for Prometheus."""
-        return metrics_text(self._status, len(self._sessions), self._refusals.count)
+        recording_ok = not self._picture.recorder.standing
+        return metrics_text(self._picture.row, len(self._sessions), self._refusals.count, recording_ok)
 
     def _turned_away(self, who: str, reason: str) -> None:
         self._refusals.record(who, "", reason)
@@ -210,7 +209,7 @@ class Port:
         refusal = await self._obeyed(command)
         if refusal:
             return {"ok": False, "refused": refusal}
-        return {"ok": True, "state": status_table(self._status)["state"]}
+        return {"ok": True, "state": self._picture.status()["state"]}
 
     def _claim_command(self, peer: Peer, request: Request) -> str:
         if request.do in FREE:
@@ -218,7 +217,7 @@ class Port:
         former = self._commander.holder(self._now())
         refusal = self._commander.claim(peer.who, request.take_over, self._now())
         if not refusal and former != peer.who:
-            self._tell(run_events.Commander(peer.who, former or None, request.why))
+            self._tell({"kind": "commander", "who": peer.who, "former": former or None, "why": request.why})
             for session in self._sessions:
                 if session.peer.who == former:
                     session.notice(
@@ -233,9 +232,9 @@ class Port:
                 session.watch(request.period_s)
             case "release":
                 self._commander.release(who)
-                self._tell(run_events.Commander(None, who, request.why))
+                self._tell({"kind": "commander", "who": None, "former": who, "why": request.why})
             case "quiet":
-                self._tell(run_events.AlarmsAcknowledged(who, request.why))
+                self._tell({"kind": "alarms_acknowledged", "who": who, "why": request.why})
         return {"ok": True, "status": self.status(), "loop": self._hooks.loop().model_dump()}
 
     def _command(self, peer: Peer, request: Request) -> commands.Command:

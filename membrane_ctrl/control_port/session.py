@@ -144,7 +144,7 @@ class Session:
         """Tell a watching peer what has happened."""
         if self._watch is not None:
             with contextlib.suppress(SlowReaderError):
-                self._wire.send({"event": event.to_dict()})
+                self._wire.send({"event": event})
 
     def watch(self, period_s: float | None) -> None:
         """Stream the status from now on; None ends it."""

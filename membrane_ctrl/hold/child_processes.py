@@ -11,11 +11,10 @@ from pathlib import Path
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import MESSAGE_BYTES
-from membrane_ctrl.model import run_events
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.telemetry import ROW_BYTES
-from membrane_ctrl.processes.child import Child, pipe
+from membrane_ctrl.processes.child import ALIVE, Child, pipe
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, ring
 
 # A child process that ends or falls silent is replaced, but not for ever.
@@ -89,15 +88,15 @@ class ManagedChild:
         name = self.child.name
         if self._ended_s is None:
             self._ended_s = now_s
-            said.append(run_events.ChildEnded(name, self.child.exit_code))
+            said.append({"kind": "child_ended", "child": name, "exit_code": self.child.exit_code})
         if self._used_up(now_s):
             if not self._given_up:
                 self._given_up = True
-                said.append(run_events.ChildGivenUp(name, len(self._replaced_s)))
+                said.append({"kind": "child_given_up", "child": name, "restarts": len(self._replaced_s)})
             return said
         if now_s - self._ended_s >= self._wait_s():
             self.replace(now_s)
-            said.append(run_events.ChildRestarted(name, self._count))
+            said.append({"kind": "child_restarted", "child": name, "restarts": self._count})
         return said
 
     def replace(self, now_s: float) -> None:
@@ -117,7 +116,7 @@ class ManagedChild:
         killed = not self._used_up(now_s)
         if killed:
             self.child.kill()
-        return run_events.ChildSilent(self.child.name, late_s, killed)
+        return {"kind": "child_silent", "child": self.child.name, "overdue_s": late_s, "killed": killed}
 
     def _used_up(self, now_s: float) -> bool:
         """Whether this hour's replacements are spent."""
@@ -132,9 +131,9 @@ class ManagedChild:
         said: list[Event] = []
         try:
             while self._line.poll():
-                event = run_events.from_dict(self._line.recv())
-                if isinstance(event, run_events.Alive):
-                    self._expected_s, self._silent = now_s + event.for_s, False
+                event = self._line.recv()
+                if event["kind"] == ALIVE:
+                    self._expected_s, self._silent = now_s + event["for_s"], False
                 else:
                     said.append(event)
         except (EOFError, OSError):  # it has ended
@@ -220,9 +219,9 @@ class ChildProcesses:
     def capture(self) -> Event | None:
         """Have the acquisition take a full set to disk, which its own event names; an event if that cannot be."""
         if self._acquisition is None:
-            return run_events.Capture(failed="no shape measurement in this run")
+            return {"kind": "capture", "failed": "no shape measurement in this run"}
         if not self._acquisition.send("capture"):
-            return run_events.Capture(failed="the acquisition does not answer; is it being replaced?")
+            return {"kind": "capture", "failed": "the acquisition does not answer; is it being replaced?"}
         return None
 
     def take_down(self) -> None:

@@ -27,13 +27,13 @@ from membrane_ctrl.controller import commands, cross_check, safe_levels, tick
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.geometry.file import geometry_in_force
 from membrane_ctrl.hold import child_processes, latched_fault
-from membrane_ctrl.hold.supervisor import Supervisor, Wiring
+from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
 from membrane_ctrl.hold.systemd import SystemdNotify
 from membrane_ctrl.instruments.bench import connect, open_bench
 from membrane_ctrl.instruments.device_lock import device_names, locked
-from membrane_ctrl.model import errors, run_events, terminal
+from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.events import CommandTaken, Event
+from membrane_ctrl.model.events import Event
 from membrane_ctrl.processes.child import raise_priority
 from membrane_ctrl.processes.ring import RingReader, RingWriter, publish
 from membrane_ctrl.run_files.latched_fault import LatchedFile, ResumeLog
@@ -187,7 +187,9 @@ async def _run(
 
     with _open(rings) as (telemetry, events, inputs, shapes):
         truth = twin.truth_reader() if twin else None
-        wiring = Wiring(bench, telemetry, events, inputs, shapes, truth, children.reports)
+        wiring = Wiring(
+            bench, telemetry, events, inputs, newest_of(shapes) if shapes else None, truth, children.reports
+        )
         controller = Controller(config, zernike_projection())
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         port = port_for(server.RunHooks(supervisor.ask, supervisor.tell, clock.now, lambda: controller.loop_config))
@@ -200,7 +202,7 @@ async def _run(
         }
         wiring.told = {"control port": port.told, "systemd": systemd.told}
         devices = config.devices.name if config.devices else ""
-        supervisor.tell(run_events.Started(devices, raise_priority(), board.cleared))
+        supervisor.tell({"kind": "start", "devices": devices, "priority": raise_priority(), "message": board.cleared})
         exit_code = errors.Exit.DEVICE_FAILED
         try:
             if not options.standby:
@@ -216,15 +218,22 @@ async def _run(
                     assert config.devices is not None
                     # last: the board's watchdog runs from here on
                     if (await connect(bench, config.devices)).map_version == 1:
-                        supervisor.tell(run_events.NoClaim(NO_CLAIM))
+                        supervisor.tell({"kind": "no_claim", "message": NO_CLAIM})
                     exit_code = await supervisor.run(options.duration_s)
         except LinkError as error:
-            supervisor.tell(run_events.Link(str(error), up=False))
+            supervisor.tell({"kind": "link", "message": str(error)})
             raise errors.DeviceError(str(error)) from None
         finally:
             await bench.close()
-            ticks, missed_ticks = supervisor.ticks, supervisor.missed_ticks
-            supervisor.tell(run_events.Ended(exit_code.name.lower(), int(exit_code), ticks, missed_ticks))
+            supervisor.tell(
+                {
+                    "kind": "end",
+                    "exit": exit_code.name.lower(),
+                    "exit_code": int(exit_code),
+                    "ticks": supervisor.ticks,
+                    "missed_ticks": supervisor.missed_ticks,
+                }
+            )
     return exit_code
 
 
@@ -233,9 +242,9 @@ def _capture(
 ) -> None:
     """A set that was asked for, and not refused, is the acquisition's to take."""
     for event in outputs.events:
-        match event:
-            case CommandTaken(command="capture", refused=None) if (failed := children.capture()) is not None:
-                tell(failed)
+        asked = event["kind"] == "command" and event["command"] == "capture" and "refused" not in event
+        if asked and (failed := children.capture()) is not None:
+            tell(failed)
 
 
 @contextlib.contextmanager

@@ -17,9 +17,9 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import remember
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs, pack_tick
-from membrane_ctrl.model import errors, run_events, shape_estimate
+from membrane_ctrl.model import errors, shape_estimate
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.events import Event, EventLine
+from membrane_ctrl.model.events import Event
 from membrane_ctrl.processes.ring import RingReader, RingWriter
 
 # Looking after a child costs a system call; half a second late is soon enough, the loop does not need them
@@ -33,13 +33,13 @@ _TEXT_CUTS = (200, 20)
 
 @dataclass(slots=True)
 class Wiring:
-    """Everything the tick is connected to."""
+    """Everything the tick is connected to; a ring that is None has no reader."""
 
     bench: Bench
-    telemetry: RingWriter
-    events: RingWriter
+    telemetry: RingWriter | None = None
+    events: RingWriter | None = None
     inputs: RingWriter | None = None  # what the ticks were given, for a replay
-    shapes: RingReader | None = None
+    shapes: Callable[[], shape_estimate.ShapeEstimate | None] | None = None  # the newest since the last call
     truth: Callable[[], tuple[float, float]] | None = None  # (displacement_um, laser_bias_um) of the twin
     reports: Callable[[], list[Event]] = list  # what the children have said since the last call
     # who wants to know what each tick decided, and what the children report; one that raises is a fault
@@ -84,9 +84,11 @@ class Supervisor:
 
     def tell(self, event: Event) -> None:
         """Put an event on record, now."""
+        if self._wiring.events is None:
+            return
         now_s = self._clock.now()
-        stamped = {"time_utc": self._clock.utc(now_s).isoformat(), "mono_s": round(now_s, 6)}
-        self._wiring.events.put(_line(stamped | event.to_dict(), self._wiring.events.slot_bytes))
+        stamped = {"time_utc": self._clock.utc(now_s).isoformat(), "mono_s": round(now_s, 6), **event}
+        self._wiring.events.put(_line(stamped, self._wiring.events.slot_bytes))
 
     async def run(self, duration_s: float | None) -> errors.Exit:
         """Tick until a tick says that the run is over; the pump is off by then, or cannot be reached."""
@@ -104,15 +106,25 @@ class Supervisor:
                 if now_s >= ends_s:
                     self.ask(Command("stop", "duration"))
                     ends_s = math.inf
-                finished = await self._tick(now_s, now_s - last_s, late_s)
+                _, outputs = await self.tick(now_s, now_s - last_s, late_s)
                 last_s = now_s
-                if finished is not None:
-                    return finished
+                if outputs.finished is not None:
+                    return outputs.finished
         finally:
-            # the vent stays as it is: a mirror that is being vented must not be shut by the end of the program
-            await self._write(BenchCommand(0.0, self._vent_fraction))
+            await self.leave()
 
-    async def _tick(self, now_s: float, dt_s: float, late_s: float) -> errors.Exit | None:
+    async def leave(self) -> None:
+        """Write the pump off; a mirror that is being vented must not be shut by the end of the program."""
+        await self._write(BenchCommand(0.0, self._vent_fraction))
+
+    async def tick(self, now_s: float, dt_s: float, late_s: float) -> tuple[TickInputs, TickOutputs]:
+        """Run one tick: read, decide, write, record.
+
+        Parameters
+        ----------
+        now_s, dt_s, late_s : float
+            Start on the run's clock, time since the last tick, and start against the deadline.
+        """
         wiring = self._wiring
         self.ticks += 1
         if not self._link_up:
@@ -147,7 +159,7 @@ class Supervisor:
             self.tell(event)
         for name, hear in wiring.heard.items():
             self._guarded(name, partial(hear, outputs))
-        return outputs.finished
+        return inputs, outputs
 
     def _remember(self, now_s: float) -> bytes:
         """Now and then the controller's memory, so that a replay need not begin with the run."""
@@ -158,6 +170,8 @@ class Supervisor:
 
     def _record(self, inputs: TickInputs, outputs: TickOutputs, memory: bytes) -> None:
         """The row for people, the inputs for a replay; a value of a wrong kind costs the replay, not the run."""
+        if self._wiring.telemetry is None:
+            return
         row = outputs.row.pack()
         self._wiring.telemetry.put(row)
         if self._wiring.inputs is None:
@@ -167,7 +181,7 @@ class Supervisor:
         except (struct.error, TypeError, ValueError) as error:
             if not self._inputs_error:
                 self._inputs_error = str(error)
-                self.tell(run_events.InputsNotRecorded(self._inputs_error))
+                self.tell({"kind": "inputs_not_recorded", "message": self._inputs_error})
             return
         for message in messages:
             self._wiring.inputs.put(message)
@@ -190,7 +204,7 @@ class Supervisor:
             self._link_failed(error)
             return
         self._link_up, self._link_error = True, ""
-        self.tell(run_events.Link(run_events.CONNECTED_AGAIN, up=True))
+        self.tell({"kind": "link", "message": "connected again"})
 
     async def _clear_board(self, mask: int) -> None:
         try:
@@ -212,20 +226,17 @@ class Supervisor:
             self._link_up = False
         if str(error) != self._link_error:
             self._link_error = str(error)
-            self.tell(run_events.Link(str(error), up=False))
+            self.tell({"kind": "link", "message": str(error)})
 
     def _newest_shape(self) -> shape_estimate.ShapeEstimate | None:
         if self._wiring.shapes is None:
             return None
-        messages = self._wiring.shapes.drain()
-        if not messages:
-            return None
         try:
-            return shape_estimate.unpack_estimate(messages[-1])
+            return self._wiring.shapes()
         except ValueError as error:  # as good as no shape, which the shape loop bears
             if str(error) != self._shape_error:
                 self._shape_error = str(error)
-                self.tell(run_events.ShapeUnreadable(str(error)))
+                self.tell({"kind": "shape_unreadable", "message": str(error)})
             return None
 
     def _watch(self) -> None:
@@ -243,7 +254,17 @@ class Supervisor:
             self._broken.setdefault(name, f"{name} ({type(error).__name__}: {error})")
 
 
-def _line(event: EventLine, most_bytes: int) -> bytes:
+def newest_of(reader: RingReader) -> Callable[[], shape_estimate.ShapeEstimate | None]:
+    """Return what takes the newest estimate out of the shapes' ring; it raises ValueError for an unreadable one."""
+
+    def newest() -> shape_estimate.ShapeEstimate | None:
+        messages = reader.drain()
+        return shape_estimate.unpack_estimate(messages[-1]) if messages else None
+
+    return newest
+
+
+def _line(event: Event, most_bytes: int) -> bytes:
     """An event for the ring: the texts of one that is too long are cut, as no message is worth the hold."""
     line = json.dumps(event, allow_nan=False, default=str).encode()
     for most in _TEXT_CUTS:

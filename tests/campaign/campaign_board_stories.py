@@ -13,7 +13,7 @@ from firmware_iface.emulators.modbus_server import RegisterRefusal
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import BenchCommand, LinkError
 from membrane_ctrl.model.states import State
-from membrane_ctrl.sim.virtual.bench import VirtualBench, _at_once
+from membrane_ctrl.sim.virtual_bench import VirtualBench, _at_once
 
 
 def counters_wrap() -> list[str]:

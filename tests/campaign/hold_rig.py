@@ -33,7 +33,7 @@ from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.states import State
 from membrane_ctrl.model.telemetry import ROW_BYTES
 from membrane_ctrl.processes.ring import RingWriter, ring
-from membrane_ctrl.sim.virtual.bench import VirtualBench
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 _LOOK_S = 0.01
 

@@ -16,8 +16,8 @@ from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.safety import TABLE
+from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
-from membrane_ctrl.model import events
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.states import Rung, State
 from membrane_ctrl.model.telemetry import TelemetryRow
@@ -25,8 +25,8 @@ from membrane_ctrl.sim.events import AmbientChange, Event
 from membrane_ctrl.sim.film import NOMINAL_PRESSURE_PA
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.sensors import PlantSample, Truth
-from membrane_ctrl.sim.virtual.bench import VirtualBench
-from membrane_ctrl.sim.virtual.run import TruthShape, VirtualRun
+from membrane_ctrl.sim.truth_shape import TruthShape
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 RATE_HZ = 10.0
 REGISTER_MAX = 2e6  # what does not fit a register of the board is sent as none
@@ -317,7 +317,7 @@ class _Watch:
         self._state, self._highest_um = State.STANDBY, -math.inf
         self._astray_um = self._pressure_pa = self._pumped_um = 0.0
 
-    def look(self, row: TelemetryRow, told: Sequence[events.Event], now_s: float) -> None:
+    def look(self, row: TelemetryRow, events: Sequence[dict[str, object]], now_s: float) -> None:
         self._state = State(int(row.state))
         if now_s <= self._begins_s:
             return
@@ -328,7 +328,7 @@ class _Watch:
         if self._state == State.HOLD and row.rung == Rung.NONE:
             off_um = truth.displacement_um - row.setpoint_um + row.trim_um
             self._astray_um = max(self._astray_um, abs(off_um))
-        for name in filter(None, map(_speaks, told)):
+        for name in filter(None, map(_speaks, events)):
             if not self._noticed:
                 self._noticed, self._after_s = name, now_s - self._begins_s
 
@@ -336,18 +336,18 @@ class _Watch:
         return Story(self._noticed, self._after_s, self._state, self._pumped_um, self._astray_um, self._pressure_pa)
 
 
-def _speaks(event: events.Event) -> str:
+def _speaks(event: dict[str, object]) -> str:
     """Who says so, if the event is a complaint."""
-    match event:
-        case events.Fault():
-            return event.name
-        case events.Plausibility() if event.liar != "nobody":
-            return f"sensors: {event.liar}"
-        case events.ShapeLoopState() if "limit" in event.reason:
+    match event["kind"]:
+        case "fault":
+            return str(event["name"])
+        case "plausibility" if event["liar"] != "nobody":
+            return f"sensors: {event['liar']}"
+        case "shape" if "limit" in str(event["reason"]):
             return "shape: trim at its limit"
-        case events.ShapeLoopState() if "repeats" in event.reason:
+        case "shape" if "repeats" in str(event["reason"]):
             return "shape: the camera repeats"
-        case events.Maintenance():
-            return f"maintenance: {event.name}"
+        case "maintenance":
+            return f"maintenance: {event['name']}"
         case _:
             return ""

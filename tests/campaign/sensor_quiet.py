@@ -10,8 +10,8 @@ from sensor_faults import Lying, LyingPlant
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
-from membrane_ctrl.model.events import Fault
 from membrane_ctrl.sim import film as film_module
 from membrane_ctrl.sim import sensors as sensors_module
 from membrane_ctrl.sim.events import (
@@ -24,8 +24,8 @@ from membrane_ctrl.sim.events import (
     PressureWeather,
 )
 from membrane_ctrl.sim.film import Film
-from membrane_ctrl.sim.virtual.bench import VirtualBench
-from membrane_ctrl.sim.virtual.run import TruthShape, VirtualRun
+from membrane_ctrl.sim.truth_shape import TruthShape
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 _DROPOUT = "displacement_missing"  # five seconds without light are no fault of the guards
 
@@ -93,8 +93,8 @@ def _quiet_hours(
         due = tuple(command for at_s, command in asked if at_s <= run.now_s)
         asked = asked[len(due) :]
         tick = run.tick(due)
-        faults = [event for event in tick.events if isinstance(event, Fault)] if tick is not None else []
-        alarms += [f"{event.name}: {event.seen}" for event in faults if event.name != _DROPOUT]
+        faults = [event for event in tick.events if event["kind"] == "fault"] if tick is not None else []
+        alarms += [f"{event['name']}: {event['seen']}" for event in faults if event["name"] != _DROPOUT]
     return QuietHours(run.now_s / 3600.0, tuple(alarms))
 
 

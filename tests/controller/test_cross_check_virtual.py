@@ -16,13 +16,12 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import parse
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.cross_check import cross_check
+from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.virtual.bench import VirtualBench
-from membrane_ctrl.sim.virtual.run import VirtualRun
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 SENSITIVITY = zernike_projection()
 # what a draw may do to a default: times these, or one of these
@@ -116,7 +115,7 @@ def tell(config: Config, event: str) -> Story:
         story.highest_um = max(story.highest_um, away_um)
         if tick is not None:
             last_state = tick.row.state
-            faults += [event.name for event in tick.events if isinstance(event, Fault)]
+            faults += [str(event["name"]) for event in tick.events if event["kind"] == "fault"]
             if last_state == State.HOLD and run.now_s < SETTLED_S:
                 story.furthest_um = max(story.furthest_um, abs(away_um))
         elif run.finished is not None and bench.board.pump_fraction == 0.0:

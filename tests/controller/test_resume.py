@@ -11,11 +11,11 @@ from membrane_ctrl.config.schema import Config, LimitsConfig, LoopConfig, Resume
 from membrane_ctrl.controller.commands import AT_START, Command
 from membrane_ctrl.controller.safe_levels import ResumeRule, SafeLevels
 from membrane_ctrl.controller.safety import TABLE, Observation
+from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.states import Rung, State
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.virtual.bench import VirtualBench
-from membrane_ctrl.sim.virtual.run import VirtualRun
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.scenario import At, Expectation, Scenario, play
 
 RULES = {rule.name: rule for rule in TABLE}
@@ -219,6 +219,6 @@ def test_a_start_tells_of_earlier_resumes_and_nobody_else_does(who: str, possibl
     for tick in range(400):
         bench.wrong.unreachable = 200 <= tick < 210
         made = run.tick()
-        resumed += sum(event.kind == "resumed" for event in made.events) if made else 0
+        resumed += sum(event["kind"] == "resumed" for event in made.events) if made else 0
     assert resumed == possible
     assert (run.finished is None) == possible

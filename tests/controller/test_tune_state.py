@@ -15,14 +15,14 @@ from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, TwinCon
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.controller.commands import Command, refusal
 from membrane_ctrl.controller.tick import RECORD, pack_tick, unpack_tick
+from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
-from membrane_ctrl.model.events import EventLine
+from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.events import AmbientChange
 from membrane_ctrl.sim.events import Event as TwinEvent
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.virtual.bench import VirtualBench
-from membrane_ctrl.sim.virtual.run import VirtualRun
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 CONFIG = Config(twin=TwinConfig(scenario="quiet", start_error_um=-5.0), shape=ShapeConfig(enabled=False))
 BEGIN_S = 40.0
@@ -43,7 +43,7 @@ class Held:
     def __init__(self, config: Config = CONFIG, twin_events: tuple[TwinEvent, ...] = ()) -> None:
         self.bench = VirtualBench(Plant(config.twin, config.pump, twin_events))
         self._run = VirtualRun(config, self.bench, zernike_projection())
-        self.events: list[EventLine] = []
+        self.events: list[Event] = []
         self.rows: list[Any] = []
         self.go(BEGIN_S, Command("hold", "tester"))
         assert self.state == State.HOLD
@@ -58,7 +58,7 @@ class Held:
             commands = ()
             if tick is not None:
                 self.rows.append(tick.row)
-                self.events += [{**event.to_dict(), "mono_s": tick.row.mono_s} for event in tick.events]
+                self.events += [{**event, "mono_s": tick.row.mono_s} for event in tick.events]
 
     def until_hold(self, at_most_s: float) -> None:
         self.go(0.02)
@@ -235,9 +235,9 @@ def test_a_trial_of_no_time_is_refused() -> None:
 def test_the_command_survives_its_record() -> None:
     """A replay gets the experiment that the run got."""
     held = Held()
-    run = held._run
-    inputs = replace(run._inputs(held.bench.read(), (tune(), gains(0.3, 5.0))), truth_displacement_um=0.0)
-    outputs = run._controller.tick(inputs)
+    tick = held._run.tick((tune(), gains(0.3, 5.0)))
+    assert tick is not None
+    inputs, outputs = replace(tick.inputs, truth_displacement_um=0.0), tick.outputs
     messages = pack_tick(1, inputs, outputs, outputs.row.pack())
     tail = b"".join(message[1:] for message in messages[:-1])
     again = unpack_tick(np.frombuffer(messages[-1][1:], dtype=RECORD)[0], tail, {})

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
-from membrane_ctrl.model.events import CommandTaken
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.virtual.bench import VirtualBench
-from membrane_ctrl.sim.virtual.run import VirtualRun
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 CONFIG = Config(
     loop=LoopConfig(rate_hz=10.0), twin=TwinConfig(scenario="calm"), shape=ShapeConfig(enabled=False)
@@ -19,7 +18,7 @@ CONFIG = Config(
 def refusals(run: VirtualRun, *commands: Command) -> list[str]:
     tick = run.tick(commands)
     assert tick is not None
-    return [event.refused or "" for event in tick.events if isinstance(event, CommandTaken)]
+    return [str(event.get("refused", "")) for event in tick.events if event["kind"] == "command"]
 
 
 def test_hold_is_refused_until_the_fault_is_acknowledged() -> None:

@@ -12,15 +12,14 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import recall
 from membrane_ctrl.controller.tick import MESSAGE_BYTES, TickAssembler
-from membrane_ctrl.hold.supervisor import Supervisor, Wiring
+from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
-from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.model.telemetry import ROW_BYTES
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.virtual.bench import VirtualBench
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 CONFIG = Config()
 
@@ -78,7 +77,7 @@ def test_an_event_that_is_too_long_for_its_slot_is_cut() -> None:
         wiring = Wiring(bench=PromptBench(), telemetry=writer, events=writer)
         supervisor = Supervisor(Controller(CONFIG, zernike_projection()), wiring, RunClock.start(), 50.0)
         texts = dict.fromkeys(("cause", "seen", "limit", "remedy"), "\N{LOUDLY CRYING FACE}" * 10_000)
-        supervisor.tell(from_dict({"kind": "fault", "name": "tick_error", **texts}))
+        supervisor.tell({"kind": "fault", "name": "tick_error", **texts})
         (told,) = reader.drain()
     assert json.loads(told)["name"] == "tick_error"
 
@@ -95,7 +94,7 @@ async def test_a_shape_that_cannot_be_read_is_told_once_and_the_hold_goes_on() -
             writers["shapes"].put(b"{}\nno shape")
             return 0.0, 0.0
 
-        wiring = Wiring(PromptBench(), writers["telemetry"], writers["events"], shapes=shapes, truth=truth)
+        wiring = Wiring(PromptBench(), writers["telemetry"], writers["events"], shapes=newest_of(shapes), truth=truth)
         supervisor = Supervisor(Controller(CONFIG, zernike_projection()), wiring, RunClock.start(), 50.0)
         assert await supervisor.run(0.2) == Exit.DONE
         told = [event for event in map(json.loads, events.drain()) if event["kind"] == "shape_unreadable"]

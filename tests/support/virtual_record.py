@@ -15,10 +15,10 @@ from membrane_ctrl.config.schema import Config, TwinConfig
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import remember
 from membrane_ctrl.controller.tick import TickAssembler, TickInputs, TickOutputs, pack_tick
+from membrane_ctrl.hold.virtual_run import Alter, run_virtual
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.run_files.inputs_file import InputsFile
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.virtual.run import Alter, run_virtual
 from tests.support.synthetic_shape import shape_at
 
 CONFIG = Config(twin=TwinConfig(laser_noise_um=0.5))
@@ -56,7 +56,7 @@ def write_record(
                 messages += pack_tick(place, inputs, outputs, outputs.row.pack(), (memories or {}).get(place, b""))
             if inputs.estimate is not None:
                 shapes.append(inputs.estimate)
-            lines += [json.dumps({"mono_s": inputs.now_s + 1e-4, **event.to_dict()}) for event in outputs.events]
+            lines += [json.dumps({"mono_s": inputs.now_s + 1e-4, **event}) for event in outputs.events]
         file.append(assembler.take(messages), shapes)
     file.close()
     lines.append(json.dumps({"mono_s": ticks[-1][0].now_s + 1e-3, "kind": "end", "exit": "done"}))

@@ -10,7 +10,7 @@ from firmware_iface.register_map import default_map
 from firmware_iface.roles import ALL_FAULTS, BenchCommand, LinkDownError, LinkError
 from membrane_ctrl.config.schema import Config, TwinConfig
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.virtual.bench import VirtualBench
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 CONFIG = Config(twin=TwinConfig(scenario="calm"))
 WATCHDOG, OVER_PRESSURE = (default_map().fault_mask(name) for name in ("watchdog", "over_pressure"))

@@ -9,7 +9,7 @@ import pytest
 from membrane_ctrl.model.errors import InputError
 from tests.support.scenario import failures, load_scenario, play
 
-FOLDER = Path(__file__).parents[2] / "scenarios"
+FOLDER = Path(__file__).parents[1] / "scenarios"
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.toml")), ids=lambda path: path.stem)

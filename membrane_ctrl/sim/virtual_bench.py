@@ -134,9 +134,9 @@ class VirtualBench:
         """Another program claims the board, clears its faults and pumps; what it is told, empty if it was obeyed."""
         other = PumpBoard("", watchdog_s=watchdog_s, link=_MemoryLink(self))
         try:
-            _at_once(other.open())
-            _at_once(other.clear_faults(roles.ALL_FAULTS))
-            _at_once(other.write(roles.BenchCommand(pump_fraction, 0.0)))
+            at_once(other.open())
+            at_once(other.clear_faults(roles.ALL_FAULTS))
+            at_once(other.write(roles.BenchCommand(pump_fraction, 0.0)))
         except roles.LinkError as error:
             return str(error)
         return ""
@@ -146,28 +146,28 @@ class VirtualBench:
         self.board.restart()
         self.drive()
 
-    def open(self) -> None:
+    def open(self) -> roles.BenchIdentity:
         """Connect and arm. Raises LinkError."""
-        _at_once(self._driver.open())
+        return at_once(self._driver.open())
 
     def read(self) -> roles.BenchReading:
         """One sample. Raises LinkError."""
-        reading = _at_once(self._driver.read())
+        reading = at_once(self._driver.read())
         if math.isnan(self.wrong.readback_fraction):
             return reading
         return replace(reading, pump_fraction=self.wrong.readback_fraction)
 
     def write(self, command: roles.BenchCommand) -> None:
         """Write pump and vent, and feed the watchdog. Raises LinkError."""
-        _at_once(self._driver.write(command))
+        at_once(self._driver.write(command))
 
     def clear_faults(self, mask: int) -> None:
         """Clear these bits of what the board has latched. Raises LinkError."""
-        _at_once(self._driver.clear_faults(mask))
+        at_once(self._driver.clear_faults(mask))
 
     def close(self) -> None:
         """Disarm if the board allows it, and go."""
-        _at_once(self._driver.close())
+        at_once(self._driver.close())
 
     def _sampled(self, last: board_state.BoardSample | None) -> board_state.BoardSample:
         wrong = self.wrong
@@ -254,7 +254,7 @@ def _refusals(name: str) -> Iterator[None]:
         raise exception_error(name, refusal.code) from None
 
 
-def _at_once(coroutine: Coroutine[Any, Any, T]) -> T:
+def at_once(coroutine: Coroutine[Any, Any, T]) -> T:
     """The result of a coroutine that waits for nothing. Raises what it raises."""
     try:
         coroutine.send(None)

@@ -1,4 +1,4 @@
-"""A virtual run is the supervisor's run: on equal plants, in equal time, both give the same rows to the bit."""
+"""The supervisor's own loop gives what a virtual run gives, which steps it: the same rows to the bit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from membrane_ctrl.config.schema import Config, LoopConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickOutputs
-from membrane_ctrl.hold.supervisor import Supervisor, Wiring
+from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
+from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
@@ -25,8 +26,8 @@ from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.virtual.bench import VirtualBench
-from membrane_ctrl.sim.virtual.run import TruthShape, VirtualRun
+from membrane_ctrl.sim.truth_shape import TruthShape
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.virtual_time import run_virtual as in_virtual_time
 
 # a power of two, so that the supervisor's sum of periods is exact and both tick at the same instants to the bit
@@ -44,27 +45,9 @@ def switched(name: str, on: object, off: object) -> Upset:
     return lambda bench, lasts: setattr(bench.wrong, name, on if lasts else off)
 
 
-def restarts(bench: VirtualBench, lasts: bool) -> None:
-    """The board restarts when the fault sets in."""
-    if lasts:
-        bench.power_cycle()
-
-
-def restarts_and_loses_answers(bench: VirtualBench, lasts: bool) -> None:
-    """The board restarts, so that it must be opened again, and every other answer is lost."""
-    restarts(bench, lasts)
-    bench.wrong.lost_every = 2 if lasts else 0
-
-
 UPSETS: dict[str, Upset] = {
     "nothing": lambda bench, lasts: None,
-    "no light": switched("no_light", True, False),
     "unreachable": switched("unreachable", True, False),
-    "no answer": switched("silent", True, False),
-    "every third answer lost": switched("lost_every", 3, 0),
-    "board restarts": restarts,
-    "board restarts and loses answers": restarts_and_loses_answers,
-    "gauge too high": switched("gauge_offset_pa", 400.0, 0.0),
     "no shapes": switched("camera_lost", True, False),
 }
 
@@ -160,7 +143,9 @@ def supervised(upset: Upset) -> tuple[list[TickOutputs], Exit]:
                 stack.callback(end.close)
             bench = WaitingBench(made(upset))
             bench.shapes = shapes
-            wiring = Wiring(bench, telemetry, events, shapes=reader, truth=bench.truth, heard={"test": heard.append})
+            wiring = Wiring(
+                bench, telemetry, events, shapes=newest_of(reader), truth=bench.truth, heard={"test": heard.append}
+            )
             controller = Controller(CONFIG, zernike_projection())
             await bench.open()
             supervisor = Supervisor(controller, wiring, cast(RunClock, LoopClock()), RATE_HZ)

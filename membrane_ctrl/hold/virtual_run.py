@@ -1,0 +1,191 @@
+"""A run in virtual time: the supervisor's own ticks on the twin behind its board, without processes or waiting.
+
+What a run has and this has not: the latency of the link (a read here is the plant's state at the tick, a write takes
+effect at once), the processes, and deadlines. The board is the emulator's own, with its watchdog, latches and limits,
+on the plant's time.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from firmware_iface import roles
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.controller.tick import TickInputs, TickOutputs
+from membrane_ctrl.hold.supervisor import Supervisor, Wiring
+from membrane_ctrl.model import errors, shape_estimate, telemetry
+from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.truth_shape import ShapeSource
+from membrane_ctrl.sim.virtual_bench import VirtualBench, at_once
+
+Alter = Callable[[float, roles.BenchReading], roles.BenchReading | None]
+
+
+@dataclass(frozen=True, slots=True)
+class VirtualTick:
+    """One tick: what went in, and what came out."""
+
+    inputs: TickInputs
+    outputs: TickOutputs
+
+    @property
+    def row(self) -> telemetry.TelemetryRow:
+        """For the record."""
+        return self.outputs.row
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """For the record."""
+        return self.outputs.events
+
+
+class VirtualRun:
+    """Steps the supervisor in virtual time, a tick a call.
+
+    Parameters
+    ----------
+    config : Config
+        As for a run.
+    bench : VirtualBench
+        Plant, board, and what is wrong with them.
+    sag_sensitivity : (36,) array
+        See `Controller`.
+    shape : callable, optional
+        Called with the time every `shape.period_s`; returns an estimate or None.
+    alter : callable, optional
+        Stands between the board and the controller: gets the time and the reading, returns what is read.
+
+    Attributes
+    ----------
+    now_s : float
+        The run's clock.
+    finished : Exit or None
+        How the run ended.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        bench: VirtualBench,
+        sag_sensitivity: FloatArray,
+        shape: ShapeSource | None = None,
+        alter: Alter | None = None,
+    ) -> None:
+        self._bench = bench
+        self._shape, self._alter = shape, alter
+        self._shape_period_s = config.shape.period_s
+        self._shape_due_s = 0.0
+        self._period_s = 1.0 / config.loop.rate_hz
+        self._steps = 0
+        self._last_s = 0.0
+        self.now_s = 0.0
+        self.finished: errors.Exit | None = None
+        self._supervisor = Supervisor(
+            Controller(config, sag_sensitivity),
+            Wiring(_AtOnce(bench, self._altered), shapes=self._newest_shape if shape else None, truth=self._truth),
+            RunClock.start(),  # of the events' stamps, which nobody records here
+            config.loop.rate_hz,
+        )
+        bench.open()
+
+    def tick(self, commands: tuple[Command, ...] = ()) -> VirtualTick | None:
+        """Let one period pass and run the tick at its end; None if the control process did not run."""
+        self._steps += 1
+        self.now_s = self._steps * self._period_s  # no sum, which would drift
+        self._bench.advance(self._period_s)
+        if self.finished is not None:
+            return None
+        if self._bench.wrong.stalled:
+            self._supervisor.missed_ticks += 1
+            return None
+        for command in commands:
+            self._supervisor.ask(command)
+        dt_s = self.now_s - self._last_s
+        late_s = 1e-3 * self._bench.wrong.late_ms + max(0.0, dt_s - 1.5 * self._period_s)
+        inputs, outputs = at_once(self._supervisor.tick(self.now_s, dt_s, late_s))
+        self._last_s = self.now_s
+        if outputs.finished is not None:
+            self.finished = outputs.finished
+            at_once(self._supervisor.leave())
+            self._bench.close()
+        return VirtualTick(inputs, outputs)
+
+    def _newest_shape(self) -> shape_estimate.ShapeEstimate | None:
+        if self._shape is None or self.now_s < self._shape_due_s:
+            return None
+        self._shape_due_s += self._shape_period_s
+        return self._shape(self.now_s)
+
+    def _truth(self) -> tuple[float, float]:
+        return self._bench.truth.displacement_um, self._bench.truth.laser_bias_um
+
+    def _altered(self, reading: roles.BenchReading) -> roles.BenchReading:
+        altered = reading if self._alter is None else self._alter(self.now_s, reading)
+        if altered is None:
+            raise roles.LinkError("no reading")
+        return altered
+
+
+class _AtOnce:
+    """A virtual bench as the supervisor's `Bench`: what it is asked, it answers without waiting."""
+
+    def __init__(self, bench: VirtualBench, altered: Callable[[roles.BenchReading], roles.BenchReading]) -> None:
+        self._bench, self._altered = bench, altered
+
+    async def open(self) -> roles.BenchIdentity:
+        return self._bench.open()
+
+    async def read(self) -> roles.BenchReading:
+        return self._altered(self._bench.read())
+
+    async def write(self, command: roles.BenchCommand) -> None:
+        self._bench.write(command)
+
+    async def clear_faults(self, mask: int) -> None:
+        self._bench.clear_faults(mask)
+
+    def dead_guards(self) -> tuple[str, ...]:
+        return ("virtual task",) if self._bench.wrong.dead_task else ()
+
+    async def close(self) -> None:
+        self._bench.close()
+
+
+def run_virtual(
+    config: Config,
+    plant: Plant,
+    duration_s: float,
+    sag_sensitivity: FloatArray,
+    shape: ShapeSource | None = None,
+    alter: Alter | None = None,
+) -> Iterator[VirtualTick]:
+    """Hold the twin for `duration_s` of its time, as fast as it goes.
+
+    Parameters
+    ----------
+    config, sag_sensitivity, shape, alter
+        See `VirtualRun`.
+    plant : Plant
+        The twin's physics.
+    duration_s : float
+        When the hold is asked to stop.
+
+    Yields
+    ------
+    VirtualTick
+        Until the controller says that the run is over.
+    """
+    run = VirtualRun(config, VirtualBench(plant), sag_sensitivity, shape, alter)
+    commands: tuple[Command, ...] = (Command("hold", "virtual run"),)
+    stop_at_s = duration_s
+    while run.finished is None:
+        if run.now_s + 1.0 / config.loop.rate_hz >= stop_at_s:
+            commands, stop_at_s = (*commands, Command("stop", "duration")), float("inf")
+        tick = run.tick(commands)
+        commands = ()
+        if tick is not None:
+            yield tick

@@ -1,1 +1,0 @@
-"""Runs in virtual time: the same controller on the twin's board."""
