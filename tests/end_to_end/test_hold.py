@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 from patience import slow_machine
@@ -127,7 +128,8 @@ def test_a_short_hold_with_the_camera_loop_leaves_everything_it_should(tmp_path:
     assert captured["verdict"] == "ok"
     head = read_head(run_dir(tmp_path) / str(captured["set"]))
     assert (head.kind, len(head.patterns)) == ("full", 18)
-    assert abs(head.displacement_um.mean()) < 5.0
+    assert np.isfinite(head.displacement_um).mean() > 0.5  # none for a frame beside which the machine stood still
+    assert abs(np.nanmean(head.displacement_um)) < 5.0
     summary = json.loads((run_dir(tmp_path) / "summary.json").read_text())
     assert summary["exit"] == "done"
     assert [s["state"] for s in summary["states"]] == ["check", "inflate", "settle", "hold", "lower"]

@@ -41,7 +41,7 @@ def test_a_killed_recorder_is_replaced_and_every_tick_replayed(
 ) -> None:
     config = tmp_path / "lab.toml"
     config.write_text(slow_machine() + "[twin]\nport = 0\n")
-    command = ["hold", "--twin", "--config", str(config), "--duration", "12s", "--name", "kill"]
+    command = ["hold", "--twin", "--config", str(config), "--duration", "20s", "--name", "kill"]
     with subprocess.Popen(
         [sys.executable, "-m", "membrane_ctrl", *command, "--logs", str(tmp_path)],
         stdout=subprocess.DEVNULL,
