@@ -51,7 +51,7 @@ class LaserAtRest:
         return 0.0
 
 
-class Scene:
+class PanelScene:
     """What the camera sees of the panel; made before, as a camera has no Python to wait for."""
 
     def __init__(self, panel: EmulatedPanel[Shown]) -> None:
@@ -161,7 +161,7 @@ def run() -> list[Figure]:
     settings = AravisSettings("127.0.0.1", exposure_ms=EXPOSURE_MS, packet_bytes=60_000)
     with ExitStack() as stack:
         stack.enter_context(x_display())
-        scene = Scene(panel)
+        scene = PanelScene(panel)
         stack.enter_context(GigeCameraEmulator(scene.expose, OPTICS.camera.width_px, OPTICS.camera.height_px))
         camera = AravisCamera(settings, clock.now, clock.sleep)
         stack.callback(camera.close)

@@ -18,7 +18,7 @@ from membrane_ctrl.calibration.sets import phases_of
 from membrane_ctrl.config.optics import ScreenPoseConfig
 from membrane_ctrl.config.schema import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.metrology.calibrate.diagnose import suspects
-from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, Bench, bench_at, sigmas
+from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, BenchGeometry, bench_at, sigmas
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
 from membrane_ctrl.metrology.calibrate.separable import References
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, solve, surface_of
@@ -104,7 +104,7 @@ def _plain(problem: Problem) -> Problem:
     held = {p.name: 0.0 for p in ALL if p.name not in ("a_mm", "b_mm", "alpha_deg")}
     sets = []
     for phases, state in zip(problem.sets, first_states(problem), strict=True):
-        left = np.std(residual_mm(Bench(problem.stated), phases, state.surface, state.vertex_z_mm))
+        left = np.std(residual_mm(BenchGeometry(problem.stated), phases, state.surface, state.vertex_z_mm))
         few = phases.thinned(5000)
         sets.append(
             SetPhases(
@@ -149,7 +149,7 @@ def _accuracy() -> list[Figure]:
     for seed in range(SEEDS):
         film, sets = _rendered(seed)
         problem = _problem(sets)
-        stated = surface_of(Bench(problem.stated), sets[2], 500.0, -1e-3 * sets[2].displacement_um)
+        stated = surface_of(BenchGeometry(problem.stated), sets[2], 500.0, -1e-3 * sets[2].displacement_um)
         none.append(_errors_um(stated, film, MOVED_UM[2]))
         plain.append(_measured(solve(_plain(problem)), film))
         full.append(_measured(solve(problem), film))

@@ -11,7 +11,7 @@ from benchmarks.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, nig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.telemetry import column
 from membrane_ctrl.review.events.found import find_events
-from membrane_ctrl.review.events.steps import Found
+from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.run_files.shapes import Shapes
 from membrane_ctrl.run_files.tables import TICK_FIELDS, first_level
 from tests.support.synthetic_shape import from_estimates
@@ -21,7 +21,7 @@ HOURS = 8.0
 REACH_S = {DOOR: 4.0, LEAK: 240.0, GLITCH: 2.0, LOST: 7.0, LATE: 12.0, JUMP: 30.0}
 
 
-def search(seed: int, scenario: str, hours: float = HOURS) -> tuple[list[Planted], list[Found]]:
+def search(seed: int, scenario: str, hours: float = HOURS) -> tuple[list[Planted], list[FoundEvent]]:
     """What was put into a night and what was found in it."""
     rng = np.random.default_rng(1000 + seed)
     events = planted(rng, hours)
@@ -31,7 +31,7 @@ def search(seed: int, scenario: str, hours: float = HOURS) -> tuple[list[Planted
     return events, find_events(level, shapes, Config().limits.band_um)
 
 
-def matched(events: list[Planted], found: list[Found]) -> tuple[list[Planted], list[Found]]:
+def matched(events: list[Planted], found: list[FoundEvent]) -> tuple[list[Planted], list[FoundEvent]]:
     """Planted events not found, and found ones that nobody planted."""
     left = list(found)
     missed = []
@@ -43,7 +43,7 @@ def matched(events: list[Planted], found: list[Found]) -> tuple[list[Planted], l
     return missed, [f for f in left if not any(abs(f.time_s - e.time_s) < 900 and _echo(f, e) for e in events)]
 
 
-def _echo(found: Found, event: Planted) -> bool:
+def _echo(found: FoundEvent, event: Planted) -> bool:
     return found.kind == "noise change" and event.kind in {LEAK, DOOR, LOST, GLITCH}
 
 

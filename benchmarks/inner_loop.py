@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class HeldRun:
     """A run, one row a tick: `true_um` is where the centre really is, `leak_um_per_s` the estimate."""
 
     time_s: Array
@@ -51,7 +51,7 @@ def hold(
     lost_s: tuple[float, float] = (np.inf, np.inf),
     target_um: Callable[[float], float] = lambda time_s: 0.0,
     true_pump: PumpConfig = PumpConfig(),  # noqa: B008 (frozen)
-) -> Held:
+) -> HeldRun:
     """Hold the simulated mirror; `lost_s` is a span without readings, `true_pump` one the loop does not know of."""
     plant, controller = Plant(twin, true_pump, events), InnerLoop(loop, PumpConfig())
     dt_s = 1 / loop.rate_hz
@@ -71,7 +71,7 @@ def hold(
         plant.advance(dt_s - WRITE_S)
         rows.append((now_s, true_um, out.setpoint_um, out.flow_um_per_s, out.leak_um_per_s, out.too_tight))
     columns = np.array(rows).T
-    return Held(*columns[:5], too_tight=columns[5].astype(bool))
+    return HeldRun(*columns[:5], too_tight=columns[5].astype(bool))
 
 
 def _configs(sensors: str, scenario: str, seed: int, **twin: Any) -> tuple[LoopConfig, TwinConfig]:

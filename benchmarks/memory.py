@@ -28,7 +28,7 @@ import psutil
 
 from benchmarks.figures import Figure, at_most
 from benchmarks.memory_acquisition import acquisition_figures
-from benchmarks.recorded_hold import Part, parts_of
+from benchmarks.recorded_hold import RunPart, parts_of
 from membrane_ctrl.alarms.process import AlarmsSpec, watch
 from membrane_ctrl.config.schema import Config, LoopConfig, RecordingConfig, ShapeConfig
 from membrane_ctrl.console.process import ConsoleSpec, console_main
@@ -150,7 +150,7 @@ def _children(
     ], ours
 
 
-def _rounds(config: Config) -> Iterator[tuple[float, Part]]:
+def _rounds(config: Config) -> Iterator[tuple[float, RunPart]]:
     """A week: the way to the hold once, and then the same 20 minutes of it, each time later."""
     seconds = list(parts_of(config, 2 * ROUND_S, 1.0))
     count = round(ROUND_S)
@@ -164,20 +164,20 @@ def _rounds(config: Config) -> Iterator[tuple[float, Part]]:
             yield begin_s + place + step, _later(part, max(number - 1, 0) * ROUND_S)
 
 
-def _joined(parts: Sequence[Part]) -> Part:
-    whole = Part()
+def _joined(parts: Sequence[RunPart]) -> RunPart:
+    whole = RunPart()
     for part in parts:
         for name in ("telemetry", "inputs", "shapes", "events"):
             getattr(whole, name).extend(getattr(part, name))
     return whole
 
 
-def _later(part: Part, by_s: float) -> Part:
+def _later(part: RunPart, by_s: float) -> RunPart:
     ticks = round(by_s * RATE_HZ)
     rows = np.frombuffer(b"".join(part.telemetry), dtype="<f8").reshape(-1, len(FIELDS)).copy()
     rows[:, _TIME] += by_s
     rows[:, _TICK] += ticks
-    return Part(
+    return RunPart(
         [row.tobytes() for row in rows],
         [_tick_later(message, ticks, by_s) for message in part.inputs],
         [_shape_later(message, by_s) for message in part.shapes],

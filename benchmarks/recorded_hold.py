@@ -24,7 +24,7 @@ Rings = dict[str, RingWriter]
 
 
 @dataclass(slots=True)
-class Part:
+class RunPart:
     """What goes into the rings in some time of a run."""
 
     telemetry: list[bytes] = field(default_factory=list)
@@ -63,13 +63,13 @@ def ring_trip(estimate: ShapeEstimate) -> ShapeEstimate:
     return unpack_estimate(estimate_message(estimate))
 
 
-def parts_of(config: Config, duration_s: float, part_s: float) -> Iterator[Part]:
+def parts_of(config: Config, duration_s: float, part_s: float) -> Iterator[RunPart]:
     """The run part by part, from standby on."""
     bench = VirtualBench(Plant(config.twin, config.pump))
     run = VirtualRun(config, bench, zernike_projection(), RealisticShapes(bench, config))
     number = 0
     for place in range(round(duration_s / part_s)):
-        made = Part()
+        made = RunPart()
         for _ in range(round(part_s * config.loop.rate_hz)):
             tick = run.tick((Command("hold", "benchmark"),) if number == 0 else ())
             if tick is not None:
@@ -78,11 +78,11 @@ def parts_of(config: Config, duration_s: float, part_s: float) -> Iterator[Part]
         yield made if place else _begun(made)
 
 
-def _begun(first: Part) -> Part:
+def _begun(first: RunPart) -> RunPart:
     return replace(first, events=[json.dumps({"kind": "start", "mono_s": 0.0}).encode(), *first.events])
 
 
-def _take(made: Part, tick: VirtualTick, number: int) -> None:
+def _take(made: RunPart, tick: VirtualTick, number: int) -> None:
     row = tick.row.pack()
     made.telemetry.append(row)
     made.inputs += pack_tick(number, tick.inputs, tick.outputs, row)

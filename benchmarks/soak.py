@@ -74,7 +74,7 @@ class Means:
 
 
 @dataclass
-class Tally:
+class SoakTally:
     """What is kept of a soak."""
 
     second: Means = field(default_factory=lambda: Means(round(RATE_HZ), BAND_UM))
@@ -102,14 +102,14 @@ def soak_config(seed: int) -> Config:
 
 def soak(
     days: float, seed: int, faults: bool = True, events: tuple[Happening, ...] = (), take: Take | None = None
-) -> Tally:
+) -> SoakTally:
     """Hold for `days` or until ctrl-C; with `faults` something goes wrong six times a day. `take` gets every tick."""
     config = soak_config(seed)
     bench = VirtualBench(Plant(config.twin, config.pump, events))
     run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, config, seed))
     upsets = _upsets(seed) if faults else iter(())
     due_s, name, lasts_s = next(upsets, (np.inf, "", 0.0))
-    until_s, tally, start_s = np.inf, Tally(), time.process_time()
+    until_s, tally, start_s = np.inf, SoakTally(), time.process_time()
     tick = run.tick((Command("hold", "soak"),))
     with contextlib.suppress(KeyboardInterrupt):
         while run.now_s < days * DAY_S and run.finished is None:
@@ -130,7 +130,7 @@ def soak(
     return tally
 
 
-def _count(tick: VirtualTick, tally: Tally) -> None:
+def _count(tick: VirtualTick, tally: SoakTally) -> None:
     row = tick.row
     if row.state == State.HOLD:
         error_um = row.truth_displacement_um - row.target_um

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.minimum_variance import least_std_um
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
-from membrane_ctrl.control.experiments.machine import Measurement
+from membrane_ctrl.control.experiments.machine import BenchSample
 from membrane_ctrl.sim import plant as twin_pump
 from membrane_ctrl.sim.events import Event
 from membrane_ctrl.sim.plant import STEP_S, Plant
@@ -81,15 +81,15 @@ class TwinBench:
         self._dt_s = 1 / case.loop().rate_hz
         self.true_um: list[float] = []
 
-    def exchange(self, pump_fraction: float, vent_fraction: float) -> Measurement:
+    def exchange(self, pump_fraction: float, vent_fraction: float) -> BenchSample:
         """One tick."""
         self.plant.actuate(pump_fraction, vent_fraction)
         self.plant.advance(self._dt_s)
         self.true_um.append(self.plant.truth().displacement_um)
         sample = self.plant.sample()
         if not self._sensors:
-            return Measurement(sample.displacement_um)
-        return Measurement(sample.displacement_um, sample.ambient_pressure_pa, sample.air_temperature_c)
+            return BenchSample(sample.displacement_um)
+        return BenchSample(sample.displacement_um, sample.ambient_pressure_pa, sample.air_temperature_c)
 
 
 def identified(case: Case, seed: int) -> dict[str, float]:

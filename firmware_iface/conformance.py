@@ -29,7 +29,7 @@ _Check = tuple[str, str, Callable[[], Awaitable[None]]]  # its name, the section
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CheckResult:
     """The result of one check: `problem` is empty when it passed, else what the board did wrong."""
 
     check: str
@@ -40,7 +40,7 @@ class Finding:
 class Conformance(BoardUnderTest):
     """The checks, in the order they are made."""
 
-    async def run(self) -> list[Finding]:
+    async def run(self) -> list[CheckResult]:
         """Make all checks; the first one decides whether the others mean anything.
 
         Raises
@@ -67,7 +67,7 @@ class Conformance(BoardUnderTest):
         await self._arm(REST_S)
         await test()
 
-    async def _made(self, check: str, section: str, test: Callable[[], Awaitable[None]]) -> Finding:
+    async def _made(self, check: str, section: str, test: Callable[[], Awaitable[None]]) -> CheckResult:
         problem = ""
         try:
             await test()
@@ -77,7 +77,7 @@ class Conformance(BoardUnderTest):
             raise
         except roles.LinkError as error:
             problem = f"no valid answer: {error}"
-        return Finding(check, section, problem)
+        return CheckResult(check, section, problem)
 
     def _checks(self) -> list[_Check]:
         checks: list[_Check] = [
@@ -327,7 +327,7 @@ def _outside(register: register_map.Register) -> list[int]:
     return [raw for raw in (low - 1, high + 1, 0xFFFF) if 0 <= raw <= 0xFFFF and not low <= raw <= high]
 
 
-async def examine(url: str, unit_id: int = 1, timeout_s: float = 0.5) -> list[Finding]:
+async def examine(url: str, unit_id: int = 1, timeout_s: float = 0.5) -> list[CheckResult]:
     """All findings about the board at a Modbus URL.
 
     Raises LinkError if it is not there or another program holds it, ValueError for the URL.

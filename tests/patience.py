@@ -14,7 +14,7 @@ from unittest.mock import patch
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.commissioning import check
-from membrane_ctrl.commissioning.probe import Probe
+from membrane_ctrl.commissioning.probe import DeviceProbe
 from membrane_ctrl.config.devices import DevicesConfig
 
 ANSWER_S = 20.0
@@ -33,7 +33,7 @@ def patient_check() -> Iterator[None]:
     """`check` waits that long."""
     probes = check._probes
 
-    async def patient(devices: DevicesConfig) -> list[Probe]:
+    async def patient(devices: DevicesConfig) -> list[DeviceProbe]:
         waits = {role: table.model_copy(update={"timeout_s": ANSWER_S}) for role, table in devices.roles().items()}
         return await probes(devices.model_copy(update={"timeout_s": ANSWER_S, **waits}))
 

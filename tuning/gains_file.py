@@ -122,7 +122,7 @@ What = Literal["kept", "taken_back", "rolled_back"]
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class GainsEntry:
     """One line.
 
     Attributes
@@ -144,12 +144,12 @@ class Entry:
     after: LoopConfig
 
 
-def entry(what: What, session: str, author: str, reason: str, before: LoopConfig, after: LoopConfig) -> Entry:
+def entry(what: What, session: str, author: str, reason: str, before: LoopConfig, after: LoopConfig) -> GainsEntry:
     """An entry of now."""
-    return Entry(datetime.now(UTC).isoformat(timespec="seconds"), what, session, author, reason, before, after)
+    return GainsEntry(datetime.now(UTC).isoformat(timespec="seconds"), what, session, author, reason, before, after)
 
 
-def note(logs: Path, what: Entry) -> None:
+def note(logs: Path, what: GainsEntry) -> None:
     """Append an entry. Raises InputError where it cannot be written: a link in its place is not followed."""
     path = logs / "tuning" / _FILE
     try:
@@ -160,7 +160,7 @@ def note(logs: Path, what: Entry) -> None:
         raise errors.InputError(f"{path}: not noted: {error.strerror}") from None
 
 
-def entries(logs: Path) -> list[Entry]:
+def entries(logs: Path) -> list[GainsEntry]:
     """All entries, oldest first; a line that was cut off is left out. Raises InputError for no plain file."""
     path = logs / "tuning" / _FILE
     try:
@@ -169,16 +169,16 @@ def entries(logs: Path) -> list[Entry]:
         return []
     except OSError as error:
         raise errors.InputError(f"{path}: {error.strerror}") from None
-    found: list[Entry] = []
+    found: list[GainsEntry] = []
     for line in text.splitlines():
         try:
-            found.append(plain.built(Entry, plain_json.loads(line)))
+            found.append(plain.built(GainsEntry, plain_json.loads(line)))
         except (ValueError, TypeError, KeyError):
             continue
     return found
 
 
-def to_roll_back(logs: Path) -> Entry:
+def to_roll_back(logs: Path) -> GainsEntry:
     """The newest gains that were kept and not rolled back since. Raises InputError if there are none."""
     undone: set[str] = set()
     for found in reversed(entries(logs)):
@@ -189,7 +189,7 @@ def to_roll_back(logs: Path) -> Entry:
     raise errors.InputError(f"{logs / 'tuning' / _FILE}: no kept gains to roll back")
 
 
-def history_table(found: list[Entry]) -> str:
+def history_table(found: list[GainsEntry]) -> str:
     """The journal as a Markdown table."""
     lines = [
         "| time | what | session | author | K 1/s | Ti s | filter s | reason |",

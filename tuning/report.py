@@ -47,7 +47,7 @@ def draw_experiments(path: Path, record: records.Record, found: identify.Identif
 
 
 def draw_weather(
-    path: Path, record: records.Record, model: loop_model.PlantModel, weather: disturbance.Disturbance
+    path: Path, record: records.Record, model: loop_model.PlantModel, weather: disturbance.DisturbanceModel
 ) -> None:
     """Spectrum of a quiet hold's readings without the pump's share, and the fitted parts."""
     figure = Figure(figsize=(8, 5), layout="constrained")

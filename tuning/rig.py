@@ -17,10 +17,10 @@ from membrane_ctrl.sessions.live_hold import HoldError, HoldLink
 from tuning.identification.records import Record, Series
 
 
-class Bench(Protocol):
+class DrivenBench(Protocol):
     """What a rig drives: the twin, a fitted model, or a live hold in its `tune` state."""
 
-    def exchange(self, pump_fraction: float, vent_fraction: float) -> machine.Measurement:
+    def exchange(self, pump_fraction: float, vent_fraction: float) -> machine.BenchSample:
         """Put out the commands, wait for the next tick, and return its reading."""
         ...
 
@@ -30,14 +30,14 @@ class Rig:
 
     Parameters
     ----------
-    bench : Bench
+    bench : DrivenBench
     loop : LoopConfig
     pump : PumpConfig
     leak_um_per_s : float
         Flow to begin with.
     """
 
-    def __init__(self, bench: Bench, loop: LoopConfig, pump: PumpConfig, leak_um_per_s: float) -> None:
+    def __init__(self, bench: DrivenBench, loop: LoopConfig, pump: PumpConfig, leak_um_per_s: float) -> None:
         self._bench = bench
         self._config, self._pump = loop, pump
         self._loop = inner_loop.InnerLoop(loop, pump)
@@ -53,7 +53,7 @@ class Rig:
     def hold(self, duration_s: float, target_um: float = 0.0) -> Record:
         """Hold at a target."""
         flows: list[float] = []
-        samples: list[machine.Measurement] = []
+        samples: list[machine.BenchSample] = []
         for _ in range(round(duration_s / self.dt_s)):
             out = self._loop.step(self._given(target_um), self.dt_s)
             flows.append(out.flow_um_per_s)
@@ -75,7 +75,7 @@ class Rig:
 
     def _run(self, guard: machine.Experiment, holding_flow_um_per_s: float) -> tuple[Record, machine.Finished]:
         flows: list[float] = []
-        samples: list[machine.Measurement] = []
+        samples: list[machine.BenchSample] = []
         while True:
             wanted = guard.step(self._last, self.dt_s)
             if isinstance(wanted, machine.Finished):
@@ -224,17 +224,17 @@ class HoldRig:
     def record(self, rows: Sequence[telemetry.TelemetryRow]) -> Record:
         """Ticks as an even record; one that was skipped has no reading and the flow before it."""
         flows: list[float] = []
-        samples: list[machine.Measurement] = []
+        samples: list[machine.BenchSample] = []
         flow = next((row.flow_um_per_s for row in rows if math.isfinite(row.flow_um_per_s)), 0.0)
         tick = rows[0].tick + rows[0].missed_ticks if rows else 0.0
         for row in rows:
             place = row.tick + row.missed_ticks
             gap = max(0, round(place - tick))
             flows += [flow] * gap
-            samples += [machine.Measurement(math.nan, row.ambient_pressure_pa, row.air_temperature_c)] * gap
+            samples += [machine.BenchSample(math.nan, row.ambient_pressure_pa, row.air_temperature_c)] * gap
             flow = row.flow_um_per_s if math.isfinite(row.flow_um_per_s) else flow
             flows.append(flow)
-            samples.append(machine.Measurement(row.displacement_um, row.ambient_pressure_pa, row.air_temperature_c))
+            samples.append(machine.BenchSample(row.displacement_um, row.ambient_pressure_pa, row.air_temperature_c))
             tick = place + 1
         return Record.from_samples(self.dt_s, flows, samples)
 

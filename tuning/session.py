@@ -19,7 +19,7 @@ from membrane_ctrl.sessions import folder, live_hold
 from membrane_ctrl.sessions import folder as plain
 from tuning.gains_file import GainsFile, PlantSection, for_hold, load_gains, require_sound, save_gains
 from tuning.identification import characterise, identify, records
-from tuning.identification.disturbance import Disturbance, observe
+from tuning.identification.disturbance import DisturbanceModel, observe
 from tuning.proposal import design, prediction, verify
 from tuning.proposal.preview import Preview, preview
 from tuning.rig import HoldRig
@@ -42,11 +42,11 @@ class ExperimentsHead:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class IdentifiedPlant:
     """`identified.json`."""
 
     identified: identify.Identified
-    quality: characterise.Quality
+    quality: characterise.FitQuality
     data_sha256: str
 
 
@@ -112,7 +112,7 @@ def experiments_of(session: folder.SessionFolder) -> characterise.Experiments:
     return characterise.Experiments(head.around, record, head.relays_s, head.pulses_s, head.finished)
 
 
-def identify_step(session: folder.SessionFolder) -> Found:
+def identify_step(session: folder.SessionFolder) -> IdentifiedPlant:
     """Fit and verdict; a refused one is kept too, for the report."""
     done = experiments_of(session)
     session.begin("identify")
@@ -120,18 +120,18 @@ def identify_step(session: folder.SessionFolder) -> Found:
         all_of_it = characterise.fitted(done)
     except ValueError as error:
         raise errors.RejectedError(f"identify: {error}") from None
-    found = Found(all_of_it.identified, all_of_it.quality, done.record.sha256())
+    found = IdentifiedPlant(all_of_it.identified, all_of_it.quality, done.record.sha256())
     plain.write(session.file("identified.json"), found)
     return found
 
 
-def found_of(session: folder.SessionFolder) -> Found:
+def found_of(session: folder.SessionFolder) -> IdentifiedPlant:
     """What was identified."""
     session.require("identify")
-    return plain.read(session.file("identified.json"), Found)
+    return plain.read(session.file("identified.json"), IdentifiedPlant)
 
 
-def observe_step(session: folder.SessionFolder, rig: HoldRig, duration_s: float = OBSERVE_S) -> Disturbance:
+def observe_step(session: folder.SessionFolder, rig: HoldRig, duration_s: float = OBSERVE_S) -> DisturbanceModel:
     """A quiet hold: the laser's noise and the weather."""
     model = found_of(session).identified.model
     session.begin("observe")
@@ -145,10 +145,10 @@ def observe_step(session: folder.SessionFolder, rig: HoldRig, duration_s: float 
     return disturbance
 
 
-def disturbance_of(session: folder.SessionFolder) -> Disturbance:
+def disturbance_of(session: folder.SessionFolder) -> DisturbanceModel:
     """What was observed."""
     session.require("observe")
-    return plain.read(session.file("disturbance.json"), Disturbance)
+    return plain.read(session.file("disturbance.json"), DisturbanceModel)
 
 
 def design_step(session: folder.SessionFolder, reason: str = "tuning session") -> GainsFile:
@@ -242,7 +242,7 @@ def verify_step(
     session.require("apply")
     after, before = checked_gains(session), session.head.before
     session.begin("verify")
-    trial = verify.Trial(found_of(session).identified.model, disturbance_of(session), before, after)
+    trial = verify.VerificationTrial(found_of(session).identified.model, disturbance_of(session), before, after)
     rig.set_gains(
         after, f"session {session.path.name}: verification", verify.settle_s(after) + stages[-1][0] + _SPARE_S
     )

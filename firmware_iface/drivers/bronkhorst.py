@@ -31,7 +31,7 @@ _GAUGE_UNITS_PA = {
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
+class InstrumentParameter:
     """One value of an instrument; `kind` is "u8", "u16", "f32" or "text", `chars` the length of a text."""
 
     name: str
@@ -41,17 +41,17 @@ class Parameter:
     chars: int = 0
 
 
-MEASURE = Parameter("measure", 1, 0, "u16")
-SETPOINT = Parameter("setpoint", 1, 1, "u16")
-CONTROL_MODE = Parameter("control mode", 1, 4, "u8")
-CAPACITY = Parameter("capacity", 1, 13, "f32")
-CAPACITY_UNIT = Parameter("capacity unit", 1, 31, "text", 7)
-FMEASURE = Parameter("fmeasure", 33, 0, "f32")
-FSETPOINT = Parameter("fsetpoint", 33, 3, "f32")
-TEMPERATURE = Parameter("temperature", 33, 7, "f32")
-DEVICE_TYPE = Parameter("device type", 113, 1, "text", 6)
-SERIAL_NUMBER = Parameter("serial number", 113, 3, "text", 16)
-FIRMWARE = Parameter("firmware version", 113, 5, "text", 5)
+MEASURE = InstrumentParameter("measure", 1, 0, "u16")
+SETPOINT = InstrumentParameter("setpoint", 1, 1, "u16")
+CONTROL_MODE = InstrumentParameter("control mode", 1, 4, "u8")
+CAPACITY = InstrumentParameter("capacity", 1, 13, "f32")
+CAPACITY_UNIT = InstrumentParameter("capacity unit", 1, 31, "text", 7)
+FMEASURE = InstrumentParameter("fmeasure", 33, 0, "f32")
+FSETPOINT = InstrumentParameter("fsetpoint", 33, 3, "f32")
+TEMPERATURE = InstrumentParameter("temperature", 33, 7, "f32")
+DEVICE_TYPE = InstrumentParameter("device type", 113, 1, "text", 6)
+SERIAL_NUMBER = InstrumentParameter("serial number", 113, 3, "text", 16)
+FIRMWARE = InstrumentParameter("firmware version", 113, 5, "text", 5)
 ALL = (
     *(MEASURE, SETPOINT, CONTROL_MODE, CAPACITY, CAPACITY_UNIT),
     *(FMEASURE, FSETPOINT, TEMPERATURE, DEVICE_TYPE, SERIAL_NUMBER, FIRMWARE),
@@ -70,15 +70,15 @@ class ParameterPort(Protocol):
         """Connect, unless that is done."""
         ...
 
-    async def number(self, parameter: Parameter) -> float:
+    async def number(self, parameter: InstrumentParameter) -> float:
         """A number, believed only if a flipped bit would have been seen."""
         ...
 
-    async def text(self, parameter: Parameter) -> str:
+    async def text(self, parameter: InstrumentParameter) -> str:
         """A text."""
         ...
 
-    async def write(self, parameter: Parameter, value: int) -> None:
+    async def write(self, parameter: InstrumentParameter, value: int) -> None:
         """Write, and know that the instrument has it."""
         ...
 
@@ -223,7 +223,7 @@ class BronkhorstPressure:
 MANUAL = "Bronkhorst 9.17.035, section 4.4.6"
 
 
-def register_of(parameter: Parameter) -> tuple[int, int]:
+def register_of(parameter: InstrumentParameter) -> tuple[int, int]:
     """First register and number of registers of a parameter."""
     if parameter.kind in ("u8", "u16"):
         return 32 * parameter.process + parameter.number, 1
@@ -247,27 +247,27 @@ class ModbusParameters:
         if not self._link.connected:
             await self._link.connect()
 
-    async def number(self, parameter: Parameter) -> float:
+    async def number(self, parameter: InstrumentParameter) -> float:
         """A number. Raises LinkError."""
         words = await self._words(parameter)
         if parameter.kind == "f32":
             return float(struct.unpack(">f", struct.pack(">2H", *words))[0])
         return float(words[0])
 
-    async def text(self, parameter: Parameter) -> str:
+    async def text(self, parameter: InstrumentParameter) -> str:
         """A text. Raises LinkError."""
         words = await self._words(parameter)
         raw = struct.pack(f">{len(words)}H", *words)[: parameter.chars]
         return raw.split(b"\0")[0].decode("ascii", "replace").strip()
 
-    async def _words(self, parameter: Parameter) -> list[int]:
+    async def _words(self, parameter: InstrumentParameter) -> list[int]:
         address, count = register_of(parameter)
         try:
             return await self._link.read_holding(address, count)
         except DeviceRefusedError as error:
             raise DeviceRefusedError(f"{error}; not a Bronkhorst, or one without {parameter.name}") from error
 
-    async def write(self, parameter: Parameter, value: int) -> None:
+    async def write(self, parameter: InstrumentParameter, value: int) -> None:
         """Write one register; the echo carries address and value back. Raises LinkError."""
         await self._link.write_register(register_of(parameter)[0], value)
 

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from firmware_iface.drivers.bronkhorst import MEASURE, Parameter
+from firmware_iface.drivers.bronkhorst import MEASURE, InstrumentParameter
 from firmware_iface.links import exchange, serial_port
 from firmware_iface.roles import DeviceRefusedError, LinkError
 
@@ -42,7 +42,7 @@ STATUS_TEXT = {
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class ProparMessage:
     """One message: sequence number (0 in ASCII, which has none), node and data."""
 
     sequence: int
@@ -50,20 +50,20 @@ class Message:
     data: bytes
 
 
-def binary_frame(message: Message) -> bytes:
+def binary_frame(message: ProparMessage) -> bytes:
     """As sent in binary."""
     body = bytes([message.sequence, message.node, len(message.data)]) + message.data
     return bytes([_DLE, _STX]) + body.replace(b"\x10", b"\x10\x10") + bytes([_DLE, _ETX])
 
 
-def ascii_frame(message: Message) -> bytes:
+def ascii_frame(message: ProparMessage) -> bytes:
     """As sent in ASCII."""
     return b":%02X%02X%s\r\n" % (len(message.data) + 1, message.node, message.data.hex().upper().encode())
 
 
-def split_binary(heard: bytes) -> tuple[list[Message], bytes]:
+def split_binary(heard: bytes) -> tuple[list[ProparMessage], bytes]:
     """The whole messages in what was heard, and the bytes left over; broken ones are left out."""
-    messages: list[Message] = []
+    messages: list[ProparMessage] = []
     while (start := heard.find(b"\x10\x02")) >= 0:
         body, at = bytearray(), start + 2
         while at + 1 < len(heard) and (heard[at] != _DLE or heard[at + 1] == _DLE):
@@ -72,12 +72,12 @@ def split_binary(heard: bytes) -> tuple[list[Message], bytes]:
         if at + 1 >= len(heard):
             return messages, heard[start:]
         if heard[at + 1] == _ETX and len(body) > 3 and body[2] == len(body) - 3:
-            messages.append(Message(body[0], body[1], bytes(body[3:])))
+            messages.append(ProparMessage(body[0], body[1], bytes(body[3:])))
         heard = heard[at + 2 if heard[at + 1] == _ETX else at :]
     return messages, heard[-1:] if heard.endswith(b"\x10") else b""
 
 
-def parse_ascii(line: bytes) -> Message | None:
+def parse_ascii(line: bytes) -> ProparMessage | None:
     """The message in a line, None if it is none."""
     try:
         raw = bytes.fromhex(line.strip().removeprefix(b":").decode("ascii"))
@@ -85,10 +85,10 @@ def parse_ascii(line: bytes) -> Message | None:
         return None
     if not line.startswith(b":") or len(raw) < 3 or raw[0] != len(raw) - 1:
         return None
-    return Message(0, raw[1], raw[2:])
+    return ProparMessage(0, raw[1], raw[2:])
 
 
-def request(parameters: Sequence[Parameter]) -> bytes:
+def request(parameters: Sequence[InstrumentParameter]) -> bytes:
     """Data that asks for parameters of one process or several, each under its place in the list as its index."""
     data = bytearray([REQUEST])
     for place, parameter in enumerate(parameters):
@@ -101,7 +101,7 @@ def request(parameters: Sequence[Parameter]) -> bytes:
     return bytes(data)
 
 
-def write_data(parameter: Parameter, value: int) -> bytes:
+def write_data(parameter: InstrumentParameter, value: int) -> bytes:
     """Data that writes a number and wants an answer."""
     kind = _TYPES[parameter.kind]
     return bytes([WRITE, parameter.process, parameter.number | kind]) + struct.pack(_PROPAR_FORMATS[kind], value)
@@ -180,7 +180,7 @@ class ProparParameters:
         if not self._port.is_open:
             self._exchange.connect()
 
-    async def number(self, parameter: Parameter) -> float:
+    async def number(self, parameter: InstrumentParameter) -> float:
         """A number that came `_COPIES` times the same. Raises LinkError."""
         first, *others = await self._asked(*[parameter] * _COPIES)
         if any(other != first for other in others):
@@ -188,14 +188,14 @@ class ProparParameters:
             raise LinkError(f"{self.name}: {parameter.name} came as {came}; noise")
         return float(struct.unpack(_FORMATS[parameter.kind], first)[0])
 
-    async def text(self, parameter: Parameter) -> str:
+    async def text(self, parameter: InstrumentParameter) -> str:
         """A text that came twice. Raises LinkError."""
         first, second = (await self._asked(parameter))[0], (await self._asked(parameter))[0]
         if first != second:
             raise LinkError(f"{self.name}: {parameter.name} came as {first!r} and as {second!r}; noise")
         return first.split(b"\0")[0].decode("ascii", "replace").strip()
 
-    async def write(self, parameter: Parameter, value: int) -> None:
+    async def write(self, parameter: InstrumentParameter, value: int) -> None:
         """Write, and read back. Raises LinkError."""
         answer = await self._transact(write_data(parameter, value), f"writing {parameter.name}")
         if answer[0] != STATUS:
@@ -212,7 +212,7 @@ class ProparParameters:
         """Port, settings, manual."""
         return {"port": f"{self.name}, {self._port.settings}", "manual": MANUAL}
 
-    async def _asked(self, *parameters: Parameter) -> list[bytes]:
+    async def _asked(self, *parameters: InstrumentParameter) -> list[bytes]:
         """Raw values of several parameters, from one message."""
         what = f"reading {parameters[0].name}"
         answer = await self._transact(request(parameters), what)
@@ -246,7 +246,7 @@ class ProparParameters:
 
     def _question(self, data: bytes, what: str) -> exchange.Question:
         self._sequence = (self._sequence + 1) % _SEQUENCES
-        frame = binary_frame(Message(self._sequence, self._node, data))
+        frame = binary_frame(ProparMessage(self._sequence, self._node, data))
         return exchange.Question(frame, _taker(self._sequence, self._node), 2 * _ANSWER_BYTES, what)
 
 

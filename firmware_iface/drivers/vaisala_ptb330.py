@@ -32,7 +32,7 @@ _ERRORS = re.compile(r"(?:(?:PASS|FAIL)\s*\r\n)?([^\r\n]+)\r\n")
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class BarometerMessage:
     """One measurement: `pressure_pa` NaN when the instrument has none, `counter` its running number."""
 
     pressure_pa: float
@@ -72,7 +72,7 @@ class VaisalaPtb330(LinkedDevice):
         super().__init__(self._link)
         self._period_s, self._age_max_s = period_s, age_max_s
         self._task: asyncio.Task[None] | None = None
-        self._newest = Message(math.nan, -1, "")
+        self._newest = BarometerMessage(math.nan, -1, "")
         self._newest_s = -math.inf
         self._down: LinkDownError | None = None
         self._identity: DeviceIdentity | None = None
@@ -88,7 +88,7 @@ class VaisalaPtb330(LinkedDevice):
             Another instrument, or a format that is not taken.
         """
         await self.close()
-        self._newest, self._newest_s, self._down = Message(math.nan, -1, ""), -math.inf, None
+        self._newest, self._newest_s, self._down = BarometerMessage(math.nan, -1, ""), -math.inf, None
         self._link.connect("\r\nS\r\nECHO OFF\r\n")
         try:
             identity = await self._known_again()
@@ -185,7 +185,7 @@ class VaisalaPtb330(LinkedDevice):
         }
 
 
-def decode_message(message: re.Match[str], name: str) -> Message:
+def decode_message(message: re.Match[str], name: str) -> BarometerMessage:
     """Check and convert a message that has the form of `FORMAT`.
 
     Raises
@@ -197,8 +197,8 @@ def decode_message(message: re.Match[str], name: str) -> Message:
     if sum(checked.encode("ascii")) % 2**16 != int(checksum, 16):
         raise LinkError(f"{name}: wrong checksum; noise on the line")
     if "*" in pressure or "1" in flags:
-        return Message(math.nan, int(counter), serial)
+        return BarometerMessage(math.nan, int(counter), serial)
     pressure_pa = float(pressure) * PA_PER_HPA
     if not RANGE_PA[0] <= pressure_pa <= RANGE_PA[1]:
         raise LinkError(f"{name}: {pressure_pa:.0f} Pa is outside of {RANGE_PA[0]:.0f} .. {RANGE_PA[1]:.0f} Pa")
-    return Message(pressure_pa, int(counter), serial)
+    return BarometerMessage(pressure_pa, int(counter), serial)

@@ -73,13 +73,13 @@ class Instrument:
         if self._actuate is not None:
             self._actuate(self.fraction)
 
-    def raw(self, parameter: bronkhorst.Parameter) -> bytes:
+    def raw(self, parameter: bronkhorst.InstrumentParameter) -> bytes:
         """A parameter as bytes, big end first; a text has its full length."""
         if parameter.kind == "text":
             return self._texts[parameter].encode().ljust(parameter.chars, b"\0")[: parameter.chars]
         return struct.pack(_FORMATS[parameter.kind], self._number(parameter))
 
-    def _number(self, parameter: bronkhorst.Parameter) -> float:
+    def _number(self, parameter: bronkhorst.InstrumentParameter) -> float:
         if parameter in self._settings:
             return self._settings[parameter]
         measured = self.fraction * self._capacity if self._measured is None else self._measured()
@@ -92,7 +92,7 @@ class Instrument:
             bronkhorst.TEMPERATURE: 20.0,
         }[parameter]
 
-    def write(self, parameter: bronkhorst.Parameter, raw: bytes) -> bool:
+    def write(self, parameter: bronkhorst.InstrumentParameter, raw: bytes) -> bool:
         """Take a setting; False when the value is impossible."""
         if parameter == bronkhorst.FSETPOINT:
             parameter, value = (
@@ -171,7 +171,9 @@ class ProparDevice(serial_device.SerialDevice):
             if ascii_message is not None:
                 self._hear(ascii_message, bronkhorst_propar.ascii_frame)
 
-    def _hear(self, message: bronkhorst_propar.Message, frame: Callable[[bronkhorst_propar.Message], bytes]) -> None:
+    def _hear(
+        self, message: bronkhorst_propar.ProparMessage, frame: Callable[[bronkhorst_propar.ProparMessage], bytes]
+    ) -> None:
         if message.node not in (self._node, _NODE_ANY):
             return
         try:
@@ -179,7 +181,7 @@ class ProparDevice(serial_device.SerialDevice):
         except (ValueError, IndexError):
             answer = bytes([bronkhorst_propar.STATUS, _COMMAND_ERROR, 0])
         if answer:
-            self.say(frame(bronkhorst_propar.Message(message.sequence, message.node, answer)))
+            self.say(frame(bronkhorst_propar.ProparMessage(message.sequence, message.node, answer)))
 
     def _answer(self, data: bytes) -> bytes:
         if data[0] == bronkhorst_propar.REQUEST:

@@ -13,7 +13,7 @@ _PERIOD_S = 0.01  # the board's own loop; the pump is off at most this and one w
 _GATEWAY_NO_RESPONSE = 11
 
 
-class Plant(Protocol):
+class BoardPlant(Protocol):
     """What hangs on the board's wires."""
 
     def sample(self) -> board_state.BoardSample:
@@ -70,7 +70,7 @@ class PumpBoardEmulator:
 
     Parameters
     ----------
-    plant : Plant
+    plant : BoardPlant
         Called from the event loop's thread only.
     host, port
         Where to listen; port 0 takes any free one (see `port` after `start`).
@@ -91,7 +91,7 @@ class PumpBoardEmulator:
 
     def __init__(
         self,
-        plant: Plant,
+        plant: BoardPlant,
         host: str = "127.0.0.1",
         port: int = 0,
         clock: Callable[[], float] | None = None,

@@ -183,7 +183,7 @@ def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
 def _camera(config: Config, section: table.CameraTable, clock: CycleClock) -> Any:
     width_px, height_px = config.optics.camera.width_px, config.optics.camera.height_px
     match section:
-        case table.AravisCamera():
+        case table.AravisCameraConfig():
             settings = camera_aravis.AravisSettings(
                 section.camera,
                 width_px,
@@ -195,16 +195,16 @@ def _camera(config: Config, section: table.CameraTable, clock: CycleClock) -> An
                 section.timeout_s,
             )
             return camera_aravis.AravisCamera(settings, clock.now, clock.sleep)
-        case table.UvcCamera():
+        case table.UvcCameraConfig():
             return camera_uvc.UvcCamera(
                 camera_uvc.UvcSettings(section.port, width_px, height_px, section.exposure, section.gain), clock.now
             )
-        case table.FolderCamera():
+        case table.FolderCameraConfig():
             return camera_folder.FolderCamera(Path(section.folder).expanduser(), width_px, height_px, clock.now)
 
 
 @dataclass(frozen=True, slots=True)
-class Findings:
+class BenchFindings:
     """What opening the bench has shown: who the camera is, what was measured, and what is wrong with which remedy."""
 
     camera: str
@@ -212,7 +212,7 @@ class Findings:
     problems: tuple[str, ...] = ()
 
 
-def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> Findings:
+def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchFindings:
     """Connect camera and screen, and let the camera measure the screen.
 
     What is found wrong does not keep a run from trying: its cycles are judged one by one.
@@ -234,7 +234,7 @@ def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> Findin
     who = " ".join(part for part in (identity.kind, identity.serial, identity.detail) if part)
     section = config.devices.screen if config.devices is not None else None
     if section is None:
-        return Findings(who)
+        return BenchFindings(who)
     screen = bench.screen
     screen.open()
     test = DisplayTest(screen, bench.camera, clock, section.width_px, section.height_px)
@@ -248,12 +248,12 @@ def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> Findin
         problems.append(told("screen", lambda: _settle(screen, test, measured)))
     if section.linearise:
         problems.append(told("screen", lambda: _linearise(screen, test, measured)))
-    return Findings(who, tuple(measured), tuple(filter(None, problems)))
+    return BenchFindings(who, tuple(measured), tuple(filter(None, problems)))
 
 
 def _exposure(config: Config, test: DisplayTest) -> str:
     camera = config.devices.camera if config.devices is not None else None
-    if not isinstance(camera, table.AravisCamera):  # another's exposure has no unit
+    if not isinstance(camera, table.AravisCameraConfig):  # another's exposure has no unit
         return ""
     return told("camera", lambda: test.exposure((1 << config.optics.camera.bits) - 1, camera.exposure_ms))
 

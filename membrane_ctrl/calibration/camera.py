@@ -12,7 +12,7 @@ import numpy as np
 from membrane_ctrl.config.schema import CameraConfig, Config
 from membrane_ctrl.geometry.prior_file import write_prior
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
-from membrane_ctrl.metrology.calibrate.lens import Board, Lens, View, calibrate_lens, on_screen
+from membrane_ctrl.metrology.calibrate.lens import Board, BoardView, Lens, calibrate_lens, on_screen
 from membrane_ctrl.metrology.calibrate.parameters import usual_sigma
 from membrane_ctrl.model import errors, files
 
@@ -89,7 +89,7 @@ def _images(folder: Path) -> list[Path]:
     return found
 
 
-def _view(path: Path, board: Board, camera: CameraConfig) -> View:
+def _view(path: Path, board: Board, camera: CameraConfig) -> BoardView:
     try:
         image = decoded_image(files.read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     except (OSError, ValueError) as error:
@@ -104,7 +104,7 @@ def _view(path: Path, board: Board, camera: CameraConfig) -> View:
     if image.dtype != np.uint8:  # the detectors know 8 bits only; a corner needs no more
         image = (np.asarray(image, float) * (255.0 / max(1, int(image.max())))).astype(np.uint8)
     place, seen_px = board.corners(np.asarray(image, np.uint8))
-    return View(path.name, place, seen_px)
+    return BoardView(path.name, place, seen_px)
 
 
 def _camera_table(camera: CameraConfig, lens: Lens) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from membrane_ctrl.calibration import session as sessions
-from membrane_ctrl.calibration.plan import Held, reach_of, setpoints_um
-from membrane_ctrl.calibration.session import Head, Session, adopt, compared
+from membrane_ctrl.calibration.plan import HeldMirror, reach_of, setpoints_um
+from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession, adopt, compared
 from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command, freed, stated_sigmas
 from membrane_ctrl.calibration.sweep import CaptureLink, Procedure, Sweep
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
@@ -66,7 +66,7 @@ def calibrate_live(options: LiveOptions) -> int:
     return solve_and_adopt(session, options)
 
 
-def take_sets(link: CaptureLink, session: Session | None, options: LiveOptions) -> Session:
+def take_sets(link: CaptureLink, session: CalibrationSession | None, options: LiveOptions) -> CalibrationSession:
     """All sets that are missing, if a person agrees; the mirror comes back to where it was.
 
     Raises
@@ -97,7 +97,7 @@ def take_sets(link: CaptureLink, session: Session | None, options: LiveOptions) 
     return session
 
 
-def solve_and_adopt(session: Session, options: LiveOptions) -> int:
+def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
     """Solve a session's sets, show old and new, put the new geometry in place if that is agreed."""
     solving = CalibrateOptions(
         session.sets,
@@ -127,12 +127,12 @@ def solve_and_adopt(session: Session, options: LiveOptions) -> int:
     return code
 
 
-def _planned(link: CaptureLink, held: Held, options: LiveOptions) -> Head:
+def _planned(link: CaptureLink, held: HeldMirror, options: LiveOptions) -> CalibrationHead:
     wanted = setpoints_um(held, reach_of(held, link.config), options.range_um, options.sets or USUAL_SETS)
     return sessions.head_of(link.name, held.setpoint_um, held.shape_on, wanted)
 
 
-def _same_bench(link: CaptureLink, session: Session) -> None:
+def _same_bench(link: CaptureLink, session: CalibrationSession) -> None:
     """Raises InputError if the hold measures with another geometry than the sets so far were taken with."""
     now = geometry_of_run(link.run_dir, link.config).optics
     for folder in session.sets:
@@ -149,7 +149,7 @@ def _written_out(optics: OpticsConfig) -> tuple[GeometryConfig, CameraConfig]:
     return optics.geometry.model_copy(update={"reference_displacement_um": None}), camera
 
 
-def _plan(head: Head, missing: int, held: Held, minutes: float) -> str:
+def _plan(head: CalibrationHead, missing: int, held: HeldMirror, minutes: float) -> str:
     low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
     return (
         f"{missing} of {len(head.setpoints_um)} sets from {low_um:g} to {high_um:g} um "
@@ -159,7 +159,7 @@ def _plan(head: Head, missing: int, held: Held, minutes: float) -> str:
     )
 
 
-def _worth(link: CaptureLink, head: Head, held: Held, options: LiveOptions) -> str:
+def _worth(link: CaptureLink, head: CalibrationHead, held: HeldMirror, options: LiveOptions) -> str:
     """How well the geometry will be determined, and by how much better if there were more room."""
     here = _foreseen(link, held, head.setpoints_um, options)
     line = f"such sets leave of a figure: sag +- {here.sag_um:.1f} um, figure +- {here.figure_rms_um:.1f} um RMS"
@@ -177,7 +177,7 @@ def _worth(link: CaptureLink, head: Head, held: Held, options: LiveOptions) -> s
 
 
 def _foreseen(
-    link: CaptureLink, held: Held, setpoints: Sequence[float], options: LiveOptions
+    link: CaptureLink, held: HeldMirror, setpoints: Sequence[float], options: LiveOptions
 ) -> propagate.Propagated:
     optics = geometry_of_run(link.run_dir, link.config).optics
     if options.geometry is not None:
@@ -190,7 +190,7 @@ def _foreseen(
         raise InputError(f"{link.name}: {error}; does [optics] state this bench?") from None
 
 
-def _origin(session: Session, place: Path | None) -> GeometryOrigin:
+def _origin(session: CalibrationSession, place: Path | None) -> GeometryOrigin:
     """Of the geometry that the sets were taken with: the file's if it is still the same, else by its numbers."""
     optics = read_head(session.sets[0]).optics
     if place is not None and place.exists():

@@ -21,7 +21,7 @@ _PIECES = 8  # of a way, for its time: the leak grows with the cube of the depth
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class HeldMirror:
     """The mirror as it is held before anything moves.
 
     Attributes
@@ -66,7 +66,7 @@ class Reach:
     high_why: str
 
 
-def reach_of(held: Held, config: Config) -> Reach:
+def reach_of(held: HeldMirror, config: Config) -> Reach:
     """The safety table's limits, less what it forgives: a mirror that lags must not trip them on its way."""
     limits, margin_um = config.limits, config.limits.following_error_max_um
     high_um, why = limits.displacement_max_um - margin_um, "limits.displacement_max_um"
@@ -79,12 +79,12 @@ def reach_of(held: Held, config: Config) -> Reach:
     return Reach(math.ceil(low_um), math.floor(high_um), "limits.displacement_min_um", why)
 
 
-def setpoints_um(held: Held, reach: Reach, range_um: float | None, sets: int) -> tuple[float, ...]:
+def setpoints_um(held: HeldMirror, reach: Reach, range_um: float | None, sets: int) -> tuple[float, ...]:
     """Setpoints of the sets, evenly spaced about where the mirror is held, nearer end first.
 
     Parameters
     ----------
-    held : Held
+    held : HeldMirror
     reach : Reach
         The range is moved to fit into it.
     range_um : float or None
@@ -113,7 +113,7 @@ def setpoints_um(held: Held, reach: Reach, range_um: float | None, sets: int) ->
     return tuple(sorted(ascending, reverse=held.setpoint_um - low_um > wide_um / 2))
 
 
-def way_s(held: Held, from_um: float, to_um: float, config: Config) -> float:
+def way_s(held: HeldMirror, from_um: float, to_um: float, config: Config) -> float:
     """How long the setpoint's ramp takes; inf if the mirror does not sink by itself, or the pump has no reserve."""
     loop, most_um_per_s = config.loop, min(config.loop.flow_max_um_per_s, config.pump.flow_full_um_per_s)
     total_s = 0.0
@@ -125,6 +125,6 @@ def way_s(held: Held, from_um: float, to_um: float, config: Config) -> float:
     return total_s
 
 
-def step_s(held: Held, from_um: float, to_um: float, config: Config) -> float:
+def step_s(held: HeldMirror, from_um: float, to_um: float, config: Config) -> float:
     """The way, settling, and the set."""
     return way_s(held, from_um, to_um, config) + SETTLE_S + _SET_S

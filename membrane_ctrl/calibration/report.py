@@ -19,7 +19,7 @@ _SOME_LASER = 0.5  # sigma of the laser's scale without any reading: 1
 
 
 def report_of(
-    solution: solve.Solution | None, findings: Sequence[verdict.Finding], analysis_radius_mm: float
+    solution: solve.Solution | None, findings: Sequence[verdict.CalibrationFinding], analysis_radius_mm: float
 ) -> dict[str, Any]:
     """The report, schema membrane-calibration/1; without a solution only what was found."""
     table: dict[str, Any] = {

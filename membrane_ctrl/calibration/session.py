@@ -19,7 +19,7 @@ FORMAT = "membrane-live-calibration/1"
 
 
 @dataclass(frozen=True, slots=True)
-class Head:
+class CalibrationHead:
     """`session.json`.
 
     Attributes
@@ -43,11 +43,11 @@ class Head:
 
 
 @dataclass(frozen=True, slots=True)
-class Session:
+class CalibrationSession:
     """A live calibration on disk; it goes on with the sets that are not there yet."""
 
     path: Path
-    head: Head
+    head: CalibrationHead
     config: Config
 
     @property
@@ -77,12 +77,14 @@ class Session:
             raise errors.DeviceError(f"{folder}: the set {taken} cannot be copied there ({error})") from None
 
 
-def head_of(source: str, start_um: float, shape_on: bool, setpoints_um: tuple[float, ...]) -> Head:
+def head_of(source: str, start_um: float, shape_on: bool, setpoints_um: tuple[float, ...]) -> CalibrationHead:
     """What a session that begins now is about."""
-    return Head(FORMAT, source, datetime.now(UTC).isoformat(timespec="seconds"), start_um, shape_on, setpoints_um)
+    return CalibrationHead(
+        FORMAT, source, datetime.now(UTC).isoformat(timespec="seconds"), start_um, shape_on, setpoints_um
+    )
 
 
-def begin(logs: Path, name: str, head: Head, config: Config) -> Session:
+def begin(logs: Path, name: str, head: CalibrationHead, config: Config) -> CalibrationSession:
     """Make a session's folder. Raises InputError for a bad name, DeviceError if it cannot be written."""
     path = fresh_folder(logs / "calibration", name, datetime.fromisoformat(head.created_utc))
     try:
@@ -91,15 +93,15 @@ def begin(logs: Path, name: str, head: Head, config: Config) -> Session:
         plain.write(path / "session.json", head)
     except OSError as error:
         raise errors.DeviceError(f"{path}: cannot be written ({(error.strerror or str(error)).lower()})") from None
-    return Session(path, head, config)
+    return CalibrationSession(path, head, config)
 
 
-def resume(path: Path) -> Session:
+def resume(path: Path) -> CalibrationSession:
     """An existing session. Raises InputError if it is none."""
-    head = plain.read(path / "session.json", Head)
+    head = plain.read(path / "session.json", CalibrationHead)
     if head.format != FORMAT:
         raise errors.InputError(f"{path}/session.json: format {head.format!r}, {FORMAT!r} is known")
-    return Session(path, head, config_file.load(path / "config.toml", Config))
+    return CalibrationSession(path, head, config_file.load(path / "config.toml", Config))
 
 
 # Old geometry against new, and the exchange of the files.

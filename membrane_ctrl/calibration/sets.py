@@ -116,9 +116,9 @@ def calibrate_command(options: CalibrateOptions) -> int:
     if not findings:
         try:
             solution = solve(problem, _progress())
-            findings = (*verdict.after(solution), *(verdict.Finding(False, note) for note in bundle.notes))
+            findings = (*verdict.after(solution), *(verdict.CalibrationFinding(False, note) for note in bundle.notes))
         except ValueError as error:
-            findings = (verdict.Finding(True, str(error)),)
+            findings = (verdict.CalibrationFinding(True, str(error)),)
     timing = {"read": read - begin, "solve": time.perf_counter() - read}
     usable = solution is not None and not any(finding.fatal for finding in findings)
     written = _write(options.out, solution, problem, bundle, findings) if usable and solution is not None else ""
@@ -238,7 +238,7 @@ def problem_of(bundle: Bundle, free: dict[str, float], laser_sigma_um: float) ->
 
 
 def _write(
-    path: Path, solution: Solution, problem: Problem, bundle: Bundle, findings: Sequence[verdict.Finding]
+    path: Path, solution: Solution, problem: Problem, bundle: Bundle, findings: Sequence[verdict.CalibrationFinding]
 ) -> str:
     """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
     slopes = [slope_residual(solution, phases, k) for k, phases in enumerate(problem.sets)]

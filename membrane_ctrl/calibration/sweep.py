@@ -10,8 +10,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
-from membrane_ctrl.calibration.plan import SETTLE_S, Held, reach_of, step_s, way_s
-from membrane_ctrl.calibration.session import Head, Session
+from membrane_ctrl.calibration.plan import SETTLE_S, HeldMirror, reach_of, step_s, way_s
+from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.model import errors, events, states, telemetry
@@ -53,7 +53,7 @@ class Sweep:
         self._last_s = math.nan
         self._why = ""
 
-    def look(self) -> Held:
+    def look(self) -> HeldMirror:
         """The mirror as it is held, over some seconds and at least one shape.
 
         Raises
@@ -76,7 +76,7 @@ class Sweep:
                 )
         newest = rows[-1]
         leaks = [row.leak_um_per_s for row in rows if math.isfinite(row.leak_um_per_s)]
-        return Held(
+        return HeldMirror(
             setpoint_um=newest.target_um,
             sag_mm=1e-3 * shape.sag_um,
             pressure_pa=_mean([row.gauge_pressure_pa for row in rows]),
@@ -195,7 +195,7 @@ class Procedure:
         The hold.
     sweep : Sweep
         The hand on it.
-    held : Held
+    held : HeldMirror
         The mirror as it was found.
     progress : Progress
         For the person who waits.
@@ -203,15 +203,15 @@ class Procedure:
 
     link: CaptureLink
     sweep: Sweep
-    held: Held
+    held: HeldMirror
     progress: Progress
 
-    def times_s(self, head: Head, missing: tuple[int, ...]) -> list[float]:
+    def times_s(self, head: CalibrationHead, missing: tuple[int, ...]) -> list[float]:
         """How long each step takes: the sets that are missing, and the way back."""
         stops = [self.held.setpoint_um, *(head.setpoints_um[k] for k in missing), head.start_um]
         return [step_s(self.held, a, b, self.link.config) for a, b in pairwise(stops)]
 
-    def check(self, head: Head) -> None:
+    def check(self, head: CalibrationHead) -> None:
         """Raises InputError if the setpoints are out of reach, or the mirror cannot be moved both ways."""
         held, config = self.held, self.link.config
         low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
@@ -227,7 +227,7 @@ class Procedure:
                 "open the bleed (loop.bleed_fraction), or give the pump more reserve"
             )
 
-    def take(self, session: Session) -> None:
+    def take(self, session: CalibrationSession) -> None:
         """Take what is missing, come back.
 
         Raises
@@ -243,7 +243,7 @@ class Procedure:
             for number, index in enumerate(session.missing):
                 self._take(session, index, times_s[number], sum(times_s[number + 1 :]))
 
-    def _take(self, session: Session, index: int, expected_s: float, after_s: float) -> None:
+    def _take(self, session: CalibrationSession, index: int, expected_s: float, after_s: float) -> None:
         setpoint_um = session.head.setpoints_um[index]
         what = f"set {index + 1} of {len(session.sets)} at {setpoint_um:+g} um"
         self.progress.begin(what, expected_s, after_s)
@@ -253,7 +253,7 @@ class Procedure:
         self.progress.say(f"{what}: {event['verdict']}" + (f" ({event['reason']})" if event.get("reason") else ""))
 
     @contextmanager
-    def _coming_back(self, session: Session) -> Iterator[None]:
+    def _coming_back(self, session: CalibrationSession) -> Iterator[None]:
         say = self.progress.say
         try:
             yield
@@ -269,7 +269,7 @@ class Procedure:
             raise
         self._come_back(session)
 
-    def _come_back(self, session: Session) -> None:
+    def _come_back(self, session: CalibrationSession) -> None:
         head = session.head
         far_um = max(head.setpoints_um, key=lambda each: abs(each - head.start_um))
         back_s = step_s(self.held, far_um, head.start_um, self.link.config)

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from membrane_ctrl.alarms.senders import require_sendable
-from membrane_ctrl.commissioning.probe import Probe, probe_board, probe_optics, probe_roles
+from membrane_ctrl.commissioning.probe import DeviceProbe, probe_board, probe_optics, probe_roles
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.port import AlarmsConfig, PortConfig
 from membrane_ctrl.config.schema import Config
@@ -66,7 +66,7 @@ def _plain(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _probed(config: Config) -> list[Probe]:
+def _probed(config: Config) -> list[DeviceProbe]:
     """What the devices say; those that another program uses are left alone, and so is the screen it may show on."""
     devices = config.devices
     if devices is None:
@@ -75,17 +75,17 @@ def _probed(config: Config) -> list[Probe]:
         try:
             stack.enter_context(device_lock.locked(device_lock.device_names(devices)))
         except errors.DeviceError as error:
-            return [Probe("board" if devices.board else "devices", devices.name, problem=str(error))]
+            return [DeviceProbe("board" if devices.board else "devices", devices.name, problem=str(error))]
         return asyncio.run(_probes(devices)) + probe_optics(config)
 
 
-async def _probes(devices: DevicesConfig) -> list[Probe]:
+async def _probes(devices: DevicesConfig) -> list[DeviceProbe]:
     if devices.board is not None:
         return [await probe_board(bench.pump_board(devices, devices.board), devices.board)]
     return await probe_roles(bench.role_devices(devices))
 
 
-def _show(source: str, probes: list[Probe], would: dict[str, str], warnings: list[str]) -> None:
+def _show(source: str, probes: list[DeviceProbe], would: dict[str, str], warnings: list[str]) -> None:
     console = terminal.table_console()
     if probes:
         table = Table("role", "device", "identity", "reading", "p50 / p99 ms")

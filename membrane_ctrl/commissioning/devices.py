@@ -18,7 +18,7 @@ _DRM = Path("/sys/class/drm")
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FoundDevice:
     """One thing that is there.
 
     Attributes
@@ -54,26 +54,27 @@ def list_devices(as_json: bool) -> int:
     return errors.Exit.DONE
 
 
-def find_ports() -> list[Found]:
+def find_ports() -> list[FoundDevice]:
     """Serial ports; by their USB identity where they have one, since that survives a replug."""
     return [
-        Found("port", f"{port.path}: {port.description}", f'port = "{port.usb_name or port.path}"')
+        FoundDevice("port", f"{port.path}: {port.description}", f'port = "{port.usb_name or port.path}"')
         for port in serial_ports()
     ]
 
 
-def find_cameras() -> tuple[list[Found], list[str]]:
+def find_cameras() -> tuple[list[FoundDevice], list[str]]:
     """GenICam cameras, and a note when they cannot be looked for."""
     try:
         cameras = list(aravis.find_cameras())
     except roles.LinkError as error:
         return [], [str(error)]
     return [
-        Found("camera", f"{camera.vendor} {camera.model}", f'camera = "{camera.camera_id}"') for camera in cameras
+        FoundDevice("camera", f"{camera.vendor} {camera.model}", f'camera = "{camera.camera_id}"')
+        for camera in cameras
     ], []
 
 
-def find_displays(root: Path = _DRM) -> list[Found]:
+def find_displays(root: Path = _DRM) -> list[FoundDevice]:
     """Connected displays, as the kernel knows them: works without a running desktop."""
     found = []
     for status in sorted(root.glob("card*-*/status")):
@@ -84,7 +85,7 @@ def find_displays(root: Path = _DRM) -> list[Found]:
         size = modes[0] if modes else "size unknown"
         width, _, height = size.partition("x")
         paste = f"width_px = {width}\nheight_px = {height}" if width.isdigit() and height.isdigit() else ""
-        found.append(Found("display", f"{connector}, {size}", paste))
+        found.append(FoundDevice("display", f"{connector}, {size}", paste))
     return found
 
 

@@ -21,7 +21,7 @@ _BACK_OFF_S = 0.2  # a bus that the device before could not open is left alone f
 
 
 @dataclass(frozen=True, slots=True)
-class Probe:
+class DeviceProbe:
     """What one device said.
 
     Attributes
@@ -55,19 +55,19 @@ class Probe:
     facts: roles.BenchIdentity | None = None
 
 
-async def probe_board(board: PumpBoard, name: str) -> Probe:
+async def probe_board(board: PumpBoard, name: str) -> DeviceProbe:
     """Look at the board, whoever holds it: nothing is written, so its claim and its watchdog stay as they are."""
     try:
         identity = await board.identify()
         reading, p50_ms, p99_ms = await _timed(board.read)
     except roles.LinkError as error:
-        return Probe("board", name, problem=str(error))
+        return DeviceProbe("board", name, problem=str(error))
     finally:
         await board.close()
     who = f"{identity.kind} {identity.firmware}, map {identity.map_version}"
     said, problem = _board_reading(reading), _board_problem(reading)
     notes = NO_CLAIM if identity.map_version == 1 else ""
-    return Probe("board", name, who, said, p50_ms, p99_ms, problem, notes, identity)
+    return DeviceProbe("board", name, who, said, p50_ms, p99_ms, problem, notes, identity)
 
 
 def _board_reading(reading: roles.BenchReading) -> str:
@@ -85,7 +85,7 @@ def _board_problem(reading: roles.BenchReading) -> str:
     return "" if math.isfinite(reading.gauge_pressure_pa) else "no gauge pressure; check the sensor"
 
 
-async def probe_roles(devices: role_bench.RoleDevices) -> list[Probe]:
+async def probe_roles(devices: role_bench.RoleDevices) -> list[DeviceProbe]:
     """Open, read and close each device, one after the other; a failed one does not hide the next."""
     reads: dict[str, tuple[Callable[[Any], Callable[[], Awaitable[Any]]], str]] = {
         "displacement": (lambda device: device.displacement, "um"),
@@ -104,14 +104,14 @@ async def probe_roles(devices: role_bench.RoleDevices) -> list[Probe]:
     return probes
 
 
-async def _probe(role: str, device: roles.Device, read: Callable[[], Awaitable[Any]], unit: str) -> Probe:
+async def _probe(role: str, device: roles.Device, read: Callable[[], Awaitable[Any]], unit: str) -> DeviceProbe:
     where = device.describe()
     name, notes = where.get("port", ""), where.get("watchdog", "")
     try:
         found = await device.open()
         value, p50_ms, p99_ms = await _timed(read)
     except roles.LinkError as error:
-        return Probe(role, name, problem=str(error), notes=notes)
+        return DeviceProbe(role, name, problem=str(error), notes=notes)
     finally:
         await device.close()
     identity = " ".join(part for part in (found.kind, found.serial, found.firmware, found.detail) if part)
@@ -126,7 +126,7 @@ async def _probe(role: str, device: roles.Device, read: Callable[[], Awaitable[A
         facts = replace(facts, displacement_range_um=found.shows)
     elif role == "gauge_pressure":
         facts = replace(facts, gauge_range_pa=found.shows)
-    return Probe(role, name, identity, f"{value:.6g} {unit}", p50_ms, p99_ms, problem, notes, facts)
+    return DeviceProbe(role, name, identity, f"{value:.6g} {unit}", p50_ms, p99_ms, problem, notes, facts)
 
 
 async def _timed(read: Callable[[], Awaitable[Any]]) -> tuple[Any, float, float]:
@@ -147,7 +147,7 @@ async def _timed(read: Callable[[], Awaitable[Any]]) -> tuple[Any, float, float]
 _GRABS = 10
 
 
-def probe_optics(config: Config) -> list[Probe]:
+def probe_optics(config: Config) -> list[DeviceProbe]:
     """One probe for camera and screen together, since each is tested with the other; none if none is configured.
 
     For the main thread only (the screen).
@@ -158,18 +158,18 @@ def probe_optics(config: Config) -> list[Probe]:
     try:
         bench = optical_bench.configured_bench(config, clock)
     except roles.LinkError as error:
-        return [Probe("camera", config.devices.camera.driver, problem=str(error))]
+        return [DeviceProbe("camera", config.devices.camera.driver, problem=str(error))]
     name = _where(bench)
     try:
         found = optical_bench.open_bench(bench, config, clock)
         p50_ms, p99_ms, median_adu = _grab(bench)
     except roles.LinkError as error:
-        return [Probe("camera", name, problem=str(error))]
+        return [DeviceProbe("camera", name, problem=str(error))]
     finally:
         bench.close()
     reading = f"{median_adu:.0f} counts"
     problems, notes = "; ".join(found.problems), "; ".join(found.measured)
-    return [Probe("camera", name, found.camera, reading, p50_ms, p99_ms, problems, notes)]
+    return [DeviceProbe("camera", name, found.camera, reading, p50_ms, p99_ms, problems, notes)]
 
 
 def _where(bench: optical_bench.OpticalBench) -> str:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from membrane_ctrl.config.optics import CameraTable, FolderCamera, ScreenTable
+from membrane_ctrl.config.optics import CameraTable, FolderCameraConfig, ScreenTable
 from membrane_ctrl.config.section import Section
 
 UnitId = Annotated[int, Field(ge=1, le=247)]
@@ -19,7 +19,7 @@ Port = Annotated[str, Field(min_length=1)]  # /dev/ttyUSB0, or usb:VID:PID[:SERI
 ModbusUrl = Annotated[str, Field(pattern=r"^(tcp|rtu)://")]  # tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200
 
 
-class Optoncdt1420(Section):
+class Optoncdt1420Config(Section):
     """Micro-Epsilon optoNCDT 1420 laser."""
 
     driver: Literal["optoncdt1420"]
@@ -33,7 +33,7 @@ class Optoncdt1420(Section):
     timeout_s: Timeout = 0.2
 
 
-class KeyenceDlRs1a(Section):
+class KeyenceDlRs1aConfig(Section):
     """Keyence DL-RS1A with an IL, IG or GT2 head."""
 
     driver: Literal["keyence_dl_rs1a"]
@@ -47,7 +47,7 @@ class KeyenceDlRs1a(Section):
     timeout_s: Timeout = 0.1
 
 
-class VaisalaPtb330(Section):
+class VaisalaPtb330Config(Section):
     """Vaisala PTB330 barometer."""
 
     driver: Literal["vaisala_ptb330"]
@@ -58,7 +58,7 @@ class VaisalaPtb330(Section):
     timeout_s: Timeout = 0.3
 
 
-class Ventus(Section):
+class VentusConfig(Section):
     """Lee / TTP Ventus disc pump."""
 
     driver: Literal["ventus"]
@@ -67,7 +67,7 @@ class Ventus(Section):
     timeout_s: Timeout = 0.1
 
 
-class BronkhorstModbus(Section):
+class BronkhorstModbusConfig(Section):
     """Bronkhorst EL-FLOW (as pump) or EL-PRESS (as gauge pressure) with a Modbus interface."""
 
     driver: Literal["bronkhorst_modbus"]
@@ -77,7 +77,7 @@ class BronkhorstModbus(Section):
     timeout_s: Timeout = 0.2
 
 
-class BronkhorstPropar(Section):
+class BronkhorstProparConfig(Section):
     """Bronkhorst EL-FLOW (as pump) or EL-PRESS (as gauge pressure) on RS-232, ProPar protocol."""
 
     driver: Literal["bronkhorst_propar"]
@@ -88,7 +88,7 @@ class BronkhorstPropar(Section):
     timeout_s: Timeout = 0.2
 
 
-class ModbusMap(Section):
+class ModbusMapConfig(Section):
     """Any device with Modbus registers; one register of it is the role's value.
 
     `raw` and `value` are two points of the straight line between the register and the role's unit.
@@ -110,7 +110,7 @@ class ModbusMap(Section):
     identity_equals: Word | None = None
 
     @model_validator(mode="after")
-    def _line(self) -> ModbusMap:
+    def _line(self) -> ModbusMapConfig:
         for name, pair in (("raw", self.raw), ("value", self.value)):
             if pair is not None and pair[0] == pair[1]:
                 raise ValueError(f"{name} needs two different numbers")
@@ -120,11 +120,19 @@ class ModbusMap(Section):
 
 
 Driver = Field(discriminator="driver")
-DisplacementDriver = Annotated[Optoncdt1420 | KeyenceDlRs1a | ModbusMap, Driver]
-PumpDriver = Annotated[BronkhorstModbus | BronkhorstPropar | Ventus | ModbusMap, Driver]
-PressureDriver = Annotated[BronkhorstModbus | BronkhorstPropar | ModbusMap, Driver]
-BarometerDriver = Annotated[VaisalaPtb330 | ModbusMap, Driver]
-AnyDriver = Optoncdt1420 | KeyenceDlRs1a | VaisalaPtb330 | Ventus | BronkhorstModbus | BronkhorstPropar | ModbusMap
+DisplacementDriver = Annotated[Optoncdt1420Config | KeyenceDlRs1aConfig | ModbusMapConfig, Driver]
+PumpDriver = Annotated[BronkhorstModbusConfig | BronkhorstProparConfig | VentusConfig | ModbusMapConfig, Driver]
+PressureDriver = Annotated[BronkhorstModbusConfig | BronkhorstProparConfig | ModbusMapConfig, Driver]
+BarometerDriver = Annotated[VaisalaPtb330Config | ModbusMapConfig, Driver]
+AnyDriver = (
+    Optoncdt1420Config
+    | KeyenceDlRs1aConfig
+    | VaisalaPtb330Config
+    | VentusConfig
+    | BronkhorstModbusConfig
+    | BronkhorstProparConfig
+    | ModbusMapConfig
+)
 
 ROLES = ("displacement", "pump", "gauge_pressure", "vent", "barometer", "thermometer")
 # without these nothing may move gas: the loop's two ends, and the limit that keeps the film whole
@@ -141,9 +149,9 @@ class DevicesConfig(Section):
     displacement: DisplacementDriver | None = None
     pump: PumpDriver | None = None
     gauge_pressure: PressureDriver | None = None
-    vent: ModbusMap | None = None
+    vent: ModbusMapConfig | None = None
     barometer: BarometerDriver | None = None
-    thermometer: ModbusMap | None = None
+    thermometer: ModbusMapConfig | None = None
     camera: CameraTable | None = None
     screen: ScreenTable | None = None
 
@@ -159,7 +167,7 @@ class DevicesConfig(Section):
             raise ValueError(f"no device fills {missing[0]}; needed are {', '.join(NEEDED)}")
         for role in ("pump", "vent"):
             section = getattr(self, role)
-            if isinstance(section, ModbusMap) and not _is_fraction(section.limits or section.value):
+            if isinstance(section, ModbusMapConfig) and not _is_fraction(section.limits or section.value):
                 raise ValueError(f"{role}: value and limits of an actuator are fractions within 0..1")
         return self
 
@@ -180,7 +188,7 @@ class DevicesConfig(Section):
     def _camera_sees_a_screen(self) -> DevicesConfig:
         if self.camera is None and self.screen is not None:
             raise ValueError("[devices.screen] needs a [devices.camera] that looks at it")
-        if self.camera is not None and (self.screen is None) != isinstance(self.camera, FolderCamera):
+        if self.camera is not None and (self.screen is None) != isinstance(self.camera, FolderCameraConfig):
             raise ValueError("a camera needs a [devices.screen]; a folder of frames needs none")
         return self
 
@@ -196,7 +204,7 @@ class DevicesConfig(Section):
 
 def address_of(section: AnyDriver) -> str:
     """Where the device is: its port or its Modbus address."""
-    if isinstance(section, (BronkhorstModbus, ModbusMap)):
+    if isinstance(section, (BronkhorstModbusConfig, ModbusMapConfig)):
         return f"{section.link} unit {section.unit_id}"
     return section.port
 

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from membrane_ctrl.config.section import Section
 
 
-class AravisCamera(Section):
+class AravisCameraConfig(Section):
     """A GenICam camera (USB3 Vision or GigE Vision)."""
 
     driver: Literal["aravis"]
@@ -29,7 +29,7 @@ class AravisCamera(Section):
         return int(self.pixel_format[-2:]) if self.pixel_format[-2:].isdigit() else 8
 
 
-class UvcCamera(Section):
+class UvcCameraConfig(Section):
     """A USB camera without GenICam."""
 
     driver: Literal["uvc"]
@@ -39,14 +39,14 @@ class UvcCamera(Section):
     bits: Literal[8] = 8
 
 
-class FolderCamera(Section):
+class FolderCameraConfig(Section):
     """Pictures from a folder instead of a camera and a screen."""
 
     driver: Literal["folder"]
     folder: Annotated[str, Field(min_length=1)]
 
 
-class PygameScreen(Section):
+class PygameScreenConfig(Section):
     """The display with the fringes."""
 
     driver: Literal["pygame"] = "pygame"
@@ -60,8 +60,8 @@ class PygameScreen(Section):
     self_test: bool = True  # exposure and checkerboard at the start
 
 
-CameraTable = Annotated[AravisCamera | UvcCamera | FolderCamera, Field(discriminator="driver")]
-ScreenTable = PygameScreen
+CameraTable = Annotated[AravisCameraConfig | UvcCameraConfig | FolderCameraConfig, Field(discriminator="driver")]
+ScreenTable = PygameScreenConfig
 
 
 # The screen in the configuration: its pose, and how its face stands off a plane.

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from membrane_ctrl.config.devices import DevicesConfig
-from membrane_ctrl.config.optics import AravisCamera, ScreenPoseConfig, UvcCamera
+from membrane_ctrl.config.optics import AravisCameraConfig, ScreenPoseConfig, UvcCameraConfig
 from membrane_ctrl.config.port import AlarmsConfig, PortConfig
 from membrane_ctrl.config.section import Section
 
@@ -291,7 +291,7 @@ class Config(Section):
                 f"loop.setpoint_um = {self.loop.setpoint_um:g} is outside the limits "
                 f"({limits.displacement_min_um:g} .. {limits.displacement_max_um:g} um)"
             )
-        if self.devices is not None and isinstance(self.devices.camera, AravisCamera | UvcCamera):
+        if self.devices is not None and isinstance(self.devices.camera, AravisCameraConfig | UvcCameraConfig):
             bits = self.devices.camera.bits
             if bits != self.optics.camera.bits:
                 raise ValueError(f"optics.camera.bits = {self.optics.camera.bits}, but devices.camera gives {bits}")

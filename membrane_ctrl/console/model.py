@@ -72,7 +72,7 @@ class ShapeView:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class ConsoleView:
     """Everything on the console, still as numbers.
 
     Attributes
@@ -196,13 +196,13 @@ class ConsoleModel:
         elif math.isnan(self._first_sag_um) and self._row is not None and self._row.state == states.State.HOLD:
             self._first_sag_um = estimate.sag_um
 
-    def view(self, now_s: float) -> View:
+    def view(self, now_s: float) -> ConsoleView:
         """What to show at a moment of the run's clock."""
         row = self._row
         errors = self._error.values()
         band_um = self._config.limits.band_um
         age_s = now_s - row.mono_s if row else 0.0
-        return View(
+        return ConsoleView(
             row=row,
             why=self._why(),
             silent_s=age_s if age_s > SILENT_S else 0.0,

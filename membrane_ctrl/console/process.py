@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.live import Live
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.model import ConsoleModel, Event, View, text
+from membrane_ctrl.console.model import ConsoleModel, ConsoleView, Event, text
 from membrane_ctrl.console.view import console_panel
 from membrane_ctrl.console.why import duration, number, percent
 from membrane_ctrl.model.clock import RunClock
@@ -39,7 +39,7 @@ _AT_ONCE = frozenset(
 )
 
 
-def line(view: View) -> str:
+def line(view: ConsoleView) -> str:
     """The second in one line."""
     row = view.row
     if view.silent_s or row is None:
@@ -77,7 +77,7 @@ def event_line(event: Event) -> str:
     return f"{number(mono_s, 1):>9} s  {str(event.get('kind', '?')).upper()} {words}{remedy}".rstrip()
 
 
-def _shape_words(view: View) -> str:
+def _shape_words(view: ConsoleView) -> str:
     shape = view.shape
     if shape.estimate is None:
         return shape.note or shape.state.name.lower()

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.model import ShapeView, View
+from membrane_ctrl.console.model import ConsoleView, ShapeView
 from membrane_ctrl.console.why import NONE, duration, number, percent
 from membrane_ctrl.model import states, telemetry
 
@@ -76,12 +76,12 @@ _BAR_WIDTH = 10
 _CALM = 0.25  # of the band: a finer scale than this would make noise look like trouble
 
 
-def console_panel(view: View, config: Config, run: str) -> Panel:
+def console_panel(view: ConsoleView, config: Config, run: str) -> Panel:
     """the whole console.
 
     Parameters
     ----------
-    view : View
+    view : ConsoleView
         What to show.
     config : Config
         For band and limits.
@@ -101,7 +101,7 @@ def console_panel(view: View, config: Config, run: str) -> Panel:
     )
 
 
-def _headline(view: View) -> Text:
+def _headline(view: ConsoleView) -> Text:
     """Faults first, else why the pump is where it is."""
     if view.silent_s:
         return Text(f"the control loop has been silent for {view.silent_s:.1f} s", style="bold red")
@@ -109,7 +109,7 @@ def _headline(view: View) -> Text:
     return Text(view.why, style=style, overflow="fold")
 
 
-def _figures(view: View, config: Config) -> Table:
+def _figures(view: ConsoleView, config: Config) -> Table:
     table = Table.grid(padding=(0, 1))
     table.add_column(style="dim", justify="right", min_width=8, no_wrap=True)
     table.add_column(ratio=1)
@@ -136,7 +136,7 @@ def _figures(view: View, config: Config) -> Table:
     return table
 
 
-def _error(view: View, config: Config) -> Text:
+def _error(view: ConsoleView, config: Config) -> Text:
     row = view.row
     assert row is not None
     inside = abs(row.error_um) <= config.limits.band_um
@@ -148,7 +148,7 @@ def _error(view: View, config: Config) -> Text:
     return text
 
 
-def _trend(view: View, config: Config) -> list[tuple[str, Text]]:
+def _trend(view: ConsoleView, config: Config) -> list[tuple[str, Text]]:
     full_um = full_scale(view.trend_um, config.limits.band_um * _CALM)
     upper, lower = signed_bars(view.trend_um, full_um, config.limits.band_um)
     return [(f"+{full_um:g} um", upper), (f"-{full_um:g} um", lower)]
@@ -178,7 +178,7 @@ def _flow(row: telemetry.TelemetryRow) -> Text:
     return Text("  ".join(f"{name} {number(value, 2, sign=True)}" for name, value in parts) + " um/s")
 
 
-def _gas(view: View, row: telemetry.TelemetryRow) -> Text:
+def _gas(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
     text = Text(f"leak {number(row.leak_um_per_s, 2, 'um/s')}")
     if view.too_tight:
         text.append(" too tight: open a bleed", style="bold yellow")
@@ -207,14 +207,14 @@ def _shape(shape: ShapeView) -> list[tuple[str, RenderableType]]:
     return [("shape", state), ("cycle", cycle)]
 
 
-def _lateness(view: View, row: telemetry.TelemetryRow) -> Text:
+def _lateness(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
     text = Text(f"{number(row.lateness_ms, 1, 'ms')}, worst of the minute {number(view.lateness_max_ms, 1, 'ms')}")
     missed = int(row.missed_ticks)
     text.append(f", {missed} of {int(row.tick) + missed} ticks missed", style="yellow" if missed else "default")
     return text
 
 
-def _faults(view: View) -> Text:
+def _faults(view: ConsoleView) -> Text:
     if view.fault:
         text = Text(view.fault, style="bold red")
         return text.append(f"; {view.remedy}", style="default") if view.remedy else text

@@ -20,7 +20,7 @@ from membrane_ctrl.config.toml_file import parse
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
 from membrane_ctrl.control_port.protocol import KINDS, VERSION, Request, Wire
-from membrane_ctrl.control_port.session import FREE, Commander, Peer, Session, may_not
+from membrane_ctrl.control_port.session import FREE, Commander, Peer, PortSession, may_not
 from membrane_ctrl.control_port.status import Picture, metrics_text, serve_metrics
 from membrane_ctrl.control_port.tls import Listeners
 from membrane_ctrl.controller import commands, tick
@@ -79,7 +79,7 @@ class Port:
         self._picture = Picture()
         self._numbers = itertools.count(1)
         self._waiting: dict[int, asyncio.Future[str]] = {}
-        self._sessions: list[Session] = []
+        self._sessions: list[PortSession] = []
         self._over = False
 
     def heard(self, outputs: tick.TickOutputs) -> None:
@@ -165,7 +165,7 @@ class Port:
 
     async def _serve(self, wire: Wire, peer: Peer, lasts_s: float | None = None) -> None:
         self._make_room(peer)
-        session = Session(wire, peer, self.status)
+        session = PortSession(wire, peer, self.status)
         self._sessions.append(session)
         loop = asyncio.get_running_loop()
         expiry = None if lasts_s is None else loop.call_later(lasts_s, self._turn_out, session, _EXPIRED)
@@ -183,7 +183,7 @@ class Port:
             if expiry is not None:
                 expiry.cancel()
 
-    def _turn_out(self, session: Session, reason: str) -> None:
+    def _turn_out(self, session: PortSession, reason: str) -> None:
         self._refusals.record(session.peer.who, "", reason)
         session.drop(reason)
 
@@ -193,7 +193,7 @@ class Port:
         if crowd:
             self._turn_out(min(crowd, key=lambda session: session.heard_s), "too many connections: silent longest")
 
-    async def _answer(self, session: Session, request: Request) -> dict[str, Any]:
+    async def _answer(self, session: PortSession, request: Request) -> dict[str, Any]:
         """Do what is asked, or say why not. What the controller refuses, it records itself."""
         peer = session.peer
         refusal = may_not(peer, request.do) or self._claim_command(peer, request)
@@ -225,7 +225,7 @@ class Port:
                     )
         return refusal
 
-    def _run_errand(self, session: Session, request: Request) -> dict[str, Any]:
+    def _run_errand(self, session: PortSession, request: Request) -> dict[str, Any]:
         who = session.peer.who
         match request.do:
             case "watch":

@@ -74,11 +74,11 @@ _PAUSE_S = 0.1
 # A program that has sent so much nonsense in a row is not going to stop
 _NONSENSE_MOST = 10
 
-Answer = Callable[["Session", Request], Awaitable[dict[str, Any]]]
+Answer = Callable[["PortSession", Request], Awaitable[dict[str, Any]]]
 Refused = Callable[[str, str, str], None]
 
 
-class Session:
+class PortSession:
     """A connection whose peer is known.
 
     Parameters

@@ -93,7 +93,7 @@ class Controller:
         error_um = last.error_um if self.state in safety.MOVING else math.nan
         left_um = scene.setpoint_um + scene.trim_um - last.setpoint_um
         scene.observer.look(inputs)
-        held = sensor_consistency.Held(
+        held = sensor_consistency.HoldStatus(
             laser_um=scene.observer.displacement_um,
             gauge_pressure_pa=scene.observer.gauge_pressure_pa,
             setpoint_um=scene.setpoint_um,

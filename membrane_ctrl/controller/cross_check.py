@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from firmware_iface.roles import BenchIdentity
-from membrane_ctrl.config.devices import DevicesConfig, VaisalaPtb330
+from membrane_ctrl.config.devices import DevicesConfig, VaisalaPtb330Config
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller import cross_check_plant, pump_obeys, safety
 from membrane_ctrl.model.errors import FindingsError
@@ -29,7 +29,7 @@ _UNKNOWN = BenchIdentity("", 0, "", math.nan)
 _TWIN_BOARD = DevicesConfig(board="tcp://twin")  # what `--twin` makes when no devices are named
 
 
-def cross_check(config: Config, board: BenchIdentity | None = None) -> tuple[cross_check_plant.Finding, ...]:
+def cross_check(config: Config, board: BenchIdentity | None = None) -> tuple[cross_check_plant.ConfigFinding, ...]:
     """Judge a configuration.
 
     Parameters
@@ -43,7 +43,7 @@ def cross_check(config: Config, board: BenchIdentity | None = None) -> tuple[cro
     tuple of Finding
         Errors first; empty for a sound configuration.
     """
-    say = cross_check_plant.Findings(config)
+    say = cross_check_plant.ConfigFindings(config)
     _finite(config, say)
     if not say.found:  # the others compute
         for judge in _RULES:
@@ -55,7 +55,7 @@ def cross_check(config: Config, board: BenchIdentity | None = None) -> tuple[cro
 
 def require_sound(
     config: Config, source: str, board: BenchIdentity | None = None
-) -> tuple[cross_check_plant.Finding, ...]:
+) -> tuple[cross_check_plant.ConfigFinding, ...]:
     """Refuse a configuration with errors; return the warnings of one without.
 
     Raises
@@ -69,7 +69,7 @@ def require_sound(
     return findings
 
 
-def _finite(config: Config, say: cross_check_plant.Findings) -> None:
+def _finite(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     """Not a number is refused where a file is read; a program may have put one in since."""
     for field, value in _numbers(config, ""):
         say.error(not math.isfinite(value), field, "is no number", "give a finite one")
@@ -88,7 +88,7 @@ def _numbers(value: Any, field: str) -> Iterator[tuple[str, float]]:
         yield from _numbers(part, f"{field}.{name}".lstrip("."))
 
 
-def _resume(config: Config, say: cross_check_plant.Findings) -> None:
+def _resume(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     resume = config.resume
     known = [rule.name for rule in safety.TABLE]
     may = sorted(rule.name for rule in safety.TABLE if rule.may_resume)
@@ -117,7 +117,7 @@ def _resume(config: Config, say: cross_check_plant.Findings) -> None:
         say.warn(waits, "resume.wait_s", why, "keep it below states.pump_off_max_s")
 
 
-def _watchdog(config: Config, say: cross_check_plant.Findings) -> None:
+def _watchdog(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     devices, limits = config.devices or _TWIN_BOARD, config.limits
     tick_s, watchdog_s = 1.0 / config.loop.rate_hz, devices.watchdog_s
     if config.devices is not None:
@@ -156,7 +156,7 @@ def _watchdog(config: Config, say: cross_check_plant.Findings) -> None:
     say.warn(limits.lateness_max_ms < 5.0, "limits.lateness_max_ms", "a healthy machine is that late", "give 100 ms")
 
 
-def _stale(config: Config, say: cross_check_plant.Findings) -> None:
+def _stale(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     limits, rate_hz = config.limits, config.loop.rate_hz
     tick_s = 1.0 / rate_hz
     say.error(
@@ -188,14 +188,14 @@ def _slowest_answers(devices: DevicesConfig) -> Iterator[tuple[str, float]]:
         return
     lines: dict[str, list[tuple[str, float]]] = defaultdict(list)
     for role, section in devices.roles().items():
-        if not isinstance(section, VaisalaPtb330):  # read in the background
+        if not isinstance(section, VaisalaPtb330Config):  # read in the background
             line = str(getattr(section, "link", None) or getattr(section, "port", ""))
             lines[line].append((f"devices.{role}.timeout_s", section.timeout_s))
     slowest = max(lines.values(), key=lambda line: sum(timeout_s for _, timeout_s in line))
     yield slowest[0][0], sum(timeout_s for _, timeout_s in slowest)
 
 
-def _states(config: Config, say: cross_check_plant.Findings) -> None:
+def _states(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     states, limits = config.states, config.limits
     blind = "the pump gives a flow for so long that nobody corrects"
     for name, most_s in (("hold_flow_max_s", _BLIND_S), ("ramp_down_s", _BLIND_S), ("pause_max_s", _PAUSE_S)):
@@ -244,7 +244,7 @@ def _states(config: Config, say: cross_check_plant.Findings) -> None:
     )
 
 
-def _limits(config: Config, say: cross_check_plant.Findings) -> None:
+def _limits(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     limits, setpoint_um = config.limits, config.loop.setpoint_um
     trim_um = config.shape.trim_max_um if config.shape.enabled else 0.0
     above_um, below_um = limits.displacement_max_um - setpoint_um, setpoint_um - limits.displacement_min_um
@@ -282,7 +282,7 @@ def _limits(config: Config, say: cross_check_plant.Findings) -> None:
     )
 
 
-def _board(config: Config, board: BenchIdentity, say: cross_check_plant.Findings) -> None:
+def _board(config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFindings) -> None:
     """The limits that the board keeps by itself."""
     say.error(
         config.limits.gauge_pressure_max_pa > board.gauge_pressure_limit_pa,

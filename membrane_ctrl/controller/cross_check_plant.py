@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from firmware_iface.roles import BenchIdentity
-from membrane_ctrl.config.devices import ModbusMap, Optoncdt1420
+from membrane_ctrl.config.devices import ModbusMapConfig, Optoncdt1420Config
 from membrane_ctrl.config.schema import Config, GeometryConfig
 from membrane_ctrl.control import gas, inner_loop
 from membrane_ctrl.control.film import CONTRADICTED_MOST, LEAK_LEAST_UM_PER_S, TAUT_PA
@@ -26,7 +26,7 @@ _APART_UM, _CREEP_UM = 7.0, 31.0
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class ConfigFinding:
     """One setting that is wrong: `error` refuses, `warning` only says."""
 
     severity: Severity
@@ -41,22 +41,22 @@ class Finding:
         return f"{source}: {mark}{self.field} = {self.value}: {self.why}; {self.remedy}"
 
 
-class Findings:
+class ConfigFindings:
     """Collects findings; the value is looked up by the field's name, so that a name cannot be wrong."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self.found: list[Finding] = []
+        self.found: list[ConfigFinding] = []
 
     def error(self, wrong: bool, field: str, why: str, remedy: str) -> None:
         """Note that the field must not be so, if it is wrong."""
         if wrong:
-            self.found.append(Finding("error", field, self._value(field), why, remedy))
+            self.found.append(ConfigFinding("error", field, self._value(field), why, remedy))
 
     def warn(self, wrong: bool, field: str, why: str, remedy: str) -> None:
         """Note that the field should not be so."""
         if wrong:
-            self.found.append(Finding("warning", field, self._value(field), why, remedy))
+            self.found.append(ConfigFinding("warning", field, self._value(field), why, remedy))
 
     def _value(self, field: str) -> str:
         value: Any = self._config
@@ -69,7 +69,7 @@ def flow_um_per_s(config: Config) -> float:
     return min(config.loop.flow_max_um_per_s, config.pump.flow_full_um_per_s)
 
 
-def judge_pump(config: Config, say: Findings) -> None:
+def judge_pump(config: Config, say: ConfigFindings) -> None:
     pump, loop = config.pump, config.loop
     say.error(
         not pump.dead_fraction <= pump.stall_fraction <= pump.start_fraction,
@@ -102,7 +102,7 @@ def judge_pump(config: Config, say: Findings) -> None:
         return
     for role in ("pump", "vent"):
         section = getattr(config.devices, role)
-        if isinstance(section, ModbusMap):
+        if isinstance(section, ModbusMapConfig):
             name = "limits" if section.limits is not None else "value"
             low, high = min(section.limits or section.value), max(section.limits or section.value)
             never = "0 is not in it, so it can never be shut" if role == "pump" else "0 is not in it"
@@ -110,7 +110,7 @@ def judge_pump(config: Config, say: Findings) -> None:
             say.error(high < 1.0, f"devices.{role}.{name}", "a command of 1 would be refused", "end at 1")
 
 
-def judge_loop(config: Config, say: Findings) -> None:
+def judge_loop(config: Config, say: ConfigFindings) -> None:
     loop = config.loop
     full_um_per_s = flow_um_per_s(config)
     sensitivity = inner_loop.peak_sensitivity(loop)
@@ -153,7 +153,7 @@ def judge_loop(config: Config, say: Findings) -> None:
     )
 
 
-def judge_shape(config: Config, say: Findings) -> None:
+def judge_shape(config: Config, say: ConfigFindings) -> None:
     shape = config.shape
     if not shape.enabled:
         return
@@ -189,13 +189,13 @@ def judge_shape(config: Config, say: Findings) -> None:
     )
 
 
-def judge_optics(config: Config, say: Findings) -> None:
+def judge_optics(config: Config, say: ConfigFindings) -> None:
     _geometry("optics.geometry", config.optics.geometry, config.optics.mirror.radius_mm, say)
     if config.twin.geometry is not None:
         _geometry("twin.geometry", config.twin.geometry, config.optics.mirror.radius_mm, say)
 
 
-def _geometry(field: str, geometry: GeometryConfig, radius_mm: float, say: Findings) -> None:
+def _geometry(field: str, geometry: GeometryConfig, radius_mm: float, say: ConfigFindings) -> None:
     if geometry.alpha_deg is not None:
         grazing = min(geometry.alpha_deg, 180.0 - geometry.alpha_deg) < _GRAZING_DEG
         as_degrees = math.degrees(geometry.alpha_deg)
@@ -215,7 +215,7 @@ def _geometry(field: str, geometry: GeometryConfig, radius_mm: float, say: Findi
         )
 
 
-def judge_alarms(config: Config, say: Findings) -> None:
+def judge_alarms(config: Config, say: ConfigFindings) -> None:
     alarms, tick_s = config.alarms, 1.0 / config.loop.rate_hz
     say.error(alarms.silent_s < 2.0 * tick_s, "alarms.silent_s", "a tick takes as long", f"give {4.0 * tick_s:g} s")
     most = {
@@ -236,7 +236,7 @@ def judge_alarms(config: Config, say: Findings) -> None:
         say.error(port.metrics_port == port.tls.port, "port.metrics_port", why, "give another")
 
 
-def judge_gauge(config: Config, say: Findings) -> None:
+def judge_gauge(config: Config, say: ConfigFindings) -> None:
     """The gauge as a guard, and as a check of the laser."""
     limits, pressure_pa = config.limits, config.optics.mirror.pressure_pa
     above_um = limits.displacement_max_um - config.loop.setpoint_um
@@ -272,7 +272,7 @@ def judge_gauge(config: Config, say: Findings) -> None:
         say.error(getattr(limits, name) < least_um, f"limits.{name}", why, f"give at least {least_um:g} um")
 
 
-def judge_film(config: Config, say: Findings) -> None:
+def judge_film(config: Config, say: ConfigFindings) -> None:
     """What is said of the film, which gas, laser and gauge are judged by."""
     limits, mirror = config.limits, config.optics.mirror
     most = 1.0 + flow_um_per_s(config) / LEAK_LEAST_UM_PER_S
@@ -294,18 +294,18 @@ def judge_film(config: Config, say: Findings) -> None:
     )
 
 
-def judge_ranges(config: Config, board: BenchIdentity, say: Findings) -> None:
+def judge_ranges(config: Config, board: BenchIdentity, say: ConfigFindings) -> None:
     """A limit that its sensor cannot show never trips."""
     limits, devices = config.limits, config.devices
     laser = devices.displacement if devices is not None else None
     gauge = devices.gauge_pressure if devices is not None else None
     stated_um = stated_pa = (-math.inf, math.inf)
-    if isinstance(laser, ModbusMap):
+    if isinstance(laser, ModbusMapConfig):
         stated_um = laser.limits or laser.value
-    elif isinstance(laser, Optoncdt1420) and laser.range_mm is not None:
+    elif isinstance(laser, Optoncdt1420Config) and laser.range_mm is not None:
         zero_mm = laser.range_mm / 2 if laser.zero_mm is None else laser.zero_mm
         stated_um = (-1e3 * laser.direction * zero_mm, 1e3 * laser.direction * (laser.range_mm - zero_mm))
-    if isinstance(gauge, ModbusMap):
+    if isinstance(gauge, ModbusMapConfig):
         stated_pa = gauge.limits or gauge.value
     low_um = max(min(stated_um), board.displacement_range_um[0])
     high_um = min(max(stated_um), board.displacement_range_um[1])

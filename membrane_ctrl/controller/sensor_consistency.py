@@ -16,7 +16,7 @@ _REPEATS = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class HoldStatus:
     """How the mirror is held.
 
     Attributes
@@ -75,7 +75,7 @@ class SensorConsistency:
         self._weather_told = False
         self.laser_lies = self.camera_lies = self.laser_gauge_apart = self.gas_excess = ""
 
-    def ask(self, inputs: tick.TickInputs, state: State, dt_s: float, held: Held) -> list[Event]:
+    def ask(self, inputs: tick.TickInputs, state: State, dt_s: float, held: HoldStatus) -> list[Event]:
         """One tick.
 
         Parameters
@@ -84,7 +84,7 @@ class SensorConsistency:
         state : State
             Only a held mirror is judged.
         dt_s : float
-        held : Held
+        held : HoldStatus
 
         Returns
         -------

@@ -11,7 +11,7 @@ from typing import Literal
 
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control import filters, inner_loop
-from membrane_ctrl.control.experiments.machine import Finished, Measurement
+from membrane_ctrl.control.experiments.machine import BenchSample, Finished
 from membrane_ctrl.control.experiments.trial import Trial
 from membrane_ctrl.controller import pump_obeys, safe_levels
 from membrane_ctrl.controller.observer import Observer
@@ -200,7 +200,7 @@ def tune(scene: Scene) -> State:
     if scene.way_down is not None:
         return _go_down(scene)
     given = _given(scene, scene.setpoint_um)
-    measurement = Measurement(given.displacement_um, given.ambient_pressure_pa, given.air_temperature_c)
+    measurement = BenchSample(given.displacement_um, given.ambient_pressure_pa, given.air_temperature_c)
     wanted: float | Finished
     if scene.hold_wanted:
         wanted = Finished(False, f"ended by {scene.asked_by}")

@@ -52,12 +52,12 @@ def role_devices(devices: DevicesConfig) -> role_bench.RoleDevices:
 
 def _driver(role: str, section: AnyDriver, links: modbus_links.ModbusLinks) -> Any:
     match section:
-        case table.ModbusMap():
+        case table.ModbusMapConfig():
             return _modbus_value(role, section, links)
-        case table.BronkhorstModbus():
+        case table.BronkhorstModbusConfig():
             link = links.link(section.link, section.unit_id, section.timeout_s)
             return _bronkhorst(role, bronkhorst.ModbusParameters(link), section.serial)
-        case table.BronkhorstPropar():
+        case table.BronkhorstProparConfig():
             port = serial_port.SerialPort(section.port, serial_port.SerialSettings(section.baud))
             return _bronkhorst(
                 role, bronkhorst_propar.ProparParameters(port, section.node, section.timeout_s), section.serial
@@ -72,13 +72,15 @@ def _bronkhorst(
     return bronkhorst.BronkhorstFlow(port, serial) if role == "pump" else bronkhorst.BronkhorstPressure(port, serial)
 
 
-def _modbus_value(role: str, section: table.ModbusMap, links: modbus_links.ModbusLinks) -> modbus_map.ModbusValue:
+def _modbus_value(
+    role: str, section: table.ModbusMapConfig, links: modbus_links.ModbusLinks
+) -> modbus_map.ModbusValue:
     value_map, fence = modbus_map.make_map(map_keys(section), section.preset)
     link = links.link(section.link, section.unit_id, section.timeout_s, fence)
     return modbus_map.ModbusValue(link, value_map, rest=0.0 if role in ACTUATORS else None)
 
 
-def map_keys(section: table.ModbusMap) -> dict[str, Any]:
+def map_keys(section: table.ModbusMapConfig) -> dict[str, Any]:
     """The keys of a map in the words of `drivers.modbus_map`."""
     keys = section.model_dump(include={"function", "type", "word_order", "address", "raw", "value", "limits"})
     if section.identity_address is not None and section.identity_equals is not None:

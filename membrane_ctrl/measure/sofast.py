@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.metrology.frames.series_integrity import Series
+from membrane_ctrl.metrology.frames.series_integrity import AxisSeries
 from membrane_ctrl.metrology.phase import equal_shifts, phasors
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
@@ -121,9 +121,9 @@ def lit_pixels(measurement: SofastMeasurement) -> BoolArray:
     return np.asarray(swing > _LIT_SHARE * np.percentile(swing, 95))
 
 
-def series_of(measurement: SofastMeasurement, mask: BoolArray) -> tuple[Series, Series]:
+def series_of(measurement: SofastMeasurement, mask: BoolArray) -> tuple[AxisSeries, AxisSeries]:
     """The axes of a measurement at the pixels in `mask`, in the order in which they were taken."""
     return (
-        Series("y", measurement.frames_y[..., mask], measurement.periods_y, SHIFTS_RAD),
-        Series("x", measurement.frames_x[..., mask], measurement.periods_x, SHIFTS_RAD),
+        AxisSeries("y", measurement.frames_y[..., mask], measurement.periods_y, SHIFTS_RAD),
+        AxisSeries("x", measurement.frames_x[..., mask], measurement.periods_x, SHIFTS_RAD),
     )

@@ -68,7 +68,7 @@ class StabilityRun:
         self._rmse, self._time = stability.Tally(), stability.Tally()
         self._finder = stability.PairFinder()
         self._pairs = {lag: (stability.Tally(), stability.Tally()) for lag in stability.LAGS_S}  # change, RMSE
-        self._shown: dict[float, stability.Pair] = {}
+        self._shown: dict[float, stability.FigurePair] = {}
         self._bad: list[dict[str, str]] = []
         self._bad_count = 0
         self.degraded = 0
@@ -228,7 +228,7 @@ class StabilityRun:
             return np.zeros(1)
         return 1e3 * self._grid.sigma(self._parameters.covariance)
 
-    def _add_pair(self, grid: monte_carlo.HeightMap, pair: stability.Pair) -> None:
+    def _add_pair(self, grid: monte_carlo.HeightMap, pair: stability.FigurePair) -> None:
         rmse_um = 1e3 * grid.sigma(pair.covariance)
         change_um = float(1e3 * np.sqrt(np.mean(np.square(grid.matrix @ pair.change))))
         for tally, value in zip(self._pairs[pair.lag_s], (change_um, float(rmse_um.mean())), strict=True):
@@ -260,7 +260,7 @@ class StabilityRun:
             for name, tally in (("change_rms_um", change), ("rmse_um", rmse))
         }
 
-    def _pair_maps(self, grid: monte_carlo.HeightMap, pair: stability.Pair) -> tuple[FloatArray, FloatArray]:
+    def _pair_maps(self, grid: monte_carlo.HeightMap, pair: stability.FigurePair) -> tuple[FloatArray, FloatArray]:
         return grid.picture(1e3 * grid.matrix @ pair.change), grid.picture(1e3 * grid.sigma(pair.covariance))
 
 

@@ -57,7 +57,7 @@ class Checked:
         The frames, swapped ones put back.
     binned : Binned
         The frames over bins.
-    view : View
+    view : BinView
         What the usable frames say.
     phase_rad : (2, rows, columns) array
         Absolute phases of the bins.
@@ -73,7 +73,7 @@ class Checked:
 
     stack: frame_stack.FrameStack
     binned: frame_stack.Binned
-    view: evidence.View
+    view: evidence.BinView
     phase_rad: FloatArray
     near: BoolArray
     tracer: reconstruct.Tracer
@@ -221,11 +221,11 @@ def _check(
 
 @dataclass(frozen=True)
 class _Attempt:
-    view: evidence.View
+    view: evidence.BinView
     phase_rad: FloatArray
     tracer: reconstruct.Tracer
     state: motion.TrackedPoints
-    scene: evidence.Scene
+    scene: evidence.SampledBins
 
 
 def _attempt(
@@ -268,7 +268,7 @@ def _merged(flags: list[integrity.Flag], known: dict[int, integrity.Flag]) -> tu
 def _absolute(
     stack: frame_stack.FrameStack,
     binned: frame_stack.Binned,
-    view: evidence.View,
+    view: evidence.BinView,
     anchor: Anchor | None,
     optics: OpticsConfig,
 ) -> FloatArray:
@@ -285,14 +285,14 @@ def _absolute(
 
 
 def _axis_orders(
-    stack: frame_stack.FrameStack, binned: frame_stack.Binned, view: evidence.View, axis: str, k: int
+    stack: frame_stack.FrameStack, binned: frame_stack.Binned, view: evidence.BinView, axis: str, k: int
 ) -> Orders:
     """Gray bits against half the light: the fringes' own mean, which no single frame can spoil."""
     bits = binned.means[stack.gray(axis)] > view.light
     return orders(view.phase_rad[k], bits, view.mask)
 
 
-def _followed(view: evidence.View, anchor: Anchor) -> FloatArray:
+def _followed(view: evidence.BinView, anchor: Anchor) -> FloatArray:
     """Phases next to the anchor's. Raises NoFigureError if the film moved too far to tell."""
     change = np.angle(np.exp(1j * (view.phase_rad - anchor.phase_rad)))
     seen = view.mask & np.isfinite(anchor.phase_rad).all(axis=0)
@@ -305,10 +305,10 @@ def _followed(view: evidence.View, anchor: Anchor) -> FloatArray:
 
 
 def _scene(
-    tracer: reconstruct.Tracer, state: motion.TrackedPoints, view: evidence.View, optics: OpticsConfig
-) -> evidence.Scene:
+    tracer: reconstruct.Tracer, state: motion.TrackedPoints, view: evidence.BinView, optics: OpticsConfig
+) -> evidence.SampledBins:
     phase = tracer.predict_screen(state.points, state.surface) / mm_per_rad(optics.pattern)
-    return evidence.Scene(
+    return evidence.SampledBins(
         state.index,
         view.light.reshape(-1)[state.index],
         phase + centre_phase_rad(optics.pattern),
@@ -320,7 +320,7 @@ def _confirm_orders(
     stack: frame_stack.FrameStack,
     phase_rad: FloatArray,
     binned: frame_stack.Binned,
-    view: evidence.View,
+    view: evidence.BinView,
     excluded: set[int],
     flags: tuple[integrity.Flag, ...],
 ) -> None:

@@ -142,7 +142,7 @@ def write_incident(
     return folder
 
 
-def _between(frames: inputs_file.InputsReader, begin: int, to_s: float) -> Iterator[inputs_file.Frame]:
+def _between(frames: inputs_file.InputsReader, begin: int, to_s: float) -> Iterator[inputs_file.InputsFrame]:
     before: dict[
         float, shape_estimate.ShapeEstimate
     ] = {}  # a shape may have come a frame ahead of the tick that used it
@@ -154,5 +154,5 @@ def _between(frames: inputs_file.InputsReader, begin: int, to_s: float) -> Itera
         tails = {tick: tail for tick, tail in frame.tails.items() if tick in ticks}
         memories = {tick: memory for tick, memory in frame.memories.items() if tick == begin}
         if ticks:
-            yield inputs_file.Frame(frame.records[wanted], tails, memories, before | frame.estimates)
+            yield inputs_file.InputsFrame(frame.records[wanted], tails, memories, before | frame.estimates)
         before = {} if ticks else frame.estimates

@@ -79,7 +79,7 @@ _SEGMENT_TIMEOUT_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class FileFinding:
     """One file of the run: what was wrong with it, and what was done."""
 
     file: str
@@ -107,7 +107,7 @@ def repair_command(run_dir: Path, in_place: bool, as_json: bool) -> int:
     return int(errors.Exit.DONE)
 
 
-def repair(run_dir: Path, in_place: bool = False) -> list[Finding]:
+def repair(run_dir: Path, in_place: bool = False) -> list[FileFinding]:
     """Mend every file of a run that a crash can have torn.
 
     Parameters
@@ -155,13 +155,13 @@ def _target(path: Path, in_place: bool) -> Path:
     return files.make_folder(path.parent / REPAIRED) / path.name
 
 
-def _repair_segment(path: Path, in_place: bool) -> Finding:
+def _repair_segment(path: Path, in_place: bool) -> FileFinding:
     try:
         require_bounded(path)
     except OSError as error:
-        return Finding(path.name, "torn", f"nothing could be recovered ({error.strerror})")
+        return FileFinding(path.name, "torn", f"nothing could be recovered ({error.strerror})")
     if sink.is_whole(path):
-        return Finding(path.name, "whole", "")
+        return FileFinding(path.name, "whole", "")
     with files.scratch_folder(path.parent, ".repair-") as folder:
         part = folder / path.name
         done = subprocess.run(
@@ -174,25 +174,27 @@ def _repair_segment(path: Path, in_place: bool) -> Finding:
         )
         if not part.exists() or not sink.is_whole(part):
             why = done.stderr.decode(errors="replace").strip().splitlines()
-            return Finding(path.name, "torn", f"nothing could be recovered ({why[-1] if why else 'no data in it'})")
+            return FileFinding(
+                path.name, "torn", f"nothing could be recovered ({why[-1] if why else 'no data in it'})"
+            )
         target = _target(path, in_place)
         files.move(part, target)
-    return Finding(path.name, "torn", f"recovered to {target.relative_to(path.parent)}")
+    return FileFinding(path.name, "torn", f"recovered to {target.relative_to(path.parent)}")
 
 
-def _repair_events(run_dir: Path, in_place: bool) -> list[Finding]:
+def _repair_events(run_dir: Path, in_place: bool) -> list[FileFinding]:
     path = run_dir / "events.jsonl"
     if not path.exists():
-        return [Finding(path.name, "missing", "the run had no event, or it was lost")]
+        return [FileFinding(path.name, "missing", "the run had no event, or it was lost")]
     data = files.read_bytes(path, run_folder.EVENTS_BYTES_MAX)
     good, torn = _split_events(data)
     if not torn:
-        return [Finding(path.name, "whole", "")]
+        return [FileFinding(path.name, "whole", "")]
     target = _target(path, in_place)
     files.write_bytes_atomic(target.with_name(f"{path.name}.torn"), torn)
     files.write_bytes_atomic(target, good)
     where = target.relative_to(run_dir)
-    return [Finding(path.name, "torn", f"{len(torn)} bytes cut to {where}.torn, the rest in {where}")]
+    return [FileFinding(path.name, "torn", f"{len(torn)} bytes cut to {where}.torn, the rest in {where}")]
 
 
 def _split_events(data: bytes) -> tuple[bytes, bytes]:
@@ -213,33 +215,33 @@ def _is_whole_object(data: bytes) -> bool:
     return isinstance(table, dict) and take_checksum(table)
 
 
-def _look_at_inputs(run_dir: Path) -> list[Finding]:
+def _look_at_inputs(run_dir: Path) -> list[FileFinding]:
     """Nothing to mend: a replay reads every frame that is whole."""
     reader = inputs_file.InputsReader(run_dir)
     ticks = sum(len(frame.records) for frame in reader)
     name = f"inputs ({len(reader.paths)} files)"
     if reader.damage:
-        return [Finding(name, "torn", f"{ticks} ticks are readable; {'; '.join(reader.damage)}")]
-    return [Finding(name, "whole", f"{ticks} ticks")] if reader.paths else []
+        return [FileFinding(name, "torn", f"{ticks} ticks are readable; {'; '.join(reader.damage)}")]
+    return [FileFinding(name, "whole", f"{ticks} ticks")] if reader.paths else []
 
 
-def _look_at_config(run_dir: Path) -> list[Finding]:
+def _look_at_config(run_dir: Path) -> list[FileFinding]:
     """Nothing to mend: a summary that is rebuilt takes what cannot be read of it at its default."""
     notes: list[str] = []
     run_folder.read_config(run_dir, notes)
-    return [Finding("config.toml", "damaged", "; ".join(notes))] if notes else []
+    return [FileFinding("config.toml", "damaged", "; ".join(notes))] if notes else []
 
 
-def _repair_summary(run_dir: Path, in_place: bool) -> Finding:
+def _repair_summary(run_dir: Path, in_place: bool) -> FileFinding:
     path = run_dir / "summary.json"
     there = path.is_symlink() or path.exists()
     if there and _is_whole_object(files.read_bytes(path, files.SMALL_BYTES)):
-        return Finding(path.name, "whole", "")
+        return FileFinding(path.name, "whole", "")
     table = rebuild_summary(run_dir)
     target = _target(path, in_place or not there)
     files.write_text_atomic(target, plain_json.dumps(table, indent=2) + "\n")
     state = "unreadable" if there else "missing"
-    return Finding(path.name, state, f"rebuilt from {table['ticks']} ticks: {target.relative_to(run_dir)}")
+    return FileFinding(path.name, state, f"rebuilt from {table['ticks']} ticks: {target.relative_to(run_dir)}")
 
 
 def rebuild_summary(run_dir: Path) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from membrane_ctrl.controller.tick import TickInputs, TickOutputs, output_crc, u
 from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.run_files.inputs_file import Frame
+from membrane_ctrl.run_files.inputs_file import InputsFrame
 
 # A shape is used in the tick it arrives in; more than these need not be remembered.
 _SHAPES_KEPT = 16
@@ -177,7 +177,7 @@ def decisions_of(events: Iterable[Event], time_s: float | None = None) -> list[D
     ]
 
 
-def tick_to_begin_with(frames: Iterable[Frame], from_s: float) -> int:
+def tick_to_begin_with(frames: Iterable[InputsFrame], from_s: float) -> int:
     """The last tick before a time of the run that has its memory with it; 1 if there is none."""
     begin = 1
     for frame in frames:
@@ -189,7 +189,9 @@ def tick_to_begin_with(frames: Iterable[Frame], from_s: float) -> int:
     return begin
 
 
-def recorded_ticks(frames: Iterable[Frame], begin: int = 1, memories: bool = True) -> Iterator[RecordedTick | Gap]:
+def recorded_ticks(
+    frames: Iterable[InputsFrame], begin: int = 1, memories: bool = True
+) -> Iterator[RecordedTick | Gap]:
     """The ticks of a record in order from the tick `begin` on, and a `Gap` wherever some are missing."""
     estimates: dict[float, shape_estimate.ShapeEstimate] = {}
     last, last_s = begin - 1, 0.0

@@ -19,7 +19,7 @@ _LEVEL_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class RunEntry:
     """A run in one line.
 
     Attributes
@@ -78,7 +78,7 @@ class Filter:
     configuration: str | None = None
     text: str | None = None
 
-    def takes(self, entry: Entry) -> bool:
+    def takes(self, entry: RunEntry) -> bool:
         """Whether an entry is wanted."""
         return (
             (self.since_utc is None or entry.started_utc >= self.since_utc)
@@ -91,7 +91,7 @@ class Filter:
         )
 
 
-def entries(logs_dir: Path, wanted: Filter | None = None) -> list[Entry]:
+def entries(logs_dir: Path, wanted: Filter | None = None) -> list[RunEntry]:
     """The runs of a folder, oldest first. Raises InputError if there is no such folder."""
     if not logs_dir.is_dir():
         raise errors.InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
@@ -99,24 +99,24 @@ def entries(logs_dir: Path, wanted: Filter | None = None) -> list[Entry]:
     return [item for item in found if wanted is None or wanted.takes(item)]
 
 
-def _entry_or_why(folder: Path) -> Entry:
+def _entry_or_why(folder: Path) -> RunEntry:
     """A folder that cannot be looked into costs its line, not the list."""
     try:
         return entry(folder)
     except OSError as error:
         began, why = origin_of(folder, ()), f"cannot be read ({(error.strerror or str(error)).lower()})"
         nan = math.nan
-        return Entry(folder, began, nan, nan, nan, 0, why, nan, nan, "", nan, 0, False)
+        return RunEntry(folder, began, nan, nan, nan, 0, why, nan, nan, "", nan, 0, False)
 
 
-def entry(folder: Path) -> Entry:
+def entry(folder: Path) -> RunEntry:
     """One run's line, from its small files only, and of one without a summary from the end of its seconds."""
     notes: list[str] = []
     events = run_folder.read_events(folder, notes)
     summary: dict[str, Any] = run_folder.read_summary(folder, notes) or {}
     loop = run_folder.read_config(folder, notes).loop
     std, duration_s = _number(summary.get("true_std_um")), _number(summary.get("duration_s"))
-    return Entry(
+    return RunEntry(
         folder=folder,
         started_utc=origin_of(folder, events),
         duration_s=duration_s if math.isfinite(duration_s) else _recorded_s(folder),
@@ -192,9 +192,9 @@ def prune(runs: Sequence[disk_budget.OldRun]) -> dict[Path, str]:
     return stay
 
 
-def as_dict(run: Entry) -> dict[str, Any]:
+def as_dict(run: RunEntry) -> dict[str, Any]:
     """An entry as plain data."""
-    names = [name for name in Entry.__dataclass_fields__ if name not in {"folder", "started_utc"}]
+    names = [name for name in RunEntry.__dataclass_fields__ if name not in {"folder", "started_utc"}]
     table = {name: getattr(run, name) for name in names}
     return {"name": run.name, "folder": str(run.folder), "started_utc": run.started_utc.isoformat(), **table}
 
@@ -224,7 +224,7 @@ def now_utc() -> datetime:
     return datetime.now(UTC)
 
 
-def dumps(runs: Sequence[Entry]) -> str:
+def dumps(runs: Sequence[RunEntry]) -> str:
     """JSON of entries; NaN as null."""
     plain = [
         {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in as_dict(r).items()} for r in runs

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from membrane_ctrl.model import errors, plain_json, terminal
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.catalogue import Entry, Filter, entries, resolve
+from membrane_ctrl.review.catalogue import Filter, RunEntry, entries, resolve
 from membrane_ctrl.review.export import export
 from membrane_ctrl.review.words import moment_s, number, one_line, span
 from membrane_ctrl.run_files.run import Run, open_run
@@ -142,7 +142,7 @@ def _console() -> Console:
     return terminal.table_console(width=None if sys.stdout.isatty() else 170)
 
 
-def _table(found: list[Entry]) -> Table:
+def _table(found: list[RunEntry]) -> Table:
     table = Table(box=None, header_style="bold", pad_edge=False)
     for title in (
         "run",

@@ -130,7 +130,7 @@ def _packed(batch: TickBatch, shapes: list[shape_estimate.ShapeEstimate]) -> byt
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class InputsFrame:
     """About a second of a run: ticks by number, tails and memories by tick, shape estimates by time."""
 
     records: Records
@@ -161,7 +161,7 @@ class InputsReader:
         self.program = ""
         self.damage: list[str] = []
 
-    def __iter__(self) -> Iterator[Frame]:
+    def __iter__(self) -> Iterator[InputsFrame]:
         """All frames in order; a tick that was written twice (a recorder that went on) comes once. Raises OSError."""
         last = 0
         for path in self.paths:
@@ -182,7 +182,7 @@ class InputsReader:
                 fresh = frame.records[frame.records["tick"] > last]
                 if len(fresh):
                     last = int(fresh["tick"][-1])
-                yield Frame(fresh, frame.tails, frame.memories, frame.estimates)
+                yield InputsFrame(fresh, frame.tails, frame.memories, frame.estimates)
 
     def since(self, time_s: float) -> InputsReader:
         """A reader that begins a file or two before this time of the run."""
@@ -259,13 +259,13 @@ def _body_at(data: bytes, place: int) -> tuple[bytes | None, int]:
     return (body, end) if inflating.eof else (None, end)
 
 
-def _frame_of(body: bytes, kind: np.dtype[np.void]) -> Frame:
+def _frame_of(body: bytes, kind: np.dtype[np.void]) -> InputsFrame:
     (count,) = _COUNT.unpack_from(body)
     if len({*(kind.names or ()), *_NEEDED}) != len(kind.names or ()):
         raise ValueError("without a field that every record has")
     records, taken = decode_columns(body[_COUNT.size :], kind, count)
     place = _COUNT.size + taken
-    frame = Frame(_known_fields(records), {}, {}, {})
+    frame = InputsFrame(_known_fields(records), {}, {}, {})
     while place < len(body):
         part, tick, length = _PART.unpack_from(body, place)
         data = body[place + _PART.size : place + _PART.size + length]

@@ -37,7 +37,7 @@ _UNCOMPRESSED_SIZE = 3 << 3  # field 3, a number
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class SegmentMessage:
     """A message's place in its file, kind and length among its bytes."""
 
     kind: int
@@ -50,7 +50,7 @@ class Message:
         return self.end - self.start
 
 
-def heads(file: BinaryIO) -> Iterator[Message]:
+def heads(file: BinaryIO) -> Iterator[SegmentMessage]:
     """Each message up to the end, as the file says it: none of it need be true."""
     at = HEAD_BYTES
     while True:
@@ -59,7 +59,7 @@ def heads(file: BinaryIO) -> Iterator[Message]:
         if len(head) < _MESSAGE.size:
             return
         kind, length = _MESSAGE.unpack(head)
-        message = Message(kind, at, at + _MESSAGE.size + length)
+        message = SegmentMessage(kind, at, at + _MESSAGE.size + length)
         yield message
         if kind == END or message.end > _PLACE_MAX:
             return
@@ -160,10 +160,10 @@ def first_message_after(path: Path, place: int) -> int:
     return at
 
 
-def whole_messages(path: Path) -> list[Message]:
+def whole_messages(path: Path) -> list[SegmentMessage]:
     """The messages that a file has in full, up to its end or to where what follows is none. Raises OSError."""
     size = path.stat().st_size
-    found: list[Message] = []
+    found: list[SegmentMessage] = []
     with open_plain(path) as file:
         if file.read(len(MAGIC)) != MAGIC:
             return found
@@ -230,12 +230,12 @@ def salvage(path: Path, entities: set[str]) -> tuple[list[Chunk], int]:
 class _Copy:
     source: BinaryIO
     path: Path
-    stores: list[Message]  # without them Rerun takes no other
+    stores: list[SegmentMessage]  # without them Rerun takes no other
     entities: set[str]
     lost_bytes: int = 0
     faults: int = 0
 
-    def chunks(self, part: list[Message]) -> list[Chunk]:
+    def chunks(self, part: list[SegmentMessage]) -> list[Chunk]:
         """Chunks of those messages of a part that decode."""
         self.source.seek(0)
         with self.path.open("wb") as file:

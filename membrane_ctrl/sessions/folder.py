@@ -101,7 +101,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 @dataclass(frozen=True, slots=True)
-class Head:
+class SessionHead:
     """`session.json`.
 
     Attributes
@@ -125,7 +125,7 @@ class SessionFolder:
     """A session on disk."""
 
     path: Path
-    head: Head
+    head: SessionHead
     config: Config
 
     def file(self, name: str) -> Path:
@@ -191,7 +191,7 @@ def create_session(
     """Make a session's folder. Raises InputError for a bad name, DeviceError if it cannot be written."""
     now = datetime.now(UTC)
     path = fresh_folder(logs / "tuning", name, now)
-    head = Head(FORMAT, name, author, source, now.isoformat(timespec="seconds"), before)
+    head = SessionHead(FORMAT, name, author, source, now.isoformat(timespec="seconds"), before)
     try:
         write(path / "session.json", head)
         files.write_text_atomic(path / "config.toml", config_file.dump(config))
@@ -202,7 +202,7 @@ def create_session(
 
 def open_session(path: Path) -> SessionFolder:
     """An existing session. Raises InputError if it is none."""
-    head = read(path / "session.json", Head)
+    head = read(path / "session.json", SessionHead)
     if head.format != FORMAT:
         raise errors.InputError(f"{path}/session.json: format {head.format!r}, {FORMAT!r} is known")
     return SessionFolder(path, head, config_file.load(path / "config.toml", Config))

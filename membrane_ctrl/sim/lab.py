@@ -40,7 +40,7 @@ class Lab:
 
     Parameters
     ----------
-    plant : Plant
+    plant : BoardPlant
         What they measure and drive.
     devices : DevicesConfig
         Which instruments, by role.
@@ -53,7 +53,7 @@ class Lab:
         By the configuration's port: its pseudo-terminal, which can be unplugged.
     """
 
-    def __init__(self, plant: pump_board.Plant, devices: DevicesConfig) -> None:
+    def __init__(self, plant: pump_board.BoardPlant, devices: DevicesConfig) -> None:
         self.serial: dict[str, serial_device.SerialDevice] = {}
         self.wires: dict[str, serial_device.PtyWire] = {}
         self._plant = plant
@@ -63,11 +63,11 @@ class Lab:
         self._servers: dict[str, modbus_server.ModbusTcpServer] = {}
         self._tables: defaultdict[str, dict[int, modbus_server.RegisterTable]] = defaultdict(dict)
         for role, section in devices.roles().items():
-            if isinstance(section, table.BronkhorstModbus):
+            if isinstance(section, table.BronkhorstModbusConfig):
                 self._tables[section.link][section.unit_id] = bronkhorst.BronkhorstRegisters(
                     self._bronkhorst(role, section.serial)
                 )
-            elif not isinstance(section, table.ModbusMap):
+            elif not isinstance(section, table.ModbusMapConfig):
                 self.serial[section.port] = self._device(role, section)
         self._map_devices()
         self._board: pump_board.PumpBoardEmulator | None = None
@@ -111,7 +111,7 @@ class Lab:
 
     def _moved(self, section: AnyDriver) -> AnyDriver:
         """The table with the emulator's address."""
-        if not isinstance(section, (table.ModbusMap, table.BronkhorstModbus)):
+        if not isinstance(section, (table.ModbusMapConfig, table.BronkhorstModbusConfig)):
             return section.model_copy(update={"port": str(self.wires[section.port].path)})
         return section.model_copy(update={"link": self._address(section.link)})
 
@@ -124,11 +124,11 @@ class Lab:
 
     def _device(self, role: str, section: AnyDriver) -> serial_device.SerialDevice:
         match section:
-            case table.Optoncdt1420():
+            case table.Optoncdt1420Config():
                 return optoncdt1420.Optoncdt1420Emulator(
                     self._sensor("displacement"), round(section.range_mm or 50), section.direction, section.baud
                 )
-            case table.KeyenceDlRs1a():
+            case table.KeyenceDlRs1aConfig():
                 return keyence_dl_rs1a.KeyenceDlRs1aEmulator(
                     self._sensor("displacement"),
                     section.direction,
@@ -136,11 +136,11 @@ class Lab:
                     section.parity,
                     section.amplifier + 1,
                 )
-            case table.VaisalaPtb330():
+            case table.VaisalaPtb330Config():
                 return vaisala_ptb330.VaisalaPtb330Emulator(self._sensor("barometer"), section.baud)
-            case table.Ventus():
+            case table.VentusConfig():
                 return ventus.VentusEmulator(self._actuator("pump"), section.power_max_mw)
-            case table.BronkhorstPropar():
+            case table.BronkhorstProparConfig():
                 return bronkhorst.ProparDevice(
                     self._bronkhorst(role, section.serial), serial_port.SerialSettings(section.baud)
                 )
@@ -149,9 +149,9 @@ class Lab:
 
     def _map_devices(self) -> None:
         """One device for all maps that name the same unit of the same link."""
-        units: defaultdict[tuple[str, int], list[tuple[str, table.ModbusMap]]] = defaultdict(list)
+        units: defaultdict[tuple[str, int], list[tuple[str, table.ModbusMapConfig]]] = defaultdict(list)
         for role, section in self._devices.roles().items():
-            if isinstance(section, table.ModbusMap):
+            if isinstance(section, table.ModbusMapConfig):
                 units[section.link, section.unit_id].append((role, section))
         for (link, unit_id), members in units.items():
             sensors: dict[ValueMap, Callable[[], float]] = {}

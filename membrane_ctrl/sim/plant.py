@@ -23,7 +23,7 @@ LAG_S = 0.15  # motor and diaphragm
 TRANSPORT_S = 0.075  # gas in the tube
 
 
-class Pump:
+class PumpModel:
     """q = q_full (d - dead) / (1 - dead) once running; starts at `start_fraction`, stalls below `stall_fraction`.
 
     Parameters
@@ -196,7 +196,7 @@ class Plant:
         self._disturbance = Disturbance(twin, events, STEP_S, chance)
         self._leak_ml_per_s_per_pa = gas_compliance_ml_per_pa() / twin.leak_time_constant_s
         self._vent_ml_per_s_per_pa = VENT_OPEN_UM_PER_S / NOMINAL_UM_PER_ML / film.NOMINAL_PRESSURE_PA
-        self._pump = Pump(pump, pump.flow_full_um_per_s / NOMINAL_UM_PER_ML, STEP_S)
+        self._pump = PumpModel(pump, pump.flow_full_um_per_s / NOMINAL_UM_PER_ML, STEP_S)
         self._loaded_s = 0.0 if twin.from_flat else film.SETTLED_S
         self._steps = 0
         self._rest = 0.0

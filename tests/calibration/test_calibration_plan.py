@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 from live_bench import config
 
-from membrane_ctrl.calibration.plan import Held, Reach, reach_of, setpoints_um, way_s
+from membrane_ctrl.calibration.plan import HeldMirror, Reach, reach_of, setpoints_um, way_s
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.errors import InputError
 
-HELD = Held(0.0, 37.1, 600.0, 1.2, 80.0, True)
+HELD = HeldMirror(0.0, 37.1, 600.0, 1.2, 80.0, True)
 WIDE = Reach(-5000.0, 5000.0, "low", "high")
 
 

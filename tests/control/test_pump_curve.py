@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control.gas import KICK_S, PumpCurve
-from membrane_ctrl.sim.plant import Pump
+from membrane_ctrl.sim.plant import PumpModel
 
 PUMP = PumpConfig()
 DT_S = 0.02
@@ -17,7 +17,7 @@ DT_S = 0.02
 
 def delivered(flows_um_per_s: list[float]) -> np.ndarray:
     """What the twin's pump makes of the commands, um/s, one value a tick."""
-    curve, pump, out = PumpCurve(PUMP), Pump(PUMP, PUMP.flow_full_um_per_s, 0.005), []
+    curve, pump, out = PumpCurve(PUMP), PumpModel(PUMP, PUMP.flow_full_um_per_s, 0.005), []
     for flow in flows_um_per_s:
         command = curve.command(flow, DT_S)
         out.append(np.mean([pump.step(command) for _ in range(4)]))

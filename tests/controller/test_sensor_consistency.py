@@ -6,7 +6,7 @@ import numpy as np
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.sensor_consistency import Held, SensorConsistency
+from membrane_ctrl.controller.sensor_consistency import HoldStatus, SensorConsistency
 from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
@@ -39,7 +39,7 @@ class Seconds:
             reading = BenchReading(0.0, 0, gauge_pa, ambient_pa, 20.0, 20.0, 0.3, 0.0, 1, self.now_s, False, 0)
             inputs = TickInputs(self.now_s, 1.0, reading, estimate=self._shape() if camera else None)
             self.events += self.consistency.ask(
-                inputs, state, 1.0, Held(0.0, gauge_pa, 0.0, 0.0, 0.0, leak_um_per_s, leak_um_per_s, bleed)
+                inputs, state, 1.0, HoldStatus(0.0, gauge_pa, 0.0, 0.0, 0.0, leak_um_per_s, leak_um_per_s, bleed)
             )
 
     def _shape(self) -> ShapeEstimate:

@@ -23,7 +23,7 @@ from firmware_iface.drivers.bronkhorst import (
     register_of,
 )
 from firmware_iface.drivers.bronkhorst_propar import (
-    Message,
+    ProparMessage,
     ProparParameters,
     ascii_frame,
     binary_frame,
@@ -91,8 +91,10 @@ def test_the_registers_of_the_manual() -> None:
 
 def test_binary_frames_survive_any_data_and_any_cut() -> None:
     rng = random.Random(1)
-    messages = [Message(rng.randrange(256), rng.choice([3, 16, 128]), rng.randbytes(1 + n % 40)) for n in range(300)]
-    messages.append(Message(16, 16, bytes([16] * 16)))
+    messages = [
+        ProparMessage(rng.randrange(256), rng.choice([3, 16, 128]), rng.randbytes(1 + n % 40)) for n in range(300)
+    ]
+    messages.append(ProparMessage(16, 16, bytes([16] * 16)))
     stream = b"".join(binary_frame(message) for message in messages)
     found, rest = [], b""
     while stream:
@@ -104,7 +106,7 @@ def test_binary_frames_survive_any_data_and_any_cut() -> None:
 
 
 def test_an_ascii_frame_is_read_back_and_a_broken_one_is_none() -> None:
-    message = Message(0, 3, b"\x04\x21\x40\x21\x40")
+    message = ProparMessage(0, 3, b"\x04\x21\x40\x21\x40")
     assert parse_ascii(ascii_frame(message)) == message
     for broken in (b"", b":", b":0603", b":07030421402140", b"06030421402140", b":0603042140214G"):
         assert parse_ascii(broken) is None

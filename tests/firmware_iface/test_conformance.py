@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from counting_plant import CountingPlant, ManualClock
 
-from firmware_iface.conformance import Conformance, Finding, examine
+from firmware_iface.conformance import CheckResult, Conformance, examine
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.board_state import BoardSample, BoardState
 from firmware_iface.emulators.modbus_server import ILLEGAL_VALUE, RegisterRefusal, RtuBusEmulator, respond
@@ -182,7 +182,7 @@ class Bench:
     board: PumpBoardEmulator
     clock: ManualClock
 
-    async def examine(self) -> list[Finding]:
+    async def examine(self) -> list[CheckResult]:
         async def sleep(duration_s: float) -> None:
             self.clock.now_s += duration_s
             await asyncio.sleep(0)
@@ -214,7 +214,7 @@ async def serve() -> AsyncIterator[Callable[[type[BoardState], int], Awaitable[B
         await bench.board.stop()
 
 
-def problems(findings: list[Finding]) -> dict[str, str]:
+def problems(findings: list[CheckResult]) -> dict[str, str]:
     return {finding.check: finding.problem for finding in findings if finding.problem}
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, Bench, bench_at, sigmas
+from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, BenchGeometry, bench_at, sigmas
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
 from membrane_ctrl.metrology.calibrate.separable import References
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, surface_of
@@ -47,7 +47,7 @@ def plain(truth: Truth) -> Problem:
     problem = truth.problem(sigmas(held))
     # what three parameters cannot explain counts as noise, or the hand's measurements would count for nothing
     left = [
-        np.std(residual_mm(Bench(STATED), phases, state.surface, state.vertex_z_mm))
+        np.std(residual_mm(BenchGeometry(STATED), phases, state.surface, state.vertex_z_mm))
         for phases, state in zip(problem.sets, first_states(problem), strict=True)
     ]
     sets = [replace(p, sigma_mm=np.full_like(p.sigma_mm, own)) for p, own in zip(problem.sets, left, strict=True)]
@@ -80,7 +80,7 @@ def make(
 
 
 def _traced(
-    bench: Bench, film: FilmShape, moved_um: float, column: FloatArray, row: FloatArray, bow_mm: float
+    bench: BenchGeometry, film: FilmShape, moved_um: float, column: FloatArray, row: FloatArray, bow_mm: float
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     geometry = bench.geometry
     camera = CameraPose(geometry.pinhole_mm, geometry.rotation)
@@ -116,4 +116,4 @@ def calibrated_errors_um(solution: Solution, truth: Truth, index: int = 2) -> tu
 def stated_errors_um(truth: Truth, index: int = 2) -> tuple[float, float]:
     """Of a set measured with the stated geometry."""
     phases = truth.sets[index]
-    return errors_um(surface_of(Bench(STATED), phases, 500.0, -1e-3 * phases.displacement_um), truth, index)
+    return errors_um(surface_of(BenchGeometry(STATED), phases, 500.0, -1e-3 * phases.displacement_um), truth, index)

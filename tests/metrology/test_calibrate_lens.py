@@ -9,7 +9,7 @@ import pytest
 from board_photograph import Photographer, photographs
 
 from membrane_ctrl.config.schema import CameraConfig
-from membrane_ctrl.metrology.calibrate.lens import LEAST_VIEWS, Board, View, calibrate_lens, on_screen
+from membrane_ctrl.metrology.calibrate.lens import LEAST_VIEWS, Board, BoardView, calibrate_lens, on_screen
 
 STATED = CameraConfig(width_px=408, height_px=342, pixel_um=20.7, focal_mm=16.0)  # 773 px
 TRUE = Photographer(408, 342, 781.3, (206.9, 167.4), (-0.12, 0.08, 4e-4, -6e-4))
@@ -17,16 +17,16 @@ BOARD = Board.parse("charuco:11x9")
 SQUARE_PX = 48
 
 
-def views_of(board: Board, images: list[np.ndarray]) -> list[View]:
-    return [View(f"{k}.png", *board.corners(image)) for k, image in enumerate(images)]
+def views_of(board: Board, images: list[np.ndarray]) -> list[BoardView]:
+    return [BoardView(f"{k}.png", *board.corners(image)) for k, image in enumerate(images)]
 
 
 @pytest.fixture(scope="module")
-def views() -> list[View]:
+def views() -> list[BoardView]:
     return views_of(BOARD, photographs(TRUE, BOARD.draw(SQUARE_PX), SQUARE_PX, 8, 1))
 
 
-def test_the_lens_is_found_within_its_sigmas(views: list[View]) -> None:
+def test_the_lens_is_found_within_its_sigmas(views: list[BoardView]) -> None:
     lens = calibrate_lens(views, STATED)
     assert lens.left_out == ()
     assert lens.rms_px < 0.3
@@ -44,7 +44,7 @@ def test_a_plain_chessboard_says_the_same() -> None:
     assert lens.focal_px == pytest.approx(TRUE.focal_px, rel=3e-3)
 
 
-def test_a_view_that_does_not_fit_is_left_out_and_named(views: list[View]) -> None:
+def test_a_view_that_does_not_fit_is_left_out_and_named(views: list[BoardView]) -> None:
     rng = np.random.default_rng(0)
     bad = replace(views[3], name="blurred.png", seen_px=views[3].seen_px + rng.normal(0, 3.0, views[3].seen_px.shape))
     lens = calibrate_lens([*views, bad], STATED)
@@ -52,7 +52,7 @@ def test_a_view_that_does_not_fit_is_left_out_and_named(views: list[View]) -> No
     assert lens.rms_px < 0.3
 
 
-def test_too_few_views_are_refused(views: list[View]) -> None:
+def test_too_few_views_are_refused(views: list[BoardView]) -> None:
     with pytest.raises(ValueError, match=f"seen in {LEAST_VIEWS - 1} photographs; at least {LEAST_VIEWS}"):
         calibrate_lens(views[: LEAST_VIEWS - 1], STATED)
 

@@ -12,7 +12,7 @@ from membrane_ctrl.metrology.calibrate.parameters import (
     NAMES,
     OPTICAL,
     POSE,
-    Bench,
+    BenchGeometry,
     bench_at,
     pose_derivatives,
     poses_at,
@@ -136,7 +136,7 @@ def test_rim_harmonics_are_those_of_the_surface() -> None:
 
 def test_averaged_points_say_what_the_bins_say() -> None:
     truth = make(np.zeros(len(NAMES)), seed=2, points=20_000)
-    phases, bench = truth.sets[2], Bench(STATED)
+    phases, bench = truth.sets[2], BenchGeometry(STATED)
     state = SetState(SURFACE, 0.0)
     few = averaged(bench, phases, state, 1000)
     assert 700 < few.column_px.size < 1600

@@ -15,7 +15,7 @@ from membrane_ctrl.metrology.calibrate.drift import CYCLES, DriftMonitor
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, sigmas
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases
 from membrane_ctrl.metrology.calibrate.solve import solve
-from membrane_ctrl.metrology.calibrate.verdict import Finding, after, before
+from membrane_ctrl.metrology.calibrate.verdict import CalibrationFinding, after, before
 
 SIGMAS = sigmas()
 VALUES = SIGMAS * np.random.default_rng(3).normal(size=len(NAMES))
@@ -33,7 +33,7 @@ def yawed(degrees: float, *which: int) -> Truth:
     return make(VALUES, 3, points=1500, bumped=dict.fromkeys(which, other))
 
 
-def judged(truth: Truth, sets: tuple[SetPhases, ...] | None = None) -> tuple[Finding, ...]:
+def judged(truth: Truth, sets: tuple[SetPhases, ...] | None = None) -> tuple[CalibrationFinding, ...]:
     problem = truth.problem(SIGMAS, sets)
     return before(problem) or after(solve(problem))
 

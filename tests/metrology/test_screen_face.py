@@ -9,7 +9,7 @@ from rendered_sets import FILM, bench, good_set
 
 from membrane_ctrl.config.optics import HeightMapConfig, ScreenPoseConfig
 from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, OpticsConfig
-from membrane_ctrl.metrology.calibrate.parameters import Bench
+from membrane_ctrl.metrology.calibrate.parameters import BenchGeometry
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
 from membrane_ctrl.metrology.checked import check
 from membrane_ctrl.metrology.full import measure_pixels, reconstruct_full
@@ -111,7 +111,7 @@ def test_the_calibration_follows_rays_to_the_same_face() -> None:
     tracer.intersect(points, surface, newton=3)
     seen = tracer.predict_screen(points, surface)
     phases = SetPhases("set", columns[inside], rows[inside], seen, np.ones(inside.sum()), 0.0)
-    assert np.abs(residual_mm(Bench(geometry), phases, surface, 0.0)).max() < 1e-9
+    assert np.abs(residual_mm(BenchGeometry(geometry), phases, surface, 0.0)).max() < 1e-9
 
 
 def test_world_points_lie_on_the_face() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.frames.series_integrity import Series, SeriesCheck, check_series
+from membrane_ctrl.metrology.frames.series_integrity import AxisSeries, SeriesCheck, check_series
 from membrane_ctrl.metrology.phase import equal_shifts
 
 PERIODS = np.array([0.9, 3.9, 15.9])
@@ -15,7 +15,7 @@ SHIFTS = -equal_shifts(4)
 PIXELS = 2000
 
 
-def scene(second: float = 0.0, noise_adu: float = 1.0) -> tuple[Series, Series]:
+def scene(second: float = 0.0, noise_adu: float = 1.0) -> tuple[AxisSeries, AxisSeries]:
     """y and then x, mean 110 and amplitude 90, with a second harmonic of the display."""
     rng = np.random.default_rng(7)
     axes = []
@@ -23,18 +23,18 @@ def scene(second: float = 0.0, noise_adu: float = 1.0) -> tuple[Series, Series]:
         place = rng.uniform(0.2, 0.8, PIXELS)
         phase = 2 * np.pi * PERIODS[:, None, None] * place + SHIFTS[:, None]
         frames = 110 + 90 * np.cos(phase) + 90 * second * np.cos(2 * phase)
-        axes.append(Series(axis, frames + rng.normal(0, noise_adu, frames.shape), PERIODS, SHIFTS))
+        axes.append(AxisSeries(axis, frames + rng.normal(0, noise_adu, frames.shape), PERIODS, SHIFTS))
     return axes[0], axes[1]
 
 
 BLACK, WHITE = np.full(PIXELS, 15.0), np.full(PIXELS, 205.0)
 
 
-def checked(axes: tuple[Series, ...]) -> SeriesCheck:
+def checked(axes: tuple[AxisSeries, ...]) -> SeriesCheck:
     return check_series(axes, BLACK, WHITE)
 
 
-def spoiled(index: int, step: int, picture: np.ndarray) -> tuple[Series, Series]:
+def spoiled(index: int, step: int, picture: np.ndarray) -> tuple[AxisSeries, AxisSeries]:
     """x with another picture in one place."""
     y, x = scene()
     frames = x.frames.copy()

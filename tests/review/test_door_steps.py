@@ -9,14 +9,14 @@ from benchmarks.nights import DOOR, Planted, night
 from membrane_ctrl.model.telemetry import COLUMN, Rows, column
 from membrane_ctrl.review.events.found import pressure_steps
 from membrane_ctrl.review.events.laser_and_door import quantum, update_s
-from membrane_ctrl.review.events.steps import Found
+from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.run_files.tables import TICK_FIELDS, first_level
 
 HOURS = 2.0
 AMBIENT = COLUMN["ambient_pressure_pa"]
 
 
-def doors_in(rows: Rows) -> list[Found]:
+def doors_in(rows: Rows) -> list[FoundEvent]:
     return pressure_steps(first_level({name: column(rows, name) for name in TICK_FIELDS}))
 
 

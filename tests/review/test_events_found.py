@@ -13,7 +13,7 @@ from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.states import State
 from membrane_ctrl.model.telemetry import COLUMN, Rows, column
 from membrane_ctrl.review.events.found import find_events, noise_changes, weather_losses
-from membrane_ctrl.review.events.steps import Found, confidence, steps
+from membrane_ctrl.review.events.steps import FoundEvent, confidence, steps
 from membrane_ctrl.run_files.tables import TICK_FIELDS, Columns, first_level
 from tests.support.synthetic_shape import from_estimates
 
@@ -24,7 +24,7 @@ def level_of(rows: Rows) -> Columns:
     return first_level({name: column(rows, name) for name in TICK_FIELDS})
 
 
-def found_in(events: list[Planted], seed: int = 1, scenario: str = "typical") -> list[Found]:
+def found_in(events: list[Planted], seed: int = 1, scenario: str = "typical") -> list[FoundEvent]:
     rows, shapes = night(seed, HOURS, scenario, events)
     return find_events(level_of(rows), from_estimates(shapes), 2.0)
 

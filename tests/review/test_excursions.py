@@ -8,7 +8,7 @@ import pytest
 from benchmarks.nights import DOOR, Planted, night
 from membrane_ctrl.model.telemetry import COLUMN, Rows, column
 from membrane_ctrl.review.events.found import find_events
-from membrane_ctrl.review.events.steps import Found
+from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.run_files.tables import TICK_FIELDS, first_level
 from tests.support.synthetic_shape import from_estimates
 
@@ -16,7 +16,7 @@ BAND_UM = 2.0
 AT_S = 1500.0
 
 
-def found_in(rows: Rows, band_um: float = BAND_UM) -> list[Found]:
+def found_in(rows: Rows, band_um: float = BAND_UM) -> list[FoundEvent]:
     return find_events(first_level({name: column(rows, name) for name in TICK_FIELDS}), from_estimates([]), band_um)
 
 

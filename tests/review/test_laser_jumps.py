@@ -8,7 +8,7 @@ import pytest
 from benchmarks.nights import DOOR, GLITCH, Planted, night
 from membrane_ctrl.model.telemetry import COLUMN, Rows, column
 from membrane_ctrl.review.events.found import laser_glitches
-from membrane_ctrl.review.events.steps import Found
+from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.run_files.tables import TICK_FIELDS, first_level
 
 HOURS = 2.0
@@ -16,7 +16,7 @@ AT_S = 3000.3
 READING = COLUMN["displacement_um"]
 
 
-def glitches_in(rows: Rows) -> list[Found]:
+def glitches_in(rows: Rows) -> list[FoundEvent]:
     return laser_glitches(first_level({name: column(rows, name) for name in TICK_FIELDS}))
 
 

@@ -7,34 +7,34 @@ import math
 import pytest
 
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
-from membrane_ctrl.sim.plant import LAG_S, STEP_S, TRANSPORT_S, Plant, Pump
+from membrane_ctrl.sim.plant import LAG_S, STEP_S, TRANSPORT_S, Plant, PumpModel
 
 FULL_ML_PER_S = 6.0
 
 
 @pytest.fixture
-def pump() -> Pump:
-    return Pump(PumpConfig(), FULL_ML_PER_S, STEP_S)
+def pump() -> PumpModel:
+    return PumpModel(PumpConfig(), FULL_ML_PER_S, STEP_S)
 
 
-def settle(pump: Pump, command: float) -> float:
+def settle(pump: PumpModel, command: float) -> float:
     for _ in range(1000):
         flow = pump.step(command)
     return flow
 
 
-def test_flow_against_command_once_running(pump: Pump) -> None:
+def test_flow_against_command_once_running(pump: PumpModel) -> None:
     for command in (1.0, 0.6, 0.3, 0.16):
         assert settle(pump, command) == pytest.approx(FULL_ML_PER_S * (command - 0.1) / 0.9)
 
 
-def test_sticks_until_the_start_command(pump: Pump) -> None:
+def test_sticks_until_the_start_command(pump: PumpModel) -> None:
     assert settle(pump, 0.219) == 0.0
     assert settle(pump, 0.22) == pytest.approx(FULL_ML_PER_S * 0.12 / 0.9)
     assert settle(pump, 0.15) == pytest.approx(FULL_ML_PER_S * 0.05 / 0.9)
 
 
-def test_stalls_and_needs_the_start_command_again(pump: Pump) -> None:
+def test_stalls_and_needs_the_start_command_again(pump: PumpModel) -> None:
     settle(pump, 0.5)
     assert settle(pump, 0.149) == pytest.approx(0.0, abs=1e-6)
     assert settle(pump, 0.21) == pytest.approx(0.0, abs=1e-6)
@@ -42,13 +42,13 @@ def test_stalls_and_needs_the_start_command_again(pump: Pump) -> None:
 
 
 def test_never_takes_gas_away() -> None:
-    pump = Pump(PumpConfig(dead_fraction=0.3), FULL_ML_PER_S, STEP_S)  # dead above stall and start
+    pump = PumpModel(PumpConfig(dead_fraction=0.3), FULL_ML_PER_S, STEP_S)  # dead above stall and start
     assert settle(pump, 0.25) == 0.0
     settle(pump, 1.0)
     assert all(pump.step(0.2) >= 0 for _ in range(2000))
 
 
-def test_answers_after_transport_and_lag(pump: Pump) -> None:
+def test_answers_after_transport_and_lag(pump: PumpModel) -> None:
     flows = [pump.step(1.0) for _ in range(200)]
     dead = round(TRANSPORT_S / STEP_S)
     assert flows[:dead] == [0.0] * dead
@@ -57,20 +57,20 @@ def test_answers_after_transport_and_lag(pump: Pump) -> None:
     assert at_one_lag == pytest.approx(FULL_ML_PER_S * (1 - math.exp(-1)), rel=1e-9)
 
 
-def test_hold_is_where_the_pump_stays(pump: Pump) -> None:
+def test_hold_is_where_the_pump_stays(pump: PumpModel) -> None:
     command = pump.hold(1.4)
     assert [pump.step(command) for _ in range(100)] == pytest.approx([1.4] * 100)
 
 
 @pytest.mark.parametrize("flow_ml_per_s", [0.2, 7.0])
-def test_hold_of_a_flow_it_cannot_keep_leaves_it_off(pump: Pump, flow_ml_per_s: float) -> None:
+def test_hold_of_a_flow_it_cannot_keep_leaves_it_off(pump: PumpModel, flow_ml_per_s: float) -> None:
     assert pump.hold(flow_ml_per_s) == 0.0
     assert pump.step(0.2) == 0.0
 
 
 def test_refuses_a_pump_that_never_delivers() -> None:
     with pytest.raises(ValueError, match="dead_fraction"):
-        Pump(PumpConfig(dead_fraction=1.0), FULL_ML_PER_S, STEP_S)
+        PumpModel(PumpConfig(dead_fraction=1.0), FULL_ML_PER_S, STEP_S)
 
 
 def test_a_fresh_plant_is_just_held() -> None:

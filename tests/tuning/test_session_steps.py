@@ -16,21 +16,21 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.sessions import folder as plain
 from tuning import gains_file as journal
 from tuning.gains_file import GainsFile, PlantSection
-from tuning.identification.disturbance import Disturbance, Noise, WeatherGain
+from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain
 from tuning.identification.loop_model import PlantModel
 from tuning.identification.records import Record
 from tuning.identification.shape_loop import STEP_UM, evaluate
 from tuning.proposal.preview import ModelBench
-from tuning.proposal.verify import SETTLE_LEAST_S, Trial, centre_std_um, health, look, settle_s
+from tuning.proposal.verify import SETTLE_LEAST_S, VerificationTrial, centre_std_um, health, look, settle_s
 from tuning.rig import Rig
 
 PLANT = PlantModel(1.0, 0.08, 0.15, 1.24)
-WEATHER = Disturbance(Noise(1.0, 0.01, 0.01, 12.0, 0.05, 0.1, 0.1, 0.02), None, None)
+WEATHER = DisturbanceModel(Noise(1.0, 0.01, 0.01, 12.0, 0.05, 0.1, 0.1, 0.02), None, None)
 LOOP = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
 
 
 def held(
-    loop: LoopConfig, plant: PlantModel = PLANT, duration_s: float = 600.0, weather: Disturbance = WEATHER
+    loop: LoopConfig, plant: PlantModel = PLANT, duration_s: float = 600.0, weather: DisturbanceModel = WEATHER
 ) -> tuple[Record, ModelBench]:
     """A hold of the model's own bench, settled."""
     bench = ModelBench(plant, weather, PumpConfig(), 3)
@@ -42,7 +42,7 @@ def held(
 def test_the_centre_s_deviation_is_seen_through_ten_times_the_noise() -> None:
     record, bench = held(LOOP)
     true_um = float(np.std(bench.true_um[1500:]))
-    trial = Trial(PLANT, WEATHER, LOOP, LOOP)
+    trial = VerificationTrial(PLANT, WEATHER, LOOP, LOOP)
     assert centre_std_um(record.displacement_um, trial, WEATHER) == pytest.approx(true_um, rel=0.2)
 
 
@@ -57,10 +57,10 @@ def test_a_slow_loop_is_given_longer_to_forget_the_change() -> None:
 def test_a_look_passes_good_gains_and_names_what_is_wrong_with_bad_ones() -> None:
     record, _ = held(LOOP)
     about_um = np.zeros(len(record))
-    assert look(record, about_um, Trial(PLANT, WEATHER, LOOP, LOOP), 1.5).reason == ""
+    assert look(record, about_um, VerificationTrial(PLANT, WEATHER, LOOP, LOOP), 1.5).reason == ""
     slow = LOOP.model_copy(update={"kp_per_s": 0.1, "ti_s": 60.0})
     record, _ = held(slow)
-    stage = look(record, about_um, Trial(PLANT, WEATHER, LOOP, slow), 1.1)
+    stage = look(record, about_um, VerificationTrial(PLANT, WEATHER, LOOP, slow), 1.1)
     assert stage.growth > 1.3
     assert "times that of the gains before" in stage.reason
 
@@ -70,7 +70,7 @@ def test_a_plant_with_less_margin_than_designed_shows_in_the_readings() -> None:
     loop = LOOP.model_copy(update={"kp_per_s": 1.0, "ti_s": 8.0, "measurement_filter_s": 0.1})
     changed = replace(PLANT, gain=2.0, dead_time_s=0.35, leak_um_per_s=2.48)
     record, _ = held(loop, changed)
-    stage = look(record, np.zeros(len(record)), Trial(PLANT, WEATHER, loop, loop), 100.0)
+    stage = look(record, np.zeros(len(record)), VerificationTrial(PLANT, WEATHER, loop, loop), 100.0)
     assert stage.ms > 2.0
     assert "less margin than designed" in stage.reason
 
@@ -79,7 +79,7 @@ def test_a_setpoint_that_moved_is_no_deviation() -> None:
     record, _ = held(LOOP)
     walk_um = 5.0 * np.sin(np.arange(len(record)) * 1e-4)
     moved = replace(record, displacement_um=record.displacement_um + walk_um)
-    trial = Trial(PLANT, WEATHER, LOOP, LOOP)
+    trial = VerificationTrial(PLANT, WEATHER, LOOP, LOOP)
     plain_um = centre_std_um(record.displacement_um, trial, WEATHER)
     assert centre_std_um(moved.displacement_um - walk_um, trial, WEATHER) == pytest.approx(plain_um, rel=1e-9)
 
@@ -148,7 +148,7 @@ def test_the_gain_is_seen_although_the_feed_forward_cancels_the_weather(gain: fl
     """A slow loop whose flow is nearly all feed-forward; the pump as it was, and one that has lost 40 %."""
     rest = Noise(1.0, 1e-4, 1e-4, 12.0, 0.05, 0.1, 0.1, 0.02)
     barometer = WeatherGain(-0.36, 0.01, 2 * 1.2**2 / 30, 0.05, 0.0)
-    weather = Disturbance(rest, barometer, WeatherGain(123.0, 1.0, 2 * 0.05**2 / 300, 0.002, 12.0))
+    weather = DisturbanceModel(rest, barometer, WeatherGain(123.0, 1.0, 2 * 0.05**2 / 300, 0.002, 12.0))
     loop = LoopConfig(kp_per_s=0.25, ti_s=20.0)
     record, _ = held(loop, replace(PLANT, gain=gain), weather=weather)
     found = health(record, np.zeros(len(record)), loop, gains_file(PLANT))

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.tuning import Case, TwinBench
 from membrane_ctrl.config.schema import PumpConfig
-from membrane_ctrl.control.experiments.machine import Around, ExcursionGuard, Finished, Measurement, Patterned
+from membrane_ctrl.control.experiments.machine import Around, BenchSample, ExcursionGuard, Finished, Patterned
 from membrane_ctrl.control.experiments.patterns import Relay, doublets, multisine, steps
 from membrane_ctrl.control.experiments.pump_map import PumpMapper
 from membrane_ctrl.sim.events import AmbientChange, LaserDropout
@@ -26,7 +26,7 @@ class SaturatingPump(TwinBench):
 
     most_fraction = 1.0
 
-    def exchange(self, pump_fraction: float, vent_fraction: float) -> Measurement:
+    def exchange(self, pump_fraction: float, vent_fraction: float) -> BenchSample:
         return super().exchange(min(pump_fraction, self.most_fraction), vent_fraction)
 
 
@@ -35,7 +35,7 @@ class StuckPump(TwinBench):
 
     stuck_from_s = math.inf
 
-    def exchange(self, pump_fraction: float, vent_fraction: float) -> Measurement:
+    def exchange(self, pump_fraction: float, vent_fraction: float) -> BenchSample:
         stuck = self.plant.time_s >= self.stuck_from_s
         return super().exchange(0.31 if stuck else pump_fraction, vent_fraction)
 
@@ -132,10 +132,10 @@ def test_the_guard_keeps_more_in_hand_where_readings_are_few(rate_hz: float, lea
     """White readings of 1 um: three standard deviations of position and coast are never taken for the limit."""
     rng = np.random.default_rng(3)
     guard = ExcursionGuard(Patterned(AROUND, lambda _: 0.0, 600.0, 0.0), AROUND, 0.0, rate_hz)
-    seen = [guard.step(Measurement(float(x), math.nan, math.nan), 1 / rate_hz) for x in rng.standard_normal(5000)]
+    seen = [guard.step(BenchSample(float(x), math.nan, math.nan), 1 / rate_hz) for x in rng.standard_normal(5000)]
     assert not any(isinstance(out, Finished) and not out.completed for out in seen)
     slow = ExcursionGuard(Patterned(AROUND, lambda _: 0.0, 600.0, 0.0), AROUND, 0.0, rate_hz)
-    out = [slow.step(Measurement(float(x), math.nan, math.nan), 1 / rate_hz) for x in np.arange(0.0, 10.0, 1e-3)]
+    out = [slow.step(BenchSample(float(x), math.nan, math.nan), 1 / rate_hz) for x in np.arange(0.0, 10.0, 1e-3)]
     stopped = next(i for i, value in enumerate(out) if isinstance(value, Finished))
     assert stopped * 1e-3 == pytest.approx(least_um, abs=0.5)
 

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.minimum_variance import least_std_um as least_of_the_twin
 from membrane_ctrl.config.schema import LoopConfig, TwinConfig
-from tuning.identification.disturbance import Disturbance, Noise, WeatherGain
+from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain
 from tuning.identification.loop_model import Gains, PlantModel, margins, sensitivity_peak
 from tuning.proposal.candidates import (
     RECOVERED_UM,
@@ -104,11 +104,11 @@ def test_load_recovery_of_a_double_root_and_of_a_loop_that_never_comes_back() ->
     assert load_recovery_s(Gains(20.0, 0.1), model, 1.0) == 0.0
 
 
-def typical(loop: LoopConfig) -> Disturbance:
+def typical(loop: LoopConfig) -> DisturbanceModel:
     """The twin's typical weather, known exactly; its slow return is left out."""
     noise = Noise(math.sqrt(1.0 + 0.1**2 / 12), 0.0, 0.0, 12.0, 0.0, 0.0, 0.0, 1 / loop.rate_hz)
     barometer = WeatherGain(-0.358, 0.0, 2 * 1.2**2 / 30, 0.05, 0.0)
-    return Disturbance(noise, barometer, WeatherGain(123.0, 0.0, 2 * 0.05**2 / 300, 0.002, 12.0))
+    return DisturbanceModel(noise, barometer, WeatherGain(123.0, 0.0, 2 * 0.05**2 / 300, 0.002, 12.0))
 
 
 @pytest.mark.parametrize(("feedforward", "agreement"), [(False, 0.05), (True, 0.1)])

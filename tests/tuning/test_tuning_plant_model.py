@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from synthetic import telegraph, way_um
 
-from membrane_ctrl.control.experiments.machine import Measurement
+from membrane_ctrl.control.experiments.machine import BenchSample
 from tuning.identification.loop_model import PlantModel, driven_um
 from tuning.identification.records import Record
 
@@ -37,7 +37,7 @@ def test_holding_flow_is_the_leak_in_commands() -> None:
 
 
 def test_lost_readings_are_counted_and_bridged() -> None:
-    samples = [Measurement(v) for v in (0.0, float("nan"), 2.0, 3.0)]
+    samples = [BenchSample(v) for v in (0.0, float("nan"), 2.0, 3.0)]
     record = Record.from_samples(0.02, [1.0] * 4, samples)
     assert record.lost_fraction == 0.25
     assert record.filled_displacement_um().tolist() == [0.0, 1.0, 2.0, 3.0]
@@ -46,20 +46,20 @@ def test_lost_readings_are_counted_and_bridged() -> None:
 
 
 def test_a_record_without_any_reading_is_refused() -> None:
-    record = Record.from_samples(0.02, [1.0] * 3, [Measurement(float("nan"))] * 3)
+    record = Record.from_samples(0.02, [1.0] * 3, [BenchSample(float("nan"))] * 3)
     with pytest.raises(ValueError, match="no laser reading"):
         record.filled_displacement_um()
 
 
 def test_parts_join_again_and_hash_the_same() -> None:
-    whole = Record.from_samples(0.02, [1.0, 2.0, 3.0, 4.0], [Measurement(float(i), 1.0, 2.0) for i in range(4)])
+    whole = Record.from_samples(0.02, [1.0, 2.0, 3.0, 4.0], [BenchSample(float(i), 1.0, 2.0) for i in range(4)])
     joined = whole.part(0.0, 0.04).followed_by(whole.part(0.04, 0.08))
     assert joined.sha256() == whole.sha256()
     assert joined.sha256() != whole.part(0.0, 0.06).sha256()
 
 
 def test_records_of_different_rates_do_not_join() -> None:
-    one = Record.from_samples(0.02, [1.0], [Measurement(0.0)])
-    other = Record.from_samples(0.05, [1.0], [Measurement(0.0)])
+    one = Record.from_samples(0.02, [1.0], [BenchSample(0.0)])
+    other = Record.from_samples(0.05, [1.0], [BenchSample(0.0)])
     with pytest.raises(ValueError, match="sample times"):
         one.followed_by(other)

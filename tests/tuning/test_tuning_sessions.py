@@ -11,7 +11,7 @@ import pytest
 import tuning
 from benchmarks.tuning import SESSIONS, Case, TwinBench, session
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
-from tuning.identification.characterise import Quality, characterise
+from tuning.identification.characterise import FitQuality, characterise
 from tuning.identification.disturbance import observe
 from tuning.identification.loop_model import Gains
 from tuning.proposal.design import RefusedError, propose, table
@@ -71,7 +71,7 @@ def designed():  # type: ignore[no-untyped-def]
 
 def test_a_proposal_is_complete_and_its_table_readable(designed) -> None:  # type: ignore[no-untyped-def]
     found, weather, loop = designed
-    proposal = propose(found, weather, loop, PumpConfig(), Quality("ok", ()))
+    proposal = propose(found, weather, loop, PumpConfig(), FitQuality("ok", ()))
     assert proposal.chosen is proposal.candidates[0]
     assert proposal.robustness.stable_fraction == 1.0
     assert proposal.robustness.ms_p95 < 1.6
@@ -86,13 +86,13 @@ def test_a_proposal_is_complete_and_its_table_readable(designed) -> None:  # typ
 def test_refused_data_are_not_designed_on(designed) -> None:  # type: ignore[no-untyped-def]
     found, weather, loop = designed
     with pytest.raises(RefusedError, match="run the relay again"):
-        propose(found, weather, loop, PumpConfig(), Quality("refused", ("run the relay again",)))
+        propose(found, weather, loop, PumpConfig(), FitQuality("refused", ("run the relay again",)))
 
 
 def test_a_leak_beyond_the_pump_is_refused(designed) -> None:  # type: ignore[no-untyped-def]
     found, weather, loop = designed
     with pytest.raises(RefusedError, match="leak"):
-        propose(found, weather, loop, PumpConfig(flow_full_um_per_s=0.5), Quality("ok", ()))
+        propose(found, weather, loop, PumpConfig(flow_full_um_per_s=0.5), FitQuality("ok", ()))
 
 
 def test_hand_made_gains_that_are_unstable_are_seen_in_preview_and_robustness(designed) -> None:  # type: ignore[no-untyped-def]

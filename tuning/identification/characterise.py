@@ -25,7 +25,7 @@ _WORSE_MAX = 1.5  # innovation on new data over that of the fit
 
 
 @dataclass(frozen=True, slots=True)
-class Quality:
+class FitQuality:
     """Verdict on data and fit.
 
     Attributes
@@ -66,7 +66,7 @@ def validate(identified: Identified, fresh: Record, settle_s: float = 2.0) -> Va
     return Validation(float(errors.std() / identified.innovation_um), whiteness(errors), independence(errors, change))
 
 
-def judge(record: Record, identified: Identified, validation: Validation | None = None) -> Quality:
+def judge(record: Record, identified: Identified, validation: Validation | None = None) -> FitQuality:
     """Verdict on a record and its fit."""
     refused, degraded = _faults(record, identified)
     if validation is not None and validation.innovation_ratio > _WORSE_MAX:
@@ -77,7 +77,7 @@ def judge(record: Record, identified: Identified, validation: Validation | None 
     if validation is not None and validation.independence_p < _P_MIN:
         degraded.append("the model leaves something of the flow in new data: repeat with the doublets experiment")
     verdict: Literal["ok", "degraded", "refused"] = "refused" if refused else "degraded" if degraded else "ok"
-    return Quality(verdict, (*refused, *degraded))
+    return FitQuality(verdict, (*refused, *degraded))
 
 
 def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str]]:
@@ -181,13 +181,13 @@ class Characterised:
     experiments : Experiments
     identified : Identified
         Fit to all of it.
-    quality : Quality
+    quality : FitQuality
         Verdict; the doublets are predicted with a fit to the relays alone.
     """
 
     experiments: Experiments
     identified: Identified
-    quality: Quality
+    quality: FitQuality
 
     @property
     def around(self) -> machine.Around:

@@ -260,7 +260,7 @@ def _regress(
 
 
 @dataclass(frozen=True, slots=True)
-class Disturbance:
+class DisturbanceModel:
     """What moves the centre, and what the laser adds.
 
     Attributes
@@ -303,9 +303,9 @@ class Disturbance:
         return np.asarray(total, dtype=float)
 
 
-def observe(record: records.Record, model: loop_model.PlantModel, loop: LoopConfig) -> Disturbance:
+def observe(record: records.Record, model: loop_model.PlantModel, loop: LoopConfig) -> DisturbanceModel:
     """Weather gains and noise from a quiet hold under any loop. Raises ValueError if it is too short."""
     weather = fit_weather(record, model, loop.gas_follows_air_s)
-    return Disturbance(
+    return DisturbanceModel(
         fit_noise(weather.rest_um, record.dt_s, loop.gas_follows_air_s), weather.barometer, weather.air
     )

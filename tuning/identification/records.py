@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from membrane_ctrl.control.experiments.machine import Measurement
+from membrane_ctrl.control.experiments.machine import BenchSample
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -41,9 +41,9 @@ class Record:
     air_temperature_c: Series
 
     @classmethod
-    def from_samples(cls, dt_s: float, flows_um_per_s: Sequence[float], samples: Sequence[Measurement]) -> Record:
+    def from_samples(cls, dt_s: float, flows_um_per_s: Sequence[float], samples: Sequence[BenchSample]) -> Record:
         """Columns of samples and of the flows that followed them."""
-        columns = [[getattr(sample, field.name) for sample in samples] for field in fields(Measurement)]
+        columns = [[getattr(sample, field.name) for sample in samples] for field in fields(BenchSample)]
         return cls(dt_s, np.array(flows_um_per_s, dtype=float), *(np.array(c, dtype=float) for c in columns))
 
     def __len__(self) -> int:

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from membrane_ctrl.config.schema import LoopConfig
 from tuning.identification import loop_model, records
-from tuning.identification.disturbance import Disturbance
+from tuning.identification.disturbance import DisturbanceModel
 from tuning.proposal.prediction import predict
 
 # Filters tried by the search: none costs more phase than the loop has.
@@ -132,7 +132,7 @@ def max_ki(model: loop_model.PlantModel, dt_s: float, filter_s: float, ms: float
 
 
 def least_variance(
-    model: loop_model.PlantModel, disturbance: Disturbance, loop: LoopConfig, demands: Demands
+    model: loop_model.PlantModel, disturbance: DisturbanceModel, loop: LoopConfig, demands: Demands
 ) -> loop_model.Gains:
     """PI and filter with the least predicted variance of the true centre, within the demands.
 
@@ -141,7 +141,7 @@ def least_variance(
     Parameters
     ----------
     model : PlantModel
-    disturbance : Disturbance
+    disturbance : DisturbanceModel
     loop : LoopConfig
         Its feed-forward counts; its gains do not.
     demands : Demands

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from tuning.identification import characterise, identify, loop_model
-from tuning.identification.disturbance import Disturbance
+from tuning.identification.disturbance import DisturbanceModel
 from tuning.proposal.candidates import (
     Demands,
     amigo,
@@ -82,7 +82,7 @@ class RefusedError(Exception):
     """The data do not carry a proposal; the message says why and which experiment would help."""
 
 
-def feedforward_settings(loop: LoopConfig, disturbance: Disturbance) -> LoopConfig:
+def feedforward_settings(loop: LoopConfig, disturbance: DisturbanceModel) -> LoopConfig:
     """The loop with the fitted weather gains where the data know them (`WeatherGain.agreed`)."""
     changed: dict[str, float] = {}
     if disturbance.barometer is not None:
@@ -102,7 +102,7 @@ def candidate(
     name: str,
     gains: loop_model.Gains,
     model: loop_model.PlantModel,
-    disturbance: Disturbance,
+    disturbance: DisturbanceModel,
     loop: LoopConfig,
     demands: Demands,
 ) -> Candidate:
@@ -116,7 +116,7 @@ def candidate(
 
 
 def candidates(
-    model: loop_model.PlantModel, disturbance: Disturbance, loop: LoopConfig, demands: Demands
+    model: loop_model.PlantModel, disturbance: DisturbanceModel, loop: LoopConfig, demands: Demands
 ) -> tuple[Candidate, ...]:
     """All candidates; the first is the one to propose."""
     dt_s, filter_s = disturbance.rest.dt_s, _RULE_FILTER_S
@@ -136,10 +136,10 @@ def candidates(
 
 def propose(
     identified: identify.Identified,
-    disturbance: Disturbance,
+    disturbance: DisturbanceModel,
     loop: LoopConfig,
     pump: PumpConfig,
-    quality: characterise.Quality,
+    quality: characterise.FitQuality,
     demands: Demands | None = None,
 ) -> Proposal:
     """Design on identified data.

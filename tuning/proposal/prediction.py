@@ -15,7 +15,7 @@ from scipy.linalg import expm, solve_discrete_are
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.model.arrays import FloatArray
 from tuning.identification import identify, loop_model
-from tuning.identification.disturbance import Disturbance
+from tuning.identification.disturbance import DisturbanceModel
 
 Matrix = FloatArray
 
@@ -30,7 +30,7 @@ class Predicted:
 
 
 def predict(
-    gains: loop_model.Gains, model: loop_model.PlantModel, disturbance: Disturbance, loop: LoopConfig
+    gains: loop_model.Gains, model: loop_model.PlantModel, disturbance: DisturbanceModel, loop: LoopConfig
 ) -> Predicted:
     """Linear prediction for a stable loop; a pump at its limit is the preview's to see."""
     dt_s = disturbance.rest.dt_s
@@ -45,14 +45,14 @@ def predict(
 
 
 def least_std_um(
-    model: loop_model.PlantModel, disturbance: Disturbance, loop: LoopConfig, write_s: float = 0.0
+    model: loop_model.PlantModel, disturbance: DisturbanceModel, loop: LoopConfig, write_s: float = 0.0
 ) -> float:
     """Bound for the sensors that the loop's feed-forward uses; a weather it does not use is disturbance only.
 
     Parameters
     ----------
     model : PlantModel
-    disturbance : Disturbance
+    disturbance : DisturbanceModel
     loop : LoopConfig
     write_s : float
         Time from a reading to its command, if the model's dead time does not hold it.
@@ -80,7 +80,7 @@ _RETURN_S = 3600.0
 _UNSEEN = 1e-6
 
 
-def _walks(disturbance: Disturbance) -> tuple[Matrix, Matrix, Matrix]:
+def _walks(disturbance: DisturbanceModel) -> tuple[Matrix, Matrix, Matrix]:
     """States: barometer, air, gas, fast rest, slow rest, what it reaches; their drift, diffusion, and the centre."""
     barometer, air, rest = disturbance.barometer, disturbance.air, disturbance.rest
     drift = -np.eye(6) / _RETURN_S
@@ -125,7 +125,7 @@ def sampled_plants(identified: identify.Identified, count: int, seed: int = 1) -
 def robustness(
     gains: loop_model.Gains,
     identified: identify.Identified,
-    disturbance: Disturbance,
+    disturbance: DisturbanceModel,
     loop: LoopConfig,
     count: int = 60,
 ) -> Robustness:

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
-from membrane_ctrl.control.experiments.machine import Measurement
+from membrane_ctrl.control.experiments.machine import BenchSample
 from tuning.identification import loop_model, records
-from tuning.identification.disturbance import Disturbance
+from tuning.identification.disturbance import DisturbanceModel
 from tuning.proposal.candidates import RECOVERED_UM
 from tuning.rig import Rig
 
@@ -28,7 +28,7 @@ class ModelBench:
     Parameters
     ----------
     model : PlantModel
-    disturbance : Disturbance
+    disturbance : DisturbanceModel
     pump : PumpConfig
     seed : int
     leak_step : tuple of float
@@ -38,7 +38,7 @@ class ModelBench:
     def __init__(
         self,
         model: loop_model.PlantModel,
-        disturbance: Disturbance,
+        disturbance: DisturbanceModel,
         pump: PumpConfig,
         seed: int,
         leak_step: tuple[float, float] = (math.inf, 0.0),
@@ -58,7 +58,7 @@ class ModelBench:
         self._ticks = 0
         self.true_um: list[float] = []
 
-    def exchange(self, pump_fraction: float, vent_fraction: float) -> Measurement:
+    def exchange(self, pump_fraction: float, vent_fraction: float) -> BenchSample:
         """One tick. The vent stands where it stood when the leak was identified."""
         pump = self._pump
         self._running = pump_fraction >= (pump.stall_fraction if self._running else pump.start_fraction)
@@ -86,13 +86,13 @@ class ModelBench:
         moved += air.gain * walks[5] if air else 0.0
         return float(moved)
 
-    def _read(self, weather_um: float) -> Measurement:
+    def _read(self, weather_um: float) -> BenchSample:
         of = self._disturbance
         true_um = self._way_um + weather_um
         self.true_um.append(true_um)
         self._ticks += 1
         laser, pressure, temperature = self._rng.standard_normal(3).tolist()
-        return Measurement(
+        return BenchSample(
             true_um + of.laser_um * laser,
             _LEVEL_PA + self._walks[3] + of.barometer.noise * pressure if of.barometer else math.nan,
             _LEVEL_C + self._walks[4] + of.air.noise * temperature if of.air else math.nan,
@@ -122,7 +122,7 @@ def preview(
     loop: LoopConfig,
     pump: PumpConfig,
     model: loop_model.PlantModel,
-    disturbance: Disturbance,
+    disturbance: DisturbanceModel,
     seed: int = 1,
     duration_s: float = 180.0,
     load_step_um_per_s: float = 0.6,
@@ -150,7 +150,7 @@ def _held(
     return np.array(bench.true_um)[round(_SETTLE_S * loop.rate_hz) :]
 
 
-def _without_weather(disturbance: Disturbance) -> Disturbance:
+def _without_weather(disturbance: DisturbanceModel) -> DisturbanceModel:
     rest = disturbance.rest
     still = type(rest)(rest.white * 1e-3, 0.0, 0.0, rest.slow_s, 0.0, 0.0, 0.0, rest.dt_s)
-    return Disturbance(still, None, None)
+    return DisturbanceModel(still, None, None)

@@ -80,24 +80,24 @@ def settle_s(loop: LoopConfig) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class VerificationTrial:
     """What is compared with what."""
 
     model: loop_model.PlantModel
-    weather: disturbance.Disturbance
+    weather: disturbance.DisturbanceModel
     before: LoopConfig
     after: LoopConfig
 
 
-def centre_std_um(off_um: records.Series, trial: Trial, weather: disturbance.Disturbance) -> float:
+def centre_std_um(off_um: records.Series, trial: VerificationTrial, weather: disturbance.DisturbanceModel) -> float:
     """Standard deviation of the centre without the laser's noise; 0 where less than nothing is left.
 
     Parameters
     ----------
     off_um : (n,) array
         Readings less setpoint.
-    trial : Trial
-    weather : Disturbance
+    trial : VerificationTrial
+    weather : DisturbanceModel
         What the prediction is made with that the readings correct.
     """
     dt_s = weather.rest.dt_s
@@ -114,7 +114,7 @@ def centre_std_um(off_um: records.Series, trial: Trial, weather: disturbance.Dis
     return math.sqrt(max(0.0, predicted_um**2 + float(np.mean(seen - expected))))
 
 
-def seen_sensitivity(off_um: records.Series, trial: Trial) -> float:
+def seen_sensitivity(off_um: records.Series, trial: VerificationTrial) -> float:
     """Largest sensitivity, from where the spectrum stands out above the one the model predicts.
 
     A plant whose gain or delay has grown shows as a peak near the crossover. The level of the weather does not
@@ -135,7 +135,7 @@ def seen_sensitivity(off_um: records.Series, trial: Trial) -> float:
     return float(model_ms * math.sqrt(max(1.0, means.max() / np.median(means))))
 
 
-def look(record: records.Record, setpoint_um: records.Series, trial: Trial, growth_max: float) -> Stage:
+def look(record: records.Record, setpoint_um: records.Series, trial: VerificationTrial, growth_max: float) -> Stage:
     """Judge what there is of the record; the setpoint of each sample is what the centre is compared with."""
     off_um = record.filled_displacement_um() - setpoint_um
     weather = trial.weather
@@ -217,7 +217,7 @@ def health(record: records.Record, setpoint_um: records.Series, loop: LoopConfig
     model = made.plant.model
     weather = disturbance.observe(record, model, loop)
     off_um = record.filled_displacement_um() - setpoint_um
-    std_um = centre_std_um(off_um, Trial(model, weather, loop, loop), weather)
+    std_um = centre_std_um(off_um, VerificationTrial(model, weather, loop, loop), weather)
     least_um = least_std_um(model, weather, loop)
     designed = predict(loop_model.Gains.of(loop), model, weather, loop).std_um / least_um
     gain, gain_sigma = _natural_gain(record, loop)

@@ -16,7 +16,7 @@ from membrane_ctrl.control.filters import LowPass
 
 
 @dataclass(frozen=True, slots=True)
-class Measurement:
+class BenchSample:
     """One sample of the bench; NaN for what the bench does not have or has lost."""
 
     displacement_um: float
@@ -66,12 +66,12 @@ class Around:
 class Experiment(Protocol):
     """A step machine."""
 
-    def step(self, measurement: Measurement, dt_s: float) -> float | Finished:
+    def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
         """Flow in um/s to put out until the next reading, or the end."""
         ...
 
 
-class Motion:
+class CentreMotion:
     """Position and speed of the centre from noisy readings: two lags, and their difference over their times'."""
 
     def __init__(self) -> None:
@@ -126,7 +126,7 @@ class ExcursionGuard:
 
     def __init__(self, experiment: Experiment, around: Around, centre_um: float, rate_hz: float) -> None:
         self._experiment = experiment
-        self._motion = Motion()
+        self._motion = CentreMotion()
         self._centre_um = centre_um
         in_hand_um = 3 * self._noise_per_laser_um(rate_hz) * around.laser_um
         if in_hand_um >= around.limit_um:
@@ -147,7 +147,7 @@ class ExcursionGuard:
         both = 2 * gain * (1 + gain) / ((FAST_S + SLOW_S) * rate_hz)
         return math.sqrt(fast + slow - both)
 
-    def step(self, measurement: Measurement, dt_s: float) -> float | Finished:
+    def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
         """The experiment's step, or the end of it."""
         self._motion.update(measurement.displacement_um, dt_s)
         if self._motion.lost_s > _LOST_MAX_S:
@@ -188,10 +188,10 @@ class Patterned:
         self._pattern = pattern
         self._duration_s = duration_s
         self._centre_um = centre_um
-        self._motion = Motion()
+        self._motion = CentreMotion()
         self._time_s = 0.0
 
-    def step(self, measurement: Measurement, dt_s: float) -> float | Finished:
+    def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
         """One tick of the pattern."""
         if self._time_s >= self._duration_s:
             return Finished(True, "done")

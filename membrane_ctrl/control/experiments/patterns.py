@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from membrane_ctrl.control.experiments.machine import COAST_S, Around, Finished, Measurement, Motion
+from membrane_ctrl.control.experiments.machine import COAST_S, Around, BenchSample, CentreMotion, Finished
 
 Pattern = Callable[[float], float]
 
@@ -97,7 +97,7 @@ class Relay:
         self._centre_um = centre_um
         self._duration_s = duration_s
         self._threshold_um = THRESHOLD_SHARE * around.limit_um
-        self._motion = Motion()
+        self._motion = CentreMotion()
         first = min(around.holding_flow_um_per_s, _FIRST_MAX_UM_PER_S)
         self._amplitudes_um_per_s = {1: first, -1: first}
         self._speeds_um_per_s = {1: first, -1: first}
@@ -107,7 +107,7 @@ class Relay:
         self._at_centre_s = math.nan
         self.crossings = 0
 
-    def step(self, measurement: Measurement, dt_s: float) -> float | Finished:
+    def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
         """One tick of the relay."""
         self._motion.update(measurement.displacement_um, dt_s)
         if self._time_s >= self._duration_s:

@@ -13,7 +13,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control import film_health, filters
-from membrane_ctrl.control.experiments.machine import Finished, Measurement, Motion
+from membrane_ctrl.control.experiments.machine import BenchSample, CentreMotion, Finished
 
 _PREPARE_S = 1.0  # seven lags of the pump: it stands, or runs
 _PROBE_MIN_S, _PROBE_MAX_S = 1.5, 5.0
@@ -73,7 +73,7 @@ class PumpMap:
 
 
 @dataclass(frozen=True, slots=True)
-class Probe:
+class PumpProbe:
     """One command after a preparation at another: 0 (standing) or running."""
 
     prepare_fraction: float
@@ -103,7 +103,7 @@ class PumpMapper:
         self._holding_fraction = holding_fraction
         self._probe_s = min(max(_TRAVEL_UM / holding_flow_um_per_s - _PREPARE_S, _PROBE_MIN_S), _PROBE_MAX_S)
         self._sinking_um_per_s: list[float] = []
-        self._motion = Motion()
+        self._motion = CentreMotion()
         self._plan = self._probes()
         self._probe = next(self._plan)
         self._returning, self._in_phase_s = True, 0.0
@@ -111,7 +111,7 @@ class PumpMapper:
         self._speed_um_per_s = math.nan
         self.result: PumpMap | None = None
 
-    def step(self, measurement: Measurement, dt_s: float) -> float | Finished:
+    def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
         """One tick: the command until the next reading, or the end."""
         self._motion.update(measurement.displacement_um, dt_s)
         self._in_phase_s += dt_s
@@ -144,24 +144,24 @@ class PumpMapper:
             return Finished(False, f"the mirror did not {way} back in {_RETURN_MAX_S:g} s: too tight, or no pump")
         return 0.0 if off_um > 0 else max(_RUN_FRACTION, self._holding_fraction)
 
-    def _mean_flow(self, prepare_fraction: float, fraction: float) -> Generator[Probe, None, float]:
+    def _mean_flow(self, prepare_fraction: float, fraction: float) -> Generator[PumpProbe, None, float]:
         """Mean of some measurements: one has an error of 0.1 um/s, and just above stalling there is no more flow."""
         total = 0.0
         for _ in range(_REPEATS):
             total += yield from self._flow(prepare_fraction, fraction)
         return total / _REPEATS
 
-    def _flow(self, prepare_fraction: float, fraction: float) -> Generator[Probe, None, float]:
+    def _flow(self, prepare_fraction: float, fraction: float) -> Generator[PumpProbe, None, float]:
         """Flow at a command: speed with it less speed without the pump, one right after the other.
 
         So the leak and the slow weather, which is as large as the flows in question, are in both.
         """
-        yield Probe(0.0, 0.0)
+        yield PumpProbe(0.0, 0.0)
         self._sinking_um_per_s.append(-self._speed_um_per_s)
-        yield Probe(prepare_fraction, fraction)
+        yield PumpProbe(prepare_fraction, fraction)
         return self._speed_um_per_s + self._sinking_um_per_s[-1]
 
-    def _probes(self) -> Generator[Probe, None, None]:
+    def _probes(self) -> Generator[PumpProbe, None, None]:
         """The plan, as a coroutine: each probe's speed is there when the next one is asked for."""
         low = self._holding_fraction + 0.02
         less = yield from self._mean_flow(_RUN_FRACTION, low)
@@ -185,7 +185,7 @@ class PumpMapper:
 
     def _edge(
         self, prepare_fraction: float, off: float, on: float, steps: int, slope: float, dead: float
-    ) -> Generator[Probe, None, float]:
+    ) -> Generator[PumpProbe, None, float]:
         """Lowest command at which a standing (or running) pump runs, by bisection; NaN if none up to `on` does."""
         highest = on
         for _ in range(steps):

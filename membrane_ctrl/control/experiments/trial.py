@@ -84,7 +84,7 @@ class Trial:
         """Its answers are pump commands (0..1), not flows."""
         return self.spec.kind == "pump_map"
 
-    def step(self, measurement: machine.Measurement, dt_s: float) -> float | machine.Finished:
+    def step(self, measurement: machine.BenchSample, dt_s: float) -> float | machine.Finished:
         """One tick: what to put out until the next reading, or the end."""
         self._left_s -= dt_s
         if self.raw and self._left_s < 0:

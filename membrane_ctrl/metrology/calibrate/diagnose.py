@@ -61,7 +61,7 @@ class LaserScale:
 
 
 @dataclass(frozen=True)
-class Bump:
+class CameraBump:
     """The camera stands otherwise for some of the sets."""
 
     sets: tuple[int, ...]
@@ -146,7 +146,7 @@ def left_out(solution: solve.Solution) -> tuple[LeftOut, ...]:
     return tuple(out)
 
 
-def bumps(solution: solve.Solution) -> tuple[Bump, ...]:
+def bumps(solution: solve.Solution) -> tuple[CameraBump, ...]:
     """The camera turned for one set, or from one set on; those that are sure, the strongest first."""
     reduced, sigmas = _reduced(solution), solution.problem.sigmas
     count = len(reduced)
@@ -164,7 +164,7 @@ def bumps(solution: solve.Solution) -> tuple[Bump, ...]:
         )
         delta, squares = _solved(sums + known, np.flatnonzero(kept))
         yaw, pitch, roll = (float(v) for v in delta[-len(_CAMERA) :])
-        out.append(Bump(group, (yaw, pitch, roll), before - squares))
+        out.append(CameraBump(group, (yaw, pitch, roll), before - squares))
     return tuple(sorted((bump for bump in out if bump.sure), key=lambda bump: -bump.fall))
 
 

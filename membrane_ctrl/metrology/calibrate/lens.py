@@ -26,7 +26,7 @@ _NAMES = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1"
 
 
 @dataclass(frozen=True)
-class View:
+class BoardView:
     """Corners of one photograph: place (n, 3) on the board in any unit, (n, 2) in px."""
 
     name: str
@@ -60,7 +60,7 @@ class Lens:
     left_out: tuple[str, ...]
 
 
-def calibrate_lens(views: Sequence[View], stated: CameraConfig) -> Lens:
+def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
     """Fit the lens.
 
     Parameters
@@ -99,7 +99,9 @@ def calibrate_lens(views: Sequence[View], stated: CameraConfig) -> Lens:
     )
 
 
-def _fit(views: Sequence[View], stated: CameraConfig) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
+def _fit(
+    views: Sequence[BoardView], stated: CameraConfig
+) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
     """RMS, camera matrix, distortion, sigmas of the intrinsics, RMS of each view."""
     places = [view.place.astype(np.float32)[:, None] for view in views]
     seen = [view.seen_px.astype(np.float32)[:, None] for view in views]
@@ -119,7 +121,7 @@ def _row(values: ArrayLike) -> FloatArray:
     return np.asarray(values, float).ravel()
 
 
-def _rms_px(views: Sequence[View], matrix: FloatArray, lens: FloatArray) -> float:
+def _rms_px(views: Sequence[BoardView], matrix: FloatArray, lens: FloatArray) -> float:
     """What a given lens leaves of the corners, each view with its own best pose."""
     squares, count = 0.0, 0
     for view in views:

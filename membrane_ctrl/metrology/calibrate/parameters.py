@@ -110,7 +110,7 @@ def usual_sigma(name: str) -> float:
 
 
 @dataclass(frozen=True)
-class Bench:
+class BenchGeometry:
     """A geometry with what `Geometry` cannot say.
 
     Attributes
@@ -135,7 +135,7 @@ class Poses:
     screen: NDArray[Any]
 
 
-def bench_at(stated: Geometry, values: FloatArray) -> Bench:
+def bench_at(stated: Geometry, values: FloatArray) -> BenchGeometry:
     """The bench whose parameters, in the order of `NAMES`, are `values`."""
     poses = poses_at(stated, values)
     focal, column, row, k1, k2, p1, p2, bow_mm, pitch = values[len(POSE) : OPTICAL]
@@ -153,7 +153,7 @@ def bench_at(stated: Geometry, values: FloatArray) -> Bench:
         screen_s_y=poses.screen[1],
         face=stated.face._replace(bow_per_mm=stated.face.bow_per_mm + bow_mm / BOW_RADIUS_MM**2),
     )
-    return Bench(geometry, 1 + pitch)
+    return BenchGeometry(geometry, 1 + pitch)
 
 
 def poses_at(stated: Geometry, values: NDArray[Any]) -> Poses:

@@ -259,7 +259,7 @@ def _set(
     dark = residuals.SetPhases(
         f"{sag_mm:.2f} mm", column, row, np.zeros((2, column.size)), np.full(column.size, sigma_mm), 1e3 * moved_mm
     )
-    bench, surface = parameters.Bench(geometry), Surface.hencky_bowl(sag_mm, mirror.radius_mm)
+    bench, surface = parameters.BenchGeometry(geometry), Surface.hencky_bowl(sag_mm, mirror.radius_mm)
     points = residuals.place_rays(bench, dark, surface, -moved_mm)
     x_mm, y_mm, _z = geometry.pinhole_mm[:, None] + points.t_mm * points.rays
     screen_mm = -residuals.residual_mm(bench, dark, surface, -moved_mm)

@@ -21,7 +21,7 @@ from functools import cache
 import numpy as np
 from numpy.polynomial import polynomial as series
 
-from membrane_ctrl.metrology.calibrate.parameters import OPTICAL, POSE, Bench, Poses
+from membrane_ctrl.metrology.calibrate.parameters import OPTICAL, POSE, BenchGeometry, Poses
 from membrane_ctrl.metrology.optics import hencky, zernike
 from membrane_ctrl.metrology.optics.compiled import kernel
 from membrane_ctrl.metrology.optics.geometry import Geometry
@@ -139,7 +139,7 @@ def camera_rays(geometry: Geometry, phases: SetPhases) -> FloatArray:
     return geometry.rays(phases.column_px, phases.row_px)
 
 
-def place_rays(bench: Bench, phases: SetPhases, surface: Surface, vertex_z_mm: float) -> Points:
+def place_rays(bench: BenchGeometry, phases: SetPhases, surface: Surface, vertex_z_mm: float) -> Points:
     """The set's rays, followed to the surface."""
     points = Points.of(camera_rays(bench.geometry, phases), phases.screen_mm)
     tracer = Tracer(bench.geometry, surface.radius_mm, vertex_z_mm)
@@ -148,7 +148,7 @@ def place_rays(bench: Bench, phases: SetPhases, surface: Surface, vertex_z_mm: f
     return points
 
 
-def residual_mm(bench: Bench, phases: SetPhases, surface: Surface, vertex_z_mm: float) -> FloatArray:
+def residual_mm(bench: BenchGeometry, phases: SetPhases, surface: Surface, vertex_z_mm: float) -> FloatArray:
     """Seen minus predicted screen points (2, n)."""
     points = place_rays(bench, phases, surface, vertex_z_mm)
     parts = [_meet(bench, points, surface, part).screen_mm for part in _parts(points.t_mm.size)]
@@ -156,7 +156,7 @@ def residual_mm(bench: Bench, phases: SetPhases, surface: Surface, vertex_z_mm: 
 
 
 def chunks(
-    bench: Bench, turns: list[Poses], phases: SetPhases, surface: Surface, vertex_z_mm: float
+    bench: BenchGeometry, turns: list[Poses], phases: SetPhases, surface: Surface, vertex_z_mm: float
 ) -> Iterator[Chunk]:
     """Residuals with derivatives, some points at a time.
 
@@ -192,7 +192,7 @@ class _Meeting:
     screen_mm: FloatArray
 
 
-def _meet(bench: Bench, points: Points, surface: Surface, part: slice) -> _Meeting:
+def _meet(bench: BenchGeometry, points: Points, surface: Surface, part: slice) -> _Meeting:
     """Reflect the rays and follow them to the face, by Newton's steps from the plane unless it is one."""
     geometry, d, t = bench.geometry, points.rays[:, part], points.t_mm[part]
     place = geometry.pinhole_mm[:, None] + t * d
@@ -212,7 +212,9 @@ def _meet(bench: Bench, points: Points, surface: Surface, part: slice) -> _Meeti
     return _Meeting(d, t, place, n, u, k, axes.T @ at, face, at[:2])
 
 
-def _derivatives(bench: Bench, turns: list[Poses], surface: Surface, m: _Meeting, lens: FloatArray) -> FloatArray:
+def _derivatives(
+    bench: BenchGeometry, turns: list[Poses], surface: Surface, m: _Meeting, lens: FloatArray
+) -> FloatArray:
     """(2, COLUMNS, m) by the formulas above, right to left: what a change of P, u, n, d does to s."""
     geometry, d, n, u, k = bench.geometry, m.ray, m.normal, m.leaves, m.reach_mm
     axes = geometry.screen_axes

@@ -118,7 +118,7 @@ class Equations:
 
 
 def equations(
-    bench: parameters.Bench,
+    bench: parameters.BenchGeometry,
     turns: list[parameters.Poses],
     phases: residuals.SetPhases,
     state: SetState,
@@ -187,7 +187,7 @@ def rim_harmonics() -> FloatArray:
 
 
 def averaged(
-    bench: parameters.Bench, phases: residuals.SetPhases, state: SetState, about: int
+    bench: parameters.BenchGeometry, phases: residuals.SetPhases, state: SetState, about: int
 ) -> residuals.SetPhases:
     """The set with about so many points; robust, each with the noise of its mean."""
     left = residuals.residual_mm(bench, phases, state.surface, state.vertex_z_mm)

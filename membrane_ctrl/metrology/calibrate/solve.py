@@ -79,7 +79,7 @@ class Solution:
     converged: bool
 
     @property
-    def bench(self) -> parameters.Bench:
+    def bench(self) -> parameters.BenchGeometry:
         """The calibrated bench."""
         return parameters.bench_at(self.problem.stated, self.values)
 
@@ -103,7 +103,7 @@ def prior(sigmas: FloatArray, common: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Step:
+class SolverStep:
     """Step (COMMON,) of the common unknowns, their covariance, and the sum of squares after it."""
 
     delta: FloatArray
@@ -111,7 +111,7 @@ class Step:
     squares: float
 
 
-def step(sums: FloatArray, sigmas: FloatArray) -> Step:
+def step(sums: FloatArray, sigmas: FloatArray) -> SolverStep:
     """Solve for what is free. `sums` (COMMON + 1, squared) hold the sets and the prior."""
     free = np.flatnonzero(np.append(sigmas > 0, np.ones(separable.COMMON - len(parameters.NAMES), bool)))
     matrix, right = sums[np.ix_(free, free)], sums[free, -1]
@@ -120,7 +120,7 @@ def step(sums: FloatArray, sigmas: FloatArray) -> Step:
     delta, covariance = np.zeros(separable.COMMON), np.zeros((separable.COMMON, separable.COMMON))
     delta[free] = inverse @ right
     covariance[np.ix_(free, free)] = inverse
-    return Step(delta, covariance, float(sums[-1, -1] - right @ delta[free]))
+    return SolverStep(delta, covariance, float(sums[-1, -1] - right @ delta[free]))
 
 
 def solve(
@@ -219,11 +219,13 @@ def _first(problem: Problem, phases: residuals.SetPhases) -> separable.SetState:
     moved_um = phases.displacement_um - problem.references.reference_um
     vertex_z_mm = -moved_um * 1e-3 if np.isfinite(moved_um) else 0.0
     return separable.SetState(
-        surface_of(parameters.Bench(problem.stated), phases, problem.radius_mm, vertex_z_mm), vertex_z_mm
+        surface_of(parameters.BenchGeometry(problem.stated), phases, problem.radius_mm, vertex_z_mm), vertex_z_mm
     )
 
 
-def surface_of(bench: parameters.Bench, phases: residuals.SetPhases, radius_mm: float, vertex_z_mm: float) -> Surface:
+def surface_of(
+    bench: parameters.BenchGeometry, phases: residuals.SetPhases, radius_mm: float, vertex_z_mm: float
+) -> Surface:
     """One set's surface on a bench without bow, as `measure` fits it. Raises ValueError if there is none."""
     return _fit(bench, phases, radius_mm, vertex_z_mm).surface
 
@@ -235,7 +237,7 @@ def slope_residual(solution: Solution, phases: residuals.SetPhases, index: int) 
 
 
 def _fit(
-    bench: parameters.Bench, phases: residuals.SetPhases, radius_mm: float, vertex_z_mm: float
+    bench: parameters.BenchGeometry, phases: residuals.SetPhases, radius_mm: float, vertex_z_mm: float
 ) -> reconstruct.Fit:
     tracer = reconstruct.Tracer(bench.geometry, radius_mm, vertex_z_mm)
     points = reconstruct.Points.of(residuals.camera_rays(bench.geometry, phases), phases.screen_mm * bench.pitch)

@@ -20,7 +20,7 @@ _HARMLESS_UM = 2.5
 
 
 @dataclass(frozen=True)
-class Finding:
+class CalibrationFinding:
     """Something that is not as it should be.
 
     Attributes
@@ -38,7 +38,7 @@ class Finding:
     sets: tuple[int, ...] = ()
 
 
-def before(problem: Problem) -> tuple[Finding, ...]:
+def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
     """What can be seen without solving: sets too close together, a laser that counts another way."""
     moved = np.array([phases.displacement_um for phases in problem.sets])
     known = np.isfinite(moved)
@@ -47,7 +47,7 @@ def before(problem: Problem) -> tuple[Finding, ...]:
     seen_um = float(np.ptp(sag_um))
     if max(spread_um, seen_um) < LEAST_SPREAD_UM:
         return (
-            Finding(
+            CalibrationFinding(
                 True,
                 f"the sets are only {max(spread_um, seen_um):.0f} um apart: they say no more than one of them; "
                 f"at least {LEAST_SPREAD_UM / 1000:.0f} mm are needed, {GOOD_SPREAD_UM / 1000:.0f} mm are good",
@@ -57,14 +57,14 @@ def before(problem: Problem) -> tuple[Finding, ...]:
         return ()  # nothing to compare
     slope = float(np.polyfit(moved[known], sag_um[known], 1)[0]) if spread_um > 0 else np.inf
     if slope < 0:
-        return (Finding(True, "the laser counts the wrong way: its reading falls as the bowl deepens"),)
+        return (CalibrationFinding(True, "the laser counts the wrong way: its reading falls as the bowl deepens"),)
     if abs(slope - 1) > _SLOPE_OFF:
         says = f"its readings are {spread_um:.4g} um apart, the sags {seen_um:.4g} um"
-        return (Finding(True, f"the laser's unit or scale is wrong, or it is stuck: {says}"),)
+        return (CalibrationFinding(True, f"the laser's unit or scale is wrong, or it is stuck: {says}"),)
     return ()
 
 
-def after(solution: Solution) -> tuple[Finding, ...]:
+def after(solution: Solution) -> tuple[CalibrationFinding, ...]:
     """What the solution says of sets and model.
 
     One thing that is wrong makes many look wrong. Of all that would explain it the one that takes most out of the
@@ -77,7 +77,7 @@ def after(solution: Solution) -> tuple[Finding, ...]:
     return (*cause, *_scatter(solution), *_spread(solution))
 
 
-def _sets(solution: Solution) -> list[tuple[float, Finding]]:
+def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     """A camera that was bumped, a set that is bad, sets that do not belong together, each with what it explains."""
     names = [phases.name for phases in solution.problem.sets]
     out = []
@@ -85,7 +85,7 @@ def _sets(solution: Solution) -> list[tuple[float, Finding]]:
         yaw, pitch, roll = bump.turned_deg
         where = f"in {names[bump.sets[0]]}" if len(bump.sets) == 1 else f"from {names[bump.sets[0]]} on"
         says = f"the camera stood otherwise {where}: yaw {yaw:+.3f}, pitch {pitch:+.3f}, roll {roll:+.3f} degrees"
-        out.append((bump.fall - 2 * 3, Finding(True, says, bump.sets)))
+        out.append((bump.fall - 2 * 3, CalibrationFinding(True, says, bump.sets)))
     worst = max(diagnose.left_out(solution), key=lambda each: each.fall)
     if worst.disagrees:
         explained = worst.fall - 2 * worst.freedom
@@ -93,26 +93,28 @@ def _sets(solution: Solution) -> list[tuple[float, Finding]]:
             each.disagrees for each in diagnose.left_out(diagnose.without(solution, worst.index))
         ):
             says = f"{names[worst.index]} disagrees with all the others: {_why(solution, worst.index)}"
-            out.append((explained, Finding(True, says, (worst.index,))))
+            out.append((explained, CalibrationFinding(True, says, (worst.index,))))
         else:
             says = "the sets contradict each other: they are not of one bench, or several of them are bad"
-            out.append((explained, Finding(True, says)))
+            out.append((explained, CalibrationFinding(True, says)))
     return out
 
 
-def _astray(solution: Solution) -> Finding:
+def _astray(solution: Solution) -> CalibrationFinding:
     """No common geometry was found: is there one without one of the sets, or for those before and after a moment?"""
     problem, count = solution.problem, len(solution.problem.sets)
     for k in range(count if count > 2 else 0):
         if _agree(replace(problem, sets=problem.sets[:k] + problem.sets[k + 1 :])):
-            return Finding(
+            return CalibrationFinding(
                 True, f"{problem.sets[k].name} disagrees with all the others: it is of another bench", (k,)
             )
     for k in range(2, count - 1):
         if all(_agree(replace(problem, sets=part)) for part in (problem.sets[:k], problem.sets[k:])):
             says = f"the bench was changed between {problem.sets[k - 1].name} and {problem.sets[k].name}"
-            return Finding(True, says, tuple(range(k, count)))
-    return Finding(True, "the sets do not show one bench: they are of different rigs, or several of them are bad")
+            return CalibrationFinding(True, says, tuple(range(k, count)))
+    return CalibrationFinding(
+        True, "the sets do not show one bench: they are of different rigs, or several of them are bad"
+    )
 
 
 def _agree(problem: Problem) -> bool:
@@ -138,26 +140,28 @@ def _why(solution: Solution, index: int) -> str:
     return "its fringes show another bench"
 
 
-def _scatter(solution: Solution) -> list[Finding]:
+def _scatter(solution: Solution) -> list[CalibrationFinding]:
     """Sets that hardly count beside the others, because their fringes are so much worse."""
     ratios = np.sqrt([each.variance for each in solution.equations])
     worse = np.flatnonzero(ratios > _SCATTER * np.median(ratios))
     names = [phases.name for phases in solution.problem.sets]
     return [
-        Finding(False, f"{names[k]} scatters {ratios[k]:.1f} times as much as its camera should", (int(k),))
+        CalibrationFinding(
+            False, f"{names[k]} scatters {ratios[k]:.1f} times as much as its camera should", (int(k),)
+        )
         for k in worse
     ]
 
 
-def _laser(solution: Solution) -> list[tuple[float, Finding]]:
+def _laser(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     laser = diagnose.laser_scale(solution)
     if not laser.sure:
         return []
     says = f"the laser's scale is wrong: the optics see {laser.value:.4f} +- {laser.sigma:.4f} um per um of it"
-    return [(laser.fall - 2, Finding(True, says))]
+    return [(laser.fall - 2, CalibrationFinding(True, says))]
 
 
-def _model(solution: Solution) -> list[tuple[float, Finding]]:
+def _model(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     found = diagnose.suspects(solution)
     if not found:
         return []
@@ -169,16 +173,20 @@ def _model(solution: Solution) -> list[tuple[float, Finding]]:
         f"the residuals have the pattern of {first.name} = {first.value:.3g} +- {first.sigma:.2g}{unit} "
         f"({parameter.says}){also}, {first.figure_um:.1f} um of figure: free it with --free {first.name}"
     )
-    return [(first.fall - 2, Finding(first.figure_um > _HARMLESS_UM, says))]
+    return [(first.fall - 2, CalibrationFinding(first.figure_um > _HARMLESS_UM, says))]
 
 
-def _spread(solution: Solution) -> tuple[Finding, ...]:
+def _spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
     """What the sets could have said if they were others."""
     moved = np.array([phases.displacement_um for phases in solution.problem.sets])
     if np.count_nonzero(np.isfinite(moved)) < 2:
-        return (Finding(False, "fewer than two sets carry a laser reading: the sag rests on fringes and ring alone"),)
+        return (
+            CalibrationFinding(
+                False, "fewer than two sets carry a laser reading: the sag rests on fringes and ring alone"
+            ),
+        )
     spread_um = float(np.ptp(moved[np.isfinite(moved)]))
     if spread_um >= GOOD_SPREAD_UM / 2:
         return ()
     says = f"the sets are {spread_um / 1000:.1f} mm apart; {GOOD_SPREAD_UM / 1000:.0f} mm would know the sag better"
-    return (Finding(False, says),)
+    return (CalibrationFinding(False, says),)

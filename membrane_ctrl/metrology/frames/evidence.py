@@ -29,7 +29,7 @@ _EDGE_RAD = 0.5
 
 
 @dataclass(frozen=True)
-class Scene:
+class SampledBins:
     """What is known of the sampled bins: (n,) and (2, n) arrays.
 
     Attributes
@@ -49,10 +49,10 @@ class Scene:
     phase_rad: FloatArray
     sensitivity_rad_per_um: FloatArray
 
-    def thinned(self) -> Scene:
+    def thinned(self) -> SampledBins:
         """Enough of the bins."""
         every = slice(None, None, max(1, self.index.size // _SAMPLE))
-        return Scene(
+        return SampledBins(
             self.index[every],
             self.light[every],
             self.phase_rad[:, every],
@@ -62,7 +62,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Evidence:
-    """One frame; units of light are those of `Scene.light`.
+    """One frame; units of light are those of `SampledBins.light`.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Evidence:
     lit: float = 1.0
 
 
-def gather(stack: FrameStack, binned: Binned, scene: Scene, readable: list[int]) -> dict[int, Evidence]:
+def gather(stack: FrameStack, binned: Binned, scene: SampledBins, readable: list[int]) -> dict[int, Evidence]:
     """Evidence of all readable frames."""
     scene = scene.thinned()
     readings = stack.displacement_um - np.nan_to_num(stack.mean_reading_um)
@@ -116,7 +116,7 @@ class _Template:
     sure: BoolArray
 
 
-def _template(stack: FrameStack, scene: Scene, frame: int, reading_um: float) -> _Template:
+def _template(stack: FrameStack, scene: SampledBins, frame: int, reading_um: float) -> _Template:
     pattern = stack.patterns[frame]
     ones = np.ones(scene.index.size)
     if pattern.role in ("white", "black"):
@@ -194,7 +194,7 @@ class NoFigureError(Exception):
 
 
 @dataclass(frozen=True)
-class View:
+class BinView:
     """Arrays over the bins, (rows, columns) each.
 
     Attributes
@@ -216,7 +216,7 @@ class View:
     mask: BoolArray
 
 
-def look(stack: FrameStack, binned: Binned, excluded: Collection[int], estimate: FloatArray | None = None) -> View:
+def look(stack: FrameStack, binned: Binned, excluded: Collection[int], estimate: FloatArray | None = None) -> BinView:
     """Combine the frames that are not excluded.
 
     Parameters
@@ -252,7 +252,7 @@ def look(stack: FrameStack, binned: Binned, excluded: Collection[int], estimate:
     mask &= np.minimum(*swing) > FRINGE_SHARE * seen
     mask &= ~saturated
     every = light if third is None else [*light, third]
-    return View((used[0], used[1]), np.stack(phase), np.stack(swing), _middle(every, mask), mask)
+    return BinView((used[0], used[1]), np.stack(phase), np.stack(swing), _middle(every, mask), mask)
 
 
 def _third_estimate(stack: FrameStack, binned: Binned, excluded: Collection[int]) -> FloatArray | None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.metrology.frames.evidence import Evidence, Scene, gather
+from membrane_ctrl.metrology.frames.evidence import Evidence, SampledBins, gather
 from membrane_ctrl.metrology.frames.frame_stack import Binned, FrameStack
 from membrane_ctrl.metrology.phase import AXES
 
@@ -93,12 +93,12 @@ def obvious(stack: FrameStack, binned: Binned) -> list[Flag]:
     return flags
 
 
-def inspect(stack: FrameStack, binned: Binned, scene: Scene, excluded: Collection[int]) -> list[Flag]:
+def inspect(stack: FrameStack, binned: Binned, scene: SampledBins, excluded: Collection[int]) -> list[Flag]:
     """Judge all readable frames, worst first.
 
     Parameters
     ----------
-    scene : Scene
+    scene : SampledBins
         Prediction from the surface fitted to the frames that are not excluded.
     excluded : collection of int
         Frames that the surface was made without; judged too, but no measure for the others.

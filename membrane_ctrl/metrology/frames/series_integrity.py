@@ -113,7 +113,7 @@ BEYOND_SHARE = 0.05  # of pixels that a frame shows brighter than white, or dark
 
 
 @dataclass(frozen=True)
-class Series:
+class AxisSeries:
     """One axis of a set.
 
     Attributes
@@ -141,7 +141,7 @@ class Series:
         """Share of the pixels whose frequencies disagree."""
         return float(np.mean(~unwrap(self.phases_rad(), self.periods).consistent))
 
-    def with_frames(self, index: int, steps: FloatArray) -> Series:
+    def with_frames(self, index: int, steps: FloatArray) -> AxisSeries:
         """The same with other frames of one frequency."""
         frames = self.frames.copy()
         frames[index] = steps
@@ -165,15 +165,15 @@ class SeriesCheck:
     verdict: Verdict
     reason: str
     flags: tuple[SeriesFlag, ...]
-    axes: tuple[Series, ...]
+    axes: tuple[AxisSeries, ...]
 
 
-def check_series(axes: tuple[Series, ...], black: FloatArray, white: FloatArray) -> SeriesCheck:
+def check_series(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatArray) -> SeriesCheck:
     """Check the axes of a set, in the order in which they were taken.
 
     Parameters
     ----------
-    axes : Series
+    axes : AxisSeries
         Four steps each.
     black, white : (n,) arrays
         Of the same pixels.
@@ -207,13 +207,13 @@ def _amplitude(steps: FloatArray, shifts_rad: FloatArray) -> float:
     return max(float(np.median(np.abs(phasors(steps, shifts_rad)))), 1e-9)
 
 
-def _closure_share(axis: Series, index: int) -> float:
+def _closure_share(axis: AxisSeries, index: int) -> float:
     """Of one series, over its amplitude."""
     steps = axis.frames[index]
     return closure(steps, axis.shifts_rad).rms_adu / _amplitude(steps, axis.shifts_rad)
 
 
-def _closure_limits(axes: tuple[Series, ...]) -> dict[str, list[float]]:
+def _closure_limits(axes: tuple[AxisSeries, ...]) -> dict[str, list[float]]:
     """For each series, from all the others."""
     shares = {(axis.axis, k): _closure_share(axis, k) for axis in axes for k in range(len(axis.periods))}
 
@@ -224,7 +224,9 @@ def _closure_limits(axes: tuple[Series, ...]) -> dict[str, list[float]]:
     return {axis.axis: [limit((axis.axis, k)) for k in range(len(axis.periods))] for axis in axes}
 
 
-def _mend(axis: Series, index: int, limit: float, axes: tuple[Series, ...]) -> tuple[list[SeriesFlag], Series]:
+def _mend(
+    axis: AxisSeries, index: int, limit: float, axes: tuple[AxisSeries, ...]
+) -> tuple[list[SeriesFlag], AxisSeries]:
     """Flags of one series, and the axis with the series as good as it can be made."""
     disagree = _closure_share(axis, index) > limit
     if not disagree and axis.inconsistent_share() <= INCONSISTENT_SHARE:
@@ -255,7 +257,7 @@ def _mend(axis: Series, index: int, limit: float, axes: tuple[Series, ...]) -> t
     return flags, axis.with_frames(index, steps)
 
 
-def _closures(axis: Series, index: int) -> tuple[Closure, Closure]:
+def _closures(axis: AxisSeries, index: int) -> tuple[Closure, Closure]:
     """Closures that can name a frame: with the other frequencies' phase known, and with the level of the next."""
     neighbour = index - 1 if index + 1 == len(axis.periods) else index + 1
     steps, near = axis.frames[index], axis.frames[neighbour]
@@ -269,7 +271,7 @@ def _closures(axis: Series, index: int) -> tuple[Closure, Closure]:
     )
 
 
-def _exchange(axis: Series, index: int, limit: float) -> tuple[tuple[int, int], Series] | None:
+def _exchange(axis: AxisSeries, index: int, limit: float) -> tuple[tuple[int, int], AxisSeries] | None:
     """The only exchange of two steps after which they agree, among themselves and with the other frequencies."""
     found = []
     for a, b in combinations(range(len(axis.shifts_rad)), 2):
@@ -281,7 +283,7 @@ def _exchange(axis: Series, index: int, limit: float) -> tuple[tuple[int, int], 
     return found[0] if len(found) == 1 else None
 
 
-def _twin(axis: Series, index: int, axes: tuple[Series, ...]) -> tuple[int, str] | None:
+def _twin(axis: AxisSeries, index: int, axes: tuple[AxisSeries, ...]) -> tuple[int, str] | None:
     """A step that shows the picture of an earlier frame, and which one."""
     earlier: list[tuple[str, FloatArray]] = []
     amplitude = _amplitude(axis.frames[index], axis.shifts_rad)
@@ -299,7 +301,7 @@ def _twin(axis: Series, index: int, axes: tuple[Series, ...]) -> tuple[int, str]
     return None
 
 
-def _flat_flags(axes: tuple[Series, ...], black: FloatArray, white: FloatArray) -> list[SeriesFlag]:
+def _flat_flags(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatArray) -> list[SeriesFlag]:
     """White and black must enclose all that the fringes show."""
     frames = np.concatenate([axis.frames.reshape(-1, black.size) for axis in axes])
     margin = 0.1 * np.ptp(np.percentile(frames, [5, 95]))

@@ -109,7 +109,7 @@ class Moment:
 
 
 @dataclass(frozen=True)
-class Pair:
+class FigurePair:
     """A change of the figure.
 
     Attributes
@@ -142,7 +142,7 @@ class PairFinder:
         self._lags_s = tuple(lags_s)
         self._kept: deque[Moment] = deque()
 
-    def add(self, moment: Moment) -> list[Pair]:
+    def add(self, moment: Moment) -> list[FigurePair]:
         """The pairs that end with this set: at most one a lag, none for a set without a time."""
         if not math.isfinite(moment.time_s):
             return []
@@ -151,7 +151,9 @@ class PairFinder:
         while self._kept and moment.time_s - self._kept[0].time_s > (1 + _TOLERANCE) * max(self._lags_s):
             self._kept.popleft()
         pairs = [
-            Pair(lag, earlier, moment) for lag in self._lags_s if (earlier := self._at(moment.time_s - lag, lag))
+            FigurePair(lag, earlier, moment)
+            for lag in self._lags_s
+            if (earlier := self._at(moment.time_s - lag, lag))
         ]
         self._kept.append(moment)
         return pairs

@@ -8,7 +8,7 @@ from membrane_ctrl.model.arrays import BoolArray
 from membrane_ctrl.model.states import State
 from membrane_ctrl.review.events.laser_and_door import door_steps, glitches, looked_at, update_s
 from membrane_ctrl.review.events.steps import (
-    Found,
+    FoundEvent,
     Level,
     confidence,
     event_around,
@@ -49,7 +49,7 @@ SPREAD_LEAST_SIGMAS = 6.0
 SPREAD_HALF_MIN = 10
 
 
-def find_events(level: Level, shapes: Shapes, band_um: float) -> list[Found]:
+def find_events(level: Level, shapes: Shapes, band_um: float) -> list[FoundEvent]:
     """All events of a run in the order of time.
 
     Parameters
@@ -61,10 +61,10 @@ def find_events(level: Level, shapes: Shapes, band_um: float) -> list[Found]:
     band_um : float
         The run's `limits.band_um`: what leaves it for no other reason is an excursion.
     """
-    found: list[Found] = []
+    found: list[FoundEvent] = []
     if level["time_s"].size:
         even = _even(level)
-        finders: Iterable[Callable[[Level], list[Found]]] = (
+        finders: Iterable[Callable[[Level], list[FoundEvent]]] = (
             pressure_steps, leak_steps, laser_glitches, laser_losses, weather_losses, lateness_bursts,
             noise_changes,
         )  # fmt: skip
@@ -75,7 +75,7 @@ def find_events(level: Level, shapes: Shapes, band_um: float) -> list[Found]:
     return sorted(found, key=lambda event: event.time_s)
 
 
-def pressure_steps(level: Level) -> list[Found]:
+def pressure_steps(level: Level) -> list[FoundEvent]:
     """Doors: the air pressure steps within some seconds."""
     values = level["mean_ambient_pressure_pa"]
     found = door_steps(values, level["min_ambient_pressure_pa"], DOOR_LEAST_PA, DOOR_LEAST_SIGMAS)
@@ -83,7 +83,7 @@ def pressure_steps(level: Level) -> list[Found]:
     return [event_around("pressure step", level, s.row, 1, s.size, "Pa", confidence(s.sigmas, places)) for s in found]
 
 
-def leak_steps(level: Level) -> list[Found]:
+def leak_steps(level: Level) -> list[FoundEvent]:
     """The flow that holds the mirror steps, and the weather (what is fed forward) does not explain it."""
     minutes = tables.coarser_level(_held(level), 60.0)
     whole = minutes["rows"] > 0.5 * np.nanmedian(minutes["rows"])
@@ -100,7 +100,7 @@ def leak_steps(level: Level) -> list[Found]:
     ]
 
 
-def laser_glitches(level: Level) -> list[Found]:
+def laser_glitches(level: Level) -> list[FoundEvent]:
     """Readings that jump and jump back, while neither the air pressure nor a loss of the laser explains it."""
     lost = level["max_displacement_quality"] > 0
     barometer = level["mean_ambient_pressure_pa"]
@@ -114,48 +114,48 @@ def laser_glitches(level: Level) -> list[Found]:
     found = glitches(low_um, mean_um, high_um, usable, calm)
     time_s = level["time_s"]
     return [
-        Found("laser glitch", float(time_s[g.first]), float(time_s[g.first]) - 30, float(time_s[g.last]) + 30,
+        FoundEvent("laser glitch", float(time_s[g.first]), float(time_s[g.first]) - 30, float(time_s[g.last]) + 30,
               g.size_um, "um", confidence(g.sigmas, time_s.size))
         for g in found
     ]  # fmt: skip
 
 
-def laser_losses(level: Level) -> list[Found]:
+def laser_losses(level: Level) -> list[FoundEvent]:
     """The laser said that its reading is no good, or gave none."""
     bad = (level["max_displacement_quality"] > 0) | ~np.isfinite(level["mean_displacement_um"])
     bad &= (level["state"] == State.HOLD) & (level["rows"] > 0)
     return _losses("laser lost", bad, level, 1)
 
 
-def weather_losses(level: Level) -> list[Found]:
+def weather_losses(level: Level) -> list[FoundEvent]:
     """A barometer or thermometer that has given values gives none: what is fed forward then misses the weather."""
-    found: list[Found] = []
+    found: list[FoundEvent] = []
     for name, kind in _WEATHER.items():
         there = np.isfinite(level[name])
         found += _losses(kind, ~there & (np.cumsum(there) > 0) & (level["rows"] > 0), level, 5)
     return found
 
 
-def _losses(kind: str, lost: BoolArray, level: Level, join: int) -> list[Found]:
+def _losses(kind: str, lost: BoolArray, level: Level, join: int) -> list[FoundEvent]:
     time_s = level["time_s"]
-    return [Found(kind, float(time_s[a]), time_s[a] - 5, time_s[b] + 6, b - a + 1.0, "s", 1.0)
+    return [FoundEvent(kind, float(time_s[a]), time_s[a] - 5, time_s[b] + 6, b - a + 1.0, "s", 1.0)
             for a, b in runs(lost, join)]  # fmt: skip
 
 
-def lateness_bursts(level: Level) -> list[Found]:
+def lateness_bursts(level: Level) -> list[FoundEvent]:
     """Several late ticks close together; a single one is any machine's."""
     worst = level["max_lateness_ms"]
     usual = float(np.nanmedian(worst)) if np.isfinite(worst).any() else 0.0
     late = worst > max(LATE_LEAST_MS, LATE_LEAST_RATIO * usual)
     return [
-        Found("lateness burst", float(level["time_s"][a]), level["time_s"][a] - 5, level["time_s"][b] + 6,
+        FoundEvent("lateness burst", float(level["time_s"][a]), level["time_s"][a] - 5, level["time_s"][b] + 6,
               float(np.nanmax(worst[a : b + 1])), "ms", 1.0)
         for a, b in runs(late, int(LATE_BURST_S))
         if int(late[a : b + 1].sum()) >= LATE_BURST_LEAST
     ]  # fmt: skip
 
 
-def noise_changes(level: Level) -> list[Found]:
+def noise_changes(level: Level) -> list[FoundEvent]:
     """The spread of the error changes for minutes."""
     held = _held(level)
     minute = np.floor(held["time_s"] / 60).astype(int)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from membrane_ctrl.model.arrays import Column
-from membrane_ctrl.review.events.steps import Step, differences, local_sigma
+from membrane_ctrl.review.events.steps import FoundStep, differences, local_sigma
 
 # A laser's noise is 1 um; the film makes no spike of a single tick.
 GLITCH_LEAST_UM = 4.0
@@ -163,7 +163,7 @@ class _Candidates:
     score: Column
 
 
-def door_steps(mean_pa: Column, reading_pa: Column, least_pa: float, least_sigmas: float) -> list[Step]:
+def door_steps(mean_pa: Column, reading_pa: Column, least_pa: float, least_sigmas: float) -> list[FoundStep]:
     """Steps of the air pressure, one for each that happened; of a door that is closed at once, both.
 
     Parameters
@@ -185,7 +185,9 @@ def door_steps(mean_pa: Column, reading_pa: Column, least_pa: float, least_sigma
     for place in chosen:
         row, lag = int(found.row[place]), int(found.lag[place])
         size = _whole_size(values, row, lag, float(found.size[place])) if every == 1 else float(found.size[place])
-        result.append(Step(_steepest(mean_pa, row * every, (row + lag) * every), size, float(found.score[place])))
+        result.append(
+            FoundStep(_steepest(mean_pa, row * every, (row + lag) * every), size, float(found.score[place]))
+        )
     return result
 
 

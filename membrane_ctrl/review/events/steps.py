@@ -16,7 +16,7 @@ _STRETCH = 3600
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class FoundStep:
     """A step found.
 
     Attributes
@@ -34,7 +34,7 @@ class Step:
     sigmas: float
 
 
-def steps(values: Column, half: int, skip: int, least: float, least_sigmas: float) -> list[Step]:
+def steps(values: Column, half: int, skip: int, least: float, least_sigmas: float) -> list[FoundStep]:
     """Steps of at least `least` and `least_sigmas`, one for each that happened.
 
     Parameters
@@ -61,7 +61,7 @@ def steps(values: Column, half: int, skip: int, least: float, least_sigmas: floa
     rows = np.flatnonzero(peak)
     if rows.size:
         rows = rows[np.concatenate(([True], np.diff(rows) > reach))]
-    return [Step(int(row), float(difference[row]), float(score[row])) for row in rows]
+    return [FoundStep(int(row), float(difference[row]), float(score[row])) for row in rows]
 
 
 def differences(values: Column, half: int, skip: int) -> Column:
@@ -110,7 +110,7 @@ Level = dict[str, FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FoundEvent:
     """An event that nobody reported.
 
     Attributes
@@ -138,10 +138,10 @@ class Found:
     confidence: float
 
 
-def event_around(kind: str, table: Level, row: int, half_s: float, size: float, unit: str, sure: float) -> Found:
+def event_around(kind: str, table: Level, row: int, half_s: float, size: float, unit: str, sure: float) -> FoundEvent:
     """An event with a range about it of some times what it was found in."""
     time_s = float(table["time_s"][row])
-    return Found(kind, time_s, time_s - 30 * half_s**0.5, time_s + 30 * half_s**0.5, size, unit, sure)
+    return FoundEvent(kind, time_s, time_s - 30 * half_s**0.5, time_s + 30 * half_s**0.5, size, unit, sure)
 
 
 def widened(flags: BoolArray, rows: int) -> BoolArray:
@@ -171,7 +171,7 @@ TIMED_S = 5.0
 _TIMED_TO_MINUTES = ("leak step", "noise change")
 
 
-def excursions(level: Level, band_um: float, known: Sequence[Found]) -> list[Found]:
+def excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -> list[FoundEvent]:
     """The 1 s mean of the error leaves the band, and no fault, pause, ramp or event known explains it."""
     time_s, error_um = level["time_s"], level["mean_error_um"]
     out = (np.abs(error_um) > band_um) & (level["state"] == State.HOLD)
@@ -186,7 +186,7 @@ def excursions(level: Level, band_um: float, known: Sequence[Found]) -> list[Fou
     found = []
     for a, b in runs(out, BACK_S):
         worst = a + int(np.nanargmax(np.abs(error_um[a : b + 1])))
-        found.append(Found("excursion", float(time_s[a]), float(time_s[a]) - 30, float(time_s[b]) + 30,
+        found.append(FoundEvent("excursion", float(time_s[a]), float(time_s[a]) - 30, float(time_s[b]) + 30,
                            float(error_um[worst]), "um", 1.0))  # fmt: skip
     return found
 
@@ -203,7 +203,7 @@ JUMP_STILL_UM = 2.0
 _SIGMA_OVER_MAD = 1.4826
 
 
-def shape_jumps(shapes: Shapes, held: BoolArray) -> list[Found]:
+def shape_jumps(shapes: Shapes, held: BoolArray) -> list[FoundEvent]:
     """The figure beside its sag (terms 5 to 11, without what a deeper bowl has of them) steps between cycles."""
     moved_um = np.abs(np.diff(shapes.displacement_um, prepend=np.nan, append=np.nan))
     still = ~(np.fmax(moved_um[:-1], moved_um[1:]) > JUMP_STILL_UM)

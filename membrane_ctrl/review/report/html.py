@@ -11,7 +11,7 @@ from membrane_ctrl.review.report import figures as figures_hold
 from membrane_ctrl.review.report import figures as figures_shape
 from membrane_ctrl.review.report.json import timeline, verdict
 from membrane_ctrl.review.statistics import compare, drift, shape_review
-from membrane_ctrl.review.statistics.analysis import Analysis, Series
+from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
 from membrane_ctrl.review.statistics.spectra import bands, unseen_s
 from membrane_ctrl.review.words import number, span
 
@@ -159,7 +159,7 @@ def _details(analysis: Analysis) -> str:
     )
 
 
-def _bands(series: Series) -> str:
+def _bands(series: ErrorSeries) -> str:
     there = [band for band in bands(series.spectrum, series.slow) if band.rms_um == band.rms_um]
     if not there:
         return "too short to say"
@@ -251,7 +251,7 @@ def _said(event: dict[str, Any]) -> str:
     )
 
 
-def _slope(slope: drift.Slope, unit: str) -> str:
+def _slope(slope: drift.FittedSlope, unit: str) -> str:
     if slope.per_hour != slope.per_hour:
         return "too short to say"
     said = f"{slope.per_hour:+.3g} {unit} (95 %: {slope.low:+.3g} to {slope.high:+.3g})"

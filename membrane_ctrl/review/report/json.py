@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from membrane_ctrl.model.states import State
 from membrane_ctrl.review.statistics import drift, shape_review, spectra
-from membrane_ctrl.review.statistics.analysis import Analysis, Series
+from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
 from membrane_ctrl.review.words import span
 
 # A run in one sentence.
@@ -124,7 +124,7 @@ def _moment_s(event: dict[str, Any]) -> float:
     return float(moment) if isinstance(moment, (int, float)) else 0.0
 
 
-def _series(series: Series | None) -> dict[str, Any] | None:
+def _series(series: ErrorSeries | None) -> dict[str, Any] | None:
     if series is None:
         return None
     return {
@@ -141,7 +141,7 @@ def _series(series: Series | None) -> dict[str, Any] | None:
     }
 
 
-def _slope(slope: drift.Slope) -> dict[str, float | bool]:
+def _slope(slope: drift.FittedSlope) -> dict[str, float | bool]:
     return asdict(slope) | {"significant": slope.significant}
 
 

@@ -10,10 +10,10 @@ from scipy import fft
 from membrane_ctrl.model import errors, states
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
-from membrane_ctrl.review.events.steps import Found
+from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.review.statistics import shape_review, spectra
 from membrane_ctrl.review.statistics.anomalies import Anomaly, anomalies
-from membrane_ctrl.review.statistics.drift import Slope, slope
+from membrane_ctrl.review.statistics.drift import FittedSlope, slope
 from membrane_ctrl.review.statistics.hold_pass import ERROR, KEPT_AWAY, READING, TRUE, HoldPass, hold_pass
 from membrane_ctrl.review.statistics.windows import WindowStatistics, describe, window_means
 from membrane_ctrl.run_files.run import Block, Run
@@ -33,7 +33,7 @@ _ALLAN_LONGEST_S = 1e5
 
 
 @dataclass(frozen=True, slots=True)
-class Series:
+class ErrorSeries:
     """Statistics of one error: `reading` (in the loop) or `true` (the twin's centre).
 
     Attributes
@@ -47,7 +47,7 @@ class Series:
         Of the ticks.
     slow : Spectrum
         Of the 1 s means, in segments of half the hold: for what is slower than the segments of `spectrum`.
-    drift : Slope
+    drift : FittedSlope
         um per hour.
     """
 
@@ -56,7 +56,7 @@ class Series:
     allan: spectra.Allan
     spectrum: spectra.Spectrum
     slow: spectra.Spectrum
-    drift: Slope
+    drift: FittedSlope
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +88,12 @@ class Analysis:
     level : dict
         Overview for the pictures; its windows are `level_s` long.
     level_s : float
-    reading, true : Series or None
+    reading, true : ErrorSeries or None
         None when there is nothing settled (or, of `true`, on a real bench).
     benefit : Benefit or None
     leak_um_per_s : tuple
         Median, least and greatest minute of the leak estimate while held.
-    found : tuple of Found
+    found : tuple of FoundEvent
     shape : ShapeReview or None
     anomalies : tuple of Anomaly
     """
@@ -103,11 +103,11 @@ class Analysis:
     ticks: HoldPass
     level: Block
     level_s: float
-    reading: Series | None
-    true: Series | None
+    reading: ErrorSeries | None
+    true: ErrorSeries | None
     benefit: Benefit | None
     leak_um_per_s: tuple[float, float, float]
-    found: tuple[Found, ...]
+    found: tuple[FoundEvent, ...]
     shape: shape_review.ShapeReview | None
     anomalies: tuple[Anomaly, ...]
 
@@ -148,7 +148,7 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
 
 def _found_and_shape(
     run: Run, seconds: Block, start_s: float, end_s: float
-) -> tuple[tuple[Found, ...], shape_review.ShapeReview | None]:
+) -> tuple[tuple[FoundEvent, ...], shape_review.ShapeReview | None]:
     """What needs the cycles; they are let go again before the ticks are read."""
     shapes = run.shapes()
     shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
@@ -158,7 +158,7 @@ def _found_and_shape(
     return tuple(find_events(seconds, shapes, run.config.limits.band_um)), shape
 
 
-def _series(run: Run, ticks: HoldPass, which: int) -> Series | None:
+def _series(run: Run, ticks: HoldPass, which: int) -> ErrorSeries | None:
     rate_hz, band_um = run.config.loop.rate_hz, run.config.limits.band_um
     second, counts, sums = ticks.seconds[which]
     moments = ticks.raw_reading if which == READING else ticks.raw_true
@@ -170,7 +170,7 @@ def _series(run: Run, ticks: HoldPass, which: int) -> Series | None:
     longest = max(1, min(grid.size // 4, round(_ALLAN_LONGEST_S * rate_hz)))
     lengths = 2 ** np.arange(int(np.log2(longest)) + 1)
     minutes = ticks.hold_s >= _SLOPE_MINUTES_FROM_S
-    return Series(
+    return ErrorSeries(
         windows=tuple(describe(means[w][1], w, band_um) for w in WINDOWS_S),
         seconds_um=np.stack(means[1]),
         allan=spectra.allan_deviation(grid, 1 / rate_hz, lengths),

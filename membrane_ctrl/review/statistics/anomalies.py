@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from membrane_ctrl.review.events.steps import Found
+from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.review.statistics import hold_pass, shape_review
-from membrane_ctrl.review.statistics.drift import Slope
+from membrane_ctrl.review.statistics.drift import FittedSlope
 from membrane_ctrl.review.statistics.windows import WindowStatistics
 from membrane_ctrl.review.words import span
 from membrane_ctrl.run_files.run import Run
@@ -44,7 +44,7 @@ class _Series(Protocol):
     @property
     def windows(self) -> tuple[WindowStatistics, ...]: ...
     @property
-    def drift(self) -> Slope: ...
+    def drift(self) -> FittedSlope: ...
 
 
 def anomalies(
@@ -55,7 +55,7 @@ def anomalies(
     true: _Series | None,
     leak_um_per_s: float,
     tracking_share: float,
-    found: Sequence[Found],
+    found: Sequence[FoundEvent],
     shape: shape_review.ShapeReview | None,
 ) -> tuple[Anomaly, ...]:
     """All of a part of a run, the gravest first."""
@@ -118,5 +118,5 @@ def _pauses_s(run: Run, part_s: tuple[float, float], end_s: float) -> list[float
     return [length_s for length_s in lengths_s if length_s > 0]
 
 
-def _of(drift: Slope, unit: str) -> str:
+def _of(drift: FittedSlope, unit: str) -> str:
     return f"{drift.per_hour:+.3g} {unit} (95 %: {drift.low:+.3g} to {drift.high:+.3g})"

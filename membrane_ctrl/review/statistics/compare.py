@@ -9,8 +9,8 @@ from scipy import stats
 from membrane_ctrl.control.shape_loop import SHAPES
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.states import ShapeState, State
-from membrane_ctrl.review.statistics.analysis import Analysis, Series
-from membrane_ctrl.review.statistics.drift import Slope, mean_p, spread_p, windowed
+from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
+from membrane_ctrl.review.statistics.drift import FittedSlope, mean_p, spread_p, windowed
 
 _SIGNIFICANT = 0.01
 _SHORT = "no test: too short for blocks"
@@ -70,7 +70,7 @@ def compare(ours: Analysis, theirs: Analysis) -> list[Difference]:
     return found
 
 
-def _series(name: str, a: Series, b: Series, offset_um: float, tracks: bool) -> list[Difference]:
+def _series(name: str, a: ErrorSeries, b: ErrorSeries, offset_um: float, tracks: bool) -> list[Difference]:
     first = a.windows[0], b.windows[0]
     mean = mean_p(a.seconds_um, b.seconds_um, offset=offset_um)
     found = [
@@ -164,7 +164,7 @@ def _reference_um(analysis: Analysis) -> float:
     return scatter_um / math.sqrt(SHAPES)
 
 
-def _slope_p(a: Slope, b: Slope) -> float:
+def _slope_p(a: FittedSlope, b: FittedSlope) -> float:
     sigmas = [(slope.high - slope.low) / 2 / 1.96 for slope in (a, b)]
     if not all(math.isfinite(sigma) and sigma > 0 for sigma in sigmas):
         return math.nan

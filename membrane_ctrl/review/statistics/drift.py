@@ -16,7 +16,7 @@ _TAKEN_MOST = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Slope:
+class FittedSlope:
     """Least-squares slope.
 
     Attributes
@@ -40,7 +40,7 @@ class Slope:
         return bool(self.low > 0 or self.high < 0)
 
 
-def slope(time_s: Column, values: Column) -> Slope:
+def slope(time_s: Column, values: Column) -> FittedSlope:
     """Slope of values against time.
 
     The variance of the ordinary slope is multiplied by the integrated autocorrelation time of the residuals,
@@ -58,7 +58,7 @@ def slope(time_s: Column, values: Column) -> Slope:
     there = np.isfinite(values)
     hours, values = time_s[there] / 3600.0, values[there]
     if hours.size < 5 or np.ptp(hours) <= 0:
-        return Slope(np.nan, np.nan, np.nan, np.nan)
+        return FittedSlope(np.nan, np.nan, np.nan, np.nan)
     hours = hours - hours.mean()
     spread = float((hours**2).sum())
     rate = float((hours * values).sum()) / spread
@@ -68,7 +68,7 @@ def slope(time_s: Column, values: Column) -> Slope:
     freedom = max(effective - 2, 1.0)
     sigma = np.sqrt(float((residual**2).sum()) / (values.size - 2) * effective / freedom * factor / spread)
     reach = float(stats.t.ppf(0.975, freedom) * sigma)
-    return Slope(rate, rate - reach, rate + reach, effective)
+    return FittedSlope(rate, rate - reach, rate + reach, effective)
 
 
 def correlation_time(residual: Column) -> float:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.model.arrays import BoolArray, Column
-from membrane_ctrl.review.statistics.drift import Slope, slope
+from membrane_ctrl.review.statistics.drift import FittedSlope, slope
 from membrane_ctrl.run_files.shapes import MAP_PX, Shapes, height_basis
 
 # Monitored points on the unit disc: within the analysis area, at three radii and azimuths (the paper's A, B and C
@@ -18,7 +18,7 @@ _LEAST_CYCLES = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class CyclePair:
     """Two cycles some time apart.
 
     Attributes
@@ -62,13 +62,13 @@ class ShapeReview:
         Standard deviation of the height.
     mean_sd_um : float
         Mean over the area.
-    drift_um_per_hour : list of Slope
+    drift_um_per_hour : list of FittedSlope
         Of Z2..Z36.
     sag_um, laser_um : (n,) arrays
         Changes by camera and by laser since the first cycle.
-    disagreement : Slope
+    disagreement : FittedSlope
         Of sag by the camera minus laser: the mount's drift, or the films'.
-    pairs : tuple of Pair
+    pairs : tuple of CyclePair
     """
 
     time_s: Column
@@ -77,11 +77,11 @@ class ShapeReview:
     points_um: dict[str, Column]
     sd_um: Column
     mean_sd_um: float
-    drift_um_per_hour: tuple[Slope, ...]
+    drift_um_per_hour: tuple[FittedSlope, ...]
     sag_um: Column
     laser_um: Column
-    disagreement: Slope
-    pairs: tuple[Pair, ...]
+    disagreement: FittedSlope
+    pairs: tuple[CyclePair, ...]
 
 
 def review_shapes(shapes: Shapes, held: BoolArray, analysis_share: float) -> ShapeReview | None:
@@ -138,7 +138,7 @@ class _Area:
         return picture
 
 
-def _pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) -> Pair | None:
+def _pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) -> CyclePair | None:
     """The pair nearest to the run's middle, and the RMS of all pairs as far apart (within half a cycle)."""
     time_s = good.time_s
     half_s = 0.5 * float(np.median(np.diff(time_s)))
@@ -157,7 +157,7 @@ def _pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) -> Pair |
     if covariances[0] is not None and covariances[1] is not None:
         variance = _quadratic(area.basis[:36], covariances[0] + covariances[1])
         sigma_um = np.sqrt(np.maximum(variance, 0.0))
-    return Pair(
+    return CyclePair(
         first_s=float(time_s[first]),
         lag_s=float(time_s[second] - time_s[first]),
         change_um=area.map(change_um),
@@ -174,7 +174,7 @@ def _quadratic(basis: Column, covariance: Column) -> Column:
     return np.asarray(np.einsum("jp,jp->p", basis, covariance @ basis))
 
 
-def _slope(time_s: Column, values: Column) -> Slope:
+def _slope(time_s: Column, values: Column) -> FittedSlope:
     every = max(1, time_s.size // _SLOPE_VALUES)
     whole = time_s.size // every * every
     means = [part[:whole].reshape(-1, every).mean(axis=1) for part in (time_s, values)]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from membrane_ctrl.model import errors, states, terminal
 from membrane_ctrl.review import catalogue, words
-from membrane_ctrl.review.events.steps import Found
+from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.review.viewer import viewer
 from membrane_ctrl.review.viewer.blueprints import TABS, ReviewBlueprint
 from membrane_ctrl.review.viewer.layer import Layer
@@ -203,7 +203,9 @@ def _around(run: Run, what: str) -> float:
                 return event_s(event)
     from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 
-    found: list[Found] = find_events(run.level(1.0, names=LEVEL_COLUMNS), run.shapes(), run.config.limits.band_um)
+    found: list[FoundEvent] = find_events(
+        run.level(1.0, names=LEVEL_COLUMNS), run.shapes(), run.config.limits.band_um
+    )
     for item in found:
         if wanted in item.kind:
             return item.time_s

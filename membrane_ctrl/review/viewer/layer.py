@@ -17,7 +17,7 @@ from membrane_ctrl.model.telemetry import FIELDS, changes
 from membrane_ctrl.recorder.blueprint import TELEMETRY_LANES
 from membrane_ctrl.recorder.rerun_streams import event_text, event_time_s
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
-from membrane_ctrl.review.events.steps import Found
+from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.review.report.figures import broken_at_gaps
 from membrane_ctrl.run_files import run_folder, streams, summary
 from membrane_ctrl.run_files.run import Block, Run
@@ -167,7 +167,7 @@ class Layer:
                 states = [lane.word(code) for _, code in found]
                 self._columns(lane.path, times, rr.StateChange.columns(state=states))
 
-    def _events(self, run: Run, found: Sequence[Found], part_s: tuple[float, float]) -> None:
+    def _events(self, run: Run, found: Sequence[FoundEvent], part_s: tuple[float, float]) -> None:
         told = [e for e in run.events if e.get("kind") != "why" and part_s[0] <= event_time_s(e) <= part_s[1]]
         if told:
             levels = ["ERROR" if event.get("kind") == "fault" else "INFO" for event in told]
