@@ -20,36 +20,38 @@ if TYPE_CHECKING:
     from tuning.command import TuneOptions
 
 
-app = typer.Typer(no_args_is_help=True, help="Tuning sessions on a running hold, or on the twin.")
+app = typer.Typer(no_args_is_help=True, help="Tune the loops in sessions on a running hold, or on the twin.")
 
-TwinOption = Annotated[bool, typer.Option("--twin", help="On the twin, in virtual time.")]
+TwinOption = Annotated[bool, typer.Option("--twin", help="Work on the twin, in virtual time.")]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="With --twin: its configuration.")]
 RunOption = Annotated[Path | None, typer.Option("--run", help="Run folder of the hold.")]
 SocketOption = Annotated[Path | None, typer.Option("--socket", help="Control port of the hold.")]
 LogsOption = Annotated[Path, typer.Option("--logs", help="Sessions are in LOGS/tuning.")]
-SessionOption = Annotated[Path | None, typer.Option("--session", help="Go on with this session folder.")]
+SessionOption = Annotated[Path | None, typer.Option("--session", help="Continue this session.")]
 NameOption = Annotated[str, typer.Option("--name", help="Name of a new session.")]
-AuthorOption = Annotated[str | None, typer.Option("--author", help="Who tunes; the one logged in by default.")]
-ReasonOption = Annotated[str, typer.Option("--reason", help="Why; stands in the gains file and the journal.")]
-LimitOption = Annotated[float, typer.Option(min=3, max=30, help="Furthest the centre may go in an experiment, um.")]
-ObserveOption = Annotated[str, typer.Option(help="How long the quiet hold is; 5m to 15m.")]
-VerifyOption = Annotated[str, typer.Option(help="How long the verification is.")]
+AuthorOption = Annotated[str | None, typer.Option("--author", help="Name of who tunes; your login by default.")]
+ReasonOption = Annotated[str, typer.Option("--reason", help="Reason, for the gains file and the journal.")]
+LimitOption = Annotated[
+    float, typer.Option(min=3, max=30, help="Largest excursion of the centre in an experiment, um.")
+]
+ObserveOption = Annotated[str, typer.Option(help="Duration of the quiet hold, 5m to 15m.")]
+VerifyOption = Annotated[str, typer.Option(help="Duration of the verification.")]
 TakeOverOption = Annotated[bool, typer.Option("--take-over", help="Take the command from whoever has it.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 _STEPS = {
-    "characterise": "Relay and doublets about the holding flow; begins a session.",
-    "identify": "Gain, dead time and lag with their errors, and whether the data carry a proposal.",
-    "observe": "A quiet hold: laser noise and weather.",
-    "design": "Candidates side by side, and the proposed gains.",
-    "preview": "Present and proposed gains on the fitted twin, before anything is applied.",
-    "apply": "Set the proposed gains, on trial: without `verify` they go back by themselves.",
-    "verify": "Ten minutes of hold with the new gains, judged in stages: kept, or taken back (exit 3).",
-    "run": "All steps that are not done yet.",
+    "characterise": "Excite the loop with relay and doublets about the mean flow; begins a session.",
+    "identify": "Identify gain, dead time and lag with their errors; judge whether the data carry a proposal.",
+    "observe": "Observe a quiet hold: laser noise and weather.",
+    "design": "Compare candidates side by side and propose gains.",
+    "preview": "Preview present and proposed gains on the fitted twin.",
+    "apply": "Apply the proposed gains on trial: without `verify` they revert.",
+    "verify": "Verify the new gains in ten minutes of hold: keep them, or revert (exit 3).",
+    "run": "Run all steps that are not done yet.",
     "pump": "Map the pump (start, stall, gain, leak); later steps of the session use it.",
-    "outer": "Sag sensitivity, noise and drift of the figure; time constant of the shape loop.",
-    "watch": "Look at a hold without touching it, and say whether a session is due (exit 3).",
-    "rollback": "Back to the gains before those that were kept last.",
+    "outer": "Measure sag sensitivity, noise and drift of the figure; propose the shape loop's time constant.",
+    "watch": "Watch a hold without touching it; say whether a session is due (exit 3).",
+    "rollback": "Roll back to the gains before the last ones kept.",
 }
 
 
@@ -117,7 +119,7 @@ for _name in _STEPS:
 
 @app.command()
 def history(logs: LogsOption = Path("logs"), json: JsonOption = False) -> int:
-    """Which gains were kept, taken back or rolled back, when, by whom and why."""
+    """List which gains were kept, reverted or rolled back, when, by whom and why."""
     import json as json_module
 
     from membrane_ctrl.sessions.folder import plain
@@ -133,8 +135,7 @@ def compare(
     a: Annotated[Path, typer.Argument(metavar="A", help="Session folder.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="Session folder.")],
 ) -> int:
-    """Two sessions side by side: each one's gains on each one's plant and weather."""
-    pass
+    """Compare two sessions: each one's gains on each one's plant and weather."""
     from membrane_ctrl.sessions.folder import open_session
 
     print(compared(open_session(a), open_session(b)))

@@ -36,7 +36,7 @@ def run(arguments: Sequence[str]) -> int:
 
 @app.callback(invoke_without_command=True)
 def top(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
-    """Hold a pneumatic membrane mirror to the micrometre and measure its figure while it is held."""
+    """Hold a pneumatic membrane mirror to the micrometre and measure its figure meanwhile."""
     if version:
         print(__version__)
         raise typer.Exit

@@ -10,7 +10,9 @@ from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, 
 # The commands that calibrate a part of the optics by itself, for `calibrate --prior` or for the configuration.
 
 
-BoardOption = Annotated[str, typer.Option(help="KIND:COLUMNSxROWS of squares, KIND charuco or chessboard.")]
+BoardOption = Annotated[
+    str, typer.Option(help="Board as KIND:COLUMNSxROWS of squares; KIND is charuco or chessboard.")
+]
 
 
 def add_auxiliary_commands(app: typer.Typer) -> None:
@@ -22,26 +24,28 @@ def add_auxiliary_commands(app: typer.Typer) -> None:
 
 
 def calibrate_board(
-    out: Annotated[Path, typer.Argument(metavar="PICTURE", help="A .png to be shown pixel for pixel.")],
-    width_px: Annotated[int, typer.Option(min=64, help="Of the screen.")],
-    height_px: Annotated[int, typer.Option(min=64, help="Of the screen.")],
-    square_px: Annotated[int, typer.Option(min=8, help="Side of a square, a multiple of 8.")],
+    out: Annotated[Path, typer.Argument(metavar="PICTURE", help="PNG file, to be shown pixel for pixel.")],
+    width_px: Annotated[int, typer.Option(min=64, help="Width of the screen, px.")],
+    height_px: Annotated[int, typer.Option(min=64, help="Height of the screen, px.")],
+    square_px: Annotated[int, typer.Option(min=8, help="Side of a square, px; a multiple of 8.")],
     board: BoardOption = "charuco:15x9",
 ) -> int:
-    """Draw the board that `calibrate-camera` looks for, for a screen of so many pixels."""
+    """Draw the board that `calibrate-camera` looks for."""
     from membrane_ctrl.calibration.camera import draw_board
 
     return draw_board(out, board, square_px, width_px, height_px)
 
 
 def calibrate_camera(
-    photographs: Annotated[Path, typer.Argument(metavar="FOLDER", help="Photographs of the board, tilted each way.")],
+    photographs: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Photographs of the board, tilted in all directions.")
+    ],
     config: ConfigOption = None,
     board: BoardOption = "charuco:15x9",
-    out: Annotated[Path, typer.Option(help="The lens, for `calibrate --prior`.")] = Path("camera.toml"),
+    out: Annotated[Path, typer.Option(help="File of the lens, for `calibrate --prior`.")] = Path("camera.toml"),
     json: JsonOption = False,
 ) -> int:
-    """Focal length, principal point and distortion from photographs of a board; size and pixels are the config's."""
+    """Determine focal length, principal point and distortion from photographs of a board."""
     from membrane_ctrl.calibration.camera import CameraOptions
     from membrane_ctrl.calibration.camera import calibrate_camera as run
 
@@ -50,13 +54,15 @@ def calibrate_camera(
 
 def calibrate_pose(
     folder: SetArgument,
-    geometry: Annotated[Path | None, typer.Option(help="Measured by hand, instead of the set's.")] = None,
+    geometry: Annotated[Path | None, typer.Option(help="Geometry measured by hand, instead of the set's.")] = None,
     prior: PriorOption = None,
-    radius_sigma_mm: Annotated[float, typer.Option(min=0.001, help="How well the ring's radius is known.")] = 0.2,
-    out: Annotated[Path, typer.Option(help="The pose, for `calibrate --prior`.")] = Path("pose.toml"),
+    radius_sigma_mm: Annotated[
+        float, typer.Option(min=0.001, help="Standard uncertainty of the ring's radius, mm.")
+    ] = 0.2,
+    out: Annotated[Path, typer.Option(help="File of the pose, for `calibrate --prior`.")] = Path("pose.toml"),
     json: JsonOption = False,
 ) -> int:
-    """Pose of the camera from the ring's ellipse in a full set."""
+    """Determine the pose of the camera from the ring's ellipse in a full set."""
     from membrane_ctrl.calibration.pose import PoseOptions
     from membrane_ctrl.calibration.pose import calibrate_pose as run
 
@@ -64,7 +70,7 @@ def calibrate_pose(
 
 
 def calibrate_display(config: ConfigArgument, json: JsonOption = False) -> int:
-    """Settle time and gamma of the screen, as the camera sees it, and what they are worth."""
+    """Measure settle time and gamma of the screen with the camera."""
     from membrane_ctrl.calibration.display import calibrate_display as run
 
     return run(configured(config), str(config), json)
@@ -80,28 +86,39 @@ def calibrate(
     folders: Annotated[
         list[Path] | None, typer.Argument(metavar="SET...", help="Capture sets at different pressures.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="The new geometry; geometry.toml here without it.")] = None,
-    geometry: Annotated[Path | None, typer.Option(help="Measured by hand, instead of the sets'.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File of the new geometry; geometry.toml by default.")] = None,
+    geometry: Annotated[Path | None, typer.Option(help="Geometry measured by hand, instead of the sets'.")] = None,
     free: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME[=SIGMA]", help="Also calibrate this, as bow_mm; sigma 0 holds it; repeatable."),
+        typer.Option(
+            metavar="NAME[=SIGMA]",
+            help="Calibrate this parameter, too, e.g. bow_mm; sigma 0 holds it fixed; repeatable.",
+        ),
     ] = None,
     prior: PriorOption = None,
-    laser_sigma_um: Annotated[float, typer.Option(min=0.001, help="Of a set's mean reading.")] = 1.0,
+    laser_sigma_um: Annotated[
+        float, typer.Option(min=0.001, help="Standard uncertainty of a set's mean laser reading, um.")
+    ] = 1.0,
     pictures: Annotated[bool, typer.Option(help="Draw the residuals beside the geometry.")] = True,
     json: JsonOption = False,
-    live: Annotated[bool, typer.Option("--live", help="Take the sets from a running hold, and ask.")] = False,
+    live: Annotated[
+        bool, typer.Option("--live", help="Take the sets from a running hold; ask before the mirror moves.")
+    ] = False,
     range_um: Annotated[
-        float | None, typer.Option(help="--live: from the first setpoint to the last; 8000, or what there is.")
+        float | None, typer.Option(help="--live: range of setpoints, um; 8000 by default, or what the limits allow.")
     ] = None,
-    sets: Annotated[int | None, typer.Option(min=2, max=20, help="--live: how many; 5.")] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="--live: move the mirror and adopt the result unasked.")] = False,
-    session: Annotated[Path | None, typer.Option(help="--live: go on with this session folder.")] = None,
+    sets: Annotated[int | None, typer.Option(min=2, max=20, help="--live: number of sets; 5 by default.")] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="--live: move the mirror and adopt the result without asking.")
+    ] = False,
+    session: Annotated[Path | None, typer.Option(help="--live: continue this session.")] = None,
     session_name: Annotated[str, typer.Option("--name", help="--live: name of a new session.")] = "live",
     logs: Annotated[Path, typer.Option(help="--live: sessions are in LOGS/calibration.")] = Path("logs"),
     run: Annotated[Path | None, typer.Option(help="--live: run folder of the hold.")] = None,
     socket: Annotated[Path | None, typer.Option(help="--live: control port of the hold.")] = None,
-    take_over: Annotated[bool, typer.Option("--take-over", help="--live: take the command from its holder.")] = False,
+    take_over: Annotated[
+        bool, typer.Option("--take-over", help="--live: take the command from whoever has it.")
+    ] = False,
 ) -> int:
     """Calibrate the optics: one geometry with its covariance, from sets at several pressures."""
     from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command

@@ -33,7 +33,7 @@ SetpointArgument = Annotated[float, typer.Argument(metavar="UM", help="Setpoint,
 FlowArgument = Annotated[float, typer.Argument(metavar="FLOW", help="Flow, um/s of the centre.", callback=_finite)]
 OnArgument = Annotated[bool, typer.Argument(metavar="on|off")]
 TextArgument = Annotated[str, typer.Argument(metavar="TEXT", help="What to write.")]
-ReasonArgument = Annotated[str, typer.Argument(metavar="[TEXT]", help="Why the mirror is locked.")]
+ReasonArgument = Annotated[str, typer.Argument(metavar="TEXT", help="Why the mirror is locked.")]
 GainsArgument = Annotated[
     str, typer.Argument(metavar="FILE", help="TOML or JSON file with loop keys, or the keys: 'kp_per_s = 0.5'.")
 ]
@@ -146,7 +146,7 @@ _OWN: dict[str, Callable[..., dict[str, Any]]] = {
 }
 
 _add("status", "Show the status once.", _plain)
-_add("watch", "Print a line of status again and again, until the run ends.", _watch)
+_add("watch", "Print the status line by line until the run ends.", _watch)
 for _kind, _rule in TABLE.items():
     if _kind in _OWN or not (_rule.needs or _kind.startswith("shape_")):  # `tune` has a command of its own
         _add(_kind, _rule.does, _OWN.get(_kind, _plain))

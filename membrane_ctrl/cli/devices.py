@@ -18,7 +18,7 @@ def check(
     config: ConfigArgument,
     json: JsonOption = False,
 ) -> int:
-    """Validate a configuration, probe the devices it names, and say what would happen."""
+    """Validate a configuration, probe its devices, and say what a hold would do."""
     from membrane_ctrl.commissioning.check import check_config
 
     return check_config(configured(config), str(config), json)
@@ -33,10 +33,10 @@ def devices(json: JsonOption = False) -> int:
 
 def conformance(
     url: Annotated[str, typer.Argument(help="The board: tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200.")],
-    unit_id: Annotated[int, typer.Option(min=1, max=247, help="Modbus unit.")] = 1,
+    unit_id: Annotated[int, typer.Option(min=1, max=247, help="Modbus unit identifier.")] = 1,
     json: JsonOption = False,
 ) -> int:
-    """Test whether a board does what a pump board must do. The pump runs at a few per cent: vent the mirror first."""
+    """Test a pump board against its specification. The pump runs at a few per cent: vent the mirror first."""
     from membrane_ctrl.commissioning.devices import run_conformance
 
     return run_conformance(url, unit_id, json)

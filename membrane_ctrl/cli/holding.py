@@ -13,7 +13,7 @@ from membrane_ctrl.model import clock, errors
 alarm_app = typer.Typer(no_args_is_help=True)
 
 FlatOption = Annotated[
-    bool, typer.Option("--from-flat", help="The simulated mirror starts flat: a fill takes two hours.")
+    bool, typer.Option("--from-flat", help="Start with a flat simulated mirror: a fill takes two hours.")
 ]
 
 
@@ -35,16 +35,18 @@ def hold(
     ] = None,
     duration: Annotated[str | None, typer.Option(help="Stop after this long, e.g. 90s, 3m, 2h30m.")] = None,
     name: Annotated[str, typer.Option(help="Name of the run folder.")] = "hold",
-    logs: Annotated[Path | None, typer.Option(help="Where run folders go.")] = None,
+    logs: Annotated[Path | None, typer.Option(help="Folder of the runs; recording.logs_dir by default.")] = None,
     clear_faults: Annotated[
         bool,
-        typer.Option("--clear-faults", help="Clear what board or an earlier run has latched, once you know why."),
+        typer.Option(
+            "--clear-faults", help="Clear the faults that the board or an earlier run has latched, once you know why."
+        ),
     ] = False,
-    standby: Annotated[bool, typer.Option("--standby", help="Wait for `ctl hold`.")] = False,
+    standby: Annotated[bool, typer.Option("--standby", help="Start in standby and wait for `ctl hold`.")] = False,
     from_flat: FlatOption = False,
     json: JsonOption = False,
 ) -> int:
-    """Hold the mirror until told to stop: the main job."""
+    """Hold the mirror until told to stop."""
     from membrane_ctrl.hold.start import HoldOptions, hold_mirror
 
     options = HoldOptions(
@@ -64,7 +66,7 @@ def hold(
 
 def twin(
     config: ConfigOption = None,
-    speed: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Simulated seconds a second.")] = 1.0,
+    speed: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Simulated seconds per second.")] = 1.0,
     from_flat: FlatOption = False,
 ) -> int:
     """Serve the simulated bench on its real protocol, for any client, until interrupted."""
@@ -75,13 +77,15 @@ def twin(
 
 def safe(
     config: ConfigArgument,
-    logs: Annotated[Path | None, typer.Option(help="The folder of the runs; the configuration's by default.")] = None,
+    logs: Annotated[Path | None, typer.Option(help="Folder of the runs; recording.logs_dir by default.")] = None,
     latch: Annotated[
         bool,
-        typer.Option(help="Keep it stopped until a person clears it; without, a running program is left alone."),
+        typer.Option(
+            help="Keep the pump stopped until a person clears the latch; --no-latch leaves a running program alone."
+        ),
     ] = True,
 ) -> int:
-    """Stop the pump of the devices that a configuration names, whatever runs or ran; the vent stays as it is."""
+    """Stop the pump that a configuration names, whatever program runs; the vent stays as it is."""
     from membrane_ctrl.commissioning.safe import make_safe
 
     return make_safe(configured(config), str(config), logs, latch)
@@ -95,10 +99,10 @@ def alarm() -> None:
 @alarm_app.command("test")
 def alarm_test(
     config: ConfigOption = None,
-    escalated: Annotated[bool, typer.Option("--escalated", help="Also to those of the escalation.")] = False,
+    escalated: Annotated[bool, typer.Option("--escalated", help="Send it to the escalation addresses, too.")] = False,
     json: JsonOption = False,
 ) -> int:
-    """Send a test notice to all whom an alarm would reach."""
+    """Send a test message to every address of the alarms."""
     from membrane_ctrl.alarms.senders import send_test_alarm
 
     return send_test_alarm(configured(config), str(config or "the defaults"), escalated, json)

@@ -19,7 +19,7 @@ def add_commands(app: typer.Typer) -> None:
 def measure(
     capture_set: SetArgument,
     geometry: Annotated[Path | None, typer.Option(help="Geometry to use instead of the set's own.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Where the result goes; SET/result by default.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the result; SET/result by default.")] = None,
     pictures: Annotated[bool, typer.Option(help="Draw pictures beside the result.")] = True,
     rerun: Annotated[bool, typer.Option("--rerun", help="Write measurement.rrd beside the result.")] = False,
     json: JsonOption = False,
@@ -33,7 +33,7 @@ def measure(
 def uncertainty(
     capture_set: SetArgument,
     against: Annotated[
-        Path | None, typer.Option(metavar="SET", help="Of the change since this set, instead of the height.")
+        Path | None, typer.Option(metavar="SET", help="Estimate the change since this set instead of the height.")
     ] = None,
     trials: TrialsOption = 100,
     seed: SeedOption = 1,
@@ -41,15 +41,15 @@ def uncertainty(
         Path | None, typer.Option(help="Geometry to use instead of the set's own, with its covariance.")
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes; by default as many as the trials are worth.")
+        int | None, typer.Option(min=1, help="Worker processes; chosen by the number of trials by default.")
     ] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Run on this Dask scheduler, e.g. tcp://host:8786.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Where the result goes; SET/uncertainty by default.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the result; SET/uncertainty by default.")] = None,
     json: JsonOption = False,
 ) -> int:
-    """Monte Carlo over geometry and pixel noise: RMSE of the height, or of the change between two sets."""
+    """Estimate by Monte Carlo the RMSE of the height, or of the change between two sets."""
     from membrane_ctrl.measure.uncertainty import UncertaintyOptions, uncertainty_command
 
     options = UncertaintyOptions(
@@ -68,19 +68,19 @@ def uncertainty(
 
 def stability(
     run_of_sets: Annotated[Path, typer.Argument(metavar="RUN_OF_SETS", help="Folder of capture sets.")],
-    out: Annotated[Path | None, typer.Option(help="Where the result goes; RUN_OF_SETS/stability by default.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the result; RUN_OF_SETS/stability by default.")] = None,
     point: Annotated[
         list[str] | None, typer.Option(help="NAME=X,Y in mm: a point to follow, instead of A, B and C; repeatable.")
     ] = None,
     geometry: Annotated[
         Path | None, typer.Option(help="Geometry to use instead of the sets' own, with its covariance.")
     ] = None,
-    trials: Annotated[int, typer.Option(min=2, help="Monte Carlo trials, for every set.")] = 100,
+    trials: Annotated[int, typer.Option(min=2, help="Monte Carlo trials per set.")] = 100,
     seed: SeedOption = 1,
     rerun: Annotated[bool, typer.Option("--rerun", help="Write stability.rrd beside the result.")] = False,
     json: JsonOption = False,
 ) -> int:
-    """Stability of a run of sets: standard deviation, points in time, pairs with their uncertainty."""
+    """Evaluate the stability of a run of sets: standard deviation, points over time, pairs with uncertainty."""
     from membrane_ctrl.measure.stability import StabilityOptions, stability_command
 
     options = StabilityOptions(run_of_sets, out, tuple(point or ()), geometry, trials, seed, json, rerun)
@@ -90,28 +90,33 @@ def stability(
 def simulate(
     set_dir: Annotated[Path, typer.Argument(metavar="SET_DIR", help="New folder for the set, or for the run.")],
     config: ConfigOption = None,
-    sag_mm: Annotated[float, typer.Option(help="Depth of the bowl.")] = 37.1,
-    figure: Annotated[bool, typer.Option(help="The astigmatism, coma and so on of a mounted film.")] = True,
+    sag_mm: Annotated[float, typer.Option(help="Depth of the bowl, mm.")] = 37.1,
+    figure: Annotated[bool, typer.Option(help="Add the astigmatism, coma and so on of a mounted film.")] = True,
     steps: Annotated[int | None, typer.Option(min=3, max=64, help="Phase steps.")] = None,
-    bits: Annotated[int | None, typer.Option(min=8, max=16, help="Depth of the frames.")] = None,
-    noise_adu: Annotated[float | None, typer.Option(min=0.0, help="Noise of a pixel.")] = None,
-    shrink: Annotated[int, typer.Option(min=1, max=16, help="Larger pixels, fewer of them.")] = 1,
-    gamma: Annotated[float, typer.Option(help="Of the display.")] = 1.0,
-    motion_um: Annotated[float, typer.Option(help="Amplitude of the film's motion.")] = 0.0,
-    motion_hz: Annotated[float, typer.Option(help="Its frequency.")] = 0.3,
-    drift_um_per_s: Annotated[float, typer.Option(help="Drift of the film.")] = 0.0,
-    displacement_um: Annotated[float, typer.Option(help="How far the bowl is from that depth at the start.")] = 0.0,
-    laser_noise_um: Annotated[float, typer.Option(min=0.0, help="Noise of the laser's readings.")] = 0.0,
+    bits: Annotated[int | None, typer.Option(min=8, max=16, help="Bits per pixel.")] = None,
+    noise_adu: Annotated[float | None, typer.Option(min=0.0, help="Noise of a pixel, counts.")] = None,
+    shrink: Annotated[int, typer.Option(min=1, max=16, help="Factor: larger pixels, fewer of them.")] = 1,
+    gamma: Annotated[float, typer.Option(help="Gamma of the display.")] = 1.0,
+    motion_um: Annotated[float, typer.Option(help="Amplitude of the film's motion, um.")] = 0.0,
+    motion_hz: Annotated[float, typer.Option(help="Frequency of the motion, Hz.")] = 0.3,
+    drift_um_per_s: Annotated[float, typer.Option(help="Drift of the film, um/s.")] = 0.0,
+    displacement_um: Annotated[
+        float, typer.Option(help="Distance of the bowl from that depth at the start, um.")
+    ] = 0.0,
+    laser_noise_um: Annotated[float, typer.Option(min=0.0, help="Noise of the laser readings, um.")] = 0.0,
     stated: Annotated[
         Path | None, typer.Option(help="Geometry that the set states; the truth is the configuration's.")
     ] = None,
     exact: Annotated[bool, typer.Option("--exact", help="Trace every pixel: slow, true to the last bit.")] = False,
     seed: SeedOption = 1,
     fault: Annotated[
-        list[str] | None, typer.Option(help="kind:frame[:amount], as stale:x_sin_2; repeatable.")
+        list[str] | None,
+        typer.Option(help="Fault to put in, kind:frame or kind:frame:amount, e.g. stale:x_sin_2; repeatable."),
     ] = None,
-    sets: Annotated[int, typer.Option(min=1, help="More than one: a run, 0000 full, the others fringes.")] = 1,
-    interval_s: Annotated[float, typer.Option(min=0.0, help="From set to set of a run.")] = 4.0,
+    sets: Annotated[
+        int, typer.Option(min=1, help="Number of sets; more than one make a run: 0000 full, the others fringes.")
+    ] = 1,
+    interval_s: Annotated[float, typer.Option(min=0.0, help="Time from set to set of a run, s.")] = 4.0,
 ) -> int:
     """Write a capture set, or a run of sets, with its truth beside it."""
     from membrane_ctrl.measure.simulate import SimulateOptions, simulate_command

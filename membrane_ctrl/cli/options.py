@@ -12,15 +12,19 @@ from membrane_ctrl.config.toml_file import load
 S = TypeVar("S", bound=Section)
 
 ConfigArgument = Annotated[Path, typer.Argument(help="Configuration, one TOML file.", metavar="CONFIG")]
-ConfigOption = Annotated[Path | None, typer.Option("--config", help="Configuration, one TOML file.")]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="Configuration, one TOML file; the defaults without it.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 PriorOption = Annotated[
     list[Path] | None,
-    typer.Option(metavar="FILE", help="Of calibrate-camera or calibrate-pose; repeatable, the last one counts."),
+    typer.Option(
+        metavar="FILE", help="Result of calibrate-camera or calibrate-pose; repeatable, the last one counts."
+    ),
 ]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")]
 SetArgument = Annotated[Path, typer.Argument(metavar="SET", help="Folder with capture.toml and its images.")]
-SeedOption = Annotated[int, typer.Option(min=0, help="Of all that is random.")]
+SeedOption = Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")]
 TrialsOption = Annotated[int, typer.Option(min=2, help="Monte Carlo trials.")]
 
 

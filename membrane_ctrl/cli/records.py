@@ -18,14 +18,12 @@ def add_commands(app: typer.Typer) -> None:
 
 def replay(
     run_dir: RunArgument,
-    start: Annotated[
-        str | None, typer.Option("--from", help="Compare from this time of the run on, e.g. 3m.")
-    ] = None,
+    start: Annotated[str | None, typer.Option("--from", help="Compare from this time of the run, e.g. 3m.")] = None,
     end: Annotated[str | None, typer.Option("--to", help="End at this time of the run.")] = None,
-    to_test: Annotated[str | None, typer.Option(help="Make a regression test of it, tests/incidents/NAME.")] = None,
+    to_test: Annotated[str | None, typer.Option(help="Write a regression test to tests/incidents/NAME.")] = None,
     json: JsonOption = False,
 ) -> int:
-    """Run a run's recorded inputs through today's control code and say what is not the same (exit 3)."""
+    """Replay a run's inputs through today's control code and report differences (exit 3)."""
     import math
 
     from membrane_ctrl.replay.command import replay_command
@@ -39,11 +37,11 @@ def replay(
 def repair(
     run_dir: RunArgument,
     in_place: Annotated[
-        bool, typer.Option("--in-place", help="Put what was repaired in place of the torn files.")
+        bool, typer.Option("--in-place", help="Replace the torn files by the repaired ones.")
     ] = False,
     json: JsonOption = False,
 ) -> int:
-    """Mend what a crash left of a run: torn segments, a torn event log, a missing summary."""
+    """Repair a run after a crash: torn segments, a torn event log, a missing summary."""
     from membrane_ctrl.replay.repair import repair_command
 
     with _files_of_the_run():

@@ -29,21 +29,21 @@ def add_commands(app: typer.Typer) -> None:
 def review(
     runs: Annotated[list[str], typer.Argument(metavar="RUN...", help="One run, or several laid over each other.")],
     at: Annotated[str | None, typer.Option(help="Open on this moment: 03:12 (UTC) or +90m from the start.")] = None,
-    around: Annotated[str | None, typer.Option(help="Open on the first event called so, e.g. a fault.")] = None,
+    around: Annotated[str | None, typer.Option(help="Open on the first event of this name, e.g. a fault.")] = None,
     start: FromOption = None,
     end: ToOption = None,
-    tab: Annotated[str, typer.Option(help="overview, loop, shape, faults or tuning.")] = "overview",
-    align: Annotated[str, typer.Option(help="Several runs: 0 s at hold, start, or by utc.")] = "hold",
+    tab: Annotated[str, typer.Option(help="Tab to open: overview, loop, shape, faults or tuning.")] = "overview",
+    align: Annotated[str, typer.Option(help="Several runs: align them at hold, start or by utc.")] = "hold",
     live: Annotated[bool, typer.Option("--live", help="Follow a run that is still going.")] = False,
     web: Annotated[bool, typer.Option("--web", help="Serve it to a browser.")] = False,
     bind: Annotated[str, typer.Option(help="With --web: address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="With --web: of the page; 0: any free one.")] = 0,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="With --web: port of the page; 0: any free one.")] = 0,
     save: Annotated[Path | None, typer.Option(help="Write the review's recording instead of showing it.")] = None,
     screenshot: Annotated[Path | None, typer.Option(help="Write a picture instead of showing it.")] = None,
 ) -> int:
     """Open the timeline of one run, or of several laid over each other, in the Rerun viewer.
 
-    `review mark RUN TEXT --at 03:12` marks a moment: it stands on the timeline and in the report.
+    `review mark RUN TEXT --at 03:12` marks a moment, on the timeline and in the report.
     """
     if runs[0] == "mark":  # what follows is text, too, and a path would lose its double slashes
         from membrane_ctrl.review.runs import mark_command
@@ -60,11 +60,13 @@ def review(
 
 def report(
     run: RunArgument,
-    out: Annotated[Path | None, typer.Option(help="Folder for report.html and report.json; RUN/report.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for report.html and report.json; RUN/report by default.")
+    ] = None,
     compare: Annotated[
         Path | None,
         typer.Option(
-            "--compare", help="Another run to set it against: of a part by +.. the same part, else the whole."
+            "--compare", help="Another run to compare with: the same part of it if --from is +.., else all of it."
         ),
     ] = None,
     start: FromOption = None,
@@ -79,15 +81,16 @@ def report(
 
 def export_run(
     run: RunArgument,
-    to: Annotated[str, typer.Option("--to", help="parquet, csv or hdf5.")] = "parquet",
-    out: Annotated[Path | None, typer.Option(help="Folder for the files; RUN/export.")] = None,
+    to: Annotated[str, typer.Option("--to", help="Format: parquet, csv or hdf5.")] = "parquet",
+    out: Annotated[Path | None, typer.Option(help="Folder for the files; RUN/export by default.")] = None,
     streams: Annotated[
-        list[str] | None, typer.Option("--streams", help="A path, a field, shapes or events; repeatable.")
+        list[str] | None,
+        typer.Option("--streams", help="What to write: a path, a field, shapes or events; repeatable."),
     ] = None,
     start: FromOption = None,
     end: Annotated[str | None, typer.Option("--until", help="Up to this moment.")] = None,
 ) -> int:
-    """Write a run's columns for other programs."""
+    """Export a run's columns for other programs."""
     from membrane_ctrl.review.runs import export_command
 
     return export_command(run, to, out, streams or [], start, end)
@@ -100,13 +103,13 @@ def list_runs(
     since: Annotated[str | None, typer.Option(help="Started on this day (UTC) or later.")] = None,
     until: Annotated[str | None, typer.Option(help="Started before this day.")] = None,
     longer: Annotated[str | None, typer.Option(help="At least this long, e.g. 2h.")] = None,
-    std_um: Annotated[float | None, typer.Option(min=0, help="Standard deviation at most this.")] = None,
+    std_um: Annotated[float | None, typer.Option(min=0, help="Standard deviation at most this, um.")] = None,
     faults: Annotated[bool | None, typer.Option("--faults/--no-faults", help="With faults, or without.")] = None,
     configuration: Annotated[str | None, typer.Option(help="Beginning of the configuration's hash.")] = None,
     name: Annotated[str | None, typer.Option(help="Part of the name.")] = None,
     json: JsonOption = False,
 ) -> int:
-    """List the runs there are, oldest first."""
+    """List the runs, oldest first."""
     from membrane_ctrl.model.clock import parse_duration_s
     from membrane_ctrl.model.errors import InputError
     from membrane_ctrl.review.catalogue import Filter
@@ -137,14 +140,17 @@ def show_run(run: RunArgument, json: JsonOption = False) -> int:
 @runs_app.command("prune")
 def prune_runs(
     logs: LogsOption = Path("logs"),
-    keep_days: Annotated[float | None, typer.Option(min=0, max=1e5, help="Give up runs older than this.")] = None,
+    keep_days: Annotated[
+        float | None, typer.Option(min=0, max=1e5, help="Delete runs older than this many days.")
+    ] = None,
     keep_gb: Annotated[
-        float | None, typer.Option(min=0, max=1e6, help="Then the oldest, until all are at most this.")
+        float | None,
+        typer.Option(min=0, max=1e6, help="Then delete the oldest until the others take at most this, GB."),
     ] = None,
     delete: Annotated[bool, typer.Option("--delete", help="Actually delete; the default is a dry run.")] = False,
     json: JsonOption = False,
 ) -> int:
-    """Give up old runs by the recorder's rule: never the newest three for their age, nor one with a file `.keep`."""
+    """Delete old runs; the newest three are never too old, and a run with a file `.keep` stays."""
     from membrane_ctrl.review.runs import prune_command
 
     return prune_command(logs, keep_days, keep_gb, delete, json)
