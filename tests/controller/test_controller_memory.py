@@ -276,7 +276,7 @@ def test_an_incident_begins_in_the_middle(record: Path, tmp_path: Path, monkeypa
     ]
     assert incident.expected[0].time_s > 13.0
     assert check_incident(incident) == []
-    monkeypatch.setattr("membrane_ctrl.replay.incident.replay", _refuse)
+    monkeypatch.setattr("tests.support.incidents.replay", _refuse)
     assert "make the incident again" in check_incident(incident)[0]
 
 
