@@ -5,7 +5,6 @@ import getpass
 import json
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from membrane_ctrl.sessions.folder import STEPS, SessionFolder, create_session, 
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, LiveHold
 from membrane_ctrl.sessions.progress import Progress
 from tuning import gains_file, report, session, twin_hold
-from tuning import gains_file as journal
 from tuning.identification.characterise import TYPICAL_S
 from tuning.proposal.verify import SETTLE_LEAST_S, STAGES, Stage
 from tuning.rig import HoldRig
@@ -157,7 +155,7 @@ def watch(options: TuneOptions) -> int:
 
 def rollback(options: TuneOptions) -> int:
     """Back to the gains before those that were kept last."""
-    kept = journal.to_roll_back(options.logs)
+    kept = gains_file.to_roll_back(options.logs)
     progress = Progress()
     with _link(options) as link:
         rig = HoldRig(link, options.author, progress)
@@ -165,8 +163,8 @@ def rollback(options: TuneOptions) -> int:
             rig.set_gains(kept.before, f"rollback of {kept.session}: {options.reason}"[:250])
         except HoldError as error:
             raise DeviceError(str(error)) from None
-    told = journal.entry("rolled_back", kept.session, options.author, options.reason, kept.before, kept.after)
-    journal.note(options.logs, told)
+    told = gains_file.entry("rolled_back", kept.session, options.author, options.reason, kept.before, kept.after)
+    gains_file.note(options.logs, told)
     progress.say(
         f"back to the gains before {kept.session}: K {kept.before.kp_per_s:g} 1/s, Ti {kept.before.ti_s:g} s"
     )
@@ -202,10 +200,10 @@ def _do(step: str, folder: SessionFolder, rig: HoldRig | None, options: TuneOpti
 
 def _verify(folder: SessionFolder, rig: HoldRig, options: TuneOptions, told: Callable[[Stage], None]) -> None:
     done = session.verify_step(folder, rig, told, options.stages)
-    what: journal.What = "kept" if done.kept else "taken_back"
+    what: gains_file.What = "kept" if done.kept else "taken_back"
     reason = options.reason if done.kept else done.reason
     author = folder.head.author
-    journal.note(options.logs, journal.entry(what, folder.path.name, author, reason, done.before, done.after))
+    gains_file.note(options.logs, gains_file.entry(what, folder.path.name, author, reason, done.before, done.after))
 
 
 def _in_a_line(step: str, folder: SessionFolder) -> str:
@@ -250,7 +248,7 @@ def _begin(progress: Progress, options: TuneOptions, step: str, after: list[str]
     progress.begin(step, planned.get(step, 0.0), sum(planned.get(later, 0.0) for later in after))
 
 
-@contextmanager
+@contextlib.contextmanager
 def _session(options: TuneOptions, fresh: bool = False) -> Iterator[tuple[SessionFolder, HoldRig, Progress]]:
     """Folder and hold of a session; whatever ends it early, the mirror gets the last good gains back."""
     progress = Progress()
@@ -277,7 +275,7 @@ def _go_back(rig: HoldRig, before: LoopConfig, progress: Progress) -> None:
     progress.say("the mirror is held with the last good gains")
 
 
-@contextmanager
+@contextlib.contextmanager
 def _link(options: TuneOptions) -> Iterator[HoldLink]:
     if options.twin:
         config = open_session(options.session).config if options.session is not None else options.config

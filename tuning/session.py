@@ -16,7 +16,6 @@ from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments import machine, pump_map
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.sessions import folder, live_hold
-from membrane_ctrl.sessions import folder as plain
 from tuning.gains_file import GainsFile, PlantSection, for_hold, load_gains, require_sound, save_gains
 from tuning.identification import characterise, identify, records
 from tuning.identification.disturbance import DisturbanceModel, observe
@@ -100,14 +99,14 @@ def characterise_step(
         raise errors.RejectedError(f"characterise: {error}") from None
     records.save_record(session.file("experiments.npz"), done.record)
     head = ExperimentsHead(done.around, done.relays_s, done.pulses_s, done.finished)
-    plain.write(session.file("experiments.json"), head)
+    folder.write(session.file("experiments.json"), head)
     return done
 
 
 def experiments_of(session: folder.SessionFolder) -> characterise.Experiments:
     """What the experiments left."""
     session.require("characterise")
-    head = plain.read(session.file("experiments.json"), ExperimentsHead)
+    head = folder.read(session.file("experiments.json"), ExperimentsHead)
     record = records.load_record(session.file("experiments.npz"))
     return characterise.Experiments(head.around, record, head.relays_s, head.pulses_s, head.finished)
 
@@ -121,14 +120,14 @@ def identify_step(session: folder.SessionFolder) -> IdentifiedPlant:
     except ValueError as error:
         raise errors.RejectedError(f"identify: {error}") from None
     found = IdentifiedPlant(all_of_it.identified, all_of_it.quality, done.record.sha256())
-    plain.write(session.file("identified.json"), found)
+    folder.write(session.file("identified.json"), found)
     return found
 
 
 def found_of(session: folder.SessionFolder) -> IdentifiedPlant:
     """What was identified."""
     session.require("identify")
-    return plain.read(session.file("identified.json"), IdentifiedPlant)
+    return folder.read(session.file("identified.json"), IdentifiedPlant)
 
 
 def observe_step(session: folder.SessionFolder, rig: HoldRig, duration_s: float = OBSERVE_S) -> DisturbanceModel:
@@ -141,14 +140,14 @@ def observe_step(session: folder.SessionFolder, rig: HoldRig, duration_s: float 
     except ValueError as error:
         raise errors.RejectedError(f"observe: {error}") from None
     records.save_record(session.file("quiet.npz"), record)
-    plain.write(session.file("disturbance.json"), disturbance)
+    folder.write(session.file("disturbance.json"), disturbance)
     return disturbance
 
 
 def disturbance_of(session: folder.SessionFolder) -> DisturbanceModel:
     """What was observed."""
     session.require("observe")
-    return plain.read(session.file("disturbance.json"), DisturbanceModel)
+    return folder.read(session.file("disturbance.json"), DisturbanceModel)
 
 
 def design_step(session: folder.SessionFolder, reason: str = "tuning session") -> GainsFile:
@@ -173,7 +172,7 @@ def design_step(session: folder.SessionFolder, reason: str = "tuning session") -
         loop=made.loop,
     )
     files.write_text_atomic(files.users(session.file("candidates.md")), design.table(made.candidates) + "\n")
-    plain.write(
+    folder.write(
         session.file("proposal.json"), Design(made.candidates, made.least_std_um, made.preview, made.robustness)
     )
     save_gains(session.file("gains.toml"), gains)
@@ -183,7 +182,7 @@ def design_step(session: folder.SessionFolder, reason: str = "tuning session") -
 def design_of(session: folder.SessionFolder) -> Design:
     """The candidates."""
     session.require("design")
-    return plain.read(session.file("proposal.json"), Design)
+    return folder.read(session.file("proposal.json"), Design)
 
 
 def preview_step(session: folder.SessionFolder) -> Previewed:
@@ -198,14 +197,14 @@ def preview_step(session: folder.SessionFolder) -> Previewed:
         for loop in (session.head.before, gains.loop)
     )
     done = Previewed(present, proposed)
-    plain.write(session.file("preview.json"), done)
+    folder.write(session.file("preview.json"), done)
     return done
 
 
 def preview_of(session: folder.SessionFolder) -> Previewed:
     """What the preview showed."""
     session.require("preview")
-    return plain.read(session.file("preview.json"), Previewed)
+    return folder.read(session.file("preview.json"), Previewed)
 
 
 def pump_of(session: folder.SessionFolder) -> PumpConfig:
@@ -228,7 +227,7 @@ def apply_step(session: folder.SessionFolder, rig: HoldRig) -> LoopConfig:
     loop = checked_gains(session)
     session.begin("apply")
     rig.set_gains(loop, f"session {session.path.name}", _APPLY_S)
-    plain.write(session.file("applied.json"), {"trial_s": _APPLY_S, "loop": loop})
+    folder.write(session.file("applied.json"), {"trial_s": _APPLY_S, "loop": loop})
     return loop
 
 
@@ -270,14 +269,14 @@ def verify_step(
     done = Verified(not reason, reason, tuple(looks), before, after)
     if record is not None:
         records.save_record(session.file("verify.npz"), record)
-    plain.write(session.file("verified.json"), done)
+    folder.write(session.file("verified.json"), done)
     return done
 
 
 def verified_of(session: folder.SessionFolder) -> Verified:
     """How the verification ended."""
     session.require("verify")
-    return plain.read(session.file("verified.json"), Verified)
+    return folder.read(session.file("verified.json"), Verified)
 
 
 def map_pump(session: folder.SessionFolder, rig: HoldRig) -> pump_map.PumpMap:
@@ -290,10 +289,10 @@ def map_pump(session: folder.SessionFolder, rig: HoldRig) -> pump_map.PumpMap:
     if not finished.completed:
         raise errors.RejectedError(f"pump map: {finished.reason}")
     values = {name: math.nan if value is None else value for name, value in event["pump_map"].items()}
-    found = plain.built(pump_map.PumpMap, values)
+    found = folder.built(pump_map.PumpMap, values)
     if not (math.isfinite(found.start_fraction) and math.isfinite(found.stall_fraction)):
         raise errors.RejectedError("pump map: the pump never started or never stalled; check the pump and its supply")
     mapped = found.applied_to(session.config.pump)
     files.write_text_atomic(files.users(session.file("pump.toml")), config_file.dump(mapped))
-    plain.write(session.file("pump_map.json"), found)
+    folder.write(session.file("pump_map.json"), found)
     return found

@@ -3,7 +3,6 @@
 import contextlib
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -201,7 +200,7 @@ def _origin(session: CalibrationSession, place: Path | None) -> GeometryOrigin:
     return origin_of(optics)
 
 
-@contextmanager
+@contextlib.contextmanager
 def _link(options: LiveOptions) -> Iterator[LiveHold]:
     socket = socket_path(options.where)
     client = PortClient.unix(socket, lambda text: _say(f"notice: {text}"))

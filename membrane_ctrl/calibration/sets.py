@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from membrane_ctrl.calibration.report import lines_of, report_of
+from membrane_ctrl.calibration.report import draw_residuals, lines_of, report_of
 from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
 from membrane_ctrl.geometry import file, prior_file
 from membrane_ctrl.measure.measurement import Figures
@@ -268,8 +268,6 @@ def _noise_urad(solution: Solution, phases: residuals.SetPhases, index: int) -> 
 
 def _draw(path: Path, solution: Solution) -> None:
     """The residuals' maps, also of a solution that is refused: there they are wanted most."""
-    from membrane_ctrl.calibration.report import draw_residuals
-
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         draw_residuals(path, solution)

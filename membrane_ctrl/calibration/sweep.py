@@ -4,7 +4,6 @@ import contextlib
 import math
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -252,7 +251,7 @@ class Procedure:
         session.keep(index, self.link.run_dir / str(event["set"]))
         self.progress.say(f"{what}: {event['verdict']}" + (f" ({event['reason']})" if event.get("reason") else ""))
 
-    @contextmanager
+    @contextlib.contextmanager
     def _coming_back(self, session: CalibrationSession) -> Iterator[None]:
         say = self.progress.say
         try:

@@ -10,7 +10,7 @@ from typing import Literal
 
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
-from membrane_ctrl.controller.safety import MOVING
+from membrane_ctrl.controller.safety_rules import MOVING
 from membrane_ctrl.model.states import State
 
 Kind = Literal[

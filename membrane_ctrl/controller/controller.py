@@ -12,7 +12,15 @@ from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control import inner_loop, shape_loop
 from membrane_ctrl.control.experiments.machine import Finished
 from membrane_ctrl.control.experiments.trial import Trial
-from membrane_ctrl.controller import commands, pump_obeys, safe_levels, safety, sensor_consistency, states
+from membrane_ctrl.controller import (
+    commands,
+    pump_obeys,
+    safe_levels,
+    safety,
+    safety_rules,
+    sensor_consistency,
+    states,
+)
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.model import errors, telemetry
@@ -77,7 +85,7 @@ class Controller:
         self._why_since_s = 0.0
         self._shape_was: tuple[int, str] = (-1, "")
         self.state = State.STANDBY
-        self.fault: safety.Rule | None = None
+        self.fault: safety_rules.Rule | None = None
 
     @property
     def loop_config(self) -> LoopConfig:
@@ -90,7 +98,7 @@ class Controller:
         events: list[Event] = []
         self._begin(inputs, events)
         last = scene.output or inner_loop.NO_OUTPUT
-        error_um = last.error_um if self.state in safety.MOVING else math.nan
+        error_um = last.error_um if self.state in safety_rules.MOVING else math.nan
         left_um = scene.setpoint_um + scene.trim_um - last.setpoint_um
         scene.observer.look(inputs)
         held = sensor_consistency.HoldStatus(
@@ -246,7 +254,7 @@ class Controller:
         self._set_gains(self._gains.revert())
         events.append({"kind": "gains_reverted", "why": why})
 
-    def _consider_resuming(self, observation: safety.Observation) -> None:
+    def _consider_resuming(self, observation: safety_rules.Observation) -> None:
         """A latched fault on the list may go, once its cause has stayed away (`resume`)."""
         scene, resume = self._scene, self._resume
         if self.state != State.FAULT or self.fault is None:
@@ -285,7 +293,7 @@ class Controller:
             settled,
             self._consistency.camera_lies,
         )
-        scene.trim_um = shape.trim_um if self.state in safety.MOVING else 0.0
+        scene.trim_um = shape.trim_um if self.state in safety_rules.MOVING else 0.0
         words = shape.reason.translate(_NO_DIGITS)  # numbers that change are no news
         if (shape.state, words) != self._shape_was:
             self._shape_was = (shape.state, words)
@@ -357,7 +365,7 @@ class Controller:
             events.append({"kind": "why", "why": scene.why})
 
     def _row(
-        self, inputs: TickInputs, observation: safety.Observation, shape: shape_loop.ShapeOutput
+        self, inputs: TickInputs, observation: safety_rules.Observation, shape: shape_loop.ShapeOutput
     ) -> telemetry.TelemetryRow:
         scene, reading = self._scene, inputs.reading or _NO_READING
         out = scene.output or inner_loop.NO_OUTPUT

@@ -4,7 +4,7 @@ import math
 
 from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.config.schema import LimitsConfig
-from membrane_ctrl.controller import safety, tick
+from membrane_ctrl.controller import safety_rules, tick
 
 # Of a slack film the gauge may read nothing but its own zero, and that for hours.
 _SLACK_PA = 20.0
@@ -104,11 +104,11 @@ class Observer:
         locked: str = "",
         laser_gauge_apart: str = "",
         gas_excess: str = "",
-    ) -> safety.Observation:
+    ) -> safety_rules.Observation:
         """One tick's observation, after `look`."""
         reading, now_s = self.reading, inputs.now_s
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
-        return safety.Observation(
+        return safety_rules.Observation(
             link_up=inputs.link_up,
             reading_age_s=now_s - self._last_read_s,
             advance_age_s=now_s - self._last_advance_s,

@@ -7,153 +7,14 @@ operator is told. `docs/faults.md` is made from this table.
 """
 
 import math
-from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD
 from membrane_ctrl.config.schema import LimitsConfig
+from membrane_ctrl.controller.safety_rules import ALWAYS, CONNECTED, HOLDING, MOVING, NOT_YET_FAULT, Observation, Rule
 from membrane_ctrl.model.states import Rung, State
 
-MOVING = frozenset({State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
-HOLDING = frozenset({State.HOLD})
-CONNECTED = MOVING | {State.CHECK}
-ALWAYS = frozenset(State)
-NOT_YET_FAULT = ALWAYS - {State.FAULT}
-
-
-@dataclass(frozen=True, slots=True)
-class Observation:
-    """What one tick shows of the bench and of ourselves; NaN and None mean "not seen", never "fine".
-
-    Attributes
-    ----------
-    link_up : bool
-        The device link is connected.
-    reading_age_s : float
-        Since the last answer of the device.
-    advance_age_s : float
-        Since the device's sample counter and time last advanced: an old answer repeated does not count.
-    same_s : float
-        Since the valid readings have been equal to the last bit.
-    displacement_um : float
-        The laser's reading as it came, NaN if it was bad or absent.
-    displacement_valid : bool
-        It is finite, of good quality, new, and not a jump that no film makes.
-    jumps : int
-        Readings in a row refused for a jump.
-    error_um : float
-        Setpoint minus reading; NaN outside the loop.
-    gauge_pressure_pa : float
-    pump_mismatch : float
-        Largest of |command - read-back| that both of the last two commands agree on.
-    watchdog_tripped : bool
-    board_faults : int
-    foreign : int
-        What of the board's claim and watchdog is not as this run set it (`roles.FOREIGN_...`).
-    lateness_ms : float
-    dead_tasks : tuple of str
-        Supervised tasks of the control process that ended.
-    tick_error : str
-        What a handler raised, if it did.
-    overdue : str
-        What the present state has waited for too long, if it has.
-    unfit : str
-        What the actuator test found, if anything.
-    runs_on : str
-        What the read-back says of a pump that was commanded off and ought to stand.
-    inflow : str
-        How the mirror rises although the pump is commanded off.
-    locked : str
-        Why a person has latched the mirror.
-    vent_fraction : float
-        The vent's read-back; NaN without one.
-    laser_lies : str
-        What laser, gauge and camera show, if it is the laser that does not fit.
-    gauge_same_s : float
-        Since the readings of a taut film's gauge have been equal to the last bit.
-    gauge_jumps : int
-        Readings in a row that no film makes.
-    laser_gauge_apart : str
-        What laser and gauge have seen, if both cannot be true.
-    gas_excess : str
-        How much more gas the film takes than it used to, if no camera sees that it stands still.
-    """
-
-    link_up: bool
-    reading_age_s: float
-    advance_age_s: float
-    displacement_um: float
-    displacement_valid: bool
-    jumps: int
-    error_um: float
-    gauge_pressure_pa: float
-    pump_mismatch: float
-    watchdog_tripped: bool
-    board_faults: int
-    lateness_ms: float
-    dead_tasks: tuple[str, ...] = ()
-    tick_error: str = ""
-    overdue: str = ""
-    unfit: str = ""
-    same_s: float = 0.0
-    laser_lies: str = ""
-    runs_on: str = ""
-    inflow: str = ""
-    locked: str = ""
-    vent_fraction: float = math.nan
-    foreign: int = 0
-    gauge_same_s: float = 0.0
-    gauge_jumps: int = 0
-    laser_gauge_apart: str = ""
-    gas_excess: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Rule:
-    """One row of the table. `limit` and `remedy` are for people; `broken` decides.
-
-    A tick in which `unseen` is true shows nothing of the cause, neither way, and is left out of the window: a sensor
-    that is only there now and then, over its limit each time, must not be forgiven for the ticks between.
-    """
-
-    code: int
-    name: str
-    cause: str
-    limit: str
-    rung: Rung
-    remedy: str
-    broken: Callable[[Observation, LimitsConfig], bool]
-    seen_in: tuple[int, int] = (1, 1)  # ticks that must show the cause, of so many
-    states: Collection[State] = MOVING
-    # `resume.faults` may name it: the cause is a message or a sensor that was lost for a while, and whether it is
-    # back is seen. All others need a person, who finds out why before gas flows again.
-    may_resume: bool = False
-    unseen: Callable[[Observation], bool] = lambda o: False
-
-    @property
-    def needed(self) -> int:
-        """Ticks of the window that must show the cause."""
-        return self.seen_in[0]
-
-    @property
-    def window(self) -> int:
-        """Ticks that are looked back at."""
-        return self.seen_in[1]
-
-    @property
-    def latching(self) -> bool:
-        """Whether the fault stays until somebody acknowledges it."""
-        return self.rung > Rung.HOLD_FLOW
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """The rule that tripped (None: safe) and the observed value in words."""
-
-    rule: Rule | None
-    seen: str = ""
-
-
+_FOREIGN = {FOREIGN_CLAIM: "another claim is in force", FOREIGN_PERIOD: "another watchdog period is in force"}
 # Two looks at a limit that must never be passed: one bit error may not vent a mirror that takes two hours to
 # fill, and two ticks are 40 ms, in which the pump moves the film by 0.2 um.
 _TWICE = (2, 3)
@@ -173,6 +34,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.VENT,
         states=ALWAYS,
         remedy="find what over-filled the mirror before it is inflated again",
+        seen=lambda o: f"{o.gauge_pressure_pa:.1f} Pa",
         broken=lambda o, c: o.gauge_pressure_pa > c.gauge_pressure_max_pa,
         unseen=lambda o: math.isnan(o.gauge_pressure_pa),
     ),
@@ -185,6 +47,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.VENT,
         states=ALWAYS,
         remedy="check the laser against a ruler, then the setpoint and the limits",
+        seen=lambda o: f"{o.displacement_um:.1f} um",
         broken=lambda o, c: o.displacement_um > c.displacement_max_um,
         unseen=lambda o: math.isnan(o.displacement_um),
     ),
@@ -196,6 +59,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.VENT,
         states=ALWAYS,
         remedy="cut the pump's power or shut its gas; then check its drive and wiring",
+        seen=lambda o: o.runs_on,
         broken=lambda o, c: bool(o.runs_on),
     ),
     Rule(
@@ -206,6 +70,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.VENT,
         states=ALWAYS - MOVING,
         remedy="cut the pump's power or shut its gas: its read-back may be wrong, or gas comes another way",
+        seen=lambda o: o.inflow,
         broken=lambda o, c: bool(o.inflow),
     ),
     Rule(
@@ -216,6 +81,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.PUMP_OFF,
         states=CONNECTED | {State.FAULT},
         remedy="see with whoever latched it that the mirror may move",
+        seen=lambda o: o.locked,
         broken=lambda o, c: bool(o.locked),
     ),
     Rule(
@@ -226,6 +92,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.PUMP_OFF,
         states=NOT_YET_FAULT,
         remedy="report it with the run folder",
+        seen=lambda o: o.tick_error,
         broken=lambda o, c: bool(o.tick_error),
     ),
     Rule(
@@ -236,6 +103,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.PUMP_OFF,
         states=NOT_YET_FAULT,
         remedy="report it with the run folder",
+        seen=lambda o: ", ".join(o.dead_tasks),
         broken=lambda o, c: bool(o.dead_tasks),
     ),
     Rule(
@@ -258,6 +126,7 @@ TABLE: tuple[Rule, ...] = (
         states=CONNECTED,
         remedy="check the board; its watchdog has stopped the pump",
         may_resume=True,
+        seen=lambda o: f"{o.reading_age_s:.2f} s",
         broken=lambda o, c: o.reading_age_s > c.stale_s,
     ),
     Rule(
@@ -268,6 +137,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.PUMP_OFF,
         states=NOT_YET_FAULT,
         remedy="find the other program that controls the board, and stop one of the two",
+        seen=lambda o: " and ".join(words for bit, words in _FOREIGN.items() if o.foreign & bit),
         broken=lambda o, c: o.foreign != 0,
     ),
     Rule(
@@ -289,6 +159,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.PUMP_OFF,
         states=CONNECTED,
         remedy="read the board's fault bits (docs/registers.md)",
+        seen=lambda o: f"bits {o.board_faults:#x}",
         broken=lambda o, c: o.board_faults != 0,
     ),
     Rule(
@@ -309,6 +180,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.HOLD_FLOW,
         remedy="restart the sensor",
         may_resume=True,
+        seen=lambda o: f"{o.advance_age_s:.2f} s",
         broken=lambda o, c: o.advance_age_s > c.stale_s,
     ),
     Rule(
@@ -319,6 +191,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.HOLD_FLOW,
         states=HOLDING,
         remedy="look for a knocked laser mount; then take a new reference with `ctl shape off` and `ctl shape on`",
+        seen=lambda o: o.laser_lies,
         broken=lambda o, c: bool(o.laser_lies),
     ),
     Rule(
@@ -330,6 +203,7 @@ TABLE: tuple[Rule, ...] = (
         states=CONNECTED,
         remedy="see which of them is wrong: laser mount, gauge hose, units; for another film set [optics.mirror] "
         "sag_mm and pressure_pa",
+        seen=lambda o: o.laser_gauge_apart,
         broken=lambda o, c: bool(o.laser_gauge_apart),
     ),
     Rule(
@@ -339,6 +213,7 @@ TABLE: tuple[Rule, ...] = (
         limit="limits.gauge_stuck_s",
         rung=Rung.RAMP_DOWN,
         remedy="restart the gauge; if it filters its noise below its own resolution raise limits.gauge_stuck_s",
+        seen=lambda o: f"{o.gauge_pressure_pa:.1f} Pa for {o.gauge_same_s:.0f} s",
         broken=lambda o, c: o.gauge_same_s > c.gauge_stuck_s,
         unseen=lambda o: math.isnan(o.gauge_pressure_pa),
     ),
@@ -350,6 +225,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.RAMP_DOWN,
         states=HOLDING,
         remedy="look for an opening seam, then for a laser that creeps: compare it with a ruler",
+        seen=lambda o: o.gas_excess,
         broken=lambda o, c: bool(o.gas_excess),
     ),
     Rule(
@@ -360,6 +236,7 @@ TABLE: tuple[Rule, ...] = (
         limit="limits.gauge_step_max_pa",
         rung=Rung.HOLD_FLOW,
         remedy="look at the gauge's hose and plug",
+        seen=lambda o: f"{o.gauge_pressure_pa:.1f} Pa",
         broken=lambda o, c: o.gauge_jumps > 0,
     ),
     Rule(
@@ -369,6 +246,7 @@ TABLE: tuple[Rule, ...] = (
         limit="limits.stuck_s",
         rung=Rung.HOLD_FLOW,
         remedy="restart the sensor; with coarse steps and a calm mirror raise limits.stuck_s",
+        seen=lambda o: f"{o.same_s:.1f} s",
         broken=lambda o, c: o.displacement_valid and o.same_s > c.stuck_s,
     ),
     Rule(
@@ -402,6 +280,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.RAMP_DOWN,
         remedy="check the pressure sensor: without it over-pressure is not seen",
         may_resume=True,
+        seen=lambda o: f"{o.gauge_pressure_pa:.1f} Pa",
         broken=lambda o, c: not math.isfinite(o.gauge_pressure_pa) and o.reading_age_s == 0,
         unseen=lambda o: o.reading_age_s > 0,
     ),
@@ -414,6 +293,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.RAMP_DOWN,
         states=HOLDING,
         remedy="look for a leak or a laser that was moved",
+        seen=lambda o: f"{o.displacement_um:.1f} um",
         broken=lambda o, c: o.displacement_um < c.displacement_min_um,
         unseen=lambda o: math.isnan(o.displacement_um),
     ),
@@ -426,6 +306,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.RAMP_DOWN,
         states=HOLDING,
         remedy="look for a leak, a stuck pump or a mirror that is too tight",
+        seen=lambda o: f"{o.error_um:.1f} um",
         broken=lambda o, c: abs(o.error_um) > c.following_error_max_um,
         unseen=lambda o: math.isnan(o.error_um),
     ),
@@ -437,6 +318,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.RAMP_DOWN,
         states=CONNECTED,
         remedy="see what it waited for; a fill from flat needs states.inflate_timeout_s of hours",
+        seen=lambda o: o.overdue,
         broken=lambda o, c: bool(o.overdue),
     ),
     Rule(
@@ -447,6 +329,7 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.PUMP_OFF,
         states={State.CHECK},
         remedy="check hoses, valve and pump, and where the laser points",
+        seen=lambda o: o.unfit,
         broken=lambda o, c: bool(o.unfit),
     ),
     Rule(
@@ -458,9 +341,18 @@ TABLE: tuple[Rule, ...] = (
         rung=Rung.RAMP_DOWN,
         remedy="take other work off this machine",
         may_resume=True,
+        seen=lambda o: f"{o.lateness_ms:.0f} ms",
         broken=lambda o, c: o.lateness_ms > c.lateness_max_ms,
     ),
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The rule that tripped (None: safe) and the observed value in words."""
+
+    rule: Rule | None
+    seen: str = ""
 
 
 class SafetyTable:
@@ -490,56 +382,4 @@ class SafetyTable:
             self._history[index] = history
             if history.bit_count() >= rule.needed and (tripped is None or rule.rung > tripped.rung):
                 tripped = rule
-        return Verdict(tripped, _seen(tripped, observation) if tripped else "")
-
-
-_FOREIGN = {FOREIGN_CLAIM: "another claim is in force", FOREIGN_PERIOD: "another watchdog period is in force"}
-
-
-def _seen(rule: Rule, observation: Observation) -> str:
-    """The observed value behind a trip, for the one line the operator reads."""
-    match rule.name:
-        case "over_pressure" | "pressure_missing":
-            return f"{observation.gauge_pressure_pa:.1f} Pa"
-        case "over_displacement" | "under_displacement":
-            return f"{observation.displacement_um:.1f} um"
-        case "following_error":
-            return f"{observation.error_um:.1f} um"
-        case "device_silent":
-            return f"{observation.reading_age_s:.2f} s"
-        case "laser_implausible":
-            return observation.laser_lies
-        case "laser_gauge_apart":
-            return observation.laser_gauge_apart
-        case "gas_excess":
-            return observation.gas_excess
-        case "gauge_stuck":
-            return f"{observation.gauge_pressure_pa:.1f} Pa for {observation.gauge_same_s:.0f} s"
-        case "gauge_jump":
-            return f"{observation.gauge_pressure_pa:.1f} Pa"
-        case "displacement_stuck":
-            return f"{observation.same_s:.1f} s"
-        case "displacement_frozen":
-            return f"{observation.advance_age_s:.2f} s"
-        case "late":
-            return f"{observation.lateness_ms:.0f} ms"
-        case "board_fault":
-            return f"bits {observation.board_faults:#x}"
-        case "pump_runs_on":
-            return observation.runs_on
-        case "gas_comes_in":
-            return observation.inflow
-        case "locked":
-            return observation.locked
-        case "board_taken":
-            return " and ".join(words for bit, words in _FOREIGN.items() if observation.foreign & bit)
-        case "dead_task":
-            return ", ".join(observation.dead_tasks)
-        case "tick_error":
-            return observation.tick_error
-        case "overdue":
-            return observation.overdue
-        case "actuator_test":
-            return observation.unfit
-        case _:
-            return ""
+        return Verdict(tripped, tripped.seen(observation) if tripped else "")

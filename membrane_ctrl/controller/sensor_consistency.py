@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control import film, film_health, gas, plausibility
-from membrane_ctrl.controller import safety, tick
+from membrane_ctrl.controller import safety_rules, tick
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.states import State
 
@@ -98,7 +98,7 @@ class SensorConsistency:
         if state != State.HOLD or held.bleed_fraction != self._bleed_fraction:
             self._bleed_fraction = held.bleed_fraction
             self._growth.reset()
-        if state in safety.CONNECTED:
+        if state in safety_rules.CONNECTED:
             self.laser_gauge_apart = self._film.step(dt_s, laser_um, held.trim_um, gauge_pa)
         elif self._film.watching:
             self._film.reset()

@@ -12,7 +12,6 @@ import math
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -71,7 +70,8 @@ def hold_mirror(options: HoldOptions) -> int:
     require_sendable(options.config.alarms)
     geometry = geometry_in_force(options.config)
     clock = RunClock.start()
-    with terminal.ends_as_by_ctrl_c(), ExitStack() as stack:  # SIGTERM before and after the ticks cleans up as well
+    # SIGTERM before and after the ticks cleans up as well
+    with terminal.ends_as_by_ctrl_c(), contextlib.ExitStack() as stack:
         twin = TwinProcess.started(options.config, clock, stack, options.lab) if options.twin else None
         config = twin.config if twin else options.config
         assert config.devices is not None

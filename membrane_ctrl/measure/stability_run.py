@@ -175,8 +175,6 @@ class StabilityRun:
 
     def draw(self) -> list[Path]:
         """Write the SD map and the pictures, and name these; the series must be closed. Raises OSError."""
-        from membrane_ctrl.measure.stability_results import draw_pairs, draw_stability, draw_zernike
-
         grid = self._grid
         if grid is None:
             return []
@@ -184,22 +182,22 @@ class StabilityRun:
         results.write_arrays(self._out / "sd.npz", x_mm=axis, y_mm=axis, sd_um=sd)
         times, heights, coeffs = self._followed()
         drawn = [self._out / f"{name}.png" for name in ("stability", "zernike", "pairs")]
-        draw_stability(drawn[0], axis, sd, times, self._points_mm, heights)
-        draw_zernike(drawn[1], times, coeffs)
+        stability_results.draw_stability(drawn[0], axis, sd, times, self._points_mm, heights)
+        stability_results.draw_zernike(drawn[1], times, coeffs)
         if not self._shown:
             return drawn[:2]
-        draw_pairs(drawn[2], axis, {lag: self._pair_maps(grid, pair) for lag, pair in self._shown.items()})
+        stability_results.draw_pairs(
+            drawn[2], axis, {lag: self._pair_maps(grid, pair) for lag, pair in self._shown.items()}
+        )
         return drawn
 
     def record(self, pictures: list[Path]) -> None:
         """Write `stability.rrd`; the series must be closed. Raises OSError."""
-        from membrane_ctrl.measure.stability_results import log_stability
-
         if self._grid is None:
             return
         sd_um = self._grid.picture(self._sd_um())
         followed = (list(self._points_mm), *self._followed())
-        log_stability(self._out / "stability.rrd", *followed, sd_um, self.lines(), pictures)
+        stability_results.log_stability(self._out / "stability.rrd", *followed, sd_um, self.lines(), pictures)
 
     def _followed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Times, heights of the points and terms of the sets that gave a figure."""

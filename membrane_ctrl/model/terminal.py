@@ -12,7 +12,6 @@ import signal
 import sys
 import unicodedata
 from collections.abc import Iterator
-from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
@@ -108,7 +107,7 @@ def _escape(letter: str) -> str:
 # A command that is ended from outside cleans up behind itself, as it does after Ctrl-C.
 
 
-@contextmanager
+@contextlib.contextmanager
 def ends_as_by_ctrl_c() -> Iterator[None]:
     """SIGTERM and SIGHUP raise KeyboardInterrupt inside: temporary files go, viewers end.
 

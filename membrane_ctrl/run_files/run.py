@@ -14,21 +14,11 @@ import pyarrow as pa
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import FIELDS
-from membrane_ctrl.run_files import column_reader, rrd_reader, run_folder, shapes
+from membrane_ctrl.run_files import column_reader, rrd_reader, run_folder, shapes, tables
 from membrane_ctrl.run_files.column_file import SUFFIX
 from membrane_ctrl.run_files.rrd_reader import cut, segment_blocks
 from membrane_ctrl.run_files.segments import is_closed
 from membrane_ctrl.run_files.shapes import Shapes
-from membrane_ctrl.run_files.tables import NAMES as LEVEL_NAMES
-from membrane_ctrl.run_files.tables import (
-    SHAPES,
-    TICK_FIELDS,
-    TICKS,
-    WINDOWS_S,
-    coarser_level,
-    first_level,
-    level_table,
-)
 
 Block = dict[str, Column]
 # Rerun rounds the time of a tick to the nanosecond; the next one is milliseconds away
@@ -41,7 +31,7 @@ _FILES_MAX = 100_000  # ten years of hours
 # What a damaged line may say else is no time of a run, and dates end.
 _YEARS = range(1970, 2200)
 _RUN_MAX_S = 1e9
-TABLES = (TICKS, *(level_table(window_s) for window_s in WINDOWS_S), SHAPES)
+TABLES = (tables.TICKS, *(tables.level_table(window_s) for window_s in tables.WINDOWS_S), tables.SHAPES)
 _STAND_IN = "Rerun segments stand in for ticks that the tables lack: without every tick, and without checksums"
 
 
@@ -110,7 +100,7 @@ class Run:
     def tick_blocks(self, names: Sequence[str], start_s: float = -np.inf, end_s: float = np.inf) -> Iterator[Block]:
         """Telemetry in blocks of some hours, so that a month needs no more memory than a night."""
         wanted = _with_time(names)
-        table = yield from self._table_blocks(TICKS, "mono_s", wanted, start_s, end_s)
+        table = yield from self._table_blocks(tables.TICKS, "mono_s", wanted, start_s, end_s)
         # a part that lies in a hole of the table; one behind its end is none
         hole = table.given_s == -np.inf and start_s < table.known_s
         if not hole and (table.known_s >= end_s or self._reaches_end(table.known_s)):
@@ -133,16 +123,16 @@ class Run:
         window_s: float,
         start_s: float = -np.inf,
         end_s: float = np.inf,
-        names: Sequence[str] = LEVEL_NAMES,
+        names: Sequence[str] = tables.NAMES,
     ) -> Block:
         """Overview: least, mean and greatest of each signal in windows of 1, 10 or 60 s (`run_files.tables`).
 
         What is not in the table of the level is made from the next finer one, in the end from the ticks.
         """
         names = tuple(dict.fromkeys(("time_s", "rows", *names)))
-        if window_s not in WINDOWS_S:
-            raise ValueError(f"levels are {', '.join(f'{w:g}' for w in WINDOWS_S)} s, not {window_s:g}")
-        blocks, table = _listed(self._table_blocks(level_table(window_s), "time_s", names, start_s, end_s))
+        if window_s not in tables.WINDOWS_S:
+            raise ValueError(f"levels are {', '.join(f'{w:g}' for w in tables.WINDOWS_S)} s, not {window_s:g}")
+        blocks, table = _listed(self._table_blocks(tables.level_table(window_s), "time_s", names, start_s, end_s))
         time_s = np.concatenate([block["time_s"] for block in blocks] or [np.empty(0)])
         missing = _holes(time_s, window_s, start_s)
         until_s = float(time_s[-1]) + window_s if time_s.size else start_s
@@ -159,16 +149,16 @@ class Run:
 
     def _made_level(self, window_s: float, start_s: float, end_s: float, names: Sequence[str]) -> list[Block]:
         """A part of a level, from the next finer one or from the ticks."""
-        finer = {coarse: fine for fine, coarse in pairwise(WINDOWS_S)}
+        finer = {coarse: fine for fine, coarse in pairwise(tables.WINDOWS_S)}
         if window_s in finer:
-            return [coarser_level(self.level(finer[window_s], start_s, end_s, names), window_s)]
-        return [first_level(block) for block in self.tick_blocks(TICK_FIELDS, start_s, end_s)]
+            return [tables.coarser_level(self.level(finer[window_s], start_s, end_s, names), window_s)]
+        return [tables.first_level(block) for block in self.tick_blocks(tables.TICK_FIELDS, start_s, end_s)]
 
     def shapes(self) -> Shapes:
         """Every measured figure of the run."""
-        files = column_reader.column_files(self.folder, SHAPES)
-        tables = (part for path in files for part in self._parts(path, files[-1], shapes.TABLE_COLUMNS))
-        found = [shapes.from_table(table) for table in tables if table.num_rows]
+        files = column_reader.column_files(self.folder, tables.SHAPES)
+        parts = (part for path in files for part in self._parts(path, files[-1], shapes.TABLE_COLUMNS))
+        found = [shapes.from_table(table) for table in parts if table.num_rows]
         if not found:
             columns = [rrd_reader.read_shapes(path, self.notes) for path in rrd_reader.segments(self.folder)]
             found = [shapes.from_columns(part) for part in columns if part]
@@ -182,7 +172,7 @@ class Run:
         for table in TABLES:
             files = column_reader.column_files(self.folder, table)
             for path in files:
-                for _ in self._parts(path, files[-1], ["mono_s" if table == TICKS else "time_s"]):
+                for _ in self._parts(path, files[-1], ["mono_s" if table == tables.TICKS else "time_s"]):
                     pass
         for path in rrd_reader.segments(self.folder):
             if not _is_closed(path):
@@ -264,14 +254,14 @@ def _missing(folder: Path, summary: dict[str, Any] | None) -> list[str]:
     """Tables and segments that are not there: by their numbers, and by the summary's count of them."""
     account = (summary or {}).get("recorder")
     counts = account if isinstance(account, dict) else {}
-    tables = counts.get("tables")
+    counted = counts.get("tables")
     notes = []
     for table in TABLES:
-        count = _count(tables.get(table) if isinstance(tables, dict) else 0)
+        count = _count(counted.get(table) if isinstance(counted, dict) else 0)
         gone = column_reader.missing_files(column_reader.column_files(folder, table), f"{table}-000{SUFFIX}", count)
         notes += [f"{name}: missing; what it held is left out" for name in gone]
     segments = rrd_reader.segments(folder)
-    ticks = bool(column_reader.column_files(folder, TICKS))
+    ticks = bool(column_reader.column_files(folder, tables.TICKS))
     if not ticks and segments:
         notes.append("the tables of ticks are missing; the Rerun segments stand in for them, without every tick")
     count = _count(counts.get("segments"))

@@ -4,11 +4,10 @@ import json
 import math
 import re
 import types
-import typing
 from dataclasses import dataclass, fields, is_dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
@@ -47,10 +46,10 @@ def built(kind: type[T], data: Any) -> T:
 
 
 def _built(kind: Any, data: Any) -> Any:
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (typing.Union, types.UnionType):
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
         return None if data is None else _built(next(a for a in arguments if a is not type(None)), data)
-    if origin is typing.Literal:
+    if origin is Literal:
         if data not in arguments:
             raise ValueError(f"{data!r} is none of {arguments}")
         return data
@@ -62,7 +61,7 @@ def _built(kind: Any, data: Any) -> Any:
     if isinstance(kind, type) and issubclass(kind, BaseModel):
         return kind.model_validate(data)
     if is_dataclass(kind):
-        hints = typing.get_type_hints(kind)
+        hints = get_type_hints(kind)
         return cast(Any, kind)(**{f.name: _built(hints[f.name], data[f.name]) for f in fields(kind)})
     return kind(data)
 

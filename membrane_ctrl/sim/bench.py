@@ -10,7 +10,6 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 
@@ -234,7 +233,7 @@ class TwinProcess:
     truth: RingAddress
 
     @classmethod
-    def started(cls, config: Config, clock: RunClock, stack: ExitStack, lab: bool = False) -> TwinProcess:
+    def started(cls, config: Config, clock: RunClock, stack: contextlib.ExitStack, lab: bool = False) -> TwinProcess:
         """Start the twin and wait until it listens; the stack ends it. Raises DeviceError, e.g. for a busy port.
 
         With `lab` it answers as the instruments that the configuration names, else as the pump board.
