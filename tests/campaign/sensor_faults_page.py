@@ -17,6 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from scipy import stats
 from sensor_faults import CAMERA, FAULTS, PAIRS, SensorFault, Story, tell
 from sensor_quiet import QuietHours, quiet_hours
 
@@ -168,14 +169,16 @@ def _quiet_lines(found: dict[_Job, dict[str, Any]]) -> list[str]:
         "",
         *_wrapped(NIGHTS_ARE),
         "",
-        "| world | nights | hours | false alarms |",
-        "|---|---|---|---|",
+        "| world | nights | hours | false alarms | 95 % sure: fewer than one in |",
+        "|---|---|---|---|---|",
     ]
     for other, some in sorted(nights.items()):
         alarms = [alarm for night in some for alarm in night.alarms]
         told = f"{len(alarms)}: {'; '.join(alarms)}" if alarms else "0"
         hours = sum(night.hours for night in some)
-        lines.append(f"| {'other' if other else 'the twin'} | {len(some)} | {hours:.0f} | {told} |")
+        bound_h = hours / (stats.chi2.ppf(0.95, 2 * (len(alarms) + 1)) / 2)  # of a Poisson process
+        world = "other" if other else "the twin"
+        lines.append(f"| {world} | {len(some)} | {hours:.0f} | {told} | {bound_h:.0f} h |")
     return lines
 
 

@@ -33,7 +33,7 @@ sys.path[:0] = [str(HERE.parents[1]), str(HERE)]
 
 MEMORY_BYTES = 700_000_000  # of a case, above what the process has: a command begins with 0.2 GB
 _CASES_A_WORKER = 1000  # each review leaves some threads of Rerun behind, which a command takes with it
-CASE_S = 60  # on a busy machine; a report of a good folder takes one
+CASE_S = 120  # on a busy machine; a step of a tuning session takes ten
 _CODES = frozenset({0, 2, 3, 4})
 _REFUSED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 
@@ -45,10 +45,10 @@ class Command:
     name: str
     words: tuple[str, ...]
     share: int
-    sets: bool = False
+    reads: str = "logs"
 
 
-# RUN, LOGS, SET, SETS and OUT are put in; `runs` costs 15 ms and `report` a second
+# RUN, LOGS, SET, SETS, TUNING, LIVE, H5 and OUT are put in; `runs` costs 15 ms and `report` a second
 COMMANDS = (
     Command("runs", ("runs", "--logs", "LOGS"), 160),
     Command("runs --json", ("runs", "--logs", "LOGS", "--json"), 50),
@@ -56,17 +56,23 @@ COMMANDS = (
     Command("replay", ("replay", "RUN"), 170),
     Command("repair", ("repair", "RUN"), 80),
     Command("repair --in-place", ("repair", "RUN", "--in-place"), 40),
-    Command("report", ("report", "RUN"), 12),
+    Command("report", ("report", "RUN"), 20),
     Command("export", ("export", "RUN", "--to", "parquet"), 70),
     Command("export csv", ("export", "RUN", "--to", "csv"), 30),
     Command("export hdf5", ("export", "RUN", "--to", "hdf5", "--out", "OUT"), 20),
     Command("review", ("review", "RUN", "--save", "OUT.rrd"), 33),
     Command("review mark", ("review", "mark", "RUN", "a mark", "--at", "+1s"), 50),
-    Command("measure", ("measure", "SET", "--no-pictures"), 95, sets=True),
-    Command("measure pictures", ("measure", "SET"), 5, sets=True),
-    Command("uncertainty", ("uncertainty", "SET", "--trials", "2"), 10, sets=True),
-    Command("stability", ("stability", "SETS", "--trials", "2"), 5, sets=True),
-    Command("calibrate", ("calibrate", "SET0", "SET1", "--out", "OUT.toml"), 10, sets=True),
+    Command("measure", ("measure", "SET", "--no-pictures"), 95, "sets"),
+    Command("measure pictures", ("measure", "SET"), 5, "sets"),
+    Command("uncertainty", ("uncertainty", "SET", "--trials", "2"), 10, "sets"),
+    Command("stability", ("stability", "SETS", "--trials", "2"), 10, "sets"),
+    Command("calibrate", ("calibrate", "SET0", "SET1", "--out", "OUT.toml"), 10, "sets"),
+    Command("measure h5", ("measure", "H5", "--no-pictures"), 60, "sofast"),
+    Command("calibrate --live", ("calibrate", "--live", "--session", "LIVE", "--no-pictures"), 3, "live"),
+    Command("tune history", ("tune", "history", "--logs", "TUNED"), 20, "tuned"),
+    Command("tune identify", ("tune", "identify", "--session", "TUNING"), 8, "tuned"),
+    Command("tune design", ("tune", "design", "--session", "TUNING"), 4, "tuned"),
+    Command("tune preview", ("tune", "preview", "--session", "TUNING"), 3, "tuned"),
 )
 
 
@@ -95,16 +101,35 @@ def _rang(number: int, frame: FrameType | None) -> None:
 class Room:
     """Good folders, and a place where a copy of one is spoiled and read."""
 
-    def __init__(self, root: Path) -> None:
-        from good_folders import RUN, good_run, good_sets
+    def __init__(self, root: Path, good: Path | None = None) -> None:
+        from good_folders import RUN, TUNING
 
         self._root = root
-        self._good = root / "good"
-        self._good.mkdir()
-        self._run_name = RUN
+        self._good = good or root / "good"
+        self._good.mkdir(exist_ok=True)
+        self._run_name, self._tuning_name = RUN, TUNING
+
+    def make(self, kind: str) -> None:
+        """A good folder of a kind, unless it is there."""
+        from good_folders import good_live, good_run, good_sets, good_sofast, good_tuning
+
+        folder = self._good / kind
+        if kind == "live":
+            self.make("sets")
+        if folder.exists():
+            return
         with _quiet():
-            good_run(self._good / "logs")
-            good_sets(self._good)
+            match kind:
+                case "logs":
+                    good_run(folder)
+                case "sets":
+                    good_sets(self._good)
+                case "sofast":
+                    good_sofast(folder)
+                case "live":
+                    good_live(folder, self._good / "sets")
+                case "tuned":
+                    good_tuning(folder)
 
     def run(self, one: Case) -> str:
         """What is wrong with a case; empty if nothing is."""
@@ -118,9 +143,12 @@ class Room:
         place.mkdir()
         (place / CANARY).write_text("untouched")
         inside = place / "inside"
-        shutil.copytree(self._good / ("sets" if one.command.sets else "logs"), inside)
-        if one.command.sets:
+        self.make(one.command.reads)
+        shutil.copytree(self._good / one.command.reads, inside)
+        if one.command.reads == "sets":
             spoil(rng.choice((inside, inside / "0000", inside / "0001")), rng)
+        elif one.command.reads != "logs":
+            spoil(inside, rng)
         else:
             spoil(inside / self._run_name, rng)
             if one.command.name.startswith("runs"):  # one bad folder must not take the list of the good ones away
@@ -135,6 +163,8 @@ class Room:
         places = {
             "LOGS": inside, "RUN": inside / self._run_name,
             "SETS": inside, "SET": inside / rng.choice(("0000", "0001")),
+            "TUNED": inside, "TUNING": inside / "tuning" / self._tuning_name,
+            "LIVE": inside, "H5": inside / "m.h5",
             "SET0": inside / "0000", "SET1": inside / "0001", "OUT": inside.parent / "out",
             "OUT.rrd": inside.parent / "out.rrd", "OUT.toml": inside.parent / "out.toml",
         }  # fmt: skip
@@ -186,7 +216,7 @@ def _quiet() -> Iterator[None]:
         yield
 
 
-def work(first: int, last: int, root: Path) -> None:
+def work(first: int, last: int, root: Path, good: Path) -> None:
     """Run cases and print a line of JSON for each: what is wrong with it, and how long it took."""
     import functools
     import warnings
@@ -198,7 +228,9 @@ def work(first: int, last: int, root: Path) -> None:
     )  # making it anew takes four times what a case does
     warnings.simplefilter("error")
     warnings.simplefilter("ignore", RuntimeWarning)  # NumPy's, of numbers that are none: a line, and no end
-    room = Room(root)
+    room = Room(root, good)
+    for kind in {case(number).command.reads for number in range(first, last)}:
+        room.make(kind)
     signal.signal(signal.SIGALRM, _rang)
     for warm in range(2):  # everything is loaded before the limit is set
         with contextlib.suppress(Exception):
@@ -243,6 +275,13 @@ def _memory_mb(what: str) -> float:
 
 def campaign(first: int, last: int, say: object = print) -> tuple[Counter[str], list[tuple[int, str, str]], float]:
     """Cases in worker processes; counts by command, what was wrong, and the greatest memory in MB."""
+    with tempfile.TemporaryDirectory(prefix="membrane-fuzz-good-") as good:
+        return _campaign(first, last, good, say)
+
+
+def _campaign(
+    first: int, last: int, good: str, say: object
+) -> tuple[Counter[str], list[tuple[int, str, str]], float]:
     counts: Counter[str] = Counter()
     found: list[tuple[int, str, str]] = []
     peak_mb = 0.0
@@ -251,7 +290,8 @@ def campaign(first: int, last: int, say: object = print) -> tuple[Counter[str], 
     while at < last:
         with tempfile.TemporaryDirectory(prefix="membrane-fuzz-") as root:
             end = min(last, at + _CASES_A_WORKER)
-            words = [sys.executable, str(Path(__file__)), "--worker", root, "--first", str(at), "--last", str(end)]
+            words = [sys.executable, str(Path(__file__)), "--worker", root, "--good", good]
+            words += ["--first", str(at), "--last", str(end)]
             with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as worker:
                 assert worker.stdout is not None
                 name = "start"
@@ -290,9 +330,10 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first case, which is its seed")
     parser.add_argument("--last", type=int, default=20_000, help="and of the one behind the last")
     parser.add_argument("--worker", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--good", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.worker is not None:
-        work(options.first, options.last, options.worker)
+        work(options.first, options.last, options.worker, options.good)
         return 0
     began_s = time.perf_counter()
     counts, found, peak_mb = campaign(options.first, options.last)

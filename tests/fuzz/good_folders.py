@@ -6,6 +6,8 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
+
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.toml_file import dump
 from membrane_ctrl.model.clock import RunClock
@@ -19,6 +21,7 @@ from tests.support.synthetic_run import shape_of
 from tests.support.virtual_record import CONFIG, kept_ticks, memory_at, write_record
 
 RUN = "20261121T010203Z-night"
+TUNING = "20261121T010203Z-session"
 _SECONDS = 4.0
 # large enough for a figure to come out, small enough for a hundred sets a minute
 _SET = ("--shrink", "16")
@@ -60,6 +63,49 @@ def _write_segment(folder: Path, rows: object) -> None:
     streams.send(rows)  # type: ignore[arg-type]
     recording.close()
     (folder / LAYOUT).unlink(missing_ok=True)
+
+
+def good_sofast(folder: Path) -> None:
+    """A SOFAST measurement `m.h5` of a few pixels."""
+    import h5py
+
+    folder.mkdir()
+    ramp = np.arange(32, dtype=np.uint8)
+    items = {
+        "fringe_images": 6 * ramp * np.ones((12, 16, 1), np.uint8),
+        "mask_images": np.array([1, 200], np.uint8) * np.ones((12, 16, 1), np.uint8),
+        "fringe_periods_x": [0.9, 3.9, 15.9, 63.9],
+        "fringe_periods_y": [0.9, 3.9, 15.9, 63.9],
+        "dist_optic_screen": np.array([10.5]),
+    }
+    with h5py.File(folder / "m.h5", "w") as file:
+        for name, value in items.items():
+            file[f"MeasurementSofastFringe/{name}"] = value
+
+
+def good_tuning(folder: Path) -> None:
+    """Run folders with the journal of a tuning session, all steps of it done on the twin: 30 s of computing."""
+    times = ("--observe", "5m", "--verify", "5m")
+    assert run(["tune", "run", "--twin", "--logs", str(folder), *times]) in (0, 3)
+    (session,) = (folder / "tuning").glob("2*")
+    session.rename(session.with_name(TUNING))
+
+
+def good_live(folder: Path, sets: Path) -> None:
+    """A session of `calibrate --live` that has all its sets."""
+    (folder / "sets").mkdir(parents=True)
+    for number in (0, 1):
+        shutil.copytree(sets / f"{number:04d}", folder / "sets" / f"set-{number + 1}")
+    head = {
+        "format": "membrane-live-calibration/1",
+        "source": "night",
+        "created_utc": "2026-11-21T01:02:03+00:00",
+        "start_um": 0.0,
+        "shape_on": True,
+        "setpoints_um": [0.0, 0.0],
+    }
+    (folder / "session.json").write_text(json.dumps(head))
+    (folder / "config.toml").write_text(dump(CONFIG))
 
 
 def good_sets(folder: Path) -> Path:
