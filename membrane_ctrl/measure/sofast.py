@@ -9,6 +9,7 @@ import numpy as np
 from membrane_ctrl.metrology.frames.series_integrity import AxisSeries
 from membrane_ctrl.metrology.phase import equal_shifts, phasors
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
+from membrane_ctrl.model.files import open_plain
 
 STEPS = 4  # SOFAST always takes four
 MM_PER_M = 1e3
@@ -72,6 +73,7 @@ def open_file(path: Path) -> Any:
     except ImportError:
         raise ImportError("SOFAST files need h5py: pip install 'membrane-ctrl[sofast]'") from None
     try:
+        open_plain(path, follow=True).close()  # h5py waits for a pipe that nobody writes to
         return h5py.File(path, "r")
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None

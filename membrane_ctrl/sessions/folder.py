@@ -160,7 +160,10 @@ class SessionFolder:
         """The step is about to be done (again): what it and the steps behind it left is gone."""
         for later in STEPS[STEPS.index(step) :]:
             for name in FILES[later]:
-                self.file(name).unlink(missing_ok=True)
+                try:
+                    self.file(name).unlink(missing_ok=True)
+                except OSError as error:  # a folder in its place
+                    raise errors.InputError(f"{self.file(name)}: cannot be removed: {error.strerror}") from None
 
 
 def fresh_folder(parent: Path, name: str, now: datetime) -> Path:

@@ -109,6 +109,7 @@ class Phase:
     from_s: float
     to_s: float
     busy: float
+    rss_mb: float
     late_p99_ms: float = 0.0
     missed: int = 0
 
@@ -127,7 +128,7 @@ async def phases_of(run: Run, how: str, certificates: Path, port: int) -> list[P
             await asyncio.sleep(PHASE_S)
             to_s = time.time()
             busy = (sum(control.cpu_times()[:2]) - used_s) / (to_s - from_s)
-        phases.append(Phase(attacked, from_s - zero_s, to_s - zero_s, busy))
+        phases.append(Phase(attacked, from_s - zero_s, to_s - zero_s, busy, control.memory_info().rss / 1e6))
     return phases
 
 
@@ -174,6 +175,7 @@ async def test_strangers_disturb_neither_ticks_nor_operators(tmp_path: Path, cer
     judge(tmp_path, phases)
     peace, attack = phases[::2], phases[1::2]
     print(f"\n{how}: {told(phases)}; {grown_mb:+.1f} MB, {files} files, {len(refused)} refusals recorded")
+    print(f"  MB after each phase: {[round(phase.rss_mb) for phase in phases]}, {before_mb:.0f} before")
     print(f"  by TLS {remote}; by socket {local}")
     assert mean(p.busy for p in attack) < mean(p.busy for p in peace) + 0.05  # the machine's load does not show in it
     ticks = 50 * CYCLES * PHASE_S

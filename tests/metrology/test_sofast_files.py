@@ -1,5 +1,6 @@
 """Reader of SOFAST files: what is wrong with a file is said in one line that names it."""
 
+import os
 import sys
 
 import numpy as np
@@ -112,3 +113,9 @@ def test_what_leads_out_of_the_file_or_is_too_large_is_refused(tmp_path):
         file.create_dataset("Camera/intrinsic_mat", (3, 3), "f8", external=[(str(other), 0, 72)])
     with pytest.raises(ValueError, match="not a data set of this file"):
         sofast_facet.read_camera(path)
+
+
+def test_a_pipe_in_place_of_a_file_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "p.h5")
+    with pytest.raises(ValueError, match=r"p\.h5: not an HDF5 file .*no plain file"):
+        sofast.read_measurement(tmp_path / "p.h5")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
@@ -205,6 +205,13 @@ def test_the_journal_follows_no_link(tmp_path: Path, place: str) -> None:
     with pytest.raises(InputError, match="link"):
         journal.entries(tmp_path / "logs")
     assert (elsewhere / "journal.jsonl").read_text() == "theirs\n"
+
+
+def test_a_folder_in_place_of_a_result_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "proposal.json").mkdir()
+    session = plain.SessionFolder(tmp_path, plain.SessionHead("", "", "", "", "", LOOP), Config())
+    with pytest.raises(InputError, match="cannot be removed"):
+        session.begin("design")
 
 
 def test_nothing_to_roll_back_is_said(tmp_path: Path) -> None:
