@@ -13,7 +13,7 @@ from firmware_iface.emulators.modbus_server import RegisterRefusal
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import BenchCommand, LinkError
 from membrane_ctrl.model.states import State
-from membrane_ctrl.sim.virtual_bench import VirtualBench, _at_once
+from membrane_ctrl.sim.virtual_bench import VirtualBench, at_once
 
 
 def counters_wrap() -> list[str]:
@@ -136,7 +136,7 @@ def another_program_opens_the_board_of_a_hold() -> list[str]:
     other = another_client(stage, 10.0)
     refused = False
     try:
-        _at_once(other.open())
+        at_once(other.open())
     except LinkError:
         refused = True
     stage.must(refused, "two programs hold one board")
@@ -153,12 +153,12 @@ def another_program_takes_the_board_of_a_dead_hold() -> list[str]:
     stage.bench.wrong.stalled = True
     stage.wait(1.0)
     other = another_client(stage)
-    _at_once(other.open())
-    _at_once(other.clear_faults(0xFFFF))
+    at_once(other.open())
+    at_once(other.clear_faults(0xFFFF))
     stage.bench.wrong.stalled = False
 
     def goes_on() -> str:
-        _at_once(other.write(BenchCommand(0.0, 0.0)))
+        at_once(other.write(BenchCommand(0.0, 0.0)))
         return stage.still()
 
     stage.wait(20.0, goes_on)
@@ -171,8 +171,8 @@ def anybody_may_stop_the_pump() -> list[str]:
     for resumes in (False, True):
         stage = Stage(resumes=resumes).held()
         other = another_client(stage)
-        _at_once(other.identify())
-        _at_once(other.stop())
+        at_once(other.identify())
+        at_once(other.stop())
         stage.bench.drive()
         stage.wait(60.0, stage.still)
         stage.must(stage.state == State.FAULT, "the hold does not notice that it was stopped")
