@@ -29,11 +29,16 @@ FLOORS = {
     1: {"firmware_iface", "membrane_ctrl/__init__", "membrane_ctrl/model"},
     2: {"membrane_ctrl/config"},
     3: {"membrane_ctrl/control", "membrane_ctrl/instruments", "membrane_ctrl/metrology", "membrane_ctrl/processes"},
-    4: {"membrane_ctrl/alarms", "membrane_ctrl/controller", "membrane_ctrl/geometry", "membrane_ctrl/sim"},
+    4: {
+        "membrane_ctrl/alarms",
+        "membrane_ctrl/console",
+        "membrane_ctrl/controller",
+        "membrane_ctrl/geometry",
+        "membrane_ctrl/sim",
+    },
     5: {"membrane_ctrl/control_port", "membrane_ctrl/measure", "membrane_ctrl/run_files"},
     6: {
         "membrane_ctrl/acquisition",
-        "membrane_ctrl/console",
         "membrane_ctrl/recorder",
         "membrane_ctrl/sessions",
     },

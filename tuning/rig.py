@@ -182,7 +182,7 @@ class HoldRig:
         """
         return self.performed(spec)[:2]
 
-    def performed(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished, events.Event]:
+    def performed(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished, events.ExperimentEnded]:
         """As `perform`, with the event that tells its end (and the pump map's figures)."""
         self._events.clear()
         self._link.ask(Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec))
@@ -193,8 +193,8 @@ class HoldRig:
             begun = begun or rows[-1].state == State.TUNE
             if not begun and len(rows) > _ANSWER_TICKS:
                 raise HoldError("the hold took the experiment and did not begin it")
-        told = self._event("experiment")
-        return self.record(rows), machine.Finished(bool(told["completed"]), str(told["reason"])), told
+        told = self._experiment_ended()
+        return self.record(rows), machine.Finished(told.completed, told.reason), told
 
     def set_gains(self, loop: LoopConfig, why: str = "tuning session", trial_s: float = math.nan) -> None:
         """Bumpless. On trial for a time, the hold goes back by itself without `keep`."""
@@ -259,15 +259,15 @@ class HoldRig:
         self._events.extend(news.events)
         self.shapes += news.shapes
 
-    def _event(self, kind: str) -> events.Event:
-        """The newest event of a kind; it may come a moment after its tick."""
+    def _experiment_ended(self) -> events.ExperimentEnded:
+        """The newest of its kind; it may come a moment after its tick."""
         for _ in range(20):
-            found = [event for event in self._events if event["kind"] == kind]
+            found = [event for event in self._events if isinstance(event, events.ExperimentEnded)]
             if found:
                 return found[-1]
             self._take()
-        raise HoldError(f"the hold did not tell of the end of the {kind}")
+        raise HoldError("the hold did not tell of the end of the experiment")
 
     def _why(self) -> str:
-        said = [str(e["why"]) for e in self._events if e["kind"] == "state"]
+        said = [event.why for event in self._events if isinstance(event, events.StateEntered)]
         return said[-1] if said else "no reason was told"

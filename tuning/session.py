@@ -288,7 +288,7 @@ def map_pump(session: folder.SessionFolder, rig: HoldRig) -> pump_map.PumpMap:
     _, finished, event = rig.performed(characterise.spec_of("pump_map", around, 1200.0))
     if not finished.completed:
         raise errors.RejectedError(f"pump map: {finished.reason}")
-    values = {name: math.nan if value is None else value for name, value in event["pump_map"].items()}
+    values = {name: math.nan if value is None else value for name, value in event.pump_map.items()}
     found = folder.built(pump_map.PumpMap, values)
     if not (math.isfinite(found.start_fraction) and math.isfinite(found.stall_fraction)):
         raise errors.RejectedError("pump map: the pump never started or never stalled; check the pump and its supply")

@@ -7,7 +7,7 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model import shape_estimate, states, telemetry
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import CommandTaken, Event
 from membrane_ctrl.sessions.live_hold import HoldError, News
 from membrane_ctrl.sim.events import Event as TwinEvent
 from membrane_ctrl.sim.plant import Plant
@@ -65,8 +65,8 @@ class TwinHold:
         answer = self._advance(1)
         self._early = _joined(self._early, answer)
         for event in answer.events:
-            if event["kind"] == "command" and event.get("refused"):
-                raise HoldError(f"refused: {event['refused']}")
+            if isinstance(event, CommandTaken) and event.refused:
+                raise HoldError(f"refused: {event.refused}")
 
     def news(self) -> News:
         """Half a second of the twin's time."""

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Literal
 
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.events import Event
 from membrane_ctrl.processes import child, ring
 
 # How many threads the numerics of this process may use: the tick of the control process must find a core.
@@ -110,7 +110,9 @@ class Remote:
         wanted, self._capture = self._capture, False
         return wanted
 
-    def report(self, state: AcquisitionState, message: str = "", **details: object) -> None:
+    def report(
+        self, state: AcquisitionState, message: str = "", cycle: int | None = None, traceback: str | None = None
+    ) -> None:
         """Send a report that says something new; a cycle as good as the last is no news for a record of weeks.
 
         It is dropped when the other end does not read, as the cycle must never wait for it.
@@ -118,9 +120,9 @@ class Remote:
         if (state, message) == self._said:
             return
         self._said = (state, message)
-        self._send({"kind": "acquisition", "state": state, "message": message, **details})
+        self._send(run_events.AcquisitionState(state, message, cycle, traceback))
 
-    def tell(self, event: Event) -> None:
+    def tell(self, event: events.Event) -> None:
         """Put an event on record; it is dropped like a report."""
         self._send(event)
 
@@ -135,10 +137,10 @@ class Remote:
             self._alive_due_s = time.monotonic() + _ALIVE_EVERY_S
             self._send(child.alive(self._step_s))
 
-    def _send(self, event: dict[str, object]) -> None:
+    def _send(self, event: events.Event) -> None:
         try:
             if select.select([], [self._control.fileno()], [], 0)[1]:
-                self._control.send(event)
+                self._control.send(event.to_dict())
         except OSError:
             self.stop = True
 
@@ -196,7 +198,7 @@ def acquisition_main(spec: AcquisitionSpec, control: Connection) -> None:
     """Measure the shape until told to stop: target of a `spawn`ed process.
 
     Ends on "stop" over `control`, on `processes.STOP`, and when the parent has died.
-    Reports go back over `control` as dicts {"kind": "acquisition", "state": ..., "message": ...}.
+    Reports go back over `control` as lines of events (`run_events.AcquisitionState`).
 
     Raises
     ------

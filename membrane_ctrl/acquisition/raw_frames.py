@@ -19,6 +19,7 @@ import tomli_w
 from firmware_iface.roles import Pattern
 from membrane_ctrl.acquisition.cycle import CyclePlan
 from membrane_ctrl.config.schema import OpticsConfig, RecordingConfig
+from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.processes.frames import FrameHead, FrameReader, Pixels
@@ -89,7 +90,7 @@ class RawFrames:
         recording: RecordingConfig,
         frames: FrameAddress,
         telemetry: RingAddress,
-        tell: Callable[[dict[str, Any]], None] = lambda event: None,
+        tell: Callable[[events.Event], None] = lambda event: None,
     ) -> None:
         self._folder, self._optics, self._plan, self._recording = folder, optics, plan, recording
         self._patterns = {pattern.name: pattern for pattern in plan.full}
@@ -186,7 +187,7 @@ class RawFrames:
         self.left_out += 1
         if why and why != self._told:
             self._told = why
-            self._tell({"kind": "raw_frames", "left_out": self.left_out, "message": f"frames are left out: {why}"})
+            self._tell(run_events.RawFrames(self.left_out, f"frames are left out: {why}"))
 
     def _collect(self) -> None:
         """Look at what has been written; a set that was not is none, and nothing may refer to it."""

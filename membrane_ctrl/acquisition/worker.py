@@ -14,7 +14,7 @@ from membrane_ctrl.metrology import bins, phase
 from membrane_ctrl.metrology.calibrate.drift import DriftMonitor, RingMonitor, noise_urad
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import Surface
-from membrane_ctrl.model import events, shape_estimate
+from membrane_ctrl.model import events, run_events, shape_estimate
 
 
 def keep_cycling(
@@ -82,23 +82,23 @@ def estimate_message(estimate: shape_estimate.ShapeEstimate) -> bytes:
 
 def _captured(
     result: CycleDone | CycleFailed | None, keep: Callable[[shape_estimate.ShapeEstimate], Path]
-) -> events.Event:
+) -> run_events.Capture:
     """What became of a set that was asked for; a rejected one is not worth its room on the disk."""
     match result:
         case None:
-            return {"kind": "capture", "failed": "the cycle was stopped"}
+            return run_events.Capture(failed="the cycle was stopped")
         case CycleFailed(number, stage, message, _):
-            return {"kind": "capture", "cycle": number, "failed": f"{stage}: {message}"}
+            return run_events.Capture(number, failed=f"{stage}: {message}")
     estimate = result.estimate
     if estimate.verdict == "rejected":
-        return {"kind": "capture", "cycle": estimate.cycle, "failed": f"rejected: {estimate.reason}"}
+        return run_events.Capture(estimate.cycle, failed=f"rejected: {estimate.reason}")
     try:
         folder = keep(estimate)
     except OSError as error:
-        return {"kind": "capture", "cycle": estimate.cycle, "failed": error.strerror or str(error)}
-    told: events.Event = {"kind": "capture", "cycle": estimate.cycle, "set": f"{folder.parent.name}/{folder.name}"}
-    moved_um = {"displacement_um": estimate.displacement_um} if math.isfinite(estimate.displacement_um) else {}
-    return {**told, **moved_um, "verdict": estimate.verdict, "reason": estimate.reason}
+        return run_events.Capture(estimate.cycle, failed=error.strerror or str(error))
+    moved_um = estimate.displacement_um if math.isfinite(estimate.displacement_um) else None
+    name = f"{folder.parent.name}/{folder.name}"
+    return run_events.Capture(estimate.cycle, name, moved_um, estimate.verdict, estimate.reason)
 
 
 def _tell(
@@ -119,9 +119,10 @@ def _tell(
 # The geometry of a live cycle: which one it is, and whether it still fits what the cycles see.
 
 
-def geometry_event(geometry: InForce) -> events.Event:
+def geometry_event(geometry: InForce) -> run_events.GeometryInForce:
     """For the record of the run."""
-    return {"kind": "geometry", **geometry.origin.table(), "message": geometry.note}
+    origin = geometry.origin
+    return run_events.GeometryInForce(origin.hash, origin.file or None, origin.calibrated_utc or None, geometry.note)
 
 
 class LiveDrift:
@@ -165,8 +166,8 @@ class LiveDrift:
         if bool(says) == self._said:
             return None
         self._said = not self._said
-        kind = "maintenance" if self._said else "maintenance_over"
-        return {"kind": kind, "name": "calibrate", "message": says or "the geometry fits again"}
+        news = events.Maintenance if self._said else events.MaintenanceOver
+        return news("calibrate", says or "the geometry fits again")
 
     def _surface(self, estimate: shape_estimate.ShapeEstimate) -> Surface:
         return Surface(estimate.coeffs_um / 1e3, estimate.hencky_um / 1e3, self._radius_mm)

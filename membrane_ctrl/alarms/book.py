@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from membrane_ctrl.config.port import AlarmRule, AlarmsConfig
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model import events, run_events
 
 # What the run's events and telemetry mean as alarms: each sign raises an alarm or takes it away.
 
@@ -53,68 +53,62 @@ class Sign:
     anew: bool = False
 
 
-def signs_of(event: Event) -> list[Sign]:
+def signs_of(event: events.Event) -> list[Sign]:
     """What an event says; most say nothing."""
-    match event.get("kind"):
-        case "fault":
-            text = f"{event.get('cause')} ({event.get('seen')}; {event.get('limit')}); {event.get('remedy')}"
-            if event.get("latching"):
-                return [Sign("fault", True, "critical", f"{event.get('name')}: {text}", anew=True)]
-            return [Sign("glitch", True, "warning", f"{event.get('name')}: {text}", _GLITCH_S)]
-        case "cleared":
+    match event:
+        case events.Fault():
+            text = f"{event.name}: {event.cause} ({event.seen}; {event.limit}); {event.remedy}"
+            if event.latching:
+                return [Sign("fault", True, "critical", text, anew=True)]
+            return [Sign("glitch", True, "warning", text, _GLITCH_S)]
+        case events.Cleared():
             return [Sign("glitch", False)]
-        case "state" if event.get("from") == "fault":
+        case events.StateEntered(from_="fault"):
             return [Sign("fault", False), Sign("glitch", False)]
-        case "link":
-            up = event.get("message") == "connected again"
-            return [Sign("link", not up, "warning", str(event.get("message")), _GLITCH_S)]
-        case "child_ended":
-            child, code = event.get("child"), event.get("exit_code")
-            text = f"the {child} process ended with {code}; the hold goes on without it"
-            return [Sign(f"{child}_ended", True, "warning", text, _GLITCH_S)]
-        case "child_silent":
-            text = f"the {event.get('child')} process does not answer; the hold goes on without it"
-            return [Sign(f"{event.get('child')}_ended", True, "warning", text, _GLITCH_S)]
-        case "child_given_up":
-            text = (
-                f"the {event.get('child')} process has ended too often and is left alone for an hour; look at the run"
-            )
-            return [Sign(f"{event.get('child')}_ended", True, "warning", text)]
-        case "child_restarted":
-            ended = Sign(f"{event.get('child')}_ended", False)
+        case events.Maintenance():
+            return [Sign(f"maintenance_{event.name}", True, "warning", event.message)]
+        case events.MaintenanceOver():
+            return [Sign(f"maintenance_{event.name}", False)]
+        case events.Plausibility():
+            who = _LIARS.get(event.liar, "one of them")
+            text = f"laser and camera do not agree; {who} is wrong ({event.seen})"
+            return [Sign("plausibility", event.liar != "nobody", "warning", text)]
+    return _signs_of_process(event)
+
+
+def _signs_of_process(event: events.Event) -> list[Sign]:
+    match event:
+        case run_events.Link():
+            return [Sign("link", not event.up, "warning", event.message, _GLITCH_S)]
+        case run_events.ChildEnded():
+            text = f"the {event.child} process ended with {event.exit_code}; the hold goes on without it"
+            return [Sign(f"{event.child}_ended", True, "warning", text, _GLITCH_S)]
+        case run_events.ChildSilent():
+            text = f"the {event.child} process does not answer; the hold goes on without it"
+            return [Sign(f"{event.child}_ended", True, "warning", text, _GLITCH_S)]
+        case run_events.ChildGivenUp():
+            text = f"the {event.child} process has ended too often and is left alone for an hour; look at the run"
+            return [Sign(f"{event.child}_ended", True, "warning", text)]
+        case run_events.ChildRestarted():
+            ended = Sign(f"{event.child}_ended", False)
             # another recorder knows nothing of the former's trouble, and says anew what still stands
-            return [ended, Sign("recorder", False)] if event.get("child") == "recorder" else [ended]
-        case "recorder_error" | "disk_low":
-            text = str(event.get("message", event))
-            return [Sign("recorder", True, "warning", text, about=str(event.get("what", "")))]
-        case "recorder_recovered":
-            return [Sign("recorder", False, about=str(event.get("what", "")))]
-        case "port_failed":
-            return [Sign("port", True, "warning", f"the control port failed: {event.get('message')}", _GLITCH_S)]
-        case "port_open":
+            return [ended, Sign("recorder", False)] if event.child == "recorder" else [ended]
+        case run_events.RecorderError() | run_events.DiskLow():
+            return [Sign("recorder", True, "warning", event.message, about=event.what)]
+        case run_events.RecorderRecovered():
+            return [Sign("recorder", False, about=event.what)]
+        case run_events.PortFailed():
+            return [Sign("port", True, "warning", f"the control port failed: {event.message}", _GLITCH_S)]
+        case run_events.PortOpen():
             return [Sign("port", False)]
-        case "maintenance" | "maintenance_over":
-            bad = event.get("kind") == "maintenance"
-            return [Sign(f"maintenance_{event.get('name')}", bad, "warning", str(event.get("message")))]
-        case "plausibility":
-            bad = event.get("liar") != "nobody"
-            who = _LIARS.get(str(event.get("liar")), "one of them")
-            text = f"laser and camera do not agree; {who} is wrong ({event.get('seen')})"
-            return [Sign("plausibility", bad, "warning", text)]
-        case "latch_failed":
-            text = f"the fault may be forgotten at the next start: {event.get('message')}"
+        case run_events.LatchFailed():
+            text = f"the fault may be forgotten at the next start: {event.message}"
             return [Sign("latch", True, "critical", text)]
-        case "latch_written":
+        case run_events.LatchWritten():
             return [Sign("latch", False)]
-        case "end":
-            return _end_signs(event)
+        case run_events.Ended() if event.exit not in ("done", "interrupted"):
+            return [Sign("run_ended", True, "critical", f"the run has ended: {event.exit}")]
     return []
-
-
-def _end_signs(event: Event) -> list[Sign]:
-    if event.get("exit") in ("done", "interrupted"):
-        return []
-    return [Sign("run_ended", True, "critical", f"the run has ended: {event.get('exit')}")]
 
 
 def sign_of_value(rule: AlarmRule, value: float, standing: bool) -> Sign | None:

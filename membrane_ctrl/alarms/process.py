@@ -8,15 +8,17 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import FrameType
 from typing import Any
 
 from membrane_ctrl.alarms.book import AlarmBook, Notice, Sign, sign_of_value, signs_of
 from membrane_ctrl.alarms.senders import Outbox, Send, apprise_senders
 from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.model import run_events
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import CommandTaken, Event, EventLine, StateEntered
+from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.processes import child, ring
 
@@ -40,10 +42,6 @@ class Watcher:
     now_s : float
         When it begins to look.
 
-    Attributes
-    ----------
-    ended : bool
-        The run has said its last word.
     """
 
     def __init__(self, config: AlarmsConfig, outboxes: Sequence[Outbox], now_s: float) -> None:
@@ -51,8 +49,12 @@ class Watcher:
         self._book = AlarmBook(config)
         self._outboxes = outboxes
         self._last_row_s = now_s + _STARTS_S
-        self._fault: Event = {}
-        self.ended = False
+        self._status = RunStatus()
+
+    @property
+    def ended(self) -> bool:
+        """The run has said its last word."""
+        return self._status.ended
 
     def look(self, rows: Sequence[bytes], events: Sequence[bytes], now_s: float) -> None:
         """Take in what came since the last look, and send what is due."""
@@ -69,17 +71,17 @@ class Watcher:
         self._book.take(Sign("control_gone", True, "critical", text), now_s)
         self._send(now_s)
 
-    def _take_event(self, event: Event, now_s: float) -> None:
-        kind = event.get("kind")
-        if kind == "fault":
-            self._fault = event
-        elif kind == "state" and event.get("state") == "fault" and not self._fault.get("latching"):
-            event = self._fault | {"latching": True}  # held on the mean flow for too long, it has latched
+    def _take_event(self, line: EventLine, now_s: float) -> None:
+        event = run_events.from_dict(line)
+        self._status = self._status.after_event(event)
+        fault = self._status.fault
+        match event:
+            case StateEntered(state="fault") if fault is not None and not fault.latching:
+                event = replace(fault, latching=True)  # held on the mean flow for too long, it has latched
+            case run_events.AlarmsAcknowledged() | CommandTaken(command="ack"):
+                self._book.acknowledge()  # whoever asks for `ack` has seen it, whether it is obeyed or not
         for sign in signs_of(event):
             self._book.take(sign, now_s)
-        if kind == "alarms_acknowledged" or (kind == "command" and event.get("command") == "ack"):
-            self._book.acknowledge()  # whoever asks for `ack` has seen it, whether it is obeyed or not
-        self.ended |= kind == "end"
 
     def _take_row(self, message: bytes, now_s: float) -> None:
         row = dict(zip(FIELDS, _ROW.unpack(message), strict=True))
@@ -187,8 +189,17 @@ def watch(
 def _reporting(send: Send, to: str, report: Callable[[Event], None]) -> Send:
     def sending(notice: Notice) -> bool:
         through = send(notice)
-        event = {"kind": "alarm", "alarm": notice.name, "what": notice.kind, "severity": notice.severity}
-        report({**event, "text": notice.text, "to": to, "sent": through, "escalated": notice.escalated})
+        report(
+            run_events.AlarmTold(
+                alarm=notice.name,
+                what=notice.kind,
+                severity=notice.severity,
+                text=notice.text,
+                to=to,
+                sent=through,
+                escalated=notice.escalated,
+            )
+        )
         return through
 
     return sending

@@ -13,7 +13,9 @@ from membrane_ctrl.calibration.plan import SETTLE_S, HeldMirror, reach_of, step_
 from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.commands import Command, Kind
-from membrane_ctrl.model import errors, events, states, telemetry
+from membrane_ctrl.model import errors, states, telemetry
+from membrane_ctrl.model.events import StateEntered
+from membrane_ctrl.model.run_events import Capture
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News
 from membrane_ctrl.sessions.progress import Progress
 
@@ -121,7 +123,7 @@ class Sweep:
                     f"the mirror does not settle at {setpoint_um:g} um in {patience_s:.0f} s; paused, or too tight?"
                 )
 
-    def take(self) -> events.Event:
+    def take(self) -> Capture:
         """Have a set taken; one that is bad is taken again, once.
 
         Raises
@@ -132,23 +134,23 @@ class Sweep:
             If the second is bad, too.
         """
         first = self._capture()
-        event = first if "set" in first else self._capture()
-        if "set" not in event:
-            raise errors.RejectedError(f"no good set in two attempts: {first['failed']}; {event['failed']}")
+        event = first if first.set else self._capture()
+        if not event.set:
+            raise errors.RejectedError(f"no good set in two attempts: {first.failed}; {event.failed}")
         return event
 
     def shape_loop(self, on: bool) -> None:
         """Switch the shape loop."""
         self._ask("shape_on" if on else "shape_off")
 
-    def _capture(self) -> events.Event:
+    def _capture(self) -> Capture:
         self._ask("capture")
         begin_s = self._last_s
         while self._last_s - begin_s < _SET_WITHIN_S:
-            told = [event for event in self._news().events if event["kind"] == "capture"]
+            told = [event for event in self._news().events if isinstance(event, Capture)]
             if told:
                 return told[-1]
-        return {"kind": "capture", "failed": f"no set within {_SET_WITHIN_S:.0f} s"}
+        return Capture(failed=f"no set within {_SET_WITHIN_S:.0f} s")
 
     def _inside(self, rows: deque[telemetry.TelemetryRow]) -> bool:
         last = [row.error_um for row in rows if rows[-1].mono_s - row.mono_s <= _MEAN_S]
@@ -161,8 +163,8 @@ class Sweep:
         """What has come; raises HoldError if the mirror is not held any more."""
         news = self._link.news()
         for event in news.events:
-            if event["kind"] == "state":
-                self._why = f" ({event['why']})"
+            if isinstance(event, StateEntered):
+                self._why = f" ({event.why})"
         for row in news.rows:
             if row.state != states.State.HOLD:
                 name = states.State(int(row.state)).name.lower()
@@ -248,8 +250,8 @@ class Procedure:
         self.progress.begin(what, expected_s, after_s)
         self.sweep.go(setpoint_um, expected_s)
         event = self.sweep.take()
-        session.keep(index, self.link.run_dir / str(event["set"]))
-        self.progress.say(f"{what}: {event['verdict']}" + (f" ({event['reason']})" if event.get("reason") else ""))
+        session.keep(index, self.link.run_dir / str(event.set))
+        self.progress.say(f"{what}: {event.verdict}" + (f" ({event.reason})" if event.reason else ""))
 
     @contextlib.contextmanager
     def _coming_back(self, session: CalibrationSession) -> Iterator[None]:

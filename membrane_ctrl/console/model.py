@@ -4,13 +4,14 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from statistics import fmean, pstdev
-from typing import Any
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.why import duration, why
 from membrane_ctrl.control.film_health import JUDGE_S, TOO_TIGHT_UM_PER_S
-from membrane_ctrl.control_port.status import RecorderTrouble
 from membrane_ctrl.model import shape_estimate, states, telemetry
+from membrane_ctrl.model.events import EventLine, Fault
+from membrane_ctrl.model.run_events import AcquisitionState, from_dict
+from membrane_ctrl.model.run_status import RunStatus
 
 # The last minute of a signal, second by second.
 
@@ -50,8 +51,6 @@ class Trend:
 
 # The tick runs at 50 Hz, the console at 5: a row this old means that the control process stands still.
 SILENT_S = 1.0
-
-Event = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,80 +124,49 @@ class ConsoleView:
 
 
 class ConsoleModel:
-    """Takes what arrives and remembers what the console needs of it.
-
-    Attributes
-    ----------
-    ended : bool
-        The event that ends a run has been seen.
-    """
+    """Takes what arrives and remembers what the console needs of it."""
 
     def __init__(self, config: Config, duration_s: float | None = None) -> None:
         self._config = config
         self._duration_s = math.inf if duration_s is None else duration_s
-        self._row: telemetry.TelemetryRow | None = None
+        self._status = RunStatus()
         self._started_s = math.nan
-        self._since_s = 0.0
-        self._told = ""
-        self._fault = ""
-        self._remedy = ""
-        self._faults = 0
-        self._last_fault = ""
         self._error = Trend()
         self._lateness = Trend()
         self._estimate: shape_estimate.ShapeEstimate | None = None
         self._first_sag_um = math.nan
         self._cycles = 0
         self._rejected = 0
-        self._acquisition = ""
-        self._shape_told = ""
-        self._recorder = RecorderTrouble()
-        self.ended = False
+
+    @property
+    def ended(self) -> bool:
+        """The event that ends a run has been seen."""
+        return self._status.ended
 
     def take_row(self, row: telemetry.TelemetryRow) -> None:
         """One tick."""
-        if self._row is None:
+        if self._status.row is None:
             self._started_s = row.mono_s
-        if self._row is None or row.state != self._row.state:
-            self._since_s = row.mono_s
-        self._row = row
+        self._status = self._status.after_row(row)
         self._error.add(row.mono_s, row.error_um)
         self._lateness.add(row.mono_s, row.lateness_ms)
 
-    def take_event(self, event: Event) -> None:
+    def take_event(self, line: EventLine) -> None:
         """One event, a line of `events.jsonl`."""
-        words = text(event)
-        self._recorder.take(event)
-        match event.get("kind"):
-            case "state" | "why":
-                self._told = words
-            case "fault":
-                self._faults += 1
-                self._fault = words or "unnamed"
-                self._remedy = event.get("remedy", "")
-                self._last_fault = f"{self._fault} at {duration(event.get('mono_s', math.nan))}"
-            case "cleared":
-                self._fault = self._remedy = ""
-            case "shape":
-                self._shape_told = words
-            case "acquisition":
-                state = event.get("state", "")
-                self._acquisition = "" if state == "running" else ": ".join(w for w in (state, words) if w)
-            case "end":
-                self.ended = True
+        self._status = self._status.after_event(from_dict(line), line.get("mono_s", math.nan))
 
     def take_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """One measurement cycle."""
-        self._estimate = estimate
+        self._estimate, row = estimate, self._status.row
         self._cycles += 1
         if estimate.verdict == "rejected":
             self._rejected += 1
-        elif math.isnan(self._first_sag_um) and self._row is not None and self._row.state == states.State.HOLD:
+        elif math.isnan(self._first_sag_um) and row is not None and row.state == states.State.HOLD:
             self._first_sag_um = estimate.sag_um
 
     def view(self, now_s: float) -> ConsoleView:
         """What to show at a moment of the run's clock."""
-        row = self._row
+        status, row = self._status, self._status.row
         errors = self._error.values()
         band_um = self._config.limits.band_um
         age_s = now_s - row.mono_s if row else 0.0
@@ -207,7 +175,7 @@ class ConsoleModel:
             why=self._why(),
             silent_s=age_s if age_s > SILENT_S else 0.0,
             state=states.State(int(row.state)) if row else states.State.STANDBY,
-            state_age_s=max(0.0, now_s - self._since_s),
+            state_age_s=max(0.0, now_s - self._status.since_s),
             elapsed_s=now_s,
             left_s=max(0.0, self._duration_s - (now_s - self._started_s if row else 0.0)),
             trend_um=self._error.means(),
@@ -215,30 +183,31 @@ class ConsoleModel:
             error_std_um=pstdev(errors) if errors else math.nan,
             in_band_fraction=fmean(abs(e) <= band_um for e in errors) if errors else math.nan,
             lateness_max_ms=max(self._lateness.values(), default=math.nan),
-            fault=self._fault,
-            remedy=self._remedy,
-            faults=self._faults,
-            last_fault=self._last_fault,
+            fault=_fault_words(status.fault),
+            remedy=status.fault.remedy if status.fault else "",
+            faults=status.faults,
+            last_fault=f"{_fault_words(status.last_fault)} at {duration(status.last_fault_s)}" * bool(status.faults),
             too_tight=self._too_tight(now_s),
-            recording=self._recorder.words,
+            recording=status.recording_words,
             shape=self._shape(now_s),
         )
 
     def _too_tight(self, now_s: float) -> bool:
-        row = self._row
-        judged = row is not None and row.state == states.State.HOLD and now_s - self._since_s >= JUDGE_S
+        row = self._status.row
+        judged = row is not None and row.state == states.State.HOLD and now_s - self._status.since_s >= JUDGE_S
         return row is not None and judged and row.leak_um_per_s < TOO_TIGHT_UM_PER_S
 
     def _why(self) -> str:
-        if self._row is None:
-            return self._told or "starting: the control loop has not ticked yet"
-        return why(self._row, self._told, self._fault, self._config)
+        status = self._status
+        if status.row is None:
+            return status.why or "starting: the control loop has not ticked yet"
+        return why(status.row, status.why, _fault_words(status.fault), self._config)
 
     def _shape(self, now_s: float) -> ShapeView:
-        estimate, row = self._estimate, self._row
+        estimate, row, status = self._estimate, self._status.row, self._status
         state = states.ShapeState(int(row.shape_state)) if row else states.ShapeState.OFF
         reason = estimate.reason if estimate and estimate.verdict != "ok" else ""
-        loop = self._shape_told if state in (states.ShapeState.WAITING, states.ShapeState.SUSPENDED) else ""
+        loop = status.shape_reason if state in (states.ShapeState.WAITING, states.ShapeState.SUSPENDED) else ""
         return ShapeView(
             state=state,
             estimate=estimate,
@@ -247,13 +216,21 @@ class ConsoleModel:
             trim_um=row.trim_um if row else math.nan,
             cycles=self._cycles,
             rejected=self._rejected,
-            note=self._acquisition or loop or reason,
+            note=_acquisition_words(status.acquisition) or loop or reason,
         )
 
 
-def text(event: Event) -> str:
+def _fault_words(fault: Fault | None) -> str:
+    return "" if fault is None else text(fault.to_dict()) or "unnamed"
+
+
+def _acquisition_words(said: AcquisitionState | None) -> str:
+    return "" if said is None or said.state == "running" else ": ".join(w for w in (said.state, said.message) if w)
+
+
+def text(line: EventLine) -> str:
     """The words of an event for a person: its name if it has one, its reason, and what was seen."""
-    name = str(event.get("name", "")).replace("_", " ")
-    reason = next((str(event[key]) for key in ("why", "reason", "cause", "message") if event.get(key)), "")
-    seen = f" ({event['seen']})" if event.get("seen") else ""
+    name = str(line.get("name", "")).replace("_", " ")
+    reason = next((str(line[key]) for key in ("why", "reason", "cause", "message") if line.get(key)), "")
+    seen = f" ({line['seen']})" if line.get("seen") else ""
     return ": ".join(words for words in (name, reason) if words) + seen

@@ -21,9 +21,10 @@ from rich.console import Console
 from rich.live import Live
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.model import ConsoleModel, ConsoleView, Event, text
+from membrane_ctrl.console.model import ConsoleModel, ConsoleView, text
 from membrane_ctrl.console.view import console_panel
 from membrane_ctrl.console.why import duration, number, percent
+from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import unpack_estimate
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
@@ -33,10 +34,12 @@ from membrane_ctrl.processes import child, ring
 # The same for a log file: a line a second, and faults at once.
 
 
-_AT_ONCE = frozenset(
-    {"fault", "cleared", "state", "link", "child_ended", "child_silent", "child_restarted", "child_given_up", "end"}
-    | {"recorder_error", "disk_low", "recorder_recovered"}  # a disk that takes nothing does not take the event either
-)
+_AT_ONCE = (
+    events.Fault | events.Cleared | events.StateEntered | run_events.Link | run_events.Ended
+    | run_events.ChildEnded | run_events.ChildSilent | run_events.ChildRestarted | run_events.ChildGivenUp
+    # a disk that takes nothing does not take the event either
+    | run_events.RecorderError | run_events.DiskLow | run_events.RecorderRecovered
+)  # fmt: skip
 
 
 def line(view: ConsoleView) -> str:
@@ -62,13 +65,15 @@ def line(view: ConsoleView) -> str:
     return "  ".join(parts)
 
 
-def at_once(event: Event) -> bool:
+def at_once(line: events.EventLine) -> bool:
     """Whether nobody should have to wait a second for the event."""
-    kind = event.get("kind")
-    return kind in _AT_ONCE or (kind == "acquisition" and event.get("state") != "running")
+    event = run_events.from_dict(line)
+    if isinstance(event, run_events.AcquisitionState):
+        return event.state != "running"
+    return isinstance(event, _AT_ONCE)
 
 
-def event_line(event: Event) -> str:
+def event_line(event: events.EventLine) -> str:
     """An event in one line."""
     mono_s = event.get("mono_s", math.nan)
     what = " ".join(str(event[key]) for key in ("state", "child", "exit") if key in event)
@@ -172,16 +177,16 @@ class _Feed:
         self._events = ring.RingReader(spec.events)
         self._shapes = ring.RingReader(spec.shapes) if spec.shapes else None
 
-    def update(self) -> list[Event]:
+    def update(self) -> list[events.EventLine]:
         """Take what has come; returns the events among it."""
         for message in self._telemetry.drain():
             self.model.take_row(TelemetryRow(*_ROW.unpack(message)))
         for message in self._shapes.drain() if self._shapes else ():
             self.model.take_shape(unpack_estimate(message))
-        events: list[Event] = [json.loads(message) for message in self._events.drain()]
-        for event in events:
-            self.model.take_event(event)
-        return events
+        lines: list[events.EventLine] = [json.loads(message) for message in self._events.drain()]
+        for line in lines:
+            self.model.take_event(line)
+        return lines
 
     def close(self) -> None:
         for reader in (self._telemetry, self._events, self._shapes):

@@ -14,7 +14,7 @@ import struct
 from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Callable
 
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model import events, run_events
 
 BACKLOG = 64  # who waits while another comes in; the kernel turns away the rest
 _INSIDE_MOST = 32
@@ -79,7 +79,7 @@ class Endpoint:
         name: str,
         listener: socket.socket,
         welcome: Welcome,
-        tell: Callable[[Event], None],
+        tell: Callable[[events.Event], None],
         refused: Callable[[str, str], None],
     ) -> None:
         self._name = name
@@ -113,12 +113,12 @@ class Endpoint:
                 came_in = await self._accept(turns)
             except Exception as error:
                 again_s = min(max(2.0 * again_s, _AGAIN_S), _AGAIN_MOST_S)
-                self._tell({"kind": "port_failed", "port": self._name, "message": str(error), "again_s": again_s})
+                self._tell(run_events.PortFailed(self._name, str(error), again_s))
                 await asyncio.sleep(again_s)
                 continue
             if again_s:
                 again_s = 0.0
-                self._tell({"kind": "port_open", "port": self._name})
+                self._tell(run_events.PortOpen(self._name))
             await asyncio.sleep(_PAUSE_S if came_in else _TURN_AWAY_S)
 
     async def _accept(self, turns: Turns) -> bool:
@@ -165,7 +165,7 @@ class Endpoint:
         try:
             await self._welcome(connection, lambda: self._strangers.pop(task, None))
         except Exception as error:  # one client's trouble is nobody else's
-            self._tell({"kind": "port_failed", "port": self._name, "message": f"{type(error).__name__}: {error}"})
+            self._tell(run_events.PortFailed(self._name, f"{type(error).__name__}: {error}"))
         finally:
             connection.close()
 
@@ -194,7 +194,7 @@ class Refusals:
         All of them.
     """
 
-    def __init__(self, tell: Callable[[Event], None], now: Callable[[], float]) -> None:
+    def __init__(self, tell: Callable[[events.Event], None], now: Callable[[], float]) -> None:
         self._tell, self._now = tell, now
         self._left, self._since_s = _REFUSAL_BURST, now()
         self._unsaid = 0
@@ -210,8 +210,5 @@ class Refusals:
             self._unsaid += 1
             return
         self._left -= 1.0
-        event: Event = {"kind": "refused", "who": who, "command": command, "why": why, "reason": reason}
-        if self._unsaid:
-            event["and_unrecorded"] = self._unsaid
-        self._tell(event)
+        self._tell(run_events.Refused(who, command, why, reason, and_unrecorded=self._unsaid or None))
         self._unsaid = 0

@@ -21,10 +21,11 @@ from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
 from membrane_ctrl.control_port.protocol import KINDS, VERSION, Request, Wire
 from membrane_ctrl.control_port.session import FREE, Commander, Peer, PortSession, may_not
-from membrane_ctrl.control_port.status import Picture, metrics_text, serve_metrics
+from membrane_ctrl.control_port.status import metrics_text, serve_metrics, status_table
 from membrane_ctrl.control_port.tls import Listeners
 from membrane_ctrl.controller import commands, tick
-from membrane_ctrl.model import errors, events
+from membrane_ctrl.model import errors, events, run_events
+from membrane_ctrl.model.run_status import RunStatus
 
 # Beyond these the connection that has been silent longest goes: one person's terminals cannot lock out another's stop
 _SESSIONS_MOST, _SESSIONS_EACH = 16, 4
@@ -76,7 +77,7 @@ class Port:
         self._tell, self._now = hooks.tell, hooks.now
         self._commander = Commander(config.commander_lapses_s)
         self._refusals = Refusals(hooks.tell, hooks.now)
-        self._picture = Picture()
+        self._status = RunStatus()
         self._numbers = itertools.count(1)
         self._waiting: dict[int, asyncio.Future[str]] = {}
         self._sessions: list[PortSession] = []
@@ -84,8 +85,9 @@ class Port:
 
     def heard(self, outputs: tick.TickOutputs) -> None:
         """Take in what a tick decided; those who asked for it get their answer."""
-        self._picture.take(outputs)
+        self._status = self._status.after_row(outputs.row)
         for event in outputs.events:
+            self._status = self._status.after_event(event)
             for session in self._sessions:
                 session.event(event)
         for number, refusal in outputs.answers:
@@ -95,7 +97,7 @@ class Port:
 
     def told(self, event: events.Event) -> None:
         """Take in what a child process reports."""
-        self._picture.note(event)
+        self._status = self._status.after_event(event)
         for session in self._sessions:
             session.event(event)
 
@@ -114,7 +116,7 @@ class Port:
         for endpoint in endpoints:
             endpoint.open()
         if endpoints:
-            self._tell({"kind": "port", **listeners.addresses})
+            self._tell(run_events.PortAddresses(**listeners.addresses))
         try:
             yield
         finally:
@@ -131,15 +133,14 @@ class Port:
         """What `status` answers and `watch` streams."""
         return {
             "run": self._run,
-            **self._picture.status(),
+            **status_table(self._status),
             "commander": self._commander.holder(self._now()) or None,
             "clients": len(self._sessions),
         }
 
     def metrics(self) -> str:
         """The same for Prometheus."""
-        recording_ok = not self._picture.recorder.standing
-        return metrics_text(self._picture.row, len(self._sessions), self._refusals.count, recording_ok)
+        return metrics_text(self._status, len(self._sessions), self._refusals.count)
 
     def _turned_away(self, who: str, reason: str) -> None:
         self._refusals.record(who, "", reason)
@@ -209,7 +210,7 @@ class Port:
         refusal = await self._obeyed(command)
         if refusal:
             return {"ok": False, "refused": refusal}
-        return {"ok": True, "state": self._picture.status()["state"]}
+        return {"ok": True, "state": status_table(self._status)["state"]}
 
     def _claim_command(self, peer: Peer, request: Request) -> str:
         if request.do in FREE:
@@ -217,7 +218,7 @@ class Port:
         former = self._commander.holder(self._now())
         refusal = self._commander.claim(peer.who, request.take_over, self._now())
         if not refusal and former != peer.who:
-            self._tell({"kind": "commander", "who": peer.who, "former": former or None, "why": request.why})
+            self._tell(run_events.Commander(peer.who, former or None, request.why))
             for session in self._sessions:
                 if session.peer.who == former:
                     session.notice(
@@ -232,9 +233,9 @@ class Port:
                 session.watch(request.period_s)
             case "release":
                 self._commander.release(who)
-                self._tell({"kind": "commander", "who": None, "former": who, "why": request.why})
+                self._tell(run_events.Commander(None, who, request.why))
             case "quiet":
-                self._tell({"kind": "alarms_acknowledged", "who": who, "why": request.why})
+                self._tell(run_events.AlarmsAcknowledged(who, request.why))
         return {"ok": True, "status": self.status(), "loop": self._hooks.loop().model_dump()}
 
     def _command(self, peer: Peer, request: Request) -> commands.Command:

@@ -144,7 +144,7 @@ class PortSession:
         """Tell a watching peer what has happened."""
         if self._watch is not None:
             with contextlib.suppress(SlowReaderError):
-                self._wire.send({"event": event})
+                self._wire.send({"event": event.to_dict()})
 
     def watch(self, period_s: float | None) -> None:
         """Stream the status from now on; None ends it."""

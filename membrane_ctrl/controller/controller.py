@@ -24,6 +24,7 @@ from membrane_ctrl.controller import (
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.model import errors, telemetry
+from membrane_ctrl.model import events as told
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.states import Rung, State
@@ -175,16 +176,17 @@ class Controller:
             or self._prepare(command)
         )
         self._answers.append((command.number, refused))
-        event: Event = {"kind": "command", "command": command.kind, "who": command.who, "why": command.why}
-        if math.isfinite(command.value):
-            event["value"] = command.value
-        if command.text:
-            event["text"] = command.text
-        if command.loop is not None:
-            event["loop"] = command.loop.model_dump()
-        if command.experiment is not None:
-            event["experiment"] = command.experiment.model_dump()
-        events.append({**event, "refused": refused} if refused else event)
+        taken = told.CommandTaken(
+            command=command.kind,
+            who=command.who,
+            why=command.why,
+            value=command.value if math.isfinite(command.value) else None,
+            text=command.text or None,
+            loop=None if command.loop is None else command.loop.model_dump(),
+            experiment=None if command.experiment is None else command.experiment.model_dump(),
+            refused=refused or None,
+        )
+        events.append(taken)
         if not refused:
             self._do(command)
         return not refused
@@ -252,7 +254,7 @@ class Controller:
 
     def _revert_gains(self, why: str, events: list[Event]) -> None:
         self._set_gains(self._gains.revert())
-        events.append({"kind": "gains_reverted", "why": why})
+        events.append(told.GainsReverted(why))
 
     def _consider_resuming(self, observation: safety_rules.Observation) -> None:
         """A latched fault on the list may go, once its cause has stayed away (`resume`)."""
@@ -272,12 +274,12 @@ class Controller:
         if rule is None:
             if levels.rung == Rung.HOLD_FLOW:
                 levels.clear(scene.now_s)
-                events.append({"kind": "cleared", "name": self.fault.name if self.fault else ""})
+                events.append(told.Cleared(self.fault.name if self.fault else ""))
                 self.fault = None
             return
         if self.fault is None or (rule.rung > Rung.HOLD_FLOW >= levels.rung):
             self.fault = rule
-            events.append(_fault_event(verdict))
+            events.append(_fault_event(rule, verdict.seen))
         levels.enter(rule.rung, scene.now_s)
         if levels.step(scene.now_s) > Rung.HOLD_FLOW and self.state != State.FAULT:
             self._go(State.FAULT, f"{self.fault.name}: {self.fault.cause}", events)
@@ -297,7 +299,7 @@ class Controller:
         words = shape.reason.translate(_NO_DIGITS)  # numbers that change are no news
         if (shape.state, words) != self._shape_was:
             self._shape_was = (shape.state, words)
-            events.append({"kind": "shape", "state": shape.state.name.lower(), "reason": shape.reason})
+            events.append(told.ShapeLoopState(shape.state.name.lower(), shape.reason))
         return shape
 
     def _act(self, events: list[Event]) -> None:
@@ -323,7 +325,7 @@ class Controller:
 
     def _go(self, state: State, why: str, events: list[Event]) -> None:
         scene = self._scene
-        events.append({"kind": "state", "state": state.name.lower(), "from": self.state.name.lower(), "why": why})
+        events.append(told.StateEntered(state.name.lower(), self.state.name.lower(), why))
         if self.state == State.TUNE:
             self._tell_trial(why, events)
         if state != State.TUNE:
@@ -333,7 +335,7 @@ class Controller:
         if self.state == State.FAULT:  # it was acknowledged, or may resume
             if not scene.acknowledged and self.fault is not None:
                 self._resume.resumed(scene.now_s)
-                events.append({"kind": "resumed", "name": self.fault.name})
+                events.append(told.Resumed(self.fault.name))
             self.fault, self._tick_error = None, ""
             scene.levels.leave()
             scene.acknowledged = False
@@ -351,8 +353,7 @@ class Controller:
         trial = self._scene.trial
         assert trial is not None
         ended = self._scene.trial_ended or Finished(False, why)
-        told = {"kind": "experiment", "experiment": trial.spec.kind, "completed": ended.completed}
-        events.append({**told, "reason": ended.reason, **trial.result()})
+        events.append(told.ExperimentEnded(trial.spec.kind, ended.completed, ended.reason, trial.pump_map()))
 
     def _tell_why(self, events: list[Event]) -> None:
         """The one line of the operator, as an event when its words (not its numbers) have changed for good."""
@@ -362,7 +363,7 @@ class Controller:
             self._why_words, self._why_since_s = words, scene.now_s
         if words != self._said_why and scene.now_s - self._why_since_s >= _WHY_STANDS_S:
             self._said_why = words
-            events.append({"kind": "why", "why": scene.why})
+            events.append(told.Why(scene.why))
 
     def _row(
         self, inputs: TickInputs, observation: safety_rules.Observation, shape: shape_loop.ShapeOutput
@@ -408,17 +409,14 @@ class Controller:
         )
 
 
-def _fault_event(verdict: safety.Verdict) -> Event:
-    rule = verdict.rule
-    assert rule is not None
-    return {
-        "kind": "fault",
-        "code": rule.code,
-        "name": rule.name,
-        "cause": rule.cause,
-        "seen": verdict.seen,
-        "limit": rule.limit,
-        "rung": rule.rung.name.lower(),
-        "latching": rule.latching,
-        "remedy": rule.remedy,
-    }
+def _fault_event(rule: safety_rules.Rule, seen: str) -> told.Fault:
+    return told.Fault(
+        code=rule.code,
+        name=rule.name,
+        cause=rule.cause,
+        seen=seen,
+        limit=rule.limit,
+        rung=rule.rung.name.lower(),
+        latching=rule.latching,
+        remedy=rule.remedy,
+    )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control import film, film_health, gas, plausibility
 from membrane_ctrl.controller import safety_rules, tick
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver, Plausibility
 from membrane_ctrl.model.states import State
 
 # A single bad answer is nobody's business.
@@ -110,8 +110,7 @@ class SensorConsistency:
         events += self._judge(self._plausibility.step(dt_s, laser_um, gauge_pa, inputs.estimate))
         self.gas_excess = self._growth.step(held.leak_um_per_s, held.flow_um_per_s, self._most_growth(inputs), dt_s)
         for warning in self._health.step(dt_s, held.leak_um_per_s, gauge_pa):
-            kind = "maintenance" if warning.bad else "maintenance_over"
-            events.append({"kind": kind, "name": warning.name, "message": warning.message})
+            events.append((Maintenance if warning.bad else MaintenanceOver)(warning.name, warning.message))
         return events
 
     def _rest(self) -> list[Event]:
@@ -149,8 +148,7 @@ class SensorConsistency:
         if self._weather_s < _WEATHER_STANDS_S:
             return []
         self._weather_told, self._weather_s = bool(failure), 0.0
-        kind = "maintenance" if failure else "maintenance_over"
-        return [{"kind": kind, "name": "weather_sensor", "message": failure or "no longer so"}]
+        return [(Maintenance if failure else MaintenanceOver)("weather_sensor", failure or "no longer so")]
 
     def _judge(self, liar: plausibility.Liar) -> list[Event]:
         repeats = self._repeats >= _REPEATS
@@ -165,4 +163,4 @@ class SensorConsistency:
         if liar == self._liar:
             return []
         self._liar = liar
-        return [{"kind": "plausibility", "liar": liar.name.lower(), "seen": str(self._plausibility.changes)}]
+        return [Plausibility(liar.name.lower(), str(self._plausibility.changes))]

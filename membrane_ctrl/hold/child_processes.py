@@ -11,10 +11,10 @@ from pathlib import Path
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import MESSAGE_BYTES
+from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.telemetry import ROW_BYTES
-from membrane_ctrl.processes.child import ALIVE, Child, pipe
+from membrane_ctrl.processes.child import Child, pipe
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, ring
 
 # A child process that ends or falls silent is replaced, but not for ever.
@@ -75,7 +75,7 @@ class ManagedChild:
             return False
         return True
 
-    def look(self, now_s: float) -> list[Event]:
+    def look(self, now_s: float) -> list[events.Event]:
         """What it has said since the last call, and what became of it; starts another when that is due.
 
         Never waits, but for starting a process (some ms, less than a tick).
@@ -88,15 +88,15 @@ class ManagedChild:
         name = self.child.name
         if self._ended_s is None:
             self._ended_s = now_s
-            said.append({"kind": "child_ended", "child": name, "exit_code": self.child.exit_code})
+            said.append(run_events.ChildEnded(name, self.child.exit_code))
         if self._used_up(now_s):
             if not self._given_up:
                 self._given_up = True
-                said.append({"kind": "child_given_up", "child": name, "restarts": len(self._replaced_s)})
+                said.append(run_events.ChildGivenUp(name, len(self._replaced_s)))
             return said
         if now_s - self._ended_s >= self._wait_s():
             self.replace(now_s)
-            said.append({"kind": "child_restarted", "child": name, "restarts": self._count})
+            said.append(run_events.ChildRestarted(name, self._count))
         return said
 
     def replace(self, now_s: float) -> None:
@@ -109,14 +109,14 @@ class ManagedChild:
         self.child, self._line = self._make(self._count)
         self.child.start()
 
-    def _fell_silent(self, now_s: float) -> Event:
+    def _fell_silent(self, now_s: float) -> events.Event:
         """Kill who keeps still, unless nobody may take the place: half a recorder is better than none."""
         self._silent = True
         late_s = round(now_s - self._expected_s, 1)
         killed = not self._used_up(now_s)
         if killed:
             self.child.kill()
-        return {"kind": "child_silent", "child": self.child.name, "overdue_s": late_s, "killed": killed}
+        return run_events.ChildSilent(self.child.name, late_s, killed)
 
     def _used_up(self, now_s: float) -> bool:
         """Whether this hour's replacements are spent."""
@@ -127,13 +127,13 @@ class ManagedChild:
     def _wait_s(self) -> float:
         return min(_LONGEST_WAIT_S, 2.0 ** (len(self._replaced_s) - 1)) if self._replaced_s else 0.0
 
-    def _said(self, now_s: float) -> list[Event]:
-        said: list[Event] = []
+    def _said(self, now_s: float) -> list[events.Event]:
+        said: list[events.Event] = []
         try:
             while self._line.poll():
-                event = self._line.recv()
-                if event["kind"] == ALIVE:
-                    self._expected_s, self._silent = now_s + event["for_s"], False
+                event = run_events.from_dict(self._line.recv())
+                if isinstance(event, run_events.Alive):
+                    self._expected_s, self._silent = now_s + event.for_s, False
                 else:
                     said.append(event)
         except (EOFError, OSError):  # it has ended
@@ -212,16 +212,16 @@ class ChildProcesses:
         for managed in self._managed:
             managed.child.stop(_CHILD_STOPS_S)
 
-    def reports(self) -> list[Event]:
+    def reports(self) -> list[events.Event]:
         """What the children have said since the last call, and who was replaced; never waits."""
         return [event for managed in self._managed for event in managed.look(self._clock.now())]
 
-    def capture(self) -> Event | None:
+    def capture(self) -> events.Event | None:
         """Have the acquisition take a full set to disk, which its own event names; an event if that cannot be."""
         if self._acquisition is None:
-            return {"kind": "capture", "failed": "no shape measurement in this run"}
+            return run_events.Capture(failed="no shape measurement in this run")
         if not self._acquisition.send("capture"):
-            return {"kind": "capture", "failed": "the acquisition does not answer; is it being replaced?"}
+            return run_events.Capture(failed="the acquisition does not answer; is it being replaced?")
         return None
 
     def take_down(self) -> None:

@@ -11,7 +11,8 @@ from functools import partial
 from types import TracebackType
 
 from membrane_ctrl.controller import commands, tick
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import CommandTaken, Event, Fault, Resumed, StateEntered
+from membrane_ctrl.model.run_events import LatchFailed, LatchWritten
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile, ResumeLog
 
 
@@ -46,7 +47,7 @@ class FaultLatch:
         self._news: deque[Event] = deque()  # from the disk's thread
         self._failing = False
         self._last: Callable[[], None] = lambda: None
-        self._fault: Event = {}
+        self._fault: Fault | None = None
 
     @property
     def latched(self) -> str:
@@ -78,24 +79,22 @@ class FaultLatch:
         self._report()
         for event in outputs.events:
             match event:
-                case {"kind": "fault"}:
+                case Fault():
                     self._fault = event
-                case {"kind": "state", "state": "fault"}:
+                case StateEntered(state="fault"):
                     self._latch(outputs.row.mono_s)
-                case {"kind": "command", "command": "latch", "who": who} if (
-                    "refused" not in event
-                    and who != commands.AT_START  # what is latched at the start is where it belongs
-                ):
-                    self._lock(who, event.get("text", ""), outputs.row.mono_s)
-                case {"kind": "resumed"} if self._resumes is not None:
+                case CommandTaken(command="latch", who=who, refused=None) if who != commands.AT_START:
+                    # what is latched at the start is where it belongs
+                    self._lock(who, event.text or "", outputs.row.mono_s)
+                case Resumed() if self._resumes is not None:
                     self._disk.submit(self._try, partial(self._resumes.add, self._utc(outputs.row.mono_s)))
-                case {"kind": "state", "from": "fault"} | {"kind": "command", "command": "ack"} if (
-                    "refused" not in event and self._file is not None
+                case StateEntered(from_="fault") | CommandTaken(command="ack", refused=None) if (
+                    self._file is not None
                 ):
                     self._disk.submit(self._try, self._file.clear)
 
     def _latch(self, now_s: float) -> None:
-        words = {key: str(self._fault.get(key, "")) for key in ("name", "cause", "seen", "remedy")}
+        words = {key: getattr(self._fault, key, "") for key in ("name", "cause", "seen", "remedy")}
         if self._file is not None:
             self._write(partial(self._file.write, self._dated(words, now_s)))
 
@@ -125,11 +124,11 @@ class FaultLatch:
             act()
         except Exception as error:  # nobody looks at what a thread raises
             if not self._failing:
-                self._news.append({"kind": "latch_failed", "message": str(error)})
+                self._news.append(LatchFailed(str(error)))
             self._failing = True
         else:
             if self._failing:
-                self._news.append({"kind": "latch_written"})
+                self._news.append(LatchWritten())
                 self._failing = False
 
     def _report(self) -> None:

@@ -30,9 +30,9 @@ from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
 from membrane_ctrl.hold.systemd import SystemdNotify
 from membrane_ctrl.instruments.bench import connect, open_bench
 from membrane_ctrl.instruments.device_lock import device_names, locked
-from membrane_ctrl.model import errors, terminal
+from membrane_ctrl.model import errors, run_events, terminal
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import CommandTaken, Event
 from membrane_ctrl.processes.child import raise_priority
 from membrane_ctrl.processes.ring import RingReader, RingWriter, publish
 from membrane_ctrl.run_files.latched_fault import LatchedFile, ResumeLog
@@ -202,7 +202,7 @@ async def _run(
         }
         wiring.told = {"control port": port.told, "systemd": systemd.told}
         devices = config.devices.name if config.devices else ""
-        supervisor.tell({"kind": "start", "devices": devices, "priority": raise_priority(), "message": board.cleared})
+        supervisor.tell(run_events.Started(devices, raise_priority(), board.cleared))
         exit_code = errors.Exit.DEVICE_FAILED
         try:
             if not options.standby:
@@ -218,22 +218,15 @@ async def _run(
                     assert config.devices is not None
                     # last: the board's watchdog runs from here on
                     if (await connect(bench, config.devices)).map_version == 1:
-                        supervisor.tell({"kind": "no_claim", "message": NO_CLAIM})
+                        supervisor.tell(run_events.NoClaim(NO_CLAIM))
                     exit_code = await supervisor.run(options.duration_s)
         except LinkError as error:
-            supervisor.tell({"kind": "link", "message": str(error)})
+            supervisor.tell(run_events.Link(str(error), up=False))
             raise errors.DeviceError(str(error)) from None
         finally:
             await bench.close()
-            supervisor.tell(
-                {
-                    "kind": "end",
-                    "exit": exit_code.name.lower(),
-                    "exit_code": int(exit_code),
-                    "ticks": supervisor.ticks,
-                    "missed_ticks": supervisor.missed_ticks,
-                }
-            )
+            ticks, missed_ticks = supervisor.ticks, supervisor.missed_ticks
+            supervisor.tell(run_events.Ended(exit_code.name.lower(), int(exit_code), ticks, missed_ticks))
     return exit_code
 
 
@@ -242,9 +235,9 @@ def _capture(
 ) -> None:
     """A set that was asked for, and not refused, is the acquisition's to take."""
     for event in outputs.events:
-        asked = event["kind"] == "command" and event["command"] == "capture" and "refused" not in event
-        if asked and (failed := children.capture()) is not None:
-            tell(failed)
+        match event:
+            case CommandTaken(command="capture", refused=None) if (failed := children.capture()) is not None:
+                tell(failed)
 
 
 @contextlib.contextmanager

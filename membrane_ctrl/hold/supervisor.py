@@ -17,9 +17,9 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import remember
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs, pack_tick
-from membrane_ctrl.model import errors, shape_estimate
+from membrane_ctrl.model import errors, run_events, shape_estimate
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.processes.ring import RingReader, RingWriter
 
 # Looking after a child costs a system call; half a second late is soon enough, the loop does not need them
@@ -87,8 +87,8 @@ class Supervisor:
         if self._wiring.events is None:
             return
         now_s = self._clock.now()
-        stamped = {"time_utc": self._clock.utc(now_s).isoformat(), "mono_s": round(now_s, 6), **event}
-        self._wiring.events.put(_line(stamped, self._wiring.events.slot_bytes))
+        stamped = {"time_utc": self._clock.utc(now_s).isoformat(), "mono_s": round(now_s, 6)}
+        self._wiring.events.put(_line(stamped | event.to_dict(), self._wiring.events.slot_bytes))
 
     async def run(self, duration_s: float | None) -> errors.Exit:
         """Tick until a tick says that the run is over; the pump is off by then, or cannot be reached."""
@@ -181,7 +181,7 @@ class Supervisor:
         except (struct.error, TypeError, ValueError) as error:
             if not self._inputs_error:
                 self._inputs_error = str(error)
-                self.tell({"kind": "inputs_not_recorded", "message": self._inputs_error})
+                self.tell(run_events.InputsNotRecorded(self._inputs_error))
             return
         for message in messages:
             self._wiring.inputs.put(message)
@@ -204,7 +204,7 @@ class Supervisor:
             self._link_failed(error)
             return
         self._link_up, self._link_error = True, ""
-        self.tell({"kind": "link", "message": "connected again"})
+        self.tell(run_events.Link(run_events.CONNECTED_AGAIN, up=True))
 
     async def _clear_board(self, mask: int) -> None:
         try:
@@ -226,7 +226,7 @@ class Supervisor:
             self._link_up = False
         if str(error) != self._link_error:
             self._link_error = str(error)
-            self.tell({"kind": "link", "message": str(error)})
+            self.tell(run_events.Link(str(error), up=False))
 
     def _newest_shape(self) -> shape_estimate.ShapeEstimate | None:
         if self._wiring.shapes is None:
@@ -236,7 +236,7 @@ class Supervisor:
         except ValueError as error:  # as good as no shape, which the shape loop bears
             if str(error) != self._shape_error:
                 self._shape_error = str(error)
-                self.tell({"kind": "shape_unreadable", "message": str(error)})
+                self.tell(run_events.ShapeUnreadable(str(error)))
             return None
 
     def _watch(self) -> None:
@@ -264,7 +264,7 @@ def newest_of(reader: RingReader) -> Callable[[], shape_estimate.ShapeEstimate |
     return newest
 
 
-def _line(event: Event, most_bytes: int) -> bytes:
+def _line(event: EventLine, most_bytes: int) -> bytes:
     """An event for the ring: the texts of one that is too long are cut, as no message is worth the hold."""
     line = json.dumps(event, allow_nan=False, default=str).encode()
     for most in _TEXT_CUTS:

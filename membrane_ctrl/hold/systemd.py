@@ -12,9 +12,9 @@ import os
 import socket
 from types import TracebackType
 
-from membrane_ctrl.control_port.status import RecorderTrouble
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.states import State
 
 _EVERY_S = 0.5  # far below any sensible WatchdogSec=, and nothing to a tick
@@ -33,7 +33,7 @@ class SystemdNotify:
         self._address = (address or os.environ.get("NOTIFY_SOCKET", "")).replace("@", "\0", 1)
         self._next_s = -math.inf
         self._state = -1.0
-        self._recorder = RecorderTrouble()
+        self._status = RunStatus()
 
     def __enter__(self) -> SystemdNotify:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
@@ -47,7 +47,7 @@ class SystemdNotify:
 
     def told(self, event: Event) -> None:
         """Take in what a child process reports; the next status line has it."""
-        self._recorder.take(event)
+        self._status = self._status.after_event(event)
 
     def heard(self, outputs: TickOutputs) -> None:
         """A tick has ended."""
@@ -58,7 +58,7 @@ class SystemdNotify:
         self._next_s, self._state = row.mono_s + _EVERY_S, row.state
         error = f", error {row.error_um:+.2f} um" if math.isfinite(row.error_um) else ""
         fault = f", fault {row.fault:g}" if row.fault else ""
-        trouble = f", recording: {self._recorder.words}" if self._recorder.standing else ""
+        trouble = f", recording: {self._status.recording_words}" if self._status.recording else ""
         self._send(f"{ready}WATCHDOG=1\nSTATUS={State(int(row.state)).name.lower()}{error}{fault}{trouble}")
 
     def _send(self, message: str) -> None:

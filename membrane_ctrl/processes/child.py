@@ -17,7 +17,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
-from membrane_ctrl.model import events, terminal
+from membrane_ctrl.model import events, run_events, terminal
 
 _CONTEXT = multiprocessing.get_context("spawn")
 _OF_THE_GROUP = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
@@ -126,23 +126,20 @@ def pipe() -> Any:
 # What a child process says to the control process over its pipe, without ever waiting for it.
 
 
-ALIVE = "alive"
-
-
-def alive(for_s: float) -> events.Event:
+def alive(for_s: float) -> run_events.Alive:
     """It is at work, and will say so again within `for_s` seconds (`ManagedChild` sees that it does)."""
-    return {"kind": ALIVE, "for_s": for_s}
+    return run_events.Alive(for_s)
 
 
-def reporter(status: Connection | None) -> Callable[[dict[str, Any]], None]:
-    """A function that sends a dict over `status` if there is room for it now, and otherwise lets it go."""
+def reporter(status: Connection | None) -> Callable[[events.Event], None]:
+    """A function that sends an event over `status` if there is room for it now, and otherwise lets it go."""
     if status is None:
-        return lambda message: None
+        return lambda event: None
     os.set_blocking(status.fileno(), False)
 
-    def report(message: dict[str, Any]) -> None:
+    def report(event: events.Event) -> None:
         try:
-            status.send({key: _short(value) for key, value in message.items()})
+            status.send({key: _short(value) for key, value in event.to_dict().items()})
         except OSError:  # full, or nobody at the other end: recording goes on
             return
 

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from membrane_ctrl.config.schema import Config, RecordingConfig
+from membrane_ctrl.model import run_events
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.recorder.sink import LAYOUT, RecorderErrors, is_whole
 from membrane_ctrl.run_files import disk_budget, run_folder
@@ -208,7 +209,7 @@ class Housekeeping:
         self.detail = disk_budget.detail_level(left_mb, least_mb, self.detail)
         if left_mb < least_mb:
             limit = f"less than recording.min_free_mb = {least_mb:g} MB free"
-            self._errors.report_error("disk", f"{self._run_dir}: {limit}; delete old runs", kind="disk_low")
+            self._errors.report_error("disk", f"{self._run_dir}: {limit}; delete old runs", run_events.DiskLow)
         else:
             self._errors.recovered("disk")
 
@@ -230,7 +231,7 @@ class Housekeeping:
 
     def _delete(self, run: disk_budget.OldRun, why: str) -> None:
         disk_budget.delete_run(run)
-        self._errors.report({"kind": "run_deleted", "run": run.folder.name, "message": why})
+        self._errors.report(run_events.RunDeleted(run.folder.name, why))
 
     def close(self) -> None:
         """End what is under way."""

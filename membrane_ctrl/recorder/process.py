@@ -13,13 +13,15 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Event as Flag
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.events import Event, EventLine
+from membrane_ctrl.model.run_events import Ended
 from membrane_ctrl.processes.child import STOP, alive, reporter
 from membrane_ctrl.processes.frames import FrameHead, FrameReader, Pixels
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
@@ -83,8 +85,7 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
     spec : RecorderSpec
         What to record and where.
     status : Connection or None
-        Gets small dicts {"kind": "recorder_error" | "recorder_recovered" | "disk_low" | "recorder_done", "message":
-        ...} and each second that it is alive; one that cannot be taken at once is given up.
+        Gets events of the recorder, and each second that it is alive; one that cannot be taken at once is given up.
     """
     asked = Flag()
     # ctrl-C reaches the whole terminal group: the supervisor decides when the run is over, with the "end" event
@@ -99,7 +100,7 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
 
 def _record(
     spec: RecorderSpec,
-    report: Callable[[dict[str, Any]], None],
+    report: Callable[[Event], None],
     asked: Callable[[], bool],
     orphan: Callable[[], bool],
 ) -> bool:
@@ -139,9 +140,9 @@ def _record(
     return not recording.stuck
 
 
-def _end_event(clock: RunClock, exit_word: str) -> dict[str, Any]:
+def _end_event(clock: RunClock, exit_word: str) -> EventLine:
     now_s = clock.now()
-    return {"time_utc": clock.utc(now_s).isoformat(), "mono_s": now_s, "kind": "end", "exit": exit_word}
+    return {"time_utc": clock.utc(now_s).isoformat(), "mono_s": now_s} | Ended(exit_word).to_dict()
 
 
 def parent_died() -> bool:

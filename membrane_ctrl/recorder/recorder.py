@@ -6,17 +6,17 @@ import math
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from membrane_ctrl import __version__
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import TickAssembler
-from membrane_ctrl.model import files, object_codec, plain_json, shape_estimate, telemetry
+from membrane_ctrl.model import files, object_codec, plain_json, run_events, shape_estimate, telemetry
 from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.processes.ring import RingReader
 from membrane_ctrl.recorder import housekeeping, rerun_output, sink
 from membrane_ctrl.run_files import events, inputs_file, tables
-from membrane_ctrl.run_files.events import Event, EventsFile
+from membrane_ctrl.run_files.events import EventsFile
 from membrane_ctrl.run_files.summary import Summary
 
 # A ring as the recorder reads it: each message once, also when another recorder goes on where one was killed.
@@ -206,7 +206,7 @@ class Recorder:
         self._messages: list[bytes] = []
         self._input_messages: list[bytes] = []
         self._shapes: list[shape_estimate.ShapeEstimate] = []
-        self._events: list[Event] = []
+        self._events: list[EventLine] = []
         self._rows_lost = before.rows_lost
         self.ended = self.urgent = False
 
@@ -220,7 +220,7 @@ class Recorder:
                 self._errors.guarded("shape estimate", partial(self._take_shape, message))
         self.take_events([events.parse(message) for message in self._feeds["events"].drain()])
 
-    def take_events(self, new: list[Event]) -> None:
+    def take_events(self, new: list[EventLine]) -> None:
         """Take in events; an "end" among them ends the run."""
         for event in new:
             self._summary.add_event(event)
@@ -325,5 +325,4 @@ class Recorder:
         if not in_haste:
             self._housekeeping.finish(closed)
         self._housekeeping.close()
-        done: dict[str, Any] = {"kind": "recorder_done", "dropped": self._dropped(), **account}
-        self._errors.report(done)
+        self._errors.report(run_events.RecorderDone(self._dropped(), **account))

@@ -6,9 +6,9 @@ from typing import Protocol
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import shape_estimate, states, telemetry
+from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.recorder import rerun_streams, sink
 from membrane_ctrl.run_files.disk_budget import DetailLevel
-from membrane_ctrl.run_files.events import Event
 
 # A full disk is tried again this often: a person who made room sees the recording go on.
 RETRY_S = 10.0
@@ -72,7 +72,7 @@ class RerunOutput:
         self,
         now_s: float,
         rows: telemetry.Rows,
-        events: list[Event],
+        events: list[EventLine],
         shapes: list[shape_estimate.ShapeEstimate],
         detail: DetailLevel,
     ) -> bool:

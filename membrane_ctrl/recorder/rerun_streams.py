@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import shape_estimate, telemetry
+from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.recorder import blueprint, sink
 from membrane_ctrl.run_files import shapes, streams
-from membrane_ctrl.run_files.events import Event
 
 # Events to Rerun: one line of the text log each.
 
@@ -29,7 +29,7 @@ _LEVELS = {
 _TIMES = frozenset({"time_utc", "mono_s", "kind"})
 
 
-def send_events(recording: sink.Recording, events: Sequence[Event]) -> None:
+def send_events(recording: sink.Recording, events: Sequence[EventLine]) -> None:
     """Send events in their order."""
     if not events:
         return
@@ -39,13 +39,13 @@ def send_events(recording: sink.Recording, events: Sequence[Event]) -> None:
     recording.columns(EVENTS_PATH, time_s, rr.TextLog.columns(text=texts, level=levels))
 
 
-def event_time_s(event: Event) -> float:
+def event_time_s(event: EventLine) -> float:
     """When it happened on the run's axis; 0 for an event that does not say."""
     mono_s = event.get("mono_s")
     return float(mono_s) if isinstance(mono_s, (int, float)) else 0.0
 
 
-def event_text(event: Event) -> str:
+def event_text(event: EventLine) -> str:
     """One line: the kind, then what the event says of itself."""
     details = [
         f"{key} {_short(value)}" for key, value in event.items() if key not in _TIMES and value not in (None, "")

@@ -14,7 +14,6 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -23,7 +22,9 @@ from rerun.chunk import RrdReader
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.files import sync_data
+from membrane_ctrl.model.run_events import DiskLow, RecorderError, RecorderRecovered
 from membrane_ctrl.recorder.blueprint import LANES, run_blueprint
 from membrane_ctrl.run_files import segments, shapes, streams
 
@@ -211,7 +212,7 @@ def _style(stream: streams.Stream) -> rr.SeriesLines:
 # Trouble of the recorder: told once for as long as it is the same, and nothing of it ends the recorder.
 
 
-Report = Callable[[dict[str, Any]], None]
+Report = Callable[[Event], None]
 
 
 class RecorderErrors:
@@ -220,14 +221,14 @@ class RecorderErrors:
     Parameters
     ----------
     report : callable
-        Takes a small dict for the supervisor; never blocks, never raises.
+        Takes an event for the supervisor; never blocks, never raises.
     errors : int
         Of a recorder before this one.
 
     Attributes
     ----------
     errors : int
-        Reports of kind "recorder_error".
+        `RecorderError`s reported.
     """
 
     def __init__(self, report: Report, errors: int = 0) -> None:
@@ -249,17 +250,17 @@ class RecorderErrors:
         else:
             self.recovered(what)
 
-    def report_error(self, what: str, message: str, kind: str = "recorder_error") -> None:
+    def report_error(self, what: str, message: str, as_: type[RecorderError | DiskLow] = RecorderError) -> None:
         """Report trouble once for as long as it is the same; the report says in `what` whose end to wait for."""
         if self._trouble.get(what) != message:
             self._trouble[what] = message
-            self.errors += kind == "recorder_error"
-            self.report({"kind": kind, "what": what, "message": message})
+            self.errors += as_ is RecorderError
+            self.report(as_(what, message))
 
     def recovered(self, what: str) -> None:
         """Say that it works again, if it did not."""
         if self._trouble.pop(what, None) is not None:
-            self.report({"kind": "recorder_recovered", "what": what, "message": f"{what} works again"})
+            self.report(RecorderRecovered(what, f"{what} works again"))
 
     def forget(self, prefix: str, but: set[str]) -> None:
         """Say that trouble is over whose cause is there no longer: what begins with `prefix` and is not in `but`."""

@@ -20,6 +20,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import load
 from membrane_ctrl.controller.tick import TickBatch
 from membrane_ctrl.model import errors, files, plain_json, shape_estimate, telemetry
+from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.replay.replay import (
     Decision,
     Replay,
@@ -72,11 +73,12 @@ def open_run(folder: Path) -> RecordedRun:
         raise errors.InputError(f"{folder}: no inputs-*.bin: this run was recorded without what a replay needs")
     events = run_folder.read_events(folder, [])
     cut = not any(event.get("kind") == "end" for event in events)
+    decisions = decisions_of((run_folder.event_s(line), from_dict(line)) for line in events)
     told_until_s = max((run_folder.event_s(event) for event in events), default=0.0) if cut else math.inf
     config = load(folder / "config.toml", Config, follow=False)
     right = plain_json.comment_is_right(files.read_text(folder / "config.toml"))
     damage = "" if right else "config.toml: does not fit its checksum (damaged or edited)"
-    return RecordedRun(folder, config, inputs, decisions_of(events), told_until_s, damage)
+    return RecordedRun(folder, config, inputs, decisions, told_until_s, damage)
 
 
 SCHEMA = "membrane-incident/1"

@@ -20,13 +20,11 @@ from membrane_ctrl.controller.memory import UnknownMemoryError, recall
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs, output_crc, unpack_tick
 from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import Cleared, Event, Fault, ShapeLoopState, StateEntered
 from membrane_ctrl.run_files.inputs_file import InputsFrame
 
 # A shape is used in the tick it arrives in; more than these need not be remembered.
 _SHAPES_KEPT = 16
-# Events that are decisions, and the key that says which.
-_DECISIONS = {"state": "state", "fault": "name", "cleared": "name", "shape": "state"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +139,7 @@ def replay(
         found.ticks += 1
         found.last_s = item.inputs.now_s
         found.finished = outputs.finished
-        found.decisions += decisions_of(outputs.events, item.inputs.now_s)
+        found.decisions += decisions_of((item.inputs.now_s, event) for event in outputs.events)
         if item.inputs.now_s >= from_s and same_past:
             _compare(item, outputs, found)
     return found
@@ -165,16 +163,14 @@ def _compare(item: RecordedTick, outputs: TickOutputs, found: Replay) -> None:
         found.first_different = found.first_different or outputs.row
 
 
-def decisions_of(events: Iterable[Event], time_s: float | None = None) -> list[Decision]:
-    """The decisions among events; their time is `time_s`, or that of the event itself."""
-    return [
-        Decision(
-            float(event.get("mono_s") or 0.0) if time_s is None else time_s,
-            f"{event['kind']} {event[_DECISIONS[event['kind']]]}",
-        )
-        for event in events
-        if event.get("kind") in _DECISIONS and _DECISIONS[event["kind"]] in event
-    ]
+def decisions_of(told: Iterable[tuple[float, Event]]) -> list[Decision]:
+    """The decisions among events with their times."""
+    found: list[Decision] = []
+    for time_s, event in told:
+        match event:
+            case StateEntered(state=what) | Fault(name=what) | Cleared(name=what) | ShapeLoopState(state=what):
+                found.append(Decision(time_s, f"{event.kind} {what}"))
+    return found
 
 
 def tick_to_begin_with(frames: Iterable[InputsFrame], from_s: float) -> int:

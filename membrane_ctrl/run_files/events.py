@@ -5,11 +5,9 @@ import os
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
+from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.plain_json import dumps_checked
-
-Event = dict[str, Any]
 
 # Synced at once: what must survive the power cut that may follow.
 _SYNCED = frozenset({"fault", "end"})
@@ -17,7 +15,7 @@ _SYNCED = frozenset({"fault", "end"})
 _WAITING_MAX = 10_000
 
 
-def parse(message: bytes) -> Event:
+def parse(message: bytes) -> EventLine:
     """The event of a ring message; one that is not a JSON object becomes an event that says so."""
     try:
         event = json.loads(message)
@@ -49,7 +47,7 @@ class EventsFile:
         self._descriptor: int | None = None
         self.lost = 0
 
-    def append(self, events: Sequence[Event]) -> None:
+    def append(self, events: Sequence[EventLine]) -> None:
         """Write events, and those still waiting from before. Raises OSError (full disk)."""
         for event in events:
             line = dumps_checked(event).encode() + b"\n"
@@ -77,7 +75,7 @@ class EventsFile:
             os.fsync(self._descriptor)
             self._sync = False
 
-    def begin_anew(self, recent: Sequence[Event]) -> None:
+    def begin_anew(self, recent: Sequence[EventLine]) -> None:
         """The file was taken away: begin another, with those that had gone into it unseen. Raises OSError."""
         gone = self._descriptor is not None  # not opened yet: nothing of it was taken
         self.close()

@@ -9,7 +9,7 @@ import numpy as np
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import shape_estimate, states, telemetry
 from membrane_ctrl.model.arrays import BoolArray, Column, FloatArray
-from membrane_ctrl.run_files.events import Event
+from membrane_ctrl.model.events import EventLine
 
 # Statistics of a run of any length in a fixed amount of memory.
 
@@ -176,10 +176,10 @@ class Summary:
         self._time_s = 0.0
         self._states: list[dict[str, Any]] = []
         self._transitions = 0
-        self._faults: list[Event] = []
+        self._faults: list[EventLine] = []
         self._fault_count = 0
-        self._geometry: Event = {}
-        self._end: Event = {}
+        self._geometry: EventLine = {}
+        self._end: EventLine = {}
 
     def add_rows(self, rows: telemetry.Rows) -> None:
         """Take in (n, len(FIELDS)) telemetry rows in their order."""
@@ -223,7 +223,7 @@ class Summary:
             settled.append(bool(holding and moment_s - self._unsettled_s >= SETTLED_AFTER_S))
         return settled
 
-    def add_event(self, event: Event) -> None:
+    def add_event(self, event: EventLine) -> None:
         """Take in one event; "fault", "geometry" and "end" matter here."""
         if event.get("kind") == "fault":
             self._fault_count += 1

@@ -12,7 +12,7 @@ from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.model import errors, shape_estimate
+from membrane_ctrl.model import errors, run_events, shape_estimate
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.processes.ring import attach
@@ -134,7 +134,7 @@ class LiveHold:
         messages = {name: reader.drain() for name, reader in self._readers.items()}
         return News(
             rows=tuple(TelemetryRow(*_ROW.unpack(message)) for message in messages.get("telemetry", ())),
-            events=tuple(events.parse(message) for message in messages.get("events", ())),
+            events=tuple(run_events.from_dict(events.parse(message)) for message in messages.get("events", ())),
             shapes=tuple(shape_estimate.unpack_estimate(message) for message in messages.get("shapes", ())),
         )
 

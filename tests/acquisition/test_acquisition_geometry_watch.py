@@ -48,9 +48,9 @@ def test_a_residual_that_has_grown_is_said_once_and_its_end_too() -> None:
     for residual_urad in (2.9, 4.5, 2.9):
         cycle = replace(CYCLE, slope_residual_urad=residual_urad)
         told += [event for _ in range(CYCLES) if (event := drift.after(cycle)) is not None]
-    assert [event["kind"] for event in told] == ["maintenance", "maintenance_over"]
-    assert {event["name"] for event in told} == {"calibrate"}
-    assert told[0]["message"].startswith("calibrate again: the fit leaves 4.50 urad")
+    assert [event.kind for event in told] == ["maintenance", "maintenance_over"]
+    assert {event.name for event in told} == {"calibrate"}
+    assert told[0].message.startswith("calibrate again: the fit leaves 4.50 urad")
 
 
 def test_a_ring_that_seems_to_tilt_is_said_and_a_deeper_bowl_is_not() -> None:
@@ -60,8 +60,8 @@ def test_a_ring_that_seems_to_tilt_is_said_and_a_deeper_bowl_is_not() -> None:
     tilted = CYCLE.coeffs_um.copy()
     tilted[1] += 4.0  # 2 x of the radius a unit: 8 um at the rim, 5.7 um RMS around it
     told = [event for _ in range(CYCLES) if (event := drift.after(replace(CYCLE, coeffs_um=tilted))) is not None]
-    assert [event["name"] for event in told] == ["calibrate"]
-    assert "the ring is seen 5.7 um RMS from where it was" in told[0]["message"]
+    assert [event.name for event in told] == ["calibrate"]
+    assert "the ring is seen 5.7 um RMS from where it was" in told[0].message
 
 
 def test_the_noise_of_weaker_fringes_is_no_drift() -> None:
@@ -84,7 +84,7 @@ def test_rejected_cycles_and_stated_geometries_say_nothing() -> None:
 
 def test_the_record_names_the_geometry() -> None:
     event = geometry_event(in_force())
-    assert event == {
+    assert event.to_dict() == {
         "kind": "geometry",
         "hash": origin_of(OPTICS).hash,
         "file": None,

@@ -14,6 +14,7 @@ from acquisition_fakes import VirtualClock, estimate
 from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed
 from membrane_ctrl.acquisition.process import Remote
 from membrane_ctrl.acquisition.worker import keep_cycling, next_deadline_s
+from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 
@@ -40,8 +41,8 @@ class ScriptedRemote(Remote):
     def report(self, state: str, message: str = "", **details: object) -> None:
         self.told.append((state, message))
 
-    def tell(self, event: dict[str, object]) -> None:
-        self.events.append(event)
+    def tell(self, event: Event) -> None:
+        self.events.append(event.to_dict())
 
 
 class ScriptedCycle:

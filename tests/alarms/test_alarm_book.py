@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from membrane_ctrl.alarms.book import AlarmBook, Notice, Sign, signs_of
 from membrane_ctrl.config.port import AlarmsConfig
 from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.run_events import ChildRestarted, DiskLow
 from membrane_ctrl.recorder.sink import RecorderErrors
 
 CONFIG = AlarmsConfig(escalate_after_s=900, remind_every_s=3600, clear_after_s=30)
@@ -131,7 +132,7 @@ class Disk:
 
 def test_trouble_with_the_disk_is_over_with_the_last_of_it_and_not_with_the_first() -> None:
     disk = Disk()
-    disk.recorder_errors.report_error("disk", "less than 500 MB free", kind="disk_low")
+    disk.recorder_errors.report_error("disk", "less than 500 MB free", DiskLow)
     assert disk.step(0.0) == [("raised", "less than 500 MB free")]
     disk.step(5.0)
     disk.recorder_errors.report_error("state file", "state file: x")
@@ -146,7 +147,7 @@ def test_trouble_with_the_disk_is_over_with_the_last_of_it_and_not_with_the_firs
 
 def test_a_reminder_names_what_still_stands() -> None:
     disk = Disk()
-    disk.recorder_errors.report_error("disk", "less than 500 MB free", kind="disk_low")
+    disk.recorder_errors.report_error("disk", "less than 500 MB free", DiskLow)
     disk.recorder_errors.report_error("state file", "state file: x")
     disk.step(0.0)
     disk.recorder_errors.recovered("disk")
@@ -157,9 +158,9 @@ def test_another_recorder_begins_without_the_formers_trouble_and_tells_its_own()
     disk = Disk()
     disk.recorder_errors.report_error("state file", "state file: x")
     disk.step(0.0)
-    disk.hear({"kind": "child_restarted", "child": "recorder"})
+    disk.hear(ChildRestarted("recorder", 1))
     disk.step(1.0)
     assert not disk.book.standing("recorder")
-    RecorderErrors(disk.hear).report_error("disk", "less than 500 MB free", kind="disk_low")
+    RecorderErrors(disk.hear).report_error("disk", "less than 500 MB free", DiskLow)
     assert disk.step(40.0) == [], "the same alarm, not told off and told again"
     assert disk.step(900.0) == [("escalated", "less than 500 MB free")]

@@ -19,7 +19,8 @@ from membrane_ctrl.cli import run
 from membrane_ctrl.config.port import AlarmsConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import DeviceError, InputError
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import Event, EventLine
+from membrane_ctrl.model.run_events import AlarmTold
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.processes.child import reporter
 from membrane_ctrl.processes.ring import RingWriter, ring
@@ -130,7 +131,7 @@ def test_an_escalation_is_tried_until_it_is_through_and_keeps_nobody_else_waitin
 
 
 @pytest.mark.parametrize("event", [{"kind": "alarms_acknowledged"}, {"kind": "command", "command": "ack"}])
-def test_an_acknowledgement_keeps_the_others_asleep(event: Event) -> None:
+def test_an_acknowledgement_keeps_the_others_asleep(event: EventLine) -> None:
     sender = FakeSender()
     watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
     watcher.look([ROW.pack()], [message(kind="fault", latching=True)], 0.0)
@@ -169,9 +170,7 @@ def test_the_process_ends_with_the_run_and_says_why_it_ended() -> None:
         watch(spec(telemetry, events), [sender], reports.append, lambda: True)
         writer.close()
     assert told(sender) == [("run_ended", "raised")]
-    assert [(r["kind"], r["alarm"], r["sent"]) for r in reports if r["kind"] != "alive"] == [
-        ("alarm", "run_ended", True)
-    ]
+    assert [(r.alarm, r.sent) for r in reports if isinstance(r, AlarmTold)] == [("run_ended", True)]
 
 
 def test_a_control_process_that_vanishes_is_told() -> None:

@@ -7,7 +7,8 @@ from membrane_ctrl.config.port import AlarmRule
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import parse
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import EventLine
+from membrane_ctrl.model.run_events import from_dict
 
 HIGH = AlarmRule(name="high", field="error_um", raise_at=10.0, clear_at=3.0, magnitude=True)
 LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=200.0)
@@ -51,15 +52,15 @@ LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=
         ({}, []),
     ],
 )  # fmt: skip
-def test_events_as_signs(event: Event, expected: list[tuple[str, bool, str]]) -> None:
-    assert [(sign.name, sign.bad, sign.severity) for sign in signs_of(event)] == expected
+def test_events_as_signs(event: EventLine, expected: list[tuple[str, bool, str]]) -> None:
+    assert [(sign.name, sign.bad, sign.severity) for sign in signs_of(from_dict(event))] == expected
 
 
 @pytest.mark.parametrize(
     ("liar", "says"), [("laser", "the laser is wrong"), ("optics", "the camera is"), ("unsure", "one of them is")]
 )
 def test_who_is_wrong_is_said_in_the_operators_words(liar: str, says: str) -> None:
-    (sign,) = signs_of({"kind": "plausibility", "liar": liar, "seen": "laser +20.0 um, camera +0.1 um"})
+    (sign,) = signs_of(from_dict({"kind": "plausibility", "liar": liar, "seen": "laser +20.0 um, camera +0.1 um"}))
     assert says in sign.text
     assert "laser +20.0 um" in sign.text
 

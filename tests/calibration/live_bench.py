@@ -21,6 +21,7 @@ from membrane_ctrl.config.schema import (
 )
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.run_events import Capture
 from membrane_ctrl.sessions.live_hold import News
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set
@@ -115,7 +116,7 @@ class LiveBench:
             signal.raise_signal(signal.SIGINT)
         self.hold.bench.wrong.no_light = self.captures == self.dark_at
         if self.fails and (failed := self.fails.pop(0)):
-            self._told = ({"kind": "capture", "failed": failed},)
+            self._told = (Capture(failed=failed),)
             return
         spec = SimulationSpec(
             self.config.optics.model_copy(update={"geometry": TRUE}),
@@ -126,4 +127,4 @@ class LiveBench:
             seed=self.captures,
         )
         simulate_set(self.run_dir / "raw" / f"cycle-{self.captures}", spec)
-        self._told = ({"kind": "capture", "set": f"raw/cycle-{self.captures}", "verdict": "ok", "reason": ""},)
+        self._told = (Capture(set=f"raw/cycle-{self.captures}", verdict="ok", reason=""),)

@@ -31,7 +31,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.latched_fault import FaultLatch
 from membrane_ctrl.model.errors import DeviceError
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import CommandTaken, Event
 from membrane_ctrl.model.states import State
 from membrane_ctrl.run_files.latched_fault import NAME, LatchedFile
 from tests.support.virtual_time import run_virtual as in_virtual_time
@@ -158,8 +158,8 @@ async def faults_that_outlive_the_run() -> list[str]:
             rig.must(first is not None and first.name == "over_pressure", f"in the file: {first}")
             rig.must(refused(), "the next hold starts over a latched fault")
             with FaultLatch(file, None, "run", LoopClock().utc, rig.events.append) as fault_latch:
-                locked = {"kind": "command", "command": "latch", "who": "somebody", "text": "later"}
-                denied = {"kind": "command", "command": "ack", "who": "somebody", "refused": "not now"}
+                locked = CommandTaken("latch", "somebody", "", text="later")
+                denied = CommandTaken("ack", "somebody", "", refused="not now")
                 for event in (locked, denied):
                     fault_latch.heard(cast(TickOutputs, _Told(rig.heard[-1], (event,))))
             rig.must(file.read() == first, "the first cause was replaced, or cleared by a refused acknowledgement")

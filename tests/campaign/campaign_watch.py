@@ -27,6 +27,7 @@ from campaign_world import WatchedPlant
 
 from firmware_iface.register_map import default_map
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
+from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.states import Rung, State
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
@@ -149,10 +150,10 @@ class Watch:
         row, before = tick.row, self.state
         self.state, rung = State(int(row.state)), Rung(int(row.rung))
         for event in tick.events:
-            if event["kind"] == "fault":
-                self.names[float(event["code"])] = event["name"]
-            if len(json.dumps(event, allow_nan=False, default=str)) > _EVENT_BYTES:
-                self._say(now_s, f"an event of kind {event['kind']} is too long to be recorded")
+            if isinstance(event, Fault):
+                self.names[float(event.code)] = event.name
+            if len(json.dumps(event.to_dict(), allow_nan=False, default=str)) > _EVENT_BYTES:
+                self._say(now_s, f"an event of kind {event.kind} is too long to be recorded")
         if not (0.0 <= row.pump_fraction <= 1.0 and 0.0 <= row.vent_fraction <= 1.0):
             self._say(now_s, f"wrote pump {row.pump_fraction} and vent {row.vent_fraction}")
         if rung < self._rung and self._rung > Rung.HOLD_FLOW and self.state == before == State.FAULT:

@@ -18,6 +18,7 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.safety import TABLE
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model import events
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.states import Rung, State
 from membrane_ctrl.model.telemetry import TelemetryRow
@@ -317,7 +318,7 @@ class _Watch:
         self._state, self._highest_um = State.STANDBY, -math.inf
         self._astray_um = self._pressure_pa = self._pumped_um = 0.0
 
-    def look(self, row: TelemetryRow, events: Sequence[dict[str, object]], now_s: float) -> None:
+    def look(self, row: TelemetryRow, told: Sequence[events.Event], now_s: float) -> None:
         self._state = State(int(row.state))
         if now_s <= self._begins_s:
             return
@@ -328,7 +329,7 @@ class _Watch:
         if self._state == State.HOLD and row.rung == Rung.NONE:
             off_um = truth.displacement_um - row.setpoint_um + row.trim_um
             self._astray_um = max(self._astray_um, abs(off_um))
-        for name in filter(None, map(_speaks, events)):
+        for name in filter(None, map(_speaks, told)):
             if not self._noticed:
                 self._noticed, self._after_s = name, now_s - self._begins_s
 
@@ -336,18 +337,18 @@ class _Watch:
         return Story(self._noticed, self._after_s, self._state, self._pumped_um, self._astray_um, self._pressure_pa)
 
 
-def _speaks(event: dict[str, object]) -> str:
+def _speaks(event: events.Event) -> str:
     """Who says so, if the event is a complaint."""
-    match event["kind"]:
-        case "fault":
-            return str(event["name"])
-        case "plausibility" if event["liar"] != "nobody":
-            return f"sensors: {event['liar']}"
-        case "shape" if "limit" in str(event["reason"]):
+    match event:
+        case events.Fault():
+            return event.name
+        case events.Plausibility() if event.liar != "nobody":
+            return f"sensors: {event.liar}"
+        case events.ShapeLoopState() if "limit" in event.reason:
             return "shape: trim at its limit"
-        case "shape" if "repeats" in str(event["reason"]):
+        case events.ShapeLoopState() if "repeats" in event.reason:
             return "shape: the camera repeats"
-        case "maintenance":
-            return f"maintenance: {event['name']}"
+        case events.Maintenance():
+            return f"maintenance: {event.name}"
         case _:
             return ""

@@ -12,6 +12,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, TwinConf
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.events import Fault
 from membrane_ctrl.sim import film as film_module
 from membrane_ctrl.sim import sensors as sensors_module
 from membrane_ctrl.sim.events import (
@@ -93,8 +94,8 @@ def _quiet_hours(
         due = tuple(command for at_s, command in asked if at_s <= run.now_s)
         asked = asked[len(due) :]
         tick = run.tick(due)
-        faults = [event for event in tick.events if event["kind"] == "fault"] if tick is not None else []
-        alarms += [f"{event['name']}: {event['seen']}" for event in faults if event["name"] != _DROPOUT]
+        faults = [event for event in tick.events if isinstance(event, Fault)] if tick is not None else []
+        alarms += [f"{event.name}: {event.seen}" for event in faults if event.name != _DROPOUT]
     return QuietHours(run.now_s / 3600.0, tuple(alarms))
 
 

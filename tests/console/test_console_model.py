@@ -142,7 +142,7 @@ def test_note_says_what_is_wrong_with_the_shape() -> None:
 def test_end_event_ends() -> None:
     given = model()
     assert not given.ended
-    given.take_event(event(0.0, "end", exit=0))
+    given.take_event(event(0.0, "end", exit="done"))
     assert given.ended
 
 

@@ -22,7 +22,7 @@ from membrane_ctrl.console.process import ConsoleSpec, console_main, give_back_t
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.model.telemetry import ROW_BYTES
-from membrane_ctrl.processes.child import ALIVE, STOP
+from membrane_ctrl.processes.child import STOP
 from membrane_ctrl.processes.ring import RingWriter, ring
 
 pytestmark = pytest.mark.real_time
@@ -98,7 +98,7 @@ def test_terminal_shows_the_run_and_is_given_back_at_the_end(run: Run, terminal:
     run.tick()
     process = run.start(theirs)
     read_until(ours, b"faults")
-    run.tell("end", exit=0)
+    run.tell("end", exit="done")
     assert b"\x1b[?25h" in finish(process, ours)  # the cursor too
 
 
@@ -114,7 +114,7 @@ def test_terminal_is_given_back_on_a_stop_and_sigint_is_not_for_us(
     if number == signal.SIGINT:
         run.tick()
         read_until(ours, b"faults")
-        run.tell("end", exit=0)
+        run.tell("end", exit="done")
     finish(process, ours)
 
 
@@ -125,7 +125,7 @@ def test_plain_lines_and_faults_when_nobody_looks(
     run.tick()
     run.tell("fault", **FAULT)
     run.tell("command", command="hold")
-    run.tell("end", exit=5)
+    run.tell("end", exit="safety_trip")
     with redirect_stderr(sys.stdout):
         console_main(run.spec)
     lines = capsys.readouterr().out.splitlines()
@@ -146,7 +146,7 @@ def test_reader_that_went_away_is_no_error_and_none_for_who_watches_the_console(
 ) -> None:
     class Gone:
         def write(self, words: str) -> int:
-            run.tell("end", exit=0)
+            run.tell("end", exit="done")
             raise BrokenPipeError
 
         def flush(self) -> None: ...
@@ -172,11 +172,11 @@ def test_a_console_that_takes_the_place_of_another_does_not_tell_old_news_again(
     run.tell("fault", **FAULT)
     time.sleep(0.002)
     spec = replace(run.spec, since_s=run.spec.clock.now())
-    run.tell("end", exit=0)
+    run.tell("end", exit="done")
     ours, theirs = multiprocessing.Pipe()
     with ours, theirs, redirect_stderr(sys.stdout):
         console_main(spec, theirs)
-        assert ours.recv()["kind"] == ALIVE
+        assert ours.recv()["kind"] == "alive"
     told = capsys.readouterr().out
     assert "END 0" in told
     assert "FAULT link lost" not in told

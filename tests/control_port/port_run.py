@@ -20,7 +20,7 @@ from membrane_ctrl.control_port.tls import Listeners, listeners_for
 from membrane_ctrl.control_port.unix import UnixListener
 from membrane_ctrl.controller.commands import Command, refusal
 from membrane_ctrl.controller.tick import TickOutputs
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.states import State
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 
@@ -48,7 +48,7 @@ class PortRun:
         self.ticking = True
         self.now_s = 100.0
         self.asked: list[Command] = []
-        self.events: list[Event] = []
+        self.events: list[EventLine] = []
         self._asked = asyncio.Event()
         self.loop = LoopConfig()
         self.path = folder / "control.sock"
@@ -59,7 +59,7 @@ class PortRun:
         more = port_config.model_copy(update={"socket": str(folder / "unused.sock")})
         others = listeners_for(more, folder, self._stack)
         self.listeners = Listeners(self.listener, others.tls, others.metrics, self.path)
-        hooks = RunHooks(self._ask, self.events.append, lambda: self.now_s, lambda: self.loop)
+        hooks = RunHooks(self._ask, self._tell, lambda: self.now_s, lambda: self.loop)
         self.port = Port(port_config, self.listeners, "the-run", hooks)
 
     async def somebody_asked(self) -> None:
@@ -67,6 +67,9 @@ class PortRun:
 
     def close(self) -> None:
         self._stack.close()
+
+    def _tell(self, event: Event) -> None:
+        self.events.append(event.to_dict())
 
     def _ask(self, command: Command) -> None:
         self.asked.append(command)
@@ -82,7 +85,7 @@ class PortRun:
         row = replace(ROW, state=self.state)
         self.port.heard(TickOutputs(BenchCommand(0.0, 0.0), row, events, None, answers))
 
-    def of_kind(self, kind: str) -> list[Event]:
+    def of_kind(self, kind: str) -> list[EventLine]:
         return [event for event in self.events if event["kind"] == kind]
 
 

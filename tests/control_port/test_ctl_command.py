@@ -8,14 +8,15 @@ from typing import Any
 import pytest
 from port_run import ROW
 
-from firmware_iface.roles import BenchCommand
 from membrane_ctrl.cli import run
 from membrane_ctrl.cli.ctl import ctl_app
 from membrane_ctrl.control_port import ctl as port_ctl
 from membrane_ctrl.control_port import protocol
 from membrane_ctrl.control_port.ctl import Where, socket_path, status_lines
-from membrane_ctrl.control_port.status import Picture
-from membrane_ctrl.controller.tick import TickOutputs
+from membrane_ctrl.control_port.status import status_table
+from membrane_ctrl.model.events import MaintenanceOver
+from membrane_ctrl.model.run_events import GeometryInForce, from_dict
+from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.states import State
 
 ARGUMENTS = {"setpoint": "-12.5", "manual": "0.5", "mark": "door", "gains": "kp_per_s = 0.5", "shape": "on"}
@@ -114,8 +115,8 @@ def test_the_socket_is_found(tmp_path: Path) -> None:
 
 
 def test_status_for_a_person() -> None:
-    picture = Picture()
-    assert "starting" in status_lines({"run": "r", **picture.status()})[0]
+    status = RunStatus()
+    assert "starting" in status_lines({"run": "r", **status_table(status)})[0]
     fault = {
         "kind": "fault",
         "code": 40,
@@ -124,8 +125,8 @@ def test_status_for_a_person() -> None:
         "remedy": "close other programs",
     }
     row = replace(ROW, fault=40.0, state=State.FAULT, leak_um_per_s=float("nan"))
-    picture.take(TickOutputs(BenchCommand(0.0, 0.0), row, (fault,), None))
-    lines = status_lines({"run": "r", "commander": "unix:ann", **picture.status()})
+    status = status.after_row(row).after_event(from_dict(fault))
+    lines = status_lines({"run": "r", "commander": "unix:ann", **status_table(status)})
     assert "FAULT 40 late: the loop is late; close other programs" in lines
     assert any(line.split() == ["error", "0.250", "um"] for line in lines)
     assert any(line.split() == ["leak", "-", "um/s"] for line in lines)
@@ -133,20 +134,18 @@ def test_status_for_a_person() -> None:
 
 
 def test_what_stands_until_it_is_over_is_shown() -> None:
-    picture = Picture()
+    status = RunStatus()
     maintenance = {"kind": "maintenance", "name": "calibrate", "message": "calibrate again: too much is left"}
-    picture.take(TickOutputs(BenchCommand(0.0, 0.0), ROW, (maintenance,), None))
-    lines = status_lines({"run": "r", **picture.status()})
+    status = status.after_row(ROW).after_event(from_dict(maintenance))
+    lines = status_lines({"run": "r", **status_table(status)})
     assert any(line.split(maxsplit=1) == ["maintenance", maintenance["message"]] for line in lines)
     assert any("none in use yet" in line for line in lines)
-    picture.note({"kind": "disk_low", "what": "disk", "message": "less than 500 MB free"})
-    lines = status_lines({"run": "r", **picture.status()})
+    status = status.after_event(from_dict({"kind": "disk_low", "what": "disk", "message": "less than 500 MB free"}))
+    lines = status_lines({"run": "r", **status_table(status)})
     assert any(line.split(maxsplit=1) == ["recording", "less than 500 MB free"] for line in lines)
-    picture.note(
-        {"kind": "geometry", "hash": "12ab", "file": "g.toml", "calibrated_utc": "2026-01-02", "message": ""}
-    )
-    picture.note({"kind": "maintenance_over", "name": "calibrate", "message": "the geometry fits again"})
-    lines = status_lines({"run": "r", **picture.status()})
+    status = status.after_event(GeometryInForce("12ab", "g.toml", "2026-01-02", ""))
+    status = status.after_event(MaintenanceOver("calibrate", "the geometry fits again"))
+    lines = status_lines({"run": "r", **status_table(status)})
     assert not any("maintenance" in line for line in lines)
     assert "  geometry       g.toml, calibrated 2026-01-02 (hash 12ab)" in lines
 

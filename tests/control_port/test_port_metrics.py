@@ -11,13 +11,14 @@ from port_run import ROW, port_run
 
 from membrane_ctrl.config.port import PortConfig
 from membrane_ctrl.control_port.status import metrics_text
+from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import FIELDS
 
 SAMPLE = re.compile(r'[a-z_][a-z0-9_]*(\{state="[a-z]+"\})? (NaN|-?[0-9.e+-]+)')
 
 
 def test_every_line_is_one_that_prometheus_reads() -> None:
-    text = metrics_text(replace(ROW, trim_um=nan), 2, 7)
+    text = metrics_text(RunStatus(row=replace(ROW, trim_um=nan)), 2, 7)
     samples = [line for line in text.splitlines() if not line.startswith("# TYPE membrane_")]
     assert all(SAMPLE.fullmatch(line) for line in samples)
     assert "membrane_error_um 0.25" in samples
@@ -30,12 +31,12 @@ def test_every_line_is_one_that_prometheus_reads() -> None:
 
 
 def test_before_the_first_tick_there_are_the_ports_own() -> None:
-    assert "error_um" not in metrics_text(None, 0, 0)
+    assert "error_um" not in metrics_text(RunStatus(), 0, 0)
 
 
 def test_trouble_with_the_recording_is_a_gauge() -> None:
-    assert "membrane_recording_ok 1.0" in metrics_text(None, 0, 0).splitlines()
-    assert "membrane_recording_ok 0.0" in metrics_text(None, 0, 0, recording_ok=False).splitlines()
+    assert "membrane_recording_ok 1.0" in metrics_text(RunStatus(), 0, 0).splitlines()
+    assert "membrane_recording_ok 0.0" in metrics_text(RunStatus(recording={"disk": "full"}), 0, 0).splitlines()
 
 
 async def fetch(port: int, request: bytes) -> bytes:

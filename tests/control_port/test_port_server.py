@@ -21,6 +21,7 @@ from membrane_ctrl.control_port.protocol import MESSAGE_BYTES
 from membrane_ctrl.control_port.session import Peer
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model.errors import DeviceError
+from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.model.states import State
 
 ANN, BOB, EVE = Peer("unix:ann", "operate"), Peer("unix:bob", "operate"), Peer("unix:eve", "read")
@@ -29,7 +30,7 @@ TOM = Peer("unix:tom", "tune")
 
 async def test_status_is_the_newest_tick(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run, client(run, EVE) as eve:
-        run.tick(events=({"kind": "why", "why": "inside the band"},))
+        run.tick(events=(from_dict({"kind": "why", "why": "inside the band"}),))
         answer = await eve.ask(do="status", number=5)
         assert (answer["number"], answer["ok"]) == (5, True)
         status = answer["status"]
@@ -152,7 +153,7 @@ async def test_an_experiment_is_validated_and_handed_on(tmp_path: Path) -> None:
 async def test_watch_streams_status_and_events(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run, client(run, EVE) as eve, client(run, ANN) as ann:
         assert (await eve.ask(do="watch", period_s=0.1))["status"]["state"] == "hold"
-        run.tick(events=({"kind": "fault", "code": 10, "name": "n", "cause": "c", "remedy": "r"},))
+        run.tick(events=(from_dict({"kind": "fault", "code": 10, "name": "n", "cause": "c", "remedy": "r"}),))
         assert (await eve.get() or {})["event"]["name"] == "n"
         run.state = State.MANUAL
         run.tick()
@@ -202,7 +203,7 @@ async def test_who_does_not_read_is_dropped(tmp_path: Path, monkeypatch: pytest.
     async with port_run(tmp_path) as run, client(run, EVE) as eve, client(run, ANN) as ann:
         assert (await eve.ask(do="watch", period_s=3600))["ok"]
         eve.writer.transport.pause_reading()  # type: ignore[attr-defined]
-        events = ({"kind": "why", "why": "x" * 1000},) * 10
+        events = (from_dict({"kind": "why", "why": "x" * 1000}),) * 10
         for _ in range(500):
             run.tick(events=events)
         await asyncio.sleep(0)

@@ -1,14 +1,30 @@
 from __future__ import annotations
 
-from membrane_ctrl.control_port.status import RecorderTrouble
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.run_events import ChildEnded, ChildGivenUp, ChildRestarted, DiskLow, RecorderError
+from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.recorder.sink import RecorderErrors
 
 
+class Trouble:
+    """The recorder's part of a run's status."""
+
+    def __init__(self) -> None:
+        self.status = RunStatus()
+
+    def take(self, event: Event) -> None:
+        self.status = self.status.after_event(event)
+
+    @property
+    def words(self) -> str:
+        return self.status.recording_words
+
+
 def test_each_trouble_stands_until_its_own_end() -> None:
-    trouble = RecorderTrouble()
+    trouble = Trouble()
     recorder_errors = RecorderErrors(trouble.take)
     assert trouble.words == ""
-    recorder_errors.report_error("disk", "less than 500 MB free", kind="disk_low")
+    recorder_errors.report_error("disk", "less than 500 MB free", DiskLow)
     recorder_errors.report_error("state file", "state file: x")
     recorder_errors.report_error("state file", "state file:\n  y")
     assert trouble.words == "less than 500 MB free; state file: y"
@@ -21,19 +37,19 @@ def test_each_trouble_stands_until_its_own_end() -> None:
 
 
 def test_without_a_recorder_nothing_is_recorded_and_the_next_one_tells_its_own_trouble() -> None:
-    trouble = RecorderTrouble()
-    trouble.take({"kind": "recorder_error", "what": "state file", "message": "state file: x"})
-    trouble.take({"kind": "child_ended", "child": "screen", "exit_code": 1})
-    assert "recorder" not in trouble.standing
-    trouble.take({"kind": "child_ended", "child": "recorder", "exit_code": -9})
-    assert trouble.standing["recorder"] == "no recorder runs"
-    trouble.take({"kind": "child_restarted", "child": "screen", "restarts": 1})
+    trouble = Trouble()
+    trouble.take(RecorderError("state file", "state file: x"))
+    trouble.take(ChildEnded("screen", 1))
+    assert "recorder" not in trouble.status.recording
+    trouble.take(ChildEnded("recorder", -9))
+    assert trouble.status.recording["recorder"] == "no recorder runs"
+    trouble.take(ChildRestarted("screen", 1))
     assert trouble.words
-    trouble.take({"kind": "child_restarted", "child": "recorder", "restarts": 1})
+    trouble.take(ChildRestarted("recorder", 1))
     assert trouble.words == ""
 
 
 def test_a_recorder_that_is_left_alone_for_an_hour_stays_in_sight() -> None:
-    trouble = RecorderTrouble()
-    trouble.take({"kind": "child_given_up", "child": "recorder", "restarts": 10})
+    trouble = Trouble()
+    trouble.take(ChildGivenUp("recorder", 10))
     assert trouble.words == "no recorder runs"

@@ -18,6 +18,7 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.safety_rules import MOVING
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.events import CommandTaken
 from membrane_ctrl.model.states import Rung, State
 
 DT_S = 0.1
@@ -177,7 +178,7 @@ def test_what_goes_down_wins_over_what_lifts_in_either_order(state: State) -> No
         for batch in orders(down, lifting):  # type: ignore[arg-type]  # literals of the table
             mirror = in_state(state)
             outputs = mirror.tick(*batch)
-            told = {event["command"]: "refused" in event for event in outputs.events if event["kind"] == "command"}
+            told = {event.command: bool(event.refused) for event in outputs.events if isinstance(event, CommandTaken)}
             answers.append(told)
             assert told[lifting] or told[down], batch
             if not told[down]:

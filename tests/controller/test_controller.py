@@ -16,7 +16,7 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick, run_virtual
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.errors import Exit
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import EventLine, Why
 from membrane_ctrl.model.states import Rung, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
@@ -34,12 +34,12 @@ class Run:
             run_virtual(config, plant, duration_s, zernike_projection(), alter=alter)
         )
         self.rows = [tick.row for tick in self.ticks]
-        self.events: list[Event] = [
-            {**event, "mono_s": tick.row.mono_s} for tick in self.ticks for event in tick.events
+        self.events: list[EventLine] = [
+            {**event.to_dict(), "mono_s": tick.row.mono_s} for tick in self.ticks for event in tick.events
         ]
         self.finished = self.ticks[-1].outputs.finished
 
-    def of(self, kind: str) -> list[Event]:
+    def of(self, kind: str) -> list[EventLine]:
         return [event for event in self.events if event["kind"] == kind]
 
     @property
@@ -103,11 +103,11 @@ def test_the_line_that_says_why_names_who_asked_for_that_and_nobody_else() -> No
     run = VirtualRun(CALM, VirtualBench(Plant(CALM.twin, CALM.pump), 0.5), zernike_projection())
     asked = {1: Command("hold", "ann"), 1000: Command("pause", "ann"), 1001: Command("shape_off", "bob")}
     said = [
-        event["why"]
+        event.why
         for number in range(1, 1200)
         if (tick := run.tick((asked[number],) if number in asked else ())) is not None
         for event in tick.events
-        if event["kind"] == "why"
+        if isinstance(event, Why)
     ]
     assert said[-1].startswith("paused by ann")
 

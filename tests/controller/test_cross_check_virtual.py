@@ -19,6 +19,7 @@ from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
@@ -115,7 +116,7 @@ def tell(config: Config, event: str) -> Story:
         story.highest_um = max(story.highest_um, away_um)
         if tick is not None:
             last_state = tick.row.state
-            faults += [str(event["name"]) for event in tick.events if event["kind"] == "fault"]
+            faults += [event.name for event in tick.events if isinstance(event, Fault)]
             if last_state == State.HOLD and run.now_s < SETTLED_S:
                 story.furthest_um = max(story.furthest_um, abs(away_um))
         elif run.finished is not None and bench.board.pump_fraction == 0.0:

@@ -38,7 +38,8 @@ from membrane_ctrl.hold.supervisor import Supervisor, Wiring
 from membrane_ctrl.hold.systemd import SystemdNotify
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import Event, EventLine
+from membrane_ctrl.model.run_events import LatchFailed
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
 from membrane_ctrl.run_files.latched_fault import LatchedFile, ResumeLog
@@ -96,7 +97,7 @@ class Bench:
         roles = RoleDevices(Instrument(), self.pump, Instrument(600.0))
         self.bench = RoleBench(roles, 0.5, lambda: asyncio.get_running_loop().time())
         self.folder = folder
-        self.events: list[Event] = []
+        self.events: list[EventLine] = []
         self.reports: Callable[[], list[Event]] = list
         self.children = SimpleNamespace(reports=lambda: self.reports())
 
@@ -229,10 +230,10 @@ def test_whatever_ends_the_run_the_last_command_is_pump_off_with_the_vent_as_it_
 
 def test_a_thread_that_raises_tells_of_it(tmp_path: Path) -> None:
     """What a thread raises is seen by nobody: anything is told as what a disk refuses is."""
-    told: list[Event] = []
+    told: list[EventLine] = []
     with FaultLatch(LatchedFile(tmp_path), None, "run", LoopClock().utc, told.append) as fault_latch:
         fault_latch._disk.submit(fault_latch._try, raises)
-    assert told[0] == {"kind": "latch_failed", "message": "broken"}
+    assert told[0] == LatchFailed("broken")
 
 
 def test_missed_deadlines_are_skipped_and_lateness_is_told_in_milliseconds() -> None:

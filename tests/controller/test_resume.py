@@ -219,6 +219,6 @@ def test_a_start_tells_of_earlier_resumes_and_nobody_else_does(who: str, possibl
     for tick in range(400):
         bench.wrong.unreachable = 200 <= tick < 210
         made = run.tick()
-        resumed += sum(event["kind"] == "resumed" for event in made.events) if made else 0
+        resumed += sum(event.kind == "resumed" for event in made.events) if made else 0
     assert resumed == possible
     assert (run.finished is None) == possible

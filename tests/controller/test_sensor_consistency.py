@@ -92,7 +92,7 @@ def test_a_barometer_in_another_unit_is_told_once_and_taken_back_once() -> None:
     mirror.pass_by(100, ambient_pa=1013.25)
     mirror.pass_by(100)
     mirror.pass_by(5, ambient_pa=1013.25)
-    kinds = [event["kind"] for event in mirror.events if event.get("name") == "weather_sensor"]
+    kinds = [event.kind for event in mirror.events if getattr(event, "name", "") == "weather_sensor"]
     assert kinds == ["maintenance", "maintenance_over"]
 
 

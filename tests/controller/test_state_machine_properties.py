@@ -120,7 +120,7 @@ class Driver:
             self.fault_pump = math.inf
         assert len(outputs.answers) == asked
         for event in outputs.events:
-            json.dumps(event, allow_nan=False, default=str)
+            json.dumps(event.to_dict(), allow_nan=False, default=str)
         if outputs.finished is not None:
             assert command.pump_fraction == 0
             self.finished = True

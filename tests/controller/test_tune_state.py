@@ -17,7 +17,7 @@ from membrane_ctrl.controller.commands import Command, refusal
 from membrane_ctrl.controller.tick import RECORD, pack_tick, unpack_tick
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.events import AmbientChange
 from membrane_ctrl.sim.events import Event as TwinEvent
@@ -43,7 +43,7 @@ class Held:
     def __init__(self, config: Config = CONFIG, twin_events: tuple[TwinEvent, ...] = ()) -> None:
         self.bench = VirtualBench(Plant(config.twin, config.pump, twin_events))
         self._run = VirtualRun(config, self.bench, zernike_projection())
-        self.events: list[Event] = []
+        self.events: list[EventLine] = []
         self.rows: list[Any] = []
         self.go(BEGIN_S, Command("hold", "tester"))
         assert self.state == State.HOLD
@@ -58,7 +58,7 @@ class Held:
             commands = ()
             if tick is not None:
                 self.rows.append(tick.row)
-                self.events += [{**event, "mono_s": tick.row.mono_s} for event in tick.events]
+                self.events += [{**event.to_dict(), "mono_s": tick.row.mono_s} for event in tick.events]
 
     def until_hold(self, at_most_s: float) -> None:
         self.go(0.02)

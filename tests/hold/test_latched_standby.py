@@ -6,6 +6,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, TwinCon
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.events import CommandTaken
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
@@ -18,7 +19,7 @@ CONFIG = Config(
 def refusals(run: VirtualRun, *commands: Command) -> list[str]:
     tick = run.tick(commands)
     assert tick is not None
-    return [str(event.get("refused", "")) for event in tick.events if event["kind"] == "command"]
+    return [event.refused or "" for event in tick.events if isinstance(event, CommandTaken)]
 
 
 def test_hold_is_refused_until_the_fault_is_acknowledged() -> None:

@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 
 from membrane_ctrl.hold.child_processes import ManagedChild
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.run_events import ChildSilent, DiskLow
 from membrane_ctrl.processes.child import alive
 
 
@@ -43,8 +45,8 @@ class Agency:
         return FakeChild(), ours
 
 
-def kinds(events: list[dict[str, Any]]) -> list[str]:
-    return [event["kind"] for event in events]
+def kinds(events: list[Event]) -> list[str]:
+    return [event.kind for event in events]
 
 
 def make_managed() -> tuple[ManagedChild, Agency]:
@@ -56,8 +58,8 @@ def make_managed() -> tuple[ManagedChild, Agency]:
 
 def test_what_the_child_says_is_handed_on() -> None:
     managed, agency = make_managed()
-    agency.theirs[0].send({"kind": "disk_low"})
-    assert managed.look(0.0) == [{"kind": "disk_low"}]
+    agency.theirs[0].send({"kind": "disk_low", "what": "disk", "message": "full"})
+    assert managed.look(0.0) == [DiskLow("disk", "full")]
     assert managed.look(0.5) == []
 
 
@@ -112,13 +114,13 @@ def test_after_an_hour_it_is_tried_again() -> None:
 
 def test_a_child_that_breaks_its_word_is_killed_and_replaced() -> None:
     managed, agency = make_managed()
-    agency.theirs[0].send(alive(5.0))
+    agency.theirs[0].send(alive(5.0).to_dict())
     assert managed.look(10.0) == []
     assert managed.look(15.0) == []
     (silent,) = managed.look(15.5)
-    assert silent == {"kind": "child_silent", "child": "recorder", "overdue_s": 0.5, "killed": True}
+    assert silent == ChildSilent("recorder", 0.5, killed=True)
     assert kinds(managed.look(16.0)) == ["child_ended", "child_restarted"]
-    agency.theirs[1].send(alive(5.0))
+    agency.theirs[1].send(alive(5.0).to_dict())
     assert managed.look(17.0) == []
 
 
@@ -134,12 +136,12 @@ def test_who_cannot_be_replaced_any_more_is_not_killed_and_may_come_back() -> No
         if len(agency.numbers) <= 10 and managed.child.alive:
             managed.child.kill()
         managed.look(float(second))
-    agency.theirs[-1].send(alive(5.0))
+    agency.theirs[-1].send(alive(5.0).to_dict())
     assert managed.look(1200.0) == []
     (silent,) = managed.look(1206.0)
-    assert silent["killed"] is False
+    assert not silent.to_dict()["killed"]
     assert managed.child.alive
     assert managed.look(1207.0) == [], "said once"
-    agency.theirs[-1].send(alive(5.0))
+    agency.theirs[-1].send(alive(5.0).to_dict())
     managed.look(1208.0)
     assert kinds(managed.look(1214.0)) == ["child_silent"]

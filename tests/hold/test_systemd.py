@@ -17,6 +17,7 @@ import pytest
 from firmware_iface.roles import BenchCommand
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.systemd import SystemdNotify
+from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.model.states import State
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 
@@ -64,9 +65,9 @@ def test_ready_once_then_the_watchdog_twice_a_second_and_at_each_change(systemd:
 
 def test_trouble_with_the_recording_is_in_the_status_until_it_is_over(systemd: socket.socket) -> None:
     with SystemdNotify() as notify:
-        notify.told({"kind": "disk_low", "what": "disk", "message": "/srv/\udcff: less than 500 MB\nfree"})
+        notify.told(from_dict({"kind": "disk_low", "what": "disk", "message": "/srv/\udcff: less than 500 MB\nfree"}))
         notify.heard(outputs(0.0, State.HOLD, fault=20))
-        notify.told({"kind": "recorder_recovered", "what": "disk", "message": "disk works again"})
+        notify.told(from_dict({"kind": "recorder_recovered", "what": "disk", "message": "disk works again"}))
         notify.heard(outputs(1.0, State.HOLD))
     messages = said(systemd)
     assert messages[0][1:] == ["WATCHDOG=1", "STATUS=hold, fault 20, recording: /srv/?: less than 500 MB free"]

@@ -6,6 +6,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, ResumeConfig, ShapeC
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
@@ -44,7 +45,7 @@ class Story:
 
 
 def faults(ticks: list[VirtualTick]) -> list[str]:
-    return [event["name"] for tick in ticks for event in tick.events if event["kind"] == "fault"]
+    return [event.name for tick in ticks for event in tick.events if isinstance(event, Fault)]
 
 
 def test_a_second_program_is_refused_as_long_as_the_hold_feeds_the_watchdog() -> None:

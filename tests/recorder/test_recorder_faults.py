@@ -103,7 +103,7 @@ def make_bench(run_dir: Path, config: Config) -> Iterator[Bench]:
         yield Bench(
             run_dir,
             recording,
-            Recorder(run_dir, clock, config, readers, recording, None, reports.append),
+            Recorder(run_dir, clock, config, readers, recording, None, lambda event: reports.append(event.to_dict())),
             writers,
             reports,
         )

@@ -23,6 +23,7 @@ import pytest
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.run_events import RecorderError
 from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.model.telemetry import COLUMN, ROW_BYTES, unpack
 from membrane_ctrl.processes.child import STOP, reporter
@@ -96,7 +97,7 @@ def received(status: Connection) -> list[dict[str, Any]]:
     reports = []
     while True:
         try:
-            reports.append(status.recv())
+            lambda event: reports.append(event.to_dict())(status.recv())
         except EOFError:
             break
     assert sum(report["kind"] == "alive" for report in reports) >= 1
@@ -170,7 +171,7 @@ def recorder_in_process(spec: RecorderSpec) -> list[dict[str, Any]]:
     from membrane_ctrl.recorder import process
 
     reports: list[dict[str, Any]] = []
-    process._record(spec, reports.append, lambda: False, lambda: False)
+    process._record(spec, lambda event: reports.append(event.to_dict()), lambda: False, lambda: False)
     return reports
 
 
@@ -274,11 +275,11 @@ def test_a_report_nobody_takes_does_not_block() -> None:
     ours, theirs = SPAWN.Pipe()
     report = reporter(theirs)
     for _ in range(10_000):
-        report({"kind": "recorder_error", "message": "x" * 5000})
+        report(RecorderError("x", "x" * 5000))
     first = ours.recv()
     assert (first["kind"], len(first["message"])) == ("recorder_error", 1000)
     ours.close()
-    report({"kind": "recorder_error", "message": "nobody is there"})
+    report(RecorderError("x", "nobody is there"))
     theirs.close()
 
 

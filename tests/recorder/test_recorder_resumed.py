@@ -13,6 +13,7 @@ import pytest
 
 from membrane_ctrl.config.schema import Config, RecordingConfig
 from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.plain_json import dumps_checked
 from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.model.telemetry import ROW_BYTES
@@ -63,7 +64,10 @@ class Run:
         readers = {name: RingReader(address) for name, address in self.addresses.items()}
         for ring_reader in readers.values():
             self._stack.callback(ring_reader.close)
-        return Recorder(self.run_dir, clock, self.config, readers, recording, None, self.reports.append, resumes)
+        return Recorder(self.run_dir, clock, self.config, readers, recording, None, self._report, resumes)
+
+    def _report(self, event: Event) -> None:
+        self.reports.append(event.to_dict())
 
     def second(self, recorder: Recorder, number: int, write: bool = True) -> None:
         """One second of the run; without `write` the recorder dies with it in its hands."""

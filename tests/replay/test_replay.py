@@ -29,6 +29,7 @@ from membrane_ctrl.controller.tick import (
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.plain_json import with_comment
 from membrane_ctrl.model.shape_estimate import pack_estimate, unpack_estimate
 from membrane_ctrl.model.telemetry import unpack
@@ -80,8 +81,8 @@ def test_the_same_code_decides_the_same_to_the_last_bit(record: Path, capsys: py
 
 
 def test_the_record_of_the_run_has_what_it_should_show() -> None:
-    faults = [event for _, outputs in TICKS for event in outputs.events if event["kind"] == "fault"]
-    assert [fault["name"] for fault in faults] == ["displacement_missing"]
+    faults = [event for _, outputs in TICKS for event in outputs.events if isinstance(event, Fault)]
+    assert [fault.name for fault in faults] == ["displacement_missing"]
     assert sum(inputs.estimate is not None for inputs, _ in TICKS) >= 9
 
 

@@ -13,15 +13,19 @@ from firmware_iface.roles import BenchCommand
 from membrane_ctrl.controller.commands import AT_START
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.latched_fault import FaultLatch
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import CommandTaken, Event, Fault, Resumed, StateEntered
+from membrane_ctrl.model.run_events import LatchFailed, LatchWritten
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.run_files.latched_fault import NAME, RESUMES_NAME, LatchedFault, LatchedFile, ResumeLog
 
 FAULT = LatchedFault("over_pressure", "too much", "801 Pa", "look", "2026-01-02T03:04:05+00:00", "run-1")
 TRIP: tuple[Event, ...] = (
-    {"kind": "fault", "name": "late", "cause": "ticks start too late", "seen": "150 ms", "remedy": "less work"},
-    {"kind": "state", "state": "fault", "from": "hold", "why": "late"},
+    Fault(40, "late", "ticks start too late", "150 ms", "50 ms", "ramp_down", True, "less work"),
+    StateEntered("fault", "hold", "late"),
 )
+
+
+ACK = CommandTaken("ack", "unix:ann", "")
 
 
 def outputs(*events: Event) -> TickOutputs:
@@ -97,27 +101,27 @@ def test_a_trip_is_latched_and_an_acknowledgement_clears_it(tmp_path: Path) -> N
         "late", "ticks start too late", "150 ms", "less work", "2026-01-01T00:00:00+00:00", "run-7"
     )
     with make(tmp_path, told) as fault_latch:
-        fault_latch.heard(outputs({"kind": "command", "command": "ack", "refused": "not now"}))
+        fault_latch.heard(outputs(replace(ACK, refused="not now")))
     assert LatchedFile(tmp_path).read() is not None
     with make(tmp_path, told) as fault_latch:
-        fault_latch.heard(outputs({"kind": "command", "command": "ack"}))
+        fault_latch.heard(outputs(ACK))
     assert LatchedFile(tmp_path).read() is None
     assert not told
 
 
-LOCK: Event = {"kind": "command", "command": "latch", "who": "unix:ann", "why": "", "text": "hands inside"}
+LOCK = CommandTaken("latch", "unix:ann", "", text="hands inside")
 
 
 def test_a_lock_outlives_its_run_and_does_not_hide_a_fault(tmp_path: Path) -> None:
     with make(tmp_path, []) as fault_latch:
-        fault_latch.heard(outputs(LOCK | {"refused": "not now"}))
-        fault_latch.heard(outputs(LOCK | {"who": AT_START}))
+        fault_latch.heard(outputs(replace(LOCK, refused="not now")))
+        fault_latch.heard(outputs(replace(LOCK, who=AT_START)))
     assert LatchedFile(tmp_path).read() is None
     with make(tmp_path, []) as fault_latch:
         fault_latch.heard(outputs(LOCK))
     assert "hands inside (by unix:ann)" in str(LatchedFile(tmp_path).read())
     with make(tmp_path, []) as fault_latch:
-        fault_latch.heard(outputs({"kind": "command", "command": "ack"}, *TRIP))
+        fault_latch.heard(outputs(ACK, *TRIP))
         fault_latch.heard(outputs(LOCK))
     found = LatchedFile(tmp_path).read()
     assert found is not None
@@ -127,7 +131,7 @@ def test_a_lock_outlives_its_run_and_does_not_hide_a_fault(tmp_path: Path) -> No
 def test_a_resumed_fault_is_no_longer_latched(tmp_path: Path) -> None:
     with make(tmp_path, []) as fault_latch:
         fault_latch.heard(outputs(*TRIP))
-        fault_latch.heard(outputs({"kind": "state", "state": "standby", "from": "fault", "why": "resumes"}))
+        fault_latch.heard(outputs(StateEntered("standby", "fault", "resumes")))
     assert LatchedFile(tmp_path).read() is None
 
 
@@ -141,7 +145,7 @@ def test_a_disk_that_fails_is_told(tmp_path: Path) -> None:
     told: list[Event] = []
     with make(tmp_path / "nowhere", told) as fault_latch:
         fault_latch.heard(outputs(*TRIP))
-    assert [event["kind"] for event in told] == ["latch_failed"]
+    assert [type(event) for event in told] == [LatchFailed]
 
 
 def test_a_disk_that_takes_files_again_is_told_once(tmp_path: Path) -> None:
@@ -153,7 +157,7 @@ def test_a_disk_that_takes_files_again_is_told_once(tmp_path: Path) -> None:
         (tmp_path / "later").mkdir()
         fault_latch.heard(outputs(*TRIP))
         fault_latch.heard(outputs(*TRIP))
-    assert [event["kind"] for event in told] == ["latch_failed", "latch_written"]
+    assert [type(event) for event in told] == [LatchFailed, LatchWritten]
 
 
 def test_the_twin_latches_nothing(tmp_path: Path) -> None:
@@ -196,7 +200,7 @@ def test_a_fault_on_a_full_disk_is_latched_in_the_room_that_was_kept(
     assert told == []
     latched = LatchedFile(tmp_path).read()
     assert latched is not None
-    assert latched.name == TRIP[0]["name"]
+    assert latched.name == "late"
     assert [path.name for path in tmp_path.iterdir()] == [NAME]
 
 
@@ -219,5 +223,5 @@ def test_a_count_of_resumes_that_cannot_be_read_is_full(tmp_path: Path, content:
 def test_a_resume_of_the_run_is_counted_for_the_next_one(tmp_path: Path) -> None:
     with make(tmp_path, []) as fault_latch:
         assert fault_latch.resumes_s == ()
-        fault_latch.heard(outputs({"kind": "resumed", "name": "link_lost"}))
+        fault_latch.heard(outputs(Resumed("link_lost")))
     assert ResumeLog(tmp_path).ages_s(datetime(2026, 1, 1, 1, tzinfo=UTC)) == (3600.0,)

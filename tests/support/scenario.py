@@ -47,7 +47,7 @@ from membrane_ctrl.config.toml_file import load
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.sim import events as happenings
 from membrane_ctrl.sim.plant import Plant
@@ -164,10 +164,10 @@ class Outcome:
     """
 
     ticks: tuple[VirtualTick, ...]
-    events: tuple[Event, ...]
+    events: tuple[EventLine, ...]
     bench: VirtualBench
 
-    def of(self, kind: str) -> list[Event]:
+    def of(self, kind: str) -> list[EventLine]:
         """The events of a kind."""
         return [event for event in self.events if event["kind"] == kind]
 
@@ -201,7 +201,7 @@ def play(scenario: Scenario) -> Outcome:
         if tick is not None:
             ticks.append(tick)
     bench.advance(5.0)
-    events = tuple({**event, "mono_s": tick.row.mono_s} for tick in ticks for event in tick.events)
+    events = tuple({**event.to_dict(), "mono_s": tick.row.mono_s} for tick in ticks for event in tick.events)
     return Outcome(tuple(ticks), events, bench)
 
 

@@ -56,7 +56,7 @@ def write_record(
                 messages += pack_tick(place, inputs, outputs, outputs.row.pack(), (memories or {}).get(place, b""))
             if inputs.estimate is not None:
                 shapes.append(inputs.estimate)
-            lines += [json.dumps({"mono_s": inputs.now_s + 1e-4, **event}) for event in outputs.events]
+            lines += [json.dumps({"mono_s": inputs.now_s + 1e-4, **event.to_dict()}) for event in outputs.events]
         file.append(assembler.take(messages), shapes)
     file.close()
     lines.append(json.dumps({"mono_s": ticks[-1][0].now_s + 1e-3, "kind": "end", "exit": "done"}))

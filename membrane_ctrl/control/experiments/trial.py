@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import asdict
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -93,10 +93,9 @@ class Trial:
             )
         return self._guard.step(measurement, dt_s)
 
-    def result(self) -> dict[str, Any]:
-        """What the experiment itself has measured, as plain data; None for what it did not find."""
+    def pump_map(self) -> dict[str, float | None] | None:
+        """What a map of the pump has measured, as plain data; None for what it did not find."""
         found = self._mapper.result if self._mapper is not None else None
         if found is None:
-            return {}
-        values = asdict(found)
-        return {"pump_map": {name: None if math.isnan(value) else value for name, value in values.items()}}
+            return None
+        return {name: None if math.isnan(value) else value for name, value in asdict(found).items()}

@@ -1,0 +1,112 @@
+"""The state of a run, put together from its ticks and events: for everyone who shows it, or is told of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from membrane_ctrl.model import events, run_events
+from membrane_ctrl.model.telemetry import TelemetryRow
+
+_GONE = "no recorder runs"
+# Of one trouble: it goes into one line of a screen and of a log, each second; the event has all of it
+_LONGEST = 300
+
+
+@dataclass(frozen=True, slots=True)
+class RunStatus:
+    """The newest tick, and what the events since the start leave standing.
+
+    Attributes
+    ----------
+    row : TelemetryRow or None
+        Of the newest tick; None before the first.
+    since_s : float
+        When the run has gone into its state.
+    why : str
+        What the controller has last given as its reason.
+    fault, last_fault : Fault or None
+        That which stands; the newest, and when it came (`last_fault_s`).
+    faults : int
+        So far in the run.
+    shape_reason : str
+        Of the outer loop.
+    acquisition : AcquisitionState or None
+        What the acquisition has last said.
+    geometry : GeometryInForce or None
+        What the cycles measure with.
+    maintenance : mapping of str to str
+        What a person should look at, by name.
+    recording : mapping of str to str
+        What keeps the run from being recorded, by what has trouble; empty when all is recorded. A full disk is the
+        one trouble that `events.jsonl` may not be able to tell of.
+    ended : bool
+        The run has said its last word.
+    """
+
+    row: TelemetryRow | None = None
+    since_s: float = 0.0
+    why: str = ""
+    fault: events.Fault | None = None
+    last_fault: events.Fault | None = None
+    last_fault_s: float = math.nan
+    faults: int = 0
+    shape_reason: str = ""
+    acquisition: run_events.AcquisitionState | None = None
+    geometry: run_events.GeometryInForce | None = None
+    maintenance: Mapping[str, str] = field(default_factory=dict)
+    recording: Mapping[str, str] = field(default_factory=dict)
+    ended: bool = False
+
+    @property
+    def recording_words(self) -> str:
+        """All trouble of the recording in one line; empty when all is recorded."""
+        return "; ".join(self.recording.values())
+
+    def after_row(self, row: TelemetryRow) -> RunStatus:
+        """One tick later."""
+        same = self.row is not None and row.state == self.row.state
+        return replace(self, row=row, since_s=self.since_s if same else row.mono_s)
+
+    def after_event(self, event: events.Event, mono_s: float = math.nan) -> RunStatus:
+        """What an event of the run leaves behind; most change nothing."""
+        match event:
+            case events.Why():
+                return replace(self, why=event.why)
+            case events.StateEntered():
+                return replace(self, why=event.why, fault=None if event.from_ == "fault" else self.fault)
+            case events.Fault():
+                return replace(self, fault=event, last_fault=event, last_fault_s=mono_s, faults=self.faults + 1)
+            case events.Cleared():
+                return replace(self, fault=None)
+            case events.ShapeLoopState():
+                return replace(self, shape_reason=event.reason)
+            case events.Maintenance():
+                return replace(self, maintenance={**self.maintenance, event.name: event.message})
+            case events.MaintenanceOver():
+                return replace(self, maintenance=_without(self.maintenance, event.name))
+            case run_events.GeometryInForce():
+                return replace(self, geometry=event)
+            case run_events.AcquisitionState():
+                return replace(self, acquisition=event)
+            case run_events.Ended():
+                return replace(self, ended=True)
+        return replace(self, recording=_recording(self.recording, event))
+
+
+def _recording(standing: Mapping[str, str], event: events.Event) -> Mapping[str, str]:
+    match event:
+        case run_events.RecorderError() | run_events.DiskLow():
+            return {**standing, event.what: " ".join(event.message.split())[:_LONGEST]}
+        case run_events.RecorderRecovered():
+            return _without(standing, event.what)
+        case run_events.ChildEnded(child="recorder") | run_events.ChildGivenUp(child="recorder"):
+            return {**standing, "recorder": _GONE}
+        case run_events.ChildRestarted(child="recorder"):
+            return {}  # the next one says anew what still stands
+    return standing
+
+
+def _without(standing: Mapping[str, str], name: str) -> Mapping[str, str]:
+    return {key: words for key, words in standing.items() if key != name}

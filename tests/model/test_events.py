@@ -1,0 +1,85 @@
+"""Events as lines of `events.jsonl` and back."""
+
+from __future__ import annotations
+
+import json
+import math
+import tarfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from membrane_ctrl.model.events import KINDS, CommandTaken, Event, Fault, StateEntered
+from membrane_ctrl.model.run_events import Capture, Commander, Link, UnknownEvent, from_dict
+
+EARLIER = Path(__file__).parents[1] / "fixtures" / "runs" / "20261122T043916Z-earlier.tar.xz"
+TIMES = ("time_utc", "mono_s")
+
+
+def lines_of(run: Path) -> list[dict[str, Any]]:
+    with tarfile.open(run) as archive:
+        (member,) = [member for member in archive.getmembers() if member.name.endswith("events.jsonl")]
+        file = archive.extractfile(member)
+        assert file is not None
+        return [json.loads(line) for line in file.read().splitlines()]
+
+
+def test_every_line_of_an_earlier_version_comes_back_as_it_was() -> None:
+    lines = lines_of(EARLIER)
+    assert len(lines) > 5
+    for line in lines:
+        event = from_dict(line)
+        assert not isinstance(event, UnknownEvent), line
+        told = event.to_dict()
+        told.pop("up", None)  # of a link, in words only
+        bare = {key: value for key, value in line.items() if key not in TIMES and not key.startswith("crc")}
+        assert list(told.items()) == list(bare.items())
+
+
+def test_keys_stay_in_the_order_of_the_format() -> None:
+    line = json.dumps(StateEntered("hold", "settle", "inside the band").to_dict())
+    assert line == '{"kind": "state", "state": "hold", "from": "settle", "why": "inside the band"}'
+
+
+def test_what_there_is_nothing_to_say_of_is_left_out_but_nobody_is_somebody() -> None:
+    assert CommandTaken("ack", "ann", "").to_dict() == {"kind": "command", "command": "ack", "who": "ann", "why": ""}
+    assert Capture(3, failed="dark").to_dict() == {"kind": "capture", "cycle": 3, "failed": "dark"}
+    assert Commander(None, "ann", "").to_dict() == {"kind": "commander", "who": None, "former": "ann", "why": ""}
+
+
+@pytest.mark.parametrize("cls", KINDS.values())
+def test_every_kind_comes_back_from_its_line(cls: type[Event]) -> None:
+    event = from_dict({"kind": cls._kind})
+    assert type(event) is cls
+    again = from_dict(json.loads(json.dumps(event.to_dict())))
+    assert repr(again) == repr(event)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [{}, {"kind": 3}, {"kind": ["fault"]}, {"kind": "of tomorrow", "x": 1}, {"kind": "fault", "code": "x"},
+     {"kind": "state", "state": None}],
+)  # fmt: skip
+def test_what_is_not_understood_is_kept_as_it_is(line: dict[str, Any]) -> None:
+    event = from_dict(line)
+    assert isinstance(event, UnknownEvent)
+    assert event.to_dict() == line
+
+
+def test_what_an_earlier_version_did_not_write_is_empty() -> None:
+    fault = from_dict({"kind": "fault", "name": "late"})
+    assert isinstance(fault, Fault)
+    assert (fault.code, fault.remedy, fault.latching) == (0, "", False)
+    silent = from_dict({"kind": "child_silent", "child": "screen"})
+    assert math.isnan(silent.to_dict()["overdue_s"])
+
+
+@pytest.mark.parametrize(
+    ("line", "up"),
+    [({"message": "connected again"}, True), ({"message": "no answer"}, False), ({"message": "x", "up": True}, True)],
+)
+def test_a_link_of_a_run_that_has_only_words_for_it(line: dict[str, Any], up: bool) -> None:
+    event = from_dict({"kind": "link", **line})
+    assert isinstance(event, Link)
+    assert event.up == up
