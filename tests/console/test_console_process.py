@@ -129,7 +129,7 @@ def test_plain_lines_and_faults_when_nobody_looks(
     with redirect_stderr(sys.stdout):
         console_main(run.spec)
     lines = capsys.readouterr().out.splitlines()
-    assert ["FAULT link lost" in lines[0], "END 5" in lines[1], "s  hold" in lines[2]] == [True] * 3
+    assert ["FAULT link lost" in lines[0], "END safety_trip" in lines[1], "s  hold" in lines[2]] == [True] * 3
     assert len(lines) == 3
 
 
@@ -178,7 +178,7 @@ def test_a_console_that_takes_the_place_of_another_does_not_tell_old_news_again(
         console_main(spec, theirs)
         assert ours.recv()["kind"] == "alive"
     told = capsys.readouterr().out
-    assert "END 0" in told
+    assert "END done" in told
     assert "FAULT link lost" not in told
 
 
