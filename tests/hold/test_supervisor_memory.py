@@ -16,6 +16,7 @@ from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.model.telemetry import ROW_BYTES
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
 from membrane_ctrl.sim.plant import Plant
@@ -77,7 +78,7 @@ def test_an_event_that_is_too_long_for_its_slot_is_cut() -> None:
         wiring = Wiring(bench=PromptBench(), telemetry=writer, events=writer)
         supervisor = Supervisor(Controller(CONFIG, zernike_projection()), wiring, RunClock.start(), 50.0)
         texts = dict.fromkeys(("cause", "seen", "limit", "remedy"), "\N{LOUDLY CRYING FACE}" * 10_000)
-        supervisor.tell({"kind": "fault", "name": "tick_error", **texts})
+        supervisor.tell(from_dict({"kind": "fault", "name": "tick_error", **texts}))
         (told,) = reader.drain()
     assert json.loads(told)["name"] == "tick_error"
 
