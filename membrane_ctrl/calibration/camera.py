@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from membrane_ctrl.config.schema import CameraConfig, Config
-from membrane_ctrl.geometry.prior_file import write_prior
+from membrane_ctrl.geometry.spread_file import write_prior
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
 from membrane_ctrl.metrology.calibrate.lens import Board, BoardView, Lens, calibrate_lens, on_screen
 from membrane_ctrl.metrology.calibrate.parameters import usual_sigma

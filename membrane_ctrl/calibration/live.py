@@ -17,7 +17,7 @@ from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConf
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.ctl import Where, socket_path
 from membrane_ctrl.geometry.file import GeometryOrigin, geometry_of_run, origin_of, read_geometry
-from membrane_ctrl.geometry.prior_file import read_prior
+from membrane_ctrl.geometry.spread_file import read_prior
 from membrane_ctrl.measure.capture_set import read_head
 from membrane_ctrl.metrology.calibrate import parameters, propagate
 from membrane_ctrl.metrology.calibrate.verdict import GOOD_SPREAD_UM

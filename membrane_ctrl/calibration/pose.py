@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.geometry import file, prior_file
+from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure import capture_set, measurement
 from membrane_ctrl.metrology import full, reconstruct
 from membrane_ctrl.metrology.calibrate.artefact import general_form
@@ -39,7 +39,7 @@ def calibrate_pose(options: PoseOptions) -> int:
     )
     optics = capture.head.optics
     for path in options.priors:
-        optics = prior_file.read_prior(path).over(optics)
+        optics = spread_file.read_prior(path).over(optics)
     capture = replace(capture, head=replace(capture.head, optics=optics))
     stated = Geometry.from_config(optics)
     light, (rim_z, rim_mean_mm) = _light(capture), _rim(capture)
@@ -53,7 +53,7 @@ def calibrate_pose(options: PoseOptions) -> int:
         raise RejectedError(f"{options.folder}: {error}") from None
     sigmas = dict(zip(POSE_NAMES, pose.sigmas.tolist(), strict=True))
     tables = {"geometry": general_form(pose.bench(stated), optics).model_dump(exclude_none=True), "sigmas": sigmas}
-    prior_file.write_prior(options.out, tables, "calibrate-pose", [options.folder.name], pose.rms_px)
+    spread_file.write_prior(options.out, tables, "calibrate-pose", [options.folder.name], pose.rms_px)
     report: dict[str, Any] = {
         "schema": "membrane-calibrate-pose/1",
         "out": str(options.out),

@@ -15,7 +15,7 @@ import tomli_w
 
 from membrane_ctrl.calibration.report import draw_residuals, lines_of, report_of
 from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
-from membrane_ctrl.geometry import file, prior_file
+from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure.measurement import Figures
 from membrane_ctrl.metrology.bins import BinGrid, pixel_sigma_adu
 from membrane_ctrl.metrology.calibrate import artefact, drift, propagate, residuals, separable, verdict
@@ -106,7 +106,7 @@ class Bundle:
 
 def calibrate_command(options: CalibrateOptions) -> int:
     """Read, solve, judge, write. Returns the exit code; raises CommandError for sets that are none."""
-    priors = [prior_file.read_prior(path) for path in options.priors]
+    priors = [spread_file.read_prior(path) for path in options.priors]
     free = {name: sigma for prior in priors for name, sigma in prior.content.sigmas.items()} | freed(options.free)
     begin = time.perf_counter()
     bundle = with_priors(read_sets(options.folders, options.geometry, options.reference_um), priors)
@@ -182,7 +182,7 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
     return Bundle(tuple(sets), benches[0], reference_um, tuple(notes))
 
 
-def with_priors(bundle: Bundle, priors: Sequence[prior_file.Prior]) -> Bundle:
+def with_priors(bundle: Bundle, priors: Sequence[spread_file.Prior]) -> Bundle:
     """The sets with the bench as auxiliary calibrations have it. Raises InputError for another camera's."""
     optics = bundle.optics
     for prior in priors:

@@ -12,7 +12,7 @@ from board_photograph import Photographer, photographs
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
-from membrane_ctrl.geometry.prior_file import read_prior
+from membrane_ctrl.geometry.spread_file import read_prior
 from membrane_ctrl.model.errors import InputError
 
 CONFIG = """

@@ -163,7 +163,7 @@ _OWN = {
     # a new folder, a temporary one, or a file that the user has named
     "sim/optics/simulate.py", "replay/incident.py", "run_files/segments.py", "review/viewer/command.py",
     "review/viewer/screenshot.py", "review/export.py", "calibration/session.py", "calibration/camera.py",
-    "calibration/sets.py", "geometry/prior_file.py",
+    "calibration/sets.py", "geometry/spread_file.py",
     # the project's own pages
     "controller/faults_page.py",
     # shared memory
