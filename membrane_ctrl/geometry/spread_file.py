@@ -1,8 +1,8 @@
 """How well a geometry is known, in files: its covariance, and what an auxiliary calibration has found.
 
 A geometry file carries a `[covariance]` table beside `[geometry]`: names = ["a_mm", "b_mm", "alpha_deg"], or of the
-twelve of the general form (see `metrology.uncertainty.geometry_spread`), and matrix = rows of their covariance. A prior
-(`calibrate --prior`) is a camera or a geometry with the sigmas of `calibrate`'s parameters.
+twelve of the general form (see `metrology.uncertainty.geometry_spread`), and matrix = rows of their covariance. A
+prior (`calibrate --prior`) is a camera or a geometry with the sigmas of `calibrate`'s parameters.
 """
 
 from collections.abc import Sequence
