@@ -106,6 +106,7 @@ def _record(
 ) -> bool:
     """Record until the end; whether the process may end in the ordinary way."""
     from membrane_ctrl.recorder.recorder import Recorder
+    from membrane_ctrl.recorder.sink import Recording
 
     addresses = {
         "telemetry": spec.telemetry,

@@ -28,7 +28,7 @@ def refuse_originals(folder: Path) -> None:
     folder = folder.resolve()
     at = folder.parent if folder.name == FOLDER else folder
     if (at / "config.toml").exists() or any(at.glob("*.rrd")) or any(at.glob(f"{FOLDER}/*.arrows")):
-        raise InputError(f"{folder}: this folder holds the recorder's files; choose another one")
+        raise InputError(f"{folder}: this folder holds the recorder's files; choose another folder")
 
 
 FORMATS = ("parquet", "csv", "hdf5")

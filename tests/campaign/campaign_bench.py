@@ -117,9 +117,14 @@ class Run:
         """Wait for something. Raises AssertionError when it does not come."""
         give_up_s = time.monotonic() + PATIENCE_S
         while not what():
-            assert time.monotonic() < give_up_s, f"waited in vain; {self.events[-3:]}"
-            assert self.process.returncode is None or what(), f"ended with {self.process.returncode}"
+            assert time.monotonic() < give_up_s, f"waited in vain; {self.events[-3:]}; {self.said()}"
+            assert self.process.returncode is None or what(), f"ended with {self.process.returncode}; {self.said()}"
             await asyncio.sleep(0.02)
+
+    def said(self) -> str:
+        """The last of what it wrote to standard error, where that is not a terminal."""
+        path = self.folder / "stderr.txt"
+        return path.read_text()[-2000:] if path.exists() else ""
 
     async def ended(self) -> int:
         """Its exit code."""
@@ -148,15 +153,16 @@ async def running(
     keep_up = asyncio.create_task(_catch_up(plant.bench))
     lab = folder / "lab.toml"
     lab.write_text(f'[devices]\nboard = "tcp://127.0.0.1:{board.port}"\nwatchdog_s = {WATCHDOG_S}\n{config}')
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "membrane_ctrl", "hold", "--config", str(lab), "--logs", str(folder / "logs")),
-        stdin=terminal,
-        stdout=terminal,
-        stderr=terminal,
-        env={**os.environ, **(environment or {})},
-        start_new_session=on_terminal,
-        preexec_fn=(lambda: ioctl(0, TIOCSCTTY, 0)) if on_terminal else None,
-    )
+    with (folder / "stderr.txt").open("wb") if not on_terminal else contextlib.nullcontext(terminal) as stderr:
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "membrane_ctrl", "hold", "--config", str(lab), "--logs", str(folder / "logs")),
+            stdin=terminal,
+            stdout=terminal,
+            stderr=stderr,
+            env={**os.environ, **(environment or {})},
+            start_new_session=on_terminal,
+            preexec_fn=(lambda: ioctl(0, TIOCSCTTY, 0)) if on_terminal else None,
+        )
     children: list[psutil.Process] = []
     try:
         run = Run(process, folder, board, plant)
