@@ -10,6 +10,8 @@ import pytest
 
 from membrane_ctrl.config.schema import RecordingConfig
 from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.run_events import RecorderError, RecorderRecovered
 from membrane_ctrl.recorder.housekeeping import RETENTION_INTERVAL_S, Housekeeping
 from membrane_ctrl.recorder.sink import RecorderErrors
 from membrane_ctrl.run_files.disk_budget import DetailLevel, OldRun, deletable_runs, delete_run, detail_level, expired
@@ -105,16 +107,16 @@ def test_the_recorder_deletes_old_runs_at_its_start_and_each_hour_and_says_which
     present = make_run(logs, "20261121T120000Z-now", summary=False)
     for day in range(1, 6):
         make_run(logs, f"202610{day:02d}T110000Z-old")
-    reports: list[dict[str, object]] = []
+    reports: list[Event] = []
     config = RecordingConfig(keep_days=30.0, min_free_mb=1.0)
     keeping = Housekeeping(present, HandClock(0.0, NOW), config, RecorderErrors(reports.append))
     keeping.look(0.0, [])
-    assert [report["run"] for report in reports] == ["20261001T110000Z-old", "20261002T110000Z-old"]
+    assert [report.to_dict()["run"] for report in reports] == ["20261001T110000Z-old", "20261002T110000Z-old"]
     make_run(logs, "20260901T110000Z-brought")
     keeping.look(RETENTION_INTERVAL_S - 1, [])
     assert len(reports) == 2
     keeping.look(RETENTION_INTERVAL_S, [])
-    assert reports[2]["run"] == "20260901T110000Z-brought"
+    assert reports[2].to_dict()["run"] == "20260901T110000Z-brought"
     assert present.exists()
     keeping.close()
 
@@ -135,19 +137,21 @@ def test_one_run_that_cannot_go_keeps_no_other_and_remains_of_a_crash_go_too(
         rename(name, target, **folders)
 
     monkeypatch.setattr(os, "rename", guarded)
-    reports: list[dict[str, object]] = []
+    reports: list[Event] = []
     config = RecordingConfig(keep_days=30.0, min_free_mb=1.0)
     keeping = Housekeeping(present, HandClock(0.0, NOW), config, RecorderErrors(reports.append))
     keeping.look(0.0, [])
-    assert [report["kind"] for report in reports] == ["recorder_error", "run_deleted"]
+    assert [report.kind for report in reports] == ["recorder_error", "run_deleted"]
     keeping.look(RETENTION_INTERVAL_S, [])
     assert len(reports) == 2, "told once"
     monkeypatch.undo()
     (tmp_path / "20261001T110000Z-old").rename(tmp_path / "by-hand")
     keeping.look(2 * RETENTION_INTERVAL_S, [])
-    assert (reports[2]["kind"], reports[2]["what"]) == ("recorder_recovered", "retention: 20261001T110000Z-old")
+    assert isinstance(reports[2], RecorderRecovered)
+    assert reports[2].what == "retention: 20261001T110000Z-old"
     keeping.close()
-    assert "Permission denied" in str(reports[0]["message"])
-    assert reports[1]["run"] == "20261002T110000Z-old"
+    assert isinstance(reports[0], RecorderError)
+    assert "Permission denied" in reports[0].message
+    assert reports[1].to_dict()["run"] == "20261002T110000Z-old"
     assert not list(tmp_path.glob(".deleted-*"))
     assert (tmp_path / "20261399T999999Z-no-time").exists()
