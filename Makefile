@@ -54,7 +54,7 @@ fuzz: $(STAMP)  ## mutated run folders and capture sets through every command th
 
 generate: $(STAMP)  ## the files made from firmware_iface/registers.toml and the safety table
 	$(BIN)/python -m firmware_iface.generate
-	$(BIN)/python -m membrane_ctrl.controller.faults_page
+	$(BIN)/python -m tests.support.faults_page
 
 clean:
 	rm -rf $(VENV) .mypy_cache .ruff_cache

@@ -11,11 +11,11 @@ import numpy as np
 
 from benchmarks.figures import Figure, at_most
 from membrane_ctrl.config.schema import Config, ShapeConfig, TwinConfig
-from membrane_ctrl.hold.virtual_run import run_virtual
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.plant import Plant
 from tests.support.virtual_camera import VirtualCamera
+from tests.support.virtual_record import run_virtual
 
 DRIFT_UM_PER_MIN = 2.0
 MINUTES = 10

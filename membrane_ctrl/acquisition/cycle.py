@@ -5,7 +5,6 @@ a camera, over the twin's renderer and over a fake in a test.
 """
 
 import math
-import struct
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from firmware_iface.roles import Pattern, Screen
 from membrane_ctrl.acquisition import exposures
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.model.telemetry import FIELDS
+from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.processes.frames import FrameWriter, Pixels
 from membrane_ctrl.processes.ring import RingAddress, RingReader
 
@@ -26,8 +25,6 @@ from membrane_ctrl.processes.ring import RingAddress, RingReader
 REJECTED_IN_A_ROW = 3
 FIRST_PAUSE_S = 1.0
 LONGEST_PAUSE_S = 60.0  # within a minute of the cause being gone the shape is measured again
-
-TRACKING_LOST = "tracking lost"
 
 
 class Reconstructor(Protocol):
@@ -132,7 +129,7 @@ class ShapeCycle:
         if estimate.kind == "full":
             self._full_next = rejected
             self._full_rejected_in_a_row = self._full_rejected_in_a_row + 1 if rejected else 0
-        elif rejected and estimate.reason.startswith(TRACKING_LOST):
+        elif estimate.tracking_lost:
             self._full_next = True
 
     def _measure(self, kind: Literal["full", "fringes"]) -> ShapeEstimate | None:
@@ -167,11 +164,6 @@ HALF_WINDOW_S = 0.2
 HALF_WINDOW_TICKS = 2.0  # below 10 Hz that would be fewer readings than make a mean
 LEAST_READINGS = 3
 _KEPT_S = 60.0  # longer than any full cycle takes
-
-_ROW = struct.Struct(f"<{len(FIELDS)}d")
-_TIME, _DISPLACEMENT, _QUALITY, _COUNTER = (
-    FIELDS.index(name) for name in ("mono_s", "displacement_um", "displacement_quality", "sample_counter")
-)
 
 
 class LaserHistory:
@@ -211,10 +203,10 @@ class LaserHistory:
 
     def _update(self) -> None:
         for message in self._reader.drain():
-            row = _ROW.unpack(message)
-            repeated = row[_COUNTER] == self._counter
-            self._counter = row[_COUNTER]
-            if math.isfinite(row[_DISPLACEMENT]) and row[_QUALITY] == 0 and not repeated:
-                self._readings.append((row[_TIME], row[_DISPLACEMENT]))
+            row = TelemetryRow.unpack(message)
+            repeated = row.sample_counter == self._counter
+            self._counter = row.sample_counter
+            if math.isfinite(row.displacement_um) and row.displacement_quality == 0 and not repeated:
+                self._readings.append((row.mono_s, row.displacement_um))
         while self._readings and self._readings[0][0] < self._readings[-1][0] - _KEPT_S:
             self._readings.popleft()

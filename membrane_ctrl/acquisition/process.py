@@ -4,7 +4,6 @@ Imports nothing heavy: its parent imports it for the specification, and the limi
 NumPy is loaded.
 """
 
-import multiprocessing
 import os
 import select
 import signal
@@ -64,13 +63,10 @@ class Remote:
     ----------
     control : Connection
         Both ways.
-    parent_pid : int
-        The process whose end is ours.
     """
 
-    def __init__(self, control: Connection, parent_pid: int) -> None:
+    def __init__(self, control: Connection) -> None:
         self._control = control
-        self._parent_pid = parent_pid
         self._full = self._capture = False
         self._said = ("", "")
         self._step_s = _PREPARING_S
@@ -80,7 +76,7 @@ class Remote:
 
     def listen(self, timeout_s: float = 0.0) -> None:
         """Take what has been sent; without anything to take, wait for it up to `timeout_s` (at most 0.2 s)."""
-        if os.getppid() != self._parent_pid:
+        if not child.parent_lives():
             self.stop = True
             return
         self._say_alive()
@@ -205,12 +201,10 @@ def acquisition_main(spec: AcquisitionSpec, control: Connection) -> None:
     SystemExit
         With 1 if it cannot work at all (after a report of the reason).
     """
-    parent = multiprocessing.parent_process()
-    parent_pid = os.getppid() if parent is None or parent.pid is None else parent.pid
     os.nice(max(0, _NICENESS - os.nice(0)))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     limit_threads()
-    remote = Remote(control, parent_pid)
+    remote = Remote(control)
     try:
         from membrane_ctrl.acquisition.session import run
 

@@ -6,7 +6,6 @@ replaces it or something refers to it.
 """
 
 import shutil
-import struct
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
@@ -21,13 +20,11 @@ from membrane_ctrl.acquisition.cycle import CyclePlan
 from membrane_ctrl.config.schema import OpticsConfig, RecordingConfig
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.model.telemetry import FIELDS
+from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.processes.frames import FrameHead, FrameReader, Pixels
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
 from membrane_ctrl.run_files.disk_budget import PICTURES_FROM
 
-_ROW = struct.Struct(f"<{len(FIELDS)}d")
-_FAULT = FIELDS.index("fault")
 # A disk that is slower than the cycles: what would wait longer than for these sets is left out
 _WAITING_SETS = 3
 _FASTEST = [cv2.IMWRITE_PNG_COMPRESSION, 1]  # a noisy frame hardly shrinks any further
@@ -136,7 +133,7 @@ class RawFrames:
     def look_for_fault(self) -> None:
         """Keep the last cycles if a fault has come up since the last call."""
         message = self._telemetry.latest()
-        fault = message is not None and _ROW.unpack(message)[_FAULT] > 0
+        fault = message is not None and TelemetryRow.unpack(message).fault > 0
         if fault and not self._in_fault and self._recording.raw_before_fault_cycles:
             cycles = sorted({head.cycle for head in self._frames.heads()})
             for cycle in cycles[-self._recording.raw_before_fault_cycles :]:

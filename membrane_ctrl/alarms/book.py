@@ -25,32 +25,16 @@ _LIARS = {"laser": "the laser", "optics": "the camera"}
 
 @dataclass(frozen=True, slots=True)
 class Sign:
-    """One alarm's condition has come or gone.
+    """One alarm's condition has come or gone."""
 
-    Attributes
-    ----------
-    name : str
-        Of the alarm.
-    bad : bool
-        It has come; False: gone.
-    severity, text
-        Of an alarm that has come.
-    for_s : float
-        How long the condition must stand before anyone is told.
-    about : str
-        Which of several conditions under one name: the alarm stands until the last of them has gone. "" with `bad`
-        False: all have gone.
-    anew : bool
-        What comes after the last one has gone is another one, however soon.
-    """
-
-    name: str
-    bad: bool
+    name: str  # of the alarm
+    bad: bool  # True: the condition has come; False: it has gone
     severity: Severity = "warning"
     text: str = ""
-    for_s: float = 0.0
+    for_s: float = 0.0  # how long the condition must stand before anyone is told
+    # which of several conditions under one name; the alarm stands until all have gone. With `bad` False, "" means all
     about: str = ""
-    anew: bool = False
+    anew: bool = False  # once all conditions have gone, the next one is a new alarm, however soon
 
 
 def signs_of(event: events.Event) -> list[Sign]:
@@ -143,23 +127,13 @@ NoticeKind = Literal["raised", "escalated", "reminder", "cleared"]
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """Something to tell people.
+    """Something to tell people."""
 
-    Attributes
-    ----------
-    kind : str
-        What has happened to the alarm.
-    name, severity, text
-        Of the alarm.
-    escalated : bool
-        Also for those behind `escalation_urls_file`.
-    """
-
-    kind: NoticeKind
-    name: str
+    kind: NoticeKind  # what has happened to the alarm
+    name: str  # of the alarm, as the next two
     severity: Severity
     text: str
-    escalated: bool = False
+    escalated: bool = False  # also for those behind `escalation_urls_file`
 
 
 @dataclass(slots=True)

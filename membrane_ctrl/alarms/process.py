@@ -1,15 +1,10 @@
 """The process that tells people: mail servers may take a minute, and nothing of the run waits for them."""
 
 import json
-import multiprocessing
-import os
-import signal
-import struct
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from types import FrameType
 from typing import Any
 
 from membrane_ctrl.alarms.book import AlarmBook, Notice, Sign, sign_of_value, signs_of
@@ -19,7 +14,7 @@ from membrane_ctrl.model import run_events
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import CommandTaken, Event, EventLine, StateEntered
 from membrane_ctrl.model.run_status import RunStatus
-from membrane_ctrl.model.telemetry import FIELDS
+from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.processes import child, ring
 
 # One look at the run: rings in, notices out.
@@ -27,7 +22,6 @@ from membrane_ctrl.processes import child, ring
 
 # before its first tick a run connects its devices, with patience of its own
 _STARTS_S = 30.0
-_ROW = struct.Struct(f"<{len(FIELDS)}d")
 
 
 class Watcher:
@@ -84,9 +78,9 @@ class Watcher:
             self._book.take(sign, now_s)
 
     def _take_row(self, message: bytes, now_s: float) -> None:
-        row = dict(zip(FIELDS, _ROW.unpack(message), strict=True))
+        row = TelemetryRow.unpack(message)
         for rule in self._config.rules:
-            sign = sign_of_value(rule, row[rule.field], self._book.standing(rule.name))
+            sign = sign_of_value(rule, getattr(row, rule.field), self._book.standing(rule.name))
             if sign is not None:
                 self._book.take(sign, now_s)
 
@@ -116,25 +110,13 @@ _IDLE_S = 15.0  # with nothing to send; who hangs then would not tell anybody an
 
 @dataclass(frozen=True, slots=True)
 class AlarmsSpec:
-    """What the process needs to know of the run.
-
-    Attributes
-    ----------
-    clock : RunClock
-        The run's clock.
-    telemetry, events : RingAddress
-        What to look at.
-    config : AlarmsConfig
-        Rules, times and files of URLs.
-    run : str
-        Name of the run folder.
-    """
+    """What the process needs to know of the run."""
 
     clock: RunClock
     telemetry: ring.RingAddress
     events: ring.RingAddress
-    config: AlarmsConfig
-    run: str
+    config: AlarmsConfig  # rules, times and files of URLs
+    run: str  # name of the run folder
 
 
 def alarms_main(spec: AlarmsSpec, status: Any) -> None:
@@ -142,11 +124,8 @@ def alarms_main(spec: AlarmsSpec, status: Any) -> None:
 
     Target of a `spawn`ed process; `status` is its end of a pipe, for events about what it has sent.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(child.STOP, _leave)
-    parent = multiprocessing.parent_process()  # who started it, even if that is gone by now
-    parent_pid = os.getppid() if parent is None else parent.pid
-    watch(spec, apprise_senders(spec.config, spec.run), child.reporter(status), lambda: os.getppid() == parent_pid)
+    child.leave_at_stop()
+    watch(spec, apprise_senders(spec.config, spec.run), child.reporter(status), child.parent_lives)
 
 
 def watch(
@@ -203,7 +182,3 @@ def _reporting(send: Send, to: str, report: Callable[[Event], None]) -> Send:
         return through
 
     return sending
-
-
-def _leave(number: int, frame: FrameType | None) -> None:
-    raise SystemExit(0)

@@ -13,7 +13,7 @@ from typing import Any
 from membrane_ctrl.alarms.book import Notice
 from membrane_ctrl.config.port import AlarmsConfig
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model.errors import DeviceError, Exit, InputError
+from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
 
 # Notices on their way: tried again until they are through, none twice, and never a pile of them.
 
@@ -84,7 +84,7 @@ def read_urls(path: Path) -> list[str]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
-        raise InputError(f"alarms: {path}: {(error.strerror or str(error)).lower()}") from None
+        raise InputError(f"alarms: {path}: {os_reason(error)}") from None
     except UnicodeDecodeError as error:
         raise InputError(f"alarms: {path}: {error}") from None
     urls = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]

@@ -54,4 +54,4 @@ def _files_of_the_run() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise errors.InputError(f"{error.filename or 'files'}: {(error.strerror or str(error)).lower()}") from None
+        raise errors.InputError(f"{error.filename or 'files'}: {errors.os_reason(error)}") from None

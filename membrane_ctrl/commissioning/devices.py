@@ -19,21 +19,11 @@ _DRM = Path("/sys/class/drm")
 
 @dataclass(frozen=True, slots=True)
 class FoundDevice:
-    """One thing that is there.
+    """A port, camera or display that was found."""
 
-    Attributes
-    ----------
-    kind : str
-        "port", "camera" or "display".
-    name : str
-        What it says it is.
-    paste : str
-        The line of a configuration that names it; empty when none does.
-    """
-
-    kind: str
-    name: str
-    paste: str = ""
+    kind: str  # "port", "camera" or "display"
+    name: str  # what it says it is
+    paste: str = ""  # the configuration line that names it; empty if there is none
 
 
 def list_devices(as_json: bool) -> int:

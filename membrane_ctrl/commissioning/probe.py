@@ -22,37 +22,17 @@ _BACK_OFF_S = 0.2  # a bus that the device before could not open is left alone f
 
 @dataclass(frozen=True, slots=True)
 class DeviceProbe:
-    """What one device said.
+    """What one device said."""
 
-    Attributes
-    ----------
-    role : str
-        What it fills; "board" for all of them.
-    device : str
-        Port and settings.
-    identity : str
-        Who answered.
-    reading : str
-        One value, with its unit.
-    latency_p50_ms, latency_p99_ms : float
-        Of a read; NaN without one.
-    problem : str
-        What is wrong and what to do; empty when nothing is.
-    notes : str
-        What to know although nothing is wrong.
-    facts : BenchIdentity or None
-        The limits of what answered.
-    """
-
-    role: str
-    device: str
-    identity: str = ""
-    reading: str = ""
-    latency_p50_ms: float = math.nan
+    role: str  # what it fills; "board" for all of them
+    device: str  # port and settings
+    identity: str = ""  # who answered
+    reading: str = ""  # one value, with its unit
+    latency_p50_ms: float = math.nan  # of a read; NaN without one
     latency_p99_ms: float = math.nan
-    problem: str = ""
-    notes: str = ""
-    facts: roles.BenchIdentity | None = None
+    problem: str = ""  # what is wrong and what to do; empty when nothing is
+    notes: str = ""  # information that is not a problem
+    facts: roles.BenchIdentity | None = None  # the limits of what answered
 
 
 async def probe_board(board: PumpBoard, name: str) -> DeviceProbe:

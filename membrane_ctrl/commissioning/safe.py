@@ -18,7 +18,7 @@ from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port import client, unix
 from membrane_ctrl.instruments import bench, device_lock
-from membrane_ctrl.model.errors import DeviceError, Exit, InputError
+from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile
 
 _CAUSE = "made safe by hand"
@@ -174,6 +174,6 @@ def _keep(file: LatchedFile) -> None:
         file.path.parent.mkdir(parents=True, exist_ok=True)
         file.add(LatchedFault("locked", _CAUSE, f"by {getpass.getuser()}", _REMEDY, now, "none"))
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
+        reason = os_reason(error)
         raise DeviceError(f"{file.path}: the pump is stopped, but this could not be written ({reason})") from None
     print(f"{file.path}: no hold before `membrane-ctrl hold --clear-faults` or `ctl ack`", file=sys.stderr)

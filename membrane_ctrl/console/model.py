@@ -72,54 +72,26 @@ class ShapeView:
 
 @dataclass(frozen=True, slots=True)
 class ConsoleView:
-    """Everything on the console, still as numbers.
+    """Everything on the console, still as numbers."""
 
-    Attributes
-    ----------
-    row : TelemetryRow or None
-        The newest tick; None before the first.
-    why : str
-        The one line.
-    silent_s : float
-        Age of the row if that is worth a warning, else 0.
-    state_age_s, elapsed_s, left_s : float
-        Times; `left_s` counts from the first tick and is infinite for a run without an end.
-    trend_um : tuple of 60 float
-        Mean error of each of the last 60 s.
-    error_mean_um, error_std_um, in_band_fraction : float
-        Of the error's samples in the last minute.
-    lateness_max_ms : float
-        The worst of the last minute.
-    fault, remedy : str
-        The fault that stands, and what to do about it.
-    faults : int
-        Faults so far in the run.
-    last_fault : str
-        The newest of them, with its time.
-    too_tight : bool
-        The leak is too small for the band.
-    recording : str
-        What keeps the run from being recorded; empty if nothing does.
-    """
-
-    row: telemetry.TelemetryRow | None
-    why: str
-    silent_s: float
+    row: telemetry.TelemetryRow | None  # the newest tick; None before the first
+    why: str  # the one line
+    silent_s: float  # age of the row if that is worth a warning, else 0
     state: states.State
     state_age_s: float
     elapsed_s: float
-    left_s: float
-    trend_um: tuple[float, ...]
-    error_mean_um: float
+    left_s: float  # from the first tick; infinite for a run without an end
+    trend_um: tuple[float, ...]  # mean error of each of the last 60 s
+    error_mean_um: float  # of the error's samples in the last minute, as the next two
     error_std_um: float
     in_band_fraction: float
-    lateness_max_ms: float
-    fault: str
-    remedy: str
-    faults: int
-    last_fault: str
-    too_tight: bool
-    recording: str
+    lateness_max_ms: float  # the worst of the last minute
+    fault: str  # that stands
+    remedy: str  # for it
+    faults: int  # faults so far in the run
+    last_fault: str  # the newest of them, with its time
+    too_tight: bool  # the leak is too small for the band
+    recording: str  # what keeps the run from being recorded; empty if nothing does
     shape: ShapeView
 
 

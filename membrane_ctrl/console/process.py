@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
-import os
-import signal
-import struct
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -15,7 +11,6 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import FrameType
 
 from rich.console import Console
 from rich.live import Live
@@ -27,7 +22,7 @@ from membrane_ctrl.console.why import duration, number, percent
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import unpack_estimate
-from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
+from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.model.terminal import Plain
 from membrane_ctrl.processes import child, ring
 
@@ -93,37 +88,20 @@ _LOOK_S = 0.2  # as fast as a person reads changing figures
 _PLAIN_S = 1.0
 # A round takes some ms; a terminal that is stopped (Ctrl-S, a dead ssh) takes what is written to it for a while
 _HANGS_S = 15.0
-_ROW = struct.Struct(f"<{len(FIELDS)}d")
 
 
 @dataclass(frozen=True, slots=True)
 class ConsoleSpec:
-    """What the console needs to know of the run.
-
-    Attributes
-    ----------
-    clock : RunClock
-        The run's clock.
-    telemetry, events, shapes : RingAddress
-        What to show; `shapes` is None for a run without a camera.
-    run_dir : Path
-        Where the recording goes, for the person to find.
-    config : Config
-        The run's configuration.
-    duration_s : float or None
-        How long the run shall take.
-    since_s : float
-        What was told before this is not told again: there was another console then.
-    """
+    """What the console needs to know of the run."""
 
     clock: RunClock
     telemetry: ring.RingAddress
     events: ring.RingAddress
-    shapes: ring.RingAddress | None
-    run_dir: Path
+    shapes: ring.RingAddress | None  # None for a run without a camera
+    run_dir: Path  # where the recording goes, for the person to find
     config: Config
     duration_s: float | None = None
-    since_s: float = -math.inf
+    since_s: float = -math.inf  # earlier events are not shown again: another console showed them
 
 
 def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
@@ -132,15 +110,12 @@ def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
     Target of a `spawn`ed process; over `status` it says that it is alive. SIGINT is left to the control process; the
     terminal is given back in any case.
     """
-    parent = multiprocessing.parent_process()  # who started it, even if that is gone by now
-    parent_pid = os.getppid() if parent is None or parent.pid is None else parent.pid
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(child.STOP, _leave)
+    child.leave_at_stop()
     report = child.reporter(status)
     with closing(_Feed(spec)) as feed:
 
         def rounds(show: Callable[[], object]) -> None:
-            while not feed.model.ended and os.getppid() == parent_pid:
+            while not feed.model.ended and child.parent_lives():
                 show()
                 report(child.alive(_HANGS_S))
                 time.sleep(_LOOK_S)
@@ -180,7 +155,7 @@ class _Feed:
     def update(self) -> list[events.EventLine]:
         """Take what has come; returns the events among it."""
         for message in self._telemetry.drain():
-            self.model.take_row(TelemetryRow(*_ROW.unpack(message)))
+            self.model.take_row(TelemetryRow.unpack(message))
         for message in self._shapes.drain() if self._shapes else ():
             self.model.take_shape(unpack_estimate(message))
         lines: list[events.EventLine] = [json.loads(message) for message in self._events.drain()]
@@ -228,7 +203,3 @@ def _plain(spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
             print(each, file=sys.stderr, flush=True)
 
     yield show
-
-
-def _leave(number: int, frame: FrameType | None) -> None:
-    raise SystemExit(0)

@@ -13,7 +13,7 @@ from typing import Any
 
 from membrane_ctrl.control_port.protocol import encode
 from membrane_ctrl.control_port.unix import short
-from membrane_ctrl.model.errors import DeviceError
+from membrane_ctrl.model.errors import DeviceError, os_reason
 
 Message = dict[str, Any]
 _ANSWER_S = 10.0
@@ -78,7 +78,7 @@ class PortClient:
             connection.close()
             if error.errno == errno.ENOTCONN:
                 return cls.unix(path, notice)
-            raise DeviceError(f"{path}: {(error.strerror or str(error)).lower()}") from None
+            raise DeviceError(f"{path}: {os_reason(error)}") from None
         return cls(connection, str(path), notice)
 
     @classmethod
@@ -88,7 +88,7 @@ class PortClient:
         try:
             plain = socket.create_connection((host, port), _ANSWER_S)
         except OSError as error:
-            raise DeviceError(f"{where}: {(error.strerror or str(error)).lower()}") from None
+            raise DeviceError(f"{where}: {os_reason(error)}") from None
         try:
             secured = context.wrap_socket(plain, server_hostname=host)
         except OSError as error:
@@ -102,7 +102,7 @@ class PortClient:
         try:
             self._connection.sendall(encode({**request, "number": self._number}))
         except OSError as error:
-            raise DeviceError(f"{self._where}: {(error.strerror or str(error)).lower()}") from None
+            raise DeviceError(f"{self._where}: {os_reason(error)}") from None
         for message in self.messages():
             if message.get("number") in (self._number, 0):  # 0: it could not be read far enough to find its number
                 return message

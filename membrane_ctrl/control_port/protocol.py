@@ -53,40 +53,19 @@ def _words(most_bytes: int) -> AfterValidator:
 
 
 class Request(Section):
-    """What a client sends.
+    """What a client sends."""
 
-    Attributes
-    ----------
-    number : int
-        Chosen by the client, returned with the answer.
-    do : str
-        A command of `commands.TABLE`, or an errand: `status` once, `watch` (the status again and again), `release`
-        (give the command back), `quiet` (acknowledge the alarms).
-    why : str
-        Recorded with the command.
-    value : float or None
-        `setpoint`: um. `manual`: um/s. `gains`: s on trial, until they are kept or go back.
-    text : str
-        `mark`: what to write. `latch`: why nobody may hold the mirror.
-    loop : dict or None
-        `gains`: the keys of `[loop]` that change.
-    experiment : dict or None
-        `tune`: an `ExperimentSpec`.
-    take_over : bool
-        Take the command from whoever has it.
-    period_s : float
-        `watch`: from status to status.
-    """
-
-    number: Annotated[int, Field(ge=0, lt=2**53)] = 0
+    number: Annotated[int, Field(ge=0, lt=2**53)] = 0  # chosen by the client, returned with the answer
+    # a command of `commands.TABLE`, or an errand: `status` once, `watch` (the status again and again), `release`
+    # (give the command back), `quiet` (acknowledge the alarms)
     do: Action
-    why: Annotated[str, _words(WHY_BYTES)] = ""
-    value: float | None = None
-    text: Annotated[str, _words(TEXT_BYTES)] = ""
-    loop: dict[str, bool | float] | None = None
-    experiment: dict[str, str | int | float] | None = None
-    take_over: bool = False
-    period_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.0
+    why: Annotated[str, _words(WHY_BYTES)] = ""  # recorded with the command
+    value: float | None = None  # `setpoint`: um. `manual`: um/s. `gains`: s on trial, until they are kept or go back
+    text: Annotated[str, _words(TEXT_BYTES)] = ""  # `mark`: what to write. `latch`: why nobody may hold the mirror
+    loop: dict[str, bool | float] | None = None  # `gains`: the keys of `[loop]` that change
+    experiment: dict[str, str | int | float] | None = None  # `tune`: an `ExperimentSpec`
+    take_over: bool = False  # take the command from whoever has it
+    period_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.0  # `watch`: from status to status
 
     @model_validator(mode="after")
     def _complete(self) -> Request:

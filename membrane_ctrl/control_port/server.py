@@ -11,7 +11,7 @@ import itertools
 import math
 import socket
 from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from membrane_ctrl.config.port import PortConfig
@@ -21,10 +21,9 @@ from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
 from membrane_ctrl.control_port.protocol import KINDS, VERSION, Request, Wire
 from membrane_ctrl.control_port.session import FREE, Commander, Peer, PortSession, may_not
-from membrane_ctrl.control_port.status import metrics_text, serve_metrics, status_table
 from membrane_ctrl.control_port.tls import Listeners
 from membrane_ctrl.controller import commands, tick
-from membrane_ctrl.model import errors, events, run_events
+from membrane_ctrl.model import errors, events, run_events, states
 from membrane_ctrl.model.run_status import RunStatus
 
 # Beyond these the connection that has been silent longest goes: one person's terminals cannot lock out another's stop
@@ -37,24 +36,12 @@ _OVER = "the run is over"
 
 @dataclass(frozen=True, slots=True)
 class RunHooks:
-    """What the port needs of the run.
+    """What the port needs of the run."""
 
-    Attributes
-    ----------
-    ask : callable
-        Hands a command to the next tick.
-    tell : callable
-        Puts an event on record.
-    now : callable
-        The run's clock.
-    loop : callable
-        The loop's settings as they are now.
-    """
-
-    ask: Callable[[commands.Command], None]
-    tell: Callable[[events.Event], None]
-    now: Callable[[], float]
-    loop: Callable[[], LoopConfig]
+    ask: Callable[[commands.Command], None]  # hands a command to the next tick
+    tell: Callable[[events.Event], None]  # puts an event on record
+    now: Callable[[], float]  # the run's clock
+    loop: Callable[[], LoopConfig]  # the loop's settings as they are now
 
 
 class Port:
@@ -267,3 +254,74 @@ class Port:
             return f"no tick took it up within {_ANSWER_S:g} s; it may still be obeyed"
         finally:
             self._waiting.pop(command.number, None)
+
+
+# Prometheus text on localhost: every field of the newest tick as a gauge, and a few counts. Names keep the project's
+# units (`membrane_error_um`), as in alarms and telemetry.
+
+_REQUEST_S = 2.0
+_COUNTERS = {"tick": "ticks_total", "missed_ticks": "missed_ticks_total"}
+
+
+def metrics_text(status: RunStatus, clients: int, refused: int) -> str:
+    """The status in Prometheus' text format, version 0.0.4; `clients` and `refused` count those of the port."""
+    lines: list[str] = []
+
+    def add(name: str, kind: str, *samples: tuple[str, float]) -> None:
+        lines.append(f"# TYPE membrane_{name} {kind}")
+        lines.extend(f"membrane_{name}{labels} {_number(value)}" for labels, value in samples)
+
+    add("port_clients", "gauge", ("", clients))
+    add("port_refused_total", "counter", ("", refused))
+    add("recording_ok", "gauge", ("", not status.recording))
+    row = status.row
+    if row is not None:
+        add("in_state", "gauge", *((f'{{state="{s.name.lower()}"}}', float(row.state == s)) for s in states.State))
+        for field, value in asdict(row).items():
+            counter = _COUNTERS.get(field)
+            add(counter or field, "counter" if counter else "gauge", ("", value))
+    return "\n".join(lines) + "\n"
+
+
+def _number(value: float) -> str:
+    return "NaN" if math.isnan(value) else repr(float(value))
+
+
+async def serve_metrics(connection: socket.socket, text: Callable[[], str]) -> None:
+    """Answer one HTTP request: `GET /metrics`, or 404."""
+    wire = await Wire.on(connection)
+    try:
+        with contextlib.suppress(TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError):
+            async with asyncio.timeout(_REQUEST_S):
+                head = await wire.until(b"\r\n\r\n")
+            found = head.split(b"\r\n")[0].split(b" ")[:2] == [b"GET", b"/metrics"]
+            body = (text() if found else "only /metrics is here\n").encode()
+            kind = "text/plain; version=0.0.4; charset=utf-8"
+            wire.send_bytes(
+                f"HTTP/1.1 {'200 OK' if found else '404 Not Found'}\r\nContent-Type: {kind}\r\n"
+                f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode()
+                + body
+            )
+    finally:
+        await wire.close()
+
+
+def status_table(status: RunStatus) -> dict[str, Any]:
+    """The status for people and programs: names instead of codes, None for what is not there."""
+    row = status.row
+    if row is None:
+        return {"state": "starting", "why": "no tick has run yet"}
+    fault, geometry = status.fault, status.geometry
+    return {
+        "state": states.State(int(row.state)).name.lower(),
+        "state_age_s": round(row.mono_s - status.since_s, 3),
+        "why": status.why,
+        "fault": {key: getattr(fault, key) for key in ("code", "name", "cause", "remedy")} if fault else None,
+        "rung": states.Rung(int(row.rung)).name.lower(),
+        "shape": states.ShapeState(int(row.shape_state)).name.lower(),
+        "shape_reason": status.shape_reason,
+        "geometry": asdict(geometry) if geometry else None,
+        "maintenance": dict(status.maintenance),
+        "recording": dict(status.recording),
+        "row": {key: value if math.isfinite(value) else None for key, value in asdict(row).items()},
+    }

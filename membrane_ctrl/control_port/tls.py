@@ -10,17 +10,13 @@ import time
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from membrane_ctrl.config.port import PortConfig, TlsConfig
 from membrane_ctrl.control_port import endpoint, protocol, session
 from membrane_ctrl.control_port.unix import SOCKET_NAME, UnixListener
 from membrane_ctrl.controller.commands import Role
-from membrane_ctrl.model.errors import DeviceError, InputError
-
-if TYPE_CHECKING:
-    pass
-
+from membrane_ctrl.model.errors import DeviceError, InputError, os_reason
 
 _ROLES: dict[str, Role] = {"read": "read", "operate": "operate", "tune": "tune"}
 
@@ -108,7 +104,7 @@ def listen_tcp(host: str, port: int, field: str) -> socket.socket:
     try:
         listener = socket.create_server((host, port), backlog=endpoint.BACKLOG)
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
+        reason = os_reason(error)
         raise DeviceError(f"{field}: cannot listen on {host}:{port} ({reason})") from None
     listener.setblocking(False)
     return listener
@@ -118,7 +114,7 @@ def _require_readable(path: Path) -> None:
     try:
         path.open("rb").close()
     except OSError as error:
-        raise InputError(f"{path}: {(error.strerror or str(error)).lower()}") from None
+        raise InputError(f"{path}: {os_reason(error)}") from None
 
 
 # All sockets of the port, bound before anything else of the run exists: an address in use is refused in one line.
@@ -154,13 +150,9 @@ def listeners_for(config: PortConfig, logs_dir: Path, stack: ExitStack) -> Liste
     stack.callback(unix.close)
     tls = metrics = None
     if config.tls is not None:
-        pass
-
         tls = TlsListener(config.tls)
         stack.callback(tls.close)
     if config.metrics_port is not None:
-        pass
-
         metrics = listen_tcp("127.0.0.1", config.metrics_port, "port.metrics_port")
         stack.callback(metrics.close)
     return Listeners(unix, tls, metrics, path)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from membrane_ctrl.control_port import endpoint, session
 from membrane_ctrl.controller.commands import Role
-from membrane_ctrl.model.errors import DeviceError, InputError
+from membrane_ctrl.model.errors import DeviceError, InputError, os_reason
 
 SOCKET_NAME = "control.sock"
 _MODE = 0o660
@@ -49,7 +49,7 @@ class UnixListener:
             _remove_stale(path)
             self.socket = _bound(path, group)
         except OSError as error:
-            reason = (error.strerror or str(error)).lower()
+            reason = os_reason(error)
             raise DeviceError(f"{path}: no control port there ({reason}); choose another with port.socket") from None
         self._inode = path.stat().st_ino
 

@@ -35,58 +35,30 @@ RUNNING = MOVING | {State.STANDBY, State.CHECK}
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What a person or program asks for.
+    """What a person or program asks for."""
 
-    Attributes
-    ----------
-    kind : str
-        One of `TABLE`, or "resumed": a resume within the last day, by an earlier run. Only a run's start tells it.
-    who, why : str
-        Recorded with it.
-    value : float
-        `setpoint`: um. `manual`: flow in um/s of the centre. `gains`: seconds until they go back to what they were,
-        unless `keep` comes before; NaN: for good. `resumed`: how many seconds ago.
-    text : str
-        `mark`: what to write on the timeline. `latch`: the fault.
-    loop : LoopConfig or None
-        `gains`: the loop's new settings, whole.
-    experiment : ExperimentSpec or None
-        `tune`: what to do.
-    number : int
-        Given by the asker, returned with the answer.
-    """
-
+    # of `TABLE`, or "resumed": an earlier run resumed within the last day; only the start of a run may say so
     kind: Kind | Literal["resumed"]
-    who: str
+    who: str  # recorded, as is `why`
     why: str = ""
+    # `setpoint`: um. `manual`: flow, um/s of the centre. `gains`: s on trial, until they are kept or revert; NaN: for
+    # good. `resumed`: s ago
     value: float = math.nan
-    text: str = ""
-    loop: LoopConfig | None = None
-    experiment: ExperimentSpec | None = None
-    number: int = 0
+    text: str = ""  # `mark`: what to write on the timeline. `latch`: the fault
+    loop: LoopConfig | None = None  # `gains`: the loop's new settings, whole
+    experiment: ExperimentSpec | None = None  # `tune`: what to do
+    number: int = 0  # given by the asker, returned with the answer
 
 
 @dataclass(frozen=True, slots=True)
 class CommandRule:
-    """One row.
+    """One row."""
 
-    Attributes
-    ----------
-    role : str
-        Who may ask for it.
-    states : collection of State
-        Where it is allowed.
-    does : str
-        For the help.
-    needs, takes : tuple of str
-        Fields of a request that must come with it, and that may.
-    """
-
-    role: Role
-    states: Collection[State]
-    does: str
-    needs: tuple[str, ...] = ()
-    takes: tuple[str, ...] = ()
+    role: Role  # who may ask for it
+    states: Collection[State]  # where it is allowed
+    does: str  # for the help
+    needs: tuple[str, ...] = ()  # fields that a request must have
+    takes: tuple[str, ...] = ()  # and those it may have
 
 
 _HOLD, _PARKED, _FLOW = (

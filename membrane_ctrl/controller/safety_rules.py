@@ -16,89 +16,36 @@ NOT_YET_FAULT = ALWAYS - {State.FAULT}
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What one tick shows of the bench and of ourselves; NaN and None mean "not seen", never "fine".
+    """What one tick shows of the bench and of ourselves; NaN and None mean "not seen", never "fine"."""
 
-    Attributes
-    ----------
-    link_up : bool
-        The device link is connected.
-    reading_age_s : float
-        Since the last answer of the device.
-    advance_age_s : float
-        Since the device's sample counter and time last advanced: an old answer repeated does not count.
-    same_s : float
-        Since the valid readings have been equal to the last bit.
-    displacement_um : float
-        The laser's reading as it came, NaN if it was bad or absent.
-    displacement_valid : bool
-        It is finite, of good quality, new, and not a jump that no film makes.
-    jumps : int
-        Readings in a row refused for a jump.
-    error_um : float
-        Setpoint minus reading; NaN outside the loop.
-    gauge_pressure_pa : float
-    pump_mismatch : float
-        Largest of |command - read-back| that both of the last two commands agree on.
-    watchdog_tripped : bool
-    board_faults : int
-    foreign : int
-        What of the board's claim and watchdog is not as this run set it (`roles.FOREIGN_...`).
-    lateness_ms : float
-    dead_tasks : tuple of str
-        Supervised tasks of the control process that ended.
-    tick_error : str
-        What a handler raised, if it did.
-    overdue : str
-        What the present state has waited for too long, if it has.
-    unfit : str
-        What the actuator test found, if anything.
-    runs_on : str
-        What the read-back says of a pump that was commanded off and ought to stand.
-    inflow : str
-        How the mirror rises although the pump is commanded off.
-    locked : str
-        Why a person has latched the mirror.
-    vent_fraction : float
-        The vent's read-back; NaN without one.
-    laser_lies : str
-        What laser, gauge and camera show, if it is the laser that does not fit.
-    gauge_same_s : float
-        Since the readings of a taut film's gauge have been equal to the last bit.
-    gauge_jumps : int
-        Readings in a row that no film makes.
-    laser_gauge_apart : str
-        What laser and gauge have seen, if both cannot be true.
-    gas_excess : str
-        How much more gas the film takes than it used to, if no camera sees that it stands still.
-    """
-
-    link_up: bool
-    reading_age_s: float
+    link_up: bool  # the device link is connected
+    reading_age_s: float  # since the last answer of the device
+    # since the device's sample counter and time last advanced; a repeated answer does not count
     advance_age_s: float
-    displacement_um: float
-    displacement_valid: bool
-    jumps: int
-    error_um: float
+    displacement_um: float  # the laser's reading as it came, NaN if it was bad or absent
+    displacement_valid: bool  # it is finite, new, of good quality, and no jump
+    jumps: int  # readings in a row refused for a jump
+    error_um: float  # setpoint minus reading; NaN outside the loop
     gauge_pressure_pa: float
-    pump_mismatch: float
+    pump_mismatch: float  # largest of |command - read-back| that both of the last two commands agree on
     watchdog_tripped: bool
     board_faults: int
     lateness_ms: float
-    dead_tasks: tuple[str, ...] = ()
-    tick_error: str = ""
-    overdue: str = ""
-    unfit: str = ""
-    same_s: float = 0.0
-    laser_lies: str = ""
-    runs_on: str = ""
-    inflow: str = ""
-    locked: str = ""
-    vent_fraction: float = math.nan
-    foreign: int = 0
-    gauge_same_s: float = 0.0
-    gauge_jumps: int = 0
-    laser_gauge_apart: str = ""
-    gas_excess: str = ""
+    dead_tasks: tuple[str, ...] = ()  # supervised tasks of the control process that ended
+    tick_error: str = ""  # what a handler raised, if it did
+    overdue: str = ""  # what the present state has waited for too long, if it has
+    unfit: str = ""  # what the actuator test found, if anything
+    same_s: float = 0.0  # since the valid readings have been equal to the last bit
+    laser_lies: str = ""  # what laser, gauge and camera show, if the laser is wrong
+    runs_on: str = ""  # the read-back of a pump that should have stopped
+    inflow: str = ""  # how the mirror rises although the pump is commanded off
+    locked: str = ""  # why a person has latched the mirror
+    vent_fraction: float = math.nan  # the vent's read-back; NaN without one
+    foreign: int = 0  # what another program changed: claim, watchdog (`roles.FOREIGN_...`)
+    gauge_same_s: float = 0.0  # since the readings of a taut film's gauge have been equal to the last bit
+    gauge_jumps: int = 0  # readings in a row that no film makes
+    laser_gauge_apart: str = ""  # what laser and gauge show, if they contradict each other
+    gas_excess: str = ""  # how much more gas the film takes than before, if no camera sees it stand still
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,31 +17,19 @@ _REPEATS = 3
 
 @dataclass(frozen=True, slots=True)
 class HoldStatus:
-    """How the mirror is held.
+    """How the mirror is held."""
 
-    Attributes
-    ----------
-    laser_um, gauge_pressure_pa : float
-        Readings that are new, good and no jump, else NaN: a mean over ten seconds must not take in a bit error.
-    setpoint_um, trim_um : float
-        What a person has asked for, and what the shape loop adds.
-    ramp_left_um : float
-        How far the setpoint's ramp has still to go. A camera sees the film of a cycle ago, and the gauge is linear
-        only about its reference: on a long way they would contradict a laser that is right.
-    leak_um_per_s, flow_um_per_s : float
-        As the inner loop estimates it, and what the pump gives; NaN without.
-    bleed_fraction : float
-        The vent that is held open on purpose.
-    """
-
+    # NaN for readings that are old, bad or a jump: a mean over ten seconds must not take in a bit error
     laser_um: float
     gauge_pressure_pa: float
-    setpoint_um: float
-    trim_um: float
+    setpoint_um: float  # as commanded
+    trim_um: float  # by the shape loop
+    # what is left of the setpoint's ramp. The camera sees the film of a cycle ago, and the gauge is linear only near
+    # its reference: on a long ramp they would contradict a correct laser
     ramp_left_um: float
-    leak_um_per_s: float
-    flow_um_per_s: float
-    bleed_fraction: float
+    leak_um_per_s: float  # as the inner loop estimates it; NaN without
+    flow_um_per_s: float  # of the pump; NaN without
+    bleed_fraction: float  # of the vent, held open on purpose
 
 
 class SensorConsistency:

@@ -25,71 +25,32 @@ from membrane_ctrl.model.events import Event
 
 @dataclass(frozen=True, slots=True)
 class TickInputs:
-    """Everything a tick may know.
+    """Everything a tick may know."""
 
-    Attributes
-    ----------
-    now_s : float
-        Start of the tick on the run's clock.
-    dt_s : float
-        True time since the last tick, clamped.
-    lateness_ms : float
-        Start against the deadline.
-    missed_ticks : int
-        Running count of skipped deadlines.
-    link_up : bool
-        The device link is connected.
-    reading : BenchReading or None
-        None if the device gave no valid answer in this tick.
-    estimate : ShapeEstimate or None
-        The newest shape, in the tick in which it arrives.
-    commands : tuple of Command
-        Since the last tick.
-    dead_tasks : tuple of str
-        Supervised tasks that ended.
-    truth_displacement_um, truth_laser_bias_um : float
-        The twin's truth, for the record only; NaN on a real bench.
-    """
-
-    now_s: float
-    dt_s: float
-    reading: BenchReading | None
-    lateness_ms: float = 0.0
-    missed_ticks: int = 0
-    link_up: bool = True
-    estimate: shape_estimate.ShapeEstimate | None = None
-    commands: tuple[Command, ...] = ()
-    dead_tasks: tuple[str, ...] = ()
+    now_s: float  # start of the tick on the run's clock
+    dt_s: float  # true time since the last tick, clamped
+    reading: BenchReading | None  # None without a valid answer in this tick
+    lateness_ms: float = 0.0  # start against the deadline
+    missed_ticks: int = 0  # running count of skipped deadlines
+    link_up: bool = True  # the device link is connected
+    estimate: shape_estimate.ShapeEstimate | None = None  # the newest shape, in the tick in which it arrives
+    commands: tuple[Command, ...] = ()  # since the last tick
+    dead_tasks: tuple[str, ...] = ()  # supervised tasks that ended
+    # the twin's truth, for the record only; NaN on a real bench
     truth_displacement_um: float = math.nan
     truth_laser_bias_um: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
 class TickOutputs:
-    """What a tick decided.
+    """What a tick decided."""
 
-    Attributes
-    ----------
-    command : BenchCommand
-        The write that ends the tick.
-    row : TelemetryRow
-        For the record.
-    events : tuple of Event
-        For the record.
-    finished : Exit or None
-        The run is over, with this exit code.
-    answers : tuple of (int, str)
-        Number of each command of this tick, and why it was refused (empty: obeyed).
-    clear_mask : int
-        Which of the board's own latches to clear: all on a person's word, the watchdog's by the resume rule.
-    """
-
-    command: BenchCommand
+    command: BenchCommand  # the write that ends the tick
     row: telemetry.TelemetryRow
     events: tuple[Event, ...]
-    finished: errors.Exit | None
-    answers: tuple[tuple[int, str], ...] = ()
-    clear_mask: int = 0
+    finished: errors.Exit | None  # the run is over, with this exit code
+    answers: tuple[tuple[int, str], ...] = ()  # number of each command, and why it was refused (empty: obeyed)
+    clear_mask: int = 0  # the board's latches to clear: all after `ack`, the watchdog's by the resume rule
 
 
 # What went into a tick, as bytes: exactly, so that a replay of them gives the same tick (docs/replay.md).

@@ -25,9 +25,9 @@ from membrane_ctrl.control_port import server, tls
 from membrane_ctrl.controller import commands, cross_check, safe_levels, tick
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.geometry.file import geometry_in_force
-from membrane_ctrl.hold import child_processes, latched_fault
+from membrane_ctrl.hold import child_processes
+from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
-from membrane_ctrl.hold.systemd import SystemdNotify
 from membrane_ctrl.instruments.bench import connect, open_bench
 from membrane_ctrl.instruments.device_lock import device_names, locked
 from membrane_ctrl.model import errors, run_events, terminal
@@ -89,8 +89,8 @@ def hold_mirror(options: HoldOptions) -> int:
         children.start(stack)
         bench = open_bench(config.devices)  # a link belongs to the event loop that opened it
         port = partial(server.Port, config.port, listeners, run_dir.name)
-        fault_latch = partial(latched_fault.FaultLatch, latched, resumes, run_dir.name, clock.utc)
-        exit_code = asyncio.run(_run(bench, config, options, clock, rings, children, twin, port, fault_latch, board))
+        latch = partial(FaultLatch, latched, resumes, run_dir.name, clock.utc)
+        exit_code = asyncio.run(_run(bench, config, options, clock, rings, children, twin, port, latch, board))
         children.take_down()
     with contextlib.suppress(OSError):  # the terminal was closed, or nobody reads any more
         _report(run_dir, options.json)
@@ -110,7 +110,7 @@ def _latched(config: Config, logs_dir: Path, options: HoldOptions) -> LatchedFil
         try:
             file.clear()
         except OSError as error:
-            reason = (error.strerror or str(error)).lower()
+            reason = errors.os_reason(error)
             raise errors.DeviceError(f"{file.path}: cannot be cleared ({reason}); remove it by hand") from None
     elif fault is not None and not options.standby:
         raise errors.DeviceError(f"a fault is latched: {fault}; {fault.remedy}, then start with --clear-faults")
@@ -180,42 +180,41 @@ async def _run(
     children: child_processes.ChildProcesses,
     twin: TwinProcess | None,
     port_for: Callable[[server.RunHooks], server.Port],
-    latch_for: Callable[[Callable[[Event], None]], latched_fault.FaultLatch],
+    latch_for: Callable[[Callable[[Event], None]], FaultLatch],
     board: BoardAtStart,
 ) -> errors.Exit:
     from membrane_ctrl.metrology.optics.hencky import zernike_projection
 
-    with _open(rings) as (telemetry, events, inputs, shapes):
-        truth = twin.truth_reader() if twin else None
-        wiring = Wiring(
-            bench, telemetry, events, inputs, newest_of(shapes) if shapes else None, truth, children.reports
+    assert config.devices is not None
+    with contextlib.ExitStack() as stack:
+        telemetry, events, inputs = (
+            stack.enter_context(contextlib.closing(RingWriter(address)))
+            for address in (rings.telemetry, rings.events, rings.inputs)
         )
+        shapes = (
+            newest_of(stack.enter_context(contextlib.closing(RingReader(rings.shapes)))) if rings.shapes else None
+        )
+        truth = twin.truth_reader() if twin else None
+        wiring = Wiring(bench, telemetry, events, inputs, shapes, truth, children.reports)
         controller = Controller(config, zernike_projection())
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         port = port_for(server.RunHooks(supervisor.ask, supervisor.tell, clock.now, lambda: controller.loop_config))
-        fault_latch, systemd = latch_for(supervisor.tell), SystemdNotify()
+        latch, systemd = latch_for(supervisor.tell), SystemdNotify()
         wiring.heard = {
             "control port": port.heard,
-            "latched-fault file": fault_latch.heard,
+            "latched-fault file": latch.heard,
             "systemd": systemd.heard,
             "capture": partial(_capture, children, supervisor.tell),
         }
         wiring.told = {"control port": port.told, "systemd": systemd.told}
-        devices = config.devices.name if config.devices else ""
-        supervisor.tell(run_events.Started(devices, raise_priority(), board.cleared))
+        supervisor.tell(run_events.Started(config.devices.name, raise_priority(), board.cleared))
         exit_code = errors.Exit.DEVICE_FAILED
         try:
-            if not options.standby:
-                supervisor.ask(commands.Command("hold", commands.AT_START))
-            elif latched := "; ".join(part for part in (fault_latch.latched, board.latched) if part):
-                supervisor.ask(commands.Command("latch", commands.AT_START, text=latched))
-            for age_s in fault_latch.resumes_s:
-                supervisor.ask(commands.Command("resumed", commands.AT_START, value=age_s))
+            _ask_first(supervisor, options.standby, latch, board)
             gc.collect()
             gc.freeze()  # what lives for the whole run need not be looked at again between two ticks
             async with port.open():
-                with _signals(supervisor), fault_latch, systemd:
-                    assert config.devices is not None
+                with _signals(supervisor), latch, systemd:
                     # last: the board's watchdog runs from here on
                     if (await connect(bench, config.devices)).map_version == 1:
                         supervisor.tell(run_events.NoClaim(NO_CLAIM))
@@ -230,6 +229,16 @@ async def _run(
     return exit_code
 
 
+def _ask_first(supervisor: Supervisor, standby: bool, latch: FaultLatch, board: BoardAtStart) -> None:
+    """What the first tick is asked: to hold, unless the run begins in standby; and what earlier runs left."""
+    if not standby:
+        supervisor.ask(commands.Command("hold", commands.AT_START))
+    elif latched := "; ".join(part for part in (latch.latched, board.latched) if part):
+        supervisor.ask(commands.Command("latch", commands.AT_START, text=latched))
+    for age_s in latch.resumes_s:
+        supervisor.ask(commands.Command("resumed", commands.AT_START, value=age_s))
+
+
 def _capture(
     children: child_processes.ChildProcesses, tell: Callable[[Event], None], outputs: tick.TickOutputs
 ) -> None:
@@ -238,18 +247,6 @@ def _capture(
         match event:
             case CommandTaken(command="capture", refused=None) if (failed := children.capture()) is not None:
                 tell(failed)
-
-
-@contextlib.contextmanager
-def _open(rings: child_processes.Rings) -> Iterator[tuple[RingWriter, RingWriter, RingWriter, RingReader | None]]:
-    telemetry, events, inputs = RingWriter(rings.telemetry), RingWriter(rings.events), RingWriter(rings.inputs)
-    shapes = RingReader(rings.shapes) if rings.shapes else None
-    try:
-        yield telemetry, events, inputs, shapes
-    finally:
-        for ring in (telemetry, events, inputs, shapes):
-            if ring is not None:
-                ring.close()
 
 
 @contextlib.contextmanager

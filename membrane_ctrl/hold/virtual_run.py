@@ -5,7 +5,7 @@ effect at once), the processes, and deadlines. The board is the emulator's own, 
 on the plant's time.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from firmware_iface import roles
@@ -18,7 +18,6 @@ from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.truth_shape import ShapeSource
 from membrane_ctrl.sim.virtual_bench import VirtualBench, at_once
 
@@ -34,12 +33,12 @@ class VirtualTick:
 
     @property
     def row(self) -> telemetry.TelemetryRow:
-        """For the record."""
+        """The tick's telemetry."""
         return self.outputs.row
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """For the record."""
+        """The tick's events."""
         return self.outputs.events
 
 
@@ -153,39 +152,3 @@ class _AtOnce:
 
     async def close(self) -> None:
         self._bench.close()
-
-
-def run_virtual(
-    config: Config,
-    plant: Plant,
-    duration_s: float,
-    sag_sensitivity: FloatArray,
-    shape: ShapeSource | None = None,
-    alter: Alter | None = None,
-) -> Iterator[VirtualTick]:
-    """Hold the twin for `duration_s` of its time, as fast as it goes.
-
-    Parameters
-    ----------
-    config, sag_sensitivity, shape, alter
-        See `VirtualRun`.
-    plant : Plant
-        The twin's physics.
-    duration_s : float
-        When the hold is asked to stop.
-
-    Yields
-    ------
-    VirtualTick
-        Until the controller says that the run is over.
-    """
-    run = VirtualRun(config, VirtualBench(plant), sag_sensitivity, shape, alter)
-    commands: tuple[Command, ...] = (Command("hold", "virtual run"),)
-    stop_at_s = duration_s
-    while run.finished is None:
-        if run.now_s + 1.0 / config.loop.rate_hz >= stop_at_s:
-            commands, stop_at_s = (*commands, Command("stop", "duration")), float("inf")
-        tick = run.tick(commands)
-        commands = ()
-        if tick is not None:
-            yield tick

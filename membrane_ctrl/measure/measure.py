@@ -26,8 +26,6 @@ def measure_command(
 ) -> int:
     """Measure one set, write the result, say what came out. Returns the exit code; raises InputError."""
     if folder.suffix == ".h5":
-        pass
-
         return facet_command(folder, as_json)
     measurement = measure_set(folder, None if geometry is None else read_geometry(geometry))
     for key in measurement.head.ignored:

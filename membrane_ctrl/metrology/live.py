@@ -28,6 +28,7 @@ LOST_SHARE = 0.002  # more points than dust and glints beyond the guard
 # A film that changes its shape moves as many phases up as down. All of them moving one way is a knock against the
 # mount, which may have been a whole period: nobody can tell a tilt of 7 mrad from one of -1.7 by phase alone.
 TILT_GUARD_RAD = 0.3 * math.pi
+NOTHING_TO_FOLLOW = "tracking lost: no accepted full cycle to follow"
 # With this share of its points the full cycle's normal matrix still contracts a hundredfold a step.
 MATRIX_KEPT_SHARE = 0.99
 # the plane z = 0 is crossed this far at most from where a ray meets the film
@@ -132,11 +133,11 @@ class LiveReconstructor:
     def fringes(self, frames: Sequence[phasor.Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
         """One fringes-only cycle of 2 N frames, in the order of `phase.fringe_sequence`; else as `full`.
 
-        Verdict "rejected" with a reason that starts with "tracking lost" asks for a full cycle.
+        An estimate with `tracking_lost` asks for a full cycle.
         """
         times, readings = _per_frame(frames, time_s, displacement_um, 2 * self._slots.steps, "fringes")
         if self._tracked is None:
-            return _rejected("fringes", times, readings, "tracking lost: no accepted full cycle to follow")
+            return _rejected("fringes", times, readings, NOTHING_TO_FOLLOW, tracking_lost=True)
         self._binner.clear()
         self._binner.add(frames, np.r_[self._slots.sinusoids].tolist())
         return self._follow("fringes", self._tracked, times, readings)
@@ -198,7 +199,7 @@ class LiveReconstructor:
         saturated = self._binner.saturated.ravel()[state.index] > 0
         usable = ~saturated & (state.fresh[:, 4].min(axis=0) > phase.FRINGE_SHARE * modulation_adu)
         if reason := _lost(state.fresh[:, 3], usable):
-            return _rejected(kind, times, readings, reason)
+            return _rejected(kind, times, readings, reason, tracking_lost=True)
         fit = self._fit(state, usable, readings)
         area = math.pi * self._optics.mirror.analysis_radius_mm**2
         quality = Quality(
@@ -295,7 +296,9 @@ def _finite_mean(values: FloatArray) -> float:
     return float(finite.mean()) if finite.size else float("nan")
 
 
-def _rejected(kind: Kind, times: FloatArray, readings: FloatArray, reason: str) -> ShapeEstimate:
+def _rejected(
+    kind: Kind, times: FloatArray, readings: FloatArray, reason: str, tracking_lost: bool = False
+) -> ShapeEstimate:
     """A cycle without a figure."""
     nan = float("nan")
     return ShapeEstimate(
@@ -313,4 +316,5 @@ def _rejected(kind: Kind, times: FloatArray, readings: FloatArray, reason: str) 
         saturated_fraction=nan,
         verdict="rejected",
         reason=reason,
+        tracking_lost=tracking_lost,
     )

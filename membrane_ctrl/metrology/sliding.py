@@ -85,8 +85,7 @@ class SlidingWindow(live.LiveReconstructor):
         self._times[step], self._readings[step] = time_s, displacement_um
         self._note_saturation(step)
         if self._tracked is None:
-            reason = "tracking lost: no accepted full cycle to follow"
-            return live._rejected("fringes", self._times, self._readings, reason)
+            return live._rejected("fringes", self._times, self._readings, live.NOTHING_TO_FOLLOW, tracking_lost=True)
         return self._follow("fringes", self._tracked, self._times, self._readings)
 
     def _fill(self, times: FloatArray, readings: FloatArray) -> None:

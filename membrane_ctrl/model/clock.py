@@ -16,18 +16,10 @@ from membrane_ctrl.model.errors import InputError
 
 @dataclass(frozen=True, slots=True)
 class RunClock:
-    """The run's time axis; picklable, so that every process of the run has the same.
+    """The run's time axis; picklable, so that every process of the run has the same."""
 
-    Attributes
-    ----------
-    origin_mono_s : float
-        `time.monotonic()` at the start of the run.
-    origin_utc : datetime
-        UTC at that moment.
-    """
-
-    origin_mono_s: float
-    origin_utc: datetime
+    origin_mono_s: float  # `time.monotonic()` at the start of the run
+    origin_utc: datetime  # UTC at that moment
 
     @classmethod
     def start(cls) -> RunClock:

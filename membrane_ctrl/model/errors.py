@@ -52,3 +52,8 @@ class DeviceError(CommandError):
     """A device, port, folder or disk that cannot be used."""
 
     exit = Exit.DEVICE_FAILED
+
+
+def os_reason(error: OSError) -> str:
+    """What the operating system says, for use within a sentence."""
+    return (error.strerror or str(error)).lower()

@@ -5,20 +5,22 @@ which is a word of Python). Keys with None as default are left out when there is
 """
 
 from dataclasses import MISSING, Field, dataclass, fields
-from typing import Any, ClassVar
+from typing import Any, ClassVar, dataclass_transform
 
 EventLine = dict[str, Any]  # of `events.jsonl`, with or without its times
 
 KINDS: dict[str, type["Event"]] = {}
 
 
+@dataclass_transform(frozen_default=True)
 @dataclass(frozen=True)
 class Event:
-    """What all kinds have in common."""
+    """What all kinds have in common; a class derived from it is a frozen dataclass."""
 
     _kind: ClassVar[str]
 
     def __init_subclass__(cls, kind: str = "") -> None:
+        dataclass(frozen=True)(cls)
         cls._kind = kind
         if kind:
             KINDS[kind] = cls
@@ -42,7 +44,6 @@ def keys(cls: type[Event]) -> tuple[tuple[Field[Any], str], ...]:
 # The controller.
 
 
-@dataclass(frozen=True)
 class StateEntered(Event, kind="state"):
     """The state machine has gone into another state."""
 
@@ -51,14 +52,12 @@ class StateEntered(Event, kind="state"):
     why: str
 
 
-@dataclass(frozen=True)
 class Why(Event, kind="why"):
     """The operator's line has changed for good."""
 
     why: str
 
 
-@dataclass(frozen=True)
 class Fault(Event, kind="fault"):
     """A rule of the safety table has spoken."""
 
@@ -72,21 +71,18 @@ class Fault(Event, kind="fault"):
     remedy: str
 
 
-@dataclass(frozen=True)
 class Cleared(Event, kind="cleared"):
     """What held the flow is over."""
 
     name: str
 
 
-@dataclass(frozen=True)
 class Resumed(Event, kind="resumed"):
     """A latched fault has gone by the resume rule."""
 
     name: str
 
 
-@dataclass(frozen=True)
 class ShapeLoopState(Event, kind="shape"):
     """The outer loop has another state, or another reason for it."""
 
@@ -94,7 +90,6 @@ class ShapeLoopState(Event, kind="shape"):
     reason: str
 
 
-@dataclass(frozen=True)
 class CommandTaken(Event, kind="command"):
     """A tick has taken up a command: it obeys, or says why not."""
 
@@ -108,14 +103,12 @@ class CommandTaken(Event, kind="command"):
     refused: str | None = None
 
 
-@dataclass(frozen=True)
 class GainsReverted(Event, kind="gains_reverted"):
     """Gains on trial have gone back."""
 
     why: str
 
 
-@dataclass(frozen=True)
 class ExperimentEnded(Event, kind="experiment"):
     """An experiment is over."""
 
@@ -125,7 +118,6 @@ class ExperimentEnded(Event, kind="experiment"):
     pump_map: Any = None
 
 
-@dataclass(frozen=True)
 class Plausibility(Event, kind="plausibility"):
     """Another one of laser, gauge and camera lies, or nobody any more."""
 
@@ -133,7 +125,6 @@ class Plausibility(Event, kind="plausibility"):
     seen: str
 
 
-@dataclass(frozen=True)
 class Maintenance(Event, kind="maintenance"):
     """Something wears out, or needs a person some day."""
 
@@ -141,7 +132,6 @@ class Maintenance(Event, kind="maintenance"):
     message: str
 
 
-@dataclass(frozen=True)
 class MaintenanceOver(Event, kind="maintenance_over"):
     """It no longer does."""
 

@@ -1,7 +1,6 @@
 """Events of the processes around the controller, and reading of all kinds."""
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 from membrane_ctrl.model.events import KINDS, Event, EventLine, keys
@@ -9,7 +8,6 @@ from membrane_ctrl.model.events import KINDS, Event, EventLine, keys
 # The control process.
 
 
-@dataclass(frozen=True)
 class Started(Event, kind="start"):
     """The run begins."""
 
@@ -18,7 +16,6 @@ class Started(Event, kind="start"):
     message: str
 
 
-@dataclass(frozen=True)
 class Ended(Event, kind="end"):
     """The run is over; a recorder that is left alone knows only that."""
 
@@ -28,14 +25,12 @@ class Ended(Event, kind="end"):
     missed_ticks: int | None = None
 
 
-@dataclass(frozen=True)
 class NoClaim(Event, kind="no_claim"):
     """The board cannot be claimed for one program."""
 
     message: str
 
 
-@dataclass(frozen=True)
 class Link(Event, kind="link"):
     """The link to the board has failed, or is there again."""
 
@@ -43,28 +38,24 @@ class Link(Event, kind="link"):
     up: bool
 
 
-@dataclass(frozen=True)
 class InputsNotRecorded(Event, kind="inputs_not_recorded"):
     """There will be no replay of some ticks."""
 
     message: str
 
 
-@dataclass(frozen=True)
 class ShapeUnreadable(Event, kind="shape_unreadable"):
     """A message of the acquisition is none."""
 
     message: str
 
 
-@dataclass(frozen=True)
 class LatchFailed(Event, kind="latch_failed"):
     """The latched fault's file could not be written."""
 
     message: str
 
 
-@dataclass(frozen=True)
 class LatchWritten(Event, kind="latch_written"):
     """Now it could."""
 
@@ -72,14 +63,12 @@ class LatchWritten(Event, kind="latch_written"):
 # Child processes.
 
 
-@dataclass(frozen=True)
 class Alive(Event, kind="alive"):
     """A child is at work; only on its pipe."""
 
     for_s: float
 
 
-@dataclass(frozen=True)
 class ChildEnded(Event, kind="child_ended"):
     """A child process has ended."""
 
@@ -87,7 +76,6 @@ class ChildEnded(Event, kind="child_ended"):
     exit_code: int | None
 
 
-@dataclass(frozen=True)
 class ChildSilent(Event, kind="child_silent"):
     """It has not said that it is alive."""
 
@@ -96,7 +84,6 @@ class ChildSilent(Event, kind="child_silent"):
     killed: bool
 
 
-@dataclass(frozen=True)
 class ChildRestarted(Event, kind="child_restarted"):
     """Another one is in its place."""
 
@@ -104,7 +91,6 @@ class ChildRestarted(Event, kind="child_restarted"):
     restarts: int
 
 
-@dataclass(frozen=True)
 class ChildGivenUp(Event, kind="child_given_up"):
     """It has ended too often in an hour."""
 
@@ -115,7 +101,6 @@ class ChildGivenUp(Event, kind="child_given_up"):
 # Acquisition.
 
 
-@dataclass(frozen=True)
 class AcquisitionState(Event, kind="acquisition"):
     """What the acquisition does, in words for a person."""
 
@@ -125,7 +110,6 @@ class AcquisitionState(Event, kind="acquisition"):
     traceback: str | None = None
 
 
-@dataclass(frozen=True)
 class GeometryInForce(Event, kind="geometry"):
     """Which geometry the cycles measure with."""
 
@@ -135,7 +119,6 @@ class GeometryInForce(Event, kind="geometry"):
     message: str
 
 
-@dataclass(frozen=True)
 class Capture(Event, kind="capture"):
     """What became of a set that was asked for: where it is, or why there is none."""
 
@@ -147,7 +130,6 @@ class Capture(Event, kind="capture"):
     failed: str | None = None
 
 
-@dataclass(frozen=True)
 class RawFrames(Event, kind="raw_frames"):
     """Frames around a fault are not kept."""
 
@@ -158,7 +140,6 @@ class RawFrames(Event, kind="raw_frames"):
 # Recorder.
 
 
-@dataclass(frozen=True)
 class RecorderError(Event, kind="recorder_error"):
     """Something is not recorded; `what` has trouble."""
 
@@ -166,7 +147,6 @@ class RecorderError(Event, kind="recorder_error"):
     message: str
 
 
-@dataclass(frozen=True)
 class DiskLow(Event, kind="disk_low"):
     """Soon it will not be."""
 
@@ -174,7 +154,6 @@ class DiskLow(Event, kind="disk_low"):
     message: str
 
 
-@dataclass(frozen=True)
 class RecorderRecovered(Event, kind="recorder_recovered"):
     """`what` works again."""
 
@@ -182,7 +161,6 @@ class RecorderRecovered(Event, kind="recorder_recovered"):
     message: str
 
 
-@dataclass(frozen=True)
 class RunDeleted(Event, kind="run_deleted"):
     """An old run has made room."""
 
@@ -190,7 +168,6 @@ class RunDeleted(Event, kind="run_deleted"):
     message: str
 
 
-@dataclass(frozen=True)
 class RecorderDone(Event, kind="recorder_done"):
     """The recorder's account; comes after the last line of the file."""
 
@@ -210,7 +187,6 @@ class RecorderDone(Event, kind="recorder_done"):
 # Control port and alarms.
 
 
-@dataclass(frozen=True)
 class PortAddresses(Event, kind="port"):
     """Where the control port listens."""
 
@@ -219,7 +195,6 @@ class PortAddresses(Event, kind="port"):
     metrics: str | None = None
 
 
-@dataclass(frozen=True)
 class PortFailed(Event, kind="port_failed"):
     """A listener, or one client of it, is in trouble."""
 
@@ -228,14 +203,12 @@ class PortFailed(Event, kind="port_failed"):
     again_s: float | None = None
 
 
-@dataclass(frozen=True)
 class PortOpen(Event, kind="port_open"):
     """The listener works again."""
 
     port: str
 
 
-@dataclass(frozen=True)
 class Commander(Event, kind="commander"):
     """Who has the command now, and who had it."""
 
@@ -244,7 +217,6 @@ class Commander(Event, kind="commander"):
     why: str
 
 
-@dataclass(frozen=True)
 class Refused(Event, kind="refused"):
     """The port has refused a request, and others that are not recorded."""
 
@@ -255,7 +227,6 @@ class Refused(Event, kind="refused"):
     and_unrecorded: int | None = None
 
 
-@dataclass(frozen=True)
 class AlarmsAcknowledged(Event, kind="alarms_acknowledged"):
     """Somebody has seen all that stands."""
 
@@ -263,7 +234,6 @@ class AlarmsAcknowledged(Event, kind="alarms_acknowledged"):
     why: str
 
 
-@dataclass(frozen=True)
 class AlarmTold(Event, kind="alarm"):
     """People were told of an alarm."""
 
@@ -283,7 +253,6 @@ CONNECTED_AGAIN = "connected again"
 _EMPTY: dict[object, object] = {str: "", int: 0, float: math.nan, bool: False}
 
 
-@dataclass(frozen=True)
 class UnknownEvent(Event):
     """Of a kind that a later version may know, or not as that kind is."""
 

@@ -16,46 +16,20 @@ _LONGEST = 300
 
 @dataclass(frozen=True, slots=True)
 class RunStatus:
-    """The newest tick, and what the events since the start leave standing.
+    """The newest tick, and what the events since the start leave standing."""
 
-    Attributes
-    ----------
-    row : TelemetryRow or None
-        Of the newest tick; None before the first.
-    since_s : float
-        When the run has gone into its state.
-    why : str
-        What the controller has last given as its reason.
-    fault, last_fault : Fault or None
-        That which stands; the newest, and when it came (`last_fault_s`).
-    faults : int
-        So far in the run.
-    shape_reason : str
-        Of the outer loop.
-    acquisition : AcquisitionState or None
-        What the acquisition has last said.
-    geometry : GeometryInForce or None
-        What the cycles measure with.
-    maintenance : mapping of str to str
-        What a person should look at, by name.
-    recording : mapping of str to str
-        What keeps the run from being recorded, by what has trouble; empty when all is recorded. A full disk is the
-        one trouble that `events.jsonl` may not be able to tell of.
-    ended : bool
-        The run has said its last word.
-    """
-
-    row: TelemetryRow | None = None
-    since_s: float = 0.0
-    why: str = ""
-    fault: events.Fault | None = None
-    last_fault: events.Fault | None = None
-    last_fault_s: float = math.nan
-    faults: int = 0
-    shape_reason: str = ""
-    acquisition: run_events.AcquisitionState | None = None
-    geometry: run_events.GeometryInForce | None = None
-    maintenance: Mapping[str, str] = field(default_factory=dict)
+    row: TelemetryRow | None = None  # of the newest tick; None before the first one
+    since_s: float = 0.0  # when the run entered its state
+    why: str = ""  # the controller's last reason
+    fault: events.Fault | None = None  # that stands
+    last_fault: events.Fault | None = None  # the newest
+    last_fault_s: float = math.nan  # when it came
+    faults: int = 0  # so far in the run
+    shape_reason: str = ""  # of the shape loop
+    acquisition: run_events.AcquisitionState | None = None  # the acquisition's last report
+    geometry: run_events.GeometryInForce | None = None  # used by the cycles
+    maintenance: Mapping[str, str] = field(default_factory=dict)  # what a person should look at, by name
+    # trouble of the recording, by what is affected. A full disk may keep `events.jsonl` from reporting itself
     recording: Mapping[str, str] = field(default_factory=dict)
     ended: bool = False
 

@@ -21,69 +21,36 @@ TERMS = 36
 
 @dataclass(frozen=True, slots=True)
 class ShapeEstimate:
-    """Figure of the mirror from one cycle.
+    """Figure of the mirror from one cycle."""
 
-    Attributes
-    ----------
-    time_s : float
-        Middle of the exposures on the run's clock.
-    kind : str
-        "full" (Gray codes taken) or "fringes" (fringe orders carried over from the last absolute phase).
-    coeffs_um : (36,) array
-        Noll j = 1..36, orthonormal over `mirror.radius_mm`, of the height measured from the vertex;
-        piston makes the surface 0 at the vertex.
-    hencky_um : float
-        Amplitude of the part of a Hencky bowl that the 36 terms cannot represent, as the sag of that bowl.
-    covariance_um2 : (36, 36) array
-        Of `coeffs_um`, from pixel noise and the residual of the fit.
-    sag_um : float
-        Height at `mirror.radius_mm`, mean over azimuth, above the vertex.
-    sag_sigma_um : float
-        Its standard deviation from `covariance_um2`.
-    geometry_sag_sigma_um : float
-        Its standard deviation from how well the geometry is known, which all cycles have in common; NaN if that is
-        not stated.
-    displacement_um : float
-        Mean laser reading during the exposures (NaN without a laser).
-    slope_residual_urad : float
-        RMS of measured minus fitted slopes.
-    valid_fraction : float
-        Share of the analysis area that gave a slope.
-    modulation_median_adu, saturated_fraction : float
-        Fringe quality.
-    verdict, reason : str
-        "ok", "degraded" or "rejected", and why.
-    latency_s : float
-        Last frame to this result (filled by the acquisition).
-    cycle : int
-        Number of the cycle in the run (filled by the acquisition).
-    """
-
-    time_s: float
-    kind: Kind
+    time_s: float  # middle of the exposures on the run's clock
+    kind: Kind  # "full" (Gray codes taken) or "fringes" (fringe orders carried over from the last absolute phase)
+    # (36,) Noll j = 1..36, orthonormal over `mirror.radius_mm`, of the height; piston makes it 0 at the vertex
     coeffs_um: FloatArray
+    # amplitude of the part of a Hencky bowl that the 36 terms cannot represent, as the sag of that bowl
     hencky_um: float
-    covariance_um2: FloatArray
-    sag_um: float
-    sag_sigma_um: float
-    displacement_um: float
-    slope_residual_urad: float
-    valid_fraction: float
-    modulation_median_adu: float
+    covariance_um2: FloatArray  # (36, 36) of `coeffs_um`, from pixel noise and the residual of the fit
+    sag_um: float  # height at `mirror.radius_mm`, mean over azimuth, above the vertex
+    sag_sigma_um: float  # its standard deviation from `covariance_um2`
+    displacement_um: float  # mean laser reading during the exposures (NaN without a laser)
+    slope_residual_urad: float  # RMS of measured minus fitted slopes
+    valid_fraction: float  # share of the analysis area that gave a slope
+    modulation_median_adu: float  # fringe quality
     saturated_fraction: float
     verdict: Verdict
     reason: str = ""
-    latency_s: float = float("nan")
-    cycle: int = 0
+    latency_s: float = float("nan")  # last frame to this result (filled by the acquisition)
+    cycle: int = 0  # number of the cycle in the run (filled by the acquisition)
+    # standard deviation of the sag from the geometry's, common to all cycles; NaN if that is not stated
     geometry_sag_sigma_um: float = float("nan")
+    tracking_lost: bool = False  # the phases cannot be followed from the last cycle: a full one is needed
 
 
 _WORDS = {"kind": get_args(Kind), "verdict": get_args(Verdict)}
 _ARRAYS = ("coeffs_um", "covariance_um2")
-_NUMBERS = tuple(
-    field.name for field in fields(ShapeEstimate) if field.name not in {*_WORDS, *_ARRAYS, "reason", "cycle"}
-)
-_KEYS = {*_NUMBERS, *_WORDS, "reason", "cycle", "terms", "symmetric", "single"}
+_OTHERS = {"reason", "cycle", "tracking_lost"}
+_NUMBERS = tuple(field.name for field in fields(ShapeEstimate) if field.name not in {*_WORDS, *_ARRAYS, *_OTHERS})
+_KEYS = {*_NUMBERS, *_WORDS, *_OTHERS, "terms", "symmetric", "single"}
 _UPPER = np.triu_indices(TERMS)
 _LINE_BYTES_MAX = 8192  # the numbers take 0.5 kB; the rest is room for a reason
 _COEFFS_BYTES = 8 * TERMS
@@ -148,6 +115,8 @@ def _checked(head: Any) -> tuple[bool, bool]:
     cycle = head.setdefault("cycle", 0)
     if type(cycle) is not int or not 0 <= cycle < 2**63 or not isinstance(head.setdefault("reason", ""), str):
         raise ValueError("shape estimate: cycle or reason is of a wrong kind")
+    if not isinstance(head.setdefault("tracking_lost", False), bool):
+        raise ValueError("shape estimate: tracking_lost is neither true nor false")
     return layout[1], layout[2]
 
 
@@ -171,27 +140,13 @@ RESIDUAL_DEGRADED_URAD = 200.0
 
 @dataclass(frozen=True)
 class Quality:
-    """Figures of one cycle.
+    """Figures of one cycle."""
 
-    Attributes
-    ----------
-    modulation_share : float
-        Median fringe amplitude over the sensor's full scale.
-    saturated_fraction : float
-        Share of the points with a saturated pixel.
-    valid_fraction : float
-        Share of the analysis area that gave a slope.
-    residual_urad : float
-        RMS of measured minus fitted slopes.
-    converged : bool
-        Whether the fit stood still at its end.
-    """
-
-    modulation_share: float
-    saturated_fraction: float
-    valid_fraction: float
-    residual_urad: float
-    converged: bool
+    modulation_share: float  # median fringe amplitude over the sensor's full scale
+    saturated_fraction: float  # share of the points with a saturated pixel
+    valid_fraction: float  # share of the analysis area that gave a slope
+    residual_urad: float  # RMS of measured minus fitted slopes
+    converged: bool  # whether the fit stood still at its end
 
 
 def judge(quality: Quality) -> tuple[Verdict, str]:

@@ -58,6 +58,11 @@ class TelemetryRow:
         """The row as doubles in field order."""
         return _STRUCT.pack(*_values(self))
 
+    @classmethod
+    def unpack(cls, message: bytes) -> "TelemetryRow":
+        """The row of `pack`. Raises struct.error."""
+        return cls(*_STRUCT.unpack(message))
+
 
 FIELDS: tuple[str, ...] = tuple(field.name for field in fields(TelemetryRow))
 _values = attrgetter(*FIELDS)  # astuple would copy deeply: 15 us a tick

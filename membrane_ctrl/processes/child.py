@@ -90,6 +90,18 @@ class Child:
             self._process.join()
 
 
+def leave_at_stop() -> None:
+    """Within a child: `STOP` ends it, with its context managers, and SIGINT is left to the control process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(STOP, lambda number, frame: sys.exit(0))
+
+
+def parent_lives() -> bool:
+    """Whether the process that started this one is still there; True in a process that nobody here started."""
+    parent = multiprocessing.parent_process()
+    return parent is None or os.getppid() == parent.pid
+
+
 def _main(target: str, args: tuple[Any, ...], nice: int) -> None:
     """Run the target, then leave without taking the interpreter down piece by piece.
 

@@ -30,27 +30,13 @@ _SHARED_MEMORY_FOLDER = Path("/dev/shm")
 
 @dataclass(frozen=True, slots=True)
 class FrameHead:
-    """What is known of a stored frame.
+    """What is known of a stored frame."""
 
-    Attributes
-    ----------
-    index : int
-        Count of the frames stored before it in the run; names the frame to `FrameReader.copy`.
-    pattern : str
-        What the screen showed (`firmware_iface.roles.Pattern.name`).
-    time_s : float
-        Start of exposure on the run's clock.
-    displacement_um : float
-        Laser reading then, as far as it was known when the frame arrived; NaN if not.
-    cycle : int
-        Number of the measurement cycle.
-    """
-
-    index: int
-    pattern: str
-    time_s: float
-    displacement_um: float
-    cycle: int
+    index: int  # count of the frames stored before it in the run; names the frame to `FrameReader.copy`
+    pattern: str  # what the screen showed (`firmware_iface.roles.Pattern.name`)
+    time_s: float  # start of exposure on the run's clock
+    displacement_um: float  # laser reading then, as far as it was known when the frame arrived; NaN if not
+    cycle: int  # number of the measurement cycle
 
 
 class FrameRing:

@@ -4,7 +4,6 @@ Rerun is imported here only after the process has started: the control process m
 that a forked child inherited loses what the child logs.
 """
 
-import multiprocessing
 import os
 import signal
 import time
@@ -22,7 +21,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.run_events import Ended
-from membrane_ctrl.processes.child import STOP, alive, reporter
+from membrane_ctrl.processes.child import STOP, alive, parent_lives, reporter
 from membrane_ctrl.processes.frames import FrameHead, FrameReader, Pixels
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
 
@@ -94,7 +93,7 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
     os.environ["RUST_LOG"] = "off"  # Rerun's own log would write over the console; its errors come as exceptions
     # read when Rerun is imported: its allocator gives back at once what a closed segment leaves, or 30 MB would stay
     os.environ["MIMALLOC_PURGE_DELAY"] = "0"
-    if not _record(spec, reporter(status), asked.is_set, parent_died):
+    if not _record(spec, reporter(status), asked.is_set, lambda: not parent_lives()):
         os._exit(0)  # everything is written; Rerun's exit handler would wait for a dead writer
 
 
@@ -144,12 +143,6 @@ def _record(
 def _end_event(clock: RunClock, exit_word: str) -> EventLine:
     now_s = clock.now()
     return {"time_utc": clock.utc(now_s).isoformat(), "mono_s": now_s} | Ended(exit_word).to_dict()
-
-
-def parent_died() -> bool:
-    """Whether the process that started this one is gone: its children get another parent."""
-    started_by = multiprocessing.parent_process()
-    return started_by is not None and os.getppid() != started_by.pid
 
 
 # Small pictures of the camera's frames, now and then.

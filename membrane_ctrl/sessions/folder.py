@@ -101,22 +101,14 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 @dataclass(frozen=True, slots=True)
 class SessionHead:
-    """`session.json`.
-
-    Attributes
-    ----------
-    format, name, author, source, created_utc : str
-        `source` is the run folder or the twin.
-    before : LoopConfig
-        The last good gains when the session began.
-    """
+    """`session.json`."""
 
     format: str
     name: str
     author: str
-    source: str
+    source: str  # run folder, or the twin
     created_utc: str
-    before: LoopConfig
+    before: LoopConfig  # the last good gains when the session began
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +129,7 @@ class SessionFolder:
         try:
             return files.read_bytes(files.users(path), _BYTES_MAX)
         except OSError as error:
-            raise errors.InputError(f"{path}: {(error.strerror or str(error)).lower()}") from None
+            raise errors.InputError(f"{path}: {errors.os_reason(error)}") from None
 
     def candidates(self) -> str:
         """The table of candidates, Markdown of at least a head, a rule and a row. Raises InputError."""
@@ -180,9 +172,7 @@ def fresh_folder(parent: Path, name: str, now: datetime) -> Path:
         except FileExistsError:
             continue
         except OSError as error:
-            raise errors.DeviceError(
-                f"{parent}: cannot be written ({(error.strerror or str(error)).lower()})"
-            ) from None
+            raise errors.DeviceError(f"{parent}: cannot be written ({errors.os_reason(error)})") from None
         return path
     raise errors.DeviceError(f"{parent}: has a thousand sessions {stem} already")
 
@@ -198,7 +188,7 @@ def create_session(
         write(path / "session.json", head)
         files.write_text_atomic(path / "config.toml", config_file.dump(config))
     except OSError as error:
-        raise errors.DeviceError(f"{logs}: cannot be written ({(error.strerror or str(error)).lower()})") from None
+        raise errors.DeviceError(f"{logs}: cannot be written ({errors.os_reason(error)})") from None
     return SessionFolder(path, head, config)
 
 

@@ -14,7 +14,7 @@ from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model import errors, run_events, shape_estimate
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
+from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.processes.ring import attach
 from membrane_ctrl.run_files import events
 
@@ -62,7 +62,6 @@ class HoldLink(Protocol):
 
 _NEWS_S = 0.2
 _SILENT_S = 5.0  # without a tick a run has ended, or is in worse trouble than a session can help with
-_ROW = struct.Struct(f"<{len(FIELDS)}d")
 
 
 class LiveHold:
@@ -133,7 +132,7 @@ class LiveHold:
     def _read_rings(self) -> News:
         messages = {name: reader.drain() for name, reader in self._readers.items()}
         return News(
-            rows=tuple(TelemetryRow(*_ROW.unpack(message)) for message in messages.get("telemetry", ())),
+            rows=tuple(TelemetryRow.unpack(message) for message in messages.get("telemetry", ())),
             events=tuple(run_events.from_dict(events.parse(message)) for message in messages.get("events", ())),
             shapes=tuple(shape_estimate.unpack_estimate(message) for message in messages.get("shapes", ())),
         )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import multiprocessing
 import os
 import signal
 import sys
@@ -18,7 +17,7 @@ from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config, PumpConfig, TwinConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import DeviceError, Exit
-from membrane_ctrl.processes.child import STOP, Child, pipe, raise_priority
+from membrane_ctrl.processes.child import STOP, Child, parent_lives, pipe, raise_priority
 from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
 from membrane_ctrl.sim.events import Event
 from membrane_ctrl.sim.lab import Lab
@@ -128,18 +127,12 @@ async def _keep_running(bench: LiveBench, spec: BenchSpec, stop: asyncio.Event) 
     while not stop.is_set():
         bench.catch_up()
         now_s = time.monotonic()
-        if orphaned_s is None and _orphaned():
+        if orphaned_s is None and not parent_lives():
             orphaned_s = now_s
         if orphaned_s is not None and now_s - orphaned_s > spec.linger_s:
             return
         deadline_s = max(deadline_s + _PERIOD_S, now_s)  # a missed deadline is not made up: catch_up has done it
         await asyncio.sleep(deadline_s - now_s)
-
-
-def _orphaned() -> bool:
-    """The process that spawned this one is gone (then its number is no longer the parent's)."""
-    parent = multiprocessing.parent_process()
-    return parent is not None and os.getppid() != parent.pid
 
 
 @contextlib.contextmanager
@@ -238,7 +231,6 @@ class TwinProcess:
 
         With `lab` it answers as the instruments that the configuration names, else as the pump board.
         """
-        pass
         from membrane_ctrl.sim.sensors import TRUTH_BYTES
 
         truth = stack.enter_context(ring(_TRUTHS_KEPT, TRUTH_BYTES))
@@ -280,8 +272,6 @@ _STOPS = {signal.SIGINT, signal.SIGTERM}
 
 def serve_twin(config: Config, speed: float) -> int:
     """Serve until SIGINT or SIGTERM; says on stderr where it listens. Raises DeviceError, e.g. for a busy port."""
-    pass
-
     ours, theirs = pipe()
     spec = BenchSpec(config.twin, config.pump, RunClock.start(), config.twin.port, speed=speed, linger_s=0.0)
     child = Child("twin", "membrane_ctrl.sim.bench:serve", (spec, theirs), nice=0)

@@ -119,7 +119,8 @@ class FakeReconstructor:
         if self.singular:
             raise np.linalg.LinAlgError("singular matrix")
         verdict, reason = self.verdicts.pop(0) if self.verdicts else ("ok", "")
-        return estimate(kind, time_s=float(np.mean(time_s)), verdict=verdict, reason=reason)
+        lost = reason.startswith("tracking lost")
+        return estimate(kind, float(np.mean(time_s)), verdict, reason, tracking_lost=lost)
 
 
 def estimate(
@@ -129,6 +130,7 @@ def estimate(
     reason: str = "",
     sag_um: float = 37100.0,
     cycle: int = 0,
+    tracking_lost: bool = False,
 ) -> ShapeEstimate:
     return ShapeEstimate(
         time_s=time_s,
@@ -146,4 +148,5 @@ def estimate(
         verdict=verdict,
         reason=reason,
         cycle=cycle,
+        tracking_lost=tracking_lost,
     )

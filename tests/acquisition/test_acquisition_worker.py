@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -16,6 +15,7 @@ from membrane_ctrl.acquisition.process import Remote
 from membrane_ctrl.acquisition.worker import keep_cycling, next_deadline_s
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.processes import child
 
 
 class ScriptedRemote(Remote):
@@ -173,7 +173,7 @@ def line() -> Iterator[tuple[Connection, Connection]]:
 
 def test_commands_over_a_real_connection(line: tuple[Connection, Connection]) -> None:
     ours, theirs = line
-    remote = Remote(theirs, os.getppid())
+    remote = Remote(theirs)
     for command in ("pause", "full"):
         ours.send(command)
     assert remote.interrupts()
@@ -189,14 +189,14 @@ def test_commands_over_a_real_connection(line: tuple[Connection, Connection]) ->
 def test_unknown_command_is_answered(line: tuple[Connection, Connection]) -> None:
     ours, theirs = line
     ours.send("dance")
-    Remote(theirs, os.getppid()).listen()
+    Remote(theirs).listen()
     assert ours.recv()["kind"] == "alive"
     assert "unknown command 'dance'" in ours.recv()["message"]
 
 
 def test_it_promises_its_next_word_sooner_once_it_is_prepared(line: tuple[Connection, Connection]) -> None:
     ours, theirs = line
-    remote = Remote(theirs, os.getppid())
+    remote = Remote(theirs)
     for _ in range(5):
         remote.listen()
     remote.prepared()
@@ -206,17 +206,21 @@ def test_it_promises_its_next_word_sooner_once_it_is_prepared(line: tuple[Connec
     assert words[0]["for_s"] > 10 * words[1]["for_s"]
 
 
-def test_closed_line_and_dead_parent_stop_the_process(line: tuple[Connection, Connection]) -> None:
+def test_closed_line_and_dead_parent_stop_the_process(
+    line: tuple[Connection, Connection], monkeypatch: pytest.MonkeyPatch
+) -> None:
     ours, theirs = line
-    orphan = Remote(theirs, parent_pid=-1)
-    assert orphan.interrupts()
+    with monkeypatch.context() as orphaned:
+        orphaned.setattr(child, "parent_lives", lambda: False)
+        assert Remote(theirs).interrupts()
+    assert not Remote(theirs).interrupts()
     ours.close()
-    assert Remote(theirs, os.getppid()).interrupts()
+    assert Remote(theirs).interrupts()
 
 
 def test_reports_never_wait_for_a_reader(line: tuple[Connection, Connection]) -> None:
     ours, theirs = line
-    remote = Remote(theirs, os.getppid())
+    remote = Remote(theirs)
     for number in range(3000):  # far more than the line holds
         remote.report("running", f"{number:0200}", cycle=1)
     assert not remote.stop
@@ -225,7 +229,7 @@ def test_reports_never_wait_for_a_reader(line: tuple[Connection, Connection]) ->
 
 def test_the_same_report_is_sent_once(line: tuple[Connection, Connection]) -> None:
     ours, theirs = line
-    remote = Remote(theirs, os.getppid())
+    remote = Remote(theirs)
     for cycle in (1, 2, 3):
         remote.report("running", "ok", cycle=cycle)
     remote.report("running", "rejected: dark", cycle=4)

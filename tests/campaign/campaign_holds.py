@@ -29,7 +29,7 @@ from firmware_iface.roles import (
 )
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import TickOutputs
-from membrane_ctrl.hold.latched_fault import FaultLatch
+from membrane_ctrl.hold.listeners import FaultLatch
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.events import CommandTaken, Event
 from membrane_ctrl.model.states import State

@@ -13,7 +13,7 @@ from membrane_ctrl.cli.ctl import ctl_app
 from membrane_ctrl.control_port import ctl as port_ctl
 from membrane_ctrl.control_port import protocol
 from membrane_ctrl.control_port.ctl import Where, socket_path, status_lines
-from membrane_ctrl.control_port.status import status_table
+from membrane_ctrl.control_port.server import status_table
 from membrane_ctrl.model.events import MaintenanceOver
 from membrane_ctrl.model.run_events import GeometryInForce, from_dict
 from membrane_ctrl.model.run_status import RunStatus

@@ -10,7 +10,7 @@ from pathlib import Path
 from port_run import ROW, port_run
 
 from membrane_ctrl.config.port import PortConfig
-from membrane_ctrl.control_port.status import metrics_text
+from membrane_ctrl.control_port.server import metrics_text
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import FIELDS
 

@@ -8,11 +8,12 @@ import pytest
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.pump_obeys import ActuatorTest
-from membrane_ctrl.hold.virtual_run import VirtualRun, run_virtual
+from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
+from tests.support.virtual_record import run_virtual
 
 
 @pytest.mark.parametrize("rate_hz", [5.0, 10.0, 20.0, 50.0])

@@ -13,13 +13,14 @@ import pytest
 from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.config.schema import Config, LimitsConfig, LoopConfig, StatesConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick, run_virtual
+from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import EventLine, Why
 from membrane_ctrl.model.states import Rung, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
+from tests.support.virtual_record import run_virtual
 
 CALM = Config(twin=TwinConfig(scenario="calm", laser_noise_um=0.3))
 Alter = Callable[[float, BenchReading], BenchReading | None]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from membrane_ctrl.controller import faults_page
 from membrane_ctrl.controller.safety import TABLE
+from tests.support import faults_page
 
 
 def test_the_committed_pages_are_fresh(capsys: pytest.CaptureFixture[str]) -> None:

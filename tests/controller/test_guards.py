@@ -32,10 +32,9 @@ from membrane_ctrl.control_port.tls import Listeners
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.hold.child_processes import ChildProcesses, rings_for
-from membrane_ctrl.hold.latched_fault import FaultLatch
+from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
 from membrane_ctrl.hold.start import BoardAtStart, HoldOptions, _run
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
-from membrane_ctrl.hold.systemd import SystemdNotify
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Event, EventLine

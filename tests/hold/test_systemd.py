@@ -16,7 +16,7 @@ import pytest
 
 from firmware_iface.roles import BenchCommand
 from membrane_ctrl.controller.tick import TickOutputs
-from membrane_ctrl.hold.systemd import SystemdNotify
+from membrane_ctrl.hold.listeners import SystemdNotify
 from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.model.states import State
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow

@@ -28,7 +28,7 @@ from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.model.telemetry import COLUMN, ROW_BYTES, unpack
 from membrane_ctrl.processes.child import STOP, reporter
 from membrane_ctrl.processes.ring import RingWriter, ring
-from membrane_ctrl.recorder.process import RecorderSpec, parent_died, recorder_main
+from membrane_ctrl.recorder.process import RecorderSpec, recorder_main
 from membrane_ctrl.run_files.run_folder import create_run_folder
 from membrane_ctrl.run_files.streams import STREAMS
 from tests.support.rrd_reading import has_footer, scalars, strings
@@ -281,10 +281,6 @@ def test_a_report_nobody_takes_does_not_block() -> None:
     ours.close()
     report(RecorderError("x", "nobody is there"))
     theirs.close()
-
-
-def test_the_main_process_is_nobodys_orphan() -> None:
-    assert not parent_died()
 
 
 def test_the_specification_does_not_load_rerun() -> None:

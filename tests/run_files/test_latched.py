@@ -12,7 +12,7 @@ import pytest
 from firmware_iface.roles import BenchCommand
 from membrane_ctrl.controller.commands import AT_START
 from membrane_ctrl.controller.tick import TickOutputs
-from membrane_ctrl.hold.latched_fault import FaultLatch
+from membrane_ctrl.hold.listeners import FaultLatch
 from membrane_ctrl.model.events import CommandTaken, Event, Fault, Resumed, StateEntered
 from membrane_ctrl.model.run_events import LatchFailed, LatchWritten
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow

@@ -165,7 +165,6 @@ _OWN = {
     "review/viewer/screenshot.py", "review/export.py", "calibration/session.py", "calibration/camera.py",
     "calibration/sets.py", "geometry/spread_file.py",
     # the project's own pages
-    "controller/faults_page.py",
     # shared memory
     "processes/frames.py", "processes/ring.py",
     # into memory, and from there by `model.files`

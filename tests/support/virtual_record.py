@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +12,56 @@ from firmware_iface.roles import BenchReading
 from membrane_ctrl import __version__
 from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import Config, TwinConfig
+from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import remember
 from membrane_ctrl.controller.tick import TickAssembler, TickInputs, TickOutputs, pack_tick
-from membrane_ctrl.hold.virtual_run import Alter, run_virtual
+from membrane_ctrl.hold.virtual_run import Alter, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.run_files.inputs_file import InputsFile
 from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.truth_shape import ShapeSource
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.synthetic_shape import shape_at
 
 CONFIG = Config(twin=TwinConfig(laser_noise_um=0.5))
+
+
+def run_virtual(
+    config: Config,
+    plant: Plant,
+    duration_s: float,
+    sag_sensitivity: FloatArray,
+    shape: ShapeSource | None = None,
+    alter: Alter | None = None,
+) -> Iterator[VirtualTick]:
+    """Hold the twin for `duration_s` of its time, as fast as it goes.
+
+    Parameters
+    ----------
+    config, sag_sensitivity, shape, alter
+        See `VirtualRun`.
+    plant : Plant
+        The twin's physics.
+    duration_s : float
+        When the hold is asked to stop.
+
+    Yields
+    ------
+    VirtualTick
+        Until the controller says that the run is over.
+    """
+    run = VirtualRun(config, VirtualBench(plant), sag_sensitivity, shape, alter)
+    commands: tuple[Command, ...] = (Command("hold", "virtual run"),)
+    stop_at_s = duration_s
+    while run.finished is None:
+        if run.now_s + 1.0 / config.loop.rate_hz >= stop_at_s:
+            commands, stop_at_s = (*commands, Command("stop", "duration")), float("inf")
+        tick = run.tick(commands)
+        commands = ()
+        if tick is not None:
+            yield tick
 
 
 def kept_ticks(duration_s: float, alter: Alter | None = None) -> list[tuple[TickInputs, TickOutputs]]:
