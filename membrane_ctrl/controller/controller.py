@@ -6,24 +6,19 @@ handler runs, and what it wants is overruled wherever a safe level is in force. 
 
 import math
 from collections.abc import Collection
+from dataclasses import replace
 
-from firmware_iface.roles import ALL_FAULTS, BenchCommand, BenchReading
+from firmware_iface.roles import ALL_FAULTS, BenchCommand
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control import inner_loop, shape_loop
 from membrane_ctrl.control.experiments.machine import Finished
 from membrane_ctrl.control.experiments.trial import Trial
-from membrane_ctrl.controller import (
-    commands,
-    pump_obeys,
-    safe_levels,
-    safety,
-    safety_rules,
-    sensor_consistency,
-    states,
-)
+from membrane_ctrl.controller import commands, pump_obeys, safe_levels, safety, safety_rules, sensor_consistency
 from membrane_ctrl.controller.observer import Observer
+from membrane_ctrl.controller.scene import Scene, telemetry_row
+from membrane_ctrl.controller.states import run_state
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
-from membrane_ctrl.model import errors, telemetry
+from membrane_ctrl.model import errors
 from membrane_ctrl.model import events as told
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.events import Event
@@ -38,21 +33,6 @@ _WHY_STANDS_S = 1.0
 # who asked for one of these is named in the line that says why
 _MOVES = frozenset({"hold", "stop", "pause", "manual", "tune", "ack", "lower", "vent"})
 _NO_DIGITS = str.maketrans("", "", "0123456789")
-# for the record of a tick without an answer; its whole numbers, which have no NaN, are not used
-_NO_READING = BenchReading(
-    displacement_um=math.nan,
-    displacement_quality=0,
-    gauge_pressure_pa=math.nan,
-    ambient_pressure_pa=math.nan,
-    air_temperature_c=math.nan,
-    gas_temperature_c=math.nan,
-    pump_fraction=math.nan,
-    vent_fraction=math.nan,
-    sample_counter=0,
-    device_time_s=math.nan,
-    watchdog_tripped=False,
-    latched_faults=0,
-)
 
 
 class Controller:
@@ -73,7 +53,7 @@ class Controller:
         observer = Observer(config.limits)
         loop = inner_loop.InnerLoop(config.loop, config.pump)
         levels, standstill = safe_levels.SafeLevels(config.states), pump_obeys.Standstill(config.loop, config.states)
-        self._scene = states.Scene(config, config.loop, loop, observer, levels, standstill, config.loop.setpoint_um)
+        self._scene = Scene(config, config.loop, loop, observer, levels, standstill, config.loop.setpoint_um)
         self._resume = safe_levels.ResumeRule(config.resume, config.limits)
         self._gains = commands.GainsTrial(config.loop)
         self._consistency = sensor_consistency.SensorConsistency(config)
@@ -116,13 +96,12 @@ class Controller:
         events += consistency.ask(inputs, self.state, scene.dt_s, held)
         stand = scene.standstill
         stand.look(inputs.now_s, inputs.reading, scene.observer.commanded, inputs.link_up)
-        observation = scene.observer.observe(
-            inputs,
-            error_um,
-            self._tick_error,
-            scene.overdue,
-            scene.unfit,
-            consistency.laser_lies,
+        observation = replace(
+            scene.observer.observe(inputs, error_um),
+            tick_error=self._tick_error,
+            overdue=scene.overdue,
+            unfit=scene.unfit,
+            laser_lies=consistency.laser_lies,
             runs_on=stand.runs_on,
             inflow=stand.inflow,
             locked=scene.latched,
@@ -140,9 +119,10 @@ class Controller:
         scene.observer.wrote(command)
         scene.last_pump_fraction = scene.pump_fraction
         self._tell_why(events)
+        fault = self.fault.code if self.fault else 0
         return TickOutputs(
             command=command,
-            row=self._row(inputs, observation, shape),
+            row=telemetry_row(scene, self.state, fault, self._ticks, inputs, observation, shape),
             events=tuple(events),
             finished=scene.finished,
             answers=tuple(self._answers),
@@ -279,7 +259,7 @@ class Controller:
             return
         if self.fault is None or (rule.rung > Rung.HOLD_FLOW >= levels.rung):
             self.fault = rule
-            events.append(_fault_event(rule, verdict.seen))
+            events.append(rule.fault(verdict.seen))
         levels.enter(rule.rung, scene.now_s)
         if levels.step(scene.now_s) > Rung.HOLD_FLOW and self.state != State.FAULT:
             self._go(State.FAULT, f"{self.fault.name}: {self.fault.cause}", events)
@@ -307,7 +287,7 @@ class Controller:
         scene = self._scene
         scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, 0.0
         try:
-            wanted = states.HANDLERS[self.state](scene)
+            wanted = run_state(self.state, scene)
         except Exception as error:
             self._tick_error = f"{type(error).__name__}: {error}"
             # a mirror that is being vented is not shut up by an error
@@ -364,59 +344,3 @@ class Controller:
         if words != self._said_why and scene.now_s - self._why_since_s >= _WHY_STANDS_S:
             self._said_why = words
             events.append(told.Why(scene.why))
-
-    def _row(
-        self, inputs: TickInputs, observation: safety_rules.Observation, shape: shape_loop.ShapeOutput
-    ) -> telemetry.TelemetryRow:
-        scene, reading = self._scene, inputs.reading or _NO_READING
-        out = scene.output or inner_loop.NO_OUTPUT
-        return telemetry.TelemetryRow(
-            mono_s=inputs.now_s,
-            tick=self._ticks,
-            dt_s=scene.dt_s,
-            lateness_ms=inputs.lateness_ms,
-            missed_ticks=inputs.missed_ticks,
-            state=self.state,
-            shape_state=shape.state,
-            rung=scene.levels.rung,
-            fault=self.fault.code if self.fault else 0,
-            target_um=scene.setpoint_um,
-            setpoint_um=out.setpoint_um,
-            displacement_um=observation.displacement_um,
-            filtered_um=out.filtered_um,
-            error_um=out.error_um,
-            p_um_per_s=out.p_um_per_s,
-            i_um_per_s=out.i_um_per_s,
-            d_um_per_s=out.d_um_per_s,
-            feedforward_um_per_s=out.feedforward_um_per_s,
-            flow_wanted_um_per_s=out.flow_wanted_um_per_s,
-            flow_um_per_s=out.flow_um_per_s,
-            pump_fraction=scene.pump_fraction,
-            vent_fraction=scene.vent_fraction,
-            pump_readback_fraction=reading.pump_fraction,
-            vent_readback_fraction=reading.vent_fraction,
-            gauge_pressure_pa=observation.gauge_pressure_pa,
-            ambient_pressure_pa=reading.ambient_pressure_pa,
-            air_temperature_c=reading.air_temperature_c,
-            gas_temperature_c=reading.gas_temperature_c,
-            displacement_quality=reading.displacement_quality if inputs.reading else math.nan,
-            sample_counter=reading.sample_counter if inputs.reading else math.nan,
-            device_time_s=reading.device_time_s,
-            leak_um_per_s=out.leak_um_per_s,
-            trim_um=shape.trim_um,
-            truth_displacement_um=inputs.truth_displacement_um,
-            truth_laser_bias_um=inputs.truth_laser_bias_um,
-        )
-
-
-def _fault_event(rule: safety_rules.Rule, seen: str) -> told.Fault:
-    return told.Fault(
-        code=rule.code,
-        name=rule.name,
-        cause=rule.cause,
-        seen=seen,
-        limit=rule.limit,
-        rung=rule.rung.name.lower(),
-        latching=rule.latching,
-        remedy=rule.remedy,
-    )

@@ -91,21 +91,8 @@ class Observer:
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
         self.gauge_pressure_pa = math.nan if self._gauge_jumps.refuse(gauge_pa) else gauge_pa
 
-    def observe(
-        self,
-        inputs: tick.TickInputs,
-        error_um: float,
-        tick_error: str,
-        overdue: str,
-        unfit: str,
-        laser_lies: str,
-        runs_on: str = "",
-        inflow: str = "",
-        locked: str = "",
-        laser_gauge_apart: str = "",
-        gas_excess: str = "",
-    ) -> safety_rules.Observation:
-        """One tick's observation, after `look`."""
+    def observe(self, inputs: tick.TickInputs, error_um: float) -> safety_rules.Observation:
+        """What the tick's inputs show, after `look`; what the control code knows itself is left empty."""
         reading, now_s = self.reading, inputs.now_s
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
         return safety_rules.Observation(
@@ -126,16 +113,7 @@ class Observer:
             foreign=reading.foreign if reading else 0,
             lateness_ms=inputs.lateness_ms,
             dead_tasks=inputs.dead_tasks,
-            tick_error=tick_error,
-            overdue=overdue,
-            unfit=unfit,
-            laser_lies=laser_lies,
-            runs_on=runs_on,
-            inflow=inflow,
-            locked=locked,
             vent_fraction=reading.vent_fraction if reading else math.nan,
-            laser_gauge_apart=laser_gauge_apart,
-            gas_excess=gas_excess,
         )
 
     def _gate(self, reading: BenchReading | None, fresh: bool) -> float:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 from membrane_ctrl.config.schema import LimitsConfig
+from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.states import Rung, State
 
 MOVING = frozenset({State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
@@ -85,3 +86,16 @@ class Rule:
     def latching(self) -> bool:
         """Whether the fault stays until somebody acknowledges it."""
         return self.rung > Rung.HOLD_FLOW
+
+    def fault(self, seen: str) -> Fault:
+        """The event of a rule that has tripped, with the observed value in words."""
+        return Fault(
+            code=self.code,
+            name=self.name,
+            cause=self.cause,
+            seen=seen,
+            limit=self.limit,
+            rung=self.rung.name.lower(),
+            latching=self.latching,
+            remedy=self.remedy,
+        )

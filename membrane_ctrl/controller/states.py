@@ -6,15 +6,11 @@ They decide only what is wanted when all is well. Safety is judged around them o
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Literal
 
-from membrane_ctrl.config.schema import Config, LoopConfig
-from membrane_ctrl.control import filters, inner_loop
+from membrane_ctrl.control import inner_loop
 from membrane_ctrl.control.experiments.machine import BenchSample, Finished
-from membrane_ctrl.control.experiments.trial import Trial
-from membrane_ctrl.controller import pump_obeys, safe_levels
-from membrane_ctrl.controller.observer import Observer
+from membrane_ctrl.controller import pump_obeys
+from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.states import Rung, State
 
@@ -26,69 +22,8 @@ _VENTED_S = 900.0  # twice what the twin's valve takes from 600 Pa; longer means
 _STOP_GIVES_UP_S = 10.0
 
 
-@dataclass(slots=True)
-class Scene:
-    """What the handlers share: the loop, this tick's facts, and what they decide."""
-
-    config: Config
-    loop_config: LoopConfig  # as it is now, after `gains`
-    loop: inner_loop.InnerLoop
-    observer: Observer
-    levels: safe_levels.SafeLevels
-    standstill: pump_obeys.Standstill
-    setpoint_um: float
-    # this tick
-    now_s: float = 0.0
-    dt_s: float = 0.02
-    state_age_s: float = 0.0  # 0 exactly in the first tick of a state
-    trim_um: float = 0.0
-    # what was asked for
-    hold_wanted: bool = False
-    manual_wanted: bool = False
-    manual_um_per_s: float = 0.0
-    manual_since_s: float = math.nan  # the last `manual` command
-    mean_flow_um_per_s: float = 0.0  # the pump's when a person took it
-    paused: bool = False
-    trial: Trial | None = None  # an experiment, until its end has been told
-    way_down: Literal["stop", "lower"] | None = None
-    venting: bool = False  # on the way down, and after a `stop` as well
-    asked_by: str = ""
-    stop_exit: Exit = Exit.DONE
-    acknowledged: bool = False
-    latched: str = ""  # a fault of an earlier run: no hold before a person has acknowledged it
-    may_resume: bool = False  # the resume rule lets a latched fault go
-    resume_possible: bool = False  # it may yet
-    # memory of the states
-    good_since_s: float = math.nan
-    last_good_s: float = math.nan  # in `check`
-    sinking: filters.Slope = field(default_factory=filters.Slope)  # of the mirror with the pump off, seen in `check`
-    test: pump_obeys.ActuatorTest | None = None
-    ramp_from_fraction: float = 0.0
-    last_pump_fraction: float = 0.0
-    # decisions of this tick
-    output: inner_loop.LoopOutput | None = None
-    pump_fraction: float = 0.0
-    vent_fraction: float = 0.0
-    why: str = ""
-    overdue: str = ""
-    unfit: str = ""
-    finished: Exit | None = None
-    trial_ended: Finished | None = None
-
-    def stay_good(self, good: bool) -> float:
-        """How long `good` has been true without a break, in seconds."""
-        if not good:
-            self.good_since_s = math.nan
-            return 0.0
-        if math.isnan(self.good_since_s):
-            self.good_since_s = self.now_s
-        return self.now_s - self.good_since_s
-
-
 def standby(scene: Scene) -> State:
     """Pump off until someone wants the mirror held."""
-    if scene.way_down is not None:
-        return _go_down(scene)
     if scene.hold_wanted:
         scene.why = "asked to hold the mirror"
         return State.CHECK
@@ -98,8 +33,6 @@ def standby(scene: Scene) -> State:
 
 def check(scene: Scene) -> State:
     """Every sensor must have been good for a while, and the film must answer, before the pump may run for good."""
-    if scene.way_down is not None:
-        return _go_down(scene)
     missing = _missing(scene)
     if not missing:
         scene.last_good_s = scene.now_s
@@ -160,9 +93,7 @@ def hold(scene: Scene) -> State:
     if (elsewhere := _asked_elsewhere(scene)) is not None:
         return elsewhere
     if scene.paused:
-        scene.output = scene.loop.stale(scene.dt_s)
-        scene.pump_fraction = scene.output.pump_fraction
-        scene.vent_fraction = scene.loop_config.bleed_fraction
+        scene.give(scene.loop.stale(scene.dt_s))
         scene.why = f"paused by {scene.asked_by}: the pump gives its mean flow"
         if scene.stay_good(True) > scene.config.states.pause_max_s or _strayed(scene):
             scene.paused = False
@@ -174,21 +105,16 @@ def hold(scene: Scene) -> State:
 
 def manual(scene: Scene) -> State:
     """The flow that a person has asked for; the loop follows, so that `hold` takes over without a bump."""
-    if scene.way_down is not None:
-        return _go_down(scene)
     if scene.hold_wanted:
         scene.why = f"{scene.asked_by} asked to hold the mirror again"
         _keep_flowing(scene)
         return State.INFLATE
-    if over := _manual_over(scene):
-        scene.output = scene.loop.follow(_given(scene, scene.setpoint_um), scene.mean_flow_um_per_s, scene.dt_s)
-        scene.pump_fraction = scene.output.pump_fraction
-        scene.vent_fraction = scene.loop_config.bleed_fraction
+    over = _manual_over(scene)
+    flow_um_per_s = scene.mean_flow_um_per_s if over else scene.manual_um_per_s
+    scene.give(scene.loop.follow(_given(scene, scene.setpoint_um), flow_um_per_s, scene.dt_s))
+    if over:
         scene.why = f"manual is over: {over}"
         return State.INFLATE
-    output = scene.output = scene.loop.follow(_given(scene, scene.setpoint_um), scene.manual_um_per_s, scene.dt_s)
-    scene.pump_fraction = output.pump_fraction
-    scene.vent_fraction = scene.loop_config.bleed_fraction
     scene.why = f"manual: {scene.asked_by} has set the flow to {scene.manual_um_per_s:.2f} um/s"
     return State.MANUAL
 
@@ -197,8 +123,6 @@ def tune(scene: Scene) -> State:
     """An experiment, inside its guard; whatever ends it, the loop takes the mirror back at the holding flow."""
     trial = scene.trial
     assert trial is not None  # the command that leads here has made it
-    if scene.way_down is not None:
-        return _go_down(scene)
     given = _given(scene, scene.setpoint_um)
     measurement = BenchSample(given.displacement_um, given.ambient_pressure_pa, given.air_temperature_c)
     wanted: float | Finished
@@ -208,18 +132,12 @@ def tune(scene: Scene) -> State:
         wanted = Finished(False, "the safety table holds the mean flow")
     else:
         wanted = trial.step(measurement, scene.dt_s)
-    scene.vent_fraction = scene.loop_config.bleed_fraction
     if isinstance(wanted, Finished):
-        scene.output = scene.loop.follow(given, trial.spec.holding_flow_um_per_s, scene.dt_s)
+        scene.give(scene.loop.follow(given, trial.spec.holding_flow_um_per_s, scene.dt_s))
         scene.trial_ended = wanted
         scene.why = f"{trial.spec.kind} {'done' if wanted.completed else 'stopped'}: {wanted.reason}"
-    elif trial.raw:
-        scene.output = scene.loop.follow_raw(given, wanted, scene.dt_s)
-    else:
-        scene.output = scene.loop.follow(given, wanted, scene.dt_s)
-    scene.pump_fraction = scene.output.pump_fraction
-    if scene.trial_ended is not None:
         return State.HOLD
+    scene.give((scene.loop.follow_raw if trial.raw else scene.loop.follow)(given, wanted, scene.dt_s))
     scene.why = f"tuning: {trial.spec.kind} asked for by {scene.asked_by}"
     return State.TUNE
 
@@ -306,9 +224,12 @@ HANDLERS: dict[State, Callable[[Scene], State]] = {
 }
 
 
-def _go_down(scene: Scene) -> State:
-    scene.why = f"{_way(scene)} asked for by {scene.asked_by}"
-    return State.LOWER
+def run_state(state: State, scene: Scene) -> State:
+    """Run the state's handler and return the next state; whoever asked for the way down comes first."""
+    if scene.way_down is not None and state not in (State.LOWER, State.FAULT):
+        scene.why = f"{_way(scene)} asked for by {scene.asked_by}"
+        return State.LOWER
+    return HANDLERS[state](scene)
 
 
 def _way(scene: Scene) -> str:
@@ -340,9 +261,7 @@ def _keep_flowing(scene: Scene) -> None:
 
 
 def _asked_elsewhere(scene: Scene) -> State | None:
-    """The state that somebody has asked for, if it is another one than a hold."""
-    if scene.way_down is not None:
-        return _go_down(scene)
+    """The state that somebody has asked for, if it is not a hold."""
     if scene.trial is not None:
         _drive(scene, scene.setpoint_um)  # the loop has this tick: without it the pump would be off for 20 ms
         scene.why = f"{scene.asked_by} asked for the experiment {scene.trial.spec.kind}"
@@ -394,9 +313,7 @@ def _drive(scene: Scene, target_um: float) -> inner_loop.LoopOutput:
         output = scene.loop.step(_given(scene, target_um), scene.dt_s)
     else:
         output = scene.loop.stale(scene.dt_s)
-    scene.output = output
-    scene.pump_fraction = output.pump_fraction
-    scene.vent_fraction = scene.loop_config.bleed_fraction
+    scene.give(output)
     return output
 
 

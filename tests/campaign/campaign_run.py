@@ -35,6 +35,7 @@ from membrane_ctrl.config.schema import Config, LimitsConfig, LoopConfig, Resume
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.controller import states
 from membrane_ctrl.controller.commands import Command, Kind
+from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.states import Rung, State
@@ -251,7 +252,7 @@ def _raising(case: Case, injection: Injection) -> Iterator[None]:
     before = dict(states.HANDLERS)
 
     def breaking(state: State) -> None:
-        def handler(scene: states.Scene) -> State:
+        def handler(scene: Scene) -> State:
             if not math.isnan(injection.started_s) and state != State.FAULT:
                 raise ZeroDivisionError("injected")
             return before[state](scene)

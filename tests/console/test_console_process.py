@@ -22,6 +22,7 @@ from membrane_ctrl.console.process import ConsoleSpec, console_main, give_back_t
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.model.telemetry import ROW_BYTES
+from membrane_ctrl.processes import child
 from membrane_ctrl.processes.child import STOP
 from membrane_ctrl.processes.ring import RingWriter, ring
 
@@ -135,10 +136,10 @@ def test_plain_lines_and_faults_when_nobody_looks(
 
 def test_dead_parent_ends_it(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(signal, "signal", lambda number, handler: None)
-    parents = iter([1000, 1000, 1])
-    monkeypatch.setattr(os, "getppid", lambda: next(parents))
+    lives = iter([True, False])
+    monkeypatch.setattr(child, "parent_lives", lambda: next(lives))
     console_main(run.spec)
-    assert list(parents) == []
+    assert list(lives) == []
 
 
 def test_reader_that_went_away_is_no_error_and_none_for_who_watches_the_console(

@@ -18,7 +18,7 @@ def look(observer: Observer, tick: int, displacement_um: float, counter: int, de
     )
     inputs = TickInputs(now_s=0.02 * tick, dt_s=0.02, reading=reading, link_up=True)
     observer.look(inputs)
-    return observer.observe(inputs, math.nan, "", "", "", "")
+    return observer.observe(inputs, math.nan)
 
 
 def test_a_sample_is_new_only_when_counter_and_time_have_both_advanced() -> None:
@@ -39,7 +39,7 @@ def gauge(observer: Observer, tick: int, gauge_pa: float) -> Observation:
     reading = BenchReading(0.1 * (tick % 2), 0, gauge_pa, 101325.0, 23.0, 23.0, 0.0, 0.0, tick, 0.1 * tick, False, 0)
     inputs = TickInputs(now_s=0.1 * tick, dt_s=0.1, reading=reading, link_up=True)
     observer.look(inputs)
-    return observer.observe(inputs, math.nan, "", "", "", "")
+    return observer.observe(inputs, math.nan)
 
 
 def test_a_gauge_that_repeats_itself_is_timed_and_any_change_ends_it() -> None:
@@ -79,4 +79,4 @@ def test_a_read_back_that_is_no_number_does_not_follow_its_command() -> None:
     for tick, (pump, mismatch) in enumerate(((0.0, 0.0), (0.3, 0.3), (math.nan, math.inf)), 1):
         inputs = TickInputs(0.02 * tick, 0.02, replace(reading, pump_fraction=pump))
         observer.look(inputs)
-        assert observer.observe(inputs, math.nan, "", "", "", "").pump_mismatch == mismatch
+        assert observer.observe(inputs, math.nan).pump_mismatch == mismatch

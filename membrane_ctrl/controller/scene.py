@@ -1,0 +1,147 @@
+"""What the states' handlers share, and the telemetry row that a tick leaves of it."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+from firmware_iface.roles import BenchReading
+from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.control import filters, inner_loop, shape_loop
+from membrane_ctrl.control.experiments.machine import Finished
+from membrane_ctrl.control.experiments.trial import Trial
+from membrane_ctrl.controller import pump_obeys, safe_levels, safety_rules, tick
+from membrane_ctrl.controller.observer import Observer
+from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import TelemetryRow
+
+# for the record of a tick without an answer; its whole numbers, which have no NaN, are not used
+_NO_READING = BenchReading(
+    displacement_um=math.nan,
+    displacement_quality=0,
+    gauge_pressure_pa=math.nan,
+    ambient_pressure_pa=math.nan,
+    air_temperature_c=math.nan,
+    gas_temperature_c=math.nan,
+    pump_fraction=math.nan,
+    vent_fraction=math.nan,
+    sample_counter=0,
+    device_time_s=math.nan,
+    watchdog_tripped=False,
+    latched_faults=0,
+)
+
+
+@dataclass(slots=True)
+class Scene:
+    """What the handlers share: the loop, this tick's facts, and what they decide."""
+
+    config: Config
+    loop_config: LoopConfig  # as it is now, after `gains`
+    loop: inner_loop.InnerLoop
+    observer: Observer
+    levels: safe_levels.SafeLevels
+    standstill: pump_obeys.Standstill
+    setpoint_um: float
+    # this tick
+    now_s: float = 0.0
+    dt_s: float = 0.02
+    state_age_s: float = 0.0  # 0 exactly in the first tick of a state
+    trim_um: float = 0.0
+    # what was asked for
+    hold_wanted: bool = False
+    manual_wanted: bool = False
+    manual_um_per_s: float = 0.0
+    manual_since_s: float = math.nan  # the last `manual` command
+    mean_flow_um_per_s: float = 0.0  # the pump's when a person took it
+    paused: bool = False
+    trial: Trial | None = None  # an experiment, until its end has been told
+    way_down: Literal["stop", "lower"] | None = None
+    venting: bool = False  # on the way down, and after a `stop` as well
+    asked_by: str = ""
+    stop_exit: Exit = Exit.DONE
+    acknowledged: bool = False
+    latched: str = ""  # a fault of an earlier run: no hold before a person has acknowledged it
+    may_resume: bool = False  # the resume rule lets a latched fault go
+    resume_possible: bool = False  # it may yet
+    # memory of the states
+    good_since_s: float = math.nan
+    last_good_s: float = math.nan  # in `check`
+    sinking: filters.Slope = field(default_factory=filters.Slope)  # of the mirror with the pump off, seen in `check`
+    test: pump_obeys.ActuatorTest | None = None
+    ramp_from_fraction: float = 0.0
+    last_pump_fraction: float = 0.0
+    # decisions of this tick
+    output: inner_loop.LoopOutput | None = None
+    pump_fraction: float = 0.0
+    vent_fraction: float = 0.0
+    why: str = ""
+    overdue: str = ""
+    unfit: str = ""
+    finished: Exit | None = None
+    trial_ended: Finished | None = None
+
+    def give(self, output: inner_loop.LoopOutput) -> None:
+        """Let the loop's output drive the pump, with the bleed open."""
+        self.output, self.pump_fraction = output, output.pump_fraction
+        self.vent_fraction = self.loop_config.bleed_fraction
+
+    def stay_good(self, good: bool) -> float:
+        """How long `good` has been true without a break, in seconds."""
+        if not good:
+            self.good_since_s = math.nan
+            return 0.0
+        if math.isnan(self.good_since_s):
+            self.good_since_s = self.now_s
+        return self.now_s - self.good_since_s
+
+
+def telemetry_row(
+    scene: Scene,
+    state: State,
+    fault: int,
+    number: int,
+    inputs: tick.TickInputs,
+    observation: safety_rules.Observation,
+    shape: shape_loop.ShapeOutput,
+) -> TelemetryRow:
+    """The row of tick `number`; `fault` is the code of the fault that stands, 0 for none."""
+    reading = inputs.reading or _NO_READING
+    out = scene.output or inner_loop.NO_OUTPUT
+    return TelemetryRow(
+        mono_s=inputs.now_s,
+        tick=number,
+        dt_s=scene.dt_s,
+        lateness_ms=inputs.lateness_ms,
+        missed_ticks=inputs.missed_ticks,
+        state=state,
+        shape_state=shape.state,
+        rung=scene.levels.rung,
+        fault=fault,
+        target_um=scene.setpoint_um,
+        setpoint_um=out.setpoint_um,
+        displacement_um=observation.displacement_um,
+        filtered_um=out.filtered_um,
+        error_um=out.error_um,
+        p_um_per_s=out.p_um_per_s,
+        i_um_per_s=out.i_um_per_s,
+        d_um_per_s=out.d_um_per_s,
+        feedforward_um_per_s=out.feedforward_um_per_s,
+        flow_wanted_um_per_s=out.flow_wanted_um_per_s,
+        flow_um_per_s=out.flow_um_per_s,
+        pump_fraction=scene.pump_fraction,
+        vent_fraction=scene.vent_fraction,
+        pump_readback_fraction=reading.pump_fraction,
+        vent_readback_fraction=reading.vent_fraction,
+        gauge_pressure_pa=observation.gauge_pressure_pa,
+        ambient_pressure_pa=reading.ambient_pressure_pa,
+        air_temperature_c=reading.air_temperature_c,
+        gas_temperature_c=reading.gas_temperature_c,
+        displacement_quality=reading.displacement_quality if inputs.reading else math.nan,
+        sample_counter=reading.sample_counter if inputs.reading else math.nan,
+        device_time_s=reading.device_time_s,
+        leak_um_per_s=out.leak_um_per_s,
+        trim_um=shape.trim_um,
+        truth_displacement_um=inputs.truth_displacement_um,
+        truth_laser_bias_um=inputs.truth_laser_bias_um,
+    )
