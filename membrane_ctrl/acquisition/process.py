@@ -131,7 +131,7 @@ class Remote:
     def _say_alive(self) -> None:
         if time.monotonic() >= self._alive_due_s:
             self._alive_due_s = time.monotonic() + _ALIVE_EVERY_S
-            self._send(child.alive(self._step_s))
+            self._send(run_events.Alive(self._step_s))
 
     def _send(self, event: events.Event) -> None:
         try:

@@ -10,48 +10,33 @@ from typing import Any
 from membrane_ctrl.alarms.book import AlarmBook, Notice, Sign, sign_of_value, signs_of
 from membrane_ctrl.alarms.senders import Outbox, Send, apprise_senders
 from membrane_ctrl.config.port import AlarmsConfig
-from membrane_ctrl.model import run_events
+from membrane_ctrl.model import run_events, run_status
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import CommandTaken, Event, EventLine, StateEntered
-from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.processes import child, ring
-
-# One look at the run: rings in, notices out.
-
 
 # before its first tick a run connects its devices, with patience of its own
 _STARTS_S = 30.0
 
 
 class Watcher:
-    """Turns what the rings hold into notices.
-
-    Parameters
-    ----------
-    config : AlarmsConfig
-        Rules and times.
-    outboxes : sequence of Outbox
-        The first gets every notice; the second, if there is one, those that are escalated.
-    now_s : float
-        When it begins to look.
-
-    """
+    """Turns what the rings hold into notices; of the outboxes the first gets all, the second the escalated ones."""
 
     def __init__(self, config: AlarmsConfig, outboxes: Sequence[Outbox], now_s: float) -> None:
         self._config = config
         self._book = AlarmBook(config)
         self._outboxes = outboxes
         self._last_row_s = now_s + _STARTS_S
-        self._status = RunStatus()
+        self._status = run_status.RunStatus()
 
     @property
     def ended(self) -> bool:
-        """The run has said its last word."""
+        """The event that ends a run has come."""
         return self._status.ended
 
     def look(self, rows: Sequence[bytes], events: Sequence[bytes], now_s: float) -> None:
-        """Take in what came since the last look, and send what is due."""
+        """Take rows and events, and send what is due."""
         for message in events:
             self._take_event(json.loads(message), now_s)
         for row in rows:
@@ -60,8 +45,8 @@ class Watcher:
         self._send(now_s)
 
     def orphaned(self, now_s: float) -> None:
-        """The control process is gone, and has not said why."""
-        text = "the control process has ended without a word; the board's watchdog has stopped the pump"
+        """The control process is gone without an "end" event."""
+        text = "the control process ended without a report; the board's watchdog has stopped the pump"
         self._book.take(Sign("control_gone", True, "critical", text), now_s)
         self._send(now_s)
 
@@ -131,30 +116,18 @@ def alarms_main(spec: AlarmsSpec, status: Any) -> None:
 def watch(
     spec: AlarmsSpec, senders: Sequence[Send], report: Callable[[Event], None], parent_lives: Callable[[], bool]
 ) -> None:
-    """The process's loop.
-
-    Parameters
-    ----------
-    spec : AlarmsSpec
-        The run.
-    senders : sequence of callable
-        Tell people, see `Outbox`: all, and those of the escalation.
-    report : callable
-        Tells the run's record what was sent, and the control process that this one is alive; never waits.
-    parent_lives : callable
-        Whether the control process is still there.
-    """
+    """The process's loop; `senders` are those of all notices, and of the escalated ones."""
     clock = spec.clock
     outboxes = [Outbox(_reporting(send, to, report)) for send, to in zip(senders, _TO, strict=False)]
     watcher = Watcher(spec.config, outboxes, clock.now())
     with closing(ring.RingReader(spec.telemetry)) as telemetry, closing(ring.RingReader(spec.events)) as events:
         while True:
             lives = parent_lives()  # before the rings: who ends puts the last word in first
-            report(child.alive(_SENDING_S))
+            report(run_events.Alive(_SENDING_S))
             watcher.look(telemetry.drain(), events.drain(), clock.now())
             if watcher.ended or not lives:
                 break
-            report(child.alive(_IDLE_S))
+            report(run_events.Alive(_IDLE_S))
             time.sleep(_LOOK_S)
         if not watcher.ended:
             watcher.orphaned(clock.now())

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.alarms.book import Notice
-from membrane_ctrl.config.port import AlarmsConfig
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config import port, schema
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
 
 # Notices on their way: tried again until they are through, none twice, and never a pile of them.
@@ -93,7 +92,7 @@ def read_urls(path: Path) -> list[str]:
     return urls
 
 
-def require_sendable(config: AlarmsConfig) -> None:
+def require_sendable(config: port.AlarmsConfig) -> None:
     """Refuse in one line, and before a run begins, what could not be sent. Raises InputError or DeviceError."""
     for name in (config.urls_file, config.escalation_urls_file):
         if name is not None:
@@ -102,7 +101,7 @@ def require_sendable(config: AlarmsConfig) -> None:
         raise DeviceError(_MISSING)
 
 
-def apprise_senders(config: AlarmsConfig, run: str) -> list[Send]:
+def apprise_senders(config: port.AlarmsConfig, run: str) -> list[Send]:
     """Senders for the configuration's URLs: of `urls_file`, and of `escalation_urls_file` if there is one.
 
     Two, as they fail apart: what has reached the people at the bench has not reached those behind them.
@@ -165,7 +164,7 @@ def _apprise() -> Any:
 # `alarm test`: does a notice arrive?
 
 
-def send_test_alarm(config: Config, source: str, escalated: bool, as_json: bool) -> int:
+def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json: bool) -> int:
     """Send one notice to all whom an alarm would reach.
 
     Parameters

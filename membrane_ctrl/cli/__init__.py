@@ -9,8 +9,7 @@ import typer
 
 from membrane_ctrl import __version__
 from membrane_ctrl.cli import calibrating, devices, holding, optics, records
-from membrane_ctrl.model.errors import CommandError, Exit
-from membrane_ctrl.model.terminal import one_line, only_text
+from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.review.cli import add_commands as add_review_commands
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
@@ -18,19 +17,19 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 
 def run(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code; an expected failure is a line on stderr, a finding each its own."""
-    with only_text():
+    with terminal.only_text():
         try:
             result = app(list(arguments), prog_name="membrane-ctrl", standalone_mode=False)
-        except CommandError as error:
+        except errors.CommandError as error:
             for line in error.lines:
-                print(f"membrane-ctrl: {one_line(line)}", file=sys.stderr)
+                print(f"membrane-ctrl: {terminal.one_line(line)}", file=sys.stderr)
             return error.exit
         except typer.TyperException as error:
-            print(f"membrane-ctrl: {one_line(error.format_message())} (see --help)", file=sys.stderr)
-            return Exit.BAD_INPUT
+            print(f"membrane-ctrl: {terminal.one_line(error.format_message())} (see --help)", file=sys.stderr)
+            return errors.Exit.BAD_INPUT
         except (KeyboardInterrupt, typer.Abort):
             print("membrane-ctrl: interrupted", file=sys.stderr)
-            return Exit.INTERRUPTED
+            return errors.Exit.INTERRUPTED
         return int(result or 0)
 
 

@@ -5,9 +5,8 @@ from typing import Annotated, TypeVar
 
 import typer
 
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.config.section import Section
-from membrane_ctrl.config.toml_file import load
 
 S = TypeVar("S", bound=Section)
 
@@ -28,14 +27,14 @@ SeedOption = Annotated[int, typer.Option(min=0, help="Seed of the random numbers
 TrialsOption = Annotated[int, typer.Option(min=2, help="Monte Carlo trials.")]
 
 
-def configured(path: Path | None) -> Config:
+def configured(path: Path | None) -> schema.Config:
     """Return the configuration of a file, or the defaults without one; raises `InputError`.
 
     The files that it names are looked for beside it, wherever the command is called.
     """
     if path is None:
-        return Config()
-    config = load(path, Config)
+        return schema.Config()
+    config = toml_file.load(path, schema.Config)
     optics, port, alarms = config.optics, config.port, config.alarms
     folder = path.resolve().parent
     if optics.geometry_file is not None:

@@ -8,10 +8,7 @@ from statistics import fmean, pstdev
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.why import duration, why
 from membrane_ctrl.control.film_health import JUDGE_S, TOO_TIGHT_UM_PER_S
-from membrane_ctrl.model import shape_estimate, states, telemetry
-from membrane_ctrl.model.events import EventLine, Fault
-from membrane_ctrl.model.run_events import AcquisitionState, from_dict
-from membrane_ctrl.model.run_status import RunStatus
+from membrane_ctrl.model import events, run_events, run_status, shape_estimate, states, telemetry
 
 # The last minute of a signal, second by second.
 
@@ -101,7 +98,7 @@ class ConsoleModel:
     def __init__(self, config: Config, duration_s: float | None = None) -> None:
         self._config = config
         self._duration_s = math.inf if duration_s is None else duration_s
-        self._status = RunStatus()
+        self._status = run_status.RunStatus()
         self._started_s = math.nan
         self._error = Trend()
         self._lateness = Trend()
@@ -123,9 +120,9 @@ class ConsoleModel:
         self._error.add(row.mono_s, row.error_um)
         self._lateness.add(row.mono_s, row.lateness_ms)
 
-    def take_event(self, line: EventLine) -> None:
+    def take_event(self, line: events.EventLine) -> None:
         """One event, a line of `events.jsonl`."""
-        self._status = self._status.after_event(from_dict(line), line.get("mono_s", math.nan))
+        self._status = self._status.after_event(run_events.from_dict(line), line.get("mono_s", math.nan))
 
     def take_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """One measurement cycle."""
@@ -192,15 +189,15 @@ class ConsoleModel:
         )
 
 
-def _fault_words(fault: Fault | None) -> str:
+def _fault_words(fault: events.Fault | None) -> str:
     return "" if fault is None else text(fault.to_dict()) or "unnamed"
 
 
-def _acquisition_words(said: AcquisitionState | None) -> str:
+def _acquisition_words(said: run_events.AcquisitionState | None) -> str:
     return "" if said is None or said.state == "running" else ": ".join(w for w in (said.state, said.message) if w)
 
 
-def text(line: EventLine) -> str:
+def text(line: events.EventLine) -> str:
     """The words of an event for a person: its name if it has one, its reason, and what was seen."""
     name = str(line.get("name", "")).replace("_", " ")
     reason = next((str(line[key]) for key in ("why", "reason", "cause", "message") if line.get(key)), "")

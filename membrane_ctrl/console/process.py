@@ -19,16 +19,13 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.model import ConsoleModel, ConsoleView, text
 from membrane_ctrl.console.view import console_panel
 from membrane_ctrl.console.why import duration, number, percent
-from membrane_ctrl.model import events, run_events
+from membrane_ctrl.model import events, run_events, shape_estimate
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.shape_estimate import unpack_estimate
 from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.model.terminal import Plain
 from membrane_ctrl.processes import child, ring
 
-# The same for a log file: a line a second, and faults at once.
-
-
+# For a log file: a line a second, and these at once
 _AT_ONCE = (
     events.Fault | events.Cleared | events.StateEntered | run_events.Link | run_events.Ended
     | run_events.ChildEnded | run_events.ChildSilent | run_events.ChildRestarted | run_events.ChildGivenUp
@@ -38,7 +35,7 @@ _AT_ONCE = (
 
 
 def line(view: ConsoleView) -> str:
-    """The second in one line."""
+    """The view in one line."""
     row = view.row
     if view.silent_s or row is None:
         silent = f"control loop silent for {view.silent_s:.1f} s" if row else view.why
@@ -61,7 +58,7 @@ def line(view: ConsoleView) -> str:
 
 
 def at_once(line: events.EventLine) -> bool:
-    """Whether nobody should have to wait a second for the event."""
+    """Whether the event is shown at once."""
     event = run_events.from_dict(line)
     if isinstance(event, run_events.AcquisitionState):
         return event.state != "running"
@@ -107,8 +104,7 @@ class ConsoleSpec:
 def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
     """Show the run on stderr until its "end" event, `processes.STOP`, or the death of the parent.
 
-    Target of a `spawn`ed process; over `status` it says that it is alive. SIGINT is left to the control process; the
-    terminal is given back in any case.
+    Target of a `spawn`ed process; over `status` it says that it is alive. The terminal is given back in any case.
     """
     child.leave_at_stop()
     report = child.reporter(status)
@@ -117,7 +113,7 @@ def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
         def rounds(show: Callable[[], object]) -> None:
             while not feed.model.ended and child.parent_lives():
                 show()
-                report(child.alive(_HANGS_S))
+                report(run_events.Alive(_HANGS_S))
                 time.sleep(_LOOK_S)
 
         try:
@@ -127,7 +123,7 @@ def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
 
 
 def _draw(spec: ConsoleSpec, feed: _Feed, rounds: Callable[[Callable[[], object]], None]) -> None:
-    """Go on drawing as what stderr is can be drawn on. Raises OSError when it is closed."""
+    """Draw on a terminal, or print lines. Raises OSError when stderr is closed."""
     console = Console(stderr=True)
     drawable = console.is_terminal and not console.is_dumb_terminal
     with _live(console, spec, feed) if drawable else _plain(spec, feed) as show:
@@ -135,7 +131,7 @@ def _draw(spec: ConsoleSpec, feed: _Feed, rounds: Callable[[Callable[[], object]
 
 
 def give_back_terminal() -> None:
-    """For a console that was killed: the first page of the terminal, and its cursor. Nothing without a terminal."""
+    """After a console that was killed: the terminal's first page and its cursor."""
     with suppress(OSError):
         terminal = getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # this once, control bytes are ours
         if terminal.isatty():
@@ -153,11 +149,11 @@ class _Feed:
         self._shapes = ring.RingReader(spec.shapes) if spec.shapes else None
 
     def update(self) -> list[events.EventLine]:
-        """Take what has come; returns the events among it."""
+        """Take what has come; returns the events."""
         for message in self._telemetry.drain():
             self.model.take_row(TelemetryRow.unpack(message))
         for message in self._shapes.drain() if self._shapes else ():
-            self.model.take_shape(unpack_estimate(message))
+            self.model.take_shape(shape_estimate.unpack_estimate(message))
         lines: list[events.EventLine] = [json.loads(message) for message in self._events.drain()]
         for line in lines:
             self.model.take_event(line)
@@ -171,7 +167,7 @@ class _Feed:
 
 @contextmanager
 def _live(console: Console, spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
-    """The console on a terminal's other page; what was on the terminal is there again afterwards."""
+    """The console on a terminal's second page; the first one is back afterwards."""
     run = str(spec.run_dir)
 
     def show() -> None:
@@ -180,7 +176,7 @@ def _live(console: Console, spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable
 
     with Live(console=console, screen=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False) as live:
         yield show
-    print(line(feed.model.view(spec.clock.now())), file=sys.stderr)  # the other page is gone: leave the last word
+    print(line(feed.model.view(spec.clock.now())), file=sys.stderr)  # a last line that stays
 
 
 @contextmanager

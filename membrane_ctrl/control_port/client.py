@@ -21,26 +21,17 @@ _TURN = struct.pack("ll", 10, 0)  # to wait for one's turn: s and us, as the ker
 
 
 class PortClient:
-    """A connection to a running hold.
-
-    Parameters
-    ----------
-    connection : socket
-        Connected, its handshake done.
-    where : str
-        For messages.
-    notice : callable
-        Gets what the hold says without being asked.
+    """A connection to a running hold; `notice` gets unsolicited notices.
 
     Attributes
     ----------
     greeting : dict
-        Who we are to the hold: `run`, `you`, `role`, `commander`.
+        `run`, `you`, `role`, `commander`.
 
     Raises
     ------
     DeviceError
-        One line: nobody there, or not a hold.
+        Nobody answers, or not a hold.
     """
 
     def __init__(self, connection: socket.socket, where: str, notice: Callable[[str], None]) -> None:

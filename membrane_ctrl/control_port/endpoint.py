@@ -1,11 +1,11 @@
-"""A listening socket in the control process: lets in few at a time, and opens again by itself after a failure.
+"""A listening socket in the control process: lets in few at a time, and reopens after a failure.
 
-`asyncio.start_server` would accept, and shake hands with, whoever comes in one go; here every newcomer waits for the
-one before. A flood of connections so costs the tick no more than twenty handshakes a second.
+`asyncio.start_server` would accept all connections at once; here each waits for the one before, so that a flood costs
+the tick no more than twenty handshakes a second.
 
-Who has not shown yet who it is (no handshake, no request) is a stranger. Strangers are few, and of one address fewer:
-for a newcomer the one that has dawdled longest goes, so that nobody can block the queue. An
-address that comes too often is turned away unheard, which makes room in the queue for the others.
+A peer that has not identified itself (no handshake, no request) is a stranger. The number of strangers is limited,
+per address as well: the longest waiting one makes room for a newcomer, so that nobody can block the queue. An address
+that comes too often is turned away at once.
 """
 
 import asyncio
@@ -33,13 +33,7 @@ Welcome = Callable[[socket.socket, LetIn], Awaitable[None]]
 
 
 class Turns:
-    """How often an address may come: a bucket each, the address that has been away longest is forgotten first.
-
-    Parameters
-    ----------
-    now : callable
-        A clock in s.
-    """
+    """How often an address may come: a token bucket each; the address that has been away longest is forgotten."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
@@ -65,13 +59,13 @@ class Endpoint:
     name : str
         For messages.
     listener : socket
-        Bound, listening, not blocking; the endpoint closes it.
+        Bound, listening, non-blocking; the endpoint closes it.
     welcome : callable
-        Looks after one connection to its end; calls its second argument when it knows who has come.
+        Serves one connection to its end; calls its second argument once the peer is identified.
     tell : callable
-        Puts an event on record.
+        Records an event.
     refused : callable
-        Gets who was not let in, and why.
+        Gets who was refused, and why.
     """
 
     def __init__(
@@ -105,7 +99,7 @@ class Endpoint:
         self._listener.close()
 
     async def _keep(self) -> None:
-        """Accept for ever; what fails is said, and tried again."""
+        """Accept for ever; report a failure and try again."""
         again_s = 0.0
         turns = Turns(asyncio.get_running_loop().time)
         while True:
@@ -170,29 +164,14 @@ class Endpoint:
             connection.close()
 
 
-# What was refused goes on record, but nobody can fill the record with it.
-
-
-# An honest mistake or ten are all there; of a flood one in ten seconds, with the count of the others
+# Refusals are recorded, but nobody can fill the record with them: ten mistakes are all there; of a flood one in ten
+# seconds, with the count of the others
 _REFUSAL_BURST = 10.0
 _REFUSALS_PER_S = 0.1
 
 
 class Refusals:
-    """Records refusals, a bucket of them at a time.
-
-    Parameters
-    ----------
-    tell : callable
-        Puts an event on record.
-    now : callable
-        The run's clock.
-
-    Attributes
-    ----------
-    count : int
-        All of them.
-    """
+    """Records refusals as a token bucket allows; `count` counts all."""
 
     def __init__(self, tell: Callable[[events.Event], None], now: Callable[[], float]) -> None:
         self._tell, self._now = tell, now

@@ -14,8 +14,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
-from membrane_ctrl.config.section import Section
-from membrane_ctrl.config.toml_file import describe
+from membrane_ctrl.config import section, toml_file
 from membrane_ctrl.controller.commands import TABLE, Kind
 
 VERSION = 1
@@ -52,7 +51,7 @@ def _words(most_bytes: int) -> AfterValidator:
     return AfterValidator(check)
 
 
-class Request(Section):
+class Request(section.Section):
     """What a client sends."""
 
     number: Annotated[int, Field(ge=0, lt=2**53)] = 0  # chosen by the client, returned with the answer
@@ -85,7 +84,7 @@ def parse(line: bytes) -> Request:
     try:
         return Request.model_validate_json(line, strict=True)
     except ValidationError as error:
-        reason = describe(error.errors(include_url=False)[0], Request).removeprefix(": ")
+        reason = toml_file.describe(error.errors(include_url=False)[0], Request).removeprefix(": ")
         raise RequestError(_short(reason), _number_in(line)) from None
 
 
@@ -109,12 +108,8 @@ def _short(reason: str, most: int = 300) -> str:
     return clean if len(clean) <= most else clean[: most - 3] + "..."
 
 
-# One connection as lines: bounded, and never waited for.
-
-
-# Who has begun a line ends it in this time
-_LINE_S = 5.0
-# Who does not read gets this much behind, and is then dropped: a watcher of 10 Hz for a minute
+_LINE_S = 5.0  # to complete a line
+# A reader this far behind is dropped: a watcher of 10 Hz after a minute
 _UNREAD_BYTES = 1 << 20
 _HANDSHAKE_S = 3.0
 
@@ -124,13 +119,7 @@ class SlowReaderError(ConnectionError):
 
 
 class Wire:
-    """Lines in, lines out.
-
-    Parameters
-    ----------
-    reader, writer
-        Of the connection.
-    """
+    """Lines in, lines out."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._reader, self._writer = reader, writer

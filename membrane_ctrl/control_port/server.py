@@ -1,8 +1,7 @@
-"""The port as the run sees it: hears what every tick decided, asks the next one.
+"""The port as the run sees it: hears what every tick decided, and hands commands to the next one.
 
-The control process has one thread and one loop: what is done here is done between two ticks, and all of it is
-bounded: connections, messages, their rate, what waits to be sent. An endpoint that fails opens again by itself
-(`endpoint.Endpoint`): a hold that cannot be asked is no reason to let the mirror down, and signals still stop it.
+It shares one thread and one event loop with the ticks, so everything is bounded: connections, messages, their rate,
+unsent data. An endpoint that fails reopens (`endpoint.Endpoint`): the hold goes on, and signals still stop it.
 """
 
 import asyncio
@@ -14,21 +13,17 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from membrane_ctrl.config.port import PortConfig
-from membrane_ctrl.config.schema import LoopConfig
-from membrane_ctrl.config.toml_file import parse
+from membrane_ctrl.config import port, schema, toml_file
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
 from membrane_ctrl.control_port.protocol import KINDS, VERSION, Request, Wire
 from membrane_ctrl.control_port.session import FREE, Commander, Peer, PortSession, may_not
 from membrane_ctrl.control_port.tls import Listeners
 from membrane_ctrl.controller import commands, tick
-from membrane_ctrl.model import errors, events, run_events, states
-from membrane_ctrl.model.run_status import RunStatus
+from membrane_ctrl.model import errors, events, run_events, run_status, states
 
-# Beyond these the connection that has been silent longest goes: one person's terminals cannot lock out another's stop
+# Beyond these the longest silent connection is dropped: one person's terminals cannot lock out another's stop
 _SESSIONS_MOST, _SESSIONS_EACH = 16, 4
-# A tick takes a command up within its period; a loop that does not in so long has other troubles, and says so
 _ANSWER_S = 5.0
 _EXPIRED = "the certificate has expired"
 _OVER = "the run is over"
@@ -41,37 +36,25 @@ class RunHooks:
     ask: Callable[[commands.Command], None]  # hands a command to the next tick
     tell: Callable[[events.Event], None]  # puts an event on record
     now: Callable[[], float]  # the run's clock
-    loop: Callable[[], LoopConfig]  # the loop's settings as they are now
+    loop: Callable[[], schema.LoopConfig]  # the loop's settings as they are now
 
 
 class Port:
-    """Commands in, answers and status out.
+    """Commands in, answers and status out; `run` is the name of the run folder."""
 
-    Parameters
-    ----------
-    config : PortConfig
-        The run's.
-    listeners : Listeners
-        Bound sockets.
-    run : str
-        Name of the run folder.
-    hooks : RunHooks
-        What it needs of the run.
-    """
-
-    def __init__(self, config: PortConfig, listeners: Listeners, run: str, hooks: RunHooks) -> None:
+    def __init__(self, config: port.PortConfig, listeners: Listeners, run: str, hooks: RunHooks) -> None:
         self._listeners, self._run, self._hooks = listeners, run, hooks
         self._tell, self._now = hooks.tell, hooks.now
         self._commander = Commander(config.commander_lapses_s)
         self._refusals = Refusals(hooks.tell, hooks.now)
-        self._status = RunStatus()
+        self._status = run_status.RunStatus()
         self._numbers = itertools.count(1)
         self._waiting: dict[int, asyncio.Future[str]] = {}
         self._sessions: list[PortSession] = []
         self._over = False
 
     def heard(self, outputs: tick.TickOutputs) -> None:
-        """Take in what a tick decided; those who asked for it get their answer."""
+        """Note what a tick decided, and answer those who asked."""
         self._status = self._status.after_row(outputs.row)
         for event in outputs.events:
             self._status = self._status.after_event(event)
@@ -83,7 +66,7 @@ class Port:
                 future.set_result(refusal)
 
     def told(self, event: events.Event) -> None:
-        """Take in what a child process reports."""
+        """Note what a child process reports."""
         self._status = self._status.after_event(event)
         for session in self._sessions:
             session.event(event)
@@ -182,7 +165,7 @@ class Port:
             self._turn_out(min(crowd, key=lambda session: session.heard_s), "too many connections: silent longest")
 
     async def _answer(self, session: PortSession, request: Request) -> dict[str, Any]:
-        """Do what is asked, or say why not. What the controller refuses, it records itself."""
+        """Do what is asked, or say why not; the controller records its own refusals."""
         peer = session.peer
         refusal = may_not(peer, request.do) or self._claim_command(peer, request)
         if not refusal and request.do not in commands.TABLE:
@@ -229,16 +212,18 @@ class Port:
         """The command of a request. Raises InputError for gains or an experiment that are none."""
         kind = next(kind for kind in KINDS if kind == request.do)
         loop = None if request.loop is None else self._new_loop(request.loop)
-        experiment = None if request.experiment is None else parse(request.experiment, ExperimentSpec, "tune")
+        experiment = (
+            None if request.experiment is None else toml_file.parse(request.experiment, ExperimentSpec, "tune")
+        )
         value = math.nan if request.value is None else request.value
         return commands.Command(
             kind, peer.who, request.why, value, request.text, loop, experiment, next(self._numbers)
         )
 
-    def _new_loop(self, changes: dict[str, bool | float]) -> LoopConfig:
+    def _new_loop(self, changes: dict[str, bool | float]) -> schema.LoopConfig:
         if "setpoint_um" in changes:
             raise errors.InputError("gains: setpoint_um: use the command setpoint")
-        return parse({**self._hooks.loop().model_dump(), **changes}, LoopConfig, "gains")
+        return toml_file.parse({**self._hooks.loop().model_dump(), **changes}, schema.LoopConfig, "gains")
 
     async def _obeyed(self, command: commands.Command) -> str:
         """Why the tick that took the command up refused it; empty if it obeyed."""
@@ -263,7 +248,7 @@ _REQUEST_S = 2.0
 _COUNTERS = {"tick": "ticks_total", "missed_ticks": "missed_ticks_total"}
 
 
-def metrics_text(status: RunStatus, clients: int, refused: int) -> str:
+def metrics_text(status: run_status.RunStatus, clients: int, refused: int) -> str:
     """The status in Prometheus' text format, version 0.0.4; `clients` and `refused` count those of the port."""
     lines: list[str] = []
 
@@ -306,7 +291,7 @@ async def serve_metrics(connection: socket.socket, text: Callable[[], str]) -> N
         await wire.close()
 
 
-def status_table(status: RunStatus) -> dict[str, Any]:
+def status_table(status: run_status.RunStatus) -> dict[str, Any]:
     """The status for people and programs: names instead of codes, None for what is not there."""
     row = status.row
     if row is None:

@@ -11,9 +11,6 @@ from membrane_ctrl.control_port.protocol import Action, Request, RequestError, S
 from membrane_ctrl.controller.commands import TABLE, Role
 from membrane_ctrl.model.events import Event
 
-# Who asks: roles, and the one who has the command.
-
-
 _RANK: dict[Role, int] = {"read": 0, "operate": 1, "tune": 2}
 _ERRANDS: dict[str, Role] = {"status": "read", "watch": "read", "release": "operate", "quiet": "operate"}
 
@@ -38,13 +35,7 @@ def may_not(peer: Peer, do: Action) -> str:
 
 
 class Commander:
-    """One commander at a time; the first to command has it until it is given back, taken over, or lapses.
-
-    Parameters
-    ----------
-    lapses_s : float
-        Without a command for so long, the next one who commands has it.
-    """
+    """One commander at a time: the first to command, until it releases the command, loses it, or is idle too long."""
 
     def __init__(self, lapses_s: float) -> None:
         self._lapses_s = lapses_s
@@ -52,11 +43,11 @@ class Commander:
         self._last_s = -math.inf
 
     def holder(self, now_s: float) -> str:
-        """Who has the command; empty: nobody."""
+        """Who has the command; empty if nobody has."""
         return self._holder if now_s - self._last_s <= self._lapses_s else ""
 
     def claim(self, who: str, take_over: bool, now_s: float) -> str:
-        """Take the command, or keep it; returns why not, or nothing."""
+        """Take or keep the command; returns why not, or an empty text."""
         holder = self.holder(now_s)
         if holder not in ("", who) and not take_over:
             return f"{holder} has the command; take it over (--take-over) or wait until it is given back"
@@ -64,7 +55,7 @@ class Commander:
         return ""
 
     def release(self, who: str) -> None:
-        """Give it back; of no effect for anyone else."""
+        """Release the command, if `who` has it."""
         if self._holder == who:
             self._holder = ""
 
@@ -79,16 +70,7 @@ Refused = Callable[[str, str, str], None]
 
 
 class PortSession:
-    """A connection whose peer is known.
-
-    Parameters
-    ----------
-    wire : Wire
-        The connection.
-    peer : Peer
-        Who it is.
-    status : callable
-        What `watch` streams.
+    """A connection whose peer is known; `watch` streams `status`.
 
     Attributes
     ----------
@@ -136,12 +118,12 @@ class PortSession:
             await asyncio.sleep(_PAUSE_S)
 
     def notice(self, text: str) -> None:
-        """Tell the peer something it has not asked for."""
+        """Send an unsolicited notice."""
         with contextlib.suppress(SlowReaderError):
             self._wire.send({"notice": text})
 
     def event(self, event: Event) -> None:
-        """Tell a watching peer what has happened."""
+        """Send an event to a peer that watches."""
         if self._watch is not None:
             with contextlib.suppress(SlowReaderError):
                 self._wire.send({"event": event.to_dict()})

@@ -22,17 +22,12 @@ _ROLES: dict[str, Role] = {"read": "read", "operate": "operate", "tune": "tune"}
 
 
 class TlsListener:
-    """A listening TCP socket and what its handshakes need.
-
-    Parameters
-    ----------
-    config : TlsConfig
-        Address and certificates.
+    """A listening TCP socket and the context of its handshakes.
 
     Raises
     ------
     InputError, DeviceError
-        One line: a file that is no certificate or key, an address that cannot be had.
+        A file is no certificate or key, or the address cannot be used.
     """
 
     def __init__(self, config: TlsConfig) -> None:
@@ -40,10 +35,7 @@ class TlsListener:
         self.socket = listen_tcp(config.host, config.port, "port.tls")
 
     def peer(self, certificate: dict[str, Any]) -> session.Peer:
-        """Who the certificate (as of `getpeercert`) names, and as what; who has no name may only read.
-
-        All the nameless would be one commander, and the record could not say who it was.
-        """
+        """Name and role of a certificate (of `getpeercert`); the record needs a name: without, it may only read."""
         subject = {key: value for part in certificate.get("subject", ()) for key, value in part}
         name = "".join(c for c in subject.get("commonName", "") if c.isprintable()).strip()
         if not name:
@@ -117,12 +109,9 @@ def _require_readable(path: Path) -> None:
         raise InputError(f"{path}: {os_reason(error)}") from None
 
 
-# All sockets of the port, bound before anything else of the run exists: an address in use is refused in one line.
-
-
 @dataclass(frozen=True, slots=True)
 class Listeners:
-    """Bound and listening; None for what is not wanted."""
+    """All sockets of the port, bound before anything else of the run exists; None for those not configured."""
 
     unix: UnixListener | None = None
     tls: TlsListener | None = None

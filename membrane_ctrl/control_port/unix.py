@@ -22,21 +22,12 @@ _SOMEBODY_THERE_S = 1.0
 
 
 class UnixListener:
-    """A listening socket file, until `close`.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    group : str or None
-        Given the file, if any.
-    group_role : str
-        Role of all whom the file lets in but its owner and root.
+    """A listening socket file, until `close`; all but its owner and root get `group_role`.
 
     Raises
     ------
     InputError, DeviceError
-        One line: no socket file there, one in use, no such group, no permission.
+        The path is taken or in use, there is no such group, or no permission.
     """
 
     def __init__(self, path: Path, group: str | None, group_role: Role) -> None:

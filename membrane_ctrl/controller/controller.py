@@ -13,14 +13,20 @@ from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control import inner_loop, shape_loop
 from membrane_ctrl.control.experiments.machine import Finished
 from membrane_ctrl.control.experiments.trial import Trial
-from membrane_ctrl.controller import commands, pump_obeys, safe_levels, safety, safety_rules, sensor_consistency
+from membrane_ctrl.controller import (
+    commands,
+    pump_obeys,
+    safe_levels,
+    safety,
+    safety_rules,
+    sensor_consistency,
+    states,
+)
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.controller.scene import Scene, telemetry_row
-from membrane_ctrl.controller.states import run_state
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
-from membrane_ctrl.model import errors
+from membrane_ctrl.model import arrays, errors
 from membrane_ctrl.model import events as told
-from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.states import Rung, State
 
@@ -46,7 +52,7 @@ class Controller:
         Zernike coefficients of a Hencky bowl per sag, in um per um, for the shape loop.
     """
 
-    def __init__(self, config: Config, sag_sensitivity: FloatArray) -> None:
+    def __init__(self, config: Config, sag_sensitivity: arrays.FloatArray) -> None:
         self._config = config
         self._safety = safety.SafetyTable(config.limits)
         self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity)
@@ -287,7 +293,7 @@ class Controller:
         scene = self._scene
         scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, 0.0
         try:
-            wanted = run_state(self.state, scene)
+            wanted = states.run_state(self.state, scene)
         except Exception as error:
             self._tick_error = f"{type(error).__name__}: {error}"
             # a mirror that is being vented is not shut up by an error

@@ -7,8 +7,7 @@ from typing import Any, Literal
 from firmware_iface.roles import BenchIdentity
 from membrane_ctrl.config.devices import ModbusMapConfig, Optoncdt1420Config
 from membrane_ctrl.config.schema import Config, GeometryConfig
-from membrane_ctrl.control import gas, inner_loop
-from membrane_ctrl.control.film import CONTRADICTED_MOST, LEAK_LEAST_UM_PER_S, TAUT_PA
+from membrane_ctrl.control import film, gas, inner_loop
 from membrane_ctrl.controller import pump_obeys, safety
 
 Severity = Literal["error", "warning"]
@@ -275,18 +274,18 @@ def judge_gauge(config: Config, say: ConfigFindings) -> None:
 def judge_film(config: Config, say: ConfigFindings) -> None:
     """What is said of the film, which gas, laser and gauge are judged by."""
     limits, mirror = config.limits, config.optics.mirror
-    most = 1.0 + flow_um_per_s(config) / LEAK_LEAST_UM_PER_S
+    most = 1.0 + flow_um_per_s(config) / film.LEAK_LEAST_UM_PER_S
     why = f"can never trip: the pump gives {flow_um_per_s(config):g} um/s"
     say.error(limits.leak_growth_max >= most, "limits.leak_growth_max", why, f"give less than {most:.1f}")
     why = "what the weather moves a leak by trips it"
-    least = CONTRADICTED_MOST
+    least = film.CONTRADICTED_MOST
     say.error(limits.leak_growth_max < least, "limits.leak_growth_max", why, f"give at least {least:g}")
     why = f"no film is so deep for its radius ({mirror.radius_mm:g} mm)"
     say.error(mirror.sag_mm >= 0.5 * mirror.radius_mm, "optics.mirror.sag_mm", why, "give the bowl's depth in mm")
     why = f"the bowl is only {mirror.sag_mm:g} mm deep (optics.mirror.sag_mm): it can never trip"
     say.error(limits.displacement_min_um <= -1e3 * mirror.sag_mm, "limits.displacement_min_um", why, "give more")
-    why = f"below {TAUT_PA:g} Pa laser and gauge are not held against each other"
-    slack = 0.0 < mirror.pressure_pa <= TAUT_PA
+    why = f"below {film.TAUT_PA:g} Pa laser and gauge are not held against each other"
+    slack = 0.0 < mirror.pressure_pa <= film.TAUT_PA
     say.warn(slack, "optics.mirror.pressure_pa", why, "measure it with the film taut")
     why = "not known: a gauge in a wrong unit is not noticed"
     say.warn(

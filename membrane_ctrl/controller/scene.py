@@ -11,9 +11,7 @@ from membrane_ctrl.control.experiments.machine import Finished
 from membrane_ctrl.control.experiments.trial import Trial
 from membrane_ctrl.controller import pump_obeys, safe_levels, safety_rules, tick
 from membrane_ctrl.controller.observer import Observer
-from membrane_ctrl.model.errors import Exit
-from membrane_ctrl.model.states import State
-from membrane_ctrl.model.telemetry import TelemetryRow
+from membrane_ctrl.model import errors, states, telemetry
 
 # for the record of a tick without an answer; its whole numbers, which have no NaN, are not used
 _NO_READING = BenchReading(
@@ -59,7 +57,7 @@ class Scene:
     way_down: Literal["stop", "lower"] | None = None
     venting: bool = False  # on the way down, and after a `stop` as well
     asked_by: str = ""
-    stop_exit: Exit = Exit.DONE
+    stop_exit: errors.Exit = errors.Exit.DONE
     acknowledged: bool = False
     latched: str = ""  # a fault of an earlier run: no hold before a person has acknowledged it
     may_resume: bool = False  # the resume rule lets a latched fault go
@@ -78,7 +76,7 @@ class Scene:
     why: str = ""
     overdue: str = ""
     unfit: str = ""
-    finished: Exit | None = None
+    finished: errors.Exit | None = None
     trial_ended: Finished | None = None
 
     def give(self, output: inner_loop.LoopOutput) -> None:
@@ -98,17 +96,17 @@ class Scene:
 
 def telemetry_row(
     scene: Scene,
-    state: State,
+    state: states.State,
     fault: int,
     number: int,
     inputs: tick.TickInputs,
     observation: safety_rules.Observation,
     shape: shape_loop.ShapeOutput,
-) -> TelemetryRow:
+) -> telemetry.TelemetryRow:
     """The row of tick `number`; `fault` is the code of the fault that stands, 0 for none."""
     reading = inputs.reading or _NO_READING
     out = scene.output or inner_loop.NO_OUTPUT
-    return TelemetryRow(
+    return telemetry.TelemetryRow(
         mono_s=inputs.now_s,
         tick=number,
         dt_s=scene.dt_s,

@@ -14,10 +14,8 @@ from functools import partial
 from types import TracebackType
 
 from membrane_ctrl.controller import commands, tick
+from membrane_ctrl.model import run_events, run_status, states
 from membrane_ctrl.model.events import CommandTaken, Event, Fault, Resumed, StateEntered
-from membrane_ctrl.model.run_events import LatchFailed, LatchWritten
-from membrane_ctrl.model.run_status import RunStatus
-from membrane_ctrl.model.states import State
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile, ResumeLog
 
 
@@ -131,11 +129,11 @@ class FaultLatch:
             act()
         except Exception as error:  # nobody looks at what a thread raises
             if not self._failing:
-                self._news.append(LatchFailed(str(error)))
+                self._news.append(run_events.LatchFailed(str(error)))
             self._failing = True
         else:
             if self._failing:
-                self._news.append(LatchWritten())
+                self._news.append(run_events.LatchWritten())
                 self._failing = False
 
     def _report(self) -> None:
@@ -163,7 +161,7 @@ class SystemdNotify:
         self._address = (address or os.environ.get("NOTIFY_SOCKET", "")).replace("@", "\0", 1)
         self._next_s = -math.inf
         self._state = -1.0
-        self._status = RunStatus()
+        self._status = run_status.RunStatus()
 
     def __enter__(self) -> SystemdNotify:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
@@ -189,7 +187,7 @@ class SystemdNotify:
         error = f", error {row.error_um:+.2f} um" if math.isfinite(row.error_um) else ""
         fault = f", fault {row.fault:g}" if row.fault else ""
         trouble = f", recording: {self._status.recording_words}" if self._status.recording else ""
-        self._send(f"{ready}WATCHDOG=1\nSTATUS={State(int(row.state)).name.lower()}{error}{fault}{trouble}")
+        self._send(f"{ready}WATCHDOG=1\nSTATUS={states.State(int(row.state)).name.lower()}{error}{fault}{trouble}")
 
     def _send(self, message: str) -> None:
         if self._address:

@@ -33,10 +33,8 @@ from membrane_ctrl.instruments.device_lock import device_names, locked
 from membrane_ctrl.model import errors, run_events, terminal
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import CommandTaken, Event
-from membrane_ctrl.processes.child import raise_priority
-from membrane_ctrl.processes.ring import RingReader, RingWriter, publish
-from membrane_ctrl.run_files.latched_fault import LatchedFile, ResumeLog
-from membrane_ctrl.run_files.run_folder import create_run_folder
+from membrane_ctrl.processes import child, ring
+from membrane_ctrl.run_files import latched_fault, run_folder
 from membrane_ctrl.sim.bench import TwinProcess
 
 
@@ -79,12 +77,12 @@ def hold_mirror(options: HoldOptions) -> int:
         listeners = tls.listeners_for(config.port, logs_dir, stack)  # a second hold ends here, no device touched
         stack.enter_context(locked(device_names(config.devices)))  # and here one with other folders
         latched = _latched(config, logs_dir, options)
-        resumes = None if latched is None else ResumeLog(logs_dir)
+        resumes = None if latched is None else latched_fault.ResumeLog(logs_dir)
         board = asyncio.run(_identify(open_bench(config.devices), config, options, resumes))
-        run_dir = create_run_folder(logs_dir, options.name, clock.origin_utc, config)
+        run_dir = run_folder.create_run_folder(logs_dir, options.name, clock.origin_utc, config)
         geometry.keep(run_dir)
         rings = child_processes.rings_for(config, twin.truth if twin else None, stack)
-        publish(run_dir, {"telemetry": rings.telemetry, "events": rings.events, "shapes": rings.shapes})
+        ring.publish(run_dir, {"telemetry": rings.telemetry, "events": rings.events, "shapes": rings.shapes})
         children = child_processes.ChildProcesses(config, clock, rings, run_dir, options.name, options.duration_s)
         children.start(stack)
         bench = open_bench(config.devices)  # a link belongs to the event loop that opened it
@@ -97,14 +95,14 @@ def hold_mirror(options: HoldOptions) -> int:
     return exit_code
 
 
-def _latched(config: Config, logs_dir: Path, options: HoldOptions) -> LatchedFile | None:
+def _latched(config: Config, logs_dir: Path, options: HoldOptions) -> latched_fault.LatchedFile | None:
     """The file of the fault that outlives a run; the twin has one only if its configuration says so.
 
     Raises DeviceError if a fault is latched, unless it is to be cleared, or nobody asks to hold the mirror yet.
     """
     if options.twin and not config.states.latch_twin_faults:
         return None
-    file = LatchedFile(logs_dir)
+    file = latched_fault.LatchedFile(logs_dir)
     fault = file.read()
     if fault is not None and options.clear_faults:
         try:
@@ -126,7 +124,7 @@ class BoardAtStart:
 
 
 async def _identify(
-    bench: Bench, config: Config, options: HoldOptions, resumes: ResumeLog | None = None
+    bench: Bench, config: Config, options: HoldOptions, resumes: latched_fault.ResumeLog | None = None
 ) -> BoardAtStart:
     """Who is there, and is it fit to run, before a run folder exists. Raises DeviceError or InputError."""
     devices = config.devices
@@ -155,7 +153,7 @@ async def _identify(
     return BoardAtStart(latched=what)
 
 
-def _may_resume(name: str, config: Config, resumes: ResumeLog | None) -> bool:
+def _may_resume(name: str, config: Config, resumes: latched_fault.ResumeLog | None) -> bool:
     """The resume rule at a start; what it allows is counted, or it is not allowed."""
     if name not in config.resume.faults:
         return False
@@ -188,11 +186,13 @@ async def _run(
     assert config.devices is not None
     with contextlib.ExitStack() as stack:
         telemetry, events, inputs = (
-            stack.enter_context(contextlib.closing(RingWriter(address)))
+            stack.enter_context(contextlib.closing(ring.RingWriter(address)))
             for address in (rings.telemetry, rings.events, rings.inputs)
         )
         shapes = (
-            newest_of(stack.enter_context(contextlib.closing(RingReader(rings.shapes)))) if rings.shapes else None
+            newest_of(stack.enter_context(contextlib.closing(ring.RingReader(rings.shapes))))
+            if rings.shapes
+            else None
         )
         truth = twin.truth_reader() if twin else None
         wiring = Wiring(bench, telemetry, events, inputs, shapes, truth, children.reports)
@@ -207,7 +207,7 @@ async def _run(
             "capture": partial(_capture, children, supervisor.tell),
         }
         wiring.told = {"control port": port.told, "systemd": systemd.told}
-        supervisor.tell(run_events.Started(config.devices.name, raise_priority(), board.cleared))
+        supervisor.tell(run_events.Started(config.devices.name, child.raise_priority(), board.cleared))
         exit_code = errors.Exit.DEVICE_FAILED
         try:
             _ask_first(supervisor, options.standby, latch, board)

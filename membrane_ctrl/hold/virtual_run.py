@@ -14,12 +14,9 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
-from membrane_ctrl.model import errors, shape_estimate, telemetry
-from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model import arrays, clock, errors, shape_estimate, telemetry
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.sim.truth_shape import ShapeSource
-from membrane_ctrl.sim.virtual_bench import VirtualBench, at_once
+from membrane_ctrl.sim import truth_shape, virtual_bench
 
 Alter = Callable[[float, roles.BenchReading], roles.BenchReading | None]
 
@@ -69,9 +66,9 @@ class VirtualRun:
     def __init__(
         self,
         config: Config,
-        bench: VirtualBench,
-        sag_sensitivity: FloatArray,
-        shape: ShapeSource | None = None,
+        bench: virtual_bench.VirtualBench,
+        sag_sensitivity: arrays.FloatArray,
+        shape: truth_shape.ShapeSource | None = None,
         alter: Alter | None = None,
     ) -> None:
         self._bench = bench
@@ -86,7 +83,7 @@ class VirtualRun:
         self._supervisor = Supervisor(
             Controller(config, sag_sensitivity),
             Wiring(_AtOnce(bench, self._altered), shapes=self._newest_shape if shape else None, truth=self._truth),
-            RunClock.start(),  # of the events' stamps, which nobody records here
+            clock.RunClock.start(),  # of the events' stamps, which nobody records here
             config.loop.rate_hz,
         )
         bench.open()
@@ -105,11 +102,11 @@ class VirtualRun:
             self._supervisor.ask(command)
         dt_s = self.now_s - self._last_s
         late_s = 1e-3 * self._bench.wrong.late_ms + max(0.0, dt_s - 1.5 * self._period_s)
-        inputs, outputs = at_once(self._supervisor.tick(self.now_s, dt_s, late_s))
+        inputs, outputs = virtual_bench.at_once(self._supervisor.tick(self.now_s, dt_s, late_s))
         self._last_s = self.now_s
         if outputs.finished is not None:
             self.finished = outputs.finished
-            at_once(self._supervisor.leave())
+            virtual_bench.at_once(self._supervisor.leave())
             self._bench.close()
         return VirtualTick(inputs, outputs)
 
@@ -132,7 +129,9 @@ class VirtualRun:
 class _AtOnce:
     """A virtual bench as the supervisor's `Bench`: what it is asked, it answers without waiting."""
 
-    def __init__(self, bench: VirtualBench, altered: Callable[[roles.BenchReading], roles.BenchReading]) -> None:
+    def __init__(
+        self, bench: virtual_bench.VirtualBench, altered: Callable[[roles.BenchReading], roles.BenchReading]
+    ) -> None:
         self._bench, self._altered = bench, altered
 
     async def open(self) -> roles.BenchIdentity:

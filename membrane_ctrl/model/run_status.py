@@ -6,8 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from membrane_ctrl.model import events, run_events
-from membrane_ctrl.model.telemetry import TelemetryRow
+from membrane_ctrl.model import events, run_events, telemetry
 
 _GONE = "no recorder runs"
 # Of one trouble: it goes into one line of a screen and of a log, each second; the event has all of it
@@ -18,7 +17,7 @@ _LONGEST = 300
 class RunStatus:
     """The newest tick, and what the events since the start leave standing."""
 
-    row: TelemetryRow | None = None  # of the newest tick; None before the first one
+    row: telemetry.TelemetryRow | None = None  # of the newest tick; None before the first one
     since_s: float = 0.0  # when the run entered its state
     why: str = ""  # the controller's last reason
     fault: events.Fault | None = None  # that stands
@@ -38,7 +37,7 @@ class RunStatus:
         """All trouble of the recording in one line; empty when all is recorded."""
         return "; ".join(self.recording.values())
 
-    def after_row(self, row: TelemetryRow) -> RunStatus:
+    def after_row(self, row: telemetry.TelemetryRow) -> RunStatus:
         """One tick later."""
         same = self.row is not None and row.state == self.row.state
         return replace(self, row=row, since_s=self.since_s if same else row.mono_s)

@@ -17,7 +17,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
-from membrane_ctrl.model import events, run_events, terminal
+from membrane_ctrl.model import events, terminal
 
 _CONTEXT = multiprocessing.get_context("spawn")
 _OF_THE_GROUP = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
@@ -31,14 +31,13 @@ class Child:
     Parameters
     ----------
     name : str
-        What it is called in messages and in the process list.
+        For messages and the process list.
     target : str
-        "package.module:function". Imported in the child, after its priority is set, so that heavy imports do
-        not compete with the tick.
+        "package.module:function". The child imports it after it has set its priority, so that heavy imports do not
+        compete with the tick.
     args : tuple
         Picklable arguments of the function.
     nice : int
-        How much the child steps back behind the control process.
     """
 
     def __init__(self, name: str, target: str, args: tuple[Any, ...], nice: int) -> None:
@@ -46,12 +45,12 @@ class Child:
         self._process = _CONTEXT.Process(target=_main, args=(target, args, nice), name=name, daemon=True)
 
     def start(self) -> None:
-        """Start it; returns at once."""
+        """Start it without waiting."""
         resource_tracker.ensure_running()  # it unblocks signals when it starts
         try:
             with _group_blocked():
                 self._process.start()
-        except BaseException:  # the signal that came meanwhile: who asked for the child does not know of it yet
+        except BaseException:  # a signal came meanwhile, and the caller does not know of the child yet
             self.stop(1.0)
             raise
 
@@ -76,11 +75,11 @@ class Child:
         return not self.alive
 
     def kill(self) -> None:
-        """SIGKILL, which a stopped process obeys as well; does not wait for its end."""
+        """Send SIGKILL, which a stopped process obeys as well, and do not wait."""
         self._process.kill()
 
     def stop(self, timeout_s: float) -> None:
-        """`STOP`, and SIGKILL if that does not end it in time."""
+        """Send `STOP`, and SIGKILL if the child has not ended in time."""
         if self._process.pid is None:
             return
         if self.alive:
@@ -103,10 +102,7 @@ def parent_lives() -> bool:
 
 
 def _main(target: str, args: tuple[Any, ...], nice: int) -> None:
-    """Run the target, then leave without taking the interpreter down piece by piece.
-
-    Arrays that still look into shared memory would otherwise be met by its destructor, which complains on stderr.
-    """
+    """Run the target, then leave at once: the interpreter's shutdown would complain of arrays in shared memory."""
     os.nice(nice)
     module, function = target.split(":")
     code = 0
@@ -122,7 +118,7 @@ def _main(target: str, args: tuple[Any, ...], nice: int) -> None:
 
 @contextlib.contextmanager
 def _group_blocked() -> Iterator[None]:
-    """The child inherits the mask, from its first instruction on; this process gets what came meanwhile."""
+    """Block the group's signals, for the child from its first instruction on; this process gets them afterwards."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_THE_GROUP)
     try:
         yield
@@ -135,16 +131,8 @@ def pipe() -> Any:
     return _CONTEXT.Pipe()
 
 
-# What a child process says to the control process over its pipe, without ever waiting for it.
-
-
-def alive(for_s: float) -> run_events.Alive:
-    """It is at work, and will say so again within `for_s` seconds (`ManagedChild` sees that it does)."""
-    return run_events.Alive(for_s)
-
-
 def reporter(status: Connection | None) -> Callable[[events.Event], None]:
-    """A function that sends an event over `status` if there is room for it now, and otherwise lets it go."""
+    """A function that sends an event over `status`, or drops it if the pipe is full; it never waits."""
     if status is None:
         return lambda event: None
     os.set_blocking(status.fileno(), False)
@@ -152,37 +140,26 @@ def reporter(status: Connection | None) -> Callable[[events.Event], None]:
     def report(event: events.Event) -> None:
         try:
             status.send({key: _short(value) for key, value in event.to_dict().items()})
-        except OSError:  # full, or nobody at the other end: recording goes on
+        except OSError:  # full, or closed at the other end
             return
 
     return report
 
 
 def _short(value: Any) -> Any:
-    """A message this short goes into a pipe whole or not at all, so that the other end never sees half of one."""
+    """A message this short goes into a pipe whole or not at all."""
     return value[:1000] if isinstance(value, str) else value
 
 
-# The tick (and the twin, which stands for devices) before everything else on the machine, where it allows that.
-
-
-# The lowest real-time priority is above every ordinary process; kernel threads that need to be first stay first
-_REAL_TIME = 1
-
-
 def raise_priority() -> str:
-    """Give this process a real-time class; the children it starts later do not inherit it.
+    """Give this process, but not its children, a real-time class; returns "real-time" or "ordinary".
 
-    A tick takes some 2 % of a core, and the kernel keeps 5 % of each second for the others whatever a real-time
-    process does. Without the right to it (root, CAP_SYS_NICE, or `LimitRTPRIO=` of the service) nothing changes.
-
-    Returns
-    -------
-    str
-        "real-time" or "ordinary", for the record.
+    A tick takes some 2 % of a core, and the kernel keeps 5 % of each second for ordinary processes. Without the right
+    to it (root, CAP_SYS_NICE, or `LimitRTPRIO=` of the service) nothing changes.
     """
     try:
-        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(_REAL_TIME))
-    except (OSError, AttributeError):  # no right to it, or not Linux
+        # the lowest real-time priority: above every ordinary process, below the kernel's own threads
+        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+    except (OSError, AttributeError):  # not permitted, or not Linux
         return "ordinary"
     return "real-time"

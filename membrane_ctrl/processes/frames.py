@@ -1,9 +1,8 @@
-"""Camera frames in shared memory: pixels are written in place by the camera and read by whoever wants them.
+"""Camera frames in shared memory: the camera writes the pixels in place, any number of readers copy them.
 
-The same idea as `membrane_ctrl.processes.ring`, for messages too big to copy on every write: one writer that never
-waits, a slot with its sequence number before and after the pixels. The number in front changes before the
-camera touches the pixels, the one behind when the frame is whole; a reader keeps a copy only if both were the
-expected one, the one behind before copying and the one in front after it.
+As in `membrane_ctrl.processes.ring`, one writer never waits, and each slot has its sequence number before and after
+the pixels. The first number changes before the camera touches the pixels, the second when the frame is whole; a
+reader keeps a copy only if the second was right before it copied, and the first afterwards.
 """
 
 from __future__ import annotations
@@ -40,22 +39,9 @@ class FrameHead:
 
 
 class FrameRing:
-    """Owns the shared memory; create it in the process that outlives writer and readers.
+    """Owns the shared memory of the last `slots` frames; create it in the process that outlives writer and readers.
 
-    Parameters
-    ----------
-    slots : int
-        Frames kept: a full cycle plus the one being taken.
-    height_px, width_px : int
-        Size of a frame.
-    dtype : str
-        "uint8" or "uint16".
-
-    Raises
-    ------
-    OSError
-        If the machine's shared memory has no room. It is reserved here: memory that is only promised would end
-        the writing process with SIGBUS at its first frame.
+    Raises OSError without room in shared memory. The memory is reserved here: otherwise SIGBUS would end the writer.
     """
 
     def __init__(self, slots: int, height_px: int, width_px: int, dtype: str = "uint8") -> None:
@@ -75,16 +61,13 @@ class FrameRing:
 
     @classmethod
     def for_optics(cls, optics: OpticsConfig, kept_cycles: int = 1) -> FrameRing:
-        """A ring for the frames of one full cycle (2 x (N sinusoids + 4 Gray) + white + black) and one more.
-
-        Larger if `kept_cycles` cycles of 2 N sinusoids need it.
-        """
+        """A ring for a full cycle (2 x (N sinusoids + 4 Gray) + white + black) or `kept_cycles` fringes, plus one."""
         camera = optics.camera
         slots = max(2 * (optics.pattern.steps + 4) + 2, kept_cycles * 2 * optics.pattern.steps) + 1
         return cls(slots, camera.height_px, camera.width_px, "uint8" if camera.bits == 8 else "uint16")
 
     def close(self) -> None:
-        """Give the memory back; who is still attached keeps it."""
+        """Free the memory; processes still attached keep it."""
         self._memory.close()
         self._memory.unlink()
 
@@ -110,7 +93,7 @@ class FrameWriter:
         self._next = self._slots.written()
 
     def begin(self) -> FrameSlot:
-        """The oldest slot, to be written over; a slot that was begun and not committed is begun again."""
+        """The oldest slot, to be overwritten; one that was begun and not committed is begun again."""
         self._slots.set_before(self._next)
         return FrameSlot(self, self._slots.pixels(self._next))
 
@@ -127,7 +110,7 @@ class FrameWriter:
 
 
 class FrameReader:
-    """One of any number of readers; it never holds the writer up."""
+    """One of any number of readers; the writer never waits for it."""
 
     def __init__(self, address: FrameAddress) -> None:
         self._memory = SharedMemory(address.name)
@@ -141,13 +124,7 @@ class FrameReader:
         return [head for head in heads if head is not None]
 
     def copy(self, head: FrameHead, step: int = 1) -> Pixels | None:
-        """Copy of a frame's pixels, every `step`-th in both directions.
-
-        Returns
-        -------
-        (H // step, W // step) array or None
-            None if the writer has come round to this slot meanwhile.
-        """
+        """Copy of a frame's pixels, every `step`-th in both directions; None once they are overwritten."""
         slots = self._slots
         if slots.after(head.index) != head.index + 1:
             return None
@@ -161,7 +138,7 @@ class FrameReader:
 
 
 class _Slots:
-    """The layout: write counter; then for each slot a head with the sequence number, pixels, and the number again."""
+    """The layout: write counter; for each slot a head with the sequence number, the pixels, the number again."""
 
     def __init__(self, memory: SharedMemory, address: FrameAddress) -> None:
         assert memory.buf is not None  # None only after close()

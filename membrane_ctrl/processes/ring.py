@@ -1,15 +1,14 @@
 """A ring of messages in shared memory: one writer that never waits, any number of readers.
 
-The writer overwrites the oldest slot; a reader that was too slow sees a gap in the sequence numbers and counts
-it. What a killed writer had put is still there for its readers.
+The writer overwrites the oldest slot; a reader that was too slow counts the gap in the sequence numbers. Messages of
+a killed writer stay readable.
 
 Counter and sequence numbers are 8-byte aligned and written through a memoryview of 8-byte words, which makes one
 store of each assignment. (`struct.pack_into` clears the bytes first, and a racing reader sees the counter as 0.)
-Each slot carries its sequence number before and after the message. A reader takes a message only if both are the one
-it expects: it reads the one behind before it copies and the one in front afterwards. That is enough on x86-64, where
-stores become visible in their order. On ARM64 they may not, so each slot also has a CRC-32 of its message, seeded
-with the sequence number: a message that is not all there yet does not fit, and the reader looks again at its next
-call.
+Each slot carries its sequence number before and after the message. A reader takes a message only if both are the
+expected one: it reads the last before it copies and the first afterwards. On x86-64 that is enough, because stores
+become visible in order. On ARM64 they may not, so each slot also has a CRC-32 of its message, seeded with its number:
+an incomplete message does not match, and the reader tries again at its next call.
 """
 
 import json
@@ -58,15 +57,7 @@ class RingAddress:
 
 
 class Ring:
-    """Owns the shared memory; create it in the process that outlives the readers' start.
-
-    Parameters
-    ----------
-    slots : int
-        Messages kept.
-    slot_bytes : int
-        Longest message.
-    """
+    """Owns the shared memory of `slots` messages of at most `slot_bytes`; create it in the longest-lived process."""
 
     def __init__(self, slots: int, slot_bytes: int) -> None:
         size_bytes = RingAddress("", slots, slot_bytes).size_bytes
@@ -77,7 +68,7 @@ class Ring:
             words[_IS_RING], words[_SLOTS], words[_SLOT_BYTES] = _MAGIC, slots, slot_bytes
 
     def close(self) -> None:
-        """Give the memory back; readers that are still attached keep theirs."""
+        """Free the memory; readers still attached keep it."""
         self._memory.close()
         self._memory.unlink()
 
@@ -148,23 +139,9 @@ class RingWriter:
 
 
 class RingReader:
-    """One reader; it starts at the oldest message still in the ring.
+    """One reader; it starts at the oldest message still in the ring, and counts the messages it lost in `dropped`.
 
-    Parameters
-    ----------
-    address : RingAddress
-        Of the ring.
-    memory : mmap, optional
-        The ring's memory, if the caller has mapped it.
-
-    Attributes
-    ----------
-    dropped : int
-        Messages overwritten before this reader got to them.
-
-    Raises
-    ------
-    RingError
+    `memory` is the ring's, if the caller has mapped it. Raises RingError.
     """
 
     def __init__(self, address: RingAddress, memory: mmap | None = None) -> None:
@@ -248,10 +225,9 @@ def _stride(slot_bytes: int) -> int:
 
 # The rings of a run for programs that the run did not start: their addresses in its folder, `rings.json`.
 #
-# Reading them costs the control process nothing, and every tick is there for a minute: what a session needs and a
-# stream of status lines through the port is not (docs/decisions/79-tuning-sessions.md). The folder may have
-# been made by somebody else: only shared memory of this user that is the ring it is said to be is opened, to be read.
-
+# Reading them costs the control process nothing, and they hold every tick of the last minute, which a session needs
+# (docs/decisions/79-tuning-sessions.md). The folder may come from anybody: only shared memory of this user that is
+# the ring it claims to be is opened, read-only.
 
 _FILE = "rings.json"
 _FILE_BYTES_MAX = 4096  # three rings take 250
@@ -269,12 +245,7 @@ def publish(run_dir: Path, rings: Mapping[str, RingAddress | None]) -> None:
 def attach(run_dir: Path) -> dict[str, RingReader]:
     """Readers of a run's rings, each at its newest message.
 
-    Raises
-    ------
-    FileNotFoundError
-        The run has published none, or is over.
-    OSError, RingError
-        `rings.json` or what it names is none of ours.
+    Raises FileNotFoundError for a run that has published none or is over; OSError or RingError for foreign rings.
     """
     readers: dict[str, RingReader] = {}
     with ExitStack() as stack:
@@ -310,9 +281,6 @@ def _mapped(address: RingAddress) -> mmap:
         if found.st_size != size_bytes:
             raise RingError(f"{address.name} has {found.st_size} bytes, not the {size_bytes} of the ring")
         return mmap(file.fileno(), size_bytes, prot=PROT_READ)
-
-
-# How another process finds the shared frames: plain data, free of NumPy (see `threads.py` for why that counts).
 
 
 @dataclass(frozen=True, slots=True)

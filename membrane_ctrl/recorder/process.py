@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event, EventLine
-from membrane_ctrl.model.run_events import Ended
-from membrane_ctrl.processes.child import STOP, alive, parent_lives, reporter
+from membrane_ctrl.model.run_events import Alive, Ended
+from membrane_ctrl.processes.child import STOP, parent_lives, reporter
 from membrane_ctrl.processes.frames import FrameHead, FrameReader, Pixels
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
 
@@ -129,7 +129,7 @@ def _record(
         elif recorder.urgent or time.monotonic() >= next_write_s:
             next_write_s = time.monotonic() + spec.flush_s
             recorder.write()
-            report(alive(_ROUND_S))
+            report(Alive(_ROUND_S))
         if not recorder.ended:
             time.sleep(POLL_S)
     recorder.finish(in_haste=asked())

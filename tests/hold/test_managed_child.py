@@ -11,8 +11,7 @@ import pytest
 
 from membrane_ctrl.hold.child_processes import ManagedChild
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.model.run_events import ChildSilent, DiskLow
-from membrane_ctrl.processes.child import alive
+from membrane_ctrl.model.run_events import Alive, ChildSilent, DiskLow
 
 
 class FakeChild:
@@ -114,13 +113,13 @@ def test_after_an_hour_it_is_tried_again() -> None:
 
 def test_a_child_that_breaks_its_word_is_killed_and_replaced() -> None:
     managed, agency = make_managed()
-    agency.theirs[0].send(alive(5.0).to_dict())
+    agency.theirs[0].send(Alive(5.0).to_dict())
     assert managed.look(10.0) == []
     assert managed.look(15.0) == []
     (silent,) = managed.look(15.5)
     assert silent == ChildSilent("recorder", 0.5, killed=True)
     assert kinds(managed.look(16.0)) == ["child_ended", "child_restarted"]
-    agency.theirs[1].send(alive(5.0).to_dict())
+    agency.theirs[1].send(Alive(5.0).to_dict())
     assert managed.look(17.0) == []
 
 
@@ -136,12 +135,12 @@ def test_who_cannot_be_replaced_any_more_is_not_killed_and_may_come_back() -> No
         if len(agency.numbers) <= 10 and managed.child.alive:
             managed.child.kill()
         managed.look(float(second))
-    agency.theirs[-1].send(alive(5.0).to_dict())
+    agency.theirs[-1].send(Alive(5.0).to_dict())
     assert managed.look(1200.0) == []
     (silent,) = managed.look(1206.0)
     assert not silent.to_dict()["killed"]
     assert managed.child.alive
     assert managed.look(1207.0) == [], "said once"
-    agency.theirs[-1].send(alive(5.0).to_dict())
+    agency.theirs[-1].send(Alive(5.0).to_dict())
     managed.look(1208.0)
     assert kinds(managed.look(1214.0)) == ["child_silent"]
