@@ -92,14 +92,14 @@ def calibrate(
         list[str] | None,
         typer.Option(
             metavar="NAME[=SIGMA]",
-            help="Calibrate this parameter, too, e.g. bow_mm; sigma 0 holds it fixed; repeatable.",
+            help="Calibrate this parameter as well, e.g. bow_mm; sigma 0 keeps it fixed; repeatable.",
         ),
     ] = None,
     prior: PriorOption = None,
     laser_sigma_um: Annotated[
         float, typer.Option(min=0.001, help="Standard uncertainty of a set's mean laser reading, um.")
     ] = 1.0,
-    pictures: Annotated[bool, typer.Option(help="Draw the residuals beside the geometry.")] = True,
+    pictures: Annotated[bool, typer.Option(help="Draw the residuals next to the geometry file.")] = True,
     json: JsonOption = False,
     live: Annotated[
         bool, typer.Option("--live", help="Take the sets from a running hold; ask before the mirror moves.")
@@ -113,7 +113,7 @@ def calibrate(
     ] = False,
     session: Annotated[Path | None, typer.Option(help="--live: continue this session.")] = None,
     session_name: Annotated[str, typer.Option("--name", help="--live: name of a new session.")] = "live",
-    logs: Annotated[Path, typer.Option(help="--live: sessions are in LOGS/calibration.")] = Path("logs"),
+    logs: Annotated[Path, typer.Option(help="--live: put sessions in LOGS/calibration.")] = Path("logs"),
     run: Annotated[Path | None, typer.Option(help="--live: run folder of the hold.")] = None,
     socket: Annotated[Path | None, typer.Option(help="--live: control port of the hold.")] = None,
     take_over: Annotated[

@@ -20,7 +20,7 @@ SocketOption = Annotated[Path | None, typer.Option(help="The hold's socket; logs
 TlsOption = Annotated[str, typer.Option(metavar="HOST:PORT", help="Connect by TCP, with the certificate below.")]
 CertificateOption = Annotated[Path | None, typer.Option(help="With --tls: your certificate.")]
 KeyOption = Annotated[Path | None, typer.Option(help="With --tls: its key.")]
-AuthorityOption = Annotated[Path | None, typer.Option(help="With --tls: who signed the hold's certificate.")]
+AuthorityOption = Annotated[Path | None, typer.Option(help="With --tls: the authority of the hold's certificate.")]
 
 
 def _finite(value: float) -> float:
@@ -32,15 +32,15 @@ def _finite(value: float) -> float:
 SetpointArgument = Annotated[float, typer.Argument(metavar="UM", help="Setpoint, um.", callback=_finite)]
 FlowArgument = Annotated[float, typer.Argument(metavar="FLOW", help="Flow, um/s of the centre.", callback=_finite)]
 OnArgument = Annotated[bool, typer.Argument(metavar="on|off")]
-TextArgument = Annotated[str, typer.Argument(metavar="TEXT", help="What to write.")]
+TextArgument = Annotated[str, typer.Argument(metavar="TEXT", help="The remark.")]
 ReasonArgument = Annotated[str, typer.Argument(metavar="TEXT", help="Why the mirror is locked.")]
 GainsArgument = Annotated[
     str, typer.Argument(metavar="FILE", help="TOML or JSON file with loop keys, or the keys: 'kp_per_s = 0.5'.")
 ]
 TrialOption = Annotated[
-    str, typer.Option(help="Go back to the old gains after this, e.g. 2m, unless `ctl keep` comes.")
+    str, typer.Option(help="Trial time, e.g. 2m; the old gains return unless `ctl keep` comes first.")
 ]
-EveryOption = Annotated[str, typer.Option(help="Time between two lines, e.g. 500ms.")]
+EveryOption = Annotated[str, typer.Option(help="Time between two lines, e.g. 0.5s.")]
 
 
 def _has_value_next(word: str) -> bool:

@@ -32,7 +32,9 @@ def devices(json: JsonOption = False) -> int:
 
 
 def conformance(
-    url: Annotated[str, typer.Argument(help="The board: tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200.")],
+    url: Annotated[
+        str, typer.Argument(metavar="URL", help="Pump board: tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200.")
+    ],
     unit_id: Annotated[int, typer.Option(min=1, max=247, help="Modbus unit identifier.")] = 1,
     json: JsonOption = False,
 ) -> int:

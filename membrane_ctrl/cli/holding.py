@@ -13,7 +13,7 @@ from membrane_ctrl.model import clock, errors
 alarm_app = typer.Typer(no_args_is_help=True)
 
 FlatOption = Annotated[
-    bool, typer.Option("--from-flat", help="Start with a flat simulated mirror: a fill takes two hours.")
+    bool, typer.Option("--from-flat", help="Start with a flat simulated mirror; filling it takes two hours.")
 ]
 
 
@@ -31,7 +31,7 @@ def hold(
     twin: Annotated[bool, typer.Option("--twin", help="Hold the simulated bench instead of devices.")] = False,
     devices: Annotated[
         Path | None,
-        typer.Option(help="With --twin: emulate the instruments that this configuration names, byte for byte."),
+        typer.Option(help="With --twin: emulate the instruments of this configuration on their own protocols."),
     ] = None,
     duration: Annotated[str | None, typer.Option(help="Stop after this long, e.g. 90s, 3m, 2h30m.")] = None,
     name: Annotated[str, typer.Option(help="Name of the run folder.")] = "hold",
@@ -39,7 +39,7 @@ def hold(
     clear_faults: Annotated[
         bool,
         typer.Option(
-            "--clear-faults", help="Clear the faults that the board or an earlier run has latched, once you know why."
+            "--clear-faults", help="Clear faults latched by the board or an earlier run; find their cause first."
         ),
     ] = False,
     standby: Annotated[bool, typer.Option("--standby", help="Start in standby and wait for `ctl hold`.")] = False,
@@ -69,7 +69,7 @@ def twin(
     speed: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Simulated seconds per second.")] = 1.0,
     from_flat: FlatOption = False,
 ) -> int:
-    """Serve the simulated bench on its real protocol, for any client, until interrupted."""
+    """Serve the simulated bench over Modbus TCP, for any client, until interrupted."""
     from membrane_ctrl.sim.bench import serve_twin
 
     return serve_twin(_started(configured(config), from_flat), speed)
@@ -81,11 +81,11 @@ def safe(
     latch: Annotated[
         bool,
         typer.Option(
-            help="Keep the pump stopped until a person clears the latch; --no-latch leaves a running program alone."
+            help="Lock the pump until a person clears the latch; --no-latch leaves a running program alone."
         ),
     ] = True,
 ) -> int:
-    """Stop the pump that a configuration names, whatever program runs; the vent stays as it is."""
+    """Stop the pump of a configuration, whatever program controls it; leave the vent as it is."""
     from membrane_ctrl.commissioning.safe import make_safe
 
     return make_safe(configured(config), str(config), logs, latch)
@@ -93,13 +93,13 @@ def safe(
 
 @alarm_app.callback()
 def alarm() -> None:
-    """Alarm messages: `alarm test` sends one."""
+    """Test the alarm messages."""
 
 
 @alarm_app.command("test")
 def alarm_test(
     config: ConfigOption = None,
-    escalated: Annotated[bool, typer.Option("--escalated", help="Send it to the escalation addresses, too.")] = False,
+    escalated: Annotated[bool, typer.Option("--escalated", help="Include the escalation addresses.")] = False,
     json: JsonOption = False,
 ) -> int:
     """Send a test message to every address of the alarms."""

@@ -20,8 +20,8 @@ def measure(
     capture_set: SetArgument,
     geometry: Annotated[Path | None, typer.Option(help="Geometry to use instead of the set's own.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the result; SET/result by default.")] = None,
-    pictures: Annotated[bool, typer.Option(help="Draw pictures beside the result.")] = True,
-    rerun: Annotated[bool, typer.Option("--rerun", help="Write measurement.rrd beside the result.")] = False,
+    pictures: Annotated[bool, typer.Option(help="Draw pictures next to the result.")] = True,
+    rerun: Annotated[bool, typer.Option("--rerun", help="Write measurement.rrd next to the result.")] = False,
     json: JsonOption = False,
 ) -> int:
     """Measure one capture set: height, Zernike coefficients, quality."""
@@ -77,7 +77,7 @@ def stability(
     ] = None,
     trials: Annotated[int, typer.Option(min=2, help="Monte Carlo trials per set.")] = 100,
     seed: SeedOption = 1,
-    rerun: Annotated[bool, typer.Option("--rerun", help="Write stability.rrd beside the result.")] = False,
+    rerun: Annotated[bool, typer.Option("--rerun", help="Write stability.rrd next to the result.")] = False,
     json: JsonOption = False,
 ) -> int:
     """Evaluate the stability of a run of sets: standard deviation, points over time, pairs with uncertainty."""
@@ -95,30 +95,28 @@ def simulate(
     steps: Annotated[int | None, typer.Option(min=3, max=64, help="Phase steps.")] = None,
     bits: Annotated[int | None, typer.Option(min=8, max=16, help="Bits per pixel.")] = None,
     noise_adu: Annotated[float | None, typer.Option(min=0.0, help="Noise of a pixel, counts.")] = None,
-    shrink: Annotated[int, typer.Option(min=1, max=16, help="Factor: larger pixels, fewer of them.")] = 1,
+    shrink: Annotated[int, typer.Option(min=1, max=16, help="Make the pixels larger and fewer by this factor.")] = 1,
     gamma: Annotated[float, typer.Option(help="Gamma of the display.")] = 1.0,
     motion_um: Annotated[float, typer.Option(help="Amplitude of the film's motion, um.")] = 0.0,
     motion_hz: Annotated[float, typer.Option(help="Frequency of the motion, Hz.")] = 0.3,
     drift_um_per_s: Annotated[float, typer.Option(help="Drift of the film, um/s.")] = 0.0,
-    displacement_um: Annotated[
-        float, typer.Option(help="Distance of the bowl from that depth at the start, um.")
-    ] = 0.0,
+    displacement_um: Annotated[float, typer.Option(help="Displacement from that depth at the start, um.")] = 0.0,
     laser_noise_um: Annotated[float, typer.Option(min=0.0, help="Noise of the laser readings, um.")] = 0.0,
     stated: Annotated[
-        Path | None, typer.Option(help="Geometry that the set states; the truth is the configuration's.")
+        Path | None, typer.Option(help="Geometry stated in the set; the true one is the configuration's.")
     ] = None,
-    exact: Annotated[bool, typer.Option("--exact", help="Trace every pixel: slow, true to the last bit.")] = False,
+    exact: Annotated[bool, typer.Option("--exact", help="Trace every pixel exactly: slow.")] = False,
     seed: SeedOption = 1,
     fault: Annotated[
         list[str] | None,
-        typer.Option(help="Fault to put in, kind:frame or kind:frame:amount, e.g. stale:x_sin_2; repeatable."),
+        typer.Option(help="Fault to add, kind:frame or kind:frame:amount, e.g. stale:x_sin_2; repeatable."),
     ] = None,
     sets: Annotated[
         int, typer.Option(min=1, help="Number of sets; more than one make a run: 0000 full, the others fringes.")
     ] = 1,
     interval_s: Annotated[float, typer.Option(min=0.0, help="Time from set to set of a run, s.")] = 4.0,
 ) -> int:
-    """Write a capture set, or a run of sets, with its truth beside it."""
+    """Simulate a capture set, or a run of sets, with its truth."""
     from membrane_ctrl.measure.simulate import SimulateOptions, simulate_command
     from membrane_ctrl.sim.optics.simulation_spec import Motion
 

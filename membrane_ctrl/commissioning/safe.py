@@ -22,7 +22,7 @@ from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile
 
 _CAUSE = "made safe by hand"
-_REMEDY = "see with whoever made it safe that the mirror may move"
+_REMEDY = "ask the person who made it safe whether the mirror may move"
 _LOOK_S = 0.1
 _LAPSE_S = 1.0  # after a watchdog period: a pump that still runs is not going to be stopped by the board
 

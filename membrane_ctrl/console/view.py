@@ -14,9 +14,6 @@ from membrane_ctrl.console.model import ConsoleView, ShapeView
 from membrane_ctrl.console.why import NONE, duration, number, percent
 from membrane_ctrl.model import states, telemetry
 
-# Bars made of characters: a level, and a signed history around zero.
-
-
 _EIGHTHS = " ▁▂▃▄▅▆▇█"
 
 
@@ -77,22 +74,12 @@ _CALM = 0.25  # of the band: a finer scale than this would make noise look like 
 
 
 def console_panel(view: ConsoleView, config: Config, run: str) -> Panel:
-    """the whole console.
-
-    Parameters
-    ----------
-    view : ConsoleView
-        What to show.
-    config : Config
-        For band and limits.
-    run : str
-        Where the recording goes.
-    """
+    """The whole console; `run` is where the recording goes."""
     time_left = f"{duration(view.left_s)} left" if math.isfinite(view.left_s) else "until stopped"
     title = Text.assemble(" ", (view.state.name.lower(), _STATE_STYLES.get(view.state, "bold")))
     title.append(f" for {duration(view.state_age_s)} ")
     return Panel(
-        Group(_headline(view), Text(), _figures(view, config)),
+        Group(_headline(view, config), Text(), _figures(view, config)),
         title=title,
         title_align="left",
         subtitle=Text(f" run {duration(view.elapsed_s)}, {time_left} · {run} ", style="dim", overflow="ellipsis"),
@@ -101,11 +88,12 @@ def console_panel(view: ConsoleView, config: Config, run: str) -> Panel:
     )
 
 
-def _headline(view: ConsoleView) -> Text:
+def _headline(view: ConsoleView, config: Config) -> Text:
     """Faults first, else why the pump is where it is."""
     if view.silent_s:
         return Text(f"the control loop has been silent for {view.silent_s:.1f} s", style="bold red")
-    style = "bold red" if view.fault else "bold yellow" if view.why.startswith("outside") else "bold"
+    outside = view.row is not None and abs(view.row.error_um) > config.limits.band_um
+    style = "bold red" if view.fault else "bold yellow" if outside else "bold"
     return Text(view.why, style=style, overflow="fold")
 
 

@@ -13,38 +13,26 @@ _RUNGS = {
     Rung.VENT: "pump is off and the vent is open",
 }
 _STATES = {
-    State.STANDBY: "pump is off: nobody has asked to hold the mirror",
+    State.STANDBY: "pump is off: no hold was requested",
     State.CHECK: "pump is off until every sensor has been good for a while",
-    State.MANUAL: "pump is where a person has put it",
+    State.MANUAL: "pump flow is set by hand",
     State.TUNE: "pump is driven by a tuning session",
     State.LOWER: "pump is being stopped: the run is ending",
-    State.FAULT: "pump is off: a fault is latched until a person clears it",
+    State.FAULT: "pump is off: a person must clear the latched fault",
 }
 # Below this share of the flow that holds the mirror a contribution is not worth naming.
 _WORTH_NAMING = 0.03
 
 
 def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
-    """The line.
-
-    Parameters
-    ----------
-    row : TelemetryRow
-        The newest tick.
-    told : str
-        What the controller itself last gave as its reason in this state; empty if nothing.
-    fault : str
-        The fault that stands, in words; empty if none.
-    config : Config
-        For band, flow limit and target.
-    """
+    """The line; `told` is the controller's own last reason, `fault` the fault that stands in words, or empty."""
     state, rung = State(int(row.state)), Rung(int(row.rung))
     if rung != Rung.NONE:
-        return f"{_RUNGS[rung]}: {fault or told or 'a fault is not named'}"
+        return f"{_RUNGS[rung]}: {fault or told or 'unknown fault'}"
     if state in _STATES:
         return told or _STATES[state]
     if not (math.isfinite(row.displacement_um) and math.isfinite(row.filtered_um)):
-        return f"{_RUNGS[Rung.HOLD_FLOW]}: {told or fault or 'there is no valid laser reading'}"
+        return f"{_RUNGS[Rung.HOLD_FLOW]}: {told or fault or 'no valid laser reading'}"
     if state == State.INFLATE:
         to_go_um = row.target_um - row.filtered_um
         return f"{_flow(row)}: {'filling' if to_go_um > 0 else 'waiting for the leak'}, {abs(to_go_um):.1f} um to go"
@@ -81,10 +69,7 @@ def _flow(row: TelemetryRow) -> str:
     return f"pump gives {row.flow_um_per_s:.2f} um/s"
 
 
-# Numbers and times as a person reads them; a dash where there is none.
-
-
-NONE = "–"
+NONE = "–"  # where there is no number
 
 
 def number(value: float, digits: int, unit: str = "", sign: bool = False) -> str:

@@ -69,21 +69,21 @@ _HOLD, _PARKED, _FLOW = (
 
 TABLE: dict[Kind, CommandRule] = {
     "setpoint": CommandRule("operate", RUNNING, "Ramp to a setpoint of the laser, in um.", needs=("value",)),
-    "hold": CommandRule("operate", _PARKED, "Hold, or go back to holding."),
+    "hold": CommandRule("operate", _PARKED, "Hold the mirror, or go back to holding it."),
     "pause": CommandRule("operate", _HOLD, "Pause the loop: the pump keeps its mean flow."),
     "resume": CommandRule("operate", _HOLD, "Resume the loop after a pause."),
-    "manual": CommandRule("operate", _FLOW, "Hold a flow by hand, in um/s of the centre.", needs=("value",)),
+    "manual": CommandRule("operate", _FLOW, "Set the pump's flow by hand, in um/s of the centre.", needs=("value",)),
     "gains": CommandRule("tune", RUNNING, "Set loop gains, on trial or for good.", needs=("loop",), takes=("value",)),
     "keep": CommandRule("tune", RUNNING, "Keep the gains that are on trial."),
     "tune": CommandRule("tune", _HOLD, "Run a tuning experiment.", needs=("experiment",)),
     "shape_on": CommandRule("operate", ANY, "Switch the shape loop on."),
     "shape_off": CommandRule("operate", ANY, "Switch the shape loop off."),
-    "mark": CommandRule("operate", ANY, "Write a line on the timeline.", needs=("text",)),
-    "capture": CommandRule("operate", _HOLD, "Take a full set into the run's raw/ folder."),
+    "mark": CommandRule("operate", ANY, "Add a remark to the timeline.", needs=("text",)),
+    "capture": CommandRule("operate", _HOLD, "Save a full capture set in the run's raw/ folder."),
     "ack": CommandRule("operate", {State.STANDBY, State.FAULT}, "Clear a latched fault and acknowledge the alarms."),
-    "lower": CommandRule("operate", RUNNING, "Lower the mirror through the leak, pump off."),
+    "lower": CommandRule("operate", RUNNING, "Stop the pump; the leak lowers the mirror."),
     "vent": CommandRule("operate", ANY, "Open the vent."),
-    "stop": CommandRule("operate", ANY, "End the run safely; always obeyed."),
+    "stop": CommandRule("operate", ANY, "End the run safely; never refused."),
     # a fault of an earlier run, or a person's lock
     "latch": CommandRule("operate", ANY, "Lock the mirror: pump off, no hold before `ack`.", takes=("text",)),
 }

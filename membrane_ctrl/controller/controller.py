@@ -152,7 +152,7 @@ class Controller:
             if self._obey(command, obeyed, events):
                 obeyed.add(command.kind)
         if self._gains.overdue(scene.now_s):
-            self._revert_gains("nobody has kept them in time", events)
+            self._revert_gains("nobody kept them in time", events)
 
     def _obey(self, command: commands.Command, obeyed: Collection[str], events: list[Event]) -> bool:
         """Do what a command asks, or say why not; either is recorded with who asked and why."""
@@ -317,7 +317,7 @@ class Controller:
         if state != State.TUNE:
             scene.trial = scene.trial_ended = None
         if state == State.FAULT and self._gains.on_trial:
-            self._revert_gains("a fault came while they were on trial", events)
+            self._revert_gains("a fault occurred during the trial", events)
         if self.state == State.FAULT:  # it was acknowledged, or may resume
             if not scene.acknowledged and self.fault is not None:
                 self._resume.resumed(scene.now_s)

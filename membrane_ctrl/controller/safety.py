@@ -54,9 +54,9 @@ TABLE: tuple[Rule, ...] = (
         seen=lambda o: o.inflow, broken=lambda o, c: bool(o.inflow),
     ),
     Rule(
-        code=51, name="locked", cause="a person has latched the mirror",
+        code=51, name="locked", cause="a person has locked the mirror",
         limit="ctl ack", rung=Rung.PUMP_OFF, states=CONNECTED | {State.FAULT},
-        remedy="see with whoever latched it that the mirror may move",
+        remedy="ask the person who locked it whether the mirror may move",
         seen=lambda o: o.locked, broken=lambda o, c: bool(o.locked),
     ),
     Rule(
@@ -78,7 +78,7 @@ TABLE: tuple[Rule, ...] = (
         broken=lambda o, c: not o.link_up,
     ),
     Rule(
-        code=31, name="device_silent", cause="the device link is up, but no answer came in time",
+        code=31, name="device_silent", cause="the link is up, but the device did not answer in time",
         limit="limits.stale_s", rung=Rung.PUMP_OFF, states=CONNECTED, may_resume=True,
         remedy="check the board; its watchdog has stopped the pump",
         seen=lambda o: f"{o.reading_age_s:.2f} s", broken=lambda o, c: o.reading_age_s > c.stale_s,
@@ -93,11 +93,11 @@ TABLE: tuple[Rule, ...] = (
     Rule(
         code=32, name="watchdog_tripped", cause="the board's watchdog stopped the pump",
         limit="must not trip", rung=Rung.PUMP_OFF, states=CONNECTED, may_resume=True,
-        remedy="look at the lateness in the recording; the machine may be overloaded",
+        remedy="check the lateness in the recording; the machine may be overloaded",
         broken=lambda o, c: o.watchdog_tripped,
     ),
     Rule(
-        code=33, name="board_fault", cause="the board has latched a fault of its own",
+        code=33, name="board_fault", cause="the board has latched a fault",
         limit="must be 0", rung=Rung.PUMP_OFF, states=CONNECTED,
         remedy="read the board's fault bits (docs/registers.md)",
         seen=lambda o: f"bits {o.board_faults:#x}", broken=lambda o, c: o.board_faults != 0,
@@ -116,16 +116,16 @@ TABLE: tuple[Rule, ...] = (
     ),
     Rule(
         code=14, name="laser_implausible",
-        cause="camera and gauge agree that the laser does not show where the mirror is",
+        cause="camera and gauge agree that the laser is wrong",
         limit="shape.disagreement_max_um", rung=Rung.HOLD_FLOW, states=HOLDING,
         remedy="look for a knocked laser mount; then take a new reference with `ctl shape off` and `ctl shape on`",
         seen=lambda o: o.laser_lies, broken=lambda o, c: bool(o.laser_lies),
     ),
     Rule(
-        code=18, name="laser_gauge_apart", cause="laser and gauge do not show the same film",
+        code=18, name="laser_gauge_apart", cause="laser and gauge contradict each other",
         limit="limits.laser_gauge_apart_max_um, limits.laser_gauge_drift_max_um", rung=Rung.RAMP_DOWN,
         states=CONNECTED,
-        remedy="see which of them is wrong: laser mount, gauge hose, units; for another film set [optics.mirror] "
+        remedy="find which of them is wrong: laser mount, gauge hose, units; for another film set [optics.mirror] "
         "sag_mm and pressure_pa",
         seen=lambda o: o.laser_gauge_apart, broken=lambda o, c: bool(o.laser_gauge_apart),
     ),
@@ -138,7 +138,7 @@ TABLE: tuple[Rule, ...] = (
     ),
     Rule(
         code=19, name="gas_excess",
-        cause="the film takes far more gas than it used to, and no camera sees it stand still",
+        cause="the film takes far more gas than before, and no camera sees it stand still",
         limit="limits.leak_growth_max", rung=Rung.RAMP_DOWN, states=HOLDING,
         remedy="look for an opening seam, then for a laser that creeps: compare it with a ruler",
         seen=lambda o: o.gas_excess, broken=lambda o, c: bool(o.gas_excess),
@@ -192,19 +192,19 @@ TABLE: tuple[Rule, ...] = (
     Rule(
         code=25, name="overdue", cause="a state took too long",
         limit="[states] time-outs", rung=Rung.RAMP_DOWN, states=CONNECTED,
-        remedy="see what it waited for; a fill from flat needs states.inflate_timeout_s of hours",
+        remedy="check what it waited for; a fill from flat needs states.inflate_timeout_s of hours",
         seen=lambda o: o.overdue, broken=lambda o, c: bool(o.overdue),
     ),
     Rule(
-        code=26, name="actuator_test", cause="the film does not answer to pump or vent",
+        code=26, name="actuator_test", cause="the film does not respond to pump or vent",
         limit="pump_obeys.py", rung=Rung.PUMP_OFF, states={State.CHECK},
         remedy="check hoses, valve and pump, and where the laser points",
         seen=lambda o: o.unfit, broken=lambda o, c: bool(o.unfit),
     ),
     Rule(
-        code=40, name="late", cause="ticks start too late to be a control loop",
+        code=40, name="late", cause="ticks start too late to control the mirror",
         limit="limits.lateness_max_ms", rung=Rung.RAMP_DOWN, seen_in=(5, 10), may_resume=True,
-        remedy="take other work off this machine",
+        remedy="move other work off this machine",
         seen=lambda o: f"{o.lateness_ms:.0f} ms", broken=lambda o, c: o.lateness_ms > c.lateness_max_ms,
     ),
 )

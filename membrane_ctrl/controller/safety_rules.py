@@ -40,7 +40,7 @@ class Observation:
     laser_lies: str = ""  # what laser, gauge and camera show, if the laser is wrong
     runs_on: str = ""  # the read-back of a pump that should have stopped
     inflow: str = ""  # how the mirror rises although the pump is commanded off
-    locked: str = ""  # why a person has latched the mirror
+    locked: str = ""  # why a person has locked the mirror
     vent_fraction: float = math.nan  # the vent's read-back; NaN without one
     foreign: int = 0  # what another program changed: claim, watchdog (`roles.FOREIGN_...`)
     gauge_same_s: float = 0.0  # since the readings of a taut film's gauge have been equal to the last bit

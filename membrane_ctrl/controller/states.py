@@ -25,9 +25,9 @@ _STOP_GIVES_UP_S = 10.0
 def standby(scene: Scene) -> State:
     """Pump off until someone wants the mirror held."""
     if scene.hold_wanted:
-        scene.why = "asked to hold the mirror"
+        scene.why = "a hold was requested"
         return State.CHECK
-    scene.why = f"standby: latched: {scene.latched}" if scene.latched else "standby: nobody has asked for a hold"
+    scene.why = f"standby: locked: {scene.latched}" if scene.latched else "standby: no hold was requested"
     return State.STANDBY
 
 
@@ -40,7 +40,7 @@ def check(scene: Scene) -> State:
     gone = not scene.now_s - scene.last_good_s <= scene.config.limits.stale_s
     good_s = scene.stay_good(not gone)
     if scene.state_age_s > scene.config.states.check_timeout_s:
-        scene.overdue = f"sensors not good after {scene.config.states.check_timeout_s:g} s: {missing}"
+        scene.overdue = f"sensors still not good after {scene.config.states.check_timeout_s:g} s: {missing}"
     if gone:
         scene.test = None  # what was measured with a hole in it is measured again
         scene.why = f"checking the sensors: {missing}"
@@ -94,7 +94,7 @@ def hold(scene: Scene) -> State:
         return elsewhere
     if scene.paused:
         scene.give(scene.loop.stale(scene.dt_s))
-        scene.why = f"paused by {scene.asked_by}: the pump gives its mean flow"
+        scene.why = f"paused by {scene.asked_by}: the pump keeps its mean flow"
         if scene.stay_good(True) > scene.config.states.pause_max_s or _strayed(scene):
             scene.paused = False
         return State.HOLD
@@ -106,7 +106,7 @@ def hold(scene: Scene) -> State:
 def manual(scene: Scene) -> State:
     """The flow that a person has asked for; the loop follows, so that `hold` takes over without a bump."""
     if scene.hold_wanted:
-        scene.why = f"{scene.asked_by} asked to hold the mirror again"
+        scene.why = f"{scene.asked_by} requested a hold again"
         _keep_flowing(scene)
         return State.INFLATE
     over = _manual_over(scene)
@@ -115,7 +115,7 @@ def manual(scene: Scene) -> State:
     if over:
         scene.why = f"manual is over: {over}"
         return State.INFLATE
-    scene.why = f"manual: {scene.asked_by} has set the flow to {scene.manual_um_per_s:.2f} um/s"
+    scene.why = f"manual: {scene.asked_by} set the flow to {scene.manual_um_per_s:.2f} um/s"
     return State.MANUAL
 
 
@@ -138,7 +138,7 @@ def tune(scene: Scene) -> State:
         scene.why = f"{trial.spec.kind} {'done' if wanted.completed else 'stopped'}: {wanted.reason}"
         return State.HOLD
     scene.give((scene.loop.follow_raw if trial.raw else scene.loop.follow)(given, wanted, scene.dt_s))
-    scene.why = f"tuning: {trial.spec.kind} asked for by {scene.asked_by}"
+    scene.why = f"tuning: {trial.spec.kind} requested by {scene.asked_by}"
     return State.TUNE
 
 
@@ -150,7 +150,7 @@ def lower(scene: Scene) -> State:
     scene.hold_wanted = False
     scene.vent_fraction = float(scene.venting)
     stand = scene.standstill
-    scene.why = f"{_way(scene)} asked for by {scene.asked_by}: pump off"
+    scene.why = f"{_way(scene)} requested by {scene.asked_by}: pump off"
     if scene.way_down == "stop":
         if stand.silent_s > scene.config.states.lower_timeout_s:
             scene.finished = Exit.DEVICE_FAILED  # nobody can see whether the pump stands
@@ -162,7 +162,7 @@ def lower(scene: Scene) -> State:
         pressure_pa = reading.gauge_pressure_pa if reading else math.nan
         scene.why = f"venting: {pressure_pa:.0f} Pa left"
         if scene.state_age_s > _VENTED_S:
-            scene.why += f" after {scene.state_age_s / 60:.0f} min: see whether the vent opens and the gauge reads"
+            scene.why += f" after {scene.state_age_s / 60:.0f} min: check the vent and the gauge"
         if not pressure_pa < scene.config.states.vented_pressure_pa:
             return State.LOWER
     if not stand.seen_off:
@@ -191,7 +191,7 @@ def fault(scene: Scene) -> State:
         return State.STANDBY
     if scene.may_resume and stand.seen_off and not stops:
         scene.hold_wanted = True
-        scene.why = "the cause has gone and may resume by itself"
+        scene.why = "the cause is gone; resuming automatically"
         return State.STANDBY
     may_end = stops or not (scene.config.states.stay_after_trip or scene.resume_possible)
     if may_end and (stand.at_rest or silent or _nothing_left_to_do(scene, rung)):
@@ -227,7 +227,7 @@ HANDLERS: dict[State, Callable[[Scene], State]] = {
 def run_state(state: State, scene: Scene) -> State:
     """Run the state's handler and return the next state; whoever asked for the way down comes first."""
     if scene.way_down is not None and state not in (State.LOWER, State.FAULT):
-        scene.why = f"{_way(scene)} asked for by {scene.asked_by}"
+        scene.why = f"{_way(scene)} requested by {scene.asked_by}"
         return State.LOWER
     return HANDLERS[state](scene)
 
@@ -264,11 +264,11 @@ def _asked_elsewhere(scene: Scene) -> State | None:
     """The state that somebody has asked for, if it is not a hold."""
     if scene.trial is not None:
         _drive(scene, scene.setpoint_um)  # the loop has this tick: without it the pump would be off for 20 ms
-        scene.why = f"{scene.asked_by} asked for the experiment {scene.trial.spec.kind}"
+        scene.why = f"{scene.asked_by} requested the experiment {scene.trial.spec.kind}"
         return State.TUNE
     if scene.manual_wanted:
         scene.hold_wanted = False
-        scene.why = f"{scene.asked_by} has taken the pump"
+        scene.why = f"{scene.asked_by} took over the pump"
         scene.mean_flow_um_per_s = scene.loop.mean_flow_um_per_s
         _keep_flowing(scene)
         return State.MANUAL
@@ -285,7 +285,7 @@ def _test_actuators(scene: Scene) -> State:
     part = scene.test.part
     if part is not None:
         scene.pump_fraction, scene.vent_fraction = part.pump_fraction, part.vent_fraction
-        scene.why = f"checking that the film answers: {part.name}"
+        scene.why = f"testing the actuators: {part.name}"
         return State.CHECK
     if _missing(scene):
         return State.CHECK  # the loop begins at a reading
@@ -293,7 +293,7 @@ def _test_actuators(scene: Scene) -> State:
     if failure:
         if scene.test.is_second:
             scene.unfit = failure
-        scene.why = f"the film does not answer{'' if scene.unfit else ' clearly'}: {failure}"
+        scene.why = f"the film does not respond{'' if scene.unfit else ' clearly'}: {failure}"
         scene.test.again()
         return State.CHECK
     return _begin(scene, scene.test.leak_um_per_s)
@@ -302,7 +302,7 @@ def _test_actuators(scene: Scene) -> State:
 def _begin(scene: Scene, leak_um_per_s: float) -> State:
     """Hand over to the loop, with the flow that balances the leak: the integrator need not find it first."""
     scene.loop.start(scene.observer.displacement_um, leak_um_per_s)
-    scene.why = f"all sensors good, the film answers; it sinks by {leak_um_per_s:.2f} um/s"
+    scene.why = f"all sensors good, the film responds and sinks by {leak_um_per_s:.2f} um/s"
     scene.pump_fraction = scene.last_pump_fraction
     return State.INFLATE
 
@@ -347,8 +347,6 @@ def _why_hold(scene: Scene, output: inner_loop.LoopOutput) -> str:
     if output.too_tight:
         return "holding, but the mirror is too tight: open a bleed (loop.bleed_fraction)"
     if output.saturated:
-        side = (
-            "more gas than the pump has" if output.flow_wanted_um_per_s > output.flow_um_per_s else "less than none"
-        )
-        return f"holding, pump at its limit: the loop wants {side}"
-    return "holding: the pump replaces what leaks"
+        side = "more than the pump has" if output.flow_wanted_um_per_s > output.flow_um_per_s else "less than none"
+        return f"holding, pump at its limit: the loop needs {side}"
+    return "holding: the pump balances the leak"

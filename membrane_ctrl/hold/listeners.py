@@ -104,7 +104,7 @@ class FaultLatch:
             self._write(partial(self._file.write, self._dated(words, now_s)))
 
     def _lock(self, who: str, text: str, now_s: float) -> None:
-        remedy = "see with whoever locked it that the mirror may move"
+        remedy = "ask the person who locked it whether the mirror may move"
         words = {"name": "locked", "cause": text or "by hand", "seen": f"by {who}", "remedy": remedy}
         if self._file is not None:
             self._write(partial(self._file.add, self._dated(words, now_s)))

@@ -221,7 +221,7 @@ def manual_has_an_end() -> list[str]:
 
 
 def manual_without_light() -> list[str]:
-    """Blind in manual: the pump gives its mean flow, whatever the operator had set."""
+    """Blind in manual: the pump keeps its mean flow, whatever the operator had set."""
     stage = Stage().held()
     stage.wait(20.0)
     stage.ask("manual", value=5.0)

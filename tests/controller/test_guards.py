@@ -124,7 +124,7 @@ class Bench:
 
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
-    monkeypatch.setattr("membrane_ctrl.hold.start.raise_priority", lambda: "ordinary")
+    monkeypatch.setattr("membrane_ctrl.processes.child.raise_priority", lambda: "ordinary")
     return Bench(tmp_path)
 
 

@@ -207,7 +207,7 @@ def test_gains_on_trial_go_back_by_themselves() -> None:
     held.go(10.0, gains(0.3, 12.0))
     assert kp_of(held) == pytest.approx(0.3, rel=0.02)
     held.go(8.0)
-    assert held.of("gains_reverted")[-1]["why"] == "nobody has kept them in time"
+    assert held.of("gains_reverted")[-1]["why"] == "nobody kept them in time"
     assert kp_of(held) == pytest.approx(CONFIG.loop.kp_per_s, rel=0.02)
 
 
