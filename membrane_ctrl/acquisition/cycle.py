@@ -15,6 +15,7 @@ import numpy as np
 from firmware_iface.roles import Pattern, Screen
 from membrane_ctrl.acquisition import exposures
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.clock import pause_s
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.processes.frames import FrameWriter, Pixels
@@ -23,8 +24,6 @@ from membrane_ctrl.processes.ring import RingAddress, RingReader
 # A full cycle may be spoilt by a door or by the mirror still moving: take two more at once. Three in a row mean
 # that there is no mirror to be seen (flat, dark, covered), which a pause does not worsen.
 REJECTED_IN_A_ROW = 3
-FIRST_PAUSE_S = 1.0
-LONGEST_PAUSE_S = 60.0  # within a minute of the cause being gone the shape is measured again
 
 
 class Reconstructor(Protocol):
@@ -145,13 +144,6 @@ class ShapeCycle:
             reconstruct = self._reconstructor.full if kind == "full" else self._reconstructor.fringes
             estimate = reconstruct([frame.pixels for frame in frames], time_s, displacement_um)
         return replace(estimate, latency_s=self._clock.now() - arrived_s, cycle=self._cycle)
-
-
-def pause_s(failures: int) -> float:
-    """How long to wait after so many failures in a row: 0, 1, 2, 4, ... 60 s."""
-    if failures <= 0:
-        return 0.0
-    return float(min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** min(failures - 1, 32)))
 
 
 # Which displacement the laser saw while a frame was exposed, from the telemetry of the control process.

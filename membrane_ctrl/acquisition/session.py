@@ -11,13 +11,13 @@ import numpy as np
 
 from firmware_iface.roles import LinkError, Pattern
 from membrane_ctrl.acquisition import optical_bench, process, raw_frames, worker
-from membrane_ctrl.acquisition.cycle import CyclePlan, LaserHistory, Reconstructor, ShapeCycle, pause_s
+from membrane_ctrl.acquisition.cycle import CyclePlan, LaserHistory, Reconstructor, ShapeCycle
 from membrane_ctrl.acquisition.exposures import CycleClock
 from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.metrology import live, phase
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
-from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.processes import child, ring
 from membrane_ctrl.processes.frames import FrameWriter, Pixels

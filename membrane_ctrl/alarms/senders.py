@@ -12,10 +12,8 @@ from typing import Any
 
 from membrane_ctrl.alarms.book import Notice
 from membrane_ctrl.config import port, schema
+from membrane_ctrl.model import clock
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
-
-# Notices on their way: tried again until they are through, none twice, and never a pile of them.
-
 
 Send = Callable[[Notice], bool]
 
@@ -25,31 +23,25 @@ _KEPT = 50
 
 
 class Outbox:
-    """A queue in front of a sender that may fail.
+    """A queue of notices, each tried until it is sent; a full box drops the oldest, which `dropped` counts.
 
-    Parameters
-    ----------
-    send : callable
-        Returns whether the notice is through; may take its time, must not raise.
-
-    Attributes
-    ----------
-    dropped : int
-        The oldest of a full box.
-    failing : bool
-        The last attempt failed.
+    `send` returns whether the notice was sent; it may take its time and must not raise.
     """
 
     def __init__(self, send: Send) -> None:
         self._send = send
         self._waiting: deque[Notice] = deque()
         self._due_s = 0.0
-        self._again_s = _AGAIN_S
+        self._failures = 0
         self.dropped = 0
-        self.failing = False
+
+    @property
+    def failing(self) -> bool:
+        """The last attempt failed."""
+        return self._failures > 0
 
     def post(self, notice: Notice) -> None:
-        """Put a notice in."""
+        """Add a notice."""
         self._waiting.append(notice)
         if len(self._waiting) > _KEPT:
             self._waiting.popleft()
@@ -57,21 +49,20 @@ class Outbox:
 
     @property
     def empty(self) -> bool:
-        """All are through."""
+        """All notices are sent."""
         return not self._waiting
 
     def step(self, now_s: float) -> None:
-        """Send what waits, oldest first, unless the last failure is too fresh."""
+        """Send what waits, oldest first, unless the last failure is too recent."""
         if now_s < self._due_s:
             return
         while self._waiting:
             if not self._send(self._waiting[0]):
-                self.failing = True
-                self._due_s = now_s + self._again_s
-                self._again_s = min(2.0 * self._again_s, _AGAIN_MOST_S)
+                self._failures += 1
+                self._due_s = now_s + clock.pause_s(self._failures, _AGAIN_S, _AGAIN_MOST_S)
                 return
             self._waiting.popleft()
-            self.failing, self._again_s = False, _AGAIN_S
+            self._failures = 0
 
 
 _MISSING = "alarms.urls_file: Apprise is not installed; pip install 'membrane-ctrl[alarms]'"
@@ -93,7 +84,7 @@ def read_urls(path: Path) -> list[str]:
 
 
 def require_sendable(config: port.AlarmsConfig) -> None:
-    """Refuse in one line, and before a run begins, what could not be sent. Raises InputError or DeviceError."""
+    """Check before a run that alarms can be sent. Raises InputError or DeviceError."""
     for name in (config.urls_file, config.escalation_urls_file):
         if name is not None:
             read_urls(Path(name))
@@ -102,23 +93,14 @@ def require_sendable(config: port.AlarmsConfig) -> None:
 
 
 def apprise_senders(config: port.AlarmsConfig, run: str) -> list[Send]:
-    """Senders for the configuration's URLs: of `urls_file`, and of `escalation_urls_file` if there is one.
-
-    Two, as they fail apart: what has reached the people at the bench has not reached those behind them.
-
-    Parameters
-    ----------
-    config : AlarmsConfig
-        Whose `urls_file` is set.
-    run : str
-        Named in every notice.
+    """One sender for `urls_file`, one for `escalation_urls_file` if it is set; every notice names the run.
 
     Raises
     ------
     DeviceError
         Apprise is not installed.
     InputError
-        A file or a URL that is none; the URL is named by its line only, as it holds passwords.
+        A bad file or URL; the URL is named by its line only, as it holds passwords.
     """
     apprise = _apprise()
     assert config.urls_file is not None
@@ -133,7 +115,7 @@ def _send(targets: Sequence[Any], run: str, notice: Notice) -> bool:
 
 
 def _notify(targets: Sequence[Any], title: str, body: str, kind: str) -> bool:
-    """Tell every target; through if one is: a dead chat server must not repeat the mail for ever."""
+    """Notify every target; one success is enough: a dead chat server must not repeat the mail for ever."""
     sent = []
     for target in targets:
         try:
@@ -161,27 +143,10 @@ def _apprise() -> Any:
         raise DeviceError(_MISSING) from None
 
 
-# `alarm test`: does a notice arrive?
-
-
 def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json: bool) -> int:
-    """Send one notice to all whom an alarm would reach.
+    """`alarm test`: send one notice to the addresses of the alarms, with `escalated` also to those of the escalation.
 
-    Parameters
-    ----------
-    config : Config
-        With `[alarms]`.
-    source : str
-        Where it came from, for messages.
-    escalated : bool
-        Also to those of the escalation.
-    as_json : bool
-        Print the result as JSON.
-
-    Raises
-    ------
-    InputError, DeviceError
-        Nothing to send to; nothing was taken.
+    Raises InputError without addresses, DeviceError if no service accepts it.
     """
     alarms = config.alarms
     if alarms.urls_file is None:

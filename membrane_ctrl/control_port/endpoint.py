@@ -14,7 +14,7 @@ import struct
 from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Callable
 
-from membrane_ctrl.model import events, run_events
+from membrane_ctrl.model import clock, events, run_events
 
 BACKLOG = 64  # who waits while another comes in; the kernel turns away the rest
 _INSIDE_MOST = 32
@@ -25,7 +25,7 @@ _BURST, _PER_S = 10.0, 2.0
 _TURN_AWAY_S = 0.005  # costs 50 us: a hundredth of a processor
 _ADDRESSES_MOST = 1024  # remembered
 _LEAVE_S = 2.0  # then the run ends without them
-_AGAIN_S, _AGAIN_MOST_S = 1.0, 60.0
+_AGAIN_S = 1.0
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: what is turned away leaves nothing behind in the kernel
 
 LetIn = Callable[[], object]
@@ -100,18 +100,19 @@ class Endpoint:
 
     async def _keep(self) -> None:
         """Accept for ever; report a failure and try again."""
-        again_s = 0.0
+        failures = 0
         turns = Turns(asyncio.get_running_loop().time)
         while True:
             try:
                 came_in = await self._accept(turns)
             except Exception as error:
-                again_s = min(max(2.0 * again_s, _AGAIN_S), _AGAIN_MOST_S)
+                failures += 1
+                again_s = clock.pause_s(failures, _AGAIN_S)
                 self._tell(run_events.PortFailed(self._name, str(error), again_s))
                 await asyncio.sleep(again_s)
                 continue
-            if again_s:
-                again_s = 0.0
+            if failures:
+                failures = 0
                 self._tell(run_events.PortOpen(self._name))
             await asyncio.sleep(_PAUSE_S if came_in else _TURN_AWAY_S)
 

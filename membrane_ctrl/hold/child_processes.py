@@ -12,42 +12,26 @@ from pathlib import Path
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import MESSAGE_BYTES
 from membrane_ctrl.model import events, run_events
-from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.telemetry import ROW_BYTES
 from membrane_ctrl.processes.child import Child, pipe
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, ring
 
-# A child process that ends or falls silent is replaced, but not for ever.
-#
-# A child says each second or so that it is alive, and for how long it may now be silent (`child_report.alive`). A
-# process that was stopped, or that hangs, is still there but does not keep its word: it is killed, and the next one
-# takes its place.
-
-
-# The first replacement comes at once, the next ones later and later: what dies at its start must not keep the
-# machine busy with starting it.
-_LONGEST_WAIT_S = 60.0
-# A day has room for many; what ends more often in an hour will not be mended by starting it again.
+# A child that ends more often will not be mended by starting it again
 _MOST_PER_HOUR = 10
 _HOUR_S = 3600.0
-# Until its first word: an interpreter that starts on a busy machine. What takes longer is said in that word.
+# Until its first report: an interpreter that starts on a busy machine
 _STARTS_S = 60.0
 
 Make = Callable[[int], tuple[Child, Connection]]
 
 
 class ManagedChild:
-    """A child process that is replaced when it ends or falls silent.
+    """A child process that is replaced when it ends or falls silent; `child` is the current one.
 
-    Parameters
-    ----------
-    make : callable
-        Makes the child that comes after so many others, not started yet, and the end of the pipe it reports by.
-
-    Attributes
-    ----------
-    child : Child
-        The one that runs, or ran last.
+    A child reports each second or so that it is alive, and how long it may now be silent (`run_events.Alive`). One
+    that was stopped, or that hangs, breaks that promise and is killed. `make` gets the number of children before, and
+    returns the next one, not yet started, with our end of its pipe.
     """
 
     def __init__(self, make: Make) -> None:
@@ -66,7 +50,7 @@ class ManagedChild:
         self.child.start()
 
     def send(self, word: str) -> bool:
-        """Hand a word to the child; False if nobody takes it now. Never waits."""
+        """Send a word to the child without waiting; False if it cannot be taken now."""
         try:
             if not (self.child.alive and select.select([], [self._line.fileno()], [], 0)[1]):
                 return False
@@ -76,10 +60,7 @@ class ManagedChild:
         return True
 
     def look(self, now_s: float) -> list[events.Event]:
-        """What it has said since the last call, and what became of it; starts another when that is due.
-
-        Never waits, but for starting a process (some ms, less than a tick).
-        """
+        """What it reported since the last call, and what became of it; starts the next one when due (some ms)."""
         said = self._said(now_s)
         if self.child.alive:
             if now_s > self._expected_s and not self._silent:
@@ -94,13 +75,14 @@ class ManagedChild:
                 self._given_up = True
                 said.append(run_events.ChildGivenUp(name, len(self._replaced_s)))
             return said
-        if now_s - self._ended_s >= self._wait_s():
+        # at once, then later and later: what dies at its start must not keep the machine busy with starting it
+        if now_s - self._ended_s >= pause_s(len(self._replaced_s)):
             self.replace(now_s)
             said.append(run_events.ChildRestarted(name, self._count))
         return said
 
     def replace(self, now_s: float) -> None:
-        """Start another child in the place of the one that ended."""
+        """Start another child in its place."""
         self._line.close()
         self._count += 1
         self._replaced_s.append(now_s)
@@ -110,7 +92,7 @@ class ManagedChild:
         self.child.start()
 
     def _fell_silent(self, now_s: float) -> events.Event:
-        """Kill who keeps still, unless nobody may take the place: half a recorder is better than none."""
+        """Kill a silent child, unless it may not be replaced: half a recorder is better than none."""
         self._silent = True
         late_s = round(now_s - self._expected_s, 1)
         killed = not self._used_up(now_s)
@@ -123,9 +105,6 @@ class ManagedChild:
         while self._replaced_s and now_s - self._replaced_s[0] > _HOUR_S:
             self._replaced_s.popleft()
         return len(self._replaced_s) >= _MOST_PER_HOUR
-
-    def _wait_s(self) -> float:
-        return min(_LONGEST_WAIT_S, 2.0 ** (len(self._replaced_s) - 1)) if self._replaced_s else 0.0
 
     def _said(self, now_s: float) -> list[events.Event]:
         said: list[events.Event] = []

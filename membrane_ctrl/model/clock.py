@@ -35,6 +35,11 @@ class RunClock:
         return self.origin_utc + timedelta(seconds=mono_s)
 
 
+def pause_s(failures: int, first_s: float = 1.0, longest_s: float = 60.0) -> float:
+    """How long to wait after so many failures in a row: `first_s`, doubled with each; 0 without a failure."""
+    return 0.0 if failures < 1 else min(longest_s, first_s * 2.0 ** min(failures - 1, 32))
+
+
 # Durations as people write them: `90`, `40s`, `3m`, `2h30m`, `1d`.
 
 

@@ -53,11 +53,11 @@ def test_outside_the_band_says_which_way_and_what_is_done() -> None:
 def test_ladder_names_its_fault() -> None:
     assert line(rung=Rung.VENT, fault="over pressure") == "pump is off and the vent is open: over pressure"
     assert line(rung=Rung.HOLD_FLOW, told="laser is back soon").endswith("laser is back soon")
-    assert line(rung=Rung.PUMP_OFF) == "pump is off: a fault is not named"
+    assert line(rung=Rung.PUMP_OFF) == "pump is off: unknown fault"
 
 
 def test_without_a_reading_the_pump_keeps_its_flow() -> None:
-    said = "pump keeps its last mean flow: there is no valid laser reading"
+    said = "pump keeps its last mean flow: no valid laser reading"
     assert line(displacement_um=math.nan) == said
     assert line(state=State.INFLATE, filtered_um=math.nan) == said  # nothing has been filtered yet
 

@@ -101,7 +101,7 @@ def test_venting_without_a_gauge_goes_on() -> None:
 
 def test_a_vent_that_does_not_empty_the_bowl_is_told_of() -> None:
     outcome = played({"time_s": 20.0, "wrong": "gauge_lost"}, {"time_s": 20.0, "command": "vent"}, duration_s=950.0)
-    (told,) = [event for event in outcome.of("why") if "see whether the vent opens" in event["why"]]
+    (told,) = [event for event in outcome.of("why") if "check the vent" in event["why"]]
     assert 920.0 <= told["mono_s"] < 930.0
     assert not changes(outcome, "standby")
 
