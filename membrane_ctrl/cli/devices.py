@@ -14,10 +14,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command()(conformance)
 
 
-def check(
-    config: ConfigArgument,
-    json: JsonOption = False,
-) -> int:
+def check(config: ConfigArgument, json: JsonOption = False) -> int:
     """Validate a configuration, probe its devices, and say what a hold would do."""
     from membrane_ctrl.commissioning.check import check_config
 

@@ -1,7 +1,7 @@
-"""The whole configuration against itself and against what the board says. Pure; `check` and `hold` refuse by it.
+"""The configuration against itself and against what the board says. Pure; `check` and `hold` refuse by it.
 
-The range of a field (`config`) catches a wrong unit. What stands here are combinations: settings that let the pump
-run when it must not, guards that can never trip or always do, and numbers that contradict each other.
+The range of a field (`config`) catches a wrong unit. The combinations are judged here: settings that let the pump run
+when it must not, guards that can never trip or always do, and numbers that contradict each other.
 """
 
 import difflib
@@ -30,19 +30,7 @@ _TWIN_BOARD = DevicesConfig(board="tcp://twin")  # what `--twin` makes when no d
 
 
 def cross_check(config: Config, board: BenchIdentity | None = None) -> tuple[cross_check_plant.ConfigFinding, ...]:
-    """Judge a configuration.
-
-    Parameters
-    ----------
-    config : Config
-    board : BenchIdentity, optional
-        What answered, with the limits it keeps; without it only the file is judged.
-
-    Returns
-    -------
-    tuple of Finding
-        Errors first; empty for a sound configuration.
-    """
+    """Findings on a configuration and, if given, on the limits that its board keeps; errors first."""
     say = cross_check_plant.ConfigFindings(config)
     _finite(config, say)
     if not say.found:  # the others compute
@@ -56,13 +44,7 @@ def cross_check(config: Config, board: BenchIdentity | None = None) -> tuple[cro
 def require_sound(
     config: Config, source: str, board: BenchIdentity | None = None
 ) -> tuple[cross_check_plant.ConfigFinding, ...]:
-    """Refuse a configuration with errors; return the warnings of one without.
-
-    Raises
-    ------
-    InputError
-        A line for each finding.
-    """
+    """Refuse a configuration with errors (FindingsError, a line each); return the warnings of one without."""
     findings = cross_check(config, board)
     if any(finding.severity == "error" for finding in findings):
         raise FindingsError([finding.line(source) for finding in findings])
@@ -96,89 +78,54 @@ def _resume(config: Config, say: cross_check_plant.ConfigFindings) -> None:
         field = f"resume.faults.{index}"
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
         hint = f"did you mean {near[0]}?" if near else f"may resume: {', '.join(may)}"
-        say.error(name not in known, field, "no fault has this name, so nothing would resume", hint)
-        say.error(
-            name in known and name not in may,
-            field,
-            "this fault needs a person before gas flows again",
-            f"take it out; may resume: {', '.join(may)}",
-        )
-    say.error(
-        resume.most_per_day > _RESUMES_MOST,
-        "resume.most_per_day",
-        "a fault that comes back so often is not passing",
-        f"give at most {_RESUMES_MOST}",
-    )
+        say.error(name not in known, field, "no fault has this name", hint)
+        why, remedy = "only a person may clear this fault", f"remove it; may resume: {', '.join(may)}"
+        say.error(name in known and name not in may, field, why, remedy)
+    why = "a fault that comes back so often has a lasting cause"
+    say.error(resume.most_per_day > _RESUMES_MOST, "resume.most_per_day", why, f"set at most {_RESUMES_MOST}")
     if resume.faults:
-        never = "the rule can never act"
-        say.warn(resume.most_per_day == 0, "resume.most_per_day", never, "give at least 1, or empty resume.faults")
+        never, remedy = "nothing would ever resume", "set at least 1, or empty resume.faults"
+        say.warn(resume.most_per_day == 0, "resume.most_per_day", never, remedy)
         waits = resume.wait_s >= config.states.pump_off_max_s
-        why = f"the mirror is vented before: {never}"
-        say.warn(waits, "resume.wait_s", why, "keep it below states.pump_off_max_s")
+        say.warn(
+            waits, "resume.wait_s", f"the mirror is vented before: {never}", "keep it below states.pump_off_max_s"
+        )
 
 
 def _watchdog(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     devices, limits = config.devices or _TWIN_BOARD, config.limits
     tick_s, watchdog_s = 1.0 / config.loop.rate_hz, devices.watchdog_s
     if config.devices is not None:
-        say.error(
-            watchdog_s > _UNATTENDED_S,
-            "devices.watchdog_s",
-            "the pump runs on for so long after the control process has died",
-            f"give at most {_UNATTENDED_S:g} s",
-        )
+        why, most = "the pump runs on for so long without a control process", f"set at most {_UNATTENDED_S:g} s"
+        say.error(watchdog_s > _UNATTENDED_S, "devices.watchdog_s", why, most)
         for field, timeout_s in _slowest_answers(devices):
-            say.error(
-                timeout_s + tick_s >= watchdog_s,
-                field,
-                f"with a tick of {tick_s:g} s, one lost answer ({timeout_s:g} s on its line) lasts longer than the "
-                f"watchdog ({watchdog_s:g} s)",
-                "shorten the time-out, or lengthen devices.watchdog_s",
-            )
-            say.warn(
-                timeout_s + tick_s >= limits.stale_s and len(devices.roles()) == 0,
-                "limits.stale_s",
-                "one lost answer ends the run",
-                f"give more than {timeout_s + tick_s:g} s",
-            )
-    say.error(
-        2.0 * tick_s > watchdog_s,
-        "loop.rate_hz",
-        f"the watchdog ({watchdog_s:g} s) trips between two ticks of {tick_s:g} s, or at the first late one",
-        f"give at least {2.0 / watchdog_s:g} Hz, or a longer devices.watchdog_s",
-    )
-    say.error(
-        1e-3 * limits.lateness_max_ms >= watchdog_s,
-        "limits.lateness_max_ms",
-        f"can never trip: the watchdog ({watchdog_s:g} s) trips first",
-        "keep it below devices.watchdog_s",
-    )
-    say.warn(limits.lateness_max_ms < 5.0, "limits.lateness_max_ms", "a healthy machine is that late", "give 100 ms")
+            lost_s = timeout_s + tick_s
+            waits = f"one lost answer ({timeout_s:g} s on its line) and a tick of {tick_s:g} s"
+            why = f"{waits} take longer than the watchdog ({watchdog_s:g} s)"
+            say.error(lost_s >= watchdog_s, field, why, "shorten it, or lengthen devices.watchdog_s")
+            ends = lost_s >= limits.stale_s and len(devices.roles()) == 0
+            say.warn(ends, "limits.stale_s", "one lost answer ends the run", f"set more than {lost_s:g} s")
+    why = f"the watchdog ({watchdog_s:g} s) trips between two ticks of {tick_s:g} s, or at the first late one"
+    remedy = f"set at least {2.0 / watchdog_s:g} Hz, or lengthen devices.watchdog_s"
+    say.error(2.0 * tick_s > watchdog_s, "loop.rate_hz", why, remedy)
+    late, why = "limits.lateness_max_ms", f"can never trip: the watchdog ({watchdog_s:g} s) trips first"
+    say.error(1e-3 * limits.lateness_max_ms >= watchdog_s, late, why, "keep it below devices.watchdog_s")
+    say.warn(limits.lateness_max_ms < 5.0, late, "a healthy machine is that late", "set 100 ms")
 
 
 def _stale(config: Config, say: cross_check_plant.ConfigFindings) -> None:
-    limits, rate_hz = config.limits, config.loop.rate_hz
-    tick_s = 1.0 / rate_hz
-    say.error(
-        limits.stale_s * rate_hz < 1.5 - 1e-9,
-        "limits.stale_s",
+    limits, tick_s = config.limits, 1.0 / config.loop.rate_hz
+    why, least = (
         f"shorter than 1.5 ticks of {tick_s:g} s: every late tick is a fault",
-        f"give at least {1.5 * tick_s:g} s",
+        f"set at least {1.5 * tick_s:g} s",
     )
-    blind = "the pump runs on without a reading for so long"
-    say.error(limits.stale_s > _UNATTENDED_S, "limits.stale_s", blind, f"give at most {_UNATTENDED_S:g} s")
-    say.error(
-        limits.stuck_s < 3.0 * tick_s,
-        "limits.stuck_s",
-        "two equal readings by chance are a fault",
-        f"give at least {3.0 * tick_s:g} s",
-    )
-    say.error(
-        limits.stuck_s > _BLIND_S,
-        "limits.stuck_s",
-        "the loop follows a laser that has stopped for so long",
-        f"give at most {_BLIND_S:g} s",
-    )
+    say.error(limits.stale_s * config.loop.rate_hz < 1.5 - 1e-9, "limits.stale_s", why, least)
+    why, most = "the pump runs on without a reading for so long", f"set at most {_UNATTENDED_S:g} s"
+    say.error(limits.stale_s > _UNATTENDED_S, "limits.stale_s", why, most)
+    why, least = "two equal readings by chance are a fault", f"set at least {3.0 * tick_s:g} s"
+    say.error(limits.stuck_s < 3.0 * tick_s, "limits.stuck_s", why, least)
+    why, most = "the loop follows a stopped laser for so long", f"set at most {_BLIND_S:g} s"
+    say.error(limits.stuck_s > _BLIND_S, "limits.stuck_s", why, most)
 
 
 def _slowest_answers(devices: DevicesConfig) -> Iterator[tuple[str, float]]:
@@ -197,116 +144,69 @@ def _slowest_answers(devices: DevicesConfig) -> Iterator[tuple[str, float]]:
 
 def _states(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     states, limits = config.states, config.limits
-    blind = "the pump gives a flow for so long that nobody corrects"
     for name, most_s in (("hold_flow_max_s", _BLIND_S), ("ramp_down_s", _BLIND_S), ("pause_max_s", _PAUSE_S)):
-        say.error(getattr(states, name) > most_s, f"states.{name}", blind, f"give at most {most_s:g} s")
-    always = "over before it can have been met"
+        too_long = getattr(states, name) > most_s
+        say.error(too_long, f"states.{name}", "the flow is not controlled for so long", f"set at most {most_s:g} s")
     needed_s = states.check_s
     if states.actuator_test:
         needed_s = pump_obeys.ActuatorTest(config.pump, True, config.loop.rate_hz).duration_s
-    say.error(
-        states.check_timeout_s <= needed_s,
-        "states.check_timeout_s",
-        f"{always}: the check takes {needed_s:.1f} s",
-        f"give at least {2.0 * needed_s:.0f} s",
-    )
-    say.error(
-        states.settle_timeout_s <= states.settle_s,
-        "states.settle_timeout_s",
-        f"{always}: states.settle_s is {states.settle_s:g} s",
-        "give some minutes",
-    )
-    say.error(
-        states.lower_timeout_s < _PUMP_STANDS_S + 2.0 / config.loop.rate_hz,
-        "states.lower_timeout_s",
-        f"{always}: a pump stands {_PUMP_STANDS_S:g} s after its command, seen a tick later",
-        "give 3 s",
-    )
-    way_um = config.loop.setpoint_um - limits.displacement_min_um
+    why, least = f"too short: the check takes {needed_s:.1f} s", f"set at least {2.0 * needed_s:.0f} s"
+    say.error(states.check_timeout_s <= needed_s, "states.check_timeout_s", why, least)
+    why = f"too short: states.settle_s is {states.settle_s:g} s"
+    say.error(states.settle_timeout_s <= states.settle_s, "states.settle_timeout_s", why, "set some minutes")
+    seen_s = _PUMP_STANDS_S + 2.0 / config.loop.rate_hz
+    why = f"too short: a pump stands {_PUMP_STANDS_S:g} s after its command, and is seen to a tick later"
+    say.error(states.lower_timeout_s < seen_s, "states.lower_timeout_s", why, "set 3 s")
     speed_um_per_s = min(config.loop.setpoint_ramp_um_per_s, cross_check_plant.flow_um_per_s(config))
-    say.warn(
-        states.inflate_timeout_s < way_um / speed_um_per_s,
-        "states.inflate_timeout_s",
-        f"{always}: the way up from limits.displacement_min_um takes {way_um / speed_um_per_s:.0f} s at least",
-        "give it more time",
-    )
-    say.error(
-        states.vented_pressure_pa > 0.5 * limits.gauge_pressure_max_pa,
-        "states.vented_pressure_pa",
-        "a mirror at this pressure is not vented",
-        "give less than half of limits.gauge_pressure_max_pa",
-    )
-    say.error(
-        states.vented_pressure_pa < _GAUGE_NOISE_PA,
-        "states.vented_pressure_pa",
-        "within the noise of a gauge at zero: venting would never end",
-        f"give at least {_GAUGE_NOISE_PA:g} Pa",
-    )
+    way_s = (config.loop.setpoint_um - limits.displacement_min_um) / speed_um_per_s
+    why = f"too short: the way up from limits.displacement_min_um takes at least {way_s:.0f} s"
+    say.warn(states.inflate_timeout_s < way_s, "states.inflate_timeout_s", why, "lengthen it")
+    vented, pressure_pa = "states.vented_pressure_pa", states.vented_pressure_pa
+    less = "set less than half of limits.gauge_pressure_max_pa"
+    too_high = pressure_pa > 0.5 * limits.gauge_pressure_max_pa
+    say.error(too_high, vented, "a mirror at this pressure is not vented", less)
+    why = "within a gauge's noise at zero: venting would never end"
+    say.error(pressure_pa < _GAUGE_NOISE_PA, vented, why, f"set at least {_GAUGE_NOISE_PA:g} Pa")
 
 
 def _limits(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     limits, setpoint_um = config.limits, config.loop.setpoint_um
     trim_um = config.shape.trim_max_um if config.shape.enabled else 0.0
     above_um, below_um = limits.displacement_max_um - setpoint_um, setpoint_um - limits.displacement_min_um
+    field = "shape.trim_max_um" if trim_um >= limits.band_um else "limits.band_um"
     for room_um, side in ((above_um, "above"), (below_um, "below")):
-        say.error(
-            trim_um + limits.band_um >= room_um,
-            "shape.trim_max_um" if trim_um >= limits.band_um else "limits.band_um",
-            f"the setpoint ({setpoint_um:g} um) has {room_um:g} um {side} it; trim and band reach the limit",
-            "give less, or move the setpoint or the limits",
-        )
-    say.warn(
-        limits.following_error_max_um >= min(above_um, below_um),
-        "limits.following_error_max_um",
-        "can never trip: a displacement limit trips first",
-        f"give less than {min(above_um, below_um):g} um",
-    )
-    say.error(
-        limits.band_um >= limits.following_error_max_um,
-        "limits.band_um",
-        f"a mirror inside the band would be a following error ({limits.following_error_max_um:g} um)",
-        "keep it below limits.following_error_max_um",
-    )
+        why = f"trim and band reach the limit, {room_um:g} um {side} the setpoint ({setpoint_um:g} um)"
+        remedy = "lower it, or move the setpoint or the limits"
+        say.error(trim_um + limits.band_um >= room_um, field, why, remedy)
+    following_um, room_um = limits.following_error_max_um, min(above_um, below_um)
+    why, less = "can never trip: a displacement limit trips first", f"set less than {room_um:g} um"
+    say.warn(following_um >= room_um, "limits.following_error_max_um", why, less)
+    why = f"a mirror inside the band would be a following error ({following_um:g} um)"
+    say.error(limits.band_um >= following_um, "limits.band_um", why, "keep it below limits.following_error_max_um")
     step_um = cross_check_plant.flow_um_per_s(config) / config.loop.rate_hz
-    say.error(
-        limits.step_max_um < 4.0 + step_um,
-        "limits.step_max_um",
-        f"a moving film ({step_um:.2f} um a tick) and the laser's noise (1 um) already jump so far",
-        f"give at least {4.0 + step_um:.0f} um",
-    )
-    say.error(
-        limits.step_max_um >= above_um,
-        "limits.step_max_um",
-        f"can never trip: the limit is {above_um:g} um above the setpoint",
-        "give less",
-    )
+    why = f"a moving film ({step_um:.2f} um a tick) and the laser's noise (1 um) reach it"
+    say.error(limits.step_max_um < 4.0 + step_um, "limits.step_max_um", why, f"set at least {4.0 + step_um:.0f} um")
+    why = f"can never trip: the limit is {above_um:g} um above the setpoint"
+    say.error(limits.step_max_um >= above_um, "limits.step_max_um", why, "lower it")
 
 
 def _board(config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFindings) -> None:
     """The limits that the board keeps by itself."""
+    own_pa = board.gauge_pressure_limit_pa
+    above = config.limits.gauge_pressure_max_pa > own_pa
     say.error(
-        config.limits.gauge_pressure_max_pa > board.gauge_pressure_limit_pa,
-        "limits.gauge_pressure_max_pa",
-        f"the board vents at {board.gauge_pressure_limit_pa:g} Pa by itself",
-        "give at most that",
+        above, "limits.gauge_pressure_max_pa", f"the board vents at {own_pa:g} Pa by itself", "lower it to that"
     )
     pump, limit = config.pump, board.pump_limit_fraction
     share = cross_check_plant.flow_um_per_s(config) / pump.flow_full_um_per_s
     needed = pump.dead_fraction + (1.0 - pump.dead_fraction) * share
-    most = f"and the board gives the pump {limit:g} at most"
-    say.error(
-        needed > limit + 1e-9,
-        "loop.flow_max_um_per_s",
-        f"takes a command of {needed:.2f}, {most}",
-        "lower it, or raise the limit of the board",
-    )
+    most = f"and the board limits the pump to {limit:g}"
+    remedy = "lower it, or raise the board's limit"
+    say.error(needed > limit + 1e-9, "loop.flow_max_um_per_s", f"takes a command of {needed:.2f}, {most}", remedy)
     test = max(part.pump_fraction for part in pump_obeys.PARTS)
-    say.error(
-        config.states.actuator_test and test > limit + 1e-9,
-        "states.actuator_test",
-        f"commands {test:g}, {most}",
-        "raise the limit of the board, or leave the test out",
-    )
+    refused = config.states.actuator_test and test > limit + 1e-9
+    remedy = "raise the board's limit, or omit the test"
+    say.error(refused, "states.actuator_test", f"commands {test:g}, {most}", remedy)
 
 
 _RULES = (

@@ -70,33 +70,22 @@ def flow_um_per_s(config: Config) -> float:
 
 def judge_pump(config: Config, say: ConfigFindings) -> None:
     pump, loop = config.pump, config.loop
-    say.error(
-        not pump.dead_fraction <= pump.stall_fraction <= pump.start_fraction,
-        "pump.stall_fraction",
-        "a pump gives nothing below dead_fraction, stalls above it, and starts above that",
-        f"order them: dead ({pump.dead_fraction:g}) <= stall ({pump.stall_fraction:g}) <= start "
-        f"({pump.start_fraction:g})",
-    )
+    why = f"must lie between dead_fraction ({pump.dead_fraction:g}) and start_fraction ({pump.start_fraction:g})"
+    ordered = pump.dead_fraction <= pump.stall_fraction <= pump.start_fraction
+    say.error(not ordered, "pump.stall_fraction", why, "measure all three")
     test_fraction = max(part.pump_fraction for part in pump_obeys.PARTS)
     if pump.start_fraction >= test_fraction:
-        why = f"the actuator test commands {test_fraction:g}, and that would not start it"
+        why = f"the actuator test commands {test_fraction:g}, which would not start the pump"
         say.error(config.states.actuator_test, "pump.start_fraction", why, "measure it; no pump starts so late")
         say.warn(not config.states.actuator_test, "pump.start_fraction", "no pump starts so late", "measure it")
     else:
         least_um_per_s = gas.PumpCurve(pump).least_flow_um_per_s
-        why = f"the least flow of a running pump is {least_um_per_s:.2f} um/s: it would only ever start and stop"
-        say.error(
-            loop.flow_max_um_per_s <= 2.0 * least_um_per_s,
-            "loop.flow_max_um_per_s",
-            why,
-            "give several times as much, or measure pump.stall_fraction",
-        )
-    say.warn(
-        loop.flow_max_um_per_s > pump.flow_full_um_per_s + 1e-9,
-        "loop.flow_max_um_per_s",
-        f"the pump has {pump.flow_full_um_per_s:g} um/s (pump.flow_full_um_per_s)",
-        "measure the pump, or lower it",
-    )
+        why = f"a running pump gives at least {least_um_per_s:.2f} um/s: it would only start and stop"
+        remedy = "set several times as much, or measure pump.stall_fraction"
+        say.error(loop.flow_max_um_per_s <= 2.0 * least_um_per_s, "loop.flow_max_um_per_s", why, remedy)
+    more = loop.flow_max_um_per_s > pump.flow_full_um_per_s + 1e-9
+    why = f"the pump gives {pump.flow_full_um_per_s:g} um/s (pump.flow_full_um_per_s)"
+    say.warn(more, "loop.flow_max_um_per_s", why, "measure the pump, or lower it")
     if config.devices is None:
         return
     for role in ("pump", "vent"):
@@ -104,88 +93,57 @@ def judge_pump(config: Config, say: ConfigFindings) -> None:
         if isinstance(section, ModbusMapConfig):
             name = "limits" if section.limits is not None else "value"
             low, high = min(section.limits or section.value), max(section.limits or section.value)
-            never = "0 is not in it, so it can never be shut" if role == "pump" else "0 is not in it"
+            never = "does not contain 0, so it can never be shut" if role == "pump" else "does not contain 0"
             say.error(low > 0.0, f"devices.{role}.{name}", never, "begin at 0")
             say.error(high < 1.0, f"devices.{role}.{name}", "a command of 1 would be refused", "end at 1")
 
 
 def judge_loop(config: Config, say: ConfigFindings) -> None:
-    loop = config.loop
-    full_um_per_s = flow_um_per_s(config)
+    loop, full_um_per_s = config.loop, flow_um_per_s(config)
     sensitivity = inner_loop.peak_sensitivity(loop)
     gains = f"with Ti {loop.ti_s:g} s, Td {loop.td_s:g} s, a filter of {loop.measurement_filter_s:g} s"
-    measure = "use `tune`, or the default gains"
-    say.error(loop.kp_per_s == 0.0, "loop.kp_per_s", "nobody would hold the mirror", measure)
+    measure = "run `tune`, or use the default gains"
+    say.error(loop.kp_per_s == 0.0, "loop.kp_per_s", "nothing would hold the mirror", measure)
     say.error(math.isinf(sensitivity), "loop.kp_per_s", f"{gains} the loop is unstable on the nominal pump", measure)
     close = f"{gains} the loop is close to unstable (peak sensitivity {sensitivity:.1f}, the defaults have 1.3)"
     say.error(_MS_MOST < sensitivity < math.inf, "loop.kp_per_s", close, measure)
     say.warn(_MS_WARN < sensitivity <= _MS_MOST, "loop.kp_per_s", close, measure)
-    for on, field, gain, nominal in (
-        (loop.feedforward_barometer, "barometer_gain_um_per_pa", loop.barometer_gain_um_per_pa, _BAROMETER_UM_PER_PA),
-        (loop.feedforward_temperature, "temperature_gain_um_per_k", loop.temperature_gain_um_per_k,
-         _TEMPERATURE_UM_PER_K),
-    ):  # fmt: skip
-        share = gain / nominal
-        remedy = f"physics gives {nominal:g}, see docs/physics.md"
-        say.error(on and share < 0.0, f"loop.{field}", "the sign is wrong: it would double the weather", remedy)
-        why = "more than twice the physical value: it does more harm than none"
-        say.error(on and share > _FEEDFORWARD_MOST, f"loop.{field}", why, remedy)
-    say.warn(
-        loop.setpoint_ramp_um_per_s > full_um_per_s,
-        "loop.setpoint_ramp_um_per_s",
-        f"faster than the pump's {full_um_per_s:g} um/s",
-        "give less",
-    )
-    say.error(
-        loop.bleed_fraction * _VENT_FULL_UM_PER_S > 0.5 * full_um_per_s,
-        "loop.bleed_fraction",
-        f"the vent would take about {loop.bleed_fraction * _VENT_FULL_UM_PER_S:.0f} um/s, half of what the pump has "
-        "or more",
-        f"give less than {0.5 * full_um_per_s / _VENT_FULL_UM_PER_S:.3f}",
-    )
+    for on, name, nominal in (
+        (loop.feedforward_barometer, "barometer_gain_um_per_pa", _BAROMETER_UM_PER_PA),
+        (loop.feedforward_temperature, "temperature_gain_um_per_k", _TEMPERATURE_UM_PER_K),
+    ):
+        share, remedy = getattr(loop, name) / nominal, f"physics gives {nominal:g}, see docs/physics.md"
+        say.error(on and share < 0.0, f"loop.{name}", "wrong sign: it would double the weather's effect", remedy)
+        why = "more than twice the physical value: worse than no feed-forward"
+        say.error(on and share > _FEEDFORWARD_MOST, f"loop.{name}", why, remedy)
+    why = f"faster than the pump's {full_um_per_s:g} um/s"
+    say.warn(loop.setpoint_ramp_um_per_s > full_um_per_s, "loop.setpoint_ramp_um_per_s", why, "lower it")
+    bleed_um_per_s = loop.bleed_fraction * _VENT_FULL_UM_PER_S
+    why = f"the vent would take about {bleed_um_per_s:.0f} um/s, half of the pump's flow or more"
+    remedy = f"set less than {0.5 * full_um_per_s / _VENT_FULL_UM_PER_S:.3f}"
+    say.error(bleed_um_per_s > 0.5 * full_um_per_s, "loop.bleed_fraction", why, remedy)
     swing_s = full_um_per_s / loop.flow_rate_limit_um_per_s2
-    say.error(
-        swing_s > 2.0,
-        "loop.flow_rate_limit_um_per_s2",
-        f"the pump needs {swing_s:.0f} s from none to full: the loop would swing",
-        f"give at least {0.5 * full_um_per_s:.1f} um/s2",
-    )
+    why = f"the pump needs {swing_s:.0f} s from none to full: the loop would swing"
+    remedy = f"set at least {0.5 * full_um_per_s:.1f} um/s2"
+    say.error(swing_s > 2.0, "loop.flow_rate_limit_um_per_s2", why, remedy)
 
 
 def judge_shape(config: Config, say: ConfigFindings) -> None:
     shape = config.shape
     if not shape.enabled:
         return
-    say.error(
-        shape.fresh_s < shape.period_s,
-        "shape.fresh_s",
-        f"a shape comes every {shape.period_s:g} s: the last one is never fresh",
-        "give several periods",
-    )
-    say.error(
-        shape.time_constant_s < 2.0 * shape.period_s,
-        "shape.time_constant_s",
-        f"shorter than two shapes ({shape.period_s:g} s each): the trim would follow their noise",
-        "give 20 periods",
-    )
-    say.error(
-        shape.trim_rate_max_um_per_s > 0.5 * config.loop.setpoint_ramp_um_per_s,
-        "shape.trim_rate_max_um_per_s",
-        "the trim may outrun the setpoint's ramp (loop.setpoint_ramp_um_per_s)",
-        "give 0.1 um/s",
-    )
-    say.error(
-        shape.disagreement_max_um >= config.limits.displacement_max_um - config.loop.setpoint_um,
-        "shape.disagreement_max_um",
-        "can never trip: limits.displacement_max_um trips first",
-        "give 10 um",
-    )
-    say.warn(
-        8.0 * shape.frame_interval_s > shape.period_s,
-        "shape.frame_interval_s",
-        f"a cycle of 8 frames does not fit shape.period_s ({shape.period_s:g} s)",
-        "shorten it",
-    )
+    why = f"a shape comes every {shape.period_s:g} s: the last one is never fresh"
+    say.error(shape.fresh_s < shape.period_s, "shape.fresh_s", why, "set several periods")
+    why = f"shorter than two periods of {shape.period_s:g} s: the trim would follow the noise"
+    say.error(shape.time_constant_s < 2.0 * shape.period_s, "shape.time_constant_s", why, "set 20 periods")
+    outruns = shape.trim_rate_max_um_per_s > 0.5 * config.loop.setpoint_ramp_um_per_s
+    why = "the trim may outrun the setpoint's ramp (loop.setpoint_ramp_um_per_s)"
+    say.error(outruns, "shape.trim_rate_max_um_per_s", why, "set 0.1 um/s")
+    never = shape.disagreement_max_um >= config.limits.displacement_max_um - config.loop.setpoint_um
+    why = "can never trip: limits.displacement_max_um trips first"
+    say.error(never, "shape.disagreement_max_um", why, "set 10 um")
+    why = f"a cycle of 8 frames does not fit shape.period_s ({shape.period_s:g} s)"
+    say.warn(8.0 * shape.frame_interval_s > shape.period_s, "shape.frame_interval_s", why, "shorten it")
 
 
 def judge_optics(config: Config, say: ConfigFindings) -> None:
@@ -197,26 +155,23 @@ def judge_optics(config: Config, say: ConfigFindings) -> None:
 def _geometry(field: str, geometry: GeometryConfig, radius_mm: float, say: ConfigFindings) -> None:
     if geometry.alpha_deg is not None:
         grazing = min(geometry.alpha_deg, 180.0 - geometry.alpha_deg) < _GRAZING_DEG
-        as_degrees = math.degrees(geometry.alpha_deg)
-        hint = (
-            f"as radians it is {as_degrees:.1f} deg" if as_degrees < 180.0 else "measure it from the mirror's plane"
-        )
+        degrees = math.degrees(geometry.alpha_deg)
+        hint = f"as radians it is {degrees:.1f} deg" if degrees < 180.0 else "measure it from the mirror's plane"
         say.error(grazing, f"{field}.alpha_deg", "camera and screen would look along the mirror", hint)
         for name in ("a", "b"):
             length_mm, sigma_mm = getattr(geometry, f"{name}_mm"), getattr(geometry, f"{name}_sigma_mm")
-            say.warn(length_mm < radius_mm, f"{field}.{name}_mm", "nearer than the mirror is wide", "in mm?")
+            say.warn(length_mm < radius_mm, f"{field}.{name}_mm", "less than the mirror's radius", "in mm?")
             wide = sigma_mm is not None and sigma_mm > 0.1 * length_mm
             say.warn(wide, f"{field}.{name}_sigma_mm", "a tenth of the length or more", "measure again")
     if geometry.camera is not None:
         behind = geometry.camera.position_mm[2] <= 0.0
-        say.error(
-            behind, f"{field}.camera.position_mm", "the camera is behind the mirror", "z points out of the mirror"
-        )
+        why = "the camera is behind the mirror"
+        say.error(behind, f"{field}.camera.position_mm", why, "z points out of the mirror")
 
 
 def judge_alarms(config: Config, say: ConfigFindings) -> None:
     alarms, tick_s = config.alarms, 1.0 / config.loop.rate_hz
-    say.error(alarms.silent_s < 2.0 * tick_s, "alarms.silent_s", "a tick takes as long", f"give {4.0 * tick_s:g} s")
+    say.error(alarms.silent_s < 2.0 * tick_s, "alarms.silent_s", "a tick takes as long", f"set {4.0 * tick_s:g} s")
     most = {
         "fault": max(rule.code for rule in safety.TABLE),
         "pump_fraction": 1.0,
@@ -227,70 +182,57 @@ def judge_alarms(config: Config, say: ConfigFindings) -> None:
     }
     for index, rule in enumerate(alarms.rules):
         if rule.raise_at > rule.clear_at and rule.field in most:
-            why = f"{rule.name} can never be raised: {rule.field} is {most[rule.field]:g} at most"
-            say.error(rule.raise_at >= most[rule.field], f"alarms.rules.{index}.raise_at", why, "give less")
+            why = f"{rule.name} can never be raised: {rule.field} is at most {most[rule.field]:g}"
+            say.error(rule.raise_at >= most[rule.field], f"alarms.rules.{index}.raise_at", why, "lower it")
     port = config.port
     if port.tls is not None and port.metrics_port is not None:
         why = "port.tls.port is the same"
-        say.error(port.metrics_port == port.tls.port, "port.metrics_port", why, "give another")
+        say.error(port.metrics_port == port.tls.port, "port.metrics_port", why, "choose another")
 
 
 def judge_gauge(config: Config, say: ConfigFindings) -> None:
     """The gauge as a guard, and as a check of the laser."""
-    limits, pressure_pa = config.limits, config.optics.mirror.pressure_pa
+    limits, pressure_pa, tick_s = config.limits, config.optics.mirror.pressure_pa, 1.0 / config.loop.rate_hz
     above_um = limits.displacement_max_um - config.loop.setpoint_um
     room_pa = limits.gauge_pressure_max_pa - pressure_pa
-    say.error(
-        room_pa <= 0.0,
-        "limits.gauge_pressure_max_pa",
-        f"the mirror has {pressure_pa:g} Pa at displacement 0 (optics.mirror.pressure_pa)",
-        "measure that, or raise the limit",
-    )
-    never = "can never trip: the pressure limit trips first"
-    say.error(
-        0.0 < room_pa <= limits.gauge_step_max_pa, "limits.gauge_step_max_pa", never, f"less than {room_pa:g} Pa"
-    )
-    why = "a gauge that has stopped guards nothing for so long"
-    say.error(
-        limits.gauge_stuck_s > _GAUGE_BLIND_S, "limits.gauge_stuck_s", why, f"give at most {_GAUGE_BLIND_S:g} s"
-    )
-    tick_s = 1.0 / config.loop.rate_hz
-    why = "two equal readings by chance are a fault"
-    say.error(limits.gauge_stuck_s < 3.0 * tick_s, "limits.gauge_stuck_s", why, f"give at least {3.0 * tick_s:g} s")
-    why = "a storm alone moves the gauge so far"
-    say.error(
-        limits.gauge_step_max_pa < _STORM_PA, "limits.gauge_step_max_pa", why, f"give at least {_STORM_PA:g} Pa"
-    )
+    why = f"the mirror has {pressure_pa:g} Pa at displacement 0 (optics.mirror.pressure_pa)"
+    say.error(room_pa <= 0.0, "limits.gauge_pressure_max_pa", why, "measure that, or raise the limit")
+    step, why = "limits.gauge_step_max_pa", "can never trip: the pressure limit trips first"
+    say.error(0.0 < room_pa <= limits.gauge_step_max_pa, step, why, f"set less than {room_pa:g} Pa")
+    least = f"set at least {_STORM_PA:g} Pa"
+    say.error(limits.gauge_step_max_pa < _STORM_PA, step, "a storm alone moves the gauge so far", least)
+    stuck, most = "limits.gauge_stuck_s", f"set at most {_GAUGE_BLIND_S:g} s"
+    say.error(limits.gauge_stuck_s > _GAUGE_BLIND_S, stuck, "a stopped gauge guards nothing for so long", most)
+    least = f"set at least {3.0 * tick_s:g} s"
+    say.error(limits.gauge_stuck_s < 3.0 * tick_s, stuck, "two equal readings by chance are a fault", least)
     for name, least_um, by in (
         ("laser_gauge_apart_max_um", _APART_UM, "the gauge's noise and a mount that warms up"),
         ("laser_gauge_drift_max_um", _CREEP_UM, "the creep of a fresh film"),
     ):
         why = f"can never trip: limits.displacement_max_um is {above_um:g} um above the setpoint"
-        say.error(getattr(limits, name) >= above_um, f"limits.{name}", why, "give less")
+        say.error(getattr(limits, name) >= above_um, f"limits.{name}", why, "lower it")
         why = f"{by} alone reach it"
-        say.error(getattr(limits, name) < least_um, f"limits.{name}", why, f"give at least {least_um:g} um")
+        say.error(getattr(limits, name) < least_um, f"limits.{name}", why, f"set at least {least_um:g} um")
 
 
 def judge_film(config: Config, say: ConfigFindings) -> None:
     """What is said of the film, which gas, laser and gauge are judged by."""
     limits, mirror = config.limits, config.optics.mirror
     most = 1.0 + flow_um_per_s(config) / film.LEAK_LEAST_UM_PER_S
-    why = f"can never trip: the pump gives {flow_um_per_s(config):g} um/s"
-    say.error(limits.leak_growth_max >= most, "limits.leak_growth_max", why, f"give less than {most:.1f}")
-    why = "what the weather moves a leak by trips it"
-    least = film.CONTRADICTED_MOST
-    say.error(limits.leak_growth_max < least, "limits.leak_growth_max", why, f"give at least {least:g}")
-    why = f"no film is so deep for its radius ({mirror.radius_mm:g} mm)"
-    say.error(mirror.sag_mm >= 0.5 * mirror.radius_mm, "optics.mirror.sag_mm", why, "give the bowl's depth in mm")
-    why = f"the bowl is only {mirror.sag_mm:g} mm deep (optics.mirror.sag_mm): it can never trip"
-    say.error(limits.displacement_min_um <= -1e3 * mirror.sag_mm, "limits.displacement_min_um", why, "give more")
-    why = f"below {film.TAUT_PA:g} Pa laser and gauge are not held against each other"
-    slack = 0.0 < mirror.pressure_pa <= film.TAUT_PA
-    say.warn(slack, "optics.mirror.pressure_pa", why, "measure it with the film taut")
-    why = "not known: a gauge in a wrong unit is not noticed"
-    say.warn(
-        mirror.pressure_pa == 0.0, "optics.mirror.pressure_pa", why, "give the gauge's reading at displacement 0"
+    growth, why = "limits.leak_growth_max", f"can never trip: the pump gives {flow_um_per_s(config):g} um/s"
+    say.error(limits.leak_growth_max >= most, growth, why, f"set less than {most:.1f}")
+    least = f"set at least {film.CONTRADICTED_MOST:g}"
+    say.error(
+        limits.leak_growth_max < film.CONTRADICTED_MOST, growth, "the weather's effect on a leak trips it", least
     )
+    why = f"no film of {mirror.radius_mm:g} mm radius is so deep"
+    say.error(mirror.sag_mm >= 0.5 * mirror.radius_mm, "optics.mirror.sag_mm", why, "set the bowl's depth in mm")
+    why = f"can never trip: the bowl is only {mirror.sag_mm:g} mm deep (optics.mirror.sag_mm)"
+    say.error(limits.displacement_min_um <= -1e3 * mirror.sag_mm, "limits.displacement_min_um", why, "raise it")
+    pressure, why = "optics.mirror.pressure_pa", f"laser and gauge are not compared below {film.TAUT_PA:g} Pa"
+    say.warn(0.0 < mirror.pressure_pa <= film.TAUT_PA, pressure, why, "measure it with the film taut")
+    why = "not known: a gauge in a wrong unit is not noticed"
+    say.warn(mirror.pressure_pa == 0.0, pressure, why, "set the gauge's reading at displacement 0")
 
 
 def judge_ranges(config: Config, board: BenchIdentity, say: ConfigFindings) -> None:
@@ -309,13 +251,8 @@ def judge_ranges(config: Config, board: BenchIdentity, say: ConfigFindings) -> N
     low_um = max(min(stated_um), board.displacement_range_um[0])
     high_um = min(max(stated_um), board.displacement_range_um[1])
     full_pa = min(max(stated_pa), board.gauge_range_pa[1])
-    shows = f"the laser shows {low_um:g} .. {high_um:g} um: nobody would see it"
-    change = "change it, or move the laser"
-    say.error(limits.displacement_max_um > high_um, "limits.displacement_max_um", shows, change)
-    say.error(limits.displacement_min_um < low_um, "limits.displacement_min_um", shows, change)
-    say.error(
-        limits.gauge_pressure_max_pa >= full_pa,
-        "limits.gauge_pressure_max_pa",
-        f"the gauge shows {full_pa:g} Pa at most: nobody would see it",
-        "give less, or another gauge",
-    )
+    why, remedy = f"can never trip: the laser's range is {low_um:g} .. {high_um:g} um", "change it, or move the laser"
+    say.error(limits.displacement_max_um > high_um, "limits.displacement_max_um", why, remedy)
+    say.error(limits.displacement_min_um < low_um, "limits.displacement_min_um", why, remedy)
+    pressure, why = "limits.gauge_pressure_max_pa", f"can never trip: the gauge shows at most {full_pa:g} Pa"
+    say.error(limits.gauge_pressure_max_pa >= full_pa, pressure, why, "lower it, or use another gauge")
