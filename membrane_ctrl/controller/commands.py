@@ -1,7 +1,4 @@
-"""What may be asked of a running hold: by whom, in which states, and why not.
-
-One table for the control port, the command line and the controller. A refusal is a sentence for a person.
-"""
+"""What may be asked of a running hold, by whom and in which states: one table for all who need it."""
 
 import math
 from collections.abc import Collection, Iterable
@@ -19,14 +16,12 @@ Kind = Literal[
 ]  # fmt: skip
 Role = Literal["read", "operate", "tune"]
 
-# Who asks for what `hold` begins with
-AT_START = "command line"
-# Gains on trial are watched by whoever asked for them; longer than this nobody watches.
-TRIAL_MAX_S = 7200.0
+AT_START = "command line"  # who asks for what `hold` begins with
+TRIAL_MAX_S = 7200.0  # nobody watches a trial for longer
 
-# Of the commands of one tick these come first, in this order: the safest wins, whoever was first
+# Of the commands of one tick these come first, in this order: the safest wins
 DOWN: tuple[Kind, ...] = ("latch", "vent", "stop", "lower")
-# and in the same tick none of these is obeyed: what lifts the mirror, or lets it be lifted, is asked for again
+# and none of these, which lift the mirror or allow it, is obeyed in the same tick
 _OVERRULED: frozenset[str] = frozenset({"hold", "manual", "tune", "resume", "ack"})
 
 ANY = frozenset(State)
@@ -129,19 +124,11 @@ def refusal(command: Command, state: State, config: Config) -> str:
     return ""
 
 
-# Gains on trial: they go back to the last good ones unless somebody says in time that they may stay.
-#
-# The one who tries them may lose its connection or be killed; the loop must then not be left with gains that nobody
-# has verified (docs/decisions/78-gains-on-trial.md).
-
-
 class GainsTrial:
-    """Remembers the last good gains.
+    """Gains on trial revert to the last good ones unless they are kept in time; the first gains of a run are good.
 
-    Parameters
-    ----------
-    loop : LoopConfig
-        The gains that a run begins with are good.
+    Whoever tries them may lose its connection or be killed: the loop must not keep gains that nobody has verified
+    (docs/decisions/78-gains-on-trial.md).
     """
 
     def __init__(self, loop: LoopConfig) -> None:
@@ -154,7 +141,7 @@ class GainsTrial:
         return math.isfinite(self._until_s)
 
     def begin(self, loop: LoopConfig, now_s: float, trial_s: float) -> None:
-        """New gains: for `trial_s` seconds unless kept, or for good if that is NaN."""
+        """Set new gains for `trial_s` seconds, or for good if that is NaN."""
         self._tried = loop
         self._until_s = now_s + trial_s
         if not self.on_trial:
@@ -165,10 +152,10 @@ class GainsTrial:
         self._good, self._until_s = self._tried, math.nan
 
     def overdue(self, now_s: float) -> bool:
-        """Nobody has kept them in time."""
+        """The trial is over, and nobody has kept the gains."""
         return now_s >= self._until_s
 
     def revert(self) -> LoopConfig:
-        """The last good gains, which are the present ones from now on."""
+        """Go back to the last good gains, and return them."""
         self._tried, self._until_s = self._good, math.nan
         return self._good

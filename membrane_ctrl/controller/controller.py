@@ -30,13 +30,10 @@ from membrane_ctrl.model import events as told
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.states import Rung, State
 
-# dt outside this range of the nominal one is no time step a loop was designed for; what is beyond is a missed
-# tick, which safety sees by its lateness
+# the loop's time step is clamped to this range of the nominal one; beyond it is a missed tick, which safety sees
 _DT_RANGE = (0.2, 5.0)
-
-# a reason that comes and goes faster (a pump that touches its limit) tells nobody anything
-_WHY_STANDS_S = 1.0
-# who asked for one of these is named in the line that says why
+_WHY_STANDS_S = 1.0  # a reason that comes and goes faster (a pump that touches its limit) is not reported
+# the operator's line names who asked for one of these
 _MOVES = frozenset({"hold", "stop", "pause", "manual", "tune", "ack", "lower", "vent"})
 _NO_DIGITS = str.maketrans("", "", "0123456789")
 
@@ -44,12 +41,7 @@ _NO_DIGITS = str.maketrans("", "", "0123456789")
 class Controller:
     """Owns the state machine, the safety table and both loops.
 
-    Parameters
-    ----------
-    config : Config
-        The run's configuration.
-    sag_sensitivity : (36,) array
-        Zernike coefficients of a Hencky bowl per sag, in um per um, for the shape loop.
+    `sag_sensitivity` (36,) are the Zernike coefficients of a Hencky bowl per sag, in um per um, for the shape loop.
     """
 
     def __init__(self, config: Config, sag_sensitivity: arrays.FloatArray) -> None:
@@ -76,11 +68,11 @@ class Controller:
 
     @property
     def loop_config(self) -> LoopConfig:
-        """The loop's settings as they are now."""
+        """The loop's present settings."""
         return self._scene.loop_config
 
     def tick(self, inputs: TickInputs) -> TickOutputs:
-        """Run one tick. Never raises: what a handler raises is a fault of the next judgement."""
+        """Run one tick. Never raises: an exception in a handler becomes a fault in the next tick."""
         scene = self._scene
         events: list[Event] = []
         self._begin(inputs, events)
@@ -155,7 +147,7 @@ class Controller:
             self._revert_gains("nobody kept them in time", events)
 
     def _obey(self, command: commands.Command, obeyed: Collection[str], events: list[Event]) -> bool:
-        """Do what a command asks, or say why not; either is recorded with who asked and why."""
+        """Do what a command asks, or refuse it; either is recorded with who asked and why."""
         refused = (
             commands.refusal(command, self.state, self._config)
             or commands.overruled(command, obeyed)
@@ -218,7 +210,7 @@ class Controller:
             scene.asked_by = command.who
 
     def _prepare(self, command: commands.Command) -> str:
-        """Make the experiment that is asked for; why it cannot be, or may not begin, if so."""
+        """Make the experiment of a `tune`; returns why the command is refused, or an empty text."""
         scene, spec = self._scene, command.experiment
         if command.kind == "hold" and scene.latched:
             return f"a fault is latched: {scene.latched}; acknowledge it first"
@@ -243,7 +235,7 @@ class Controller:
         events.append(told.GainsReverted(why))
 
     def _consider_resuming(self, observation: safety_rules.Observation) -> None:
-        """A latched fault on the list may go, once its cause has stayed away (`resume`)."""
+        """Decide whether a latched fault may clear by itself (`resume`)."""
         scene, resume = self._scene, self._resume
         if self.state != State.FAULT or self.fault is None:
             resume.forget()
@@ -254,7 +246,7 @@ class Controller:
         self._clear_mask |= resume.clear_mask
 
     def _apply(self, verdict: safety.Verdict, events: list[Event]) -> None:
-        """Enter the safe level of the verdict; whatever goes below HOLD_FLOW latches as the run's fault."""
+        """Enter the safe level of the verdict; every level below HOLD_FLOW latches the fault."""
         scene, levels = self._scene, self._scene.levels
         rule = verdict.rule
         if rule is None:
@@ -296,10 +288,10 @@ class Controller:
             wanted = states.run_state(self.state, scene)
         except Exception as error:
             self._tick_error = f"{type(error).__name__}: {error}"
-            # a mirror that is being vented is not shut up by an error
+            # an error must not close the vent of a mirror that is being vented
             vents = scene.venting or scene.levels.rung == Rung.VENT
             scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, float(vents)
-            if self.state == State.FAULT:  # nothing is left that could judge it
+            if self.state == State.FAULT:  # no safer state is left
                 scene.finished = errors.Exit.SAFETY_TRIP
             return
         for name, fraction in (("pump", scene.pump_fraction), ("vent", scene.vent_fraction)):
@@ -327,7 +319,7 @@ class Controller:
             scene.acknowledged = False
         if state == State.STANDBY:
             scene.venting = False
-        scene.manual_wanted = scene.paused = False  # asked of the hold that was, not of the next one
+        scene.manual_wanted = scene.paused = False  # they end with the hold they belong to
         self.state = state
         self._state_since_s = math.nan
         scene.good_since_s = scene.last_good_s = math.nan
@@ -342,7 +334,7 @@ class Controller:
         events.append(told.ExperimentEnded(trial.spec.kind, ended.completed, ended.reason, trial.pump_map()))
 
     def _tell_why(self, events: list[Event]) -> None:
-        """The one line of the operator, as an event when its words (not its numbers) have changed for good."""
+        """Report the operator's line when its words (not its numbers) have changed for good."""
         scene = self._scene
         words = scene.why.translate(_NO_DIGITS)
         if words != self._why_words:

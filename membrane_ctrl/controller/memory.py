@@ -1,8 +1,7 @@
-"""All that a controller remembers, as bytes: a replay can begin in the middle of a run, to the last bit.
+"""All that a controller remembers, as bytes, so that a replay can begin in the middle of a run, to the last bit.
 
-JSON of plain data (`object_codec`), compressed. A run folder may come from anywhere: what is read back is checked,
-attribute by attribute, against today's code, and memory of another layout is refused. The run's configuration is not
-in it (the folder has it), and rules of the safety table go by their code.
+Compressed JSON (`object_codec`). A run folder may come from anywhere: every attribute is checked against today's
+code, and memory of another layout is refused. The run's configuration is not in it, as the folder has it.
 """
 
 import json
@@ -26,7 +25,7 @@ class UnknownMemoryError(ValueError):
 
 
 def remember(controller: Controller) -> bytes:
-    """The controller's memory; empty while something is under way that cannot be written down (an experiment)."""
+    """The controller's memory; empty during an experiment, which cannot be written down."""
     try:
         plain = object_codec.encode(controller, _specials(controller._config))
     except TypeError:
@@ -35,19 +34,7 @@ def remember(controller: Controller) -> bytes:
 
 
 def recall(memory: bytes, fresh: Controller) -> Controller:
-    """The controller as it was.
-
-    Parameters
-    ----------
-    memory : bytes
-        Of `remember`.
-    fresh : Controller
-        A new one of the same configuration: how today's code is laid out.
-
-    Raises
-    ------
-    UnknownMemoryError
-    """
+    """The controller of `remember`; `fresh` is a new one of the same configuration. Raises UnknownMemoryError."""
     config = fresh._config
     examples = (fresh, pump_obeys.ActuatorTest(config.pump, test_vent=True, rate_hz=config.loop.rate_hz))
     decoder = object_codec.Decoder(examples, _specials(config))

@@ -1,4 +1,4 @@
-"""From a tick's raw inputs to the observation that safety judges and the reading that the loop may use."""
+"""From a tick's inputs to the observation that safety judges and the reading that the loop may use."""
 
 import math
 
@@ -6,27 +6,26 @@ from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller import safety_rules, tick
 
-# Of a slack film the gauge may read nothing but its own zero, and that for hours.
-_SLACK_PA = 20.0
+_SLACK_PA = 20.0  # below it the gauge of a slack film may repeat its zero for hours
 
 
 class _Repeats:
-    """How long a value has come again and again, equal to the last bit."""
+    """How long a value has been equal to the last bit."""
 
     def __init__(self) -> None:
         self._value = self._since_s = math.nan
 
     def same_s(self, value: float, now_s: float) -> float:
-        """In seconds; a value that is absent (NaN) changes nothing."""
+        """In seconds; NaN changes nothing."""
         if math.isfinite(value) and value != self._value:
             self._value, self._since_s = value, now_s
         return 0.0 if math.isnan(self._since_s) else now_s - self._since_s
 
 
 class _Jumps:
-    """Refuses values further from the last good one than they can be; believes the new place after ten in a row.
+    """Refuses values impossibly far from the last good one; accepts the new place after ten in a row.
 
-    The safety table has spoken by then, and what is measured may really have moved while nothing was seen.
+    By then the safety table has tripped, and the film may really have moved unseen.
     """
 
     def __init__(self, step_max: float) -> None:
@@ -35,7 +34,7 @@ class _Jumps:
         self.count = 0
 
     def refuse(self, value: float) -> bool:
-        """Whether a value is a jump; one that is absent (NaN) is none."""
+        """Whether a value is a jump; NaN is none."""
         if not math.isfinite(value):
             return False
         if abs(value - self._good) > self._step_max and self.count < 10:
@@ -54,9 +53,9 @@ class Observer:
     reading : BenchReading or None
         This tick's reading.
     displacement_um : float
-        The laser reading that the loop may use; NaN if there is none in this tick.
+        The laser reading that the loop may use; NaN without one.
     gauge_pressure_pa : float
-        The gauge's reading if it is no jump; NaN if there is none. Limits are judged on what it says in any case.
+        The gauge's reading; NaN without one, or for a jump, which limits are judged on all the same.
     commanded : tuple of float
         The last two pump commands, newest first.
     """
@@ -72,11 +71,11 @@ class Observer:
         self.displacement_um = self.gauge_pressure_pa = math.nan
 
     def wrote(self, command: BenchCommand) -> None:
-        """Note the command of the tick that just ended, to compare it with its read-back."""
+        """Note the tick's command, to compare it with the next read-backs."""
         self.commanded = (command.pump_fraction, self.commanded[0])
 
     def look(self, inputs: tick.TickInputs) -> None:
-        """Take the tick's reading: what of it is new, and what is no jump."""
+        """Take the tick's reading: what is new, and what is a jump."""
         reading = self.reading = inputs.reading
         now_s = inputs.now_s
         if math.isnan(self._last_read_s):  # ages count from the first tick
@@ -129,7 +128,7 @@ class Observer:
         return same_s if abs(gauge_pa) > _SLACK_PA else 0.0
 
     def _mismatch(self, reading: BenchReading | None) -> float:
-        """How far the read-back is from both of the last two commands: one tick of transport is no mismatch."""
+        """Distance of the read-back from the nearer of the last two commands: a tick of transport is no mismatch."""
         if reading is None:
             return 0.0  # no reading has its own rules
         if not math.isfinite(reading.pump_fraction):

@@ -1,7 +1,7 @@
-"""Does the pump stand when it is commanded off? Judged by its read-back, and by the mirror itself. Pure.
+"""Does the pump obey? Its standstill when commanded off, and the actuator test before a hold. Pure.
 
-A pump that runs on shows in its read-back; one whose read-back lies shows in the mirror, which rises although gas can
-only leak out. What else lifts it is warmer gas and a falling barometer; both are measured, and allowed for.
+A pump that runs on shows in its read-back; if that is wrong, in the mirror, which rises although gas can only leak
+out. Warmer gas and a falling barometer lift it as well; both are measured and allowed for.
 """
 
 import math
@@ -36,19 +36,12 @@ _Block = tuple[float, float, float, float, float]
 class Standstill:
     """What is seen of the pump since it was commanded off.
 
-    Parameters
-    ----------
-    loop : LoopConfig
-        What weather does to the mirror.
-    states : StatesConfig
-        How long the pump may take.
-
     Attributes
     ----------
     seen_off : bool
         The newest reading, taken after a command of 0, says that the pump stands.
     runs_on : str
-        What the read-back says of a pump that ought to have stopped by now; empty if all is well.
+        The read-back of a pump that should have stopped; empty if all is well.
     inflow : str
         How the mirror rises although the pump is commanded off; empty if it does not.
     silent_s : float
@@ -67,14 +60,14 @@ class Standstill:
 
     @property
     def at_rest(self) -> bool:
-        """The pump stands by its read-back, and for two seconds the mirror has not risen as with a running pump."""
+        """The pump stands by its read-back, and the mirror has not risen as by a pump for two seconds."""
         if not self.seen_off or len(self._blocks) < _REST_BLOCKS:
             return False
         rise_um = self._blocks[-1][1] - self._blocks[-_REST_BLOCKS][1]
         return not rise_um > _REST_RISE_MAX_UM  # without a laser the read-back alone decides
 
     def look(self, now_s: float, reading: BenchReading | None, commanded: tuple[float, float], link_up: bool) -> None:
-        """Take a tick's reading, and the last two pump commands before it."""
+        """Note a tick's reading, and the last two pump commands before it."""
         if reading is not None or math.isnan(self._read_s):
             self._read_s = now_s
         self.silent_s = now_s - self._read_s
@@ -130,7 +123,7 @@ class Standstill:
         self.inflow = self._rise()
 
     def _rise(self) -> str:
-        """Laser and gauge must agree on a rise beyond weather's; without one of them the other decides."""
+        """Laser and gauge must both show a rise beyond the weather's; without one of them the other decides."""
         last = self._blocks[-1]
         first = next((block for block in reversed(self._blocks) if last[0] - block[0] >= _WINDOW_S), None)
         if first is None:
@@ -149,24 +142,14 @@ class Standstill:
 
 
 def _range(values: Iterable[float]) -> float:
-    """Largest minus smallest; 0 of a sensor that is not there."""
+    """Largest minus smallest; 0 without a sensor."""
     finite = [value for value in values if math.isfinite(value)]
     return max(finite) - min(finite) if finite else 0.0
 
 
-# Before a hold: does the film answer when the vent opens, the pump stands, and the pump runs?
-#
-# A short scripted sequence; in each part the speed of the centre is the slope of the laser readings. What it checks
-# is sign and size within a factor, not calibration: a disconnected hose, a stuck valve or a laser on the wrong spot
-# are found, a pump that is 30 % weaker than stated is not.
-#
-# Where the answer is not clear, all of it is done once more; a clear answer then is enough, otherwise the mean of
-# both decides. With 1 um of noise a good bench needs that in one start of a hundred.
-
-
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One part: commands, time to let the answer arrive (lag 0.15 s, transport 0.1 s), time to measure."""
+    """A part of the actuator test: commands, time for the response (lag 0.15 s, transport 0.1 s), time to measure."""
 
     name: str
     pump_fraction: float
@@ -175,31 +158,35 @@ class Part:
     measure_s: float
 
 
-# First nothing: the pump has stood and the vent was shut until now. The vent costs height that the pump then has to
-# bring back; little of it, 7 um. The pump last and at 0.8: what it adds is on the way to the setpoint anyway.
+# The vent costs 7 um of height, which the pump has to bring back. The pump comes last and at 0.8: what it adds is on
+# the way to the setpoint anyway.
 PARTS = (
     Part("off", 0.0, 0.0, 0.0, 1.2),
     Part("vent", 0.0, 0.08, 0.35, 0.5),
     Part("pump", 0.8, 0.0, 0.5, 1.0),
 )
-_RATE_HZ = 50.0  # for which the parts' times are
+_RATE_HZ = 50.0  # to which the parts' times belong
 # At 50 Hz and with 1 um of noise the vent's speed has a standard deviation of 1.4 um/s, the pump's 0.6 um/s, and the
-# means of two 1.0 and 0.4 um/s. What is clear is three of them from nothing, what decides in the end two and a half.
+# means of two 1.0 and 0.4 um/s. Three of them are clear; two and a half decide in the end.
 _VENT_CLEAR_UM_PER_S, _VENT_LEAST_UM_PER_S = 4.5, 2.5
 _PUMP_CLEAR_SHARE, _PUMP_LEAST_SHARE, _PUMP_MOST_SHARE = 0.5, 0.3, 3.0
 
 
 class ActuatorTest:
-    """Run it by asking for the commands each tick and giving it the readings.
+    """Does the film respond to vent and pump? Each tick obeys the commands of `part`, and gives `step` its reading.
+
+    The speed of the centre in each part is the slope of the laser readings. The test checks sign and size within a
+    factor: it finds a disconnected hose, a stuck valve or a laser on the wrong spot, not a pump 30 % too weak. After
+    an unclear response it runs again; then a clear response is enough, otherwise the mean of both decides. With 1 um
+    of noise a good bench needs that in one start of a hundred.
 
     Parameters
     ----------
     pump : PumpConfig
-        What the pump is said to give.
     test_vent : bool
-        The bench has a vent, and the mirror has the pressure to let gas out by it.
+        The bench has a vent, and the mirror has pressure to release.
     rate_hz : float
-        Tick rate. Fewer readings a second take longer to show a slope.
+        Tick rate; fewer readings a second take longer to show a slope.
     """
 
     def __init__(self, pump: PumpConfig, test_vent: bool, rate_hz: float) -> None:
@@ -214,14 +201,14 @@ class ActuatorTest:
         self._elapsed_s = 0.0
 
     def again(self) -> None:
-        """Begin once more; what is not clear this time either is judged by the mean of both."""
+        """Begin once more; what is unclear again is judged by the mean of both."""
         self._before = {name: slope.per_s for name, slope in self._speeds.items()}
         self._speeds = {part.name: Slope() for part in self._parts}
         self._elapsed_s = 0.0
 
     @property
     def is_second(self) -> bool:
-        """What it says is the last word."""
+        """The test runs for the second and last time."""
         return bool(self._before)
 
     @property
@@ -240,7 +227,7 @@ class ActuatorTest:
         return None
 
     def step(self, displacement_um: float, dt_s: float) -> None:
-        """Take one reading (NaN: none), and let time pass."""
+        """Take one reading (NaN: none) and advance the time."""
         part = self.part
         if part is None:
             return
@@ -255,11 +242,11 @@ class ActuatorTest:
         return max(0.0, -self._speeds["off"].per_s)
 
     def failure(self) -> str:
-        """What did not answer as it should, the first time what did not do so clearly; empty when all did."""
+        """What did not respond, or on the first run not clearly; empty if all did."""
         speeds = {name: slope.per_s for name, slope in self._speeds.items()}
         unclear = self._judged(speeds, _VENT_CLEAR_UM_PER_S, _PUMP_CLEAR_SHARE)
         if not (unclear and self._before):
-            return unclear  # a clear second answer is enough: something may have been in the beam during the first
+            return unclear  # something may have been in the beam during the first run
         means = {name: (speed + self._before[name]) / 2 for name, speed in speeds.items()}
         return self._judged(means, _VENT_LEAST_UM_PER_S, _PUMP_LEAST_SHARE)
 

@@ -1,8 +1,8 @@
 """The safe levels: hold the last mean flow -> ramp down -> pump off -> vent.
 
-A fault chooses the rung to enter at; each rung times out into the next; nothing but a clear observation on the
-first rung leads back up. The time that the first rung lasts is a store that fills again only as fast as it is used:
-a cause that comes and goes, and is there more than half of the time, times out as one that stays.
+A fault chooses the rung to enter at; each rung times out into the next; only a clear observation on the first rung
+leads back up. The first rung's time recovers only as fast as it is used: a cause that is there more than half of the
+time times out like one that stays.
 """
 
 import math
@@ -41,26 +41,19 @@ class SafeLevels:
         self.rung = Rung.NONE
 
     def leave(self) -> None:
-        """Leave the safe levels from any of them: a person has acknowledged, or the resume rule allows it."""
+        """Leave the safe levels from any rung: after an acknowledgement, or by the resume rule."""
         self.rung, self._used_s = Rung.NONE, 0.0
 
     def age_s(self, now_s: float) -> float:
-        """Time on the present rung; on HOLD_FLOW with what was left of earlier times there."""
+        """Time on the present rung; on HOLD_FLOW including what has not recovered of earlier times."""
         return now_s - self._since_s
 
     def step(self, now_s: float) -> Rung:
-        """The rung in force now: a rung whose time is over gives way to the next."""
+        """The present rung, after a time-out the next one."""
         limit_s = self._limit_s.get(self.rung)
         if limit_s is not None and self.age_s(now_s) > limit_s:
             self.enter(Rung(self.rung + 1), now_s)
         return self.rung
-
-
-# May a latched fault clear by itself? Only listed ones, only when their cause has stayed away, only so often.
-#
-# Never what has vented, never what the board has latched beyond its watchdog's own trip, never a board that another
-# program has taken, and nothing that a person has latched: one sign of these at any moment of the fault decides,
-# whatever its first cause was.
 
 
 DAY_S = 86_400.0
@@ -71,7 +64,11 @@ VENTED_FRACTION = 0.5
 
 
 class ResumeRule:
-    """Counts the resumes of the last day and how long the present cause has been away."""
+    """May a latched fault clear by itself? Only a listed one, after its cause has stayed away, so often a day.
+
+    Never after a vent, a board latch other than the watchdog's trip, a board taken by another program, or a person's
+    lock: one of these at any moment of the fault decides, whatever its first cause was.
+    """
 
     def __init__(self, config: ResumeConfig, limits: LimitsConfig) -> None:
         self._config, self._limits = config, limits
@@ -86,14 +83,14 @@ class ResumeRule:
         self._resumed_s.append(at_s)
 
     def forget(self) -> None:
-        """There is no fault: what was seen in an earlier one does not count in the next."""
+        """The fault is over: what was seen in it does not count in the next."""
         self._clear_since_s, self._never, self.possible, self.clear_mask = math.nan, False, False, 0
 
     def due(self, fault: Rule, levels: SafeLevels, observation: Observation, now_s: float) -> bool:
-        """Look at a tick of a fault; True once the cause has stayed away for long enough.
+        """Look at a tick of a fault; True once its cause has been absent for long enough.
 
-        Afterwards `possible` says whether the fault may still clear by itself, and `clear_mask` which of the board's
-        latches have to be cleared for it: the watchdog's own, or none.
+        Sets `possible`, whether the fault may still clear by itself, and `clear_mask`, the board's latches to clear
+        for that: the watchdog's, or none.
         """
         self._never |= _decides(levels, observation)
         listed = fault.may_resume and fault.name in self._config.faults
@@ -105,11 +102,11 @@ class ResumeRule:
         silent = not observation.link_up or observation.reading_age_s > self._limits.stale_s
         gone = not (silent or self.clear_mask or fault.broken(observation, self._limits))
         if gone and observation.reading_age_s > 0.0:
-            return False  # an answer that is lost now and then says nothing
+            return False  # a single lost answer says nothing
         return self._waited(gone, now_s)
 
     def _left(self, now_s: float) -> bool:
-        """The day's number is not used up."""
+        """The day's resumes are not used up."""
         while self._resumed_s and now_s - self._resumed_s[0] > DAY_S:
             self._resumed_s.popleft()
         return len(self._resumed_s) < self._config.most_per_day
@@ -124,7 +121,7 @@ class ResumeRule:
 
 
 def _decides(levels: SafeLevels, observation: Observation) -> bool:
-    """Something that only a person may clear."""
+    """Whether only a person may clear it."""
     return (
         levels.rung == Rung.VENT
         or bool(observation.board_faults & ~WATCHDOG_MASK)

@@ -1,9 +1,8 @@
 """The safety table: a tick's observation in, a verdict out. No I/O, no clock.
 
-Each rule names a cause, how many of the last ticks must show it (N of M), the limit, the rung among the
-safe actions where it enters, and whether it latches. Every rule is judged on every tick in the states where it
-applies. Of rules that trip together the one that enters deepest wins; the first cause of a fault is what the
-operator is told. `docs/faults.md` is made from this table.
+Each rule names a cause, how many of the last ticks must show it (N of M), its limit, and the safe level that it
+enters. It is judged on every tick in the states where it applies. Of rules that trip together the one that enters
+deepest wins; the operator is told the first cause of a fault. `docs/faults.md` is made from this table.
 """
 
 import math
@@ -15,14 +14,11 @@ from membrane_ctrl.controller.safety_rules import ALWAYS, CONNECTED, HOLDING, MO
 from membrane_ctrl.model.states import Rung, State
 
 _FOREIGN = {FOREIGN_CLAIM: "another claim is in force", FOREIGN_PERIOD: "another watchdog period is in force"}
-# Two looks at a limit that must never be passed: one bit error may not vent a mirror that takes two hours to
-# fill, and two ticks are 40 ms, in which the pump moves the film by 0.2 um.
+# One bit error must not vent a mirror that takes two hours to fill; in two ticks the pump moves the film by 0.2 um
 _TWICE = (2, 3)
-# The pump needs its lag (0.15 s) and the dead time of a tick or two to follow a command.
-# What the loop's own noise moves the command by hides a constant difference in some ticks.
+# The pump follows with its lag (0.15 s) and a tick or two; the loop's noise hides a constant difference in some ticks
 _FOLLOWED = (40, 50)
-# The loop holds its mean flow over any tick without a reading; one repeated sample of a busy device is no fault yet.
-_A_FEW = (3, 3)
+_A_FEW = (3, 3)  # one repeated sample of a busy device is no fault
 
 # fmt: off
 TABLE: tuple[Rule, ...] = (
@@ -228,9 +224,9 @@ class SafetyTable:
         self._history = [0] * len(table)
 
     def judge(self, state: State, observation: Observation) -> Verdict:
-        """The tripped rule that enters deepest, of equal ones the first. All are looked at: no history has a hole.
+        """The tripped rule that enters deepest, of equal ones the first; all are judged: no history has a hole.
 
-        Not simply the first: a lost laser, which is held on the mean flow, must not hide a lost pressure sensor.
+        Not simply the first: a lost laser, which only holds the flow, must not hide a lost pressure sensor.
         """
         tripped: Rule | None = None
         for index, rule in enumerate(self._table):

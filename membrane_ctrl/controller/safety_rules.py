@@ -53,8 +53,8 @@ class Observation:
 class Rule:
     """One row of the table. `limit` and `remedy` are for people; `broken` decides.
 
-    A tick in which `unseen` is true shows nothing of the cause, neither way, and is left out of the window: a sensor
-    that is only there now and then, over its limit each time, must not be forgiven for the ticks between.
+    A tick in which `unseen` is true is left out of the window: a sensor that answers now and then, each time over its
+    limit, must not be excused by the ticks between.
     """
 
     code: int
@@ -64,11 +64,10 @@ class Rule:
     rung: Rung
     remedy: str
     broken: Callable[[Observation, LimitsConfig], bool]
-    seen: Callable[[Observation], str] = lambda o: ""  # the observed value, for the one line the operator reads
+    seen: Callable[[Observation], str] = lambda o: ""  # the observed value, for the operator
     seen_in: tuple[int, int] = (1, 1)  # ticks that must show the cause, of so many
     states: Collection[State] = MOVING
-    # `resume.faults` may name it: the cause is a message or a sensor that was lost for a while, and whether it is
-    # back is seen. All others need a person, who finds out why before gas flows again.
+    # `resume.faults` may name it: a lost message or sensor, whose return is seen. All others need a person.
     may_resume: bool = False
     unseen: Callable[[Observation], bool] = lambda o: False
 

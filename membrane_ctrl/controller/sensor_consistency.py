@@ -1,4 +1,4 @@
-"""What a held mirror's sensors say about each other and about the film: who lies, and what wears out."""
+"""What the sensors of a held mirror show about each other and about the film: which is wrong, what wears out."""
 
 import math
 from dataclasses import dataclass
@@ -9,9 +9,8 @@ from membrane_ctrl.controller import safety_rules, tick
 from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver, Plausibility
 from membrane_ctrl.model.states import State
 
-# A single bad answer is nobody's business.
-_WEATHER_STANDS_S = 10.0
-# No two cycles have the same noise; one that comes twice may be the same message.
+_WEATHER_STANDS_S = 10.0  # a single bad answer is not reported
+# No two cycles have the same noise; a shape that comes twice may be the same message
 _REPEATS = 3
 
 
@@ -37,14 +36,10 @@ class SensorConsistency:
 
     Attributes
     ----------
-    laser_lies : str
-        What laser, gauge and camera show, if it is the laser that does not fit.
+    laser_lies, laser_gauge_apart, gas_excess : str
+        As in `Observation`.
     camera_lies : str
-        The same of the camera, as a reason for the shape loop.
-    laser_gauge_apart : str
-        What laser and gauge have seen, if both cannot be true.
-    gas_excess : str
-        How much more gas the film takes than it used to, if no camera sees it.
+        What laser, gauge and camera show, if the camera is wrong: a reason for the shape loop.
     """
 
     def __init__(self, config: Config) -> None:
@@ -102,7 +97,7 @@ class SensorConsistency:
         return events
 
     def _rest(self) -> list[Event]:
-        """Nothing is held, or not yet where it is to be."""
+        """The mirror is not held, or not yet at its setpoint."""
         self._growth.moves()
         self.gas_excess = ""
         if self._plausibility.watching:
@@ -110,7 +105,7 @@ class SensorConsistency:
         return self._judge(plausibility.Liar.NOBODY)
 
     def _look_at_camera(self, inputs: tick.TickInputs) -> None:
-        """Note when it has last seen the film, and how often the same to the last bit."""
+        """Note when the camera last saw the film, and how often it repeated one shape to the last bit."""
         estimate = inputs.estimate
         if estimate is None or estimate.verdict == "rejected":
             return
@@ -119,7 +114,7 @@ class SensorConsistency:
         self._sag_um = estimate.sag_um
 
     def _most_growth(self, inputs: tick.TickInputs) -> float:
-        """How far the leak may grow: as it likes, while a camera sees the film where the laser does."""
+        """How far the leak may grow: without limit while the camera agrees with the laser."""
         if self._repeats >= _REPEATS:
             return self._leak_growth_max
         if not inputs.now_s - self._camera_s <= self._fresh_s:
@@ -127,7 +122,7 @@ class SensorConsistency:
         return math.inf if self._liar == plausibility.Liar.NOBODY else film.CONTRADICTED_MOST
 
     def _judge_weather(self, inputs: tick.TickInputs, dt_s: float) -> list[Event]:
-        """A barometer or thermometer that cannot be right is left out, and that is told once."""
+        """Report once that a barometer or thermometer cannot be right; the loop ignores it."""
         reading = inputs.reading
         if reading is None:
             return []
@@ -136,7 +131,7 @@ class SensorConsistency:
         if self._weather_s < _WEATHER_STANDS_S:
             return []
         self._weather_told, self._weather_s = bool(failure), 0.0
-        return [(Maintenance if failure else MaintenanceOver)("weather_sensor", failure or "no longer so")]
+        return [(Maintenance if failure else MaintenanceOver)("weather_sensor", failure or "the sensor is back")]
 
     def _judge(self, liar: plausibility.Liar) -> list[Event]:
         repeats = self._repeats >= _REPEATS
@@ -146,7 +141,7 @@ class SensorConsistency:
             self.camera_lies = "the camera repeats one shape to the last bit: restart it"
         elif liar != plausibility.Liar.OPTICS:
             self.camera_lies = ""
-        elif not self.camera_lies:  # the words stay: a reason whose numbers change is no new one
+        elif not self.camera_lies:  # a reason whose numbers change is not a new one
             self.camera_lies = f"laser and gauge agree that the camera is wrong: {seen}"
         if liar == self._liar:
             return []

@@ -53,12 +53,11 @@ class TickOutputs:
     clear_mask: int = 0  # the board's latches to clear: all after `ack`, the watchdog's by the resume rule
 
 
-# What went into a tick, as bytes: exactly, so that a replay of them gives the same tick (docs/replay.md).
+# The inputs of a tick as bytes, exactly, so that a replay gives the same tick (docs/replay.md).
 #
-# A tick is one fixed record; what is rarely there (commands, ended tasks) goes before it as JSON, in as many pieces
-# as it takes. A shape estimate is named by its time only: the recorder has it from the ring it came by. Of what came
-# out of the tick a checksum is kept: enough to say that a replay is the same, and 4 bytes instead of 280.
-
+# A tick is one fixed record; what is rare (commands, ended tasks) precedes it as JSON, in pieces. A shape estimate is
+# named by its time only: the recorder has it from its own ring. Of the outputs only a checksum is kept: it tells
+# whether a replay is the same, in 4 bytes instead of 280.
 
 # First bytes of the messages of the inputs ring.
 TICK, PIECE, MEMORY = b"T", b"P", b"M"
@@ -92,18 +91,10 @@ _NO_READING = tuple(0 if name in _FORMATS else math.nan for name in _READING)
 
 
 def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes, memory: bytes = b"") -> list[bytes]:
-    """Messages for the inputs ring, in their order; the last one is the tick.
+    """Messages for the inputs ring, in order; the last one is the tick.
 
-    Parameters
-    ----------
-    tick : int
-        Number of the tick, from 1.
-    inputs, outputs
-        Of `Controller.tick`.
-    row : bytes
-        The outputs' telemetry row, packed: it has been packed for its own ring already.
-    memory : bytes
-        The controller's memory before this tick, if a replay shall be able to begin with it.
+    `tick` counts from 1, `row` is the packed telemetry row of the outputs, and `memory` the controller's memory
+    before this tick, if a replay shall be able to begin here.
     """
     tail = _tail(inputs)
     reading, estimate = inputs.reading, inputs.estimate
@@ -147,21 +138,10 @@ def _tail(inputs: TickInputs) -> bytes:
 
 
 def unpack_tick(record: np.void, tail: bytes, estimates: Mapping[float, shape_estimate.ShapeEstimate]) -> TickInputs:
-    """The inputs of a tick, equal to the last bit to what they were.
+    """The inputs of a tick, exact to the last bit; `tail` are its commands and ended tasks as JSON.
 
-    Parameters
-    ----------
-    record : np.void
-        One row of dtype `RECORD`.
-    tail : bytes
-        Commands and ended tasks; empty if there were none.
-    estimates : mapping
-        Shape estimates of the run by their time.
-
-    Raises
-    ------
-    LookupError
-        The record names an estimate or a tail that is not there.
+    `estimates` are the run's shape estimates by their time. Raises LookupError for an estimate or a tail that is
+    missing.
     """
     values: dict[str, Any] = dict(zip(RECORD.names or (), record.item(), strict=True))
     if len(tail) != values["tail_bytes"]:
