@@ -75,7 +75,7 @@ def _step(name: str) -> None:
         json: JsonOption = False,
     ) -> int:
         from membrane_ctrl.control_port.ctl import Where
-        from membrane_ctrl.control_port.unix import SOCKET_NAME
+        from membrane_ctrl.control_port.sockets import SOCKET_NAME
         from tuning import command as tune
 
         if socket is None and run is None:

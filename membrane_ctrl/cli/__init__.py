@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from membrane_ctrl import __version__
-from membrane_ctrl.cli import calibrating, devices, holding, optics, records
+from membrane_ctrl.cli import calibrating, holding, optics, records
 from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.review.cli import add_commands as add_review_commands
 
@@ -41,7 +41,7 @@ def top(version: Annotated[bool, typer.Option("--version", help="Print the versi
         raise typer.Exit
 
 
-for _family in (holding, devices, optics, calibrating, records):
+for _family in (holding, optics, calibrating, records):
     _family.add_commands(app)
 add_review_commands(app)
 # tuning builds on this package, not the reverse: `tune` comes as an entry point

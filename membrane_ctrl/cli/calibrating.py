@@ -136,7 +136,7 @@ def calibrate(
         )
     from membrane_ctrl.calibration.live import LiveOptions, calibrate_live
     from membrane_ctrl.control_port.ctl import Where
-    from membrane_ctrl.control_port.unix import SOCKET_NAME
+    from membrane_ctrl.control_port.sockets import SOCKET_NAME
 
     if folders or out:
         raise InputError("calibrate --live takes its sets into its session's folder: leave out SET... and --out")

@@ -1,4 +1,4 @@
-"""The commands that hold a mirror, or talk to a hold."""
+"""The commands that hold a mirror, talk to a hold, or look at devices."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,10 +18,9 @@ FlatOption = Annotated[
 
 
 def add_commands(app: typer.Typer) -> None:
-    """Add `hold`, `twin`, `safe`, `ctl`, `alarm`."""
-    app.command()(hold)
-    app.command()(twin)
-    app.command()(safe)
+    """Add `hold`, `twin`, `safe`, `check`, `devices`, `conformance`, `ctl`, `alarm`."""
+    for command in (hold, twin, safe, check, devices, conformance):
+        app.command()(command)
     app.add_typer(ctl_app, name="ctl")
     app.add_typer(alarm_app, name="alarm")
 
@@ -89,6 +88,33 @@ def safe(
     from membrane_ctrl.commissioning.safe import make_safe
 
     return make_safe(configured(config), str(config), logs, latch)
+
+
+def check(config: ConfigArgument, json: JsonOption = False) -> int:
+    """Validate a configuration, probe its devices, and say what a hold would do."""
+    from membrane_ctrl.commissioning.check import check_config
+
+    return check_config(configured(config), str(config), json)
+
+
+def devices(json: JsonOption = False) -> int:
+    """List serial ports, cameras and displays, with the text to paste into a configuration."""
+    from membrane_ctrl.commissioning.devices import list_devices
+
+    return list_devices(json)
+
+
+def conformance(
+    url: Annotated[
+        str, typer.Argument(metavar="URL", help="Pump board: tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200.")
+    ],
+    unit_id: Annotated[int, typer.Option(min=1, max=247, help="Modbus unit identifier.")] = 1,
+    json: JsonOption = False,
+) -> int:
+    """Test a pump board against its specification. The pump runs at a few per cent: vent the mirror first."""
+    from membrane_ctrl.commissioning.devices import run_conformance
+
+    return run_conformance(url, unit_id, json)
 
 
 @alarm_app.callback()

@@ -14,7 +14,7 @@ from membrane_ctrl.commissioning.probe import DeviceProbe, probe_board, probe_op
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.port import AlarmsConfig, PortConfig
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.control_port import tls, unix
+from membrane_ctrl.control_port import sockets
 from membrane_ctrl.controller.cross_check import cross_check, require_sound
 from membrane_ctrl.geometry.file import geometry_in_force
 from membrane_ctrl.instruments import bench, device_lock
@@ -129,9 +129,9 @@ def _port(port: PortConfig) -> str:
     """Where a hold could be asked. Raises InputError for certificates that cannot be used."""
     if not port.enabled:
         return "off"
-    ways = [port.socket or f"{unix.SOCKET_NAME} beside the run folders"]
+    ways = [port.socket or f"{sockets.SOCKET_NAME} beside the run folders"]
     if port.tls is not None:
-        tls.server_context(port.tls)
+        sockets.server_context(port.tls)
         ways.append(f"TLS on {port.tls.host}:{port.tls.port}")
     if port.metrics_port is not None:
         ways.append(f"metrics on 127.0.0.1:{port.metrics_port}")

@@ -16,7 +16,7 @@ from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.roles import BenchReading, LinkError
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.control_port import client, unix
+from membrane_ctrl.control_port import client, sockets
 from membrane_ctrl.instruments import bench, device_lock
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile
@@ -151,7 +151,7 @@ async def _standing(board: PumpBoard, watchdog_s: float) -> BenchReading:
 
 def _hold_told(config: Config, folder: Path) -> str:
     """Have a running hold latch; what came of it, empty if none answers."""
-    path = Path(config.port.socket) if config.port.socket else folder / unix.SOCKET_NAME
+    path = Path(config.port.socket) if config.port.socket else folder / sockets.SOCKET_NAME
     if not config.port.enabled or not path.exists():
         return ""
     try:

@@ -16,9 +16,8 @@ from rich.console import Console
 from rich.live import Live
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.model import ConsoleModel, ConsoleView, text
+from membrane_ctrl.console import model, why
 from membrane_ctrl.console.view import console_panel
-from membrane_ctrl.console.why import duration, number, percent
 from membrane_ctrl.model import events, run_events, shape_estimate
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.telemetry import TelemetryRow
@@ -34,7 +33,7 @@ _AT_ONCE = (
 )  # fmt: skip
 
 
-def line(view: ConsoleView) -> str:
+def line(view: model.ConsoleView) -> str:
     """The view in one line."""
     row = view.row
     if view.silent_s or row is None:
@@ -43,17 +42,17 @@ def line(view: ConsoleView) -> str:
     shape = view.shape
     parts = [
         f"{view.elapsed_s:9.1f} s  {view.state.name.lower():7}",
-        f"error {number(row.error_um, 2, sign=True):>7} um",
-        f"pump {percent(row.pump_fraction):>5}",
-        f"leak {number(row.leak_um_per_s, 2)} um/s" + (" TOO TIGHT" if view.too_tight else ""),
-        f"shape {_shape_words(view)} trim {number(shape.trim_um, 2, sign=True)} um",
-        f"late {number(row.lateness_ms, 1)} ms",
+        f"error {why.number(row.error_um, 2, sign=True):>7} um",
+        f"pump {why.percent(row.pump_fraction):>5}",
+        f"leak {why.number(row.leak_um_per_s, 2)} um/s" + (" TOO TIGHT" if view.too_tight else ""),
+        f"shape {_shape_words(view)} trim {why.number(shape.trim_um, 2, sign=True)} um",
+        f"late {why.number(row.lateness_ms, 1)} ms",
         view.why,
     ]
     if view.recording:
         parts.append(f"RECORDING {view.recording}")
     if math.isfinite(view.left_s):
-        parts.append(f"{duration(view.left_s)} left")
+        parts.append(f"{why.duration(view.left_s)} left")
     return "  ".join(parts)
 
 
@@ -69,16 +68,16 @@ def event_line(event: events.EventLine) -> str:
     """An event in one line."""
     mono_s = event.get("mono_s", math.nan)
     what = " ".join(str(event[key]) for key in ("state", "child", "exit") if key in event)
-    words = " ".join(f"{what} {text(event)}".split())  # one line, whatever an error said
+    words = " ".join(f"{what} {model.text(event)}".split())  # one line, whatever an error said
     remedy = f"; {event['remedy']}" if event.get("remedy") else ""
-    return f"{number(mono_s, 1):>9} s  {str(event.get('kind', '?')).upper()} {words}{remedy}".rstrip()
+    return f"{why.number(mono_s, 1):>9} s  {str(event.get('kind', '?')).upper()} {words}{remedy}".rstrip()
 
 
-def _shape_words(view: ConsoleView) -> str:
+def _shape_words(view: model.ConsoleView) -> str:
     shape = view.shape
     if shape.estimate is None:
         return shape.note or shape.state.name.lower()
-    return f"{shape.state.name.lower()} {shape.estimate.verdict} {duration(shape.age_s)}"
+    return f"{shape.state.name.lower()} {shape.estimate.verdict} {why.duration(shape.age_s)}"
 
 
 _LOOK_S = 0.2  # as fast as a person reads changing figures
@@ -143,7 +142,7 @@ class _Feed:
     """The rings, poured into the model."""
 
     def __init__(self, spec: ConsoleSpec) -> None:
-        self.model = ConsoleModel(spec.config, spec.duration_s)
+        self.model = model.ConsoleModel(spec.config, spec.duration_s)
         self._telemetry = ring.RingReader(spec.telemetry)
         self._events = ring.RingReader(spec.events)
         self._shapes = ring.RingReader(spec.shapes) if spec.shapes else None

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.control_port.protocol import encode
-from membrane_ctrl.control_port.unix import short
+from membrane_ctrl.control_port.sockets import short
 from membrane_ctrl.model.errors import DeviceError, os_reason
 
 Message = dict[str, Any]
@@ -74,7 +74,7 @@ class PortClient:
 
     @classmethod
     def tls(cls, host: str, port: int, context: ssl.SSLContext, notice: Callable[[str], None]) -> PortClient:
-        """Connect by TCP; the context holds the own certificate (`tls.client_context`)."""
+        """Connect by TCP; the context holds the own certificate (`sockets.client_context`)."""
         where = f"{host}:{port}"
         try:
             plain = socket.create_connection((host, port), _ANSWER_S)

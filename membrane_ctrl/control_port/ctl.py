@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.config.toml_file import read_toml
-from membrane_ctrl.control_port import unix
+from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.model import errors
 
@@ -141,14 +141,14 @@ def _connect(where: Where) -> PortClient:
 
 
 def _connect_tls(where: Where, notice: Any) -> PortClient:
-    from membrane_ctrl.control_port.tls import client_context
-
     host, _, port = where.tls.rpartition(":")
     if not host or not port.isdigit():
         raise errors.InputError(f"--tls {where.tls}: expected HOST:PORT")
     if where.certificate is None or where.key is None or where.authority is None:
         raise errors.InputError("--tls needs --certificate, --key and --authority")
-    return PortClient.tls(host, int(port), client_context(where.certificate, where.key, where.authority), notice)
+    return PortClient.tls(
+        host, int(port), sockets.client_context(where.certificate, where.key, where.authority), notice
+    )
 
 
 def socket_path(where: Where) -> Path:
@@ -156,6 +156,6 @@ def socket_path(where: Where) -> Path:
     if where.socket is not None:
         return where.socket
     if where.run is None:
-        return Path("logs") / unix.SOCKET_NAME
+        return Path("logs") / sockets.SOCKET_NAME
     configured = read_toml(where.run / "config.toml").get("port", {}).get("socket")
-    return Path(configured) if configured else where.run.resolve().parent / unix.SOCKET_NAME
+    return Path(configured) if configured else where.run.resolve().parent / sockets.SOCKET_NAME

@@ -18,7 +18,7 @@ from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
 from membrane_ctrl.control_port.protocol import KINDS, VERSION, Request, Wire
 from membrane_ctrl.control_port.session import FREE, Commander, Peer, PortSession, may_not
-from membrane_ctrl.control_port.tls import Listeners
+from membrane_ctrl.control_port.sockets import Listeners
 from membrane_ctrl.controller import commands, tick
 from membrane_ctrl.model import errors, events, run_events, run_status, states
 

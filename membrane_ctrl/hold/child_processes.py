@@ -120,8 +120,7 @@ class ManagedChild:
         return said
 
 
-# A recorder that is busy for a minute (a slow disk, a big flush) loses nothing
-_TELEMETRY_KEPT_S = 60.0
+_TELEMETRY_KEPT_S = 60.0  # a recorder that is busy so long (a slow disk) loses nothing
 _EVENTS_KEPT, _EVENT_BYTES = 1024, 4096
 _SHAPES_KEPT, _SHAPE_BYTES = 64, 1 << 16  # a 36 x 36 covariance is 10 kB
 _RECORDER_CLOSES_S = 30.0
@@ -142,7 +141,7 @@ class Rings:
 
 
 def rings_for(config: Config, truth: RingAddress | None, stack: ExitStack) -> Rings:
-    """Make the rings; the stack gives their memory back."""
+    """Make the rings; the stack frees their memory."""
     kept = round(_TELEMETRY_KEPT_S * config.loop.rate_hz)
     telemetry = stack.enter_context(ring(kept, ROW_BYTES))
     events = stack.enter_context(ring(_EVENTS_KEPT, _EVENT_BYTES))
@@ -163,7 +162,7 @@ def _frames(config: Config, stack: ExitStack) -> FrameAddress:
 
 
 class ChildProcesses:
-    """Recorder, console, acquisition and alarms of one run. The hold goes on without any of them, and says so."""
+    """Recorder, console, acquisition and alarms of one run. The hold goes on without any of them, and reports it."""
 
     def __init__(
         self, config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str, duration_s: float | None
@@ -182,7 +181,7 @@ class ChildProcesses:
         return [each for each in (self._recorder, self._acquisition, self._alarms, self._console) if each is not None]
 
     def start(self, stack: ExitStack) -> None:
-        """Start all; the stack ends whatever `take_down` has not."""
+        """Start all; the stack stops what `take_down` has not."""
         stack.callback(self._stop)
         for managed in self._managed:
             managed.start(self._clock.now())
@@ -192,11 +191,11 @@ class ChildProcesses:
             managed.child.stop(_CHILD_STOPS_S)
 
     def reports(self) -> list[events.Event]:
-        """What the children have said since the last call, and who was replaced; never waits."""
+        """The children's reports since the last call, and who was replaced; never waits."""
         return [event for managed in self._managed for event in managed.look(self._clock.now())]
 
     def capture(self) -> events.Event | None:
-        """Have the acquisition take a full set to disk, which its own event names; an event if that cannot be."""
+        """Have the acquisition save a full set, and report it; returns an event if that is impossible."""
         if self._acquisition is None:
             return run_events.Capture(failed="no shape measurement in this run")
         if not self._acquisition.send("capture"):
@@ -204,13 +203,13 @@ class ChildProcesses:
         return None
 
     def take_down(self) -> None:
-        """Stop the acquisition, then let recorder and console finish by themselves: the "end" event is their sign."""
+        """Stop the acquisition, then wait for recorder and console, which end with the "end" event."""
         if self._acquisition is not None:
             self._acquisition.child.stop(_CHILD_STOPS_S)
         recorder = self._recorder.child
         if not recorder.join(_RECORDER_CLOSES_S):
-            recorder.stop(0.0)  # stopped, or its disk takes nothing any more
-        if recorder.exit_code != 0 and not self._summary.exists():  # another writes the end down
+            recorder.stop(0.0)  # it hangs, or its disk does
+        if recorder.exit_code != 0 and not self._summary.exists():  # another one records the end
             self._recorder.replace(self._clock.now())
             self._recorder.child.join(_RECORDER_CLOSES_S)
         self._end_console()
@@ -218,7 +217,7 @@ class ChildProcesses:
             self._alarms.child.join(_ALARMS_LEAVE_S)
 
     def _end_console(self) -> None:
-        """The terminal is a person's again, whatever has become of who drew on it."""
+        """Give the terminal back, even if the console hangs."""
         from membrane_ctrl.console.process import give_back_terminal
 
         console = self._console.child

@@ -20,22 +20,20 @@ from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile, Res
 
 
 class FaultLatch:
-    """Keeps the latched-fault file in step with the controller.
-
-    A context manager that waits for the disk at the end, when the pump is off.
+    """Keeps the latched-fault file in step with the controller; on exit it waits for the disk, when the pump is off.
 
     Parameters
     ----------
     file : LatchedFile or None
         None: nothing is latched beyond the run (the twin's default).
     resumes : ResumeLog or None
-        Where resumes are counted beyond the run.
+        Counts resumes beyond the run.
     run : str
         Name of the run folder.
     utc : callable
         UTC of a moment on the run's clock.
     tell : callable
-        Takes an event, for a file that could not be written, or can again.
+        Records that the file could not be written, or can again.
     """
 
     def __init__(
@@ -56,7 +54,7 @@ class FaultLatch:
 
     @property
     def latched(self) -> str:
-        """What is latched now, in one line; empty for nothing."""
+        """The latched fault in one line; empty without one."""
         fault = None if self._file is None else self._file.read()
         return "" if fault is None else str(fault)
 
@@ -67,7 +65,7 @@ class FaultLatch:
 
     def __enter__(self) -> FaultLatch:
         if self._file is not None:
-            with contextlib.suppress(OSError):  # then it is tried without when it matters, and a failure is told
+            with contextlib.suppress(OSError):  # a failure is reported when it matters
                 self._file.reserve()
         return self
 
@@ -80,7 +78,7 @@ class FaultLatch:
         self._report()
 
     def heard(self, outputs: tick.TickOutputs) -> None:
-        """A tick has ended: latch a fault or a person's lock, clear what was left or acknowledged."""
+        """After a tick: latch a fault or a person's lock, clear what was left or acknowledged."""
         self._report()
         for event in outputs.events:
             match event:
@@ -89,7 +87,7 @@ class FaultLatch:
                 case StateEntered(state="fault"):
                     self._latch(outputs.row.mono_s)
                 case CommandTaken(command="latch", who=who, refused=None) if who != commands.AT_START:
-                    # what is latched at the start is where it belongs
+                    # what is latched at the start is in the file already
                     self._lock(who, event.text or "", outputs.row.mono_s)
                 case Resumed() if self._resumes is not None:
                     self._disk.submit(self._try, partial(self._resumes.add, self._utc(outputs.row.mono_s)))
@@ -117,7 +115,7 @@ class FaultLatch:
         self._disk.submit(self._try, act)
 
     def _settle(self, file: LatchedFile) -> None:
-        """The run is over: what the disk did not take is tried once more, and the disk is waited for."""
+        """At the end of the run: try once more what the disk did not take, and wait for the disk."""
         if self._failing:
             self._try(self._last)
         if not self._failing:
@@ -145,16 +143,10 @@ _NOTIFY_S = 0.5  # far below any sensible WatchdogSec=, and nothing to a tick
 
 
 class SystemdNotify:
-    """Tells systemd that ticks go on: `Type=notify`, `WatchdogSec=`, a status line. Silent without systemd.
+    """Tells systemd that ticks go on (`Type=notify`, `WatchdogSec=`), with a status line, and that they end.
 
-    The protocol is a datagram of KEY=VALUE lines to the socket in NOTIFY_SOCKET (sd_notify(3)). It is sent at the end
-    of a tick: a loop that hangs sends nothing, and systemd restarts it. A message that the socket refuses is lost.
-    A context manager that reports the end.
-
-    Parameters
-    ----------
-    address : str or None
-        Of the socket, by default from the environment; "@name" is an abstract one.
+    The protocol is a datagram of KEY=VALUE lines to the socket in NOTIFY_SOCKET (sd_notify(3)); "@name" is an
+    abstract one, and without a socket nothing is sent. A loop that hangs sends nothing, and systemd restarts it.
     """
 
     def __init__(self, address: str | None = None) -> None:
@@ -174,11 +166,11 @@ class SystemdNotify:
         self._socket.close()
 
     def told(self, event: Event) -> None:
-        """Take in what a child process reports; the next status line has it."""
+        """Note a child's report for the next status line."""
         self._status = self._status.after_event(event)
 
     def heard(self, outputs: tick.TickOutputs) -> None:
-        """A tick has ended."""
+        """After a tick: notify, at most twice a second unless the state changes."""
         row = outputs.row
         if row.mono_s < self._next_s and row.state == self._state:
             return

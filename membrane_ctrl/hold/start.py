@@ -21,7 +21,7 @@ from firmware_iface.drivers.pump_board import NO_CLAIM
 from firmware_iface.roles import ALL_FAULTS, Bench, LinkError
 from membrane_ctrl.alarms.senders import require_sendable
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.control_port import server, tls
+from membrane_ctrl.control_port import server, sockets
 from membrane_ctrl.controller import commands, cross_check, safe_levels, tick
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.geometry.file import geometry_in_force
@@ -74,7 +74,7 @@ def hold_mirror(options: HoldOptions) -> int:
         config = twin.config if twin else options.config
         assert config.devices is not None
         logs_dir = options.logs_dir or Path(config.recording.logs_dir)
-        listeners = tls.listeners_for(config.port, logs_dir, stack)  # a second hold ends here, no device touched
+        listeners = sockets.listeners_for(config.port, logs_dir, stack)  # a second hold ends here, no device touched
         stack.enter_context(locked(device_names(config.devices)))  # and here one with other folders
         latched = _latched(config, logs_dir, options)
         resumes = None if latched is None else latched_fault.ResumeLog(logs_dir)

@@ -1,7 +1,7 @@
 """The tick: asyncio, absolute deadlines, one device exchange, one pure function, one write.
 
-Nothing here may take longer than a tick: no image, no Rerun, no file. What is recorded goes into shared-memory
-rings, which never wait. A missed deadline is skipped and counted, never made up in a burst.
+Nothing here may take longer than a tick: no image, no Rerun, no file; the record goes into shared-memory rings, which
+never wait. A missed deadline is skipped and counted, never made up in a burst.
 """
 
 import asyncio
@@ -22,13 +22,10 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.processes.ring import RingReader, RingWriter
 
-# Looking after a child costs a system call; half a second late is soon enough, the loop does not need them
-_CHILD_WATCH_S = 0.5
-# A replay has to run through half of this on the way to its part, in some seconds; a memory takes 0.6 ms of a
-# tick and 7 kB
+_CHILD_WATCH_S = 0.5  # looking after a child costs a system call
+# A replay runs through half of this on the way to its part, in some seconds; a memory takes 0.6 ms of a tick and 7 kB
 MEMORY_EVERY_S = 600.0
-# of a text in an event that is longer than a slot of the ring; a letter takes up to 12 bytes in JSON
-_TEXT_CUTS = (200, 20)
+_TEXT_CUTS = (200, 20)  # letters of a text, if the event is longer than a slot; one takes up to 12 bytes in JSON
 
 
 @dataclass(slots=True)
@@ -38,29 +35,17 @@ class Wiring:
     bench: Bench
     telemetry: RingWriter | None = None
     events: RingWriter | None = None
-    inputs: RingWriter | None = None  # what the ticks were given, for a replay
+    inputs: RingWriter | None = None  # of the ticks, for a replay
     shapes: Callable[[], shape_estimate.ShapeEstimate | None] | None = None  # the newest since the last call
     truth: Callable[[], tuple[float, float]] | None = None  # (displacement_um, laser_bias_um) of the twin
-    reports: Callable[[], list[Event]] = list  # what the children have said since the last call
-    # who wants to know what each tick decided, and what the children report; one that raises is a fault
+    reports: Callable[[], list[Event]] = list  # of the children since the last call
+    # listeners to each tick's outputs, and to the children's reports; one that raises is a fault
     heard: Mapping[str, Callable[[TickOutputs], None]] = field(default_factory=dict)
     told: Mapping[str, Callable[[Event], None]] = field(default_factory=dict)
 
 
 class Supervisor:
-    """Runs the ticks of one run, from the first one to the exit code.
-
-    Parameters
-    ----------
-    controller : Controller
-        The pure tick.
-    wiring : Wiring
-        Devices, rings and children.
-    clock : RunClock
-        The run's clock.
-    rate_hz : float
-        Tick rate.
-    """
+    """Runs the ticks of one run, from the first one to the exit code."""
 
     def __init__(self, controller: Controller, wiring: Wiring, clock: RunClock, rate_hz: float) -> None:
         self._controller = controller
@@ -74,7 +59,7 @@ class Supervisor:
         self._next_watch_s = 0.0
         self._next_memory_s = MEMORY_EVERY_S
         self._vent_fraction = 0.0
-        self._broken: dict[str, str] = {}  # parts of the program that raised, with what
+        self._broken: dict[str, str] = {}  # parts of the program that raised, with the exception
         self.ticks = 0
         self.missed_ticks = 0
 
@@ -83,7 +68,7 @@ class Supervisor:
         self._pending.append(command)
 
     def tell(self, event: Event) -> None:
-        """Put an event on record, now."""
+        """Record an event, now."""
         if self._wiring.events is None:
             return
         now_s = self._clock.now()
@@ -118,13 +103,7 @@ class Supervisor:
         await self._write(BenchCommand(0.0, self._vent_fraction))
 
     async def tick(self, now_s: float, dt_s: float, late_s: float) -> tuple[TickInputs, TickOutputs]:
-        """Run one tick: read, decide, write, record.
-
-        Parameters
-        ----------
-        now_s, dt_s, late_s : float
-            Start on the run's clock, time since the last tick, and start against the deadline.
-        """
+        """Run one tick: read, decide, write, record. It starts at `now_s`, `late_s` after its deadline."""
         wiring = self._wiring
         self.ticks += 1
         if not self._link_up:
@@ -162,14 +141,14 @@ class Supervisor:
         return inputs, outputs
 
     def _remember(self, now_s: float) -> bytes:
-        """Now and then the controller's memory, so that a replay need not begin with the run."""
+        """Now and then the controller's memory, so that a replay can begin there."""
         if self._wiring.inputs is None or now_s < self._next_memory_s:
             return b""
         self._next_memory_s = now_s + MEMORY_EVERY_S
         return remember(self._controller)
 
     def _record(self, inputs: TickInputs, outputs: TickOutputs, memory: bytes) -> None:
-        """The row for people, the inputs for a replay; a value of a wrong kind costs the replay, not the run."""
+        """Record the row, and the inputs for a replay; a value of a wrong type costs the replay, not the run."""
         if self._wiring.telemetry is None:
             return
         row = outputs.row.pack()
@@ -195,12 +174,12 @@ class Supervisor:
         return reading
 
     async def _reconnect(self) -> None:
-        """Try the lost link again; the link backs off by itself, and there is nothing to be late for meanwhile."""
+        """Try the lost link again; the link itself paces the attempts."""
         try:
             await self._wiring.bench.open()
         except LinkWaitsError:
             return
-        except LinkError as error:  # another one than that which broke it: it answers, and another program holds it
+        except LinkError as error:  # e.g. it answers, but another program holds it
             self._link_failed(error)
             return
         self._link_up, self._link_error = True, ""
@@ -233,7 +212,7 @@ class Supervisor:
             return None
         try:
             return self._wiring.shapes()
-        except ValueError as error:  # as good as no shape, which the shape loop bears
+        except ValueError as error:  # the shape loop goes on without it
             if str(error) != self._shape_error:
                 self._shape_error = str(error)
                 self.tell(run_events.ShapeUnreadable(str(error)))
@@ -247,7 +226,7 @@ class Supervisor:
                 self._guarded(name, partial(told, report))
 
     def _guarded(self, name: str, act: Callable[[], None]) -> None:
-        """Let a part of the program act. If it raises, the next tick sees it (`dead_task`) and goes down in order."""
+        """Run a part of the program; if it raises, the next tick sees the fault `dead_task`."""
         try:
             act()
         except Exception as error:
@@ -255,7 +234,7 @@ class Supervisor:
 
 
 def newest_of(reader: RingReader) -> Callable[[], shape_estimate.ShapeEstimate | None]:
-    """Return what takes the newest estimate out of the shapes' ring; it raises ValueError for an unreadable one."""
+    """A function that takes the newest estimate out of the shapes' ring; it raises ValueError for a bad one."""
 
     def newest() -> shape_estimate.ShapeEstimate | None:
         messages = reader.drain()
@@ -265,7 +244,7 @@ def newest_of(reader: RingReader) -> Callable[[], shape_estimate.ShapeEstimate |
 
 
 def _line(event: EventLine, most_bytes: int) -> bytes:
-    """An event for the ring: the texts of one that is too long are cut, as no message is worth the hold."""
+    """An event for the ring; its texts are cut if it is too long."""
     line = json.dumps(event, allow_nan=False, default=str).encode()
     for most in _TEXT_CUTS:
         if len(line) <= most_bytes:

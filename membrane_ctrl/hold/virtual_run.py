@@ -1,8 +1,7 @@
 """A run in virtual time: the supervisor's own ticks on the twin behind its board, without processes or waiting.
 
-What a run has and this has not: the latency of the link (a read here is the plant's state at the tick, a write takes
-effect at once), the processes, and deadlines. The board is the emulator's own, with its watchdog, latches and limits,
-on the plant's time.
+It lacks the latency of the link (a read is the plant's state at the tick, a write takes effect at once), the
+processes and the deadlines. The board is the emulator's, with its watchdog, latches and limits, on the plant's time.
 """
 
 from collections.abc import Callable
@@ -45,15 +44,14 @@ class VirtualRun:
     Parameters
     ----------
     config : Config
-        As for a run.
     bench : VirtualBench
-        Plant, board, and what is wrong with them.
+        Plant, board, and their faults.
     sag_sensitivity : (36,) array
         See `Controller`.
     shape : callable, optional
         Called with the time every `shape.period_s`; returns an estimate or None.
     alter : callable, optional
-        Stands between the board and the controller: gets the time and the reading, returns what is read.
+        Gets the time and the board's reading, returns what the controller reads.
 
     Attributes
     ----------
@@ -83,13 +81,13 @@ class VirtualRun:
         self._supervisor = Supervisor(
             Controller(config, sag_sensitivity),
             Wiring(_AtOnce(bench, self._altered), shapes=self._newest_shape if shape else None, truth=self._truth),
-            clock.RunClock.start(),  # of the events' stamps, which nobody records here
+            clock.RunClock.start(),  # for the events' stamps, which are not recorded
             config.loop.rate_hz,
         )
         bench.open()
 
     def tick(self, commands: tuple[Command, ...] = ()) -> VirtualTick | None:
-        """Let one period pass and run the tick at its end; None if the control process did not run."""
+        """Advance one period and run a tick; None if the control process does not run."""
         self._steps += 1
         self.now_s = self._steps * self._period_s  # no sum, which would drift
         self._bench.advance(self._period_s)
@@ -127,7 +125,7 @@ class VirtualRun:
 
 
 class _AtOnce:
-    """A virtual bench as the supervisor's `Bench`: what it is asked, it answers without waiting."""
+    """A virtual bench as the supervisor's `Bench`, which answers without waiting."""
 
     def __init__(
         self, bench: virtual_bench.VirtualBench, altered: Callable[[roles.BenchReading], roles.BenchReading]

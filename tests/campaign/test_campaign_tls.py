@@ -23,7 +23,7 @@ import tls_attackers
 from campaign_bench import Run, make_plant, running
 
 from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.control_port.tls import client_context
+from membrane_ctrl.control_port.sockets import client_context
 from membrane_ctrl.model.errors import DeviceError, Exit
 from membrane_ctrl.run_files.run import open_run
 

@@ -16,8 +16,7 @@ from membrane_ctrl.config.port import PortConfig
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control_port.server import Port, RunHooks
 from membrane_ctrl.control_port.session import Peer
-from membrane_ctrl.control_port.tls import Listeners, listeners_for
-from membrane_ctrl.control_port.unix import UnixListener
+from membrane_ctrl.control_port.sockets import Listeners, UnixListener, listeners_for
 from membrane_ctrl.controller.commands import Command, refusal
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.model.events import Event, EventLine

@@ -17,7 +17,7 @@ from test_port_tls import address_of, greet
 from membrane_ctrl.config.port import PortConfig, TlsConfig
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Turns
-from membrane_ctrl.control_port.tls import client_context, listen_tcp
+from membrane_ctrl.control_port.sockets import client_context, listen_tcp
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from port_run import PortRun, port_run
 from membrane_ctrl.config.port import PortConfig, TlsConfig
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.session import Peer
-from membrane_ctrl.control_port.tls import TlsListener, client_context
+from membrane_ctrl.control_port.sockets import TlsListener, client_context
 from membrane_ctrl.model.errors import DeviceError, InputError
 
 pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="makes certificates with openssl")

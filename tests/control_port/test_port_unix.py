@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.control_port.unix import UnixListener, short
+from membrane_ctrl.control_port.sockets import UnixListener, short
 from membrane_ctrl.model.errors import DeviceError, InputError
 
 
@@ -73,7 +73,7 @@ def test_a_living_holds_socket_is_refused_and_left_alone(tmp_path: Path) -> None
 
 def test_a_hanging_holds_socket_is_busy_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its queue is full, and a connection waits: no reason to take its place."""
-    monkeypatch.setattr("membrane_ctrl.control_port.unix._SOMEBODY_THERE_S", 0.05)
+    monkeypatch.setattr("membrane_ctrl.control_port.sockets._SOMEBODY_THERE_S", 0.05)
     path = tmp_path / "control.sock"
     hanging = socket.socket(socket.AF_UNIX)
     hanging.bind(str(path))

@@ -28,7 +28,7 @@ from firmware_iface.roles import (
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig
 from membrane_ctrl.control_port.server import Port
-from membrane_ctrl.control_port.tls import Listeners
+from membrane_ctrl.control_port.sockets import Listeners
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.hold.child_processes import ChildProcesses, rings_for

@@ -158,7 +158,7 @@ _OWN = {
     "run_files/column_file.py", "recorder/sink.py", "recorder/housekeeping.py", "run_files/run_folder.py",
     "acquisition/raw_frames.py",
     # the logs' own folder, each by its own handle or without following; a socket; a set of one's own run
-    "run_files/latched_fault.py", "commissioning/safe.py", "run_files/disk_budget.py", "control_port/unix.py",
+    "run_files/latched_fault.py", "commissioning/safe.py", "run_files/disk_budget.py", "control_port/sockets.py",
     "sessions/folder.py",
     # a new folder, a temporary one, or a file that the user has named
     "sim/optics/simulate.py", "replay/incident.py", "run_files/segments.py", "review/viewer/command.py",
