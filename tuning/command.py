@@ -71,10 +71,7 @@ def run_session(options: TuneOptions) -> int:
 def one_step(step: str, options: TuneOptions) -> int:
     """One step of the newest session, or of the one named; `characterise` begins one.
 
-    Raises
-    ------
-    InputError, DeviceError, RejectedError
-        One line each; the mirror is held with the last good gains then.
+    Raises InputError, DeviceError or RejectedError; the mirror is then held with the last good gains.
     """
     if step not in _MOVES:
         folder = _folder(options, None)

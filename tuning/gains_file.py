@@ -80,18 +80,15 @@ def load_gains(path: Path) -> GainsFile:
 def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
     """Refuse gains that must not be applied.
 
+    Raises InputError if the loop would be unstable on the file's own plant or has too little margin, or ticks
+    differently.
+
     Parameters
     ----------
-    gains : GainsFile
     where : str
         For the message.
     running : LoopConfig
         Of the hold they are for.
-
-    Raises
-    ------
-    InputError
-        If the loop would be unstable on the file's own plant or has too little margin, or ticks differently.
     """
     dt_s = 1 / gains.loop.rate_hz
     found = loop_model.margins(loop_model.Gains.of(gains.loop), gains.plant.model, dt_s)
@@ -123,24 +120,14 @@ What = Literal["kept", "taken_back", "rolled_back"]
 
 @dataclass(frozen=True, slots=True)
 class GainsEntry:
-    """One line.
-
-    Attributes
-    ----------
-    time_utc : str
-    what : str
-        "kept": verified; "taken_back": the verification failed; "rolled_back": by a person.
-    session, author, reason : str
-    before, after : LoopConfig
-        Gains before and with it; after "taken_back" those before run again.
-    """
+    """One line."""
 
     time_utc: str
-    what: What
+    what: What  # "kept": verified; "taken_back": the verification failed; "rolled_back": by a person
     session: str
     author: str
     reason: str
-    before: LoopConfig
+    before: LoopConfig  # gains before and with it; after "taken_back" those before run again
     after: LoopConfig
 
 

@@ -30,9 +30,6 @@ class Rig:
 
     Parameters
     ----------
-    bench : DrivenBench
-    loop : LoopConfig
-    pump : PumpConfig
     leak_um_per_s : float
         Flow to begin with.
     """
@@ -138,10 +135,8 @@ class HoldRig:
 
     Parameters
     ----------
-    link : HoldLink
     who : str
         Recorded with every command.
-    progress : callable
 
     Attributes
     ----------

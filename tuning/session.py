@@ -69,19 +69,9 @@ class Previewed:
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """`verified.json`.
+    """`verified.json`."""
 
-    Attributes
-    ----------
-    kept : bool
-        The new gains stay.
-    reason : str
-        Why not.
-    stages : tuple of Stage
-    before, after : LoopConfig
-    """
-
-    kept: bool
+    kept: bool  # the new gains stay
     reason: str
     stages: tuple[verify.Stage, ...]
     before: LoopConfig

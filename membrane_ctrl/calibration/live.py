@@ -66,12 +66,9 @@ def calibrate_live(options: LiveOptions) -> int:
 
 
 def take_sets(link: CaptureLink, session: CalibrationSession | None, options: LiveOptions) -> CalibrationSession:
-    """All sets that are missing, if a person agrees; the mirror comes back to where it was.
+    """Take the missing sets, if a person agrees, and move the mirror back to where it was.
 
-    Raises
-    ------
-    InputError, DeviceError, RejectedError, KeyboardInterrupt
-        The sets so far stay in the session's folder then.
+    Raises InputError, DeviceError, RejectedError or KeyboardInterrupt; the session's folder keeps the sets so far.
     """
     progress = Progress()
     sweep = Sweep(link, link.config.limits, progress)

@@ -20,26 +20,15 @@ FORMAT = "membrane-live-calibration/1"
 
 @dataclass(frozen=True, slots=True)
 class CalibrationHead:
-    """`session.json`.
-
-    Attributes
-    ----------
-    format, source, created_utc : str
-        `source` is the run it began on.
-    start_um : float
-        Setpoint to come back to; what was measured by hand is taken to hold for a mirror that stands there.
-    shape_on : bool
-        Whether the shape loop was on.
-    setpoints_um : tuple of float
-        Of the sets, in their order.
-    """
+    """`session.json`."""
 
     format: str
-    source: str
+    source: str  # the run it began on
     created_utc: str
+    # Setpoint to return to; the measurements by hand are taken to hold there
     start_um: float
-    shape_on: bool
-    setpoints_um: tuple[float, ...]
+    shape_on: bool  # whether the shape loop was on
+    setpoints_um: tuple[float, ...]  # of the sets, in their order
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +105,6 @@ def compared(optics: OpticsConfig, origin: GeometryOrigin, new: GeometryFile) ->
         As in force, for the sets say what they were taken with.
     origin : GeometryOrigin
         Its name.
-    new : GeometryFile
     """
     old = "by hand" if not origin.calibrated_utc else f"calibrated {origin.calibrated_utc}"
     lines = [
@@ -143,10 +131,7 @@ def _by_tape(geometry: Geometry) -> list[tuple[str, float]]:
 def adopt(new: Path, place: Path) -> Path | None:
     """Put a geometry where the configuration looks for it; returns where the one before it is kept now.
 
-    Raises
-    ------
-    DeviceError
-        If it cannot be written; then the old one is still there.
+    Raises DeviceError if it cannot be written; then the old one is still there.
     """
     try:
         place.parent.mkdir(parents=True, exist_ok=True)

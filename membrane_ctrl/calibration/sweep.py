@@ -42,7 +42,6 @@ class Sweep:
 
     Parameters
     ----------
-    link : CaptureLink
     limits : LimitsConfig
         For the band.
     progress : callable
@@ -55,15 +54,7 @@ class Sweep:
         self._why = ""
 
     def look(self) -> HeldMirror:
-        """The mirror as it is held, over some seconds and at least one shape.
-
-        Raises
-        ------
-        HoldError
-            If it is not held.
-        DeviceError
-            If no camera measures it.
-        """
+        """The mirror as held, from some seconds and a shape. Raises HoldError, or DeviceError without a camera."""
         rows: deque[telemetry.TelemetryRow] = deque()
         shape = None
         while shape is None or rows[-1].mono_s - rows[0].mono_s < _LOOK_S:
@@ -94,12 +85,7 @@ class Sweep:
     def go(self, setpoint_um: float, expected_s: float) -> None:
         """Ramp there and settle.
 
-        Raises
-        ------
-        HoldError
-            If the mirror is no longer held, or somebody else moves it.
-        DeviceError
-            If it does not arrive.
+        Raises HoldError if the mirror is no longer held or somebody else moves it; DeviceError if it does not arrive.
         """
         self._ask("setpoint", setpoint_um)
         patience_s = _LATE[0] * expected_s + _LATE[1]
@@ -124,14 +110,9 @@ class Sweep:
                 )
 
     def take(self) -> Capture:
-        """Have a set taken; one that is bad is taken again, once.
+        """Have a set taken; repeat a bad one once.
 
-        Raises
-        ------
-        HoldError
-            If the hold refuses, or the mirror is no longer held.
-        RejectedError
-            If the second is bad, too.
+        Raises HoldError if the hold refuses or the mirror is no longer held; RejectedError if both are bad.
         """
         first = self._capture()
         event = first if first.set else self._capture()
@@ -188,23 +169,11 @@ def _mean(values: list[float]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Procedure:
-    """What moves the mirror for a calibration.
-
-    Attributes
-    ----------
-    link : CaptureLink
-        The hold.
-    sweep : Sweep
-        The hand on it.
-    held : HeldMirror
-        The mirror as it was found.
-    progress : Progress
-        For the person who waits.
-    """
+    """What moves the mirror for a calibration."""
 
     link: CaptureLink
-    sweep: Sweep
-    held: HeldMirror
+    sweep: Sweep  # the hand on it
+    held: HeldMirror  # the mirror as it was found
     progress: Progress
 
     def times_s(self, head: CalibrationHead, missing: tuple[int, ...]) -> list[float]:
@@ -229,14 +198,10 @@ class Procedure:
             )
 
     def take(self, session: CalibrationSession) -> None:
-        """Take what is missing, come back.
+        """Take the missing sets and move the mirror back.
 
-        Raises
-        ------
-        HoldError
-            If the mirror is held no more, or somebody else moves it; it is left alone then.
-        DeviceError, RejectedError, KeyboardInterrupt
-            After the mirror has come back.
+        Raises HoldError if the mirror is no longer held or somebody else moves it (it is then left alone); DeviceError,
+        RejectedError or KeyboardInterrupt after the mirror has moved back.
         """
         with self.progress.catching(), self._coming_back(session):
             self.sweep.shape_loop(False)

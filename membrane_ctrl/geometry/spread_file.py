@@ -52,10 +52,7 @@ def spread_of(geometry: GeometryConfig, file: Path | None) -> tuple[GeometrySpre
     The file's covariance, the geometry's own sigmas, the paper's instruments for the short form. A general form
     without a covariance is taken as exact.
 
-    Raises
-    ------
-    InputError
-        If the file's covariance is of the other form.
+    Raises InputError if the file's covariance is of the other form.
     """
     given = None if file is None else read_spread(file)
     if given is not None:

@@ -63,43 +63,19 @@ class CaptureFile(Section):
 
 @dataclass(frozen=True)
 class CaptureHead:
-    """What `capture.toml` says, checked and in order.
+    """What `capture.toml` says, checked and in order."""
 
-    Attributes
-    ----------
-    folder : Path
-        Of the set.
-    kind : "full" or "fringes"
-        See INTERFACES section 3.
-    reference : Path or None
-        Of a fringes set: the full set that anchors it.
-    optics : OpticsConfig
-        Geometry, camera, pattern and mirror; `camera.bits` is to be trusted only if `bits_stated`.
-    bits_stated : bool
-        Whether the set says how deep its frames are.
-    files : tuple of str
-        In the order of the patterns.
-    patterns : tuple of Pattern
-        x sinusoids, x Gray bits, y sinusoids, y Gray bits, white, black (of a full set).
-    time_s, displacement_um : (frames,) arrays
-        NaN where the set says nothing.
-    ignored : tuple of str
-        Keys of the file that are not known.
-    geometry : GeometryOrigin
-        Which geometry is in `optics`.
-    """
-
-    folder: Path
+    folder: Path  # of the set
     kind: Literal["full", "fringes"]
-    reference: Path | None
-    optics: OpticsConfig
-    bits_stated: bool
-    files: tuple[str, ...]
-    patterns: tuple[Pattern, ...]
-    time_s: FloatArray
-    displacement_um: FloatArray
-    ignored: tuple[str, ...]
-    geometry: GeometryOrigin
+    reference: Path | None  # of a fringes set: the full set that anchors it
+    optics: OpticsConfig  # geometry, camera, pattern and mirror; `camera.bits` is to be trusted only if `bits_stated`
+    bits_stated: bool  # whether the set says how deep its frames are
+    files: tuple[str, ...]  # in the order of the patterns
+    patterns: tuple[Pattern, ...]  # x sinusoids, x Gray bits, y sinusoids, y Gray bits, white, black (of a full set)
+    time_s: FloatArray  # (frames,): NaN where the set says nothing
+    displacement_um: FloatArray  # (frames,)
+    ignored: tuple[str, ...]  # keys of the file that are not known
+    geometry: GeometryOrigin  # which geometry is in `optics`
 
 
 @dataclass(frozen=True)
@@ -125,7 +101,7 @@ class CaptureSet:
 
 
 def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead:
-    """Read `capture.toml`.
+    """Read `capture.toml`. Raises InputError.
 
     Parameters
     ----------
@@ -133,11 +109,6 @@ def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead
         The set.
     geometry : GeometryFile, optional
         Used instead of the set's own, with the lens and the pitch that were calibrated with it.
-
-    Raises
-    ------
-    InputError
-        One line with the file and the field.
     """
     path = folder / "capture.toml"
     if not folder.is_dir():
@@ -194,10 +165,7 @@ def read_set(folder: Path, geometry: GeometryFile | None = None) -> CaptureSet:
 def assemble(head: CaptureHead, images: Sequence[Frames | str]) -> CaptureSet:
     """Frames of one size and depth in one array; an image that is a text is the reason why there is none.
 
-    Raises
-    ------
-    InputError
-        If no frame is readable, or if most contradict the file's own camera.
+    Raises InputError if no frame is readable, or if most contradict the file's own camera.
     """
     path = head.folder / "capture.toml"
     good = [image for image in images if not isinstance(image, str)]

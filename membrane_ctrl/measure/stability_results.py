@@ -164,7 +164,7 @@ def log_stability(
     lines: Sequence[str],
     pictures: Sequence[Path],
 ) -> None:
-    """Write a recording.
+    """Write a recording. Raises OSError if the file cannot be written.
 
     Parameters
     ----------
@@ -182,11 +182,6 @@ def log_stability(
         Map of standard deviations, rows along y, NaN outside.
     lines, pictures
         The report, and what was drawn.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
     """
     terms = [f"Z{j}" for j in range(2, 37)]
     with result_recording(path, "membrane_ctrl_stability", _blueprint(pictures)) as recording:

@@ -29,42 +29,19 @@ _NO_SLOPE = 4e-3
 
 @dataclass(frozen=True)
 class FullResult:
-    """Everything of one set.
+    """Everything of one set."""
 
-    Attributes
-    ----------
-    fit : Fit
-        The surface: Hencky excess and 36 terms; `changes_mm` of all iterations from the start.
-    index : (n,) int array
-        Pixels inside the analysis radius that gave slopes, counted row by row.
-    field : (6, n) array
-        x, y in mm, measured slopes, fitted slopes.
-    weights : (n,) array
-        What each had to say in the fit.
-    swing_adu : (n,) array
-        The smaller of the two fringe amplitudes.
-    rest_adu : (n,) array
-        What the sinusoids leave of the frames: noise, motion, the display's harmonics.
-    grid : ResidualGrid
-        Mean slope residuals in cells.
-    residual_mm : (m, m) array
-        Height over the fit, 0 at the vertex; NaN where nothing was measured.
-    quality : Quality
-        For the verdict.
-    moved : bool
-        Whether the film's motion was taken out.
-    """
-
-    fit: reconstruct.Fit
-    index: NDArray[np.int64]
-    field: FloatArray
-    weights: FloatArray
-    swing_adu: NDArray[np.float32]
+    fit: reconstruct.Fit  # the surface: Hencky excess and 36 terms; `changes_mm` of all iterations from the start
+    index: NDArray[np.int64]  # (n,): pixels inside the analysis radius that gave slopes, counted row by row
+    field: FloatArray  # (6, n): x, y in mm, measured slopes, fitted slopes
+    weights: FloatArray  # (n,): what each had to say in the fit
+    swing_adu: NDArray[np.float32]  # (n,): the smaller of the two fringe amplitudes
+    # (n,): what the sinusoids leave of the frames: noise, motion, the display's harmonics
     rest_adu: NDArray[np.float32]
-    grid: zonal.ResidualGrid
-    residual_mm: FloatArray
-    quality: Quality
-    moved: bool
+    grid: zonal.ResidualGrid  # mean slope residuals in cells
+    residual_mm: FloatArray  # (m, m): height over the fit, 0 at the vertex; NaN where nothing was measured
+    quality: Quality  # for the verdict
+    moved: bool  # whether the film's motion was taken out
 
     @property
     def surface(self) -> Surface:
@@ -223,30 +200,14 @@ def _quality(optics: OpticsConfig, checked: Checked, pixels: PixelPoints, fit: r
 
 @dataclass(frozen=True)
 class BinFigure:
-    """Surface through the bins of one set.
+    """Surface through the bins of one set."""
 
-    Attributes
-    ----------
-    fit : Fit
-        Hencky excess and 36 terms.
-    points : Points
-        The bins' rays and screen points, standing on the surface.
-    index : (n,) int array
-        Their bins.
-    sigma_mm : (2, n) array
-        1 sigma of the screen points from the noise of the pixels.
-    quality : Quality
-        For the verdict.
-    moved : bool
-        Whether the film's motion between the frames was taken out.
-    """
-
-    fit: reconstruct.Fit
-    points: reconstruct.Points
-    index: NDArray[np.int64]
-    sigma_mm: FloatArray
-    quality: Quality
-    moved: bool
+    fit: reconstruct.Fit  # Hencky excess and 36 terms
+    points: reconstruct.Points  # the bins' rays and screen points, standing on the surface
+    index: NDArray[np.int64]  # (n,): their bins
+    sigma_mm: FloatArray  # (2, n): 1 sigma of the screen points from the noise of the pixels
+    quality: Quality  # for the verdict
+    moved: bool  # whether the film's motion between the frames was taken out
 
 
 def bin_figure(optics: OpticsConfig, checked: Checked) -> BinFigure:

@@ -89,7 +89,7 @@ class LiveReconstructor:
         self._tracked: motion.TrackedPoints | None = None
 
     def full(self, frames: Sequence[phasor.Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
-        """One full cycle.
+        """One full cycle. Raises ValueError for a wrong number, size or type of frames.
 
         Parameters
         ----------
@@ -102,11 +102,6 @@ class LiveReconstructor:
         -------
         ShapeEstimate
             Verdict "rejected" with the reason when the images give no figure.
-
-        Raises
-        ------
-        ValueError
-            For a wrong number, size or type of frames.
         """
         times, readings = _per_frame(frames, time_s, displacement_um, self._slots.count, "full")
         sinusoids = np.r_[self._slots.sinusoids].tolist()

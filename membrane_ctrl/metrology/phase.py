@@ -23,6 +23,8 @@ from membrane_ctrl.model.arrays import FloatArray
 def step_weights(shifts_rad: Sequence[float] | FloatArray) -> FloatArray:
     """Rows that turn the N intensities of a pixel into A, C and S.
 
+    Raises ValueError if the steps do not determine a phase (fewer than three different ones on the circle).
+
     Parameters
     ----------
     shifts_rad : (N,) array
@@ -32,11 +34,6 @@ def step_weights(shifts_rad: Sequence[float] | FloatArray) -> FloatArray:
     -------
     (3, N) array
         Pseudo-inverse of the columns [1, cos d, -sin d].
-
-    Raises
-    ------
-    ValueError
-        If the steps do not determine a phase (fewer than three different ones on the circle).
     """
     shifts = np.asarray(shifts_rad, float)
     design = np.stack([np.ones_like(shifts), np.cos(shifts), -np.sin(shifts)], axis=1)
@@ -222,35 +219,22 @@ class FullSlots:
 
 @dataclass(frozen=True)
 class Decoded:
-    """Absolute phases of a full cycle.
+    """Absolute phases of a full cycle."""
 
-    Attributes
-    ----------
-    phase_rad : (2, ...) array
-        x and y, counted from the low edge's -pi (see `unwrap`); NaN where not valid.
-    modulation_adu : (2, ...) array
-        Fringe amplitude.
-    valid : (...) bool array
-        Pixels that see the pattern in the mirror.
-    """
-
-    phase_rad: FloatArray
-    modulation_adu: FloatArray
-    valid: NDArray[np.bool_]
+    phase_rad: FloatArray  # (2, ...): x and y, counted from the low edge's -pi (see `unwrap`); NaN where not valid
+    modulation_adu: FloatArray  # (2, ...): fringe amplitude
+    valid: NDArray[np.bool_]  # (...): pixels that see the pattern in the mirror
 
 
 def decode_full(images: FloatArray, pattern: PatternConfig, shifts_rad: FloatArray) -> Decoded:
     """Decode the images of a full cycle (2 (N + 4) + 2, ...), in `patterns.full_sequence`'s order.
 
+    Raises ValueError if there are more or fewer images.
+
     Parameters
     ----------
     shifts_rad : (2, N) array
         Phase steps of x and y.
-
-    Raises
-    ------
-    ValueError
-        If there are more or fewer images.
     """
     slots = FullSlots(pattern.steps)
     if len(images) != slots.count:

@@ -125,17 +125,14 @@ class Binner:
     def add(self, frames: Sequence[Image], slots: Sequence[int], watched: Container[int] | None = None) -> None:
         """Sum frames into slots.
 
+        Raises ValueError for a frame of wrong size or type of pixel; nothing is summed then.
+
         Parameters
         ----------
         frames, slots : sequences of the same length
             Frame k goes to slots[k].
         watched : container of slots, optional
             Only these are watched for saturation; all if not given. A white or Gray frame loses nothing by it.
-
-        Raises
-        ------
-        ValueError
-            For a frame of wrong size or type of pixel; nothing is summed then.
         """
         for frame in frames:
             if frame.shape != self._size:
@@ -157,18 +154,11 @@ class Binner:
 
 @dataclass(frozen=True)
 class StepCombination:
-    """How the frames of one axis become a phasor.
+    """How the frames of one axis become a phasor."""
 
-    Attributes
-    ----------
-    cosine, sine : (N,) arrays
-        Weights of the frames' bin sums for C and S (per pixel: divided by the bin's area).
-    turn, mirror : complex
-        First-order effect of the film's motion per radian and unit of sensitivity (see `motion`); 0 without.
-    """
-
-    cosine: FloatArray
-    sine: FloatArray
+    cosine: FloatArray  # (N,): weights of the frames' bin sums for C and S (per pixel: divided by the bin's area)
+    sine: FloatArray  # (N,)
+    # First-order effect of the film's motion per radian and unit of sensitivity (see `motion`); 0 without
     turn: complex = 0j
     mirror: complex = 0j
 

@@ -59,6 +59,8 @@ class SlidingWindow(live.LiveReconstructor):
     ) -> ShapeEstimate:
         """Renew the estimate with one frame.
 
+        Raises ValueError for an unknown step, or an image of wrong size or type.
+
         Parameters
         ----------
         image : (height, width) uint8 or uint16 array
@@ -72,11 +74,6 @@ class SlidingWindow(live.LiveReconstructor):
         -------
         ShapeEstimate
             `time_s` and `displacement_um` are means over the window: half a window behind the frame.
-
-        Raises
-        ------
-        ValueError
-            For an unknown step, or an image of wrong size or type.
         """
         if not 0 <= step < len(self._fringe_slots):
             raise ValueError(f"step {step} is not one of the {len(self._fringe_slots)} of a fringes-only cycle")

@@ -20,45 +20,21 @@ _LEVEL_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class RunEntry:
-    """A run in one line.
-
-    Attributes
-    ----------
-    folder : Path
-    started_utc : datetime
-    duration_s : float
-        Of a run that goes on, or whose recorder was killed, as far as its tables go; NaN without any.
-    std_um : float
-        Of the true centre on the twin, else of the reading.
-    in_band : float
-        Share of 1 s means within the band.
-    faults : int
-    exit : str
-        "done", "trip", ...; "open" without a summary.
-    kp_per_s, ti_s : float
-        Gains.
-    configuration : str
-        First 8 digits of the SHA-256 of `config.toml`.
-    size_mb : float
-    marks : int
-        Annotations.
-    kept : bool
-        A file `.keep` is in the folder: it is never pruned.
-    """
+    """A run in one line."""
 
     folder: Path
     started_utc: datetime
-    duration_s: float
-    std_um: float
-    in_band: float
+    duration_s: float  # of a run that goes on, or whose recorder was killed, as far as its tables go; NaN without any
+    std_um: float  # of the true centre on the twin, else of the reading
+    in_band: float  # share of 1 s means within the band
     faults: int
-    exit: str
+    exit: str  # "done", "trip", ...; "open" without a summary
     kp_per_s: float
     ti_s: float
-    configuration: str
+    configuration: str  # first 8 digits of the SHA-256 of `config.toml`
     size_mb: float
-    marks: int
-    kept: bool
+    marks: int  # annotations
+    kept: bool  # the folder has a file `.keep`: it is never pruned
 
     @property
     def name(self) -> str:
@@ -136,10 +112,7 @@ def entry(folder: Path) -> RunEntry:
 def resolve(run: Path, logs_dir: Path = Path("logs")) -> Path:
     """The folder meant: a path; a run's name, or the end of it, below `logs`; or `last`.
 
-    Raises
-    ------
-    InputError
-        If no run, or more than one, is meant.
+    Raises InputError if no run, or more than one, is meant.
     """
     if run.exists() or not logs_dir.is_dir():
         return run

@@ -46,9 +46,11 @@ def export(
 ) -> list[Path]:
     """Write a run's columns.
 
+    Raises InputError if the format or a stream is not known, h5py is missing, the run has nothing of what is wanted,
+    or the folder is one of a run; DeviceError if the folder cannot be written.
+
     Parameters
     ----------
-    run : Run
     to : str
         One of `FORMATS`.
     out : Path
@@ -57,14 +59,6 @@ def export(
         Rerun paths (`/loop/error`), fields (`error_um`), `shapes` or `events`; everything by default.
     start_s, end_s : float
         Part of the run.
-
-    Raises
-    ------
-    InputError
-        If the format or a stream is not known, h5py is missing, the run has nothing of what is wanted, or the folder
-        is one of a run.
-    DeviceError
-        If the folder cannot be written.
     """
     if to not in FORMATS:
         raise InputError(f"--to {to}: known are {', '.join(FORMATS)}")

@@ -37,10 +37,7 @@ def moment_s(text: str, origin_utc: datetime) -> float:
 
     A time of the day is the first such after the start of the run.
 
-    Raises
-    ------
-    InputError
-        If it is none of these.
+    Raises InputError if it is none of these.
     """
     text = text.strip()
     if re.fullmatch(r"\+ *0+[dhms]?", text):  # the start: no duration, but a moment

@@ -101,22 +101,14 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 @dataclass(frozen=True, slots=True)
 class SessionHead:
-    """`session.json`.
-
-    Attributes
-    ----------
-    format, name, author, source, created_utc : str
-        `source` is the run folder or the twin.
-    before : LoopConfig
-        The last good gains when the session began.
-    """
+    """`session.json`."""
 
     format: str
     name: str
     author: str
-    source: str
+    source: str  # a run folder, or the twin
     created_utc: str
-    before: LoopConfig
+    before: LoopConfig  # the last good gains when the session began
 
 
 @dataclass(frozen=True, slots=True)

@@ -68,6 +68,8 @@ _ROW = struct.Struct(f"<{len(FIELDS)}d")
 class LiveHold:
     """A `HoldLink` on a run of this machine.
 
+    Raises InputError if the folder is not that of the run the client talks to, or its rings are not there.
+
     Parameters
     ----------
     client : PortClient
@@ -76,11 +78,6 @@ class LiveHold:
         Its folder.
     take_over : bool
         Take the command from whoever has it, at the first command.
-
-    Raises
-    ------
-    InputError
-        If the folder is not that of the run the client talks to, or its rings are not there.
     """
 
     def __init__(self, client: PortClient, run_dir: Path, take_over: bool = False) -> None:

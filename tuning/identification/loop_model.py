@@ -29,24 +29,13 @@ from tuning.identification.records import Series
 
 @dataclass(frozen=True, slots=True)
 class PlantModel:
-    """Gain, delay and leak.
+    """Gain, delay and leak."""
 
-    Attributes
-    ----------
-    gain : float
-        k, speed of the centre per commanded flow.
-    dead_time_s : float
-        theta, from a reading's tick to the first gas in the mirror (half a sample of holding comes on top).
-    lag_s : float
-        T, of the pump.
-    leak_um_per_s : float
-        What leak and bleed take away.
-    """
-
-    gain: float
+    gain: float  # k, speed of the centre per commanded flow
+    # theta, from a reading's tick to the first gas in the mirror (half a sample of holding comes on top)
     dead_time_s: float
-    lag_s: float
-    leak_um_per_s: float
+    lag_s: float  # T
+    leak_um_per_s: float  # what leak and bleed take away
 
     @property
     def delay_s(self) -> float:
@@ -78,8 +67,6 @@ def driven_um(flow_um_per_s: Series, dead_time_s: float, lag_s: float, dt_s: flo
     ----------
     flow_um_per_s : (n,) array
         v; its first value is taken to have stood for ever.
-    dead_time_s, lag_s : float
-    dt_s : float
 
     Returns
     -------
@@ -160,29 +147,14 @@ _FINE_DT_S = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """Margins of a loop.
+    """Margins of a loop."""
 
-    Attributes
-    ----------
-    ms : float
-        Largest sensitivity, max |1 / (1 + L)|.
-    gain_margin : float
-        Factor on the gain at which the loop oscillates.
-    phase_margin_deg : float
-    delay_margin_s : float
-        Additional dead time at which the loop oscillates.
-    disk_margin : float
-        Balanced disk margin, 2 / max |S - T|: gain and phase may change together within that disk.
-    stable : bool
-        By Nyquist's criterion. The other figures mean nothing where this is false.
-    """
-
-    ms: float
-    gain_margin: float
+    ms: float  # largest sensitivity, max |1 / (1 + L)|
+    gain_margin: float  # factor on the gain at which the loop oscillates
     phase_margin_deg: float
-    delay_margin_s: float
-    disk_margin: float
-    stable: bool
+    delay_margin_s: float  # additional dead time at which the loop oscillates
+    disk_margin: float  # balanced disk margin, 2 / max |S - T|: gain and phase may change together within that disk
+    stable: bool  # by Nyquist's criterion; if false, the other figures mean nothing
 
 
 def margins(gains: Gains, model: PlantModel, dt_s: float) -> Margins:

@@ -28,53 +28,27 @@ _RULE_FILTER_S = 0.2  # what the rules that do not choose a filter get, against 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One row of the table.
-
-    Attributes
-    ----------
-    name : str
-    gains : Gains
-    margins : Margins
-    predicted : Predicted or None
-        None for an unstable loop.
-    ratio : float
-        Predicted standard deviation over the least possible.
-    load_peak_um, load_recovery_s : float
-        After the demanded step of the leak, by formula: furthest excursion, and how long until it is over.
-    """
+    """One row of the table."""
 
     name: str
     gains: loop_model.Gains
     margins: loop_model.Margins
-    predicted: Predicted | None
-    ratio: float
+    predicted: Predicted | None  # None for an unstable loop
+    ratio: float  # predicted standard deviation over the least possible
+    # After the demanded step of the leak, by formula: furthest excursion, and how long until it is over
     load_peak_um: float
     load_recovery_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """What the tuner proposes, and why.
+    """What the tuner proposes, and why."""
 
-    Attributes
-    ----------
-    loop : LoopConfig
-        The configuration with the proposed gains and feed-forward.
-    chosen : Candidate
-    candidates : tuple of Candidate
-        All of them, the chosen one and the present gains included.
-    least_std_um : float
-        The bound.
-    preview : Preview
-        Of the chosen one on the fitted twin.
-    robustness : Robustness
-    """
-
-    loop: LoopConfig
+    loop: LoopConfig  # the configuration with the proposed gains and feed-forward
     chosen: Candidate
-    candidates: tuple[Candidate, ...]
-    least_std_um: float
-    preview: Preview
+    candidates: tuple[Candidate, ...]  # all of them, the chosen one and the present gains included
+    least_std_um: float  # the bound
+    preview: Preview  # of the chosen one on the fitted twin
     robustness: Robustness
 
 
@@ -144,10 +118,8 @@ def propose(
 ) -> Proposal:
     """Design on identified data.
 
-    Raises
-    ------
-    RefusedError
-        If the data were refused, the mirror cannot be held in the pump's range, or no candidate keeps the demands.
+    Raises RefusedError if the data were refused, the mirror cannot be held in the pump's range, or no candidate keeps
+    the demands.
     """
     if quality.verdict == "refused":
         raise RefusedError("; ".join(quality.reasons))

@@ -51,9 +51,6 @@ def least_std_um(
 
     Parameters
     ----------
-    model : PlantModel
-    disturbance : DisturbanceModel
-    loop : LoopConfig
     write_s : float
         Time from a reading to its command, if the model's dead time does not hold it.
     """

@@ -27,10 +27,6 @@ class ModelBench:
 
     Parameters
     ----------
-    model : PlantModel
-    disturbance : DisturbanceModel
-    pump : PumpConfig
-    seed : int
     leak_step : tuple of float
         Time in s and size in um/s of a step of the leak.
     """
@@ -101,19 +97,11 @@ class ModelBench:
 
 @dataclass(frozen=True, slots=True)
 class Preview:
-    """What the fitted twin did.
+    """What the fitted twin did."""
 
-    Attributes
-    ----------
-    std_um, bias_um : float
-        Of the true centre.
-    load_peak_um, recovery_s : float
-        After a step of the leak: furthest excursion, and time until the centre stays within
-        `RECOVERED_UM` (weather off).
-    """
-
-    std_um: float
+    std_um: float  # of the true centre
     bias_um: float
+    # After a step of the leak, weather off: furthest excursion, and time until the centre stays within `RECOVERED_UM`
     load_peak_um: float
     recovery_s: float
 

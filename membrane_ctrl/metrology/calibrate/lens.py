@@ -36,42 +36,27 @@ class BoardView:
 
 @dataclass(frozen=True)
 class Lens:
-    """What the views say.
-
-    Attributes
-    ----------
-    focal_px, principal_px, distortion
-        Of the lens; distortion is k1, k2, p1, p2.
-    sigmas : dict of float
-        By the calibration's names of the parameters.
-    rms_px, stated_rms_px : float
-        What is left of a corner (both components), with this lens and with the stated one.
-    used, left_out : tuple of str
-        Names of views.
-    """
+    """What the views say."""
 
     focal_px: float
     principal_px: tuple[float, float]
-    distortion: tuple[float, ...]
-    sigmas: dict[str, float]
-    rms_px: float
+    distortion: tuple[float, ...]  # k1, k2, p1, p2
+    sigmas: dict[str, float]  # by the calibration's names of the parameters
+    rms_px: float  # what is left of a corner (both components), with this lens and with the stated one
     stated_rms_px: float
-    used: tuple[str, ...]
+    used: tuple[str, ...]  # names of views
     left_out: tuple[str, ...]
 
 
 def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
     """Fit the lens.
 
+    Raises ValueError with fewer than `LEAST_VIEWS` views of `LEAST_CORNERS` corners, or if nothing fits.
+
     Parameters
     ----------
     stated : CameraConfig
         Where to begin, and what the result is compared with.
-
-    Raises
-    ------
-    ValueError
-        With fewer than `LEAST_VIEWS` views of `LEAST_CORNERS` corners, or if nothing fits.
     """
     good = [view for view in views if len(view.place) >= LEAST_CORNERS]
     while True:
@@ -152,18 +137,10 @@ _MARKERS = 1000  # of the dictionary
 
 @dataclass(frozen=True)
 class Board:
-    """A board.
+    """A board."""
 
-    Attributes
-    ----------
-    kind : "charuco" or "chessboard"
-        With markers (OpenCV's DICT_4X4_1000), of which a part is enough, or plain.
-    columns, rows : int
-        Squares.
-    """
-
-    kind: str
-    columns: int
+    kind: str  # "charuco" or "chessboard": with markers (OpenCV's DICT_4X4_1000), of which a part is enough, or plain
+    columns: int  # squares
     rows: int
 
     @classmethod

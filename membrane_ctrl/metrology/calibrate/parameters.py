@@ -28,21 +28,11 @@ _COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number that may be wrong.
+    """One number that may be wrong."""
 
-    Attributes
-    ----------
-    name : str
-        Ends in the unit.
-    sigma : float
-        What is known of it by hand, in that unit: a ruler, a laser meter, a protractor, a data sheet.
-    says : str
-        For a person.
-    """
-
-    name: str
-    sigma: float
-    says: str
+    name: str  # ends in the unit
+    sigma: float  # what is known of it by hand, in that unit: a ruler, a laser meter, a protractor, a data sheet
+    says: str  # for a person
 
     @property
     def unit(self) -> str:
@@ -84,15 +74,12 @@ OPTICAL = len(POSE) + len(OPTIONAL)  # those that the fringes depend on; the las
 def sigmas(free: Mapping[str, float] | None = None) -> FloatArray:
     """Prior standard deviations in the order of `NAMES`; 0 holds a parameter where it is.
 
+    Raises ValueError for a name that is not a parameter, or a sigma below 0.
+
     Parameters
     ----------
     free : mapping from name to sigma, optional
         Changes: another sigma, 0 to hold, more than 0 to free. Without it the poses and the laser's scale are free.
-
-    Raises
-    ------
-    ValueError
-        For a name that is not a parameter, or a sigma below 0.
     """
     own = {p.name: p.sigma for p in (*POSE, LASER)}
     for name, sigma in (free or {}).items():
@@ -111,18 +98,10 @@ def usual_sigma(name: str) -> float:
 
 @dataclass(frozen=True)
 class BenchGeometry:
-    """A geometry with what `Geometry` cannot say.
+    """A geometry with what `Geometry` cannot say."""
 
-    Attributes
-    ----------
-    geometry : Geometry
-        Camera and screen.
-    pitch : float
-        True length of what the screen calls a millimetre.
-    """
-
-    geometry: Geometry
-    pitch: float = 1.0
+    geometry: Geometry  # camera and screen
+    pitch: float = 1.0  # true length of what the screen calls a millimetre
 
 
 @dataclass(frozen=True)

@@ -79,28 +79,14 @@ _CHUNK = 8192  # points whose derivatives are in memory at a time: 8 MB
 
 @dataclass(frozen=True)
 class SetPhases:
-    """What one capture set says, as screen points of bins.
-
-    Attributes
-    ----------
-    name : str
-        Of the set, for people.
-    column_px, row_px : (n,) arrays
-        Centres of the bins.
-    screen_mm : (2, n) array
-        s_x, s_y seen there.
-    sigma_mm : (n,) array
-        Expected noise of each of the two.
-    displacement_um : float
-        Mean laser reading of the set; NaN without.
-    """
+    """What one capture set says, as screen points of bins."""
 
     name: str
-    column_px: FloatArray
-    row_px: FloatArray
-    screen_mm: FloatArray
-    sigma_mm: FloatArray
-    displacement_um: float
+    column_px: FloatArray  # (n,): centres of the bins
+    row_px: FloatArray  # (n,)
+    screen_mm: FloatArray  # (2, n): s_x, s_y seen there
+    sigma_mm: FloatArray  # (n,): expected noise of each of the two
+    displacement_um: float  # mean laser reading of the set; NaN without
 
     def thinned(self, most: int) -> SetPhases:
         """Every k-th bin, so that at most `most` are left."""
@@ -117,20 +103,11 @@ class SetPhases:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Residuals and derivatives of some points.
+    """Residuals and derivatives of some points."""
 
-    Attributes
-    ----------
-    place : slice
-        Which points.
-    residual_mm : (2, m) array
-        Seen minus predicted.
-    derivatives : (2, COLUMNS, m) array
-        Of the prediction: 36 of the surface in mm, the vertex' height in mm, the optical parameters in their units.
-    """
-
-    place: slice
-    residual_mm: FloatArray
+    place: slice  # which points
+    residual_mm: FloatArray  # (2, m): seen minus predicted
+    # (2, COLUMNS, m), of the prediction by: 36 surface terms and the vertex's height, mm; the optical parameters
     derivatives: FloatArray
 
 

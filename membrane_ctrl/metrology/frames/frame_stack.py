@@ -22,24 +22,12 @@ _LARGEST_BIN_PX = 4  # curvature of the phase over a larger bin is no longer sma
 
 @dataclass(frozen=True)
 class FrameStack:
-    """Frames of a capture set in the order of their patterns.
+    """Frames of a capture set in the order of their patterns."""
 
-    Attributes
-    ----------
-    frames : (frames, height, width) array
-        uint8 or uint16.
-    patterns : tuple of Pattern
-        What each frame should show; sinusoids with their phase step.
-    displacement_um : (frames,) array
-        Laser reading at each, NaN without.
-    unusable : dict from frame to reason
-        Frames that hold no picture.
-    """
-
-    frames: Frames
-    patterns: tuple[Pattern, ...]
-    displacement_um: FloatArray
-    unusable: dict[int, str]
+    frames: Frames  # (frames, height, width): uint8 or uint16
+    patterns: tuple[Pattern, ...]  # what each frame should show; sinusoids with their phase step
+    displacement_um: FloatArray  # (frames,): laser reading at each, NaN without
+    unusable: dict[int, str]  # frames that hold no picture
 
     def sinusoids(self, axis: str) -> list[int]:
         """Frames that show the sinusoids of an axis."""
@@ -79,21 +67,11 @@ class FrameStack:
 
 @dataclass(frozen=True)
 class Binned:
-    """Frames as means over bins.
+    """Frames as means over bins."""
 
-    Attributes
-    ----------
-    bin_px : int
-        Side of a bin.
-    means : (frames, rows, columns) float32 array
-        In the frames' units.
-    saturated : (frames, rows, columns) bool array
-        Bins with a saturated pixel.
-    """
-
-    bin_px: int
-    means: NDArray[np.float32]
-    saturated: NDArray[np.bool_]
+    bin_px: int  # side of a bin
+    means: NDArray[np.float32]  # (frames, rows, columns): in the frames' units
+    saturated: NDArray[np.bool_]  # (frames, rows, columns): bins with a saturated pixel
 
     def reordered(self, order: list[int]) -> Binned:
         """As `FrameStack.reordered`."""
@@ -124,24 +102,12 @@ def bin_frames(stack: FrameStack, full_scale_adu: int) -> Binned:
 
 @dataclass(frozen=True)
 class PixelPhases:
-    """One axis at n pixels.
+    """One axis at n pixels."""
 
-    Attributes
-    ----------
-    phase_rad : (n,) array
-        Absolute phase, the period nearest to the reference.
-    swing_adu : (n,) float32 array
-        Fringe amplitude.
-    rest_adu : (n,) float32 array
-        Root of the sum of squares that the sinusoid leaves; 0 for three frames.
-    saturated : (n,) bool array
-        Whether a frame is saturated there.
-    """
-
-    phase_rad: FloatArray
-    swing_adu: NDArray[np.float32]
-    rest_adu: NDArray[np.float32]
-    saturated: NDArray[np.bool_]
+    phase_rad: FloatArray  # (n,): absolute phase, the period nearest to the reference
+    swing_adu: NDArray[np.float32]  # (n,): fringe amplitude
+    rest_adu: NDArray[np.float32]  # (n,): root of the sum of squares that the sinusoid leaves; 0 for three frames
+    saturated: NDArray[np.bool_]  # (n,): whether a frame is saturated there
 
 
 @kernel

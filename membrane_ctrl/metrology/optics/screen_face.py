@@ -22,22 +22,13 @@ _ORDER = 4  # coefficients of a cubic
 
 
 class Face(NamedTuple):
-    """A face; a named tuple, since compiled loops take one as it is.
+    """A face; a named tuple, since compiled loops take one as it is."""
 
-    Attributes
-    ----------
-    bow_per_mm : float
-        c, in 1/mm.
-    cells_mm : (rows, columns, 4, 4) array
-        Polynomials of the map's cells, along s_y and s_x; without cells there is no map.
-    low_mm, pitch_mm : (2,) arrays
-        First node and distance of the nodes along s_x and s_y.
-    """
-
-    bow_per_mm: float
+    bow_per_mm: float  # c, in 1/mm
+    # (rows, columns, 4, 4): polynomials of the map's cells, along s_y and s_x; without cells there is no map
     cells_mm: FloatArray
-    low_mm: FloatArray
-    pitch_mm: FloatArray
+    low_mm: FloatArray  # (2,): first node along s_x and s_y
+    pitch_mm: FloatArray  # (2,): distance of the nodes
 
     @classmethod
     def of(cls, screen: ScreenPoseConfig | None) -> Face:

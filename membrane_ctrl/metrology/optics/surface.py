@@ -19,21 +19,11 @@ PARAMETERS = 36  # j = 2..36 and the excess; piston follows from h(0) = 0
 
 @dataclass(frozen=True)
 class Surface:
-    """Height above the vertex, h(0, 0) = 0, over a disc.
+    """Height above the vertex, h(0, 0) = 0, over a disc."""
 
-    Attributes
-    ----------
-    coeffs_mm : (36,) array
-        Noll j = 1..36, orthonormal; piston is whatever makes h(0, 0) = 0.
-    hencky_mm : float
-        Amplitude of the excess, as the sag of the Hencky bowl it belongs to.
-    radius_mm : float
-        Radius of the Zernike disc.
-    """
-
-    coeffs_mm: FloatArray
-    hencky_mm: float
-    radius_mm: float
+    coeffs_mm: FloatArray  # (36,): Noll j = 1..36, orthonormal; piston is whatever makes h(0, 0) = 0
+    hencky_mm: float  # amplitude of the excess, as the sag of the Hencky bowl it belongs to
+    radius_mm: float  # radius of the Zernike disc
 
     @classmethod
     def from_parameters(cls, parameters: FloatArray, radius_mm: float) -> Surface:
@@ -120,29 +110,15 @@ _RINGS = 48
 
 @dataclass(frozen=True)
 class RadialProfile:
-    """Height over radius.
+    """Height over radius."""
 
-    Attributes
-    ----------
-    radius_mm : (n,) array
-        Middle of the rings.
-    mean_mm, low_mm, high_mm : (n,) arrays
-        Mean over azimuth and the band that holds 95 % of the ring.
-    hencky_mm : (n,) array
-        Hencky's bowl of the sag that fits best.
-    sag_mm : float
-        That sag, at the rim.
-    pressure_pa : float
-        Gauge pressure that bends the paper's film to that sag.
-    """
-
-    radius_mm: FloatArray
-    mean_mm: FloatArray
-    low_mm: FloatArray
-    high_mm: FloatArray
-    hencky_mm: FloatArray
-    sag_mm: float
-    pressure_pa: float
+    radius_mm: FloatArray  # (n,): middle of the rings
+    mean_mm: FloatArray  # (n,): mean over azimuth
+    low_mm: FloatArray  # (n,): ends of the band that holds 95 % of the ring
+    high_mm: FloatArray  # (n,)
+    hencky_mm: FloatArray  # (n,): Hencky's bowl of the sag that fits best
+    sag_mm: float  # that sag, at the rim
+    pressure_pa: float  # gauge pressure that bends the paper's film to that sag
 
 
 def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) -> RadialProfile:

@@ -28,21 +28,11 @@ GENERAL_NAMES = tuple(
 class GeometrySpread:
     """Covariance of a geometry.
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of `SHORT_NAMES` or of `GENERAL_NAMES`; what is not named is exact.
-    covariance : (k, k) array
-        Of their changes, in the units of the names.
-
-    Raises
-    ------
-    ValueError
-        On construction, for unknown or mixed names and for what is no covariance.
+    Raises ValueError on construction, for unknown or mixed names and for what is no covariance.
     """
 
-    names: tuple[str, ...]
-    covariance: FloatArray
+    names: tuple[str, ...]  # of `SHORT_NAMES` or of `GENERAL_NAMES`; what is not named is exact
+    covariance: FloatArray  # (k, k): of their changes, in the units of the names
 
     def __post_init__(self) -> None:
         if len(set(self.names)) != len(self.names):
@@ -91,13 +81,7 @@ def stated_spread(geometry: GeometryConfig) -> GeometrySpread | None:
 
 
 def changed(geometry: GeometryConfig, names: tuple[str, ...], change: ArrayLike) -> GeometryConfig:
-    """The geometry changed by (k,) amounts.
-
-    Raises
-    ------
-    ValueError
-        If the names belong to the other form.
-    """
+    """The geometry changed by (k,) amounts. Raises ValueError if the names belong to the other form."""
     amounts = dict(zip(names, np.asarray(change, float).tolist(), strict=True))
     if not amounts:
         return geometry

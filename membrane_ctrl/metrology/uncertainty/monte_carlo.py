@@ -33,31 +33,15 @@ TRIAL_POINTS = 6000
 
 @dataclass(frozen=True)
 class TrialBench:
-    """All that the trials of one set need; half a megabyte, so that it can be sent to where they run.
+    """All that the trials of one set need; half a megabyte, so that it can be sent to where they run."""
 
-    Attributes
-    ----------
-    optics : OpticsConfig
-        With the nominal geometry.
-    vertex_z_mm : float
-        Where the vertex stood.
-    column_px, row_px : (n,) arrays
-        The points in the picture.
-    screen_mm, sigma_mm : (2, n) arrays
-        Where the fitted surface sends them, and 1 sigma of noise there.
-    t_mm : (n,) array
-        Lengths of their rays.
-    surface, normal
-        The fit, and the normal matrix of these points.
-    """
-
-    optics: OpticsConfig
-    vertex_z_mm: float
-    column_px: FloatArray
-    row_px: FloatArray
-    screen_mm: FloatArray
-    sigma_mm: FloatArray
-    t_mm: FloatArray
+    optics: OpticsConfig  # with the nominal geometry
+    vertex_z_mm: float  # where the vertex stood
+    column_px: FloatArray  # (n,): the points in the picture
+    row_px: FloatArray  # (n,)
+    screen_mm: FloatArray  # (2, n): where the fitted surface sends them
+    sigma_mm: FloatArray  # (2, n): 1 sigma of noise there
+    t_mm: FloatArray  # (n,): lengths of their rays
     surface: Surface
     normal: reconstruct.NormalMatrix
 
@@ -104,10 +88,7 @@ class TrialBench:
     def solve(self, geometry: Geometry, disturbance_mm: FloatArray | float = 0.0) -> FloatArray:
         """Parameters (36,) in mm of the surface under a geometry, the screen points (2, n) off by a disturbance.
 
-        Raises
-        ------
-        ArithmeticError
-            If the fit does not converge: the geometry is not near the nominal one.
+        Raises ArithmeticError if the fit does not converge: the geometry is not near the nominal one.
         """
         tracer = reconstruct.Tracer(geometry, self.surface.radius_mm, self.vertex_z_mm)
         points = reconstruct.Points.of(geometry.rays(self.column_px, self.row_px), self.screen_mm + disturbance_mm)
@@ -186,21 +167,11 @@ MAP_SIDE = 101  # points across a map: 10 mm a cell, far below what 36 terms can
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Points of a square grid inside a radius, and the matrix that makes heights of parameters there.
+    """Points of a square grid inside a radius, and the matrix that makes heights of parameters there."""
 
-    Attributes
-    ----------
-    axis_mm : (n,) array
-        Of x and of y.
-    inside : (n, n) bool array
-        Rows along y.
-    matrix : (points, 36) array
-        Heights, 0 at the vertex, of the points inside.
-    """
-
-    axis_mm: FloatArray
-    inside: BoolArray
-    matrix: FloatArray
+    axis_mm: FloatArray  # (n,): of x and of y
+    inside: BoolArray  # (n, n): rows along y
+    matrix: FloatArray  # (points, 36): heights, 0 at the vertex, of the points inside
 
     @classmethod
     def over(cls, analysis_radius_mm: float, radius_mm: float, side: int = MAP_SIDE) -> HeightMap:

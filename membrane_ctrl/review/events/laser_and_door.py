@@ -172,7 +172,6 @@ def door_steps(mean_pa: Column, reading_pa: Column, least_pa: float, least_sigma
         Means of a second each, NaN where there is none.
     reading_pa : (n,) array
         A single reading of each second, that shows in which steps the barometer counts.
-    least_pa : float
     least_sigmas : float
         Against the differences nearby of windows as long.
     """

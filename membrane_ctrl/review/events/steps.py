@@ -17,21 +17,11 @@ _STRETCH = 3600
 
 @dataclass(frozen=True, slots=True)
 class FoundStep:
-    """A step found.
+    """A step found."""
 
-    Attributes
-    ----------
-    row : int
-        Place in the series.
-    size : float
-        After minus before, in the series' unit.
-    sigmas : float
-        Its size over the noise of such differences.
-    """
-
-    row: int
-    size: float
-    sigmas: float
+    row: int  # place in the series
+    size: float  # after minus before, in the series' unit
+    sigmas: float  # its size over the noise of such differences
 
 
 def steps(values: Column, half: int, skip: int, least: float, least_sigmas: float) -> list[FoundStep]:
@@ -82,7 +72,6 @@ def local_sigma(values: Column, share: float = 0.5) -> Column:
 
     Parameters
     ----------
-    values : (n,) array
     share : float
         Of the values that are nothing but noise: what this share of them keeps below is judged by a normal
         distribution. Half of them (the median) is the most robust, and blind to values that mostly repeat.
@@ -111,31 +100,17 @@ Level = dict[str, FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class FoundEvent:
-    """An event that nobody reported.
+    """An event that nobody reported."""
 
-    Attributes
-    ----------
-    kind : str
-        "pressure step", "leak step", "laser glitch", "laser lost", "barometer lost", "thermometer lost",
-        "lateness burst", "noise change", "shape jump" or "excursion".
-    start_s, end_s : float
-        Time range of the run that shows it.
-    time_s : float
-        When it happened.
-    size : float
-        In `unit`.
-    unit : str
-    confidence : float
-        1 minus the chance that noise alone looks like this somewhere in the run.
-    """
-
+    # "pressure step", "leak step", "laser glitch", "laser lost", "barometer lost", "thermometer lost",
+    # "lateness burst", "noise change", "shape jump" or "excursion"
     kind: str
-    time_s: float
-    start_s: float
+    time_s: float  # when it happened
+    start_s: float  # time range of the run that shows it
     end_s: float
-    size: float
+    size: float  # in `unit`
     unit: str
-    confidence: float
+    confidence: float  # 1 minus the chance that noise alone looks like this somewhere in the run
 
 
 def event_around(kind: str, table: Level, row: int, half_s: float, size: float, unit: str, sure: float) -> FoundEvent:

@@ -84,7 +84,6 @@ def broken_at_gaps(columns: Mapping[str, Column], time_name: str = "time_s") -> 
 
     Parameters
     ----------
-    columns : mapping of str to (n,) or (n, m) array
     time_name : str
         The column of times, s, ascending. A gap is longer than 5 s and three of its usual steps.
     """

@@ -60,7 +60,6 @@ def render(analysis: Analysis, other: Analysis | None = None, differences: Seque
 
     Parameters
     ----------
-    analysis : Analysis
     other : Analysis, optional
         A run it is set against.
     differences : sequence of Difference

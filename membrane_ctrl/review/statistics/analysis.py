@@ -34,45 +34,24 @@ _ALLAN_LONGEST_S = 1e5
 
 @dataclass(frozen=True, slots=True)
 class ErrorSeries:
-    """Statistics of one error: `reading` (in the loop) or `true` (the twin's centre).
+    """Statistics of one error: `reading` (in the loop) or `true` (the twin's centre)."""
 
-    Attributes
-    ----------
-    windows : tuple of WindowStatistics
-        At `WINDOWS_S`.
-    seconds_um : (2, n) array
-        Times and means of the 1 s windows.
-    allan : Allan
-    spectrum : Spectrum
-        Of the ticks.
-    slow : Spectrum
-        Of the 1 s means, in segments of half the hold: for what is slower than the segments of `spectrum`.
-    drift : FittedSlope
-        um per hour.
-    """
-
-    windows: tuple[WindowStatistics, ...]
-    seconds_um: Column
+    windows: tuple[WindowStatistics, ...]  # at `WINDOWS_S`
+    seconds_um: Column  # (2, n): times and means of the 1 s windows
     allan: spectra.Allan
-    spectrum: spectra.Spectrum
+    spectrum: spectra.Spectrum  # of the ticks
+    # Of the 1 s means, in segments of half the hold: for what is slower than the segments of `spectrum`
     slow: spectra.Spectrum
-    drift: FittedSlope
+    drift: FittedSlope  # um per hour
 
 
 @dataclass(frozen=True, slots=True)
 class Benefit:
-    """Feed-forward: std of the 1 s means as held, and as they would have been without it (um).
-
-    Attributes
-    ----------
-    with_um, without_um : float
-    without_seconds_um : (2, n) array
-        Times and 1 s means without it.
-    """
+    """Feed-forward: std of the 1 s means as held, and as they would have been without it (um)."""
 
     with_um: float
     without_um: float
-    without_seconds_um: Column
+    without_seconds_um: Column  # (2, n): times and 1 s means without it
 
 
 @dataclass(frozen=True, slots=True)

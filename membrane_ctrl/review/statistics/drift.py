@@ -17,22 +17,12 @@ _TAKEN_MOST = 0.5
 
 @dataclass(frozen=True, slots=True)
 class FittedSlope:
-    """Least-squares slope.
+    """Least-squares slope."""
 
-    Attributes
-    ----------
-    per_hour : float
-        Unit of the values per hour.
-    low, high : float
-        95 % confidence interval.
-    effective_samples : float
-        Independent samples that would say as much; NaN when there are too few values.
-    """
-
-    per_hour: float
-    low: float
+    per_hour: float  # unit of the values per hour
+    low: float  # 95 % confidence interval
     high: float
-    effective_samples: float
+    effective_samples: float  # independent samples that would say as much; NaN when there are too few values
 
     @property
     def significant(self) -> bool:
@@ -152,7 +142,6 @@ def mean_p(a: Column, b: Column, window_s: float = 1.0, offset: float = 0.0, cor
 
     Parameters
     ----------
-    a, b : (2, n) arrays
     window_s : float
         Of a value.
     offset : float

@@ -130,54 +130,28 @@ class PumpActivity:
 
 @dataclass(frozen=True, slots=True)
 class HoldPass:
-    """What single ticks say.
-
-    Attributes
-    ----------
-    ticks, settled : int
-        Of `settled` only those with a reading.
-    unread_s : float
-        Settled time without a reading.
-    missed_ticks : int
-        Within the part.
-    start_s, end_s : float
-    hold_s, settled_s : float
-        Time in `hold`, and that of it which was settled.
-    thin_s : float
-        Settled seconds whose ticks are not all there: their means are those of the level.
-    uncovered_s : float
-        Those whose means the level has not either: no statistics cover them.
-    reading_um, true_um : (n,) float32
-        Setpoint minus laser reading and target minus true centre on a grid of ticks, NaN where not settled.
-    seconds : tuple
-        `SecondSums.result` of the ticks with a reading (`READING`) and of those with a true centre (`TRUE`): rows of
-        sums are the error (`ERROR`) and what the feed-forward kept away (`KEPT_AWAY`: of the true centre, if known).
-    raw_reading, raw_true : Moments
-    raw_in_band : float
-        Share of settled readings within the band.
-    histogram_um, histogram_counts : arrays
-        Edges and counts of the reading error.
-    lateness_ms : LogHistogram
-    pump : PumpActivity
-    """
+    """What single ticks say."""
 
     ticks: int
-    settled: int
-    unread_s: float
-    missed_ticks: int
+    settled: int  # those with a reading
+    unread_s: float  # settled time without a reading
+    missed_ticks: int  # within the part
     start_s: float
     end_s: float
-    hold_s: float
+    hold_s: float  # time in `hold`
     settled_s: float
-    thin_s: float
-    uncovered_s: float
+    thin_s: float  # settled seconds whose ticks are not all there: their means are those of the level
+    uncovered_s: float  # those whose means the level has not either: no statistics cover them
+    # (n,) each: setpoint minus laser reading, target minus true centre; on a grid of ticks, NaN where not settled
     reading_um: Single
     true_um: Single
+    # `SecondSums.result` of the ticks with a reading (`READING`) and of those with a true centre (`TRUE`): rows of
+    # sums are the error (`ERROR`) and what the feed-forward kept away (`KEPT_AWAY`: of the true centre, if known)
     seconds: tuple[windows.SecondsOf, windows.SecondsOf]
     raw_reading: summary.Moments
     raw_true: summary.Moments
-    raw_in_band: float
-    histogram_um: Column
+    raw_in_band: float  # share of settled readings within the band
+    histogram_um: Column  # edges and counts of the reading error
     histogram_counts: NDArray[np.int64]
     lateness_ms: summary.LogHistogram
     pump: PumpActivity
@@ -188,7 +162,6 @@ def hold_pass(run: Run, span_s: tuple[float, float], part_s: tuple[float, float]
 
     Parameters
     ----------
-    run : Run
     span_s : tuple
         First and last second, from a level.
     part_s : tuple

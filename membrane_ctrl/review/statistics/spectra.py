@@ -20,20 +20,11 @@ _BATCH = 32
 
 @dataclass(frozen=True, slots=True)
 class Spectrum:
-    """One-sided density.
+    """One-sided density."""
 
-    Attributes
-    ----------
-    frequency_hz : (k,) array
-    density : (k,) array
-        Unit squared per Hz.
-    segments : int
-        Averaged; 0: nothing was long enough.
-    """
-
-    frequency_hz: Column
-    density: Column
-    segments: int
+    frequency_hz: Column  # (k,)
+    density: Column  # (k,): unit squared per Hz
+    segments: int  # averaged; 0: nothing was long enough
 
     def band_rms(self, low_hz: float, high_hz: float) -> float:
         """RMS between two frequencies, low one excluded; NaN if no frequency lies there."""
@@ -51,7 +42,6 @@ def power_spectrum(values: NDArray[np.floating], rate_hz: float, length: int | N
     ----------
     values : (n,) array
         NaN where there is a gap: a segment with one is left out.
-    rate_hz : float
     length : int, optional
         Of a segment; by default an eighth of the series, at most 32768.
     """
@@ -82,21 +72,11 @@ def power_spectrum(values: NDArray[np.floating], rate_hz: float, length: int | N
 
 @dataclass(frozen=True, slots=True)
 class Allan:
-    """Overlapping Allan deviation.
+    """Overlapping Allan deviation."""
 
-    Attributes
-    ----------
-    tau_s : (k,) array
-        Averaging times.
-    deviation : (k,) array
-        Same unit as the series.
-    windows : (k,) array of int
-        Differences of neighbouring means that went in.
-    """
-
-    tau_s: Column
-    deviation: Column
-    windows: NDArray[np.int64]
+    tau_s: Column  # (k,): averaging times
+    deviation: Column  # (k,): same unit as the series
+    windows: NDArray[np.int64]  # (k,): differences of neighbouring means that went in
 
 
 def allan_deviation(values: NDArray[np.floating], period_s: float, lengths: NDArray[np.int64] | None = None) -> Allan:
@@ -164,22 +144,14 @@ _SLOW_MOST_HZ = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """RMS between two frequencies.
-
-    Attributes
-    ----------
-    low_hz, high_hz : float
-    from_hz : float
-        Lowest frequency that was seen: above `low_hz` when the series is too short for the whole band; NaN when it
-        is too short for any of it.
-    rms_um : float
-        NaN if nothing was seen.
-    """
+    """RMS between two frequencies."""
 
     low_hz: float
     high_hz: float
+    # Lowest frequency that was seen: above `low_hz` when the series is too short for the whole band; NaN when it is
+    # too short for any of it
     from_hz: float
-    rms_um: float
+    rms_um: float  # NaN if nothing was seen
 
 
 def bands(fast: Spectrum, slow: Spectrum) -> list[Band]:

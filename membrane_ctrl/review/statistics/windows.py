@@ -20,26 +20,15 @@ _LEAST_SHARE = 0.9
 
 @dataclass(frozen=True, slots=True)
 class WindowStatistics:
-    """Statistics of means over windows of one length; NaN without windows, and one alone has no `std_um`.
+    """Statistics of means over windows of one length; NaN without windows, and one alone has no `std_um`."""
 
-    Attributes
-    ----------
-    window_s : float
-        0: single ticks.
-    count : int
-    mean_um, std_um, max_um, p99_7_um : float
-        `max` and `p99_7` of the absolute value.
-    in_band : float
-        Share within the band.
-    """
-
-    window_s: float
+    window_s: float  # 0: single ticks
     count: int
     mean_um: float
     std_um: float
     max_um: float
     p99_7_um: float
-    in_band: float
+    in_band: float  # share within the band
 
 
 class SecondSums:

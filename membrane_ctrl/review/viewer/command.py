@@ -114,11 +114,12 @@ def _require_writable(target: Path, runs: Sequence[Run]) -> None:
 def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> float | None:
     """Write the recording that the viewer opens.
 
+    Raises InputError if a time or an event asked for is not in the first run, or no run has telemetry.
+
     Parameters
     ----------
     runs : sequence of Run
         One, or several that are laid over each other.
-    options : ReviewOptions
     file : Path
         To write.
 
@@ -126,11 +127,6 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> floa
     -------
     float or None
         Second of the timeline that was asked for: the moment, or where the part begins.
-
-    Raises
-    ------
-    InputError
-        If a time or an event asked for is not in the first run, or no run has telemetry.
     """
     runs = _with_telemetry(runs)
     span_s = _span(runs[0], options)

@@ -105,7 +105,6 @@ class Layer:
 
         Parameters
         ----------
-        run : Run
         prefix : str
             In front of its paths; empty for a run alone.
         zero_s : float

@@ -26,21 +26,15 @@ _BETWEEN_S = 0.5
 def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:
     """PNG of the whole run, at its end.
 
+    Raises FileNotFoundError if there is no recording in the folder; ValueError if the recording has no such tab;
+    RuntimeError if the viewer does not start (no Vulkan driver) or does not come to rest.
+
     Parameters
     ----------
     run_dir : Path
         Folder of the run; all its segments are opened.
     tab : str
         Name of a tab of the blueprint.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no recording in the folder.
-    ValueError
-        If the recording has no such tab.
-    RuntimeError
-        If the viewer does not start (no Vulkan driver) or does not come to rest.
     """
     segments = sorted(str(path.resolve()) for path in run_dir.glob("*.rrd"))
     if not segments:
