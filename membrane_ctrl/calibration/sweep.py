@@ -200,8 +200,8 @@ class Procedure:
     def take(self, session: CalibrationSession) -> None:
         """Take the missing sets and move the mirror back.
 
-        Raises HoldError if the mirror is no longer held or somebody else moves it (it is then left alone); DeviceError,
-        RejectedError or KeyboardInterrupt after the mirror has moved back.
+        Raises HoldError if the mirror is no longer held or somebody else moves it (it is then left alone);
+        DeviceError, RejectedError or KeyboardInterrupt after the mirror has moved back.
         """
         with self.progress.catching(), self._coming_back(session):
             self.sweep.shape_loop(False)

@@ -1,11 +1,10 @@
 """The runs there are: listed, filtered, shown, pruned."""
 
 import hashlib
-import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -69,10 +68,14 @@ class Filter:
 
 def entries(logs_dir: Path, wanted: Filter | None = None) -> list[RunEntry]:
     """The runs of a folder, oldest first. Raises InputError if there is no such folder."""
-    if not logs_dir.is_dir():
-        raise errors.InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
+    _require_folder(logs_dir)
     found = [_entry_or_why(folder) for folder in _folders(logs_dir)]
     return [item for item in found if wanted is None or wanted.takes(item)]
+
+
+def _require_folder(logs_dir: Path) -> None:
+    if not logs_dir.is_dir():
+        raise errors.InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
 
 
 def _entry_or_why(folder: Path) -> RunEntry:
@@ -122,9 +125,7 @@ def resolve(run: Path, logs_dir: Path = Path("logs")) -> Path:
     near = [folder for folder in folders if folder.name == str(run)]
     near = near or [folder for folder in folders if str(run) in folder.name]
     if len(near) > 1:
-        raise errors.InputError(
-            f"{run}: more than one run is called so: {', '.join(folder.name for folder in near[:4])}"
-        )
+        raise errors.InputError(f"{run}: several runs match: {', '.join(folder.name for folder in near[:4])}")
     return near[0] if near else run
 
 
@@ -146,10 +147,9 @@ def to_prune(
     logs_dir: Path, now_utc: datetime, keep_days: float | None, keep_gb: float | None
 ) -> list[tuple[disk_budget.OldRun, str]]:
     """The runs that the recorder's retention rule (`recording.retention`) gives up, and why; oldest first."""
-    if not logs_dir.is_dir():
-        raise errors.InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
+    _require_folder(logs_dir)
     if keep_days is None and keep_gb is None:
-        raise errors.InputError("runs prune: say what to keep: --keep-days, --keep-gb or both")
+        raise errors.InputError("runs prune: give --keep-days, --keep-gb or both")
     runs = disk_budget.deletable_runs(logs_dir, logs_dir / "none", now_utc)
     return disk_budget.expired(runs, 0, keep_gb, keep_days, now_utc)
 
@@ -167,9 +167,8 @@ def prune(runs: Sequence[disk_budget.OldRun]) -> dict[Path, str]:
 
 def as_dict(run: RunEntry) -> dict[str, Any]:
     """An entry as plain data."""
-    names = [name for name in RunEntry.__dataclass_fields__ if name not in {"folder", "started_utc"}]
-    table = {name: getattr(run, name) for name in names}
-    return {"name": run.name, "folder": str(run.folder), "started_utc": run.started_utc.isoformat(), **table}
+    texts = {"folder": str(run.folder), "started_utc": run.started_utc.isoformat()}
+    return {"name": run.name} | asdict(run) | texts
 
 
 def _recorded_s(folder: Path) -> float:
@@ -190,16 +189,3 @@ def _hash(path: Path) -> str:
         return hashlib.sha256(files.read_bytes(path, files.SMALL_BYTES)).hexdigest()[:8]
     except OSError:
         return ""
-
-
-def now_utc() -> datetime:
-    """The wall clock: a run's age is counted in days."""
-    return datetime.now(UTC)
-
-
-def dumps(runs: Sequence[RunEntry]) -> str:
-    """JSON of entries; NaN as null."""
-    plain = [
-        {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in as_dict(r).items()} for r in runs
-    ]
-    return json.dumps(plain, indent=1)

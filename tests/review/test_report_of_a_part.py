@@ -50,7 +50,7 @@ def test_faults_and_missed_ticks_of_a_part_are_its_own(folder: Path) -> None:
     ("part", "whole", "said"),
     [
         (["--from", "+100s", "--to", "+180s"], False, ", same part: Held for 1 min 20 s"),
-        (["--from", "18:02", "--to", "18:04"], True, ", the whole of it: Held for 6 min"),
+        (["--from", "18:02", "--to", "18:04"], True, ", all of it: Held for 6 min"),
         ([], True, "-other: Held for 6 min"),
     ],
 )

@@ -251,7 +251,7 @@ def test_nothing_to_show_is_explained_and_beside_another_run_only_noted(
     assert command(["review", str(broken), "--save", str(target)]) == 2
     said = capsys.readouterr().err
     assert "1 line cannot be read" in said
-    assert said.splitlines()[-1].endswith("nothing to show: no telemetry can be read")
+    assert said.splitlines()[-1].endswith("no telemetry can be read")
     assert command(["review", str(broken), str(whole), "--save", str(target)]) == 0
     assert "broken: not shown" in capsys.readouterr().err
     assert entities(target)["/overview/error"] > 0

@@ -1,4 +1,4 @@
-"""Events found by machine: what a person would circle on the timeline, with time, size and confidence."""
+"""Events detected in a run: what a person would circle on the timeline, with time, size and confidence."""
 
 from collections.abc import Callable, Iterable
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import BoolArray
 from membrane_ctrl.model.states import State
-from membrane_ctrl.review.events.laser_and_door import door_steps, glitches, looked_at, update_s
+from membrane_ctrl.review.events.laser_and_door import LAGS, door_steps, glitches, update_s
 from membrane_ctrl.review.events.steps import (
     FoundEvent,
     Level,
@@ -79,7 +79,7 @@ def pressure_steps(level: Level) -> list[FoundEvent]:
     """Doors: the air pressure steps within some seconds."""
     values = level["mean_ambient_pressure_pa"]
     found = door_steps(values, level["min_ambient_pressure_pa"], DOOR_LEAST_PA, DOOR_LEAST_SIGMAS)
-    places = looked_at(values.size)
+    places = values.size * len(LAGS)
     return [event_around("pressure step", level, s.row, 1, s.size, "Pa", confidence(s.sigmas, places)) for s in found]
 
 

@@ -134,11 +134,8 @@ def _alike(size_um: float, other_um: float) -> bool:
     return size_um * other_um > 0 and _EDGES_ALIKE <= abs(size_um / other_um) <= 1 / _EDGES_ALIKE
 
 
-# Steps of the air pressure: quick or slow ones, seen by quick, slow or coarse barometers.
-
-
 # A door takes up to 5 s, and what begins within a second takes a window more; longer changes are weather.
-_LAGS = (1, 2, 3, 4, 6, 8)
+LAGS = (1, 2, 3, 4, 6, 8)
 # Nine in ten differences are weather: a coarse barometer repeats its value in more than half of the windows.
 _USUAL_SHARE = 0.9
 # The difference of two rounded values has this standard deviation, in steps of the rounding.
@@ -178,7 +175,9 @@ def door_steps(mean_pa: Column, reading_pa: Column, least_pa: float, least_sigma
     every = update_s(mean_pa)
     floor_pa = _ROUNDING * quantum(reading_pa)
     values = mean_pa[::every]
-    found = _candidates(values, _lags(every), floor_pa, least_pa, least_sigmas)
+    # two values at least: a step may fall on the one between
+    lags = tuple(lag for lag in LAGS if lag <= 2 or lag * every <= LAGS[-1])
+    found = _candidates(values, lags, floor_pa, least_pa, least_sigmas)
     chosen = sorted(_chosen(found, values.size), key=lambda place: int(found.row[place]))
     result = []
     for place in chosen:
@@ -188,11 +187,6 @@ def door_steps(mean_pa: Column, reading_pa: Column, least_pa: float, least_sigma
             FoundStep(_steepest(mean_pa, row * every, (row + lag) * every), size, float(found.score[place]))
         )
     return result
-
-
-def looked_at(rows: int) -> int:
-    """Windows that `door_steps` looks at in so many rows."""
-    return rows * len(_LAGS)
 
 
 def update_s(mean_pa: Column) -> int:
@@ -216,11 +210,6 @@ def quantum(reading_pa: Column) -> float:
     return float(np.quantile(change, _LOW_SHARE)) if change.size else 0.0
 
 
-def _lags(every: int) -> tuple[int, ...]:
-    # two values at least: a step may fall on the one between
-    return tuple(lag for lag in _LAGS if lag <= 2 or lag * every <= _LAGS[-1])
-
-
 def _candidates(
     values: Column, lags: tuple[int, ...], floor_pa: float, least_pa: float, least_sigmas: float
 ) -> _Candidates:
@@ -236,7 +225,7 @@ def _candidates(
 
 def _chosen(found: _Candidates, rows: int) -> list[int]:
     """The windows that stand out most; others nearby with the same sign are of the same step."""
-    reach = _LAGS[-1]
+    reach = LAGS[-1]
     taken = np.zeros((2, rows), dtype=bool)
     chosen = []
     for place in np.argsort(-found.score, kind="stable"):

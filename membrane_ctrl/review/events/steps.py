@@ -92,9 +92,6 @@ def confidence(sigmas: float, looked_at: int) -> float:
     return float(max(0.0, 1.0 - looked_at * special.erfc(sigmas / np.sqrt(2))))
 
 
-# One event found by machine, and what its finders share.
-
-
 Level = dict[str, FloatArray]
 
 
@@ -133,9 +130,6 @@ def runs(flags: BoolArray, join: int) -> list[tuple[int, int]]:
     return [(int(part[0]), int(part[-1])) for part in parts]
 
 
-# Times out of the band that nothing else of the run explains.
-
-
 # After what explains it: what the loop needs to be back in the band (a leak of 1.2 um/s and 40 um: 32 s).
 BACK_S = 30
 # Means of so many seconds tell a setpoint on its way from noise.
@@ -164,9 +158,6 @@ def excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -> lis
         found.append(FoundEvent("excursion", float(time_s[a]), float(time_s[a]) - 30, float(time_s[b]) + 30,
                            float(error_um[worst]), "um", 1.0))  # fmt: skip
     return found
-
-
-# Steps of the figure from one cycle to the next.
 
 
 JUMP_LEAST_UM = 0.3

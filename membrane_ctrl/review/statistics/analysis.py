@@ -90,6 +90,11 @@ class Analysis:
     shape: shape_review.ShapeReview | None
     anomalies: tuple[Anomaly, ...]
 
+    @property
+    def is_part(self) -> bool:
+        """Whether a part of the run was asked for."""
+        return any(map(math.isfinite, self.part_s))
+
 
 def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> Analysis:
     """Analyse a run or a part of it.

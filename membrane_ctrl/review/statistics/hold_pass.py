@@ -19,13 +19,7 @@ LEVEL_COLUMNS = ("state", "mean_displacement_um", "mean_true_error_um")
 
 
 class ThinSeconds:
-    """Finds them, over blocks that come in their order.
-
-    Parameters
-    ----------
-    rate_hz : float
-        Ticks a second of the run.
-    """
+    """Finds them, over blocks in order of time."""
 
     def __init__(self, rate_hz: float) -> None:
         self._least = windows.least_ticks(1.0, rate_hz)
@@ -36,7 +30,7 @@ class ThinSeconds:
         if not time_s.size:
             return
         second = np.floor(time_s + 1e-9).astype(np.int32)
-        starts = _starts(second)
+        starts = windows.group_starts(second)
         rows = np.stack((np.ones(time_s.size), settled.astype(np.float64), setpoint_um))
         sums = np.add.reduceat(rows, starts, axis=1)
         # a second that two blocks share is thin in both
@@ -50,7 +44,7 @@ class ThinSeconds:
         second = np.concatenate([part[0] for part in self._parts])
         if not second.size:
             return second, np.empty(0)
-        starts = _starts(second)
+        starts = windows.group_starts(second)
         ticks, settled, setpoint_um = np.add.reduceat(np.hstack([part[1] for part in self._parts]), starts, axis=1)
         thin = (ticks < self._least) & (settled == ticks)
         return second[starts][thin], setpoint_um[thin] / ticks[thin]
@@ -91,10 +85,6 @@ def filled(seconds: windows.SecondsOf, means: LevelMeans, error_um: Column) -> w
     order = np.argsort(joined, kind="stable")
     errors_um = np.concatenate((sums[0][kept], error_um[there] * ticks))[order]
     return joined[order], np.concatenate((counts[kept], ticks))[order], np.stack((errors_um, errors_um * np.nan))
-
-
-def _starts(second: windows.Seconds) -> NDArray[np.intp]:
-    return np.flatnonzero(np.concatenate(([True], second[1:] != second[:-1])))
 
 
 Single = NDArray[np.float32]
@@ -158,15 +148,7 @@ class HoldPass:
 
 
 def hold_pass(run: Run, span_s: tuple[float, float], part_s: tuple[float, float] = (-np.inf, np.inf)) -> HoldPass:
-    """Go through a run once.
-
-    Parameters
-    ----------
-    span_s : tuple
-        First and last second, from a level.
-    part_s : tuple
-        Part of the run wanted.
-    """
+    """Go once through a run, or a part of it; `span_s` is its first and last second, from a level."""
     collected = _Collector(run, span_s, math.isfinite(part_s[0]))
     for block in run.tick_blocks(NAMES, *part_s):
         collected.add(block)

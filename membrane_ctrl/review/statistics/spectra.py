@@ -67,9 +67,6 @@ def power_spectrum(values: NDArray[np.floating], rate_hz: float, length: int | N
     return Spectrum(frequency_hz, density, count)
 
 
-# Overlapping Allan deviation of a series with gaps.
-
-
 @dataclass(frozen=True, slots=True)
 class Allan:
     """Overlapping Allan deviation."""
@@ -129,9 +126,6 @@ def _second_differences(total: Column, gaps: NDArray[np.int32], m: int) -> tuple
             square += difference * difference
             count += 1
     return square, count
-
-
-# RMS by decades of frequency, from the spectrum that resolves each.
 
 
 # Decades of frequency whose RMS is given; the last ends at half the tick rate. The first is that of days.
