@@ -81,14 +81,7 @@ def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
     """Refuse gains that must not be applied.
 
     Raises InputError if the loop would be unstable on the file's own plant or has too little margin, or ticks
-    differently.
-
-    Parameters
-    ----------
-    where : str
-        For the message.
-    running : LoopConfig
-        Of the hold they are for.
+    differently from the hold (`running`); `where` names the file.
     """
     dt_s = 1 / gains.loop.rate_hz
     found = loop_model.margins(loop_model.Gains.of(gains.loop), gains.plant.model, dt_s)

@@ -26,13 +26,7 @@ class DrivenBench(Protocol):
 
 
 class Rig:
-    """One loop on one bench, in ticks.
-
-    Parameters
-    ----------
-    leak_um_per_s : float
-        Flow to begin with.
-    """
+    """One loop on one bench, in ticks; it begins with the flow `leak_um_per_s`."""
 
     def __init__(self, bench: DrivenBench, loop: LoopConfig, pump: PumpConfig, leak_um_per_s: float) -> None:
         self._bench = bench

@@ -99,12 +99,7 @@ def resume(path: Path) -> CalibrationSession:
 def compared(optics: OpticsConfig, origin: GeometryOrigin, new: GeometryFile) -> list[str]:
     """The geometry in force beside the new one, in the numbers that a person can check with a tape.
 
-    Parameters
-    ----------
-    optics : OpticsConfig
-        As in force, for the sets say what they were taken with.
-    origin : GeometryOrigin
-        Its name.
+    `optics` is the bench in force, as the sets state it; `origin` names it.
     """
     old = "by hand" if not origin.calibrated_utc else f"calibrated {origin.calibrated_utc}"
     lines = [

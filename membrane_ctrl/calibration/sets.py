@@ -33,11 +33,8 @@ from membrane_ctrl.model.files import users, write_text_atomic
 def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.SetPhases:
     """The bins inside the analysis radius that the set's own fit kept.
 
-    Parameters
-    ----------
-    optics : OpticsConfig
-        Of the set: camera, pattern, and the stated geometry, which only chooses the bins and tells what averaging
-        over a bin adds to a curved phase (some 1e-3 mm: no calibration changes it).
+    The stated geometry only chooses the bins and corrects the averaging of a curved phase over a bin (some 1e-3 mm,
+    which no calibration changes).
     """
     state, bin_px = checked.state, checked.binned.bin_px
     grid = BinGrid(checked.tracer.geometry, optics.camera, bin_px)

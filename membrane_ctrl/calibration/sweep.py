@@ -40,12 +40,7 @@ class CaptureLink(HoldLink, Protocol):
 class Sweep:
     """Moves and looks; every wait ends by itself.
 
-    Parameters
-    ----------
-    limits : LimitsConfig
-        For the band.
-    progress : callable
-        Told the seconds of the hold that have passed; may raise KeyboardInterrupt.
+    `progress` is told the seconds of the hold that have passed, and may raise KeyboardInterrupt.
     """
 
     def __init__(self, link: CaptureLink, limits: LimitsConfig, progress: Callable[[float], None]) -> None:

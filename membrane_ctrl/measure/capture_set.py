@@ -103,12 +103,7 @@ class CaptureSet:
 def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead:
     """Read `capture.toml`. Raises InputError.
 
-    Parameters
-    ----------
-    folder : Path
-        The set.
-    geometry : GeometryFile, optional
-        Used instead of the set's own, with the lens and the pitch that were calibrated with it.
+    `geometry` replaces the set's own, with the lens and the pitch that were calibrated with it.
     """
     path = folder / "capture.toml"
     if not folder.is_dir():

@@ -19,14 +19,8 @@ _SHORT = 3  # the type of a 16-bit number in a TIFF
 def decoded_image(data: bytes, flags: int) -> NDArray[np.generic]:
     """The pixels of an image file.
 
-    Raises ValueError if it is not an image, is cut short, or has more than `PIXELS_MAX` pixels.
-
-    Parameters
-    ----------
-    data : bytes
-        The file's content: PNG, TIFF, BMP, JPEG.
-    flags : int
-        Of `cv2.imdecode`.
+    Raises ValueError if it is not an image, is cut short, or has more than `PIXELS_MAX` pixels. `data` is the
+    file's content: PNG, TIFF, BMP or JPEG; `flags` are those of `cv2.imdecode`.
     """
     if data.startswith(_PNG) and b"IEND" not in data[-12:]:
         # the decoder would write to the terminal, and might fill the rest with black

@@ -56,12 +56,8 @@ class ErrorBars:
 def error_bars(measurement: Measurement, geometry: Path | None) -> ErrorBars | None:
     """Error bars of a measurement; None if it has no figure.
 
-    Raises InputError if that covariance is none, or of the other form of geometry.
-
-    Parameters
-    ----------
-    geometry : Path, optional
-        The file that the geometry is from, with its covariance.
+    Raises InputError if that covariance is none, or of the other form of geometry. `geometry` is the file
+    with the covariance.
     """
     full, checked, optics = measurement.full, measurement.checked, measurement.head.optics
     if full is None or checked is None:

@@ -26,12 +26,7 @@ _ZERNIKE = tuple(f"z{j}_um" for j in range(1, 37))
 class SeriesFile:
     """Writes `series.csv`; a set that gave no figure has a line without numbers.
 
-    Parameters
-    ----------
-    path : Path
-        Overwritten.
-    points : sequence of str
-        Names of the points whose height is followed.
+    `path` is overwritten; `points` are the names of the points whose height is followed.
     """
 
     def __init__(self, path: Path, points: Sequence[str]) -> None:

@@ -131,10 +131,7 @@ def reconstruct_full(
 ) -> FullResult:
     """Fit the pixels and integrate what the fit leaves.
 
-    Parameters
-    ----------
-    start : height function, optional
-        The starting shape, the paper's parabola of 40 mm if not given.
+    `start` is the starting shape, by default the paper's parabola of 40 mm.
     """
     tracer, points = checked.tracer, pixels.points
     # the way from the start is walked with the bins; the pixels take it up where it is nearly at its end

@@ -125,14 +125,8 @@ class Binner:
     def add(self, frames: Sequence[Image], slots: Sequence[int], watched: Container[int] | None = None) -> None:
         """Sum frames into slots.
 
-        Raises ValueError for a frame of wrong size or type of pixel; nothing is summed then.
-
-        Parameters
-        ----------
-        frames, slots : sequences of the same length
-            Frame k goes to slots[k].
-        watched : container of slots, optional
-            Only these are watched for saturation; all if not given. A white or Gray frame loses nothing by it.
+        Raises ValueError for a frame of wrong size or type of pixel; nothing is summed then. Frame k goes to
+        slots[k]. Only `watched` slots, by default all, are watched for saturation: it does not harm white or Gray.
         """
         for frame in frames:
             if frame.shape != self._size:

@@ -61,12 +61,8 @@ def undriven_um(record: records.Record, model: loop_model.PlantModel) -> records
 def fit_noise(series: records.Series, dt_s: float, slow_s: float) -> Noise:
     """Intensities of white noise and walks in a series; a straight trend does not matter.
 
-    Raises ValueError if the series is shorter than two of the slowest periods looked at.
-
-    Parameters
-    ----------
-    slow_s : float
-        Lag of the slow walk; 0 leaves it out.
+    Raises ValueError if the series is shorter than two of the slowest periods looked at. `slow_s` is the lag of the
+    slow walk; 0 omits it.
     """
     if series.size * dt_s < 2 * _SLOWEST_S:
         raise ValueError(f"{series.size * dt_s:.0f} s of hold are too short: {2 * _SLOWEST_S:.0f} s at least")
@@ -164,12 +160,7 @@ def lagged(series: records.Series, lag_s: float, dt_s: float) -> records.Series:
 def fit_weather(record: records.Record, model: loop_model.PlantModel, gas_follows_air_s: float) -> WeatherFit:
     """Regress what the pump did not do on the weather.
 
-    Parameters
-    ----------
-    record : Record
-        A quiet hold of some minutes.
-    gas_follows_air_s : float
-        Lag of the gas behind the air.
+    `record` is a quiet hold of some minutes, `gas_follows_air_s` the lag of the gas behind the air.
     """
     z = undriven_um(record, model)
     channels: list[tuple[records.Series, float]] = []

@@ -86,10 +86,7 @@ def prediction_errors(
 ) -> records.Series:
     """One-step prediction errors of a model on a record, (n - 1,) um; the first are the filter's start.
 
-    Parameters
-    ----------
-    pressure_gain_um_per_pa : float
-        How the barometer moves the centre; 0 leaves it out.
+    `pressure_gain_um_per_pa` is the barometer's effect on the centre; 0 omits it.
     """
     x = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
     moved = np.diff(record.filled_displacement_um()) - model.gain * np.diff(x) + model.leak_um_per_s * record.dt_s

@@ -99,12 +99,7 @@ class ShapeLoopFit:
 def step_experiment(rig: HoldRig, setpoint_um: float, restore: bool) -> list[list[ShapeEstimate]]:
     """Hold low, high, low with the shape loop off; the shapes of each level.
 
-    Parameters
-    ----------
-    setpoint_um : float
-        The hold's own, which it ends at.
-    restore : bool
-        The shape loop is switched on again.
+    It ends at `setpoint_um`, the hold's own; `restore` switches the shape loop on again.
     """
     levels: list[list[ShapeEstimate]] = []
     rig.shape_loop(False, "shape loop: the step is the session's")

@@ -126,10 +126,7 @@ def least_variance(
 
     No D: at best it takes 1 % off the prediction, for twice the pump's activity, which then costs more than that.
 
-    Parameters
-    ----------
-    loop : LoopConfig
-        Its feed-forward counts; its gains do not.
+    Of `loop` only the feed-forward counts, not the gains.
     """
     dt_s = disturbance.rest.dt_s
 

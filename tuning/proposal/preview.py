@@ -25,10 +25,7 @@ _LEVEL_PA, _LEVEL_C = 101_325.0, 23.0  # any: only changes count
 class ModelBench:
     """A simulated bench made of what was identified; equal seeds give equal weather.
 
-    Parameters
-    ----------
-    leak_step : tuple of float
-        Time in s and size in um/s of a step of the leak.
+    `leak_step` has the time in s and the size in um/s of a step of the leak.
     """
 
     def __init__(

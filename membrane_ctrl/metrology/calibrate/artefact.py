@@ -38,13 +38,7 @@ class Origin:
 
 
 def tables_of(solution: solve.Solution, optics: OpticsConfig, origin: Origin) -> dict[str, Any]:
-    """The content of `geometry.toml`.
-
-    Parameters
-    ----------
-    optics : OpticsConfig
-        The stated bench.
-    """
+    """The content of `geometry.toml`; `optics` is the stated bench."""
     free = [parameters.NAMES.index(name) for name in solution.free]
     tables: dict[str, Any] = {
         "schema": SCHEMA,

@@ -39,10 +39,7 @@ def noise_urad(geometry: Geometry, surface: Surface, screen_sigma_mm: float) -> 
 class DriftMonitor:
     """Watches the live residual.
 
-    Parameters
-    ----------
-    calibrated_urad, calibrated_noise_urad : float
-        `slope_residual_urad` and `slope_noise_urad` of the geometry's `[calibration]`.
+    What it is given are `slope_residual_urad` and `slope_noise_urad` of the geometry's `[calibration]`.
     """
 
     calibrated_urad: float

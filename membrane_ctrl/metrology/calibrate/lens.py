@@ -51,12 +51,8 @@ class Lens:
 def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
     """Fit the lens.
 
-    Raises ValueError with fewer than `LEAST_VIEWS` views of `LEAST_CORNERS` corners, or if nothing fits.
-
-    Parameters
-    ----------
-    stated : CameraConfig
-        Where to begin, and what the result is compared with.
+    Raises ValueError with fewer than `LEAST_VIEWS` views of `LEAST_CORNERS` corners, or if nothing fits. `stated`
+    is where the fit begins, and what the result is compared with.
     """
     good = [view for view in views if len(view.place) >= LEAST_CORNERS]
     while True:

@@ -74,12 +74,8 @@ OPTICAL = len(POSE) + len(OPTIONAL)  # those that the fringes depend on; the las
 def sigmas(free: Mapping[str, float] | None = None) -> FloatArray:
     """Prior standard deviations in the order of `NAMES`; 0 holds a parameter where it is.
 
-    Raises ValueError for a name that is not a parameter, or a sigma below 0.
-
-    Parameters
-    ----------
-    free : mapping from name to sigma, optional
-        Changes: another sigma, 0 to hold, more than 0 to free. Without it the poses and the laser's scale are free.
+    Raises ValueError for a name that is not a parameter, or a sigma below 0. `free` has changes:
+    another sigma, 0 to hold, more than 0 to free. Without it the poses and the laser's scale are free.
     """
     own = {p.name: p.sigma for p in (*POSE, LASER)}
     for name, sigma in (free or {}).items():

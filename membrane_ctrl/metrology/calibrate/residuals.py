@@ -135,13 +135,7 @@ def residual_mm(bench: BenchGeometry, phases: SetPhases, surface: Surface, verte
 def chunks(
     bench: BenchGeometry, turns: list[Poses], phases: SetPhases, surface: Surface, vertex_z_mm: float
 ) -> Iterator[Chunk]:
-    """Residuals with derivatives, some points at a time.
-
-    Parameters
-    ----------
-    turns : list of Poses
-        `pose_derivatives` at the bench's parameters.
-    """
+    """Residuals with derivatives, some points at a time. `turns` are the `pose_derivatives` there."""
     points = place_rays(bench, phases, surface, vertex_z_mm)
     for part in _parts(points.t_mm.size):
         meet = _meet(bench, points, surface, part)

@@ -94,14 +94,8 @@ def solve(
 ) -> Solution:
     """Calibrate. Sets of very many bins are solved with some of them first, and then with means of them all.
 
-    Raises ValueError if there is no set, or if a set's points do not determine a surface.
-
-    Parameters
-    ----------
-    progress : callable, optional
-        Told the number of the step and its largest change in standard deviations.
-    start : Solution, optional
-        Of the same sets: where to begin.
+    Raises ValueError if there is no set, or if a set's points do not determine a surface. `progress` is told the
+    number of the step and its largest change in standard deviations; `start` is a solution of the same sets.
     """
     if not problem.sets:
         raise ValueError("no capture set to calibrate with")

@@ -84,12 +84,8 @@ def obvious(stack: FrameStack, binned: Binned) -> list[Flag]:
 def inspect(stack: FrameStack, binned: Binned, scene: SampledBins, excluded: Collection[int]) -> list[Flag]:
     """Judge all readable frames, worst first.
 
-    Parameters
-    ----------
-    scene : SampledBins
-        Prediction from the surface fitted to the frames that are not excluded.
-    excluded : collection of int
-        Frames that the surface was made without; judged too, but no measure for the others.
+    `scene` is predicted from the surface fitted to the frames that are not excluded. Excluded frames are judged too,
+    but are no measure for the others.
     """
     readable = [k for k in range(len(stack.patterns)) if k not in stack.unusable]
     evidence = gather(stack, binned, scene, readable)

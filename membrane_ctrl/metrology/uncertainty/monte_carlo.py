@@ -237,10 +237,7 @@ def geometry_covariance(jacobian: FloatArray, spread: GeometrySpread) -> FloatAr
 def linear_covariance(benches: Sequence[TrialBench], spread: GeometrySpread) -> FloatArray:
     """What the Monte Carlo finds, without it: (36, 36) in mm^2.
 
-    Parameters
-    ----------
-    benches : one or two TrialBench
-        Of two the covariance is that of the change between them: the geometry is common to both, the noise is not.
+    With two benches the covariance is that of the change between them: they share the geometry, not the noise.
     """
     jacobian = geometry_jacobian(benches[0], spread)
     if len(benches) > 1:

@@ -77,10 +77,7 @@ _LEAST_S = 5.0
 def broken_at_gaps(columns: Mapping[str, Column], time_name: str = "time_s") -> dict[str, Column]:
     """Columns with a row of NaN in every gap, so that a plot does not bridge it with a straight line.
 
-    Parameters
-    ----------
-    time_name : str
-        The column of times, s, ascending. A gap is longer than 5 s and three of its usual steps.
+    A gap in the times (s, ascending, in the column `time_name`) is longer than 5 s and three of their usual steps.
     """
     time_s = columns[time_name]
     steps_s = np.diff(time_s)

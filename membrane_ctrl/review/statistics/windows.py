@@ -104,10 +104,7 @@ _LEAST_GAP_S = 2.0
 class HeldTime:
     """Sum of the times between ticks whose first is held, over blocks that come in their order.
 
-    Parameters
-    ----------
-    quiet_hz : float
-        Fewest rows a second that are recorded. A gap longer than twice that is a loss: nobody knows what was in it.
+    `quiet_hz` is the lowest rate of recorded rows. A gap longer than two of its periods is a loss.
     """
 
     def __init__(self, quiet_hz: float) -> None:

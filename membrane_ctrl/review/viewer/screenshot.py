@@ -27,14 +27,8 @@ def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:
     """PNG of the whole run, at its end.
 
     Raises FileNotFoundError if there is no recording in the folder; ValueError if the recording has no such tab;
-    RuntimeError if the viewer does not start (no Vulkan driver) or does not come to rest.
-
-    Parameters
-    ----------
-    run_dir : Path
-        Folder of the run; all its segments are opened.
-    tab : str
-        Name of a tab of the blueprint.
+    RuntimeError if the viewer does not start (no Vulkan driver) or does not come to rest. All segments
+    of the run are opened; `tab` is the name of a tab of the blueprint.
     """
     segments = sorted(str(path.resolve()) for path in run_dir.glob("*.rrd"))
     if not segments:
