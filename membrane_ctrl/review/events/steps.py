@@ -70,8 +70,8 @@ def differences(values: Column, half: int, skip: int) -> Column:
 def local_sigma(values: Column, share: float = 0.5) -> Column:
     """(n,) robust standard deviation of stretches of the series, constant within each, about 0.
 
-    The quantile `share` of the absolute values is compared with that of a normal distribution. Half (the median) is the
-    most robust, and blind to values that mostly repeat.
+    The quantile `share` of the absolute values is compared with that of a normal distribution. Half (the median) is
+    the most robust, and blind to values that mostly repeat.
     """
     result = np.full(values.size, np.nan)
     sigmas = float(special.ndtri(0.5 * (1 + share)))
