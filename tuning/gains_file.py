@@ -4,8 +4,6 @@ A file that was edited by hand is read like any other: its gains are checked on 
 or has too little margin is refused by name.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict, dataclass
@@ -40,7 +38,7 @@ class PlantSection(Section):
     delay_sigma_s: Annotated[float, Field(ge=0)]
 
     @classmethod
-    def of(cls, identified: identify.Identified) -> PlantSection:
+    def of(cls, identified: identify.Identified) -> "PlantSection":
         """The section for a fit."""
         sigma = identified.sigma
         return cls(**asdict(identified.model), gain_sigma=sigma.gain, delay_sigma_s=sigma.delay_s)

@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from firmware_iface.roles import Pattern
@@ -24,11 +23,11 @@ from membrane_ctrl.config.toml_file import parse, prune, read_toml, with_height_
 from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, origin_of
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
 from membrane_ctrl.metrology.phase import AXES, GRAY_BITS
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import FloatArray, Image
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.files import read_bytes
 
-Frames = NDArray[np.uint8] | NDArray[np.uint16]
+Frames = Image
 
 _DEPTHS = (10, 12, 14, 16)  # bits of a sensor in 16-bit files, when the set does not say
 _READERS = 2

@@ -4,7 +4,8 @@ import struct
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from membrane_ctrl.model.arrays import AnyArray
 
 # A file of 16-bit pixels that do not compress.
 IMAGE_BYTES_MAX = 150_000_000
@@ -16,7 +17,7 @@ _WIDTH, _HEIGHT = 256, 257  # tags of a TIFF
 _SHORT = 3  # the type of a 16-bit number in a TIFF
 
 
-def decoded_image(data: bytes, flags: int) -> NDArray[np.generic]:
+def decoded_image(data: bytes, flags: int) -> AnyArray:
     """The pixels of an image file.
 
     Raises ValueError if it is not an image, is cut short, or has more than `PIXELS_MAX` pixels. `data` is the

@@ -1,7 +1,5 @@
 """The table of a stability run, one line a set, written as the sets pass by and read back thinned for pictures."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -34,7 +32,7 @@ class SeriesFile:
         self._writer = csv.writer(self._file, lineterminator="\n")
         self._writer.writerow((*_HEAD, *_NUMBERS, *(f"{name}_um" for name in points), *_ZERNIKE))
 
-    def __enter__(self) -> SeriesFile:
+    def __enter__(self) -> "SeriesFile":
         return self
 
     def __exit__(

@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, phase, phasor, reconstruct, zonal
@@ -13,7 +12,7 @@ from membrane_ctrl.metrology.frames.frame_stack import PixelPhases, pixel_phases
 from membrane_ctrl.metrology.motion import combine_steps, sensitivity_mm_per_um, worth_correcting
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import Surface
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 from membrane_ctrl.model.shape_estimate import Quality
 
 LASER_NOISE_UM = 1.0  # repeatability of the bench's laser; motion below twice that is not taken out
@@ -32,12 +31,12 @@ class FullResult:
     """Everything of one set."""
 
     fit: reconstruct.Fit  # the surface: Hencky excess and 36 terms; `changes_mm` of all iterations from the start
-    index: NDArray[np.int64]  # (n,): pixels inside the analysis radius that gave slopes, counted row by row
+    index: IntArray  # (n,): pixels inside the analysis radius that gave slopes, counted row by row
     field: FloatArray  # (6, n): x, y in mm, measured slopes, fitted slopes
     weights: FloatArray  # (n,): what each had to say in the fit
-    swing_adu: NDArray[np.float32]  # (n,): the smaller of the two fringe amplitudes
+    swing_adu: Singles  # (n,): the smaller of the two fringe amplitudes
     # (n,): what the sinusoids leave of the frames: noise, motion, the display's harmonics
-    rest_adu: NDArray[np.float32]
+    rest_adu: Singles
     grid: zonal.ResidualGrid  # mean slope residuals in cells
     residual_mm: FloatArray  # (m, m): height over the fit, 0 at the vertex; NaN where nothing was measured
     quality: Quality  # for the verdict
@@ -58,10 +57,10 @@ class FullResult:
 class PixelPoints:
     """Pixels that see the pattern, with their screen points."""
 
-    index: NDArray[np.int64]
+    index: IntArray
     points: reconstruct.Points
-    swing_adu: NDArray[np.float32]
-    rest_adu: NDArray[np.float32]
+    swing_adu: Singles
+    rest_adu: Singles
     moved: bool
 
 
@@ -92,7 +91,7 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     return PixelPoints(index[keep], points.subset(keep), swing[keep], rest[keep], moved)
 
 
-def _rays(geometry: Geometry, column: NDArray[np.int64], row: NDArray[np.int64]) -> FloatArray:
+def _rays(geometry: Geometry, column: IntArray, row: IntArray) -> FloatArray:
     """Rays of pixels, in parts: what is needed on the way to them is larger than they are."""
     out = np.empty((3, column.size))
     for start in range(0, column.size, _PART):
@@ -105,8 +104,8 @@ def _axis_phases(
     optics: OpticsConfig,
     checked: Checked,
     axis: int,
-    index: NDArray[np.int64],
-    in_bin: NDArray[np.int64],
+    index: IntArray,
+    in_bin: IntArray,
     sensitivity: FloatArray | None,
 ) -> PixelPhases:
     stack, used = checked.stack, checked.view.used[axis]
@@ -201,7 +200,7 @@ class BinFigure:
 
     fit: reconstruct.Fit  # Hencky excess and 36 terms
     points: reconstruct.Points  # the bins' rays and screen points, standing on the surface
-    index: NDArray[np.int64]  # (n,): their bins
+    index: IntArray  # (n,): their bins
     sigma_mm: FloatArray  # (2, n): 1 sigma of the screen points from the noise of the pixels
     quality: Quality  # for the verdict
     moved: bool  # whether the film's motion between the frames was taken out

@@ -10,13 +10,12 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, motion, phase, phasor, reconstruct
 from membrane_ctrl.metrology.optics import geometry, hencky, surface, zernike
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
-from membrane_ctrl.model.arrays import BoolArray, FloatArray
+from membrane_ctrl.model.arrays import ArrayLike, BoolArray, FloatArray
 from membrane_ctrl.model.shape_estimate import Quality, ShapeEstimate, judge
 
 Kind = Literal["full", "fringes"]

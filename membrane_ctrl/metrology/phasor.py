@@ -10,12 +10,9 @@ from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.optics.compiled import kernel, split, step
-from membrane_ctrl.model.arrays import FloatArray
-
-Image = NDArray[np.uint8] | NDArray[np.uint16]
+from membrane_ctrl.model.arrays import AnyArray, FloatArray, Image, IntArray
 
 _BLOCK = 512
 _NEVER = np.uint32(2**32 - 1)  # above any pixel
@@ -227,8 +224,8 @@ def _track(sums, index, cosine, sine, turn, mirror, slope, last, out, start, sto
 
 
 def track(
-    sums: Sequence[NDArray[np.uint32]],
-    index: NDArray[np.int64],
+    sums: Sequence[AnyArray],
+    index: IntArray,
     combined: Sequence[StepCombination],
     sensitivity_rad_per_um: FloatArray,
     last: FloatArray,

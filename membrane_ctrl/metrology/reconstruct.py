@@ -8,8 +8,6 @@ solution on its own surface, whatever matrix stands on the left: so a matrix of 
 kept without moving the end point.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -58,7 +56,7 @@ class NormalMatrix:
     inverse: FloatArray
 
     @classmethod
-    def from_products(cls, products: FloatArray, radius_mm: float) -> NormalMatrix:
+    def from_products(cls, products: FloatArray, radius_mm: float) -> "NormalMatrix":
         """From the moments of `kernels.product_sums`. Raises ValueError if the points do not determine a surface."""
         x, y = _assemble(products, radius_mm)
         inverse = x + y
@@ -133,13 +131,13 @@ class Points:
     t_mm: FloatArray  # (n,): length of each ray to the surface; kept between solutions as the start of the next
 
     @classmethod
-    def of(cls, rays: FloatArray, screen_mm: FloatArray, weights: FloatArray | None = None) -> Points:
+    def of(cls, rays: FloatArray, screen_mm: FloatArray, weights: FloatArray | None = None) -> "Points":
         """Points with unit weights unless given."""
         count = rays.shape[1]
         weights = np.ones(count) if weights is None else weights
         return cls(np.ascontiguousarray(rays), np.ascontiguousarray(screen_mm), weights, np.zeros(count))
 
-    def subset(self, keep: BoolArray) -> Points:
+    def subset(self, keep: BoolArray) -> "Points":
         """Those points where `keep` is set."""
         return Points(
             np.ascontiguousarray(self.rays[:, keep]),

@@ -9,12 +9,11 @@ still over the length of the window.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import live, phasor
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 

@@ -72,7 +72,7 @@ def test_a_run_without_an_end_is_as_long_as_what_it_has(tmp_path: Path) -> None:
 def test_a_run_is_found_by_part_of_its_name(logs: Path) -> None:
     assert resolve(Path("1122"), logs).name == "20261122T180000Z-night"
     assert resolve(Path("last"), logs).name == "20261123T180000Z-night"
-    with pytest.raises(InputError, match="more than one"):
+    with pytest.raises(InputError, match="several runs match"):
         resolve(Path("night"), logs)
     second = logs / "20261122T180000Z-night-2"  # a second run in the same second
     leftover = logs / ".deleted-20261123T180000Z-night"

@@ -7,17 +7,15 @@ h / 2 is what a command held for a sample comes late on average. A Pade approxim
 much as the designs differ; a frequency response needs none.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import control
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.model.arrays import ComplexArray
 from tuning.identification.records import Series
 
 # The mirror as tuning sees it: an integrator behind the pump's transport delay and lag.
@@ -85,7 +83,7 @@ def driven_um(flow_um_per_s: Series, dead_time_s: float, lag_s: float, dt_s: flo
     return np.asarray(way + first * dt_s * np.arange(flow_um_per_s.size), dtype=float)
 
 
-Response = NDArray[np.complex128]
+Response = ComplexArray
 
 _SLOWEST_RAD_PER_S = 1e-4
 
@@ -100,7 +98,7 @@ class Gains:
     filter_s: float = 0.0
 
     @classmethod
-    def of(cls, loop: LoopConfig) -> Gains:
+    def of(cls, loop: LoopConfig) -> "Gains":
         """Gains of a configured loop."""
         return cls(loop.kp_per_s, loop.ti_s, loop.td_s, loop.measurement_filter_s)
 

@@ -4,8 +4,6 @@ The model is the one that the self-calibration frees: one focal length, k1, k2, 
 the others (blurred, a corner taken for its neighbour) are left out and named.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,10 +11,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from membrane_ctrl.config.schema import CameraConfig
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import AnyArray, ArrayLike, FloatArray
 
 LEAST_VIEWS = 4  # each has a pose of its own; with fewer the lens hides in the poses
 LEAST_CORNERS = 12  # of a view
@@ -122,7 +119,7 @@ def _matrix(camera: CameraConfig) -> FloatArray:
 # A board of known squares, on a screen or on a plate: its picture, and its corners in a photograph.
 
 
-Levels = NDArray[np.uint8]
+Levels = AnyArray
 
 # A marker of 4 x 4 bits has a border of one: 6 modules; with a margin of one on each side a square has 8, so that
 # squares of a multiple of 8 pixels have every edge on a pixel's edge
@@ -140,7 +137,7 @@ class Board:
     rows: int
 
     @classmethod
-    def parse(cls, text: str) -> Board:
+    def parse(cls, text: str) -> "Board":
         """From "charuco:15x9". Raises ValueError."""
         found = re.fullmatch(r"(charuco|chessboard):(\d{1,3})x(\d{1,3})", text)
         if found is None:

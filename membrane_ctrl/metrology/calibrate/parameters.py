@@ -17,11 +17,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.screen_face import BOW_RADIUS_MM
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
 _COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
 
@@ -104,10 +103,10 @@ class BenchGeometry:
 class Poses:
     """Pinhole (3,), camera rows (3, 3), screen origin (3,) and screen rows (3, 3): s_x, s_y, normal."""
 
-    pinhole_mm: NDArray[Any]
-    camera: NDArray[Any]
-    origin_mm: NDArray[Any]
-    screen: NDArray[Any]
+    pinhole_mm: AnyArray
+    camera: AnyArray
+    origin_mm: AnyArray
+    screen: AnyArray
 
 
 def bench_at(stated: Geometry, values: FloatArray) -> BenchGeometry:
@@ -131,7 +130,7 @@ def bench_at(stated: Geometry, values: FloatArray) -> BenchGeometry:
     return BenchGeometry(geometry, 1 + pitch)
 
 
-def poses_at(stated: Geometry, values: NDArray[Any]) -> Poses:
+def poses_at(stated: Geometry, values: AnyArray) -> Poses:
     """Poses of a parameter vector (real, or complex for `pose_derivatives`); only the first eleven count."""
     a, b, alpha, x, y, turn_x, turn_y, turn_z, yaw, pitch, roll = _radians(values[: len(POSE)])
     f0, o0 = stated.pinhole_mm, stated.screen_origin_mm
@@ -162,7 +161,7 @@ def pose_derivatives(stated: Geometry, values: FloatArray) -> list[Poses]:
     return out
 
 
-def _radians(values: NDArray[Any]) -> NDArray[Any]:
+def _radians(values: AnyArray) -> AnyArray:
     """Millimetres as they are, degrees as radians."""
     factors = [np.pi / 180 if parameter.unit == "deg" else 1.0 for parameter in POSE]
     return np.asarray(values * factors)
@@ -177,7 +176,7 @@ def _hinge(pinhole_mm: FloatArray, origin_mm: FloatArray) -> FloatArray:
     return across / length
 
 
-def _turn(axis: FloatArray, angle: Any) -> NDArray[Any]:
+def _turn(axis: FloatArray, angle: Any) -> AnyArray:
     """Rodrigues' matrix of a turn about a unit vector."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -12,8 +12,6 @@ with X the screen's rows, E the first two, N = (third row) - w_x e_x - w_y e_y t
 w = c s^2 + map (see `metrology.face`) and T = E (1 - u N^T / (N u)), which lets the ray run to the face.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -88,7 +86,7 @@ class SetPhases:
     sigma_mm: FloatArray  # (n,): expected noise of each of the two
     displacement_um: float  # mean laser reading of the set; NaN without
 
-    def thinned(self, most: int) -> SetPhases:
+    def thinned(self, most: int) -> "SetPhases":
         """Every k-th bin, so that at most `most` are left."""
         keep = slice(None, None, -(-self.column_px.size // most))
         return SetPhases(

@@ -10,8 +10,6 @@ the rim, z_i e_0 + E q_i, are the same in all sets (a polynomial of degree 7 has
 the laser says: z_i = -(1 + scale) (d_i - reference) / 1000, d_i in um.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 
@@ -53,12 +51,12 @@ class Trust:
     variance: float
 
     @classmethod
-    def full(cls, phases: residuals.SetPhases) -> Trust:
+    def full(cls, phases: residuals.SetPhases) -> "Trust":
         """Every point as its noise says."""
         return cls(np.ones(phases.sigma_mm.size), 1.0)
 
     @classmethod
-    def seen(cls, phases: residuals.SetPhases, residual_mm: FloatArray) -> Trust:
+    def seen(cls, phases: residuals.SetPhases, residual_mm: FloatArray) -> "Trust":
         """From residuals (2, n): Huber's weights against their own scatter."""
         length = np.hypot(*residual_mm) / phases.sigma_mm
         # the median of a Rayleigh distribution is 1.177 sigma; less noise than the camera must have is not believed

@@ -19,10 +19,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from membrane_ctrl.metrology.phase import step_residual, step_weights
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
 _TINY = 1e-9  # a share of a frame that the model does not explain: below this it is explained whatever it is
 

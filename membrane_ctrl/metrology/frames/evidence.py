@@ -11,8 +11,6 @@ I = g (lo + (hi - lo) bit); white and black have one. Over thousands of bins noi
 what does not belong there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -37,7 +35,7 @@ class SampledBins:
     phase_rad: FloatArray  # (2, n): predicted absolute phase, film at its mean displacement
     sensitivity_rad_per_um: FloatArray  # (2, n): change of phase per um of displacement
 
-    def thinned(self) -> SampledBins:
+    def thinned(self) -> "SampledBins":
         """Enough of the bins."""
         every = slice(None, None, max(1, self.index.size // _SAMPLE))
         return SampledBins(

@@ -1,20 +1,17 @@
 """The frames of one set in memory, and their means over bins."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.metrology.optics.compiled import kernel, split
 from membrane_ctrl.metrology.phase import AXES, step_weights
 from membrane_ctrl.metrology.phasor import Binner, StepCombination, arctan2
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, IntArray, Singles
 
-Frames = NDArray[np.uint8] | NDArray[np.uint16]
+Frames = Image
 
 _ENOUGH_BINS = 50_000  # for 36 terms and for the checks of the frames; more only cost time
 _LARGEST_BIN_PX = 4  # curvature of the phase over a larger bin is no longer small
@@ -45,7 +42,7 @@ class FrameStack:
         """Phase steps of sinusoids."""
         return np.array([self.patterns[k].shift_rad for k in frames])
 
-    def reordered(self, order: list[int]) -> FrameStack:
+    def reordered(self, order: list[int]) -> "FrameStack":
         """The same with other pictures for the patterns: frame k shows what `order[k]` did."""
         return replace(self, frames=self.frames[order])
 
@@ -70,10 +67,10 @@ class Binned:
     """Frames as means over bins."""
 
     bin_px: int  # side of a bin
-    means: NDArray[np.float32]  # (frames, rows, columns): in the frames' units
-    saturated: NDArray[np.bool_]  # (frames, rows, columns): bins with a saturated pixel
+    means: Singles  # (frames, rows, columns): in the frames' units
+    saturated: BoolArray  # (frames, rows, columns): bins with a saturated pixel
 
-    def reordered(self, order: list[int]) -> Binned:
+    def reordered(self, order: list[int]) -> "Binned":
         """As `FrameStack.reordered`."""
         return replace(self, means=self.means[order], saturated=self.saturated[order])
 
@@ -105,9 +102,9 @@ class PixelPhases:
     """One axis at n pixels."""
 
     phase_rad: FloatArray  # (n,): absolute phase, the period nearest to the reference
-    swing_adu: NDArray[np.float32]  # (n,): fringe amplitude
-    rest_adu: NDArray[np.float32]  # (n,): root of the sum of squares that the sinusoid leaves; 0 for three frames
-    saturated: NDArray[np.bool_]  # (n,): whether a frame is saturated there
+    swing_adu: Singles  # (n,): fringe amplitude
+    rest_adu: Singles  # (n,): root of the sum of squares that the sinusoid leaves; 0 for three frames
+    saturated: BoolArray  # (n,): whether a frame is saturated there
 
 
 @kernel
@@ -146,7 +143,7 @@ def pixel_phases(
     frames: Frames,
     shifts_rad: FloatArray,
     combined: StepCombination,
-    index: NDArray[np.int64],
+    index: IntArray,
     sensitivity_rad_per_um: FloatArray,
     reference_rad: FloatArray,
     full_scale_adu: int,

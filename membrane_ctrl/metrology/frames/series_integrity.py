@@ -12,8 +12,6 @@ nobody's fault. Three closures:
 Of four steps one can be done without: I0 = I1 + I3 - I2 is what the phase of the other three says, and so on round.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -114,7 +112,7 @@ class AxisSeries:
         """Share of the pixels whose frequencies disagree."""
         return float(np.mean(~unwrap(self.phases_rad(), self.periods).consistent))
 
-    def with_frames(self, index: int, steps: FloatArray) -> AxisSeries:
+    def with_frames(self, index: int, steps: FloatArray) -> "AxisSeries":
         """The same with other frames of one frequency."""
         frames = self.frames.copy()
         frames[index] = steps

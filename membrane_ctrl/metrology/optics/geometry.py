@@ -5,19 +5,16 @@ without roll, image down is world -y, forward is -F / a, and image right is the 
 towards +x: (sin alpha, 0, -cos alpha).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
 from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
 from membrane_ctrl.metrology.optics.screen_face import Face
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
 _UNDONE = 1e-9  # of a tangent: 5e-6 of a pixel of the paper's lens
 
@@ -37,7 +34,7 @@ class Geometry:
     face: Face  # how the screen stands off the plane of s_x and s_y
 
     @classmethod
-    def from_config(cls, optics: OpticsConfig) -> Geometry:
+    def from_config(cls, optics: OpticsConfig) -> "Geometry":
         """The geometry a configuration describes."""
         camera = optics.camera
         pinhole, rotation, origin, s_x, s_y = _poses(optics.geometry)

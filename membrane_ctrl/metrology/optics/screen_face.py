@@ -5,8 +5,6 @@ kept as its polynomial in each cell, sum of C[m, n] v^m u^n with u and v from 0 
 needs one look-up and a Horner scheme. Beyond the grid the height of its edge goes on.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -31,7 +29,7 @@ class Face(NamedTuple):
     pitch_mm: FloatArray  # (2,): distance of the nodes
 
     @classmethod
-    def of(cls, screen: ScreenPoseConfig | None) -> Face:
+    def of(cls, screen: ScreenPoseConfig | None) -> "Face":
         """The face that a configuration describes; a plane for None."""
         bow_mm = 0.0 if screen is None else screen.bow_mm
         cells, low, pitch = _cells(None if screen is None else screen.height_map)

@@ -4,8 +4,6 @@ The excess is orthogonal to the 36 terms over the disc, so the coefficients are 
 its amplitude: a shape made of 36 terms has amplitude 0, a true Hencky bowl has its own sag.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache, cached_property
 
@@ -26,13 +24,13 @@ class Surface:
     radius_mm: float  # radius of the Zernike disc
 
     @classmethod
-    def from_parameters(cls, parameters: FloatArray, radius_mm: float) -> Surface:
+    def from_parameters(cls, parameters: FloatArray, radius_mm: float) -> "Surface":
         """The surface of a parameter vector [a_2..a_36, excess with unit RMS] in mm; piston set for h(0, 0) = 0."""
         hencky_mm = float(parameters[-1]) / hencky.excess_rms()
         return cls(parameter_to_coeffs() @ parameters, hencky_mm, radius_mm)
 
     @classmethod
-    def hencky_bowl(cls, sag_mm: float, radius_mm: float) -> Surface:
+    def hencky_bowl(cls, sag_mm: float, radius_mm: float) -> "Surface":
         """A Hencky bowl of the given sag."""
         return cls(sag_mm * hencky.zernike_projection(), sag_mm, radius_mm)
 

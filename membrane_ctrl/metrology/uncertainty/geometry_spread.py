@@ -4,16 +4,13 @@ The short form changes in a, b and alpha. The general form changes in twelve num
 shifted (mm, in world) and turned (rad, a rotation vector in world, about the pinhole and about O').
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, Vector3
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
 SHORT_NAMES = ("a_mm", "b_mm", "alpha_deg")
 GENERAL_NAMES = tuple(
@@ -50,7 +47,7 @@ class GeometrySpread:
             raise ValueError("matrix: not a covariance (an eigenvalue is negative)")
 
     @classmethod
-    def independent(cls, sigmas: dict[str, float]) -> GeometrySpread:
+    def independent(cls, sigmas: dict[str, float]) -> "GeometrySpread":
         """From one sigma a name."""
         return cls(tuple(sigmas), np.diag(np.square(np.array(list(sigmas.values()), float))))
 

@@ -10,8 +10,6 @@ Seeds: the geometry of trial t comes from (seed, 0, t), the noise of set s in it
 of the order, of the number of workers and of what else is in the run, and the geometry is common to all sets.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -48,7 +46,7 @@ class TrialBench:
     @classmethod
     def of(
         cls, optics: OpticsConfig, checked: Checked, figure: full.BinFigure, count: int = TRIAL_POINTS
-    ) -> TrialBench:
+    ) -> "TrialBench":
         """Of a set's figure, its points thinned to about `count`."""
         row, column = np.divmod(figure.index, checked.phase_rad.shape[2])
         side = checked.binned.bin_px
@@ -67,7 +65,7 @@ class TrialBench:
         place_px: FloatArray,
         sigma_mm: FloatArray,
         count: int,
-    ) -> TrialBench:
+    ) -> "TrialBench":
         """Of points that stand on a surface, seen at `place_px` (2, n), thinned to about `count`."""
         chosen = _spread_evenly(points.t_mm.size, count)
         thinning = points.t_mm.size / np.count_nonzero(chosen)
@@ -174,7 +172,7 @@ class HeightMap:
     matrix: FloatArray  # (points, 36): heights, 0 at the vertex, of the points inside
 
     @classmethod
-    def over(cls, analysis_radius_mm: float, radius_mm: float, side: int = MAP_SIDE) -> HeightMap:
+    def over(cls, analysis_radius_mm: float, radius_mm: float, side: int = MAP_SIDE) -> "HeightMap":
         """A grid over the analysis radius; `radius_mm` is that of the Zernike disc."""
         axis = np.linspace(-analysis_radius_mm, analysis_radius_mm, side)
         x, y = np.meshgrid(axis, axis)

@@ -3,10 +3,9 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.arrays import BoolArray, Column, IntArray
 from membrane_ctrl.review.events.steps import FoundStep, differences, local_sigma
 
 # A laser's noise is 1 um; the film makes no spike of a single tick.
@@ -33,9 +32,7 @@ class Glitch:
     sigmas: float
 
 
-def glitches(
-    low_um: Column, mean_um: Column, high_um: Column, usable: NDArray[np.bool_], calm: NDArray[np.bool_]
-) -> list[Glitch]:
+def glitches(low_um: Column, mean_um: Column, high_um: Column, usable: BoolArray, calm: BoolArray) -> list[Glitch]:
     """Spikes and longer glitches, one for each that happened.
 
     Parameters
@@ -74,7 +71,7 @@ def _sized(glitch: Glitch, size_um: Column) -> Glitch:
     return replace(glitch, size_um=float(part[np.nanargmax(np.abs(part))]))
 
 
-def _spikes(size_um: Column, mean_um: Column, usable: NDArray[np.bool_]) -> list[Glitch]:
+def _spikes(size_um: Column, mean_um: Column, usable: BoolArray) -> list[Glitch]:
     """A reading far from where the seconds around it are, while the mirror before and after is where it was."""
     far = np.abs(size_um)
     usual = float(np.nanmedian(far))
@@ -87,7 +84,7 @@ def _spikes(size_um: Column, mean_um: Column, usable: NDArray[np.bool_]) -> list
     return [Glitch(int(row), int(row), float(size_um[row]), float(score[row])) for row in found]
 
 
-def _edges(mean_um: Column, usable: NDArray[np.bool_]) -> list[Glitch]:
+def _edges(mean_um: Column, usable: BoolArray) -> list[Glitch]:
     """Steps of the reading within two seconds, each a glitch without an end; `first` is the second of the step."""
     change = np.full(mean_um.size, np.nan)
     change[1:-1] = mean_um[_EDGE_S:] - mean_um[:-_EDGE_S]
@@ -154,8 +151,8 @@ _BEYOND = 1
 class _Candidates:
     """Windows that differ enough: first row, length, difference and its sigmas."""
 
-    row: NDArray[np.intp]
-    lag: NDArray[np.intp]
+    row: IntArray
+    lag: IntArray
     size: Column
     score: Column
 

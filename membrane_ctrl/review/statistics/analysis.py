@@ -4,11 +4,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
 from membrane_ctrl.model import errors, states
-from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.arrays import Column, Singles
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.review.statistics import shape_review, spectra
@@ -183,7 +182,7 @@ def slow_spectrum(time_s: Column, means: Column) -> spectra.Spectrum:
     return spectra.power_spectrum(grid, 1.0, fft.prev_fast_len(max(8, longest // 2), real=True))
 
 
-def fill_short_gaps(values: NDArray[np.float32], most: int) -> NDArray[np.float32]:
+def fill_short_gaps(values: Singles, most: int) -> Singles:
     """Gaps of at most `most` values filled with straight lines; longer ones stay NaN."""
     gap = ~np.isfinite(values)
     edges = np.flatnonzero(np.diff(np.concatenate(([False], gap, [False])).astype(np.int8)))
@@ -194,7 +193,7 @@ def fill_short_gaps(values: NDArray[np.float32], most: int) -> NDArray[np.float3
     return filled
 
 
-def _first(grid: NDArray[np.float32]) -> int:
+def _first(grid: Singles) -> int:
     """Places in front of the first value."""
     return int(np.argmax(np.isfinite(grid)))
 

@@ -5,9 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.arrays import BoolArray, Column, IntArray, Singles
 from membrane_ctrl.model.states import State
 from membrane_ctrl.review.statistics import windows
 from membrane_ctrl.run_files import summary, tables
@@ -25,7 +24,7 @@ class ThinSeconds:
         self._least = windows.least_ticks(1.0, rate_hz)
         self._parts: list[tuple[windows.Seconds, Column]] = []
 
-    def add(self, time_s: Column, setpoint_um: Column, settled: NDArray[np.bool_]) -> None:
+    def add(self, time_s: Column, setpoint_um: Column, settled: BoolArray) -> None:
         """Take in (n,) times, setpoints and whether each tick is settled."""
         if not time_s.size:
             return
@@ -87,7 +86,7 @@ def filled(seconds: windows.SecondsOf, means: LevelMeans, error_um: Column) -> w
     return joined[order], np.concatenate((counts[kept], ticks))[order], np.stack((errors_um, errors_um * np.nan))
 
 
-Single = NDArray[np.float32]
+Single = Singles
 
 NAMES = (
     *summary.FIELDS, "displacement_um", "truth_displacement_um", "feedforward_um_per_s", "flow_wanted_um_per_s",
@@ -142,7 +141,7 @@ class HoldPass:
     raw_true: summary.Moments
     raw_in_band: float  # share of settled readings within the band
     histogram_um: Column  # edges and counts of the reading error
-    histogram_counts: NDArray[np.int64]
+    histogram_counts: IntArray
     lateness_ms: summary.LogHistogram
     pump: PumpActivity
 

@@ -6,10 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy import signal
 
-from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.arrays import AnyArray, Column, IntArray
 
 # Enough segments for an estimate that is good to a third, and no segment longer than shows one more decade.
 _SEGMENTS = 8
@@ -35,7 +34,7 @@ class Spectrum:
         return float(np.sqrt(self.density[inside].sum() * step_hz))
 
 
-def power_spectrum(values: NDArray[np.floating], rate_hz: float, length: int | None = None) -> Spectrum:
+def power_spectrum(values: AnyArray, rate_hz: float, length: int | None = None) -> Spectrum:
     """Welch's estimate: Hann window, half overlapping segments, each without its mean; as `scipy.signal.welch`.
 
     Parameters
@@ -73,10 +72,10 @@ class Allan:
 
     tau_s: Column  # (k,): averaging times
     deviation: Column  # (k,): same unit as the series
-    windows: NDArray[np.int64]  # (k,): differences of neighbouring means that went in
+    windows: IntArray  # (k,): differences of neighbouring means that went in
 
 
-def allan_deviation(values: NDArray[np.floating], period_s: float, lengths: NDArray[np.int64] | None = None) -> Allan:
+def allan_deviation(values: AnyArray, period_s: float, lengths: IntArray | None = None) -> Allan:
     """Overlapping Allan deviation of equally spaced values.
 
     With x the running sum of y and m the samples in tau,
@@ -117,7 +116,7 @@ def allan_deviation(values: NDArray[np.floating], period_s: float, lengths: NDAr
 
 
 @njit(cache=True)
-def _second_differences(total: Column, gaps: NDArray[np.int32], m: int) -> tuple[float, int]:
+def _second_differences(total: Column, gaps: AnyArray, m: int) -> tuple[float, int]:
     square = 0.0
     count = 0
     for i in range(total.size - 2 * m):

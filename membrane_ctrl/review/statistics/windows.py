@@ -4,14 +4,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
-from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column, IntArray, Singles
 
 # Of a month there are millions: single precision, which counts ticks exactly.
-Seconds = NDArray[np.int32]
-Counts = NDArray[np.float32]
+Seconds = AnyArray
+Counts = Singles
 SecondsOf = tuple[Seconds, Counts, Column]
 
 # A window with fewer of its ticks than this says nothing of its length.
@@ -31,7 +30,7 @@ class WindowStatistics:
     in_band: float  # share within the band
 
 
-def group_starts(number: NDArray[np.integer]) -> NDArray[np.intp]:
+def group_starts(number: AnyArray) -> IntArray:
     """Where each run of equal numbers begins."""
     return np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
 
@@ -112,7 +111,7 @@ class HeldTime:
         self._last = (math.nan, False)
         self.held_s = 0.0
 
-    def add(self, time_s: Column, held: NDArray[np.bool_]) -> None:
+    def add(self, time_s: Column, held: BoolArray) -> None:
         """Take in (n,) times and whether the mirror was held."""
         if not time_s.size:
             return

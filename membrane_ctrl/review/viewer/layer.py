@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
-from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
 from membrane_ctrl.model.telemetry import FIELDS, changes
 from membrane_ctrl.recorder.blueprint import TELEMETRY_LANES
 from membrane_ctrl.recorder.rerun_streams import event_text, event_time_s
@@ -231,7 +230,7 @@ def _of_run(colour: streams.Colour, number: int) -> streams.Colour:
     return (red // 2, green // 2, blue // 2) if colour == streams.GREY else (red, green, blue)
 
 
-def _nanoseconds(time_s: Column) -> NDArray[np.timedelta64]:
+def _nanoseconds(time_s: Column) -> AnyArray:
     return np.round(np.asarray(time_s, dtype=np.float64) * 1e9).astype("timedelta64[ns]")
 
 
@@ -241,7 +240,7 @@ def _end_s(run: Run) -> float:
     return float(duration) if isinstance(duration, (int, float)) else end_s(run)
 
 
-def _some(count: int, most: int) -> NDArray[np.bool_]:
+def _some(count: int, most: int) -> BoolArray:
     """(count,) true for at most `most` places, evenly spread, the first among them."""
     chosen = np.zeros(count, dtype=bool)
     chosen[:: max(1, -(-count // most))] = True
