@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from membrane_ctrl.config import schema
 from membrane_ctrl.config import toml_file as config_file
-from membrane_ctrl.config.schema import Config, OpticsConfig
 from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, read_geometry
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.model import errors, files
@@ -37,7 +37,7 @@ class CalibrationSession:
 
     path: Path
     head: CalibrationHead
-    config: Config
+    config: schema.Config
 
     @property
     def sets(self) -> tuple[Path, ...]:
@@ -73,7 +73,7 @@ def head_of(source: str, start_um: float, shape_on: bool, setpoints_um: tuple[fl
     )
 
 
-def begin(logs: Path, name: str, head: CalibrationHead, config: Config) -> CalibrationSession:
+def begin(logs: Path, name: str, head: CalibrationHead, config: schema.Config) -> CalibrationSession:
     """Make a session's folder. Raises InputError for a bad name, DeviceError if it cannot be written."""
     path = fresh_folder(logs / "calibration", name, datetime.fromisoformat(head.created_utc))
     try:
@@ -90,13 +90,13 @@ def resume(path: Path) -> CalibrationSession:
     head = plain.read(path / "session.json", CalibrationHead)
     if head.format != FORMAT:
         raise errors.InputError(f"{path}/session.json: format {head.format!r}, {FORMAT!r} is known")
-    return CalibrationSession(path, head, config_file.load(path / "config.toml", Config))
+    return CalibrationSession(path, head, config_file.load(path / "config.toml", schema.Config))
 
 
 # Old geometry against new, and the exchange of the files.
 
 
-def compared(optics: OpticsConfig, origin: GeometryOrigin, new: GeometryFile) -> list[str]:
+def compared(optics: schema.OpticsConfig, origin: GeometryOrigin, new: GeometryFile) -> list[str]:
     """The geometry in force beside the new one, in the numbers that a person can check with a tape.
 
     `optics` is the bench in force, as the sets state it; `origin` names it.

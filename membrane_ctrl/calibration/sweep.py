@@ -13,9 +13,7 @@ from membrane_ctrl.calibration.plan import SETTLE_S, HeldMirror, reach_of, step_
 from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.commands import Command, Kind
-from membrane_ctrl.model import errors, states, telemetry
-from membrane_ctrl.model.events import StateEntered
-from membrane_ctrl.model.run_events import Capture
+from membrane_ctrl.model import errors, events, run_events, states, telemetry
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News
 from membrane_ctrl.sessions.progress import Progress
 
@@ -104,7 +102,7 @@ class Sweep:
                     f"the mirror does not settle at {setpoint_um:g} um in {patience_s:.0f} s; paused, or too tight?"
                 )
 
-    def take(self) -> Capture:
+    def take(self) -> run_events.Capture:
         """Have a set taken; repeat a bad one once.
 
         Raises HoldError if the hold refuses or the mirror is no longer held; RejectedError if both are bad.
@@ -119,14 +117,14 @@ class Sweep:
         """Switch the shape loop."""
         self._ask("shape_on" if on else "shape_off")
 
-    def _capture(self) -> Capture:
+    def _capture(self) -> run_events.Capture:
         self._ask("capture")
         begin_s = self._last_s
         while self._last_s - begin_s < _SET_WITHIN_S:
-            told = [event for event in self._news().events if isinstance(event, Capture)]
+            told = [event for event in self._news().events if isinstance(event, run_events.Capture)]
             if told:
                 return told[-1]
-        return Capture(failed=f"no set within {_SET_WITHIN_S:.0f} s")
+        return run_events.Capture(failed=f"no set within {_SET_WITHIN_S:.0f} s")
 
     def _inside(self, rows: deque[telemetry.TelemetryRow]) -> bool:
         last = [row.error_um for row in rows if rows[-1].mono_s - row.mono_s <= _MEAN_S]
@@ -139,7 +137,7 @@ class Sweep:
         """What has come; raises HoldError if the mirror is not held any more."""
         news = self._link.news()
         for event in news.events:
-            if isinstance(event, StateEntered):
+            if isinstance(event, events.StateEntered):
                 self._why = f" ({event.why})"
         for row in news.rows:
             if row.state != states.State.HOLD:

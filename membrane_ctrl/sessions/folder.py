@@ -12,8 +12,8 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
+from membrane_ctrl.config import schema
 from membrane_ctrl.config import toml_file as config_file
-from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.model import errors, files, plain_json
 
 # Results of steps as plain JSON and back: dataclasses, configuration sections, arrays, tuples and numbers.
@@ -108,7 +108,7 @@ class SessionHead:
     author: str
     source: str  # a run folder, or the twin
     created_utc: str
-    before: LoopConfig  # the last good gains when the session began
+    before: schema.LoopConfig  # the last good gains when the session began
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ class SessionFolder:
 
     path: Path
     head: SessionHead
-    config: Config
+    config: schema.Config
 
     def file(self, name: str) -> Path:
         """A file in it."""
@@ -180,7 +180,7 @@ def fresh_folder(parent: Path, name: str, now: datetime) -> Path:
 
 
 def create_session(
-    logs: Path, name: str, author: str, source: str, config: Config, before: LoopConfig
+    logs: Path, name: str, author: str, source: str, config: schema.Config, before: schema.LoopConfig
 ) -> SessionFolder:
     """Make a session's folder. Raises InputError for a bad name, DeviceError if it cannot be written."""
     now = datetime.now(UTC)
@@ -199,7 +199,7 @@ def open_session(path: Path) -> SessionFolder:
     head = read(path / "session.json", SessionHead)
     if head.format != FORMAT:
         raise errors.InputError(f"{path}/session.json: format {head.format!r}, {FORMAT!r} is known")
-    return SessionFolder(path, head, config_file.load(path / "config.toml", Config))
+    return SessionFolder(path, head, config_file.load(path / "config.toml", schema.Config))
 
 
 def sessions_in(logs: Path) -> list[Path]:

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from membrane_ctrl.config import schema
 from membrane_ctrl.config import toml_file as config_file
-from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.model import errors, run_events, shape_estimate
+from membrane_ctrl.model import errors, run_events, shape_estimate, telemetry
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.processes.ring import attach
 from membrane_ctrl.run_files import events
 
@@ -29,7 +28,7 @@ class HoldError(Exception):
 class News:
     """What has come since the last call, each in its order."""
 
-    rows: tuple[TelemetryRow, ...]
+    rows: tuple[telemetry.TelemetryRow, ...]
     events: tuple[Event, ...]
     shapes: tuple[shape_estimate.ShapeEstimate, ...]
 
@@ -38,7 +37,7 @@ class HoldLink(Protocol):
     """What a session needs of a hold."""
 
     @property
-    def config(self) -> Config:
+    def config(self) -> schema.Config:
         """Of the run."""
         ...
 
@@ -62,7 +61,7 @@ class HoldLink(Protocol):
 
 _NEWS_S = 0.2
 _SILENT_S = 5.0  # without a tick a run has ended, or is in worse trouble than a session can help with
-_ROW = struct.Struct(f"<{len(FIELDS)}d")
+_ROW = struct.Struct(f"<{len(telemetry.FIELDS)}d")
 
 
 class LiveHold:
@@ -84,8 +83,8 @@ class LiveHold:
         self._client, self._take_over = client, take_over
         if client.greeting["run"] != run_dir.resolve().name:
             raise errors.InputError(f"{run_dir}: is not running; {client.greeting['run']} is")
-        loop = LoopConfig.model_validate(client.ask(do="status")["loop"])
-        config = config_file.load(run_dir / "config.toml", Config)
+        loop = schema.LoopConfig.model_validate(client.ask(do="status")["loop"])
+        config = config_file.load(run_dir / "config.toml", schema.Config)
         self.config = config.model_copy(update={"loop": loop})
         self.name, self.run_dir = run_dir.name, run_dir
         try:
@@ -130,7 +129,7 @@ class LiveHold:
     def _read_rings(self) -> News:
         messages = {name: reader.drain() for name, reader in self._readers.items()}
         return News(
-            rows=tuple(TelemetryRow(*_ROW.unpack(message)) for message in messages.get("telemetry", ())),
+            rows=tuple(telemetry.TelemetryRow(*_ROW.unpack(message)) for message in messages.get("telemetry", ())),
             events=tuple(run_events.from_dict(events.parse(message)) for message in messages.get("events", ())),
             shapes=tuple(shape_estimate.unpack_estimate(message) for message in messages.get("shapes", ())),
         )

@@ -18,8 +18,7 @@ from scipy.signal import welch
 
 from membrane_ctrl.config.schema import LoopConfig
 from tuning.gains_file import GainsFile
-from tuning.identification import disturbance, loop_model, records
-from tuning.identification.identify import identify
+from tuning.identification import disturbance, identify, loop_model, records
 from tuning.proposal.prediction import least_std_um, predict
 
 # Time of a stage, and growth that ends the trial there: early on only what is plainly wrong, for a minute of weather
@@ -210,7 +209,7 @@ def _natural_gain(record: records.Record, loop: LoopConfig) -> tuple[float, floa
         by_air_um = loop.temperature_gain_um_per_k * gas_k
         record = replace(record, displacement_um=record.displacement_um - by_air_um)
     try:
-        found = identify(record)
+        found = identify.identify(record)
     except ValueError:
         return math.nan, math.nan
     return found.model.gain, found.sigma.gain

@@ -20,11 +20,8 @@ import numpy as np
 from numpy.polynomial import polynomial as series
 
 from membrane_ctrl.metrology.calibrate.parameters import OPTICAL, POSE, BenchGeometry, Poses
-from membrane_ctrl.metrology.optics import hencky, zernike
-from membrane_ctrl.metrology.optics.compiled import kernel
+from membrane_ctrl.metrology.optics import compiled, hencky, kernels, screen_face, zernike
 from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.kernels import FACE_STEPS
-from membrane_ctrl.metrology.optics.screen_face import BOW_RADIUS_MM
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer
 from membrane_ctrl.model.arrays import FloatArray
@@ -38,7 +35,7 @@ from membrane_ctrl.model.arrays import FloatArray
 _BLOCK = 512  # columns that stay in the second-level cache
 
 
-@kernel
+@compiled.kernel
 def gram(rows):  # type: ignore[no-untyped-def]
     """rows @ rows.T of a (c, n) array with many columns."""
     count, size = rows.shape
@@ -57,7 +54,7 @@ def gram(rows):  # type: ignore[no-untyped-def]
     return out
 
 
-@kernel
+@compiled.kernel
 def multiply(table, rows):  # type: ignore[no-untyped-def]
     """table @ rows of an (a, b) and a (b, n) array with many columns; zeros in the table cost nothing."""
     out = np.zeros((table.shape[0], rows.shape[1]))
@@ -171,7 +168,7 @@ def _meet(bench: BenchGeometry, points: Points, surface: Surface, part: slice) -
     axes = geometry.screen_axes
     start, along = axes @ (place - geometry.screen_origin_mm[:, None]), axes @ u
     k = -start[2] / along[2]
-    for _ in range(0 if geometry.face.is_plane else FACE_STEPS):
+    for _ in range(0 if geometry.face.is_plane else kernels.FACE_STEPS):
         at = start + k * along
         w, by_x, by_y = geometry.face.heights(at[:2])
         k = k - (at[2] - w) / (along[2] - by_x * along[0] - by_y * along[1])
@@ -217,7 +214,7 @@ def _derivatives(
     first = LOCAL + len(POSE)
     out[:, first : first + len(lens)] = np.einsum("acm,lcm->alm", by_ray, lens)
     square = m.screen_mm[0] ** 2 + m.screen_mm[1] ** 2
-    out[:, -2] = across * square / onto / BOW_RADIUS_MM**2
+    out[:, -2] = across * square / onto / screen_face.BOW_RADIUS_MM**2
     out /= bench.pitch
     out[:, -1] = -m.screen_mm / bench.pitch**2
     return out

@@ -5,8 +5,7 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-from membrane_ctrl.model import plain_json
-from membrane_ctrl.model.errors import DeviceError
+from membrane_ctrl.model import errors, plain_json
 from membrane_ctrl.model.files import make_folder, write_text_atomic
 from membrane_ctrl.review import catalogue, words
 from membrane_ctrl.review.report.html import render
@@ -64,7 +63,9 @@ def _write(folder: Path, files: dict[str, str]) -> None:
             write_text_atomic(folder / name, text)
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
-        raise DeviceError(f"{folder}: cannot be written ({reason}); choose another folder with --out") from None
+        raise errors.DeviceError(
+            f"{folder}: cannot be written ({reason}); choose another folder with --out"
+        ) from None
 
 
 def _say(analysis: Analysis, other: Analysis | None, folder: Path, took_s: float) -> None:

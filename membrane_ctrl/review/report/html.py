@@ -8,9 +8,8 @@ from typing import Any
 from membrane_ctrl import __version__
 from membrane_ctrl.review.report import figures
 from membrane_ctrl.review.report.json import timeline, verdict
-from membrane_ctrl.review.statistics import compare, drift, shape_review
+from membrane_ctrl.review.statistics import compare, drift, shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
-from membrane_ctrl.review.statistics.spectra import bands, unseen_s
 from membrane_ctrl.review.words import number, span
 
 STYLE = """
@@ -139,11 +138,11 @@ def _details(analysis: Analysis) -> str:
 
 
 def _bands(series: ErrorSeries) -> str:
-    there = [band for band in bands(series.spectrum, series.slow) if band.rms_um == band.rms_um]
+    there = [band for band in spectra.bands(series.spectrum, series.slow) if band.rms_um == band.rms_um]
     if not there:
         return "too short to say"
     said = [f"{number(b.from_hz)}–{number(b.high_hz)} Hz: {number(b.rms_um)} µm" for b in there]
-    return f"{'; '.join(said)}; not seen: what is slower than {span(unseen_s(there))}"
+    return f"{'; '.join(said)}; not seen: what is slower than {span(spectra.unseen_s(there))}"
 
 
 def _pump(analysis: Analysis) -> str:

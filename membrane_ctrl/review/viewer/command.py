@@ -9,8 +9,7 @@ from pathlib import Path
 
 from membrane_ctrl.model import errors, states, terminal
 from membrane_ctrl.review import catalogue, words
-from membrane_ctrl.review.viewer import viewer
-from membrane_ctrl.review.viewer.blueprints import TABS, ReviewBlueprint
+from membrane_ctrl.review.viewer import blueprints, viewer
 from membrane_ctrl.review.viewer.layer import Layer
 from membrane_ctrl.review.viewer.screenshot import screenshot_of
 from membrane_ctrl.run_files.run import Run, open_run
@@ -75,8 +74,8 @@ def _show(file: Path, options: ReviewOptions, cursor_s: float | None) -> int:
 
 def _require_sense(options: ReviewOptions) -> None:
     """No option that is unknown, or that would be passed over in silence."""
-    if options.tab not in TABS:
-        raise errors.InputError(f"--tab {options.tab}: known are {', '.join(TABS)}")
+    if options.tab not in blueprints.TABS:
+        raise errors.InputError(f"--tab {options.tab}: known are {', '.join(blueprints.TABS)}")
     if options.align not in {"hold", "start", "utc"}:
         raise errors.InputError(f"--align {options.align}: known are hold, start, utc")
     if options.around is not None and not options.around.strip():
@@ -139,7 +138,7 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> floa
         maps_um.append(layer.add(run, prefix, zero_s, part_s))
         if prefix:
             print(f"{prefix.strip('/')} is {run.name}", file=sys.stderr)
-    blueprint = ReviewBlueprint(prefixes, shown, runs[0].config.limits.band_um, maps_um)
+    blueprint = blueprints.ReviewBlueprint(prefixes, shown, runs[0].config.limits.band_um, maps_um)
     layer.blueprint(blueprint.made(options.tab))
     layer.close()
     if shown is None:
