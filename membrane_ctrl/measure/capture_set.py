@@ -27,8 +27,6 @@ from membrane_ctrl.model.arrays import FloatArray, Image
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.files import read_bytes
 
-Frames = Image
-
 _DEPTHS = (10, 12, 14, 16)  # bits of a sensor in 16-bit files, when the set does not say
 _READERS = 2
 # All frames of a set are in memory at once: 18 of a camera of 16 megapixels.
@@ -94,7 +92,7 @@ class CaptureSet:
     """
 
     head: CaptureHead
-    frames: Frames
+    frames: Image
     unusable: dict[int, str]
     lost: tuple[int, ...] = ()
 
@@ -156,7 +154,7 @@ def read_set(folder: Path, geometry: GeometryFile | None = None) -> CaptureSet:
     return assemble(head, images)
 
 
-def assemble(head: CaptureHead, images: Sequence[Frames | str]) -> CaptureSet:
+def assemble(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet:
     """Frames of one size and depth in one array; an image that is a text is the reason why there is none.
 
     Raises InputError if no frame is readable, or if most contradict the file's own camera.
@@ -172,7 +170,7 @@ def assemble(head: CaptureHead, images: Sequence[Frames | str]) -> CaptureSet:
         raise InputError(
             f"{path}: camera.width_px, height_px: {size[1]} x {size[0]}, but the images are {seen[1]} x {seen[0]}"
         )
-    frames: Frames = np.zeros((len(images), *size), depth)
+    frames: Image = np.zeros((len(images), *size), depth)
     unusable: dict[int, str] = {}
     for k, image in enumerate(images):
         if isinstance(image, str):
@@ -215,7 +213,7 @@ def _with_reference_displacement(optics: OpticsConfig, displacement_um: float | 
     return optics.model_copy(update={"geometry": geometry.model_copy(update=update)})
 
 
-def _read_image(path: Path) -> Frames | str:
+def _read_image(path: Path) -> Image | str:
     """The image, or why there is none."""
     try:
         image = decoded_image(read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_UNCHANGED)
@@ -227,10 +225,10 @@ def _read_image(path: Path) -> Frames | str:
         return f"unreadable: {image.shape[2]} colour channels instead of one"
     if image.dtype not in (np.uint8, np.uint16):
         return f"wrong bit depth: {image.dtype} pixels"
-    return image  # type: ignore[return-value]  # checked above
+    return image
 
 
-def _depth(head: CaptureHead, frames: Frames, path: Path) -> int:
+def _depth(head: CaptureHead, frames: Image, path: Path) -> int:
     """Bits of the sensor: as stated, else the least of the usual ones that holds the brightest pixel."""
     bits = head.optics.camera.bits
     if not head.bits_stated:

@@ -214,7 +214,7 @@ def bin_figure(optics: OpticsConfig, checked: Checked) -> BinFigure:
     steps = [_combination(checked, axis, moved) for axis in range(len(phase.AXES))]
     followed = np.empty_like(state.accepted)
     # the loop takes any numbers: here means over the bins, hence a bin side of 1 in the combinations
-    phasor.track(sums, state.index, steps, state.sensitivity_rad_per_um, state.accepted, followed)  # type: ignore[arg-type]
+    phasor.track(sums, state.index, steps, state.sensitivity_rad_per_um, state.accepted, followed)
     scale = phase.mm_per_rad(optics.pattern)
     points = state.points.subset(np.ones(state.index.size, bool))
     points.screen_mm[:] = followed[:, 0] * scale - state.offset_mm

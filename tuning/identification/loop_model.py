@@ -83,8 +83,6 @@ def driven_um(flow_um_per_s: Series, dead_time_s: float, lag_s: float, dt_s: flo
     return np.asarray(way + first * dt_s * np.arange(flow_um_per_s.size), dtype=float)
 
 
-Response = ComplexArray
-
 _SLOWEST_RAD_PER_S = 1e-4
 
 
@@ -118,19 +116,19 @@ def frequencies(dt_s: float, points: int = 400) -> Series:
     return np.geomspace(_SLOWEST_RAD_PER_S, np.pi / dt_s, points)
 
 
-def pump_response(model: PlantModel, w_rad_per_s: Series, dt_s: float) -> Response:
+def pump_response(model: PlantModel, w_rad_per_s: Series, dt_s: float) -> ComplexArray:
     """From commanded flow to speed of the centre, without the leak."""
     s = 1j * w_rad_per_s
     return np.asarray(model.gain * np.exp(-s * (model.dead_time_s + dt_s / 2)) / (1 + s * model.lag_s))
 
 
-def controller_response(gains: Gains, w_rad_per_s: Series) -> Response:
+def controller_response(gains: Gains, w_rad_per_s: Series) -> ComplexArray:
     """From error to commanded flow."""
     s = 1j * w_rad_per_s
     return np.asarray(gains.kp_per_s * (1 + 1 / (s * gains.ti_s) + s * gains.td_s) / (1 + s * gains.filter_s))
 
 
-def loop_response(gains: Gains, model: PlantModel, w_rad_per_s: Series, dt_s: float) -> Response:
+def loop_response(gains: Gains, model: PlantModel, w_rad_per_s: Series, dt_s: float) -> ComplexArray:
     """L."""
     integrator = 1 / (1j * w_rad_per_s)
     return controller_response(gains, w_rad_per_s) * pump_response(model, w_rad_per_s, dt_s) * integrator

@@ -6,18 +6,7 @@ from dataclasses import dataclass
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from tuning.identification import characterise, identify, loop_model
 from tuning.identification.disturbance import DisturbanceModel
-from tuning.proposal.candidates import (
-    Demands,
-    amigo,
-    effective_delay_s,
-    lambda_tuned,
-    least_variance,
-    load_peak_um,
-    load_recovery_s,
-    max_ki,
-    simc,
-    ziegler_nichols,
-)
+from tuning.proposal import candidates as rules
 from tuning.proposal.prediction import Predicted, Robustness, least_std_um, predict, robustness
 from tuning.proposal.preview import Preview, preview
 
@@ -68,7 +57,7 @@ def feedforward_settings(loop: LoopConfig, disturbance: DisturbanceModel) -> Loo
 
 def relay_ultimate(model: loop_model.PlantModel, dt_s: float) -> tuple[float, float]:
     """Ultimate gain in 1/s and period in s of the integrator with delay: Ku = pi / (2 k d), Tu = 4 d."""
-    delay_s = effective_delay_s(model, dt_s, 0.0)
+    delay_s = rules.effective_delay_s(model, dt_s, 0.0)
     return math.pi / (2 * model.gain * delay_s), 4 * delay_s
 
 
@@ -78,32 +67,35 @@ def candidate(
     model: loop_model.PlantModel,
     disturbance: DisturbanceModel,
     loop: LoopConfig,
-    demands: Demands,
+    demands: rules.Demands,
 ) -> Candidate:
     """One row."""
     found = loop_model.margins(gains, model, disturbance.rest.dt_s)
     predicted = predict(gains, model, disturbance, loop) if found.stable else None
     ratio = predicted.std_um / least_std_um(model, disturbance, loop) if predicted is not None else math.inf
     step_um_per_s = demands.load_step_um_per_s
-    peak_um, over_s = load_peak_um(gains, model, step_um_per_s), load_recovery_s(gains, model, step_um_per_s)
+    peak_um, over_s = (
+        rules.load_peak_um(gains, model, step_um_per_s),
+        rules.load_recovery_s(gains, model, step_um_per_s),
+    )
     return Candidate(name, gains, found, predicted, ratio, peak_um, over_s)
 
 
 def candidates(
-    model: loop_model.PlantModel, disturbance: DisturbanceModel, loop: LoopConfig, demands: Demands
+    model: loop_model.PlantModel, disturbance: DisturbanceModel, loop: LoopConfig, demands: rules.Demands
 ) -> tuple[Candidate, ...]:
     """All candidates; the first is the one to propose."""
     dt_s, filter_s = disturbance.rest.dt_s, _RULE_FILTER_S
-    delay_s = effective_delay_s(model, dt_s, filter_s)
+    delay_s = rules.effective_delay_s(model, dt_s, filter_s)
     named = {
-        f"least variance, Ms <= {demands.ms:g}": least_variance(model, disturbance, loop, demands),
+        f"least variance, Ms <= {demands.ms:g}": rules.least_variance(model, disturbance, loop, demands),
         "present": loop_model.Gains.of(loop),
-        "SIMC, tc = delay": simc(model, dt_s, filter_s),
-        "SIMC, tc = 4 delays": simc(model, dt_s, filter_s, 4 * delay_s),
-        "AMIGO": amigo(model, dt_s, filter_s),
-        "lambda = 3 delays": lambda_tuned(model, dt_s, filter_s),
-        f"max ki, Ms <= {demands.ms:g}": max_ki(model, dt_s, filter_s, demands.ms),
-        "Ziegler-Nichols": ziegler_nichols(*relay_ultimate(model, dt_s)),
+        "SIMC, tc = delay": rules.simc(model, dt_s, filter_s),
+        "SIMC, tc = 4 delays": rules.simc(model, dt_s, filter_s, 4 * delay_s),
+        "AMIGO": rules.amigo(model, dt_s, filter_s),
+        "lambda = 3 delays": rules.lambda_tuned(model, dt_s, filter_s),
+        f"max ki, Ms <= {demands.ms:g}": rules.max_ki(model, dt_s, filter_s, demands.ms),
+        "Ziegler-Nichols": rules.ziegler_nichols(*relay_ultimate(model, dt_s)),
     }
     return tuple(candidate(name, gains, model, disturbance, loop, demands) for name, gains in named.items())
 
@@ -114,7 +106,7 @@ def propose(
     loop: LoopConfig,
     pump: PumpConfig,
     quality: characterise.FitQuality,
-    demands: Demands | None = None,
+    demands: rules.Demands | None = None,
 ) -> Proposal:
     """Design on identified data.
 
@@ -123,7 +115,7 @@ def propose(
     """
     if quality.verdict == "refused":
         raise RefusedError("; ".join(quality.reasons))
-    demands = demands or Demands()
+    demands = demands or rules.Demands()
     model = identified.model
     if not 0 < model.holding_flow_um_per_s < pump.flow_full_um_per_s:
         raise RefusedError(

@@ -11,8 +11,6 @@ from membrane_ctrl.metrology.phase import AXES, step_weights
 from membrane_ctrl.metrology.phasor import Binner, StepCombination, arctan2
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, IntArray, Singles
 
-Frames = Image
-
 _ENOUGH_BINS = 50_000  # for 36 terms and for the checks of the frames; more only cost time
 _LARGEST_BIN_PX = 4  # curvature of the phase over a larger bin is no longer small
 
@@ -21,7 +19,7 @@ _LARGEST_BIN_PX = 4  # curvature of the phase over a larger bin is no longer sma
 class FrameStack:
     """Frames of a capture set in the order of their patterns."""
 
-    frames: Frames  # (frames, height, width): uint8 or uint16
+    frames: Image  # (frames, height, width): uint8 or uint16
     patterns: tuple[Pattern, ...]  # what each frame should show; sinusoids with their phase step
     displacement_um: FloatArray  # (frames,): laser reading at each, NaN without
     unusable: dict[int, str]  # frames that hold no picture
@@ -140,7 +138,7 @@ def _phases(frames, index, weights, shift_cos, shift_sin, turn, mirror, slope, r
 
 
 def pixel_phases(
-    frames: Frames,
+    frames: Image,
     shifts_rad: FloatArray,
     combined: StepCombination,
     index: IntArray,

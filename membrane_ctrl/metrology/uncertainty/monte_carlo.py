@@ -18,10 +18,9 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, full, reconstruct
 from membrane_ctrl.metrology.checked import Checked
-from membrane_ctrl.metrology.optics import hencky
+from membrane_ctrl.metrology.optics import hencky, zernike
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, parameter_to_coeffs
-from membrane_ctrl.metrology.optics.zernike import values
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread, changed
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
@@ -194,7 +193,7 @@ class HeightMap:
 def height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> FloatArray:
     """Matrix (points, 36) from parameters to heights, 0 at the vertex."""
     x, y = np.asarray(x_mm) / radius_mm, np.asarray(y_mm) / radius_mm
-    out = np.asarray(values(x, y).T @ parameter_to_coeffs())
+    out = np.asarray(zernike.values(x, y).T @ parameter_to_coeffs())
     out[:, -1] += np.polynomial.polynomial.polyval(x * x + y * y, hencky.excess()) / hencky.excess_rms()
     return out
 

@@ -86,8 +86,6 @@ def filled(seconds: windows.SecondsOf, means: LevelMeans, error_um: Column) -> w
     return joined[order], np.concatenate((counts[kept], ticks))[order], np.stack((errors_um, errors_um * np.nan))
 
 
-Single = Singles
-
 NAMES = (
     *summary.FIELDS, "displacement_um", "truth_displacement_um", "feedforward_um_per_s", "flow_wanted_um_per_s",
     "pump_fraction", "lateness_ms", "missed_ticks",
@@ -132,8 +130,8 @@ class HoldPass:
     thin_s: float  # settled seconds whose ticks are not all there: their means are those of the level
     uncovered_s: float  # those whose means the level has not either: no statistics cover them
     # (n,) each: setpoint minus laser reading, target minus true centre; on a grid of ticks, NaN where not settled
-    reading_um: Single
-    true_um: Single
+    reading_um: Singles
+    true_um: Singles
     # `SecondSums.result` of the ticks with a reading (`READING`) and of those with a true centre (`TRUE`): rows of
     # sums are the error (`ERROR`) and what the feed-forward kept away (`KEPT_AWAY`: of the true centre, if known)
     seconds: tuple[windows.SecondsOf, windows.SecondsOf]
