@@ -21,8 +21,7 @@ from membrane_ctrl.geometry.spread_file import read_prior
 from membrane_ctrl.measure.capture_set import read_head
 from membrane_ctrl.metrology.calibrate import parameters, propagate, verdict
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
-from membrane_ctrl.sessions.live_hold import HoldError, LiveHold
-from membrane_ctrl.sessions.progress import Progress
+from membrane_ctrl.sessions.live_hold import HoldError, LiveHold, Progress
 
 USUAL_SETS = 5
 _NEARLY_ALL = 0.9  # of the good range: more would hardly be better

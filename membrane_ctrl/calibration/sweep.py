@@ -14,8 +14,7 @@ from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSessio
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.model import errors, events, run_events, states, telemetry
-from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News
-from membrane_ctrl.sessions.progress import Progress
+from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News, Progress
 
 WHY = "calibration of the optics"
 _LOOK_S = 10.0  # at the pressure and the leak, which are noisy
