@@ -43,12 +43,7 @@ class Conformance(BoardUnderTest):
     async def run(self) -> list[CheckResult]:
         """Make all checks; the first one decides whether the others mean anything.
 
-        Raises
-        ------
-        LinkDownError
-            The board went away.
-        DeviceBusyError
-            Another program holds it.
+        Raises LinkDownError (the board went away), DeviceBusyError (another program holds it).
         """
         findings = [await self._made("identity", "Registers", self._identity)]
         if findings[0].problem:

@@ -32,40 +32,18 @@ class RegisterMapError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """One quantity of the device.
+    """One quantity of the device."""
 
-    Attributes
-    ----------
-    name : str
-        Ends in its unit.
-    address : int
-        Of its first word.
-    type : str
-        "u16", "u32", "i32" or "f32".
-    unit : str
-        "1" for a pure number.
-    counts_per_unit : int
-        value = raw / counts_per_unit.
-    minimum, maximum : float
-        Limits of a write, in the unit; infinite where nothing may be written.
-    access : str
-        "ro" or "rw".
-    meaning : str
-        One line for people.
-    since : int
-        The first map version that has it.
-    """
-
-    name: str
-    address: int
-    type: str
-    unit: str
-    counts_per_unit: int
-    minimum: float
+    name: str  # ends in its unit
+    address: int  # of its first word
+    type: str  # "u16", "u32", "i32" or "f32"
+    unit: str  # "1" for a pure number
+    counts_per_unit: int  # value = raw / counts_per_unit
+    minimum: float  # limit of a write, in the unit; infinite where nothing may be written
     maximum: float
-    access: str
-    meaning: str
-    since: int = 1
+    access: str  # "ro" or "rw"
+    meaning: str  # one line for people
+    since: int = 1  # the first map version that has it
 
     @property
     def words(self) -> int:
@@ -202,11 +180,8 @@ def known_maps() -> dict[int, RegisterMap]:
 def load(path: Path) -> RegisterMap:
     """Read and check a map.
 
-    Raises
-    ------
-    RegisterMapError
-        For a file that is no such map, and for overlaps, gaps, wrong order, unknown types or keys, missing
-        limits and names that do not end in their unit.
+    Raises RegisterMapError for a file that is no such map, and for overlaps, gaps, wrong order, unknown types or
+    keys, missing limits and names that do not end in their unit.
     """
     try:
         return parse(tomllib.loads(path.read_text(encoding="utf-8")))

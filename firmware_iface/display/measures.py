@@ -22,18 +22,10 @@ _BLOCK_PX = 16  # the mean of 256 pixels has a sixteenth of their noise
 
 @dataclass(frozen=True, slots=True)
 class Settling:
-    """What was found.
+    """What was found."""
 
-    Attributes
-    ----------
-    settle_s : float
-        From the command to the start of an exposure.
-    latency_s, tau_s : float
-        Of the model; NaN where the display was too fast for the camera to see it on its way.
-    """
-
-    settle_s: float
-    latency_s: float
+    settle_s: float  # from the command to the start of an exposure
+    latency_s: float  # of the model; NaN where the display was too fast for the camera to see it on its way
     tau_s: float
 
 
@@ -54,6 +46,8 @@ def share_left(frame: ArrayLike, before: ArrayLike, after: ArrayLike) -> float:
 def settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settling:
     """Latency, time constant and the time to wait.
 
+    Raises ValueError if the display never settles.
+
     Parameters
     ----------
     delay_s : (K,) array
@@ -62,11 +56,6 @@ def settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settlin
         What was left of the step (`share_left`).
     noise : float
         What `left` is when nothing is left.
-
-    Raises
-    ------
-    ValueError
-        If the display never settles.
     """
     delays, shares = np.asarray(delay_s, np.float64), np.asarray(left, np.float64)
     order = np.argsort(delays)
@@ -107,7 +96,6 @@ def block_means(image: ArrayLike) -> FloatArray:
 
 
 # Is the camera's exposure right for the screen? From one frame of white and one of black.
-
 
 _SATURATED_SHARE = 0.001  # of the pixels: dust and glints
 _TARGET = 0.8  # of full scale, for the brightest pixels but a hundredth
@@ -163,7 +151,6 @@ def _two_digits(number: float) -> str:
 # light everywhere. A scaler in between mixes neighbours before the display's gamma: 0 and 255 become 127, which is a
 # quarter of the light (gamma 2.2: 0.22); where its grid and the panel's agree again the half comes back. So a panel
 # that announces 1360 and has 1366 columns shows six bands.
-
 
 _LIT_SHARE = 0.3  # of the brightest block: where the mirror shows the screen
 _LEAST_LIT = 0.02  # of all blocks

@@ -19,18 +19,10 @@ _LARGEST_STEP_BACK = 0.02
 
 @dataclass(frozen=True, slots=True)
 class DisplayResponse:
-    """Light against level.
+    """Light against level."""
 
-    Attributes
-    ----------
-    levels : (K,) array
-        Rising, first 0 and last 255.
-    light : (K,) array
-        0..1, strictly rising.
-    """
-
-    levels: FloatArray
-    light: FloatArray
+    levels: FloatArray  # (K,), rising, first 0 and last 255
+    light: FloatArray  # (K,), 0..1, strictly rising
 
     @property
     def gamma(self) -> float:
@@ -57,17 +49,14 @@ def linear_response() -> DisplayResponse:
 def measured_response(levels: ArrayLike, seen_adu: ArrayLike) -> DisplayResponse:
     """The response from a ramp.
 
+    Raises ValueError if the camera saw no ramp, with the remedy.
+
     Parameters
     ----------
     levels : (K,) array
         What was shown, rising, from 0 to 255.
     seen_adu : (K,) array
         What the camera saw, unsaturated.
-
-    Raises
-    ------
-    ValueError
-        If the camera saw no ramp, with the remedy.
     """
     shown, seen = np.asarray(levels, np.float64), np.asarray(seen_adu, np.float64)
     if (
@@ -92,7 +81,6 @@ def measured_response(levels: ArrayLike, seen_adu: ArrayLike) -> DisplayResponse
 
 # Patterns as the pixels of a screen (docs/interfaces.md section 2).
 
-
 _GRAY_BITS = 4
 
 
@@ -100,28 +88,15 @@ _GRAY_BITS = 4
 class ScreenRaster:
     """The screen's pixels, and the pattern region on them: a square centred on O'.
 
-    Attributes
-    ----------
-    width_px, height_px : int
-    pixel_mm : float
-        Pitch.
-    periods : int
-    period_mm : float
-    centre_px : (column, row) or None
-        Where O' is; None: the middle of the screen.
-
-    Raises
-    ------
-    ValueError
-        If the region does not fit on the screen.
+    Raises ValueError if the region does not fit on the screen.
     """
 
     width_px: int
     height_px: int
-    pixel_mm: float
+    pixel_mm: float  # pitch
     periods: int
     period_mm: float
-    centre_px: tuple[float, float] | None = None
+    centre_px: tuple[float, float] | None = None  # (column, row) of O'; None: the middle of the screen
 
     def __post_init__(self) -> None:
         (column, row), half_px = self.centre, self.half_side_mm / self.pixel_mm
@@ -155,10 +130,7 @@ class ScreenRaster:
 def pattern_light(pattern: Pattern, raster: ScreenRaster) -> NDArray[np.float32]:
     """Light (0..1) of every pixel, (height, width); dark outside the region.
 
-    Raises
-    ------
-    ValueError
-        For a role or Gray bit that is unknown.
+    Raises ValueError for a role or Gray bit that is unknown.
     """
     inside = {axis: _inside(raster.from_low_edge_mm(axis), 2 * raster.half_side_mm) for axis in "xy"}
     lit = {axis: inside[axis].astype(np.float32) for axis in "xy"}

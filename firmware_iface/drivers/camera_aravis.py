@@ -39,33 +39,18 @@ _TAKEN = (arv.NOT_CONTROLLER, arv.ACCESS_DENIED, arv.BUSY)
 
 @dataclass(frozen=True, slots=True)
 class AravisSettings:
-    """How to set the camera.
+    """How to set the camera."""
 
-    Attributes
-    ----------
-    camera_id : str
-        As `membrane-ctrl devices` lists it, or an address; empty: the first that is found.
-    width_px, height_px : int
-        The whole sensor; another size is refused.
-    pixel_format : str
-        A key of `firmware_iface.links.aravis.PIXEL_FORMATS`. Bayer needs no demosaicing: each pixel's phase is
-        independent of its gain.
-    exposure_ms : float
-    gain_db : float
-    packet_bytes : int
-        Of a GigE Vision stream; 0 leaves what the camera has.
-    timeout_s : float
-        For a frame, from the end of its exposure.
-    """
-
-    camera_id: str = ""
-    width_px: int = 2448
+    camera_id: str = ""  # as `membrane-ctrl devices` lists it, or an address; empty: the first that is found
+    width_px: int = 2448  # the whole sensor; another size is refused
     height_px: int = 2048
+    # a key of `firmware_iface.links.aravis.PIXEL_FORMATS`. Bayer needs no demosaicing: each pixel's phase is
+    # independent of its gain
     pixel_format: str = "Mono8"
     exposure_ms: float = 20.0
     gain_db: float = 0.0
-    packet_bytes: int = 0
-    timeout_s: float = 1.0
+    packet_bytes: int = 0  # of a GigE Vision stream; 0 leaves what the camera has
+    timeout_s: float = 1.0  # for a frame, from the end of its exposure
 
     @property
     def name(self) -> str:
@@ -88,15 +73,10 @@ class AravisCamera:
 
     Parameters
     ----------
-    settings : AravisSettings
     now : callable
         The run's clock.
     sleep : callable
         Waits on it.
-
-    Attributes
-    ----------
-    counts : FrameCounts
     """
 
     def __init__(
@@ -116,12 +96,8 @@ class AravisCamera:
     def open(self) -> DeviceIdentity:
         """Connect, apply the settings, read them back, start the stream.
 
-        Raises
-        ------
-        LinkError
-            No library, no camera, camera in use.
-        DeviceRefusedError
-            A setting that the camera does not take.
+        Raises LinkError (no library, no camera, camera in use), DeviceRefusedError (a setting that the camera does
+        not take).
         """
         self.close()
         library, settings = arv.aravis(), self.settings
@@ -143,10 +119,7 @@ class AravisCamera:
     def expose(self, out: Pixels | None = None) -> None:
         """Trigger, and return when the exposure is over: the screen may change while the frame is transferred.
 
-        Raises
-        ------
-        LinkError
-            No camera.
+        Raises LinkError without a camera.
         """
         if self._stream is None:
             self.open()
@@ -165,12 +138,8 @@ class AravisCamera:
     def fetch(self) -> Frame:
         """The frame of the last `expose`, in its `out` if one was given.
 
-        Raises
-        ------
-        FrameLostError
-            It did not come, or not whole: show the pattern again and expose again.
-        LinkError
-            Nothing was exposed.
+        Raises FrameLostError (it did not come, or not whole: show the pattern again and expose again), LinkError
+        (nothing was exposed).
         """
         if self._pending is None or self._stream is None:
             raise LinkError(f"{self.settings.name}: no exposure to fetch")
@@ -201,15 +170,12 @@ class AravisCamera:
     def grab(self, out: Pixels | None = None) -> Frame:
         """One exposure, taken again when it is lost.
 
+        Raises LinkError (no camera, or three frames lost in a row).
+
         Parameters
         ----------
         out : (height, width) array, optional
             Where the pixels go; else a new array.
-
-        Raises
-        ------
-        LinkError
-            No camera, or three frames lost in a row.
         """
         return regrab(self, out)
 

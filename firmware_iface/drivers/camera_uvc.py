@@ -26,45 +26,29 @@ class Capture(Protocol):
 
     def isOpened(self) -> bool:  # noqa: N802 (OpenCV's name)
         """There is a camera."""
-        ...
 
     def read(self) -> tuple[bool, Any]:
         """Whether there was a frame, and the frame."""
-        ...
 
     def set(self, prop: int, value: float) -> bool:
         """Whether the property is known to the camera."""
-        ...
 
     def get(self, prop: int) -> float:
         """A property."""
-        ...
 
     def release(self) -> None:
         """Give the camera back."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
 class UvcSettings:
-    """How to set the camera.
+    """How to set the camera."""
 
-    Attributes
-    ----------
-    port : str
-        Its number, or its path such as /dev/video0 (better: below /dev/v4l/by-id).
-    width_px, height_px : int
-    exposure : float
-        In the camera's own unit, often 0.1 ms; 0 leaves it as it is.
-    gain : float
-        In the camera's own unit; 0 leaves it as it is.
-    """
-
-    port: str = "0"
+    port: str = "0"  # its number, or its path such as /dev/video0 (better: below /dev/v4l/by-id)
     width_px: int = 1920
     height_px: int = 1080
-    exposure: float = 0.0
-    gain: float = 0.0
+    exposure: float = 0.0  # in the camera's own unit, often 0.1 ms; 0 leaves it as it is
+    gain: float = 0.0  # in the camera's own unit; 0 leaves it as it is
 
 
 class UvcCamera:
@@ -72,7 +56,6 @@ class UvcCamera:
 
     Parameters
     ----------
-    settings : UvcSettings
     now : callable
         The run's clock.
     capture : callable
@@ -119,10 +102,7 @@ class UvcCamera:
     def grab(self, out: NDArray[np.uint8] | None = None) -> Frame:
         """The next whole frame that was begun after the call, as grey (the green channel of a colour camera).
 
-        Raises
-        ------
-        LinkDownError
-            The camera went away.
+        Raises LinkDownError (the camera went away).
         """
         if self._capture is None:
             self.open()

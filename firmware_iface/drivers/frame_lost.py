@@ -21,11 +21,9 @@ class ExposingCamera(Protocol):
 
     def expose(self, out: NDArray[np.uint8] | NDArray[np.uint16] | None = None) -> None:
         """Trigger, and return when the exposure is over. Raises LinkError."""
-        ...
 
     def fetch(self) -> Frame:
         """The frame of the last `expose`. Raises FrameLostError, LinkError."""
-        ...
 
 
 def regrab(camera: ExposingCamera, out: NDArray[np.uint8] | NDArray[np.uint16] | None = None) -> Frame:

@@ -39,7 +39,7 @@ _STEPS_UM = {3: 1.0, 2: 10.0, 1: 100.0}  # decimals of the millimetre
 class KeyenceDlRs1a(LinkedDevice):
     """A `DisplacementSensor`.
 
-    Displacement = direction * (value - zero).
+    Displacement = direction * (value - zero). Raises ValueError (settings that the unit does not have).
 
     Parameters
     ----------
@@ -58,11 +58,6 @@ class KeyenceDlRs1a(LinkedDevice):
         A reading farther than this from both before it is not believed.
     timeout_s : float
         For an answer.
-
-    Raises
-    ------
-    ValueError
-        Settings that the unit does not have.
     """
 
     def __init__(
@@ -102,12 +97,8 @@ class KeyenceDlRs1a(LinkedDevice):
     async def open(self) -> DeviceIdentity:
         """Open the port, see that the amplifier is there and well. The unit has no settings of its own to apply.
 
-        Raises
-        ------
-        LinkError
-            No valid answer; LinkDownError without a port.
-        DeviceRefusedError
-            No such amplifier, one in error, or one with steps coarser than `step_max_um`.
+        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (no such amplifier, one
+        in error, or one with steps coarser than `step_max_um`).
         """
         await self._link.close()
         self._gate = StepGate(self._step_max_um)
@@ -141,14 +132,8 @@ class KeyenceDlRs1a(LinkedDevice):
     async def displacement(self) -> DisplacementSample:
         """Ask for the value now.
 
-        Counter and time are the driver's: valid answers so far, time of arrival.
-
-        Raises
-        ------
-        LinkError
-            No valid answer, or a jump that is not believed before it is repeated.
-        LinkDownError
-            The port is gone.
+        Counter and time are the driver's: valid answers so far, time of arrival. Raises LinkError (no valid answer,
+        or a jump that is not believed before it is repeated), LinkDownError (the port is gone).
         """
         quality, displacement_um, passed = await self._reading()
         if not passed:

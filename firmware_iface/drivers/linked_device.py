@@ -9,12 +9,10 @@ class Reconnecting(Protocol):
     @property
     def reconnects(self) -> int:
         """Times it was opened after the first."""
-        ...
 
     @property
     def retry_in_s(self) -> float:
         """Time until it will try to open."""
-        ...
 
 
 class LinkedDevice:

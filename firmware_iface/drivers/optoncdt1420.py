@@ -37,7 +37,8 @@ class Optoncdt1420(linked_device.LinkedDevice):
 
     Displacement = direction * (distance - zero). The sensor stands behind the mirror: when the bowl deepens the
     vertex comes nearer, so the default direction is -1. Counter and time are the driver's: trusted values so far,
-    time of arrival. A sensor that repeats itself repeats its counter too, and that is no new value.
+    time of arrival. A sensor that repeats itself repeats its counter too, and that is no new value. Raises ValueError
+    (a rate the sensor does not have, or that this baud rate cannot carry).
 
     Parameters
     ----------
@@ -57,11 +58,6 @@ class Optoncdt1420(linked_device.LinkedDevice):
         A reading farther than this from both before it is not believed.
     timeout_s : float
         For an answer, and for a value to come when none has since the last reading.
-
-    Raises
-    ------
-    ValueError
-        A rate the sensor does not have, or that this baud rate cannot carry.
     """
 
     def __init__(
@@ -105,12 +101,8 @@ class Optoncdt1420(linked_device.LinkedDevice):
     async def open(self) -> DeviceIdentity:
         """Open the port, stop the stream, check who it is, set it and read it back, start the stream.
 
-        Raises
-        ------
-        LinkError
-            No valid answer; LinkDownError without a port.
-        DeviceRefusedError
-            Another device, another range, or a setting that is not taken.
+        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another device, another
+        range, or a setting that is not taken).
         """
         await self.close()
         self._settle_anew()
@@ -197,12 +189,8 @@ class Optoncdt1420(linked_device.LinkedDevice):
     async def displacement(self) -> DisplacementSample:
         """Middle of all values since the last call; waits for one when there is none yet.
 
-        Raises
-        ------
-        LinkError
-            No value in time, or one that cannot be: it is dropped.
-        LinkDownError
-            The port is gone, or the sensor stopped streaming: open it again.
+        Raises LinkError (no value in time, or one that cannot be: it is dropped), LinkDownError (the port is gone, or
+        the sensor stopped streaming: open it again).
         """
         try:
             await self._wait_for_values()

@@ -80,12 +80,8 @@ class VaisalaPtb330(LinkedDevice):
     async def open(self) -> DeviceIdentity:
         """Open the port, stop what it sends by itself, check who it is, set unit and format, start to ask.
 
-        Raises
-        ------
-        LinkError
-            No valid answer; LinkDownError without a port.
-        DeviceRefusedError
-            Another instrument, or a format that is not taken.
+        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another instrument, or a
+        format that is not taken).
         """
         await self.close()
         self._newest, self._newest_s, self._down = BarometerMessage(math.nan, -1, ""), -math.inf, None
@@ -156,10 +152,7 @@ class VaisalaPtb330(LinkedDevice):
     async def ambient_pressure_pa(self) -> float:
         """The newest value, NaN when it is too old or the instrument has none.
 
-        Raises
-        ------
-        LinkDownError
-            The port is gone: open it again.
+        Raises LinkDownError (the port is gone: open it again).
         """
         if self._down is not None:
             raise LinkDownError(str(self._down))
@@ -188,10 +181,7 @@ class VaisalaPtb330(LinkedDevice):
 def decode_message(message: re.Match[str], name: str) -> BarometerMessage:
     """Check and convert a message that has the form of `FORMAT`.
 
-    Raises
-    ------
-    LinkError
-        Wrong checksum, or a pressure that the instrument cannot measure.
+    Raises LinkError (wrong checksum, or a pressure that the instrument cannot measure).
     """
     checked, pressure, flags, counter, serial, checksum = message.groups()
     if sum(checked.encode("ascii")) % 2**16 != int(checksum, 16):

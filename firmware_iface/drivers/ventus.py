@@ -30,6 +30,8 @@ _STEP_MW = 0.0011  # values are written with three decimals
 class Ventus(LinkedDevice):
     """A `Pump`: the fraction is that of `power_max_mw`.
 
+    Raises ValueError (more power than these pumps are made for).
+
     Parameters
     ----------
     port : str or BytePort
@@ -38,11 +40,6 @@ class Ventus(LinkedDevice):
         Full drive.
     timeout_s : float
         For an answer.
-
-    Raises
-    ------
-    ValueError
-        More power than these pumps are made for.
     """
 
     def __init__(
@@ -63,12 +60,8 @@ class Ventus(LinkedDevice):
     async def open(self) -> DeviceIdentity:
         """Open the port, stop the pump, check who it is, apply the settings and read them back.
 
-        Raises
-        ------
-        LinkError
-            No valid answer; LinkDownError without a port.
-        DeviceRefusedError
-            Another device, or a setting that is not taken.
+        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another device, or a
+        setting that is not taken).
         """
         await self._link.close()
         # off at once, also when nothing else works; a stream would never leave the line quiet
@@ -106,14 +99,8 @@ class Ventus(LinkedDevice):
     async def set_pump(self, fraction: float) -> None:
         """Command the pump and read it back.
 
-        Raises
-        ------
-        ValueError
-            Not within 0..1; nothing is sent.
-        LinkError
-            No valid answer: the pump may or may not have it.
-        LinkDownError
-            The port is gone, or the pump does not have what was written: open it again.
+        Raises ValueError (not within 0..1; nothing is sent), LinkError (no valid answer: the pump may or may not have
+        it), LinkDownError (the port is gone, or the pump does not have what was written: open it again).
         """
         if not 0.0 <= fraction <= 1.0:
             raise ValueError(f"pump fraction = {fraction} is not within 0..1")
@@ -124,12 +111,8 @@ class Ventus(LinkedDevice):
     async def pump_fraction(self) -> float:
         """Read back what the pump is set to.
 
-        Raises
-        ------
-        LinkError
-            No valid answer, or the pump reports an error.
-        LinkDownError
-            The port is gone, or the pump is set to something that it was not told: open it again.
+        Raises LinkError (no valid answer, or the pump reports an error), LinkDownError (the port is gone, or the pump
+        is set to something that it was not told: open it again).
         """
         return await self._check(await self._write_and_read({}, *_STATE)) / self._power_max_mw
 

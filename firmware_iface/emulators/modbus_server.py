@@ -36,11 +36,9 @@ class RegisterTable(Protocol):
 
     def read(self, address: int, count: int) -> list[int]:
         """Words. Raises RegisterRefusal."""
-        ...
 
     def write(self, address: int, words: Sequence[int]) -> None:
         """All of it or nothing. Raises RegisterRefusal."""
-        ...
 
 
 def respond(pdu: bytes, table: RegisterTable) -> bytes:
@@ -94,24 +92,12 @@ def _words_written(data: bytes, most: int) -> tuple[int, list[int]]:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What goes back for a request.
+    """What goes back for a request."""
 
-    Attributes
-    ----------
-    pdu : bytes
-        Empty: nothing is sent.
-    delay_s : float
-        Sent this much later; later requests of the connection are answered meanwhile.
-    hang_up : bool
-        The connection is dropped instead.
-    transaction_offset : int
-        Added to the transaction id; other than 0 it is a wrong answer.
-    """
-
-    pdu: bytes = b""
-    delay_s: float = 0.0
-    hang_up: bool = False
-    transaction_offset: int = 0
+    pdu: bytes = b""  # empty: nothing is sent
+    delay_s: float = 0.0  # sent this much later; later requests of the connection are answered meanwhile
+    hang_up: bool = False  # the connection is dropped instead
+    transaction_offset: int = 0  # added to the transaction id; other than 0 it is a wrong answer
 
 
 Handler = Callable[[int, bytes], Answer]
@@ -215,7 +201,6 @@ class _Connection(asyncio.Protocol):
 
 
 # Any Modbus device as an RTU slave on an emulated serial line, alone or with others on the same bus.
-
 
 _SHORTEST = 4  # unit, function, CRC
 _SILENCE_S = 0.005  # far above the 1.75 ms of the standard: a program's bytes may be held up between two reads

@@ -20,37 +20,19 @@ from firmware_iface.roles import LinkDownError
 
 @dataclass(slots=True)
 class SerialFaults:
-    """What is wrong with the line or the device; each can be switched on and off while it runs.
+    """What is wrong with the line or the device; each can be switched on and off while it runs."""
 
-    Attributes
-    ----------
-    silent : bool
-        Questions are carried out and not answered.
-    deaf : bool
-        Questions do not arrive.
-    delay_s : float
-        Answers come this much later; longer than the asker waits, it is a late reply. Answers keep their order.
-    garbage_bytes : int
-        So many random bytes in place of each answer.
-    bit_errors : int
-        So many bits of each answer are turned over. On a line with parity, a byte with an odd number of them is
-        dropped, as the receiver does.
-    question_bit_errors : int
-        So many bits of each question are turned over.
-    cut_bytes : int
-        So many bytes are missing at the end of each answer.
-    frozen : bool
-        The measured value stays what it was.
-    """
-
-    silent: bool = False
-    deaf: bool = False
+    silent: bool = False  # questions are carried out and not answered
+    deaf: bool = False  # questions do not arrive
+    # answers come this much later; longer than the asker waits, it is a late reply. Answers keep their order
     delay_s: float = 0.0
-    garbage_bytes: int = 0
+    garbage_bytes: int = 0  # so many random bytes in place of each answer
+    # so many bits of each answer are turned over. On a line with parity, a byte with an odd number of them is
+    # dropped, as the receiver does
     bit_errors: int = 0
-    question_bit_errors: int = 0
-    cut_bytes: int = 0
-    frozen: bool = False
+    question_bit_errors: int = 0  # so many bits of each question are turned over
+    cut_bytes: int = 0  # so many bytes are missing at the end of each answer
+    frozen: bool = False  # the measured value stays what it was
 
 
 class SerialDevice:
@@ -183,7 +165,6 @@ class LineDevice(SerialDevice):
 
 
 # What lies between a program and an emulated serial device: a pseudo-terminal, or nothing but time.
-
 
 _READ_BYTES = 65_536
 _SPEED = 4  # place of the input speed in what tcgetattr gives; the output speed follows

@@ -28,24 +28,13 @@ _FAILURES_MAX = 5
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is sent, and how its answer is known.
+    """What is sent, and how its answer is known."""
 
-    Attributes
-    ----------
-    data : bytes
-        Sent as it is.
-    take : callable
-        Of all bytes heard so far: the answer, None while more must come. Raises LinkError when they are no answer.
-    answer_bytes : int
-        Length of the longest answer: its time on the wire comes on top of the device's own.
-    what : str
-        For messages: device and what is asked.
-    """
-
-    data: bytes
+    data: bytes  # sent as it is
+    # of all bytes heard so far: the answer, None while more must come. Raises LinkError when they are no answer
     take: Callable[[bytes], bytes | None]
-    answer_bytes: int
-    what: str
+    answer_bytes: int  # length of the longest answer: its time on the wire comes on top of the device's own
+    what: str  # for messages: device and what is asked
 
 
 class SerialExchange:
@@ -87,15 +76,12 @@ class SerialExchange:
     def connect(self, greeting: bytes = b"") -> None:
         """Open the line; what devices may still owe to an earlier user is not believed.
 
+        Raises LinkDownError (the port does not open).
+
         Parameters
         ----------
         greeting : bytes
             Sent at once, and whatever comes back is thrown away: for a device that talks unasked until told to stop.
-
-        Raises
-        ------
-        LinkDownError
-            The port does not open.
         """
         self._port.open(self)
         self._sure.clear()
@@ -115,7 +101,8 @@ class SerialExchange:
     async def ask(self, question: Question, timeout_s: float, fence: Question | None, key: int = 0) -> bytes:
         """The answer to a question.
 
-        Devices that wait are served in turn, each with one question.
+        Devices that wait are served in turn, each with one question. Raises LinkError (no valid answer),
+        LinkDownError (the line is closed or went away).
 
         Parameters
         ----------
@@ -127,13 +114,6 @@ class SerialExchange:
             See the module; None for a device that has none, which `quiet_s` alone then protects.
         key : int
             Which device of the line.
-
-        Raises
-        ------
-        LinkError
-            No valid answer.
-        LinkDownError
-            The line is closed or went away.
         """
         async with self._key_turns[key]:
             await self._turn.acquire()  # cancelled while waiting here, a question is never sent
@@ -232,7 +212,6 @@ class SerialExchange:
 
 # One device that is asked in lines of text.
 
-
 _SHOWN_CHARS = 60
 _LINE_ENDS = b"\r\n"
 
@@ -300,6 +279,8 @@ class LineLink:
     async def query(self, command: str, answer: re.Pattern[str], longest: int = 80) -> re.Match[str]:
         """The answer to a command, whose whole text has the given form (line ends included).
 
+        Raises LinkError (no answer of this form in time), LinkDownError (the line is gone).
+
         Parameters
         ----------
         command : str
@@ -308,13 +289,6 @@ class LineLink:
             Has to match everything that comes, line ends before it aside, and nothing that is still incomplete.
         longest : int
             Characters of the longest answer; more are no answer.
-
-        Raises
-        ------
-        LinkError
-            No answer of this form in time.
-        LinkDownError
-            The line is gone.
         """
         fence = self._question(self._fence.command, self._fence.answer, self._fence.longest)
         heard = await self._exchange.ask(self._question(command, answer, longest), self._timeout_s, fence)

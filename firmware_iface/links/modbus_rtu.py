@@ -167,14 +167,8 @@ class GuardedModbusRtu:
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         """Write holding registers (function code 16) and check the echo.
 
-        Raises
-        ------
-        LinkError
-            No valid reply in time: the device may or may not have carried it out.
-        LinkDownError
-            The port is gone; the same holds.
-        DeviceRefusedError
-            The device refused and changed nothing.
+        Raises LinkError (no valid reply in time: the device may or may not have carried it out), LinkDownError (the
+        port is gone; the same holds), DeviceRefusedError (the device refused and changed nothing).
         """
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
         pdu = struct.pack(
@@ -216,12 +210,7 @@ def take_reply(heard: bytes, unit_id: int, function_code: int, answer_bytes: int
     """The PDU of a whole reply, None while bytes are missing.
 
     The length is known beforehand: silences between bytes, by which RTU frames are delimited on the wire, do not
-    survive the buffers of adapters and kernels.
-
-    Raises
-    ------
-    LinkError
-        Another unit, function, length or CRC.
+    survive the buffers of adapters and kernels. Raises LinkError (another unit, function, length or CRC).
     """
     if heard[0] != unit_id:
         raise LinkError(f"{what}: answer of unit {heard[0]}, asked was {unit_id}")

@@ -99,11 +99,9 @@ class Receiver(Protocol):
 
     def received(self, data: bytes) -> None:
         """Bytes came."""
-        ...
 
     def lost(self, error: LinkDownError) -> None:
         """The port is gone and closed."""
-        ...
 
 
 class BytePort(Protocol):
@@ -112,47 +110,40 @@ class BytePort(Protocol):
     @property
     def name(self) -> str:
         """For messages."""
-        ...
 
     @property
     def settings(self) -> SerialSettings:
         """Of the line."""
-        ...
 
     @property
     def is_open(self) -> bool:
         """Whether bytes can flow."""
-        ...
 
     @property
     def reconnects(self) -> int:
         """Times it was opened after the first."""
-        ...
 
     @property
     def retry_in_s(self) -> float:
         """Time until `open` will try."""
-        ...
 
     def open(self, receiver: Receiver) -> None:
         """Open anew. Raises LinkDownError or DeviceRefusedError."""
-        ...
 
     def write(self, data: bytes) -> None:
         """Hand over bytes for sending. Raises LinkDownError or LinkError."""
-        ...
 
     def succeeded(self) -> None:
         """A valid answer came: the next `open` may be at once."""
-        ...
 
     def close(self) -> None:
         """Close; never raises."""
-        ...
 
 
 class SerialPort:
     """A serial port of this machine.
+
+    Raises ValueError (the name is neither).
 
     Parameters
     ----------
@@ -162,11 +153,6 @@ class SerialPort:
         Of the line.
     clock : callable
         Seconds on any axis that does not go back; for the back-off.
-
-    Raises
-    ------
-    ValueError
-        The name is neither.
     """
 
     def __init__(self, port: str, settings: SerialSettings, clock: Callable[[], float] = time.monotonic) -> None:
@@ -208,12 +194,8 @@ class SerialPort:
     def open(self, receiver: Receiver) -> None:
         """Open anew, as the only user of the port.
 
-        Raises
-        ------
-        LinkDownError
-            Not there, busy, not permitted, or not yet time for the next attempt.
-        DeviceRefusedError
-            Several adapters have this USB identity.
+        Raises LinkDownError (not there, busy, not permitted, or not yet time for the next attempt),
+        DeviceRefusedError (several adapters have this USB identity).
         """
         if (wait_s := self.retry_in_s) > 0:
             raise LinkWaitsError(f"{self._port}: next attempt to open in {wait_s:.1f} s")
@@ -228,12 +210,8 @@ class SerialPort:
     def write(self, data: bytes) -> None:
         """Hand over bytes for sending.
 
-        Raises
-        ------
-        LinkDownError
-            The port is closed or just went away.
-        LinkError
-            The kernel's buffer is full: nothing is being sent.
+        Raises LinkDownError (the port is closed or just went away), LinkError (the kernel's buffer is full: nothing
+        is being sent).
         """
         if self._serial is None:
             raise LinkDownError(f"{self._port}: not open")

@@ -36,12 +36,7 @@ def check_port_name(name: str) -> str:
 def port_path(name: str, comports: Callable[[], Iterable[Any]] = list_ports.comports) -> str:
     """Where the port of this name is now.
 
-    Raises
-    ------
-    LinkDownError
-        Not plugged in.
-    DeviceRefusedError
-        Several adapters answer to the name.
+    Raises LinkDownError (not plugged in), DeviceRefusedError (several adapters answer to the name).
     """
     wanted = _USB_NAME.fullmatch(name)
     if wanted is None:

@@ -35,11 +35,9 @@ class Reconstructor(Protocol):
 
     def full(self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray) -> ShapeEstimate:
         """Figure from sinusoids, Gray codes, white and black, in the order of the full sequence."""
-        ...
 
     def fringes(self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray) -> ShapeEstimate:
         """Figure from the sinusoids alone, tracked against the last absolute phase."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

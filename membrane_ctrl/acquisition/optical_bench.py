@@ -35,7 +35,6 @@ class TestCamera(Protocol):
 
     def grab(self) -> Frame:
         """One exposure. Raises LinkError."""
-        ...
 
 
 class TestScreen(Protocol):
@@ -43,7 +42,6 @@ class TestScreen(Protocol):
 
     def show_levels(self, levels: Levels) -> None:
         """Send an image to the display, level for level; not waited for. Raises LinkError."""
-        ...
 
 
 class DisplayTest:
@@ -81,12 +79,7 @@ class DisplayTest:
     def settling(self) -> Settling:
         """Time from a command to the light, over steps both ways between black, white and two greys.
 
-        The greys are there because panels are slowest between them.
-
-        Raises
-        ------
-        ValueError
-            If the display never settles.
+        The greys are there because panels are slowest between them. Raises ValueError if the display never settles.
         """
         delays_s: list[float] = []
         left: list[float] = []
@@ -158,10 +151,7 @@ class OpticalBench:
 def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
     """The drivers that `[devices.camera]` and `[devices.screen]` name, not yet open.
 
-    Raises
-    ------
-    LinkError
-        If the configuration names none, or patterns that do not fit on the screen.
+    Raises LinkError if the configuration names none, or patterns that do not fit on the screen.
     """
     devices = config.devices
     if devices is None or devices.camera is None:
@@ -215,20 +205,15 @@ class BenchFindings:
 def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchFindings:
     """Connect camera and screen, and let the camera measure the screen.
 
-    What is found wrong does not keep a run from trying: its cycles are judged one by one.
+    What is found wrong does not keep a run from trying: its cycles are judged one by one. Raises LinkError if one of
+    them is not there or not usable.
 
     Parameters
     ----------
     bench : OpticalBench
         From `configured_bench`.
-    config : Config
     clock : CycleClock
         The run's clock.
-
-    Raises
-    ------
-    LinkError
-        If one of them is not there or not usable.
     """
     identity = bench.camera.open()
     who = " ".join(part for part in (identity.kind, identity.serial, identity.detail) if part)

@@ -150,12 +150,8 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
     """Prepare, then measure until told to stop.
 
     Until the first cycle `processes.STOP` simply ends the process, as nothing is held that would need care and a
-    kernel that is being compiled cannot be asked; from then on it ends the cycle at its next exposure.
-
-    Raises
-    ------
-    LinkError
-        If no camera is configured, or its patterns do not fit on the screen.
+    kernel that is being compiled cannot be asked; from then on it ends the cycle at its next exposure. Raises
+    LinkError if no camera is configured, or its patterns do not fit on the screen.
     """
     remote.listen()  # the first word, which promises the next one for when all this is over
     remote.report("preparing", "tracing the first picture, compiling what is not compiled yet")

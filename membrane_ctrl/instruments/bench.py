@@ -35,10 +35,7 @@ _SERIAL_DRIVERS = {
 def role_devices(devices: DevicesConfig) -> role_bench.RoleDevices:
     """The drivers that the tables name, not yet connected; those on one serial bus share it.
 
-    Raises
-    ------
-    InputError
-        A port, URL, preset or setting that the driver does not take.
+    Raises InputError (a port, URL, preset or setting that the driver does not take).
     """
     links = modbus_links.ModbusLinks()
     made: dict[str, Any] = {}
@@ -114,10 +111,7 @@ def pump_board(devices: DevicesConfig, url: str) -> PumpBoard:
 async def connect(bench: roles.Bench, devices: DevicesConfig) -> roles.BenchIdentity:
     """Open the bench, with patience for a device that is not there yet and none for one that is the wrong one.
 
-    Raises
-    ------
-    DeviceError
-        One line that names the device and what is wrong.
+    Raises DeviceError (one line that names the device and what is wrong).
     """
     return await patiently(bench.open, devices.board or "devices")  # a composed bench names the role itself
 

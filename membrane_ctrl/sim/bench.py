@@ -30,40 +30,19 @@ _STEPS_AT_ONCE = 4000  # some 10 ms of work: after a stall, clients are answered
 
 @dataclass(frozen=True, slots=True)
 class BenchSpec:
-    """What a bench process needs to know; picklable.
-
-    Attributes
-    ----------
-    twin, pump : TwinConfig, PumpConfig
-        The plant.
-    clock : RunClock
-        The run's clock, on which the truth is stamped.
-    port : int
-        Where to listen; 0: any free port.
-    host : str
-        Address to listen on.
-    speed : float
-        Plant seconds a second.
-    truth : RingAddress or None
-        Where to publish `Truth.pack()` with every sample.
-    linger_s : float
-        How long the bench outlives the process that started it, so that the tripped watchdog can be seen.
-    events : tuple of Event
-        What happens when, in plant time (0 at the start).
-    lab : DevicesConfig or None
-        Serve these instruments in place of the pump board.
-    """
+    """What a bench process needs to know; picklable."""
 
     twin: TwinConfig
     pump: PumpConfig
-    clock: RunClock
-    port: int
+    clock: RunClock  # the run's clock, on which the truth is stamped
+    port: int  # where to listen; 0: any free port
     host: str = "127.0.0.1"
-    speed: float = 1.0
-    truth: RingAddress | None = None
+    speed: float = 1.0  # plant seconds a second
+    truth: RingAddress | None = None  # where to publish `Truth.pack()` with every sample
+    # how long the bench outlives the process that started it, so that the tripped watchdog can be seen
     linger_s: float = 5.0
-    events: tuple[Event, ...] = ()
-    lab: DevicesConfig | None = None
+    events: tuple[Event, ...] = ()  # what happens when, in plant time (0 at the start)
+    lab: DevicesConfig | None = None  # serve these instruments in place of the pump board
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,25 +191,16 @@ class LiveBench:
 
 # The twin as a process beside the hold: started, asked for its port, and its truth read for the record.
 
-
 _TRUTHS_KEPT = 64
 _READY_S = 60.0  # importing on a busy machine; a fresh one compiles first
 
 
 @dataclass(frozen=True, slots=True)
 class TwinProcess:
-    """A running simulated bench.
+    """A running simulated bench."""
 
-    Attributes
-    ----------
-    config : Config
-        The run's configuration with the twin's own address as its device.
-    truth : RingAddress
-        Where the twin publishes what its mirror really does.
-    """
-
-    config: Config
-    truth: RingAddress
+    config: Config  # the run's configuration with the twin's own address as its device
+    truth: RingAddress  # where the twin publishes what its mirror really does
 
     @classmethod
     def started(cls, config: Config, clock: RunClock, stack: contextlib.ExitStack, lab: bool = False) -> TwinProcess:
@@ -273,7 +243,6 @@ class TwinProcess:
 
 
 # `twin`: the simulated bench on its real protocol, for any client.
-
 
 _STOPS = {signal.SIGINT, signal.SIGTERM}
 

@@ -24,18 +24,10 @@ _START = 1e-4  # the equation is 0/0 at the centre; a series of second order is 
 
 @dataclass(frozen=True, slots=True)
 class Hencky:
-    """Two numbers that carry everything the gas sees of a film.
+    """Two numbers that carry everything the gas sees of a film."""
 
-    Attributes
-    ----------
-    sag : float
-        w0 / (a q^(1/3)) with q = p a / (E t); 0.65344 for nu = 0.3.
-    volume : float
-        Volume under the film / (pi a^2 w0); 0.5214 for nu = 0.3.
-    """
-
-    sag: float
-    volume: float
+    sag: float  # w0 / (a q^(1/3)) with q = p a / (E t); 0.65344 for nu = 0.3
+    volume: float  # volume under the film / (pi a^2 w0); 0.5214 for nu = 0.3
 
 
 @lru_cache(maxsize=8)
@@ -46,13 +38,9 @@ def solve(poisson: float = POISSON_PET) -> Hencky:
     falls by dW/drho = q^(1/3) rho / (2 n).
 
     The equation keeps its form under n(rho) = lam m(kappa rho) if lam^3 kappa^2 = 1. So one initial value problem
-    m(0) = 1 holds the solution for every nu: the rim stands at that r = kappa where r m' + (1 - nu) m = 0.
-    Sag and volume are integrated with it; by parts, the volume over pi a^2 is the integral of rho^2 dW.
-
-    Raises
-    ------
-    ValueError
-        If the Poisson ratio is outside [0, 0.5].
+    m(0) = 1 holds the solution for every nu: the rim stands at that r = kappa where r m' + (1 - nu) m = 0. Sag and
+    volume are integrated with it; by parts, the volume over pi a^2 is the integral of rho^2 dW. Raises ValueError if
+    the Poisson ratio is outside [0, 0.5].
     """
     if not 0 <= poisson <= 0.5:
         raise ValueError(f"poisson = {poisson:g} is outside 0 .. 0.5")
@@ -84,20 +72,11 @@ CREEP_START_S = 60.0  # t0 of the creep law (assumed): the time a fill takes to 
 
 @dataclass(frozen=True, slots=True)
 class Film:
-    """One round film.
-
-    Attributes
-    ----------
-    thickness_um : float
-        Thickness.
-    creep_per_decade : float
-        m of the creep law J = J0 (1 + m log10(1 + t/t0)).
-    modulus_pa : float
-        Young's modulus of the film `SETTLED_S` after loading: tabulated figures hold for the settled film.
-    """
+    """One round film."""
 
     thickness_um: float
-    creep_per_decade: float
+    creep_per_decade: float  # m of the creep law J = J0 (1 + m log10(1 + t/t0))
+    # Young's modulus of the film `SETTLED_S` after loading: tabulated figures hold for the settled film
     modulus_pa: float = MODULUS_PA
 
     def sag_mm_per_root_pa(self, age_s: float | FloatArray) -> FloatArray:
@@ -123,7 +102,6 @@ NOMINAL_SAG_MM = float(MIRROR_FILM.sag_mm_per_root_pa(SETTLED_S)) * NOMINAL_PRES
 # Amounts and flows are in mL at reference conditions (nominal absolute pressure, 23 deg C), as a mass-flow meter
 # counts them: one mL is always the same number of molecules.
 
-
 STANDARD_AMBIENT_PA = 101_325.0
 REFERENCE_K = 296.15  # 23 deg C, the standard laboratory atmosphere (ISO 291); 123 um/K holds there
 JOULE_PER_ML = (STANDARD_AMBIENT_PA + NOMINAL_PRESSURE_PA) * 1e-6  # P V of a reference mL at 23 deg C
@@ -132,21 +110,11 @@ GAS_FOLLOWS_AIR_S = 12.0  # through 10 um of PET (PHYSICS: film and gas, estimat
 
 @dataclass(slots=True)
 class Gas:
-    """State of the gas.
+    """State of the gas."""
 
-    Attributes
-    ----------
-    amount_ml : float
-        Gas between the films; flat films hold none.
-    temperature_k : float
-        Its temperature.
-    root_pa : float
-        Cube root of the gauge pressure.
-    """
-
-    amount_ml: float
+    amount_ml: float  # gas between the films; flat films hold none
     temperature_k: float
-    root_pa: float
+    root_pa: float  # cube root of the gauge pressure
 
     @property
     def gauge_pressure_pa(self) -> float:

@@ -38,25 +38,13 @@ class Finished:
 
 @dataclass(frozen=True, slots=True)
 class Around:
-    """What an experiment is made about.
+    """What an experiment is made about."""
 
-    Attributes
-    ----------
-    holding_flow_um_per_s : float
-        Mean flow of the loop before it.
-    least_flow_um_per_s, full_flow_um_per_s : float
-        The pump's range while it runs.
-    laser_um : float
-        Standard deviation of a reading.
-    limit_um : float
-        Furthest the centre may go from where it stood.
-    """
-
-    holding_flow_um_per_s: float
-    least_flow_um_per_s: float
+    holding_flow_um_per_s: float  # mean flow of the loop before it
+    least_flow_um_per_s: float  # of the pump while it runs
     full_flow_um_per_s: float
-    laser_um: float
-    limit_um: float = 10.0
+    laser_um: float  # standard deviation of a reading
+    limit_um: float = 10.0  # furthest the centre may go from where it stood
 
     def within(self, flow_um_per_s: float) -> float:
         """The nearest flow of a running pump."""
@@ -68,7 +56,6 @@ class Experiment(Protocol):
 
     def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
         """Flow in um/s to put out until the next reading, or the end."""
-        ...
 
 
 class CentreMotion:
@@ -107,21 +94,15 @@ class ExcursionGuard:
     """Lets an experiment run while the centre can still be stopped within the limit.
 
     The centre is judged where it will have come to rest, position + speed x `COAST_S`, with three standard deviations
-    of that figure's own noise in hand.
+    of that figure's own noise in hand. Raises ValueError if the noise kept in hand leaves nothing of the limit; the
+    message says what would help.
 
     Parameters
     ----------
-    experiment : Experiment
-    around : Around
     centre_um : float
         Where the mirror stood before.
     rate_hz : float
         Readings in a second: with fewer, the figure is noisier and more is kept in hand.
-
-    Raises
-    ------
-    ValueError
-        If the noise kept in hand leaves nothing of the limit; the message says what would help.
     """
 
     def __init__(self, experiment: Experiment, around: Around, centre_um: float, rate_hz: float) -> None:
@@ -172,11 +153,8 @@ class Patterned:
 
     Parameters
     ----------
-    around : Around
     pattern : callable
         Time in s to flow in um/s about the holding flow.
-    duration_s : float
-    centre_um : float
     """
 
     PULL_PER_S = 0.15

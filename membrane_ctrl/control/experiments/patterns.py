@@ -71,7 +71,6 @@ def room(around: Around) -> tuple[float, float]:
 # end), while the way up has most of the pump. The amplitude starts small and grows while the mirror overshoots its
 # threshold by little, so that a pump three times stronger or slower than configured stays within the same bounds.
 
-
 THRESHOLD_SHARE = 0.25  # of the excursion limit
 OVERSHOOT_SHARE = 0.2
 _GROWTH = 1.6
@@ -86,10 +85,8 @@ class Relay:
 
     Parameters
     ----------
-    around : Around
     centre_um : float
         Middle of the band.
-    duration_s : float
     """
 
     def __init__(self, around: Around, centre_um: float, duration_s: float = 120.0) -> None:

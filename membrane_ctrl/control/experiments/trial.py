@@ -39,19 +39,15 @@ _PATTERNS = {"steps": patterns.steps, "doublets": patterns.doublets, "multisine"
 class Trial:
     """An experiment inside its guard.
 
+    Raises ValueError if the pump has no room about the holding flow, or the noise none in the limit; the message says
+    what would help.
+
     Parameters
     ----------
-    spec : ExperimentSpec
     loop, pump : LoopConfig, PumpConfig
         The pump's range, as configured.
     centre_um : float
         Where the mirror stands.
-
-    Raises
-    ------
-    ValueError
-        If the pump has no room about the holding flow, or the noise none in the limit; the message says what would
-        help.
     """
 
     def __init__(self, spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre_um: float) -> None:

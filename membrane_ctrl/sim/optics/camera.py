@@ -31,6 +31,7 @@ class OpticsRenderer:
 
     The film is traced at nodes (see `shade`) and, unless `exact`, at displacements _CELL_UM apart: a parabola through
     the three nearest gives the maps at any other, so that a moving film costs nothing until it leaves its cell.
+    Raises ValueError if the film's rim is not the configured one.
 
     Parameters
     ----------
@@ -48,11 +49,6 @@ class OpticsRenderer:
         Trace every pixel at every displacement: slow, for sets that must be true to the last bit.
     seed : int
         Of the pixel noise (`camera.noise_adu`); each picture has its own.
-
-    Raises
-    ------
-    ValueError
-        If the film's rim is not the configured one.
     """
 
     optics: OpticsConfig
@@ -94,6 +90,8 @@ class OpticsRenderer:
     ) -> Pixels:
         """The picture of one pattern, (H, W).
 
+        Raises ValueError if the pattern is unknown or `out` has another shape or type.
+
         Parameters
         ----------
         pattern : Pattern
@@ -104,11 +102,6 @@ class OpticsRenderer:
             Filled and returned (frames in shared memory); otherwise a new one is made.
         gain : float
             Exposure against the nominal one.
-
-        Raises
-        ------
-        ValueError
-            If the pattern is unknown or `out` has another shape or type.
         """
         camera, config = self.optics.camera, self.optics.pattern
         picture = self.blank() if out is None else out
@@ -184,12 +177,10 @@ class FilmPosition(Protocol):
     @property
     def displacement_um(self) -> float:
         """Of the centre, positive when the bowl is deeper."""
-        ...
 
     @property
     def sag_mm(self) -> float:
         """Depth of the bowl."""
-        ...
 
 
 class Clock(Protocol):
@@ -197,7 +188,6 @@ class Clock(Protocol):
 
     def now(self) -> float:
         """Seconds since the run's start."""
-        ...
 
 
 class TwinOptics:
@@ -219,11 +209,6 @@ class TwinOptics:
         Gives the time of exposure.
     film : FilmShape, optional
         Another film; its sag belongs to displacement 0.
-
-    Attributes
-    ----------
-    screen : TwinScreen
-    camera : TwinCamera
     """
 
     def __init__(
@@ -305,10 +290,7 @@ class TwinCamera:
     def grab(self, out: Pixels | None = None) -> Frame:
         """One exposure; the picture lands in `out` (H, W) if given, else in a new array.
 
-        Raises
-        ------
-        LinkError
-            If the camera is closed or the screen shows nothing.
+        Raises LinkError if the camera is closed or the screen shows nothing.
         """
         if not self._open:
             raise LinkError("twin camera: closed")

@@ -97,7 +97,6 @@ def heights(terms: FilmTerms, sag_mm: float, x_mm: FloatArray, y_mm: FloatArray)
 # With n = sum_k b_k rho^(2k) and g = 1/n the equation reads 4 k (k + 1) b_k = -(g^2)_(k-1) / 8, so that all b_k
 # follow from b_0, which the rim's condition fixes. The terms fall by about 0.3 each: 40 of them reach the last bit.
 
-
 _TERMS = 40
 _POISSON = 0.3  # PET
 
@@ -153,10 +152,7 @@ def paraboloid_series() -> FloatArray:
 def noll_orders(j: int) -> tuple[int, int]:
     """Radial order n and azimuthal order m of Noll's index j (from 1); m < 0 stands for the sine term.
 
-    Raises
-    ------
-    ValueError
-        If j < 1.
+    Raises ValueError if j < 1.
     """
     if j < 1:
         raise ValueError(f"Noll's index starts at 1, not {j}")

@@ -161,7 +161,6 @@ def shade(
 #
 # s is measured from the low edge of the pattern region, a square centred on O'; outside it the screen is dark.
 
-
 _GRAY_BITS = 4
 # linear interpolation of a cosine in this many cells is 2e-8 off at most: below a thousandth of a 16-bit count
 _SINE_CELLS = 16384
@@ -171,29 +170,14 @@ _SINE_CELLS = 16384
 class Light:
     """From the pattern's level to the camera's counts.
 
-    Attributes
-    ----------
-    dark_fraction : float
-        Counts without light, of full scale.
-    white_fraction : float
-        Counts of a white screen in the middle of the picture, of full scale.
-    leak : float
-        Light of a black screen, of a white one.
-    gamma : float
-        The screen's light is level**gamma; 1 is a linear screen.
-    vignetting : float
-        Loss of light at the picture's corner, growing with the square of the distance from its middle.
-
-    Raises
-    ------
-    ValueError
-        On construction, naming the field and what would be right.
+    Raises ValueError that names the field and what would be right.
     """
 
-    dark_fraction: float = 0.02
-    white_fraction: float = 0.80
-    leak: float = 0.02
-    gamma: float = 1.0
+    dark_fraction: float = 0.02  # counts without light, of full scale
+    white_fraction: float = 0.80  # counts of a white screen in the middle of the picture, of full scale
+    leak: float = 0.02  # light of a black screen, of a white one
+    gamma: float = 1.0  # the screen's light is level**gamma; 1 is a linear screen
+    # loss of light at the picture's corner, growing with the square of the distance from its middle
     vignetting: float = 0.15
 
     def __post_init__(self) -> None:
@@ -229,10 +213,7 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
     - "gray": bit `index` (1 is the most significant of 4) of gray(V2), V2 = floor(2 s / T), over the region;
     - "white" and "black": 1 and 0 over the region.
 
-    Raises
-    ------
-    ValueError
-        If the pattern's role or Gray bit is unknown.
+    Raises ValueError if the pattern's role or Gray bit is unknown.
     """
     if pattern.role == "sin":
         phi = np.linspace(0.0, 2.0 * pi, _SINE_CELLS + 1) - pi
@@ -252,17 +233,14 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
 def pattern_sequence(kind: str, config: PatternConfig, shifts_rad: tuple[float, ...] = ()) -> list[Pattern]:
     """The patterns of a set in the order they are shown: x and y sinusoids and Gray bits, white, black.
 
+    Raises ValueError if the kind is unknown.
+
     Parameters
     ----------
     kind : str
         "full" or "fringes" (sinusoids alone).
     shifts_rad : tuple of floats
         One a step; empty: 2 pi k / N.
-
-    Raises
-    ------
-    ValueError
-        If the kind is unknown.
     """
     if kind not in ("full", "fringes"):
         raise ValueError(f"kind = {kind!r} must be full or fringes")

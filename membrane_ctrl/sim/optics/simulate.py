@@ -130,17 +130,14 @@ class _Exposure:
 def simulate_set(folder: Path, spec: SimulationSpec) -> None:
     """Write one capture set and its truth.
 
+    Raises OSError if the folder or a file cannot be written.
+
     Parameters
     ----------
     folder : Path
         Made if it is not there.
     spec : SimulationSpec
         The set.
-
-    Raises
-    ------
-    OSError
-        If the folder or a file cannot be written.
     """
     _write_set(folder, spec, _renderer(spec))
 
@@ -154,6 +151,8 @@ def simulate_run(
 ) -> None:
     """Write a run: `0000` is the full set, the others are fringes that lean on it; one clock and one motion for all.
 
+    Raises ValueError if the first set is not full, lists its displacements, or the sets overlap in time.
+
     Parameters
     ----------
     folder : Path
@@ -166,11 +165,6 @@ def simulate_run(
         From the start of one set to the start of the next.
     on_set : callable, optional
         Told the number of sets written, after each.
-
-    Raises
-    ------
-    ValueError
-        If the first set is not full, lists its displacements, or the sets overlap in time.
     """
     if spec.kind != "full" or spec.displacements_um:
         raise ValueError("kind: the first set of a run must be full, and move by motion, not displacements_um")
