@@ -5,7 +5,7 @@ A driver converts to these units at its edge; nothing behind it knows registers,
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -255,3 +255,22 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Give the camera back."""
+
+
+# One lost packet spoils a frame; three spoilt in a row are no accident
+TRIES = 3
+
+
+class FrameLostError(LinkError):
+    """One exposure gave no whole frame; the camera is there and may be asked again."""
+
+
+@runtime_checkable
+class ExposingCamera(Protocol):
+    """A camera whose transfer may overlap with the next pattern."""
+
+    def expose(self, out: NDArray[np.uint8] | NDArray[np.uint16] | None = None) -> None:
+        """Trigger, and return when the exposure is over. Raises LinkError."""
+
+    def fetch(self) -> Frame:
+        """The frame of the last `expose`. Raises FrameLostError, LinkError."""

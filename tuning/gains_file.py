@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 import tomli_w
 from pydantic import Field
 
-from membrane_ctrl.config import section
+from firmware_iface.settings import Section
 from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.model import errors, files, plain_json
@@ -27,7 +27,7 @@ MS_MAX = 1.6
 Positive = Annotated[float, Field(gt=0)]
 
 
-class PlantSection(section.Section):
+class PlantSection(Section):
     """The plant the gains were made for (`plant_model.PlantModel`), with standard errors."""
 
     gain: Positive
@@ -49,7 +49,7 @@ class PlantSection(section.Section):
         return loop_model.PlantModel(self.gain, self.dead_time_s, self.lag_s, self.leak_um_per_s)
 
 
-class GainsFile(section.Section):
+class GainsFile(Section):
     """`gains.toml`."""
 
     format: Literal["membrane-gains/1"] = "membrane-gains/1"

@@ -13,12 +13,11 @@ import asyncio
 import math
 import re
 
-from firmware_iface.drivers.linked_device import LinkedDevice, StepGate
+from firmware_iface.drivers.linked_device import LineDriver, StepGate
 from firmware_iface.links import exchange, serial_port
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, DisplacementSample, LinkError
+from firmware_iface.settings import KeyenceDlRs1aConfig
 
-MANUAL = "DL-RS1A user's manual, IL edition, pages 7-16"
-BAUDS = (2400, 4800, 9600, 19_200, 38_400)  # page 7
 _VALUE = r"[+-](?:\d\d\.\d{3}|\d{3}\.\d\d|\d{4}\.\d|E{2}\.E{3}|E{3}\.E{2}|E{4}\.E)"
 _ALL = re.compile(rf"(?:M0((?:,{_VALUE})+)|ER,M0,(\d\d))\r\n?")
 _ALL_CHARS = 4 + 15 * 8
@@ -36,61 +35,23 @@ _NOT_READABLE = "22"
 _STEPS_UM = {3: 1.0, 2: 10.0, 1: 100.0}  # decimals of the millimetre
 
 
-class KeyenceDlRs1a(LinkedDevice):
-    """A `DisplacementSensor`.
+class KeyenceDlRs1a(LineDriver):
+    """A `DisplacementSensor`; `port` stands in for the configured one. Displacement = direction * (value - zero)."""
 
-    Displacement = direction * (value - zero). Raises ValueError (settings that the unit does not have).
+    manual = "DL-RS1A user's manual, IL edition, pages 7-16"
 
-    Parameters
-    ----------
-    port : str or BytePort
-        A path or `usb:VID:PID[:SERIAL]`.
-    baud, parity
-        As set by the unit's switches; the factory's 9600 without parity is good for 25 readings a second, 38400 with
-        even parity for 80.
-    amplifier : int
-        0 is the main unit, 1..14 are expansions.
-    zero_mm : float
-        Value at displacement 0.
-    direction : int
-        -1 when the value falls as the bowl deepens (a head behind the mirror that counts up with distance), else 1.
-    step_max_um : float
-        A reading farther than this from both before it is not believed.
-    timeout_s : float
-        For an answer.
-    """
-
-    def __init__(
-        self,
-        port: str | serial_port.BytePort,
-        baud: int = 9600,
-        parity: str = "N",
-        amplifier: int = 0,
-        zero_mm: float = 0.0,
-        direction: int = -1,
-        step_max_um: float = 10.0,
-        timeout_s: float = 0.1,
-    ) -> None:
-        if baud not in BAUDS:
-            raise ValueError(f"baud = {baud}: the unit has {', '.join(map(str, BAUDS))}")
-        if not 0 <= amplifier <= 14:
-            raise ValueError(f"amplifier = {amplifier}: wanted 0 .. 14")
-        if direction not in (-1, 1):
-            raise ValueError(f"direction = {direction}: wanted 1 or -1")
-        self._settings = serial_port.SerialSettings(baud, parity=parity)
-        self._amplifier, self._zero_mm, self._direction = amplifier, zero_mm, direction
-        self._step_max_um = step_max_um
-        number = f"{amplifier:02d}"
+    def __init__(self, config: KeyenceDlRs1aConfig, port: serial_port.BytePort | None = None) -> None:
+        self._config = config
+        number = f"{config.amplifier:02d}"
         self._read_command = f"SR,{number},038"
         self._read_answer = re.compile(rf"(?:SR,{number},038,({_VALUE})|ER,SR,(\d\d))\r\n?")
         self._errors_command = f"SR,{number},033"
         self._errors_answer = re.compile(rf"(?:SR,{number},033,(\d{{5}})|ER,SR,(\d\d))\r\n?")
         # the fence has to differ from a reading also when it is refused, as when the amplifier is pulled off: `M0`
-        self._link = exchange.LineLink(
-            serial_port.as_port(port, self._settings), "\r\n", timeout_s, exchange.LineFence("M0", _ALL, _ALL_CHARS)
-        )
-        super().__init__(self._link)
-        self._gate = StepGate(step_max_um)
+        fence = exchange.LineFence("M0", _ALL, _ALL_CHARS)
+        settings = serial_port.SerialSettings(config.baud, parity=config.parity)
+        super().__init__(port or serial_port.SerialPort(config.port, settings), "\r\n", config.timeout_s, fence)
+        self._gate = StepGate(config.step_max_um)
         self._decimals = 3
         self._readings = 0
 
@@ -101,24 +62,20 @@ class KeyenceDlRs1a(LinkedDevice):
         in error, or one with steps coarser than `step_max_um`).
         """
         await self._link.close()
-        self._gate = StepGate(self._step_max_um)
-        self._link.connect()
-        try:
-            return await self._identify()
-        except LinkError:
-            await self._link.close()
-            raise
+        self._gate = StepGate(self._config.step_max_um)
+        return await self._opened(self._identify)
 
     async def _identify(self) -> DeviceIdentity:
         every = await self._link.query("M0", _ALL, _ALL_CHARS)
         _refuse(self._link.name, every[2])
         values = every[1][1:].split(",")
-        if self._amplifier >= len(values):
+        if self._config.amplifier >= len(values):
             raise DeviceRefusedError(
-                f"{self._link.name}: amplifier = {self._amplifier}, but there are only {len(values)} (0 is the first)"
+                f"{self._link.name}: amplifier = {self._config.amplifier}, but there are only {len(values)} "
+                "(0 is the first)"
             )
-        self._decimals = len(values[self._amplifier].partition(".")[2])
-        if _STEPS_UM[self._decimals] > self._step_max_um:
+        self._decimals = len(values[self._config.amplifier].partition(".")[2])
+        if _STEPS_UM[self._decimals] > self._config.step_max_um:
             raise DeviceRefusedError(f"{self._link.name}: head with steps of {_STEPS_UM[self._decimals]:g} um")
         errors = await self._link.query(self._errors_command, self._errors_answer)
         if errors[2] != _NOT_READABLE:  # amplifiers that do not tell: their head error is seen in the value
@@ -126,7 +83,7 @@ class KeyenceDlRs1a(LinkedDevice):
         if bits := int(errors[1] or 0):
             raise DeviceRefusedError(f"{self._link.name}: amplifier in error (state {bits:016b}); see its manual")
         await self._reading()  # the first one is confirmed by a second
-        detail = f"amplifier {self._amplifier} of {len(values)}, steps of {_STEPS_UM[self._decimals]:g} um"
+        detail = f"amplifier {self._config.amplifier} of {len(values)}, steps of {_STEPS_UM[self._decimals]:g} um"
         return DeviceIdentity("Keyence DL-RS1A", "", "", detail)
 
     async def displacement(self) -> DisplacementSample:
@@ -155,20 +112,13 @@ class KeyenceDlRs1a(LinkedDevice):
         # page 12: beyond the display above or below; one less: no value
         if text[1:].replace(".", "") in ("99999", "99998"):
             return QUALITY_OUT_OF_RANGE, math.nan, True
-        displacement_um = 1000 * self._direction * (float(text) - self._zero_mm)
+        displacement_um = 1000 * self._config.direction * (float(text) - self._config.zero_mm)
         return 0, displacement_um, self._gate.passes(displacement_um)
 
-    async def close(self) -> None:
-        """Close the port. Never raises."""
-        await self._link.close()
-
-    def describe(self) -> dict[str, str]:
-        """For people: port, settings, manual."""
-        return {
-            "port": f"{self._link.name}, {self._settings}",
-            "settings": f"amplifier {self._amplifier}, zero at {self._zero_mm:g} mm, direction {self._direction:+d}",
-            "manual": MANUAL,
-        }
+    @property
+    def _shown(self) -> str:
+        config = self._config
+        return f"amplifier {config.amplifier}, zero at {config.zero_mm:g} mm, direction {config.direction:+d}"
 
 
 def _refuse(name: str, code: str | None) -> None:

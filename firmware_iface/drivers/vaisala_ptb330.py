@@ -13,11 +13,11 @@ import math
 import re
 from dataclasses import dataclass
 
-from firmware_iface.drivers.linked_device import LinkedDevice
+from firmware_iface.drivers.linked_device import LineDriver
 from firmware_iface.links import exchange, serial_port
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
+from firmware_iface.settings import VaisalaPtb330Config
 
-MANUAL = "PTB330 user's guide M210855EN, pages 70-88"
 FORMAT = '4.3 P " " U3 " " ERR " " MCTR " " SN " " CS4 #r #n'
 PA_PER_HPA = 100.0
 RANGE_PA = (50_000.0, 110_000.0)  # of the instrument
@@ -40,37 +40,19 @@ class BarometerMessage:
     serial: str
 
 
-class VaisalaPtb330(LinkedDevice):
-    """A `Barometer`. A task of its own asks as fast as `period_s` says and serves the newest value.
+class VaisalaPtb330(LineDriver):
+    """A `Barometer`. A task of its own asks every `period_s` and serves the newest value.
 
-    Parameters
-    ----------
-    port : str or BytePort
-        A path or `usb:VID:PID[:SERIAL]`.
-    baud : int
-        As the instrument is set.
-    period_s : float
-        Between two questions; at 4800 baud a message alone takes 80 ms.
-    age_max_s : float
-        A value that did not change its running number for this long is none any more (NaN).
-    timeout_s : float
-        For an answer.
+    `port` stands in for the configured one.
     """
 
-    def __init__(
-        self,
-        port: str | serial_port.BytePort,
-        baud: int = 4800,
-        period_s: float = 0.2,
-        age_max_s: float = 3.0,
-        timeout_s: float = 0.3,
-    ) -> None:
-        self._settings = serial_port.SerialSettings(baud, data_bits=7, parity="E")
-        self._link = exchange.LineLink(
-            serial_port.as_port(port, self._settings), "\r\n", timeout_s, exchange.LineFence("VERS", _VERSION)
-        )
-        super().__init__(self._link)
-        self._period_s, self._age_max_s = period_s, age_max_s
+    manual = "PTB330 user's guide M210855EN, pages 70-88"
+
+    def __init__(self, config: VaisalaPtb330Config, port: serial_port.BytePort | None = None) -> None:
+        settings = serial_port.SerialSettings(config.baud, data_bits=7, parity="E")
+        fence = exchange.LineFence("VERS", _VERSION)
+        super().__init__(port or serial_port.SerialPort(config.port, settings), "\r\n", config.timeout_s, fence)
+        self._period_s, self._age_max_s = config.period_s, config.age_max_s
         self._task: asyncio.Task[None] | None = None
         self._newest = BarometerMessage(math.nan, -1, "")
         self._newest_s = -math.inf
@@ -85,18 +67,17 @@ class VaisalaPtb330(LinkedDevice):
         """
         await self.close()
         self._newest, self._newest_s, self._down = BarometerMessage(math.nan, -1, ""), -math.inf, None
-        self._link.connect("\r\nS\r\nECHO OFF\r\n")
-        try:
-            identity = await self._known_again()
-            if identity is None:
-                identity = await self._identify()
-                await self._apply_settings()
-                self._identity = identity
-                await self._refresh()
-        except LinkError:
-            await self._link.close()
-            raise
+        identity = await self._opened(self._begin, "\r\nS\r\nECHO OFF\r\n")
         self._task = asyncio.create_task(self._run(), name="barometer")
+        return identity
+
+    async def _begin(self) -> DeviceIdentity:
+        identity = await self._known_again()
+        if identity is None:
+            identity = await self._identify()
+            await self._apply_settings()
+            self._identity = identity
+            await self._refresh()
         return identity
 
     async def _known_again(self) -> DeviceIdentity | None:
@@ -156,7 +137,7 @@ class VaisalaPtb330(LinkedDevice):
         """
         if self._down is not None:
             raise LinkDownError(str(self._down))
-        if not self._link.connected:
+        if not self._link.port.is_open:
             raise LinkDownError(f"{self._link.name}: not connected")
         fresh = asyncio.get_running_loop().time() - self._newest_s <= self._age_max_s
         return self._newest.pressure_pa if fresh else math.nan
@@ -169,13 +150,9 @@ class VaisalaPtb330(LinkedDevice):
             await asyncio.wait([task])
         await self._link.close()
 
-    def describe(self) -> dict[str, str]:
-        """For people: port, settings, manual."""
-        return {
-            "port": f"{self._link.name}, {self._settings}",
-            "settings": f"asked every {self._period_s:g} s, NaN when older than {self._age_max_s:g} s",
-            "manual": MANUAL,
-        }
+    @property
+    def _shown(self) -> str:
+        return f"asked every {self._period_s:g} s, NaN when older than {self._age_max_s:g} s"
 
 
 def decode_message(message: re.Match[str], name: str) -> BarometerMessage:

@@ -10,15 +10,14 @@ its analogue input says, until it is told otherwise. Where gas must stop by itse
 import contextlib
 import re
 
-from firmware_iface.drivers.linked_device import LinkedDevice
+from firmware_iface.drivers.linked_device import LineDriver
 from firmware_iface.links import exchange, serial_port
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
+from firmware_iface.settings import VentusConfig
 
-MANUAL = "TN003 Communications Guide; no watchdog: the pump runs on when the host is gone"
 ENABLE, POWER_LIMIT_MW, STREAM, MODE, MANUAL_SOURCE, SET_VALUE, ERROR = 0, 1, 2, 10, 11, 23, 31
 FIRMWARE, DEVICE_TYPE, FIRMWARE_MINOR = 36, 37, 38
 DEVICE_TYPES = {2: "general purpose driver", 3: "smart pump module"}
-POWER_MAX_MW = 1400.0  # the most that any of these pumps is made for
 _MODE_MANUAL, _SOURCE_SET_VALUE, _OFF, _ON = 0, 0, 0, 1
 # what a hit write could change unseen, or a power cycle: read back with every command
 _KEPT = (POWER_LIMIT_MW, MODE, MANUAL_SOURCE)
@@ -27,34 +26,18 @@ _NUMBER = r"-?\d+(?:\.\d+)?"
 _STEP_MW = 0.0011  # values are written with three decimals
 
 
-class Ventus(LinkedDevice):
-    """A `Pump`: the fraction is that of `power_max_mw`.
+class Ventus(LineDriver):
+    """A `Pump`: the fraction is that of `power_max_mw`; `port` stands in for the configured one."""
 
-    Raises ValueError (more power than these pumps are made for).
+    manual = "TN003 Communications Guide; no watchdog: the pump runs on when the host is gone"
 
-    Parameters
-    ----------
-    port : str or BytePort
-        A path or `usb:VID:PID[:SERIAL]`.
-    power_max_mw : float
-        Full drive.
-    timeout_s : float
-        For an answer.
-    """
-
-    def __init__(
-        self, port: str | serial_port.BytePort, power_max_mw: float = 1000.0, timeout_s: float = 0.1
-    ) -> None:
-        if not 0 < power_max_mw <= POWER_MAX_MW:
-            raise ValueError(f"power_max_mw = {power_max_mw:g}: wanted more than 0, at most {POWER_MAX_MW:g}")
-        self._power_max_mw = power_max_mw
+    def __init__(self, config: VentusConfig, port: serial_port.BytePort | None = None) -> None:
+        self._power_max_mw = config.power_max_mw
         # streamed lines may be on their way when the stream is switched off
-        fence = exchange.LineFence(
-            f"#R{DEVICE_TYPE}", re.compile(rf"(?:#S[^\n]*\n)*#R{DEVICE_TYPE},({_NUMBER})\r?\n")
-        )
-        self._settings = serial_port.SerialSettings(115_200)
-        self._link = exchange.LineLink(serial_port.as_port(port, self._settings), "\n", timeout_s, fence)
-        super().__init__(self._link)
+        answer = re.compile(rf"(?:#S[^\n]*\n)*#R{DEVICE_TYPE},({_NUMBER})\r?\n")
+        fence = exchange.LineFence(f"#R{DEVICE_TYPE}", answer)
+        port = port or serial_port.SerialPort(config.port, serial_port.SerialSettings(115_200))
+        super().__init__(port, "\n", config.timeout_s, fence)
         self._commanded_mw = 0.0
 
     async def open(self) -> DeviceIdentity:
@@ -65,28 +48,19 @@ class Ventus(LinkedDevice):
         """
         await self._link.close()
         # off at once, also when nothing else works; a stream would never leave the line quiet
-        self._link.connect(f"\n#W{ENABLE},{_OFF}\n#W{STREAM},0\n")
-        try:
-            identity = await self._identify()
-            await self._apply_settings()
-            await self.set_pump(0.0)
-        except LinkError:
-            await self._link.close()
-            raise
-        return identity
+        return await self._opened(self._begin, f"\n#W{ENABLE},{_OFF}\n#W{STREAM},0\n")
 
-    async def _identify(self) -> DeviceIdentity:
+    async def _begin(self) -> DeviceIdentity:
         about = await self._write_and_read({}, DEVICE_TYPE, FIRMWARE, FIRMWARE_MINOR)
         kind = int(about[DEVICE_TYPE])
         if kind not in DEVICE_TYPES:
             raise DeviceRefusedError(f"{self._link.name}: device type {kind} is no Ventus driver (2 or 3)")
-        return DeviceIdentity(f"Ventus {DEVICE_TYPES[kind]}", "", f"{about[FIRMWARE]:g}.{about[FIRMWARE_MINOR]:g}")
-
-    async def _apply_settings(self) -> None:
         wanted = self._settings_wanted()
         found = await self._write_and_read(wanted, *wanted)
         if found != wanted:
             raise DeviceRefusedError(f"{self._link.name}: registers set to {wanted}, read back {found}")
+        await self.set_pump(0.0)
+        return DeviceIdentity(f"Ventus {DEVICE_TYPES[kind]}", "", f"{about[FIRMWARE]:g}.{about[FIRMWARE_MINOR]:g}")
 
     def _settings_wanted(self) -> dict[int, float]:
         return {
@@ -148,18 +122,14 @@ class Ventus(LinkedDevice):
 
     async def close(self) -> None:
         """Switch the pump off and close the port. Never raises."""
-        if self._link.connected:
+        if self._link.port.is_open:
             with contextlib.suppress(LinkError):  # out of reach: what then stops the gas is not this program
                 await self.set_pump(0.0)
         await self._link.close()
 
-    def describe(self) -> dict[str, str]:
-        """For people: port, settings, manual."""
-        return {
-            "port": f"{self._link.name}, {self._settings}",
-            "settings": f"full drive {self._power_max_mw:g} mW",
-            "manual": MANUAL,
-        }
+    @property
+    def _shown(self) -> str:
+        return f"full drive {self._power_max_mw:g} mW"
 
 
 def _registers(*registers: int) -> re.Pattern[str]:

@@ -53,7 +53,7 @@ class SerialExchange:
     """
 
     def __init__(self, port: BytePort, gap_s: float, quiet_s: float, blank: bytes = b"") -> None:
-        self._port = port
+        self.port = port
         self._gap_s = gap_s
         self._quiet_s = quiet_s
         self._blank = blank
@@ -68,11 +68,6 @@ class SerialExchange:
         self._take: Callable[[bytes], bytes | None] | None = None
         self._answer: asyncio.Future[bytes] | None = None
 
-    @property
-    def port(self) -> BytePort:
-        """The line."""
-        return self._port
-
     def connect(self, greeting: bytes = b"") -> None:
         """Open the line; what devices may still owe to an earlier user is not believed.
 
@@ -83,18 +78,18 @@ class SerialExchange:
         greeting : bytes
             Sent at once, and whatever comes back is thrown away: for a device that talks unasked until told to stop.
         """
-        self._port.open(self)
+        self.port.open(self)
         self._sure.clear()
         self._failures = 0
         self._noisy = True
         self._last_byte_s = asyncio.get_running_loop().time()
         if greeting:
-            self._port.write(greeting)
+            self.port.write(greeting)
 
     async def close(self) -> None:
         """Close the line; a question in flight fails at once."""
-        self._port.close()
-        self.lost(LinkDownError(f"{self._port.name}: closed"))
+        self.port.close()
+        self.lost(LinkDownError(f"{self.port.name}: closed"))
         if self._in_flight is not None:
             await asyncio.wait([self._in_flight])
 
@@ -143,11 +138,11 @@ class SerialExchange:
             self._failures += 1
             if self._failures < _FAILURES_MAX:
                 raise
-            self._port.close()
+            self.port.close()
             raise LinkDownError(f"{error}; the {_FAILURES_MAX}th failure in a row, connection given up") from error
         self._failures = 0
         self._sure.add(key)
-        self._port.succeeded()
+        self.port.succeeded()
         return answer
 
     async def _settle(self, what: str, timeout_s: float) -> None:
@@ -165,11 +160,11 @@ class SerialExchange:
 
     async def _ask(self, question: Question, timeout_s: float) -> bytes:
         self._require_open(question.what)
-        self._port.write(question.data)
+        self.port.write(question.data)
         self._heard, self._take = b"", question.take
         answer: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
         self._answer = answer
-        wire_s = (len(question.data) + question.answer_bytes) * self._port.settings.char_s
+        wire_s = (len(question.data) + question.answer_bytes) * self.port.settings.char_s
         try:
             # not asyncio.timeout: it throws away an answer that has come while this process was kept from running
             await asyncio.wait([answer], timeout=timeout_s + wire_s)
@@ -180,12 +175,12 @@ class SerialExchange:
         return answer.result()
 
     def _require_open(self, what: str) -> None:
-        if not self._port.is_open:
+        if not self.port.is_open:
             raise LinkDownError(f"{what}: not connected")
 
     def _missing(self, timeout_s: float) -> str:
         if not self._heard:
-            return f"no answer within {timeout_s:g} s; is it on, wired and set to {self._port.settings}?"
+            return f"no answer within {timeout_s:g} s; is it on, wired and set to {self.port.settings}?"
         shown = self._heard[:_SHOWN_BYTES]
         return f"no whole answer within {timeout_s:g} s, but {len(self._heard)} bytes ({shown!r}); wrong baud rate?"
 
@@ -243,6 +238,7 @@ class LineLink:
     """
 
     def __init__(self, port: BytePort, end: str, timeout_s: float, fence: LineFence, quiet_s: float = 0.1) -> None:
+        self.port = port
         self._exchange = SerialExchange(port, gap_s=0.0, quiet_s=quiet_s, blank=_LINE_ENDS)
         self._end = end
         self._timeout_s = timeout_s
@@ -251,22 +247,7 @@ class LineLink:
     @property
     def name(self) -> str:
         """For messages."""
-        return self._exchange.port.name
-
-    @property
-    def connected(self) -> bool:
-        """Whether the line is open."""
-        return self._exchange.port.is_open
-
-    @property
-    def reconnects(self) -> int:
-        """Times the line was opened after the first."""
-        return self._exchange.port.reconnects
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until `connect` will try."""
-        return self._exchange.port.retry_in_s
+        return self.port.name
 
     def connect(self, greeting: str = "") -> None:
         """Open the line; see `SerialExchange.connect`. Raises LinkDownError."""

@@ -274,11 +274,6 @@ class SerialPort:
         return error
 
 
-def as_port(port: str | BytePort, settings: SerialSettings) -> BytePort:
-    """A port of this machine by its name; one that is made already is taken as it is. Raises ValueError."""
-    return SerialPort(port, settings) if isinstance(port, str) else port
-
-
 def _opened(path: str, name: str, settings: SerialSettings) -> Any:
     try:
         port = serial.Serial(

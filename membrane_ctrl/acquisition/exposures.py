@@ -13,8 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Literal, Protocol, runtime_checkable
 
-from firmware_iface.drivers.frame_lost import TRIES, ExposingCamera, FrameLostError
-from firmware_iface.roles import Frame, Pattern, Screen
+from firmware_iface.roles import TRIES, ExposingCamera, Frame, FrameLostError, Pattern, Screen
 from membrane_ctrl.processes.frames import FrameSlot, FrameWriter, Pixels
 
 # Where a cycle failed: whatever a device or the numerics raise becomes one kind of error that names the stage.

@@ -8,12 +8,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_iface import settings
 from firmware_iface.display import response
 from firmware_iface.display.measures import Settling, checkerboard_problem, exposure_problem, settling, share_left
 from firmware_iface.drivers import camera_aravis, camera_folder, camera_uvc, screen_pygame
 from firmware_iface.roles import Frame, LinkError
 from membrane_ctrl.acquisition.exposures import CycleClock
-from membrane_ctrl.config import optics as table
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.metrology.phase import full_sequence
 
@@ -166,31 +166,19 @@ def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
         )
     except ValueError as error:
         raise LinkError(f"devices.screen: {error}") from None
-    settings = screen_pygame.ScreenSettings(raster, full_sequence(pattern), screen.display)
-    return OpticalBench(camera, screen_pygame.PygameScreen(settings, now=clock.now, sleep=clock.sleep))
+    shown = screen_pygame.ScreenSettings(raster, full_sequence(pattern), screen.display)
+    return OpticalBench(camera, screen_pygame.PygameScreen(shown, now=clock.now, sleep=clock.sleep))
 
 
-def _camera(config: Config, section: table.CameraTable, clock: CycleClock) -> Any:
-    width_px, height_px = config.optics.camera.width_px, config.optics.camera.height_px
+def _camera(config: Config, section: settings.CameraConfig, clock: CycleClock) -> Any:
+    size_px = config.optics.camera.width_px, config.optics.camera.height_px
     match section:
-        case table.AravisCameraConfig():
-            settings = camera_aravis.AravisSettings(
-                section.camera,
-                width_px,
-                height_px,
-                section.pixel_format,
-                section.exposure_ms,
-                section.gain_db,
-                section.packet_bytes,
-                section.timeout_s,
-            )
-            return camera_aravis.AravisCamera(settings, clock.now, clock.sleep)
-        case table.UvcCameraConfig():
-            return camera_uvc.UvcCamera(
-                camera_uvc.UvcSettings(section.port, width_px, height_px, section.exposure, section.gain), clock.now
-            )
-        case table.FolderCameraConfig():
-            return camera_folder.FolderCamera(Path(section.folder).expanduser(), width_px, height_px, clock.now)
+        case settings.AravisCameraConfig():
+            return camera_aravis.AravisCamera(section, *size_px, clock.now, clock.sleep)
+        case settings.UvcCameraConfig():
+            return camera_uvc.UvcCamera(section, *size_px, clock.now)
+        case settings.FolderCameraConfig():
+            return camera_folder.FolderCamera(Path(section.folder).expanduser(), *size_px, clock.now)
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,7 +226,7 @@ def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchF
 
 def _exposure(config: Config, test: DisplayTest) -> str:
     camera = config.devices.camera if config.devices is not None else None
-    if not isinstance(camera, table.AravisCameraConfig):  # another's exposure has no unit
+    if not isinstance(camera, settings.AravisCameraConfig):  # another's exposure has no unit
         return ""
     return told("camera", lambda: test.exposure((1 << config.optics.camera.bits) - 1, camera.exposure_ms))
 

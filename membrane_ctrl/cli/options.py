@@ -5,8 +5,8 @@ from typing import Annotated, TypeVar
 
 import typer
 
+from firmware_iface.settings import Section
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.section import Section
 from membrane_ctrl.config.toml_file import load
 
 S = TypeVar("S", bound=Section)

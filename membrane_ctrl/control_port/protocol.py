@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
-from membrane_ctrl.config.section import Section
+from firmware_iface.settings import Section
 from membrane_ctrl.config.toml_file import describe
 from membrane_ctrl.controller.commands import TABLE, Kind
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from firmware_iface.roles import BenchIdentity
-from membrane_ctrl.config.devices import ModbusMapConfig, Optoncdt1420Config
+from firmware_iface.settings import ModbusMapConfig, Optoncdt1420Config
 from membrane_ctrl.config.schema import Config, GeometryConfig
 from membrane_ctrl.control import gas, inner_loop
 from membrane_ctrl.control.film import CONTRADICTED_MOST, LEAK_LEAST_UM_PER_S, TAUT_PA

@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 
 import tomli_w
 
+from firmware_iface.settings import Section
 from membrane_ctrl.config.schema import CameraConfig, Config, GeometryConfig, OpticsConfig
-from membrane_ctrl.config.section import Section
 from membrane_ctrl.config.toml_file import parse, prune, read_toml, with_height_map
 from membrane_ctrl.model import errors, files, plain_json
 

@@ -15,7 +15,8 @@ import numpy as np
 import tomli_w
 from pydantic import Field
 
-from membrane_ctrl.config import schema, section, toml_file
+from firmware_iface.settings import Section
+from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.geometry.file import LensTable
 from membrane_ctrl.metrology.calibrate.parameters import NAMES
 from membrane_ctrl.metrology.uncertainty.geometry_spread import PAPER_SPREAD, GeometrySpread, changed, stated_spread
@@ -23,7 +24,7 @@ from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.errors import InputError
 
 
-class CovarianceTable(section.Section):
+class CovarianceTable(Section):
     """The `[covariance]` table."""
 
     names: tuple[str, ...]
@@ -70,7 +71,7 @@ def spread_of(geometry: schema.GeometryConfig, file: Path | None) -> tuple[Geome
 SCHEMA = "membrane-prior/1"
 
 
-class PriorFile(section.Section):
+class PriorFile(Section):
     """The file.
 
     `camera` and `geometry` stand instead of what the sets state; `sigmas` are those of `calibrate`'s parameters.

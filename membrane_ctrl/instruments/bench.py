@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 
-from firmware_iface import role_bench, roles
+from firmware_iface import role_bench, roles, settings
 from firmware_iface.drivers import (
     bronkhorst,
     bronkhorst_propar,
@@ -16,19 +16,18 @@ from firmware_iface.drivers import (
 )
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.links import modbus_links, serial_port
-from membrane_ctrl.config import devices as table
-from membrane_ctrl.config.devices import AnyDriver, DevicesConfig
+from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.model.errors import DeviceError, InputError
 
 # From a `[devices.<role>]` table to the driver that fills the role.
 
 
 ACTUATORS = ("pump", "vent")
-_SERIAL_DRIVERS = {
-    "optoncdt1420": optoncdt1420.Optoncdt1420,
-    "keyence_dl_rs1a": keyence_dl_rs1a.KeyenceDlRs1a,
-    "vaisala_ptb330": vaisala_ptb330.VaisalaPtb330,
-    "ventus": ventus.Ventus,
+_SERIAL_DRIVERS: dict[type[settings.Section], Callable[[Any], roles.Device]] = {
+    settings.Optoncdt1420Config: optoncdt1420.Optoncdt1420,
+    settings.KeyenceDlRs1aConfig: keyence_dl_rs1a.KeyenceDlRs1a,
+    settings.VaisalaPtb330Config: vaisala_ptb330.VaisalaPtb330,
+    settings.VentusConfig: ventus.Ventus,
 }
 
 
@@ -47,20 +46,20 @@ def role_devices(devices: DevicesConfig) -> role_bench.RoleDevices:
     return role_bench.RoleDevices(**made)
 
 
-def _driver(role: str, section: AnyDriver, links: modbus_links.ModbusLinks) -> Any:
+def _driver(role: str, section: settings.AnyDriver, links: modbus_links.ModbusLinks) -> Any:
     match section:
-        case table.ModbusMapConfig():
+        case settings.ModbusMapConfig():
             return _modbus_value(role, section, links)
-        case table.BronkhorstModbusConfig():
+        case settings.BronkhorstModbusConfig():
             link = links.link(section.link, section.unit_id, section.timeout_s)
             return _bronkhorst(role, bronkhorst.ModbusParameters(link), section.serial)
-        case table.BronkhorstProparConfig():
+        case settings.BronkhorstProparConfig():
             port = serial_port.SerialPort(section.port, serial_port.SerialSettings(section.baud))
             return _bronkhorst(
                 role, bronkhorst_propar.ProparParameters(port, section.node, section.timeout_s), section.serial
             )
         case _:
-            return _SERIAL_DRIVERS[section.driver](**section.model_dump(exclude={"driver"}))
+            return _SERIAL_DRIVERS[type(section)](section)
 
 
 def _bronkhorst(
@@ -70,14 +69,14 @@ def _bronkhorst(
 
 
 def _modbus_value(
-    role: str, section: table.ModbusMapConfig, links: modbus_links.ModbusLinks
+    role: str, section: settings.ModbusMapConfig, links: modbus_links.ModbusLinks
 ) -> modbus_map.ModbusValue:
     value_map, fence = modbus_map.make_map(map_keys(section), section.preset)
     link = links.link(section.link, section.unit_id, section.timeout_s, fence)
     return modbus_map.ModbusValue(link, value_map, rest=0.0 if role in ACTUATORS else None)
 
 
-def map_keys(section: table.ModbusMapConfig) -> dict[str, Any]:
+def map_keys(section: settings.ModbusMapConfig) -> dict[str, Any]:
     """The keys of a map in the words of `drivers.modbus_map`."""
     keys = section.model_dump(include={"function", "type", "word_order", "address", "raw", "value", "limits"})
     if section.identity_address is not None and section.identity_equals is not None:

@@ -13,6 +13,7 @@ import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from firmware_iface import settings
 from firmware_iface.links import modbus_links, usb_ports
 from firmware_iface.roles import LinkError
 from membrane_ctrl.config.devices import DevicesConfig
@@ -57,9 +58,10 @@ def device_names(devices: DevicesConfig) -> set[str]:
         return modbus_names(devices.board, devices.unit_id)
     names: set[str] = set()
     for section in devices.roles().values():
-        names |= (
-            {_serial_name(section.port)} if hasattr(section, "port") else modbus_names(section.link, section.unit_id)
-        )
+        if isinstance(section, settings.ON_MODBUS):
+            names |= modbus_names(section.link, section.unit_id)
+        else:
+            names.add(_serial_name(section.port))
     return names
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from pydantic import Field
 
 from firmware_iface.roles import Pattern
+from firmware_iface.settings import Section
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig, PatternConfig
-from membrane_ctrl.config.section import Section
 from membrane_ctrl.config.toml_file import parse, prune, read_toml, with_height_map
 from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, origin_of
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from firmware_iface import settings
 from firmware_iface.drivers.modbus_map import ValueMap, make_map, preset
 from firmware_iface.emulators import (
     bronkhorst,
@@ -25,8 +26,7 @@ from firmware_iface.emulators import (
     ventus,
 )
 from firmware_iface.links import modbus_rtu, serial_port
-from membrane_ctrl.config import devices as table
-from membrane_ctrl.config.devices import AnyDriver, DevicesConfig
+from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.instruments.bench import map_keys
 
 _GATEWAY_NO_RESPONSE = 11
@@ -63,11 +63,11 @@ class Lab:
         self._servers: dict[str, modbus_server.ModbusTcpServer] = {}
         self._tables: defaultdict[str, dict[int, modbus_server.RegisterTable]] = defaultdict(dict)
         for role, section in devices.roles().items():
-            if isinstance(section, table.BronkhorstModbusConfig):
+            if isinstance(section, settings.BronkhorstModbusConfig):
                 self._tables[section.link][section.unit_id] = bronkhorst.BronkhorstRegisters(
                     self._bronkhorst(role, section.serial)
                 )
-            elif not isinstance(section, table.ModbusMapConfig):
+            elif not isinstance(section, settings.ModbusMapConfig):
                 self.serial[section.port] = self._device(role, section)
         self._map_devices()
         self._board: pump_board.PumpBoardEmulator | None = None
@@ -76,11 +76,11 @@ class Lab:
             self._tables[devices.board][devices.unit_id] = self._board.state
         for url, slaves in self._tables.items():
             if url.startswith("rtu:"):
-                _, settings = modbus_rtu.parse_rtu_url(url)
+                _, line = modbus_rtu.parse_rtu_url(url)
                 handlers = {
                     unit: partial(modbus_map_device.respond_to_input, table=found) for unit, found in slaves.items()
                 }
-                self.serial[url] = modbus_server.RtuBusEmulator(settings, handlers)
+                self.serial[url] = modbus_server.RtuBusEmulator(line, handlers)
 
     async def start(self) -> DevicesConfig:
         """Plug everything in; the configuration with the addresses that now answer. Raises OSError."""
@@ -109,9 +109,9 @@ class Lab:
             await self._board.stop()
         shutil.rmtree(self._folder, ignore_errors=True)
 
-    def _moved(self, section: AnyDriver) -> AnyDriver:
+    def _moved(self, section: settings.AnyDriver) -> settings.AnyDriver:
         """The table with the emulator's address."""
-        if not isinstance(section, (table.ModbusMapConfig, table.BronkhorstModbusConfig)):
+        if not isinstance(section, settings.ON_MODBUS):
             return section.model_copy(update={"port": str(self.wires[section.port].path)})
         return section.model_copy(update={"link": self._address(section.link)})
 
@@ -122,13 +122,13 @@ class Lab:
         _, mark, options = url.partition("?")
         return f"rtu://{self.wires[url].path}{mark}{options}"
 
-    def _device(self, role: str, section: AnyDriver) -> serial_device.SerialDevice:
+    def _device(self, role: str, section: settings.AnyDriver) -> serial_device.SerialDevice:
         match section:
-            case table.Optoncdt1420Config():
+            case settings.Optoncdt1420Config():
                 return optoncdt1420.Optoncdt1420Emulator(
                     self._sensor("displacement"), round(section.range_mm or 50), section.direction, section.baud
                 )
-            case table.KeyenceDlRs1aConfig():
+            case settings.KeyenceDlRs1aConfig():
                 return keyence_dl_rs1a.KeyenceDlRs1aEmulator(
                     self._sensor("displacement"),
                     section.direction,
@@ -136,11 +136,11 @@ class Lab:
                     section.parity,
                     section.amplifier + 1,
                 )
-            case table.VaisalaPtb330Config():
+            case settings.VaisalaPtb330Config():
                 return vaisala_ptb330.VaisalaPtb330Emulator(self._sensor("barometer"), section.baud)
-            case table.VentusConfig():
+            case settings.VentusConfig():
                 return ventus.VentusEmulator(self._actuator("pump"), section.power_max_mw)
-            case table.BronkhorstProparConfig():
+            case settings.BronkhorstProparConfig():
                 return bronkhorst.ProparDevice(
                     self._bronkhorst(role, section.serial), serial_port.SerialSettings(section.baud)
                 )
@@ -149,9 +149,9 @@ class Lab:
 
     def _map_devices(self) -> None:
         """One device for all maps that name the same unit of the same link."""
-        units: defaultdict[tuple[str, int], list[tuple[str, table.ModbusMapConfig]]] = defaultdict(list)
+        units: defaultdict[tuple[str, int], list[tuple[str, settings.ModbusMapConfig]]] = defaultdict(list)
         for role, section in self._devices.roles().items():
-            if isinstance(section, table.ModbusMapConfig):
+            if isinstance(section, settings.ModbusMapConfig):
                 units[section.link, section.unit_id].append((role, section))
         for (link, unit_id), members in units.items():
             sensors: dict[ValueMap, Callable[[], float]] = {}

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from firmware_iface.settings import Section
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
-from membrane_ctrl.config.section import Section
 from membrane_ctrl.control.experiments import machine, patterns, pump_map
 from membrane_ctrl.control.gas import PumpCurve
 

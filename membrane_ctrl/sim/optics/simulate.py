@@ -12,7 +12,7 @@ import tomli_w
 from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern
-from membrane_ctrl.config.section import Section
+from firmware_iface.settings import Section
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
