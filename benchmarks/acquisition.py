@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from benchmarks.figures import Figure, at_most
-from firmware_iface.display.response import ScreenRaster
+from firmware_iface.display import ScreenRaster
 from firmware_iface.drivers.camera_aravis import AravisCamera
 from firmware_iface.drivers.screen_pygame import PygameScreen, ScreenSettings
 from firmware_iface.roles import Pattern

@@ -12,7 +12,7 @@ from functools import partial
 
 from firmware_iface import board_under_test, register_map, roles
 from firmware_iface.board_under_test import PERIOD_S, PUMP_FRACTION, REST_S, other_key, require
-from firmware_iface.links.modbus_links import ModbusLinks
+from firmware_iface.links.modbus_rtu import ModbusLinks
 
 _GRACE_S = 0.1  # the board's own loop and one wake-up after the period
 _NEAR = 0.002  # of a fraction: counts of a board that rounds its output

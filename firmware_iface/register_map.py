@@ -1,7 +1,5 @@
 """The register map: loaded from `registers.toml`, checked, and used to turn registers into values and back."""
 
-from __future__ import annotations
-
 import math
 import struct
 import tomllib
@@ -146,7 +144,7 @@ class RegisterMap:
         """The bit of the fault of that name, as a number. Raises KeyError."""
         return {fault.name: fault.mask for fault in self.faults}[name]
 
-    def of_version(self, version: int) -> RegisterMap:
+    def of_version(self, version: int) -> "RegisterMap":
         """The map as boards of an earlier version have it. Raises RegisterMapError for one that is not known."""
         if not 1 <= version <= self.map_version:
             raise RegisterMapError(f"map version {version} is none of 1..{self.map_version}")

@@ -229,11 +229,14 @@ class Pattern:
         return f"{self.axis}_{self.role}_{self.index}" if self.axis else self.role
 
 
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+
 @dataclass(frozen=True, slots=True)
 class Frame:
     """One exposure: `pixels` (height, width) uint8 or uint16, `time_s` the start of exposure on the run's clock."""
 
-    pixels: NDArray[np.uint8] | NDArray[np.uint16]
+    pixels: Pixels
     time_s: float
 
 
@@ -269,7 +272,7 @@ class FrameLostError(LinkError):
 class ExposingCamera(Protocol):
     """A camera whose transfer may overlap with the next pattern."""
 
-    def expose(self, out: NDArray[np.uint8] | NDArray[np.uint16] | None = None) -> None:
+    def expose(self, out: Pixels | None = None) -> None:
         """Trigger, and return when the exposure is over. Raises LinkError."""
 
     def fetch(self) -> Frame:

@@ -1,7 +1,5 @@
 """What can be set of each driver: its table in the configuration, with the limits and the defaults."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -56,7 +54,7 @@ class Optoncdt1420Config(Section):
     timeout_s: Timeout = 0.2  # for an answer, and for a value to come when none has since the last reading
 
     @model_validator(mode="after")
-    def _rate(self) -> Optoncdt1420Config:
+    def _rate(self) -> "Optoncdt1420Config":
         rates_khz = (0.25, 0.5, 1.0, 2.0, 4.0)
         if self.rate_khz not in rates_khz:
             raise ValueError(f"rate_khz = {self.rate_khz:g}: the sensor has {', '.join(f'{r:g}' for r in rates_khz)}")
@@ -146,7 +144,7 @@ class ModbusMapConfig(Section):
     identity_equals: Word | None = None
 
     @model_validator(mode="after")
-    def _line(self) -> ModbusMapConfig:
+    def _line(self) -> "ModbusMapConfig":
         for name, pair in (("raw", self.raw), ("value", self.value)):
             if pair is not None and pair[0] == pair[1]:
                 raise ValueError(f"{name} needs two different numbers")

@@ -16,14 +16,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from firmware_iface import roles
+from firmware_iface import roles, settings
 from firmware_iface.links import aravis as arv
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, Frame, LinkDownError, LinkError
-from firmware_iface.settings import AravisCameraConfig
-
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 # One frame being filled and one to spare; each is copied out at once
 _BUFFERS = 3
@@ -57,7 +52,7 @@ class AravisCamera:
 
     def __init__(
         self,
-        config: AravisCameraConfig,
+        config: settings.AravisCameraConfig,
         width_px: int,
         height_px: int,
         now: Callable[[], float] = time.monotonic,
@@ -71,9 +66,9 @@ class AravisCamera:
         self._camera: int | None = None
         self._stream: int | None = None
         self._opened = False
-        self._pending: tuple[float, Pixels | None] | None = None
+        self._pending: tuple[float, roles.Pixels | None] | None = None
 
-    def open(self) -> DeviceIdentity:
+    def open(self) -> roles.DeviceIdentity:
         """Connect, apply the settings, read them back, start the stream.
 
         Raises LinkError (no library, no camera, camera in use), DeviceRefusedError (a setting that the camera does
@@ -84,19 +79,19 @@ class AravisCamera:
         try:
             self._camera = library.call("arv_camera_new", config.camera.encode() or None)
             if not self._camera:
-                raise LinkDownError(f"{self._name}: not found; see `membrane-ctrl devices`")
+                raise roles.LinkDownError(f"{self._name}: not found; see `membrane-ctrl devices`")
             self._look_whether_ours()
             identity = self._identity()
             self._apply()
             self._start_stream()
-        except LinkError as error:
+        except roles.LinkError as error:
             self.close()
             raise self._told(error, "opening") from None
         self.counts.reconnects += self._opened
         self._opened = True
         return identity
 
-    def expose(self, out: Pixels | None = None) -> None:
+    def expose(self, out: roles.Pixels | None = None) -> None:
         """Trigger, and return when the exposure is over: the screen may change while the frame is transferred.
 
         Raises LinkError without a camera.
@@ -109,20 +104,20 @@ class AravisCamera:
         time_s = self._now()
         try:
             library.call("arv_camera_software_trigger", self._camera)
-        except LinkError as error:
+        except roles.LinkError as error:
             self._abandon()
             raise self._told(error, "trigger") from None
         self._pending = time_s, out
         self._sleep(max(0.0, time_s + self.config.exposure_ms / 1000.0 - self._now()))
 
-    def fetch(self) -> Frame:
+    def fetch(self) -> roles.Frame:
         """The frame of the last `expose`, in its `out` if one was given.
 
         Raises FrameLostError (it did not come, or not whole: show the pattern again and expose again), LinkError
         (nothing was exposed).
         """
         if self._pending is None or self._stream is None:
-            raise LinkError(f"{self._name}: no exposure to fetch")
+            raise roles.LinkError(f"{self._name}: no exposure to fetch")
         (time_s, out), self._pending = self._pending, None
         library = arv.aravis()
         timeout_us = round(1e6 * self.config.timeout_s)
@@ -138,13 +133,13 @@ class AravisCamera:
                 raise roles.FrameLostError(
                     f"{self._name}: frame not whole (aravis status {status}); cable, packet size, other traffic?"
                 )
-            frame = Frame(self._pixels(buffer, out), time_s)
+            frame = roles.Frame(self._pixels(buffer, out), time_s)
         finally:
             library.call("arv_stream_push_buffer", self._stream, buffer)
         self.counts.taken += 1
         return frame
 
-    def grab(self, out: Pixels | None = None) -> Frame:
+    def grab(self, out: roles.Pixels | None = None) -> roles.Frame:
         """One exposure, taken again when it is lost.
 
         Raises LinkError (no camera, or three frames lost in a row).
@@ -189,13 +184,13 @@ class AravisCamera:
             "manual": "GenICam SFNC 2.7; aravis 0.8",
         }
 
-    def _identity(self) -> DeviceIdentity:
+    def _identity(self) -> roles.DeviceIdentity:
         words = (
             arv.aravis().text(f"arv_camera_get_{word}", self._camera)
             for word in ("vendor_name", "model_name", "device_serial_number")
         )
         vendor, model, serial = words
-        return DeviceIdentity(f"{vendor} {model}", serial, "", self.describe()["settings"])
+        return roles.DeviceIdentity(f"{vendor} {model}", serial, "", self.describe()["settings"])
 
     def _look_whether_ours(self) -> None:
         """A GigE Vision camera lets everyone read, and everyone but its one controller write into the void."""
@@ -210,7 +205,7 @@ class AravisCamera:
         sensor = [ctypes.c_int() for _ in range(2)]
         call("arv_camera_get_sensor_size", camera, *map(ctypes.byref, sensor))
         if (found := (sensor[0].value, sensor[1].value)) != self._size:
-            raise DeviceRefusedError(
+            raise roles.DeviceRefusedError(
                 f"its sensor has {found[0]} x {found[1]} pixels, [optics.camera] says "
                 f"{self._size[0]} x {self._size[1]}"
             )
@@ -242,7 +237,7 @@ class AravisCamera:
 
     def _must_be(self, name: str, found: Any, wanted: Any) -> None:
         if found != wanted:
-            raise DeviceRefusedError(f"{name} = {found} after {wanted} was written")
+            raise roles.DeviceRefusedError(f"{name} = {found} after {wanted} was written")
 
     @property
     def _format(self) -> int:
@@ -258,7 +253,7 @@ class AravisCamera:
                 library.call("arv_camera_gv_set_packet_size", camera, self.config.packet_bytes)
         self._stream = library.call("arv_camera_create_stream", camera, None, None)
         if not self._stream:
-            raise LinkError("no stream")
+            raise roles.LinkError("no stream")
         if gige:
             library.fix_socket_buffer(self._stream, _SOCKET_BYTES)
         payload_bytes = library.call("arv_camera_get_payload", camera)
@@ -281,7 +276,7 @@ class AravisCamera:
         if self._stream is None:
             return
         library = arv.aravis()
-        with suppress(LinkError):
+        with suppress(roles.LinkError):
             library.call("arv_camera_stop_acquisition", self._camera)
         library.call("g_object_unref", self._stream)
         self._stream = None
@@ -291,10 +286,10 @@ class AravisCamera:
         self._stop_stream()
         try:
             self._start_stream()
-        except LinkError:
+        except roles.LinkError:
             self._abandon()
 
-    def _pixels(self, buffer: int, out: Pixels | None) -> Pixels:
+    def _pixels(self, buffer: int, out: roles.Pixels | None) -> roles.Pixels:
         """Copy a whole frame's pixels."""
         library = arv.aravis()
         found = tuple(
@@ -302,16 +297,16 @@ class AravisCamera:
         )
         height_px, width_px = self._size[::-1]
         if found != (height_px, width_px, self._format):
-            raise LinkError(f"{self._name}: sent a frame of {found[1]} x {found[0]}, format {found[2]:#x}")
+            raise roles.LinkError(f"{self._name}: sent a frame of {found[1]} x {found[0]}, format {found[2]:#x}")
         wide = (self._format >> 16) & 0xFF > 8  # bits a pixel, in the format's number
         dtype: np.dtype[Any] = np.dtype(np.uint16 if wide else np.uint8)
         size = ctypes.c_size_t()
         start = library.call("arv_buffer_get_data", buffer, ctypes.byref(size))
         count = height_px * width_px
         if size.value < count * dtype.itemsize:
-            raise LinkError(f"{self._name}: sent {size.value} bytes instead of {count * dtype.itemsize}")
+            raise roles.LinkError(f"{self._name}: sent {size.value} bytes instead of {count * dtype.itemsize}")
         memory = memoryview((ctypes.c_char * (count * dtype.itemsize)).from_address(start))
-        seen: Pixels = np.ndarray(count, dtype, memory).reshape(height_px, width_px)
+        seen: roles.Pixels = np.ndarray(count, dtype, memory).reshape(height_px, width_px)
         if out is None:
             return seen.copy()
         if out.shape != seen.shape or out.dtype != seen.dtype:
@@ -319,16 +314,18 @@ class AravisCamera:
         np.copyto(out, seen)
         return out
 
-    def _told(self, error: LinkError, doing: str) -> LinkError:
+    def _told(self, error: roles.LinkError, doing: str) -> roles.LinkError:
         """The error with the camera's name and the remedy."""
         name, message = self._name, str(error)
         code = error.code if isinstance(error, arv.AravisError) else -1
         if code in _TAKEN:
-            return LinkError(f"{name}: in use by another program ({message}); close it, then try again")
+            return roles.LinkError(f"{name}: in use by another program ({message}); close it, then try again")
         if code == arv.NOT_FOUND:
-            return LinkDownError(f"{name}: not found; is it on and plugged in? `membrane-ctrl devices` lists what is")
+            return roles.LinkDownError(
+                f"{name}: not found; is it on and plugged in? `membrane-ctrl devices` lists what is"
+            )
         if code in _GONE:
-            return LinkDownError(f"{name}: {doing}: no answer ({message}); is it on and plugged in?")
-        if isinstance(error, LinkDownError) or message == arv.MISSING:
+            return roles.LinkDownError(f"{name}: {doing}: no answer ({message}); is it on and plugged in?")
+        if isinstance(error, roles.LinkDownError) or message == arv.MISSING:
             return error
-        return DeviceRefusedError(f"{name}: {doing}: {message}; see [devices.camera]")
+        return roles.DeviceRefusedError(f"{name}: {doing}: {message}; see [devices.camera]")

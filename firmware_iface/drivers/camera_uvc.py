@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, Frame, LinkDownError
-from firmware_iface.settings import UvcCameraConfig
+from firmware_iface import roles, settings
 
 # One in the driver's queue although one was asked for, and one whose exposure had begun
 _STALE_FRAMES = 2
@@ -48,7 +47,7 @@ class UvcCamera:
 
     def __init__(
         self,
-        config: UvcCameraConfig,
+        config: settings.UvcCameraConfig,
         width_px: int,
         height_px: int,
         now: Callable[[], float] = time.monotonic,
@@ -57,14 +56,14 @@ class UvcCamera:
         self._config, self._size, self._now, self._make = config, (width_px, height_px), now, capture
         self._capture: Capture | None = None
 
-    def open(self) -> DeviceIdentity:
+    def open(self) -> roles.DeviceIdentity:
         """Connect and set. Raises LinkDownError without a camera, DeviceRefusedError for another size or exposure."""
         self.close()
         config = self._config
         self._capture = capture = self._make(int(config.port) if config.port.isdigit() else config.port)
         if not capture.isOpened():
             self.close()
-            raise LinkDownError(
+            raise roles.LinkDownError(
                 f"camera {config.port}: cannot be opened; is it plugged in, used by another program, "
                 "and are you in the group video?"
             )
@@ -82,10 +81,12 @@ class UvcCamera:
             capture.set(prop, value)
             if (found := capture.get(prop)) != value:
                 self.close()
-                raise DeviceRefusedError(f"camera {config.port}: {name} = {found:g} after {value:g} was written")
-        return DeviceIdentity("UVC camera", "", "", self.describe()["settings"])
+                raise roles.DeviceRefusedError(
+                    f"camera {config.port}: {name} = {found:g} after {value:g} was written"
+                )
+        return roles.DeviceIdentity("UVC camera", "", "", self.describe()["settings"])
 
-    def grab(self, out: NDArray[np.uint8] | None = None) -> Frame:
+    def grab(self, out: NDArray[np.uint8] | None = None) -> roles.Frame:
         """The next whole frame that was begun after the call, as grey (the green channel of a colour camera).
 
         Raises LinkDownError (the camera went away).
@@ -99,16 +100,16 @@ class UvcCamera:
             good, image = self._capture.read()
             if not good:
                 self.close()
-                raise LinkDownError(f"camera {self._config.port}: no frame; unplugged?")
+                raise roles.LinkDownError(f"camera {self._config.port}: no frame; unplugged?")
         pixels: NDArray[np.uint8] = np.asarray(image)
         if pixels.ndim == 3:
             pixels = pixels[:, :, 1]
         if out is None:
-            return Frame(pixels.copy(), time_s)
+            return roles.Frame(pixels.copy(), time_s)
         if out.shape != pixels.shape:
-            raise DeviceRefusedError(f"camera {self._config.port}: sent {pixels.shape}, wanted is {out.shape}")
+            raise roles.DeviceRefusedError(f"camera {self._config.port}: sent {pixels.shape}, wanted is {out.shape}")
         np.copyto(out, pixels)
-        return Frame(out, time_s)
+        return roles.Frame(out, time_s)
 
     def close(self) -> None:
         """Give the camera back. Never raises."""

@@ -13,10 +13,9 @@ import asyncio
 import math
 import re
 
+from firmware_iface import roles, settings
 from firmware_iface.drivers.linked_device import LineDriver, StepGate
 from firmware_iface.links import exchange, serial_port
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, DisplacementSample, LinkError
-from firmware_iface.settings import KeyenceDlRs1aConfig
 
 _VALUE = r"[+-](?:\d\d\.\d{3}|\d{3}\.\d\d|\d{4}\.\d|E{2}\.E{3}|E{3}\.E{2}|E{4}\.E)"
 _ALL = re.compile(rf"(?:M0((?:,{_VALUE})+)|ER,M0,(\d\d))\r\n?")
@@ -40,7 +39,7 @@ class KeyenceDlRs1a(LineDriver):
 
     manual = "DL-RS1A user's manual, IL edition, pages 7-16"
 
-    def __init__(self, config: KeyenceDlRs1aConfig, port: serial_port.BytePort | None = None) -> None:
+    def __init__(self, config: settings.KeyenceDlRs1aConfig, port: serial_port.BytePort | None = None) -> None:
         self._config = config
         number = f"{config.amplifier:02d}"
         self._read_command = f"SR,{number},038"
@@ -55,7 +54,7 @@ class KeyenceDlRs1a(LineDriver):
         self._decimals = 3
         self._readings = 0
 
-    async def open(self) -> DeviceIdentity:
+    async def open(self) -> roles.DeviceIdentity:
         """Open the port, see that the amplifier is there and well. The unit has no settings of its own to apply.
 
         Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (no such amplifier, one
@@ -65,28 +64,30 @@ class KeyenceDlRs1a(LineDriver):
         self._gate = StepGate(self._config.step_max_um)
         return await self._opened(self._identify)
 
-    async def _identify(self) -> DeviceIdentity:
+    async def _identify(self) -> roles.DeviceIdentity:
         every = await self._link.query("M0", _ALL, _ALL_CHARS)
         _refuse(self._link.name, every[2])
         values = every[1][1:].split(",")
         if self._config.amplifier >= len(values):
-            raise DeviceRefusedError(
+            raise roles.DeviceRefusedError(
                 f"{self._link.name}: amplifier = {self._config.amplifier}, but there are only {len(values)} "
                 "(0 is the first)"
             )
         self._decimals = len(values[self._config.amplifier].partition(".")[2])
         if _STEPS_UM[self._decimals] > self._config.step_max_um:
-            raise DeviceRefusedError(f"{self._link.name}: head with steps of {_STEPS_UM[self._decimals]:g} um")
+            raise roles.DeviceRefusedError(f"{self._link.name}: head with steps of {_STEPS_UM[self._decimals]:g} um")
         errors = await self._link.query(self._errors_command, self._errors_answer)
         if errors[2] != _NOT_READABLE:  # amplifiers that do not tell: their head error is seen in the value
             _refuse(self._link.name, errors[2])
         if bits := int(errors[1] or 0):
-            raise DeviceRefusedError(f"{self._link.name}: amplifier in error (state {bits:016b}); see its manual")
+            raise roles.DeviceRefusedError(
+                f"{self._link.name}: amplifier in error (state {bits:016b}); see its manual"
+            )
         await self._reading()  # the first one is confirmed by a second
         detail = f"amplifier {self._config.amplifier} of {len(values)}, steps of {_STEPS_UM[self._decimals]:g} um"
-        return DeviceIdentity("Keyence DL-RS1A", "", "", detail)
+        return roles.DeviceIdentity("Keyence DL-RS1A", "", "", detail)
 
-    async def displacement(self) -> DisplacementSample:
+    async def displacement(self) -> roles.DisplacementSample:
         """Ask for the value now.
 
         Counter and time are the driver's: valid answers so far, time of arrival. Raises LinkError (no valid answer,
@@ -94,11 +95,11 @@ class KeyenceDlRs1a(LineDriver):
         """
         quality, displacement_um, passed = await self._reading()
         if not passed:
-            raise LinkError(
+            raise roles.LinkError(
                 f"{self._link.name}: jump to {displacement_um:.0f} um, not believed before it is repeated"
             )
         self._readings += 1
-        return DisplacementSample(displacement_um, quality, self._readings, asyncio.get_running_loop().time())
+        return roles.DisplacementSample(displacement_um, quality, self._readings, asyncio.get_running_loop().time())
 
     async def _reading(self) -> tuple[int, float, bool]:
         """Quality, displacement and whether the gate passed it."""
@@ -106,7 +107,7 @@ class KeyenceDlRs1a(LineDriver):
         _refuse(self._link.name, answer[2])
         text = answer[1]
         if len(text.partition(".")[2]) != self._decimals:
-            raise LinkError(f"{self._link.name}: {text} has not {self._decimals} decimals as before")
+            raise roles.LinkError(f"{self._link.name}: {text} has not {self._decimals} decimals as before")
         if "E" in text:
             return QUALITY_AMPLIFIER_ERROR, math.nan, True
         # page 12: beyond the display above or below; one less: no value
@@ -123,4 +124,4 @@ class KeyenceDlRs1a(LineDriver):
 
 def _refuse(name: str, code: str | None) -> None:
     if code is not None:
-        raise DeviceRefusedError(f"{name}: error {code} ({ERRORS.get(int(code), 'unknown')})")
+        raise roles.DeviceRefusedError(f"{name}: error {code} ({ERRORS.get(int(code), 'unknown')})")

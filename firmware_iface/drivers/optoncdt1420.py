@@ -22,10 +22,9 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_iface import roles, settings
 from firmware_iface.drivers.linked_device import LinkedDevice, StepGate
 from firmware_iface.links.serial_port import BytePort, SerialPort, SerialSettings
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, DisplacementSample, LinkDownError, LinkError
-from firmware_iface.settings import Optoncdt1420Config
 
 _IN_RANGE = (643, 64_877)  # page 65: below and above are reserves, measured but not specified
 _PROMPT = b"->"
@@ -95,7 +94,7 @@ class Optoncdt1420(LinkedDevice):
     time of arrival. A sensor that repeats itself repeats its counter too, and that is no new value.
     """
 
-    def __init__(self, config: Optoncdt1420Config, port: BytePort | None = None) -> None:
+    def __init__(self, config: settings.Optoncdt1420Config, port: BytePort | None = None) -> None:
         self._config = config
         self._port = port or SerialPort(config.port, SerialSettings(config.baud))
         super().__init__(self._port)
@@ -112,7 +111,7 @@ class Optoncdt1420(LinkedDevice):
         self._arrived_s = 0.0
         self._silent = 0
 
-    async def open(self) -> DeviceIdentity:
+    async def open(self) -> roles.DeviceIdentity:
         """Open the port, stop the stream, check who it is, set it and read it back, start the stream.
 
         Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another device, another
@@ -122,7 +121,7 @@ class Optoncdt1420(LinkedDevice):
         self._settle_anew()
         self._port.open(self)
         try:
-            with contextlib.suppress(DeviceRefusedError):  # refused with what was said to it half before
+            with contextlib.suppress(roles.DeviceRefusedError):  # refused with what was said to it half before
                 await self._command("OUTPUT NONE")
             await self._command("OUTPUT NONE")
             identity = await self._identify()
@@ -131,7 +130,7 @@ class Optoncdt1420(LinkedDevice):
             self._port.write(b"OUTPUT RS422\n")  # what the stream is mixed with the answer to this is skipped
             self._heard = None
             await self._first_readings()
-        except LinkError:
+        except roles.LinkError:
             await self.close()
             raise
         self._port.succeeded()
@@ -146,22 +145,22 @@ class Optoncdt1420(LinkedDevice):
             "OUTADD_RS422 COUNTER",
         ]
 
-    async def _identify(self) -> DeviceIdentity:
+    async def _identify(self) -> roles.DeviceIdentity:
         text = await self._command("GETINFO")
         fields = dict(re.findall(r"^\s*([\w. -]+?):\s*(.*?)\s*$", text, re.MULTILINE))
         name, measuring_range = fields.get("Name", ""), fields.get("Measuring range", "")
         found = re.match(r"([\d.]+)\s*mm", measuring_range)
         if "1420" not in name or found is None:
-            raise DeviceRefusedError(f"{self._port.name}: {name or text[:40]!r} is no optoNCDT 1420")
+            raise roles.DeviceRefusedError(f"{self._port.name}: {name or text[:40]!r} is no optoNCDT 1420")
         self._range_mm = float(found[1])
         if self._config.range_mm is not None and self._range_mm != self._config.range_mm:
-            raise DeviceRefusedError(
+            raise roles.DeviceRefusedError(
                 f"{self._port.name}: {name} measures {self._range_mm:g} mm, range_mm = {self._config.range_mm:g}"
             )
         self._zero_mm = self._range_mm / 2 if self._config.zero_mm is None else self._config.zero_mm
         ends = [1000 * self._config.direction * (end_mm - self._zero_mm) for end_mm in (0.0, self._range_mm)]
         serial, version = fields.get("Serial", ""), fields.get("Version", "")
-        return DeviceIdentity(name, serial, version, f"{self._range_mm:g} mm", (min(ends), max(ends)))
+        return roles.DeviceIdentity(name, serial, version, f"{self._range_mm:g} mm", (min(ends), max(ends)))
 
     async def _set(self, setting: str) -> None:
         name = setting.split()[0]
@@ -169,7 +168,7 @@ class Optoncdt1420(LinkedDevice):
         text = await self._command(name)
         found = re.search(rf"^\s*{name} +(.+?)\s*$", text, re.MULTILINE)
         if found is None or _plain(found[1]) != _plain(setting.split()[1]):
-            raise DeviceRefusedError(f"{self._port.name}: set {setting!r}, read back {text.strip()[:60]!r}")
+            raise roles.DeviceRefusedError(f"{self._port.name}: set {setting!r}, read back {text.strip()[:60]!r}")
 
     async def _command(self, command: str) -> str:
         """The answer without its prompt. Raises LinkError, DeviceRefusedError."""
@@ -184,11 +183,11 @@ class Optoncdt1420(LinkedDevice):
             hint = f"no answer within {self._config.timeout_s:g} s; is it on, wired and set to {self._port.settings}?"
             if self._heard:
                 hint = f"{len(self._heard)} bytes but no prompt within {self._config.timeout_s:g} s; wrong baud rate?"
-            raise LinkError(f"{what}: {hint}")
+            raise roles.LinkError(f"{what}: {hint}")
         # bytes of a stream that is just being stopped have no text in them that could be an error: see the marks
         text = self._heard.rstrip()[: -len(_PROMPT)].decode("ascii", "replace")
         if error := _ERROR.search(text):
-            raise DeviceRefusedError(f"{what}: E{error[1]}{error[2]}")
+            raise roles.DeviceRefusedError(f"{what}: E{error[1]}{error[2]}")
         return text
 
     async def _first_readings(self) -> None:
@@ -200,7 +199,7 @@ class Optoncdt1420(LinkedDevice):
             if len(good):
                 self._gate.passes(self._displacement_um(middle(good)))
 
-    async def displacement(self) -> DisplacementSample:
+    async def displacement(self) -> roles.DisplacementSample:
         """Middle of all values since the last call; waits for one when there is none yet.
 
         Raises LinkError (no value in time, or one that cannot be: it is dropped), LinkDownError (the port is gone, or
@@ -208,42 +207,44 @@ class Optoncdt1420(LinkedDevice):
         """
         try:
             await self._wait_for_values()
-        except LinkDownError:
+        except roles.LinkDownError:
             raise
-        except LinkError as error:
+        except roles.LinkError as error:
             self._silent += 1
             if self._silent < _SILENT_MAX:
                 raise
             await self.close()
-            raise LinkDownError(f"{error}; it restarted or lost its power: open it again") from error
+            raise roles.LinkDownError(f"{error}; it restarted or lost its power: open it again") from error
         self._silent = 0
         self._port.succeeded()
         values = self._taken()
         good = values[values <= _RAW_MAX]
         if 2 * len(good) <= len(values):
             codes, counts = np.unique(values[values > _RAW_MAX], return_counts=True)
-            return DisplacementSample(math.nan, int(codes[np.argmax(counts)]), self._counted, self._arrived_s)
+            return roles.DisplacementSample(math.nan, int(codes[np.argmax(counts)]), self._counted, self._arrived_s)
         raw = middle(good)
         displacement_um = self._displacement_um(raw)
         if not self._gate.passes(displacement_um):
-            raise LinkError(
+            raise roles.LinkError(
                 f"{self._port.name}: a jump to {displacement_um:.1f} um is not believed before it is repeated"
             )
         quality = 0 if _IN_RANGE[0] <= raw <= _IN_RANGE[1] else int(raw)
-        return DisplacementSample(math.nan if quality else displacement_um, quality, self._counted, self._arrived_s)
+        return roles.DisplacementSample(
+            math.nan if quality else displacement_um, quality, self._counted, self._arrived_s
+        )
 
     def _displacement_um(self, raw: float) -> float:
         return 1000 * self._config.direction * (distance_mm(raw, self._range_mm) - self._zero_mm)
 
     async def _wait_for_values(self) -> None:
         if not self._port.is_open:
-            raise LinkDownError(f"{self._port.name}: not connected")
+            raise roles.LinkDownError(f"{self._port.name}: not connected")
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._config.timeout_s):
                 while not self._batches:
                     await self._stirred()
         if not self._batches:
-            raise LinkError(f"{self._port.name}: no value within {self._config.timeout_s:g} s")
+            raise roles.LinkError(f"{self._port.name}: no value within {self._config.timeout_s:g} s")
 
     def _taken(self) -> NDArray[np.int64]:
         values = np.concatenate(self._batches)
@@ -255,7 +256,7 @@ class Optoncdt1420(LinkedDevice):
         self._stir.clear()
         await self._stir.wait()
         if not self._port.is_open:
-            raise LinkDownError(f"{self._port.name}: the port is gone")
+            raise roles.LinkDownError(f"{self._port.name}: the port is gone")
 
     def received(self, data: bytes) -> None:
         """Bytes came (called by the port)."""
@@ -268,7 +269,7 @@ class Optoncdt1420(LinkedDevice):
             del self._batches[:-_BATCHES_MAX]
         self._stir.set()
 
-    def lost(self, error: LinkDownError) -> None:
+    def lost(self, error: roles.LinkDownError) -> None:
         """The port is gone (called by the port)."""
         self._stir.set()
 

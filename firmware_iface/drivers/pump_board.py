@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from firmware_iface import roles
 from firmware_iface.drivers.linked_device import LinkedDevice
-from firmware_iface.links import modbus_links, modbus_rules
+from firmware_iface.links import modbus_rtu, modbus_rules
 from firmware_iface.register_map import Block, default_map, known_maps
 
 _KIND = "membrane pump board"
@@ -57,7 +57,7 @@ class PumpBoard(LinkedDevice):
         link: modbus_rules.ModbusLink | None = None,
     ) -> None:
         if link is None:
-            link = modbus_links.ModbusLinks().link(url, unit_id, timeout_s)
+            link = modbus_rtu.ModbusLinks().link(url, unit_id, timeout_s)
         self._registers = default_map()  # of the board that answers, once it has said its version
         period = self._registers.register("watchdog_period_s")
         if not period.allows(watchdog_s):

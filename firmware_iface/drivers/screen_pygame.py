@@ -4,7 +4,7 @@ Source: pygame-ce documentation, `pygame.display`. Patterns are rendered once, w
 out another size than the one asked for without a word, so every size that there is gets compared.
 
 `flip` returns when the picture is queued, not when it is lit: `show` waits the settle time, which is to be measured
-(`firmware_iface.display.measures`).
+(`firmware_iface.display`).
 """
 
 import importlib
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.display.response import DisplayResponse, ScreenRaster, linear_response, pattern_light
+from firmware_iface.display import DisplayResponse, ScreenRaster, linear_response, pattern_light
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkError, Pattern
 
 MISSING = "pygame-ce is not installed: pip install 'membrane-ctrl[screen]'"

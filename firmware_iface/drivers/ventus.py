@@ -10,10 +10,9 @@ its analogue input says, until it is told otherwise. Where gas must stop by itse
 import contextlib
 import re
 
+from firmware_iface import roles, settings
 from firmware_iface.drivers.linked_device import LineDriver
 from firmware_iface.links import exchange, serial_port
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
-from firmware_iface.settings import VentusConfig
 
 ENABLE, POWER_LIMIT_MW, STREAM, MODE, MANUAL_SOURCE, SET_VALUE, ERROR = 0, 1, 2, 10, 11, 23, 31
 FIRMWARE, DEVICE_TYPE, FIRMWARE_MINOR = 36, 37, 38
@@ -31,7 +30,7 @@ class Ventus(LineDriver):
 
     manual = "TN003 Communications Guide; no watchdog: the pump runs on when the host is gone"
 
-    def __init__(self, config: VentusConfig, port: serial_port.BytePort | None = None) -> None:
+    def __init__(self, config: settings.VentusConfig, port: serial_port.BytePort | None = None) -> None:
         self._power_max_mw = config.power_max_mw
         # streamed lines may be on their way when the stream is switched off
         answer = re.compile(rf"(?:#S[^\n]*\n)*#R{DEVICE_TYPE},({_NUMBER})\r?\n")
@@ -40,7 +39,7 @@ class Ventus(LineDriver):
         super().__init__(port, "\n", config.timeout_s, fence)
         self._commanded_mw = 0.0
 
-    async def open(self) -> DeviceIdentity:
+    async def open(self) -> roles.DeviceIdentity:
         """Open the port, stop the pump, check who it is, apply the settings and read them back.
 
         Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another device, or a
@@ -50,17 +49,19 @@ class Ventus(LineDriver):
         # off at once, also when nothing else works; a stream would never leave the line quiet
         return await self._opened(self._begin, f"\n#W{ENABLE},{_OFF}\n#W{STREAM},0\n")
 
-    async def _begin(self) -> DeviceIdentity:
+    async def _begin(self) -> roles.DeviceIdentity:
         about = await self._write_and_read({}, DEVICE_TYPE, FIRMWARE, FIRMWARE_MINOR)
         kind = int(about[DEVICE_TYPE])
         if kind not in DEVICE_TYPES:
-            raise DeviceRefusedError(f"{self._link.name}: device type {kind} is no Ventus driver (2 or 3)")
+            raise roles.DeviceRefusedError(f"{self._link.name}: device type {kind} is no Ventus driver (2 or 3)")
         wanted = self._settings_wanted()
         found = await self._write_and_read(wanted, *wanted)
         if found != wanted:
-            raise DeviceRefusedError(f"{self._link.name}: registers set to {wanted}, read back {found}")
+            raise roles.DeviceRefusedError(f"{self._link.name}: registers set to {wanted}, read back {found}")
         await self.set_pump(0.0)
-        return DeviceIdentity(f"Ventus {DEVICE_TYPES[kind]}", "", f"{about[FIRMWARE]:g}.{about[FIRMWARE_MINOR]:g}")
+        return roles.DeviceIdentity(
+            f"Ventus {DEVICE_TYPES[kind]}", "", f"{about[FIRMWARE]:g}.{about[FIRMWARE_MINOR]:g}"
+        )
 
     def _settings_wanted(self) -> dict[int, float]:
         return {
@@ -96,13 +97,13 @@ class Ventus(LineDriver):
             state = await self._write_and_read({}, *_STATE)
         if not self._as_commanded(state):
             await self._link.close()
-            raise LinkDownError(
+            raise roles.LinkDownError(
                 f"{self._link.name}: told {self._commanded_mw:.3f} mW, it has {state[SET_VALUE]:g} mW (on: "
                 f"{state[ENABLE]:g}, mode: {state[MODE]:g}, source: {state[MANUAL_SOURCE]:g}, limit: "
                 f"{state[POWER_LIMIT_MW]:g} mW); noise on the line, or it restarted: open it again"
             )
         if error := state[ERROR]:
-            raise LinkError(f"{self._link.name}: the pump reports error {error:g}; see its manual")
+            raise roles.LinkError(f"{self._link.name}: the pump reports error {error:g}; see its manual")
         return state[SET_VALUE] if state[ENABLE] else 0.0
 
     def _as_commanded(self, state: dict[int, float]) -> bool:
@@ -123,7 +124,7 @@ class Ventus(LineDriver):
     async def close(self) -> None:
         """Switch the pump off and close the port. Never raises."""
         if self._link.port.is_open:
-            with contextlib.suppress(LinkError):  # out of reach: what then stops the gas is not this program
+            with contextlib.suppress(roles.LinkError):  # out of reach: what then stops the gas is not this program
                 await self.set_pump(0.0)
         await self._link.close()
 

@@ -4,8 +4,6 @@ Written for itself and not on the client's library: two independent implementati
 server has no way to be silent, late or short. Source: Modbus application protocol 1.1b3 and messaging guide 1.0b.
 """
 
-from __future__ import annotations
-
 import asyncio
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -139,14 +137,14 @@ class ModbusTcpServer:
         for connection in tuple(self._connections):
             connection.hang_up()
 
-    def _connection(self) -> _Connection:
+    def _connection(self) -> "_Connection":
         return _Connection(self._handler, self._connections)
 
 
 class _Connection(asyncio.Protocol):
     """One client."""
 
-    def __init__(self, handler: Handler, connections: set[_Connection]) -> None:
+    def __init__(self, handler: Handler, connections: set["_Connection"]) -> None:
         self._handler = handler
         self._connections = connections
         self._buffer = b""

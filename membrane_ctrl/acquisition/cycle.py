@@ -13,12 +13,12 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from firmware_iface.roles import Pattern, Screen
+from firmware_iface.roles import Pattern, Pixels, Screen
 from membrane_ctrl.acquisition import exposures
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import FIELDS
-from membrane_ctrl.processes.frames import FrameWriter, Pixels
+from membrane_ctrl.processes.frames import FrameWriter
 from membrane_ctrl.processes.ring import RingAddress, RingReader
 
 # A full cycle may be spoilt by a door or by the mirror still moving: take two more at once. Three in a row mean

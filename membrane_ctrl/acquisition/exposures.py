@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Literal, Protocol, runtime_checkable
 
-from firmware_iface.roles import TRIES, ExposingCamera, Frame, FrameLostError, Pattern, Screen
-from membrane_ctrl.processes.frames import FrameSlot, FrameWriter, Pixels
+from firmware_iface.roles import TRIES, ExposingCamera, Frame, FrameLostError, Pattern, Pixels, Screen
+from membrane_ctrl.processes.frames import FrameSlot, FrameWriter
 
 # Where a cycle failed: whatever a device or the numerics raise becomes one kind of error that names the stage.
 

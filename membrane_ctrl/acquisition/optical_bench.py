@@ -8,11 +8,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface import settings
-from firmware_iface.display import response
-from firmware_iface.display.measures import Settling, checkerboard_problem, exposure_problem, settling, share_left
+from firmware_iface import display, settings
 from firmware_iface.drivers import camera_aravis, camera_folder, camera_uvc, screen_pygame
-from firmware_iface.roles import Frame, LinkError
+from firmware_iface.roles import Frame, LinkError, Pixels
 from membrane_ctrl.acquisition.exposures import CycleClock
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.metrology.phase import full_sequence
@@ -21,7 +19,6 @@ from membrane_ctrl.metrology.phase import full_sequence
 
 
 Levels = NDArray[np.uint8]
-Frames = NDArray[np.uint8] | NDArray[np.uint16]
 
 # Longer than any display takes that is fit for this
 LONG_S = 0.5
@@ -69,14 +66,16 @@ class DisplayTest:
     def exposure(self, full_scale_adu: int, exposure_ms: float) -> str:
         """What is wrong with the camera's exposure; empty when nothing is."""
         white, black = self._still(self._grey(255)), self._still(self._grey(0))
-        return exposure_problem(white, black, full_scale_adu, exposure_ms)
+        return display.exposure_problem(white, black, full_scale_adu, exposure_ms)
 
     def checkerboard(self) -> str:
         """Whether the screen shows pixel for pixel; empty when it does."""
         white, black = self._still(self._grey(255)), self._still(self._grey(0))
-        return checkerboard_problem(self._still(response.checkerboard(self._size[1], self._size[0])), white, black)
+        return display.checkerboard_problem(
+            self._still(display.checkerboard(self._size[1], self._size[0])), white, black
+        )
 
-    def settling(self) -> Settling:
+    def settling(self) -> display.Settling:
         """Time from a command to the light, over steps both ways between black, white and two greys.
 
         The greys are there because panels are slowest between them. Raises ValueError if the display never settles.
@@ -87,30 +86,30 @@ class DisplayTest:
         for one, other in ((0, 255), (64, 160)):
             pictures = {level: _thin(self._still(self._grey(level))) for level in (one, other)}
             again = _thin(self._still(self._grey(one)))
-            noise = max(noise, share_left(again, pictures[other], pictures[one]))
+            noise = max(noise, display.share_left(again, pictures[other], pictures[one]))
             for before, after in ((one, other), (other, one)) * _TIMES:
                 self._still(self._grey(before))
                 for delay_s, pixels in list(self._follow(self._grey(after))):  # looked at afterwards
                     delays_s.append(delay_s)
-                    left.append(share_left(pixels, pictures[before], pictures[after]))
-        found = settling(delays_s, left, noise)
+                    left.append(display.share_left(pixels, pictures[before], pictures[after]))
+        found = display.settling(delays_s, left, noise)
         self.settle_s = found.settle_s
         return found
 
-    def response(self) -> response.DisplayResponse:
+    def response(self) -> display.DisplayResponse:
         """Light against level. Raises ValueError if the camera sees no ramp."""
-        frames = [self._still(self._grey(level)) for level in response.RAMP_LEVELS]
+        frames = [self._still(self._grey(level)) for level in display.RAMP_LEVELS]
         swing = frames[-1].astype(np.float64) - frames[0]
         lit = swing > 0.5 * np.quantile(swing, 0.99)
-        return response.measured_response(response.RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames])
+        return display.measured_response(display.RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames])
 
-    def _still(self, levels: Levels) -> Frames:
+    def _still(self, levels: Levels) -> Pixels:
         self._screen.show_levels(levels)
         self._clock.sleep(self.settle_s)
         return self._camera.grab().pixels
 
-    def _follow(self, levels: Levels) -> Iterator[tuple[float, Frames]]:
-        """Frames one after the other, each with the time from the command to the start of its exposure."""
+    def _follow(self, levels: Levels) -> Iterator[tuple[float, Pixels]]:
+        """Pixels one after the other, each with the time from the command to the start of its exposure."""
         self._screen.show_levels(levels)
         begun_s = self._clock.now()
         while self._clock.now() - begun_s < _FOLLOWED_S:
@@ -121,7 +120,7 @@ class DisplayTest:
         return np.full(self._size, level, np.uint8)
 
 
-def _thin(pixels: Frames) -> Frames:
+def _thin(pixels: Pixels) -> Pixels:
     """Every fourth pixel both ways (of a Bayer sensor always the same colour): enough for means over blocks."""
     return pixels[::4, ::4].copy()
 
@@ -161,7 +160,7 @@ def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
         return OpticalBench(camera, camera)  # a folder of frames is both
     screen, pattern = devices.screen, config.optics.pattern
     try:
-        raster = response.ScreenRaster(
+        raster = display.ScreenRaster(
             screen.width_px, screen.height_px, screen.pixel_mm, pattern.periods, pattern.period_mm, screen.centre_px
         )
     except ValueError as error:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_iface.roles import LinkError, Pattern
+from firmware_iface.roles import LinkError, Pattern, Pixels
 from membrane_ctrl.acquisition import optical_bench, process, raw_frames, worker
 from membrane_ctrl.acquisition.cycle import CyclePlan, LaserHistory, Reconstructor, ShapeCycle, pause_s
 from membrane_ctrl.acquisition.exposures import CycleClock
@@ -20,7 +20,7 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.processes import child, ring
-from membrane_ctrl.processes.frames import FrameWriter, Pixels
+from membrane_ctrl.processes.frames import FrameWriter
 from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics
 from membrane_ctrl.sim.sensors import Truth
 

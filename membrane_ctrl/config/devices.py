@@ -1,7 +1,5 @@
 """The `[devices]` part of the configuration: the pump board, or one table a role and the `driver` that fills it."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 
@@ -31,7 +29,7 @@ class DevicesConfig(settings.Section):
     screen: settings.PygameScreenConfig | None = None
 
     @model_validator(mode="after")
-    def _board_or_roles(self) -> DevicesConfig:
+    def _board_or_roles(self) -> "DevicesConfig":
         filled = [role for role in ROLES if getattr(self, role) is not None]
         if self.board is not None and filled:
             raise ValueError(f"give either board, or one table a role; not board and {filled[0]}")
@@ -47,7 +45,7 @@ class DevicesConfig(settings.Section):
         return self
 
     @model_validator(mode="after")
-    def _one_owner_a_port(self) -> DevicesConfig:
+    def _one_owner_a_port(self) -> "DevicesConfig":
         owners: dict[str, tuple[str, str]] = {}
         for role, section in self.roles().items():
             link = ""
@@ -63,7 +61,7 @@ class DevicesConfig(settings.Section):
         return self
 
     @model_validator(mode="after")
-    def _camera_sees_a_screen(self) -> DevicesConfig:
+    def _camera_sees_a_screen(self) -> "DevicesConfig":
         if self.camera is None and self.screen is not None:
             raise ValueError("[devices.screen] needs a [devices.camera] that looks at it")
         if self.camera is not None and (self.screen is None) != isinstance(self.camera, settings.FolderCameraConfig):

@@ -1,7 +1,5 @@
 """The screen in the configuration: its pose, and how its face stands off a plane."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np
@@ -28,7 +26,7 @@ class HeightMapConfig(Section):
     heights_mm: tuple[Axis, ...]
 
     @model_validator(mode="after")
-    def _grid(self) -> HeightMapConfig:
+    def _grid(self) -> "HeightMapConfig":
         for name, axis in (("s_x_mm", self.s_x_mm), ("s_y_mm", self.s_y_mm)):
             steps = np.diff(axis)
             if not (steps[0] > 0 and np.ptp(steps) <= _EVEN * steps[0]):
@@ -63,7 +61,7 @@ class ScreenPoseConfig(Section):
         return self.origin_mm, self.s_x, self.s_y
 
     @model_validator(mode="after")
-    def _whole(self) -> ScreenPoseConfig:
+    def _whole(self) -> "ScreenPoseConfig":
         given = [value is not None for value in (self.origin_mm, self.s_x, self.s_y)]
         if any(given) and not all(given):
             raise ValueError("origin_mm, s_x and s_y belong together: give all or none")

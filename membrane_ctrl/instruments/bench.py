@@ -15,7 +15,7 @@ from firmware_iface.drivers import (
     ventus,
 )
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.links import modbus_links, serial_port
+from firmware_iface.links import modbus_rtu, serial_port
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.model.errors import DeviceError, InputError
 
@@ -36,7 +36,7 @@ def role_devices(devices: DevicesConfig) -> role_bench.RoleDevices:
 
     Raises InputError (a port, URL, preset or setting that the driver does not take).
     """
-    links = modbus_links.ModbusLinks()
+    links = modbus_rtu.ModbusLinks()
     made: dict[str, Any] = {}
     for role, section in devices.roles().items():
         try:
@@ -46,7 +46,7 @@ def role_devices(devices: DevicesConfig) -> role_bench.RoleDevices:
     return role_bench.RoleDevices(**made)
 
 
-def _driver(role: str, section: settings.AnyDriver, links: modbus_links.ModbusLinks) -> Any:
+def _driver(role: str, section: settings.AnyDriver, links: modbus_rtu.ModbusLinks) -> Any:
     match section:
         case settings.ModbusMapConfig():
             return _modbus_value(role, section, links)
@@ -69,7 +69,7 @@ def _bronkhorst(
 
 
 def _modbus_value(
-    role: str, section: settings.ModbusMapConfig, links: modbus_links.ModbusLinks
+    role: str, section: settings.ModbusMapConfig, links: modbus_rtu.ModbusLinks
 ) -> modbus_map.ModbusValue:
     value_map, fence = modbus_map.make_map(map_keys(section), section.preset)
     link = links.link(section.link, section.unit_id, section.timeout_s, fence)

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from firmware_iface import settings
-from firmware_iface.links import modbus_links, usb_ports
+from firmware_iface.links import modbus_rtu, usb_ports
 from firmware_iface.roles import LinkError
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.model.errors import DeviceError
@@ -70,7 +70,7 @@ def modbus_names(url: str, unit_id: int) -> set[str]:
     if url.startswith("rtu:"):
         return {_serial_name(url.removeprefix("rtu://").partition("?")[0])}
     try:
-        host, port = modbus_links.parse_tcp_url(url)
+        host, port = modbus_rtu.parse_tcp_url(url)
     except ValueError:
         return {url}  # no device can be there: whoever opens it says so
     return {f"{address} port {port} unit {unit_id}" for address in _addresses(host)}

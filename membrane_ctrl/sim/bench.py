@@ -1,7 +1,5 @@
 """The simulated bench as a process: the plant in real time behind the pump board's own protocol."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import multiprocessing
@@ -100,7 +98,7 @@ async def _serve(spec: BenchSpec, ready: Connection) -> None:
             await served.stop()
 
 
-async def _keep_running(bench: LiveBench, spec: BenchSpec, stop: asyncio.Event) -> None:
+async def _keep_running(bench: "LiveBench", spec: BenchSpec, stop: asyncio.Event) -> None:
     """Step the bench on absolute deadlines until told to stop."""
     orphaned_s: float | None = None
     deadline_s = time.monotonic()
@@ -203,7 +201,9 @@ class TwinProcess:
     truth: RingAddress  # where the twin publishes what its mirror really does
 
     @classmethod
-    def started(cls, config: Config, clock: RunClock, stack: contextlib.ExitStack, lab: bool = False) -> TwinProcess:
+    def started(
+        cls, config: Config, clock: RunClock, stack: contextlib.ExitStack, lab: bool = False
+    ) -> "TwinProcess":
         """Start the twin and wait until it listens; the stack ends it. Raises DeviceError, e.g. for a busy port.
 
         With `lab` it answers as the instruments that the configuration names, else as the pump board.

@@ -1,7 +1,5 @@
 """What the bench's sensors say of the truth."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import astuple, dataclass, fields
 
@@ -35,7 +33,7 @@ class Truth:
         return _STRUCT.pack(*astuple(self))
 
     @classmethod
-    def unpack(cls, message: bytes) -> Truth:
+    def unpack(cls, message: bytes) -> "Truth":
         """Inverse of `pack`. Raises struct.error on a message of another length."""
         return cls(*_STRUCT.unpack(message))
 

@@ -5,7 +5,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from membrane_ctrl.control.experiments import machine, patterns, trial
+from membrane_ctrl.control.experiments import machine, trial
 from tuning.identification.identify import Identified, identify, independence, prediction_errors, two_gains, whiteness
 from tuning.identification.records import Record
 
@@ -201,7 +201,7 @@ def experiment(rig: ExperimentRig, limit_um: float = 10.0) -> Experiments:
     """
     rig.hold(_SETTLE_S)
     around = rig.around(rig.hold(_QUIET_S), limit_um)
-    patterns.room(around)  # a relay without it would only say that it was stopped
+    machine.room(around)  # a relay without it would only say that it was stopped
     relays, finished = _relays(rig, around)
     gain = identify(relays).model.gain
     whole = relays

@@ -6,17 +6,13 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from firmware_iface.roles import Frame, LinkError, Pattern
+from firmware_iface.roles import Frame, LinkError, Pattern, Pixels
 from membrane_ctrl.config.schema import OpticsConfig, TwinConfig
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.shade import Light, cubic_weights, level_table, node_positions, normal_quantiles, shade
 from membrane_ctrl.sim.optics.trace import ScreenError, Trace, camera_pose, pixel_directions, screen_pose, trace
-
-# Pictures that the camera takes of the screen in the moving film.
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 # Nodes this far apart on the mirror put a typical film's phase < 1e-4 rad off the exact trace (asserted in the tests)
 _NODE_MM = 4.6

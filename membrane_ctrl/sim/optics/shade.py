@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from firmware_iface.roles import Pattern
+from firmware_iface.roles import Pattern, Pixels
 from membrane_ctrl.config.schema import PatternConfig
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -101,7 +101,7 @@ def shade(
     scale: FloatArray,
     loss: tuple[FloatArray, FloatArray],
     noise: tuple[NDArray[np.float32], float, int],
-    out: NDArray[np.uint8] | NDArray[np.uint16],
+    out: Pixels,
 ) -> None:
     """Fill `out` (H, W) with the picture of one pattern.
 
@@ -201,7 +201,7 @@ class LevelTable:
     an end; the other is one value a cell over the whole region.
     """
 
-    values: NDArray[np.float64]
+    values: FloatArray
     cell_mm: float
     smooth: bool
 
@@ -253,6 +253,6 @@ def pattern_sequence(kind: str, config: PatternConfig, shifts_rad: tuple[float, 
     return patterns + ([Pattern("white"), Pattern("black")] if kind == "full" else [])
 
 
-def _lit(levels: NDArray[np.float64], light: Light) -> NDArray[np.float64]:
+def _lit(levels: FloatArray, light: Light) -> FloatArray:
     """Share of a white screen's light: gamma, and what leaks through a black screen."""
     return np.asarray(light.leak + (1.0 - light.leak) * np.clip(levels, 0.0, 1.0) ** light.gamma)

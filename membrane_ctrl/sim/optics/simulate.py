@@ -9,9 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 import tomli_w
-from numpy.typing import NDArray
 
-from firmware_iface.roles import Pattern
+from firmware_iface.roles import Pattern, Pixels
 from firmware_iface.settings import Section
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
@@ -113,7 +112,6 @@ def _frame_row(spec: SimulationSpec, frame: int, reading_um: float) -> dict[str,
     return row
 
 
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 # noise does not compress: harder levels cost time and save nothing
 _PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 

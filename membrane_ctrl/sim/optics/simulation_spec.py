@@ -1,7 +1,5 @@
 """What a simulated capture set is made of, checked before anything is written."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from math import isfinite, pi, sin
 from typing import Literal, get_args
@@ -44,7 +42,7 @@ class FrameFault:
         return _DEFAULT_AMOUNT[self.kind] if self.amount is None else self.amount
 
     @classmethod
-    def parse(cls, text: str) -> FrameFault:
+    def parse(cls, text: str) -> "FrameFault":
         """Read `kind:frame` or `kind:frame:amount`.
 
         Raises ValueError if the text has another form, names no known kind or its amount is not a number.
