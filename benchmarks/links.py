@@ -25,19 +25,25 @@ from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
 from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
 from firmware_iface.drivers.ventus import Ventus
-from firmware_iface.emulators.bronkhorst import Instrument, ProparDevice
-from firmware_iface.emulators.keyence_dl_rs1a import KeyenceDlRs1aEmulator
-from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer, RtuBusEmulator, respond
-from firmware_iface.emulators.optoncdt1420 import Optoncdt1420Emulator
-from firmware_iface.emulators.serial_device import MemoryWire, SerialDevice, SerialFaults
-from firmware_iface.emulators.vaisala_ptb330 import VaisalaPtb330Emulator
-from firmware_iface.emulators.ventus import VentusEmulator
+from firmware_iface.emulators.bronkhorst import Instrument
+from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer, respond
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.modbus_rules import ModbusLink
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import Device, DisplacementSensor, LinkDownError, LinkError, Pump
 from firmware_iface.settings import KeyenceDlRs1aConfig, Optoncdt1420Config, VaisalaPtb330Config, VentusConfig
+from tests.support.faulty_devices import (
+    KeyenceDlRs1aEmulator,
+    MemoryWire,
+    Optoncdt1420Emulator,
+    ProparDevice,
+    RtuBusEmulator,
+    SerialDevice,
+    SerialFaults,
+    VaisalaPtb330Emulator,
+    VentusEmulator,
+)
 from tests.support.virtual_time import run_virtual
 
 TIMEOUT_S = 0.05

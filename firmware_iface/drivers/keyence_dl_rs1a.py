@@ -39,7 +39,7 @@ class KeyenceDlRs1a(LineDriver):
 
     manual = "DL-RS1A user's manual, IL edition, pages 7-16"
 
-    def __init__(self, config: settings.KeyenceDlRs1aConfig, port: serial_port.BytePort | None = None) -> None:
+    def __init__(self, config: settings.KeyenceDlRs1aConfig, port: serial_port.SerialPort | None = None) -> None:
         self._config = config
         number = f"{config.amplifier:02d}"
         self._read_command = f"SR,{number},038"

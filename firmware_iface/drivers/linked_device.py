@@ -4,7 +4,7 @@ from collections.abc import Awaitable, Callable
 from typing import Protocol
 
 from firmware_iface.links.exchange import LineFence, LineLink
-from firmware_iface.links.serial_port import BytePort
+from firmware_iface.links.serial_port import SerialPort
 from firmware_iface.roles import DeviceIdentity, LinkError
 
 
@@ -42,7 +42,7 @@ class LineDriver(LinkedDevice):
 
     manual = ""
 
-    def __init__(self, port: BytePort, end: str, timeout_s: float, fence: LineFence) -> None:
+    def __init__(self, port: SerialPort, end: str, timeout_s: float, fence: LineFence) -> None:
         super().__init__(port)
         self._link = LineLink(port, end, timeout_s, fence)
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from firmware_iface import roles, settings
 from firmware_iface.drivers.linked_device import LinkedDevice, StepGate
-from firmware_iface.links.serial_port import BytePort, SerialPort, SerialSettings
+from firmware_iface.links.serial_port import SerialPort, SerialSettings
 
 _IN_RANGE = (643, 64_877)  # page 65: below and above are reserves, measured but not specified
 _PROMPT = b"->"
@@ -94,7 +94,7 @@ class Optoncdt1420(LinkedDevice):
     time of arrival. A sensor that repeats itself repeats its counter too, and that is no new value.
     """
 
-    def __init__(self, config: settings.Optoncdt1420Config, port: BytePort | None = None) -> None:
+    def __init__(self, config: settings.Optoncdt1420Config, port: SerialPort | None = None) -> None:
         self._config = config
         self._port = port or SerialPort(config.port, SerialSettings(config.baud))
         super().__init__(self._port)

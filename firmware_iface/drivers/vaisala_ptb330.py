@@ -47,7 +47,7 @@ class VaisalaPtb330(LineDriver):
 
     manual = "PTB330 user's guide M210855EN, pages 70-88"
 
-    def __init__(self, config: settings.VaisalaPtb330Config, port: serial_port.BytePort | None = None) -> None:
+    def __init__(self, config: settings.VaisalaPtb330Config, port: serial_port.SerialPort | None = None) -> None:
         settings = serial_port.SerialSettings(config.baud, data_bits=7, parity="E")
         fence = exchange.LineFence("VERS", _VERSION)
         super().__init__(port or serial_port.SerialPort(config.port, settings), "\r\n", config.timeout_s, fence)

@@ -30,7 +30,7 @@ class Ventus(LineDriver):
 
     manual = "TN003 Communications Guide; no watchdog: the pump runs on when the host is gone"
 
-    def __init__(self, config: settings.VentusConfig, port: serial_port.BytePort | None = None) -> None:
+    def __init__(self, config: settings.VentusConfig, port: serial_port.SerialPort | None = None) -> None:
         self._power_max_mw = config.power_max_mw
         # streamed lines may be on their way when the stream is switched off
         answer = re.compile(rf"(?:#S[^\n]*\n)*#R{DEVICE_TYPE},({_NUMBER})\r?\n")

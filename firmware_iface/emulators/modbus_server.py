@@ -219,24 +219,10 @@ class RtuBusEmulator(SerialDevice):
         Unit id to what answers it (for example `lambda pdu: respond(pdu, table)`); other units stay silent.
     echo_test : bool
         Whether function 8 ("return query data") is known; otherwise it is refused.
-    seed : int
-        For faults.
-
-    Attributes
-    ----------
-    wrong_unit, wrong_function : bool
-        Faults of the protocol: answers carry the next unit id, or the next function code.
-    exception_code : int
-        Every request is answered with this exception and not carried out; 0: off.
     """
 
-    def __init__(
-        self, settings: SerialSettings, slaves: Mapping[int, PduHandler], echo_test: bool = True, seed: int = 0
-    ) -> None:
-        super().__init__(settings, seed)
-        self.wrong_unit = False
-        self.wrong_function = False
-        self.exception_code = 0
+    def __init__(self, settings: SerialSettings, slaves: Mapping[int, PduHandler], echo_test: bool = True) -> None:
+        super().__init__(settings)
         self._slaves = slaves
         self._echo_test = echo_test
         self._heard = b""
@@ -252,19 +238,14 @@ class RtuBusEmulator(SerialDevice):
             return
         self._heard = b""
         unit, pdu = frame[0], frame[1:-2]
-        if unit not in self._slaves:
-            return
-        if self.exception_code:
-            reply = exception_pdu(pdu, self.exception_code)
-        elif self._echo_test and pdu[0] == DIAGNOSTICS and pdu[1:3] == b"\0\0":
-            reply = pdu
-        else:
-            reply = self._slaves[unit](pdu)
-        if not reply:
-            return
-        reply = bytes([reply[0] + self.wrong_function]) + reply[1:]
-        body = bytes([unit + self.wrong_unit]) + reply
-        self.say(body + struct.pack("<H", bitwise_crc(body)))
+        if unit in self._slaves and (body := self.answer(unit, pdu)):
+            self.say(body + struct.pack("<H", bitwise_crc(body)))
+
+    def answer(self, unit: int, pdu: bytes) -> bytes:
+        """Unit id and answer PDU to a request; empty for none."""
+        echoed = self._echo_test and pdu[0] == DIAGNOSTICS and pdu[1:3] == b"\0\0"
+        reply = pdu if echoed else self._slaves[unit](pdu)
+        return bytes([unit]) + reply if reply else b""
 
 
 def bitwise_crc(data: bytes) -> int:

@@ -17,7 +17,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from firmware_iface.links.serial_port import BytePort
+from firmware_iface.links.serial_port import SerialPort
 from firmware_iface.roles import LinkDownError, LinkError
 
 _SHOWN_BYTES = 24
@@ -42,7 +42,7 @@ class SerialExchange:
 
     Parameters
     ----------
-    port : BytePort
+    port : SerialPort
         The line; this object is its only user.
     gap_s : float
         Silence that the devices want between an answer and the next question.
@@ -52,7 +52,7 @@ class SerialExchange:
         Of these, what comes between answers means nothing, like the LF behind a CR that already ended one.
     """
 
-    def __init__(self, port: BytePort, gap_s: float, quiet_s: float, blank: bytes = b"") -> None:
+    def __init__(self, port: SerialPort, gap_s: float, quiet_s: float, blank: bytes = b"") -> None:
         self.port = port
         self._gap_s = gap_s
         self._quiet_s = quiet_s
@@ -225,7 +225,7 @@ class LineLink:
 
     Parameters
     ----------
-    port : BytePort
+    port : SerialPort
         The line.
     end : str
         What a command ends in.
@@ -237,7 +237,7 @@ class LineLink:
         Silence after a loss.
     """
 
-    def __init__(self, port: BytePort, end: str, timeout_s: float, fence: LineFence, quiet_s: float = 0.1) -> None:
+    def __init__(self, port: SerialPort, end: str, timeout_s: float, fence: LineFence, quiet_s: float = 0.1) -> None:
         self.port = port
         self._exchange = SerialExchange(port, gap_s=0.0, quiet_s=quiet_s, blank=_LINE_ENDS)
         self._end = end

@@ -68,13 +68,13 @@ class RtuBus:
 
     Parameters
     ----------
-    port : BytePort
+    port : SerialPort
         The line.
     quiet_s : float
         Silence after a loss, before the next request: as long as devices are usually late at most.
     """
 
-    def __init__(self, port: serial_port.BytePort, quiet_s: float = 0.2) -> None:
+    def __init__(self, port: serial_port.SerialPort, quiet_s: float = 0.2) -> None:
         baud = port.settings.baud
         gap_s = _FAST_GAP_S if baud > _FAST_BAUD else 3.5 * port.settings.char_s
         self.exchange = exchange.SerialExchange(port, gap_s, quiet_s)

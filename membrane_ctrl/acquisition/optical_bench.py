@@ -8,9 +8,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface import display, settings
+from firmware_iface import display, roles, settings
 from firmware_iface.drivers import camera_aravis, camera_folder, camera_uvc, screen_pygame
-from firmware_iface.roles import Frame, LinkError, Pixels
 from membrane_ctrl.acquisition.exposures import CycleClock
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.metrology.phase import full_sequence
@@ -30,7 +29,7 @@ _TIMES = 3
 class TestCamera(Protocol):
     """What is needed of the camera."""
 
-    def grab(self) -> Frame:
+    def grab(self) -> roles.Frame:
         """One exposure. Raises LinkError."""
 
 
@@ -103,13 +102,13 @@ class DisplayTest:
         lit = swing > 0.5 * np.quantile(swing, 0.99)
         return display.measured_response(display.RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames])
 
-    def _still(self, levels: Levels) -> Pixels:
+    def _still(self, levels: Levels) -> roles.Pixels:
         self._screen.show_levels(levels)
         self._clock.sleep(self.settle_s)
         return self._camera.grab().pixels
 
-    def _follow(self, levels: Levels) -> Iterator[tuple[float, Pixels]]:
-        """Pixels one after the other, each with the time from the command to the start of its exposure."""
+    def _follow(self, levels: Levels) -> Iterator[tuple[float, roles.Pixels]]:
+        """roles.Pixels one after the other, each with the time from the command to the start of its exposure."""
         self._screen.show_levels(levels)
         begun_s = self._clock.now()
         while self._clock.now() - begun_s < _FOLLOWED_S:
@@ -120,7 +119,7 @@ class DisplayTest:
         return np.full(self._size, level, np.uint8)
 
 
-def _thin(pixels: Pixels) -> Pixels:
+def _thin(pixels: roles.Pixels) -> roles.Pixels:
     """Every fourth pixel both ways (of a Bayer sensor always the same colour): enough for means over blocks."""
     return pixels[::4, ::4].copy()
 
@@ -154,7 +153,7 @@ def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
     """
     devices = config.devices
     if devices is None or devices.camera is None:
-        raise LinkError("no camera: name one in [devices.camera], or set shape.enabled = false")
+        raise roles.LinkError("no camera: name one in [devices.camera], or set shape.enabled = false")
     camera = _camera(config, devices.camera, clock)
     if devices.screen is None:
         return OpticalBench(camera, camera)  # a folder of frames is both
@@ -164,7 +163,7 @@ def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
             screen.width_px, screen.height_px, screen.pixel_mm, pattern.periods, pattern.period_mm, screen.centre_px
         )
     except ValueError as error:
-        raise LinkError(f"devices.screen: {error}") from None
+        raise roles.LinkError(f"devices.screen: {error}") from None
     shown = screen_pygame.ScreenSettings(raster, full_sequence(pattern), screen.display)
     return OpticalBench(camera, screen_pygame.PygameScreen(shown, now=clock.now, sleep=clock.sleep))
 

@@ -5,16 +5,12 @@ from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 
 from firmware_iface import role_bench, roles, settings
-from firmware_iface.drivers import (
-    bronkhorst,
-    bronkhorst_propar,
-    keyence_dl_rs1a,
-    modbus_map,
-    optoncdt1420,
-    vaisala_ptb330,
-    ventus,
-)
+from firmware_iface.drivers import bronkhorst, bronkhorst_propar, modbus_map
+from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
+from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
 from firmware_iface.drivers.pump_board import PumpBoard
+from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
+from firmware_iface.drivers.ventus import Ventus
 from firmware_iface.links import modbus_rtu, serial_port
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.model.errors import DeviceError, InputError
@@ -24,10 +20,10 @@ from membrane_ctrl.model.errors import DeviceError, InputError
 
 ACTUATORS = ("pump", "vent")
 _SERIAL_DRIVERS: dict[type[settings.Section], Callable[[Any], roles.Device]] = {
-    settings.Optoncdt1420Config: optoncdt1420.Optoncdt1420,
-    settings.KeyenceDlRs1aConfig: keyence_dl_rs1a.KeyenceDlRs1a,
-    settings.VaisalaPtb330Config: vaisala_ptb330.VaisalaPtb330,
-    settings.VentusConfig: ventus.Ventus,
+    settings.Optoncdt1420Config: Optoncdt1420,
+    settings.KeyenceDlRs1aConfig: KeyenceDlRs1a,
+    settings.VaisalaPtb330Config: VaisalaPtb330,
+    settings.VentusConfig: Ventus,
 }
 
 

@@ -13,9 +13,8 @@ import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from firmware_iface import settings
-from firmware_iface.links import modbus_rtu, usb_ports
-from firmware_iface.roles import LinkError
+from firmware_iface import roles, settings
+from firmware_iface.links import modbus_rtu, serial_port
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.terminal import one_line
@@ -78,8 +77,8 @@ def modbus_names(url: str, unit_id: int) -> set[str]:
 
 def _serial_name(port: str) -> str:
     try:
-        return os.path.realpath(usb_ports.port_path(port))
-    except LinkError:
+        return os.path.realpath(serial_port.port_path(port))
+    except roles.LinkError:
         return port  # not plugged in, or not to be told from another
 
 

@@ -21,6 +21,7 @@ from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ri
 from membrane_ctrl.sim.events import Event
 from membrane_ctrl.sim.lab import Lab
 from membrane_ctrl.sim.plant import STEP_S, Plant
+from membrane_ctrl.sim.sensors import TRUTH_BYTES, Truth
 
 _PERIOD_S = 0.004  # below the sensors' 5 ms, so that each of their samples is out on time
 _STEPS_AT_ONCE = 4000  # some 10 ms of work: after a stall, clients are answered while the plant catches up
@@ -208,9 +209,6 @@ class TwinProcess:
 
         With `lab` it answers as the instruments that the configuration names, else as the pump board.
         """
-        pass
-        from membrane_ctrl.sim.sensors import TRUTH_BYTES
-
         truth = stack.enter_context(ring(_TRUTHS_KEPT, TRUTH_BYTES))
         spec = BenchSpec(
             config.twin, config.pump, clock, config.twin.port, truth=truth, lab=config.devices if lab else None
@@ -228,8 +226,6 @@ class TwinProcess:
 
     def truth_reader(self) -> Callable[[], tuple[float, float]]:
         """A function that returns the newest true displacement and laser bias, in um."""
-        from membrane_ctrl.sim.sensors import Truth
-
         reader = RingReader(self.truth)
 
         def newest() -> tuple[float, float]:
@@ -249,8 +245,6 @@ _STOPS = {signal.SIGINT, signal.SIGTERM}
 
 def serve_twin(config: Config, speed: float) -> int:
     """Serve until SIGINT or SIGTERM; says on stderr where it listens. Raises DeviceError, e.g. for a busy port."""
-    pass
-
     ours, theirs = pipe()
     spec = BenchSpec(config.twin, config.pump, RunClock.start(), config.twin.port, speed=speed, linger_s=0.0)
     child = Child("twin", "membrane_ctrl.sim.bench:serve", (spec, theirs), nice=0)

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from firmware_iface.drivers.keyence_dl_rs1a import QUALITY_AMPLIFIER_ERROR, QUALITY_OUT_OF_RANGE, KeyenceDlRs1a
-from firmware_iface.emulators.keyence_dl_rs1a import KeyenceDlRs1aEmulator
-from firmware_iface.emulators.serial_device import MemoryWire, PtyWire, SerialFaults
+from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import KeyenceDlRs1aConfig
+from tests.support.faulty_devices import KeyenceDlRs1aEmulator, MemoryWire, SerialFaults
 from tests.support.virtual_time import run_virtual
 
 

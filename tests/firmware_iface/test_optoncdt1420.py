@@ -14,10 +14,11 @@ import pytest
 
 from firmware_iface.drivers.linked_device import StepGate
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420, StreamParser, distance_mm, middle
-from firmware_iface.emulators.optoncdt1420 import NO_PEAK, Optoncdt1420Emulator, three_bytes
-from firmware_iface.emulators.serial_device import MemoryWire, PtyWire
+from firmware_iface.emulators.optoncdt1420 import NO_PEAK, three_bytes
+from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import Optoncdt1420Config
+from tests.support.faulty_devices import MemoryWire, Optoncdt1420Emulator
 from tests.support.virtual_time import run_virtual, stand_still
 
 STEP_UM = 50_000 * 1.02 / 65_520  # a digital step at 50 mm range

@@ -6,7 +6,6 @@ nodes (Lagrange) in each direction; with step 1 every pixel is a node and nothin
 
 from dataclasses import dataclass
 from functools import cache
-from math import ceil, pi
 from statistics import NormalDist
 
 import numpy as np
@@ -23,7 +22,7 @@ _LOW_16 = np.uint64(0xFFFF)
 
 def node_positions(pixels: int, step: int) -> FloatArray:
     """Pixel positions of the nodes along one side of the picture."""
-    return np.asarray(np.arange(-1, ceil(pixels / step) + 2) * step, dtype=np.float64)
+    return np.asarray(np.arange(-1, -(-pixels // step) + 2) * step, dtype=np.float64)
 
 
 def cubic_weights(step: int) -> FloatArray:
@@ -216,7 +215,7 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
     Raises ValueError if the pattern's role or Gray bit is unknown.
     """
     if pattern.role == "sin":
-        phi = np.linspace(0.0, 2.0 * pi, _SINE_CELLS + 1) - pi
+        phi = np.linspace(0.0, 2.0 * np.pi, _SINE_CELLS + 1) - np.pi
         levels = 0.5 + 0.5 * np.cos(phi + pattern.shift_rad)
         return LevelTable(_lit(levels, light), config.period_mm / _SINE_CELLS, smooth=True)
     half_periods = np.arange(2 * config.periods)
@@ -244,7 +243,7 @@ def pattern_sequence(kind: str, config: PatternConfig, shifts_rad: tuple[float, 
     """
     if kind not in ("full", "fringes"):
         raise ValueError(f"kind = {kind!r} must be full or fringes")
-    shifts = shifts_rad or tuple(2.0 * pi * k / config.steps for k in range(config.steps))
+    shifts = shifts_rad or tuple(2.0 * np.pi * k / config.steps for k in range(config.steps))
     patterns: list[Pattern] = []
     for axis in ("x", "y"):
         patterns += [Pattern("sin", axis, k, shift) for k, shift in enumerate(shifts)]
