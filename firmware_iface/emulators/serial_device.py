@@ -161,7 +161,7 @@ class PtyWire:
         """What the other end makes of the bytes: at another baud rate, garbage."""
         assert self._ends is not None
         same = termios.tcgetattr(self._ends[0])[_SPEED] == _speed(self._device)
-        return data if same else bytes(byte ^ 0xA5 for byte in data)
+        return data if same else bytes((7 * byte + 0xA5) % 256 for byte in data)
 
 
 def _speed(device: SerialDevice) -> int:
