@@ -23,7 +23,6 @@ NAMES = (
     "hold_live",
     "ticks",
     "live_cycle",
-    "sliding_window",
     "measure_full",
     "monte_carlo",
     "acquisition",

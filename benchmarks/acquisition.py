@@ -19,10 +19,11 @@ import cv2
 import numpy as np
 
 from benchmarks.figures import Figure, at_most
-from firmware_iface.display.response import ScreenRaster
-from firmware_iface.drivers.camera_aravis import AravisCamera, AravisSettings
+from firmware_iface.display import ScreenRaster
+from firmware_iface.drivers.camera_aravis import AravisCamera
 from firmware_iface.drivers.screen_pygame import PygameScreen, ScreenSettings
 from firmware_iface.roles import Pattern
+from firmware_iface.settings import AravisCameraConfig
 from membrane_ctrl.acquisition.cycle import CycleDone, CyclePlan, ShapeCycle
 from membrane_ctrl.acquisition.optical_bench import DisplayTest
 from membrane_ctrl.acquisition.session import WaitingClock
@@ -158,12 +159,13 @@ def run() -> list[Figure]:
     panel: EmulatedPanel[Shown] = EmulatedPanel(PanelResponse(), clock.now)
     patterns = full_sequence(OPTICS.pattern)
     raster = ScreenRaster(WIDTH_PX, HEIGHT_PX, PIXEL_MM, OPTICS.pattern.periods, OPTICS.pattern.period_mm)
-    settings = AravisSettings("127.0.0.1", exposure_ms=EXPOSURE_MS, packet_bytes=60_000)
+    config = AravisCameraConfig(camera="127.0.0.1", exposure_ms=EXPOSURE_MS, packet_bytes=60_000)
+    size_px = OPTICS.camera.width_px, OPTICS.camera.height_px
     with ExitStack() as stack:
         stack.enter_context(x_display())
         scene = PanelScene(panel)
-        stack.enter_context(GigeCameraEmulator(scene.expose, OPTICS.camera.width_px, OPTICS.camera.height_px))
-        camera = AravisCamera(settings, clock.now, clock.sleep)
+        stack.enter_context(GigeCameraEmulator(scene.expose, *size_px))
+        camera = AravisCamera(config, *size_px, clock.now, clock.sleep)
         stack.callback(camera.close)
         screen = ScreenOnPanel(PygameScreen(ScreenSettings(raster, patterns), None, clock.now, clock.sleep), panel)
         stack.callback(screen.close)

@@ -25,18 +25,25 @@ from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
 from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
 from firmware_iface.drivers.ventus import Ventus
-from firmware_iface.emulators.bronkhorst import Instrument, ProparDevice
-from firmware_iface.emulators.keyence_dl_rs1a import KeyenceDlRs1aEmulator
-from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer, RtuBusEmulator, respond
-from firmware_iface.emulators.optoncdt1420 import Optoncdt1420Emulator
-from firmware_iface.emulators.serial_device import MemoryWire, SerialDevice, SerialFaults
-from firmware_iface.emulators.vaisala_ptb330 import VaisalaPtb330Emulator
-from firmware_iface.emulators.ventus import VentusEmulator
+from firmware_iface.emulators.bronkhorst import Instrument
+from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer, respond
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.modbus_rules import ModbusLink
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import Device, DisplacementSensor, LinkDownError, LinkError, Pump
+from firmware_iface.settings import KeyenceDlRs1aConfig, Optoncdt1420Config, VaisalaPtb330Config, VentusConfig
+from tests.support.faulty_devices import (
+    KeyenceDlRs1aEmulator,
+    MemoryWire,
+    Optoncdt1420Emulator,
+    ProparDevice,
+    RtuBusEmulator,
+    SerialDevice,
+    SerialFaults,
+    VaisalaPtb330Emulator,
+    VentusEmulator,
+)
 from tests.support.virtual_time import run_virtual
 
 TIMEOUT_S = 0.05
@@ -192,14 +199,18 @@ async def _perhaps_cancelled(call: Coroutine[Any, Any, Any], dice: random.Random
 async def _keyence(transactions: int, audit: Audit, seed: int) -> None:
     """Displacement that ramps at the speed of a fill; wrong is more than the driver's own gate."""
     emulator = KeyenceDlRs1aEmulator(_ramp_um, baud=38_400, parity="E", seed=seed)
-    driver = KeyenceDlRs1a(MemoryWire(emulator), baud=38_400, parity="E", timeout_s=TIMEOUT_S)
+    driver = KeyenceDlRs1a(
+        KeyenceDlRs1aConfig(port="memory", baud=38_400, parity="E", timeout_s=TIMEOUT_S), MemoryWire(emulator)
+    )
     await _displacements(driver, emulator, transactions, audit, seed)
 
 
 async def _optoncdt(transactions: int, audit: Audit, seed: int) -> None:
     """The same with a stream; wrong is more than ten times its noise."""
     emulator = Optoncdt1420Emulator(_ramp_um, noise_um=1.0, seed=seed)
-    driver = Optoncdt1420(MemoryWire(emulator), rate_khz=1.0, step_max_um=10.0, timeout_s=TIMEOUT_S)
+    driver = Optoncdt1420(
+        Optoncdt1420Config(port="memory", rate_khz=1.0, step_max_um=10.0, timeout_s=TIMEOUT_S), MemoryWire(emulator)
+    )
     await _displacements(driver, emulator, transactions, audit, seed)
 
 
@@ -237,7 +248,8 @@ async def _ventus(transactions: int, audit: Audit, seed: int) -> None:
     """A disc pump; its power has three decimals."""
     driven = [0.0]
     emulator = VentusEmulator(lambda fraction: driven.__setitem__(0, fraction), seed=seed)
-    await _pump(Ventus(MemoryWire(emulator), timeout_s=TIMEOUT_S), emulator, driven, 1e-5, transactions, audit, seed)
+    driver = Ventus(VentusConfig(port="memory", timeout_s=TIMEOUT_S), MemoryWire(emulator))
+    await _pump(driver, emulator, driven, 1e-5, transactions, audit, seed)
 
 
 async def _propar(transactions: int, audit: Audit, seed: int) -> None:
@@ -288,7 +300,9 @@ async def _ptb330(transactions: int, audit: Audit, seed: int) -> None:
         return 101_325.0 + 0.1 * abs(asyncio.get_running_loop().time() % 4000.0 - 2000.0)
 
     emulator = VaisalaPtb330Emulator(pressure_pa, seed=seed)
-    driver = VaisalaPtb330(MemoryWire(emulator), timeout_s=TIMEOUT_S, period_s=0.1)
+    driver = VaisalaPtb330(
+        VaisalaPtb330Config(port="memory", timeout_s=TIMEOUT_S, period_s=0.1), MemoryWire(emulator)
+    )
     await driver.open()
     emulator.draw_faults = random_faults(seed)
     while audit.transactions < transactions:

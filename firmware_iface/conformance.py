@@ -10,17 +10,9 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
 
-from firmware_iface import register_map, roles
-from firmware_iface.board_under_test import (
-    PERIOD_S,
-    PUMP_FRACTION,
-    REST_S,
-    BoardUnderTest,
-    ConformanceError,
-    other_key,
-    require,
-)
-from firmware_iface.links.modbus_links import ModbusLinks
+from firmware_iface import board_under_test, register_map, roles
+from firmware_iface.board_under_test import PERIOD_S, PUMP_FRACTION, REST_S, other_key, require
+from firmware_iface.links.modbus_rtu import ModbusLinks
 
 _GRACE_S = 0.1  # the board's own loop and one wake-up after the period
 _NEAR = 0.002  # of a fraction: counts of a board that rounds its output
@@ -37,18 +29,13 @@ class CheckResult:
     problem: str
 
 
-class Conformance(BoardUnderTest):
+class Conformance(board_under_test.BoardUnderTest):
     """The checks, in the order they are made."""
 
     async def run(self) -> list[CheckResult]:
         """Make all checks; the first one decides whether the others mean anything.
 
-        Raises
-        ------
-        LinkDownError
-            The board went away.
-        DeviceBusyError
-            Another program holds it.
+        Raises LinkDownError (the board went away), DeviceBusyError (another program holds it).
         """
         findings = [await self._made("identity", "Registers", self._identity)]
         if findings[0].problem:
@@ -71,7 +58,7 @@ class Conformance(BoardUnderTest):
         problem = ""
         try:
             await test()
-        except ConformanceError as error:
+        except board_under_test.ConformanceError as error:
             problem = str(error)
         except roles.LinkDownError:
             raise
@@ -175,7 +162,7 @@ class Conformance(BoardUnderTest):
             await self._link.read_holding(last, 1)
         except roles.DeviceRefusedError:
             return
-        raise ConformanceError(f"answers a read of register {last}, which the map does not have")
+        raise board_under_test.ConformanceError(f"answers a read of register {last}, which the map does not have")
 
     async def _settings(self) -> None:
         for period_s in (PERIOD_S, 1.5):
@@ -192,7 +179,7 @@ class Conformance(BoardUnderTest):
             await self._arm(REST_S, 0.0)
         except roles.DeviceRefusedError:
             return
-        raise ConformanceError("lets the watchdog be disarmed while the pump is commanded")
+        raise board_under_test.ConformanceError("lets the watchdog be disarmed while the pump is commanded")
 
     async def _silent(self) -> None:
         await self._arm()

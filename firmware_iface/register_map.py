@@ -1,7 +1,5 @@
 """The register map: loaded from `registers.toml`, checked, and used to turn registers into values and back."""
 
-from __future__ import annotations
-
 import math
 import struct
 import tomllib
@@ -32,40 +30,18 @@ class RegisterMapError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """One quantity of the device.
+    """One quantity of the device."""
 
-    Attributes
-    ----------
-    name : str
-        Ends in its unit.
-    address : int
-        Of its first word.
-    type : str
-        "u16", "u32", "i32" or "f32".
-    unit : str
-        "1" for a pure number.
-    counts_per_unit : int
-        value = raw / counts_per_unit.
-    minimum, maximum : float
-        Limits of a write, in the unit; infinite where nothing may be written.
-    access : str
-        "ro" or "rw".
-    meaning : str
-        One line for people.
-    since : int
-        The first map version that has it.
-    """
-
-    name: str
-    address: int
-    type: str
-    unit: str
-    counts_per_unit: int
-    minimum: float
+    name: str  # ends in its unit
+    address: int  # of its first word
+    type: str  # "u16", "u32", "i32" or "f32"
+    unit: str  # "1" for a pure number
+    counts_per_unit: int  # value = raw / counts_per_unit
+    minimum: float  # limit of a write, in the unit; infinite where nothing may be written
     maximum: float
-    access: str
-    meaning: str
-    since: int = 1
+    access: str  # "ro" or "rw"
+    meaning: str  # one line for people
+    since: int = 1  # the first map version that has it
 
     @property
     def words(self) -> int:
@@ -168,7 +144,7 @@ class RegisterMap:
         """The bit of the fault of that name, as a number. Raises KeyError."""
         return {fault.name: fault.mask for fault in self.faults}[name]
 
-    def of_version(self, version: int) -> RegisterMap:
+    def of_version(self, version: int) -> "RegisterMap":
         """The map as boards of an earlier version have it. Raises RegisterMapError for one that is not known."""
         if not 1 <= version <= self.map_version:
             raise RegisterMapError(f"map version {version} is none of 1..{self.map_version}")
@@ -202,11 +178,8 @@ def known_maps() -> dict[int, RegisterMap]:
 def load(path: Path) -> RegisterMap:
     """Read and check a map.
 
-    Raises
-    ------
-    RegisterMapError
-        For a file that is no such map, and for overlaps, gaps, wrong order, unknown types or keys, missing
-        limits and names that do not end in their unit.
+    Raises RegisterMapError for a file that is no such map, and for overlaps, gaps, wrong order, unknown types or
+    keys, missing limits and names that do not end in their unit.
     """
     try:
         return parse(tomllib.loads(path.read_text(encoding="utf-8")))

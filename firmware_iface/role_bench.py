@@ -81,10 +81,7 @@ class RoleBench:
     async def open(self) -> roles.BenchIdentity:
         """Open every device, sensors first, and start the watchdog; what it has latched stays.
 
-        Raises
-        ------
-        LinkError
-            The first device that is not there or not as the configuration says, with its role.
+        Raises LinkError (the first device that is not there or not as the configuration says, with its role).
         """
         await self._stop_reopening()  # the watchdog of an opening before stays: the pump may still run
         if self._commanded > 0:  # it was lost while it ran: it must not wait for a sensor that is gone as well
@@ -115,10 +112,8 @@ class RoleBench:
     async def read(self) -> roles.BenchReading:
         """All sensors at once; what a sensor cannot say is NaN.
 
-        Raises
-        ------
-        LinkError
-            Pump or vent gave no valid answer; LinkDownError when its link is gone, or the watchdog has ended.
+        Raises LinkError (pump or vent gave no valid answer; LinkDownError when its link is gone, or the watchdog has
+        ended).
         """
         await self._require_watchdog()
         sensors = asyncio.ensure_future(self._sensors())  # never raises
@@ -144,12 +139,8 @@ class RoleBench:
     async def write(self, command: roles.BenchCommand) -> None:
         """Command pump and vent at once, and feed the watchdog; after a trip the pump stays off.
 
-        Raises
-        ------
-        ValueError
-            A fraction that is not within 0..1, or NaN; nothing is sent.
-        LinkError
-            The device may or may not have it; the other one was commanded all the same.
+        Raises ValueError (a fraction that is not within 0..1, or NaN; nothing is sent), LinkError (the device may or
+        may not have it; the other one was commanded all the same).
         """
         for name, fraction in (("pump", command.pump_fraction), ("vent", command.vent_fraction)):
             if not 0.0 <= fraction <= 1.0:

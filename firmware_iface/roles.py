@@ -5,7 +5,7 @@ A driver converts to these units at its edge; nothing behind it knows registers,
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,23 +79,15 @@ class BenchCommand:
 
 @dataclass(frozen=True, slots=True)
 class BenchIdentity:
-    """Who answered, how its watchdog is set (read back), and the limits that it has (infinite: none known).
-
-    Attributes
-    ----------
-    gauge_pressure_limit_pa, pump_limit_fraction : float
-        What the board keeps by itself.
-    displacement_range_um, gauge_range_pa : tuple of float
-        What the sensors can show.
-    """
+    """Who answered, how its watchdog is set (read back), and the limits that it has (infinite: none known)."""
 
     kind: str
     map_version: int
     firmware: str
     watchdog_s: float
-    gauge_pressure_limit_pa: float = math.inf
+    gauge_pressure_limit_pa: float = math.inf  # the board's own limit
     pump_limit_fraction: float = 1.0
-    displacement_range_um: tuple[float, float] = (-math.inf, math.inf)
+    displacement_range_um: tuple[float, float] = (-math.inf, math.inf)  # what the sensor can show
     gauge_range_pa: tuple[float, float] = (-math.inf, math.inf)
 
 
@@ -104,30 +96,24 @@ class Bench(Protocol):
 
     async def open(self) -> BenchIdentity:
         """Connect, check the identity, arm the watchdog and read it back. Raises LinkError."""
-        ...
 
     async def read(self) -> BenchReading:
         """One sample. Raises LinkError; never returns an old or invented value."""
-        ...
 
     async def write(self, command: BenchCommand) -> None:
         """Write pump and vent, and feed the watchdog. Raises LinkError."""
-        ...
 
     async def clear_faults(self, mask: int) -> None:
         """Clear those bits of what the devices have latched, and no others. Raises LinkError.
 
         Everything (`ALL_FAULTS`) only ever because a person said so.
         """
-        ...
 
     def dead_guards(self) -> tuple[str, ...]:
         """Names of what ought to watch this bench and no longer runs; asked in every tick."""
-        ...
 
     async def close(self) -> None:
         """Close the link; the caller has written the safe state before. Never raises."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,22 +155,15 @@ class Device(Protocol):
     async def open(self) -> DeviceIdentity:
         """Connect, check the identity, apply the settings and read them back; again after every lost link.
 
-        Raises
-        ------
-        LinkError
-            No valid answer; LinkDownError without a connection.
-        DeviceRefusedError
-            Another device than the configuration names, or one that does not take its settings.
+        Raises LinkError (no valid answer; LinkDownError without a connection), DeviceRefusedError (another device
+        than the configuration names, or one that does not take its settings).
         """
-        ...
 
     async def close(self) -> None:
         """Leave the device safe and close the link. Never raises."""
-        ...
 
     def describe(self) -> dict[str, str]:
         """For people: port, settings, manual."""
-        ...
 
 
 class DisplacementSensor(Device, Protocol):
@@ -192,7 +171,6 @@ class DisplacementSensor(Device, Protocol):
 
     async def displacement(self) -> DisplacementSample:
         """The newest sample. Raises LinkError."""
-        ...
 
 
 class PressureSensor(Device, Protocol):
@@ -200,7 +178,6 @@ class PressureSensor(Device, Protocol):
 
     async def gauge_pressure_pa(self) -> float:
         """The newest value, NaN for none. Raises LinkError."""
-        ...
 
 
 class Barometer(Device, Protocol):
@@ -208,7 +185,6 @@ class Barometer(Device, Protocol):
 
     async def ambient_pressure_pa(self) -> float:
         """The newest value, NaN for none. Raises LinkError."""
-        ...
 
 
 class Thermometer(Device, Protocol):
@@ -216,7 +192,6 @@ class Thermometer(Device, Protocol):
 
     async def air_temperature_c(self) -> float:
         """The newest value, NaN for none. Raises LinkError."""
-        ...
 
 
 class Pump(Device, Protocol):
@@ -224,11 +199,9 @@ class Pump(Device, Protocol):
 
     async def set_pump(self, fraction: float) -> None:
         """Command it, 0..1 of full scale. Raises LinkError: the device may or may not have it."""
-        ...
 
     async def pump_fraction(self) -> float:
         """What the device says it was commanded (or gives). Raises LinkError."""
-        ...
 
 
 class Vent(Device, Protocol):
@@ -236,11 +209,9 @@ class Vent(Device, Protocol):
 
     async def set_vent(self, fraction: float) -> None:
         """Open it, 0..1. Raises LinkError: the device may or may not have it."""
-        ...
 
     async def vent_fraction(self) -> float:
         """What the device says it was commanded (or gives). Raises LinkError."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,11 +229,14 @@ class Pattern:
         return f"{self.axis}_{self.role}_{self.index}" if self.axis else self.role
 
 
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+
 @dataclass(frozen=True, slots=True)
 class Frame:
     """One exposure: `pixels` (height, width) uint8 or uint16, `time_s` the start of exposure on the run's clock."""
 
-    pixels: NDArray[np.uint8] | NDArray[np.uint16]
+    pixels: Pixels
     time_s: float
 
 
@@ -271,11 +245,9 @@ class Screen(Protocol):
 
     def show(self, pattern: Pattern) -> None:
         """Show the pattern; returns when it is lit and settled."""
-        ...
 
     def close(self) -> None:
         """Give the screen back."""
-        ...
 
 
 class Camera(Protocol):
@@ -283,8 +255,25 @@ class Camera(Protocol):
 
     def grab(self) -> Frame:
         """Trigger one exposure and return it. Raises LinkError."""
-        ...
 
     def close(self) -> None:
         """Give the camera back."""
-        ...
+
+
+# One lost packet spoils a frame; three spoilt in a row are no accident
+TRIES = 3
+
+
+class FrameLostError(LinkError):
+    """One exposure gave no whole frame; the camera is there and may be asked again."""
+
+
+@runtime_checkable
+class ExposingCamera(Protocol):
+    """A camera whose transfer may overlap with the next pattern."""
+
+    def expose(self, out: Pixels | None = None) -> None:
+        """Trigger, and return when the exposure is over. Raises LinkError."""
+
+    def fetch(self) -> Frame:
+        """The frame of the last `expose`. Raises FrameLostError, LinkError."""

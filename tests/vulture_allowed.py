@@ -8,11 +8,10 @@ acquisition_main, alarms_main, console_main, recorder_main  # named as text to t
 _.pump_readback_fraction, _.vent_readback_fraction  # fields of a row, read by their place
 _.effective_samples  # written to the report by `asdict`
 Camera  # the role that the camera drivers fulfil, written down
-SlidingWindow, _.geometry_covariance_um2, _.screen_points, gradients  # a library: docs/uncertainty.md, metrology.md
+_.geometry_covariance_um2, _.screen_points, gradients  # a library: docs/metrology.md
 _.frame_rms_adu, _.step_periods, _.white_sigma, _.fast_sigma, _.slow_sigma, _.sensitivity_sigma  # parts of a result
 _.trace_pixels, _.on_film, _.back_sag_mm, _.pump_um_per_s  # the twin's truth, which tests compare with
 _.power_cycle, _.intrude, _.set_double  # faults that scenarios and tests bring about
-MemoryWire  # a device without a wire, for tests
 ACTIONS  # every action of the port: a test asks each role for each
 _.__signature__  # Typer reads a command's options from it
 _.failing  # state of an outbox, which tests look at

@@ -15,8 +15,7 @@ from membrane_ctrl.control_port.ctl import Where, socket_path
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, RejectedError
 from membrane_ctrl.sessions import folder as plain
 from membrane_ctrl.sessions.folder import STEPS, SessionFolder, create_session, newest_session, open_session
-from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, LiveHold
-from membrane_ctrl.sessions.progress import Progress
+from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, LiveHold, Progress
 from tuning import gains_file, report, session, twin_hold
 from tuning.identification.characterise import TYPICAL_S
 from tuning.proposal.verify import SETTLE_LEAST_S, STAGES, Stage
@@ -71,10 +70,7 @@ def run_session(options: TuneOptions) -> int:
 def one_step(step: str, options: TuneOptions) -> int:
     """One step of the newest session, or of the one named; `characterise` begins one.
 
-    Raises
-    ------
-    InputError, DeviceError, RejectedError
-        One line each; the mirror is held with the last good gains then.
+    Raises InputError, DeviceError or RejectedError; the mirror is then held with the last good gains.
     """
     if step not in _MOVES:
         folder = _folder(options, None)

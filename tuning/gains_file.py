@@ -4,8 +4,6 @@ A file that was edited by hand is read like any other: its gains are checked on 
 or has too little margin is refused by name.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict, dataclass
@@ -16,9 +14,9 @@ from typing import Annotated, Literal
 import tomli_w
 from pydantic import Field
 
+from firmware_iface.settings import Section
 from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import LoopConfig
-from membrane_ctrl.config.section import Section
 from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.sessions import folder as plain
 from tuning.identification import identify, loop_model
@@ -40,7 +38,7 @@ class PlantSection(Section):
     delay_sigma_s: Annotated[float, Field(ge=0)]
 
     @classmethod
-    def of(cls, identified: identify.Identified) -> PlantSection:
+    def of(cls, identified: identify.Identified) -> "PlantSection":
         """The section for a fit."""
         sigma = identified.sigma
         return cls(**asdict(identified.model), gain_sigma=sigma.gain, delay_sigma_s=sigma.delay_s)
@@ -80,18 +78,8 @@ def load_gains(path: Path) -> GainsFile:
 def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
     """Refuse gains that must not be applied.
 
-    Parameters
-    ----------
-    gains : GainsFile
-    where : str
-        For the message.
-    running : LoopConfig
-        Of the hold they are for.
-
-    Raises
-    ------
-    InputError
-        If the loop would be unstable on the file's own plant or has too little margin, or ticks differently.
+    Raises InputError if the loop would be unstable on the file's own plant or has too little margin, or ticks
+    differently from the hold (`running`); `where` names the file.
     """
     dt_s = 1 / gains.loop.rate_hz
     found = loop_model.margins(loop_model.Gains.of(gains.loop), gains.plant.model, dt_s)
@@ -123,24 +111,14 @@ What = Literal["kept", "taken_back", "rolled_back"]
 
 @dataclass(frozen=True, slots=True)
 class GainsEntry:
-    """One line.
-
-    Attributes
-    ----------
-    time_utc : str
-    what : str
-        "kept": verified; "taken_back": the verification failed; "rolled_back": by a person.
-    session, author, reason : str
-    before, after : LoopConfig
-        Gains before and with it; after "taken_back" those before run again.
-    """
+    """One line."""
 
     time_utc: str
-    what: What
+    what: What  # "kept": verified; "taken_back": the verification failed; "rolled_back": by a person
     session: str
     author: str
     reason: str
-    before: LoopConfig
+    before: LoopConfig  # gains before and with it; after "taken_back" those before run again
     after: LoopConfig
 
 

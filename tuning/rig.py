@@ -26,16 +26,7 @@ class DrivenBench(Protocol):
 
 
 class Rig:
-    """One loop on one bench, in ticks.
-
-    Parameters
-    ----------
-    bench : DrivenBench
-    loop : LoopConfig
-    pump : PumpConfig
-    leak_um_per_s : float
-        Flow to begin with.
-    """
+    """One loop on one bench, in ticks; it begins with the flow `leak_um_per_s`."""
 
     def __init__(self, bench: DrivenBench, loop: LoopConfig, pump: PumpConfig, leak_um_per_s: float) -> None:
         self._bench = bench
@@ -138,10 +129,8 @@ class HoldRig:
 
     Parameters
     ----------
-    link : HoldLink
     who : str
         Recorded with every command.
-    progress : callable
 
     Attributes
     ----------

@@ -20,7 +20,6 @@ from tuning.gains_file import GainsFile, PlantSection, for_hold, load_gains, req
 from tuning.identification import characterise, identify, records
 from tuning.identification.disturbance import DisturbanceModel, observe
 from tuning.proposal import design, prediction, verify
-from tuning.proposal.preview import Preview, preview
 from tuning.rig import HoldRig
 
 OBSERVE_S = 600.0
@@ -55,7 +54,7 @@ class Design:
 
     candidates: tuple[design.Candidate, ...]
     least_std_um: float
-    preview: Preview
+    preview: design.Preview
     robustness: prediction.Robustness
 
 
@@ -63,25 +62,15 @@ class Design:
 class Previewed:
     """`preview.json`: the present gains and the proposed ones on the fitted twin, a seed a row."""
 
-    present: tuple[Preview, ...]
-    proposed: tuple[Preview, ...]
+    present: tuple[design.Preview, ...]
+    proposed: tuple[design.Preview, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """`verified.json`.
+    """`verified.json`."""
 
-    Attributes
-    ----------
-    kept : bool
-        The new gains stay.
-    reason : str
-        Why not.
-    stages : tuple of Stage
-    before, after : LoopConfig
-    """
-
-    kept: bool
+    kept: bool  # the new gains stay
     reason: str
     stages: tuple[verify.Stage, ...]
     before: LoopConfig
@@ -193,7 +182,7 @@ def preview_step(session: folder.SessionFolder) -> Previewed:
     session.begin("preview")
     pump, model = pump_of(session), found.identified.model
     present, proposed = (
-        tuple(preview(loop, pump, model, disturbance, seed) for seed in range(1, _PREVIEW_SEEDS + 1))
+        tuple(design.preview(loop, pump, model, disturbance, seed) for seed in range(1, _PREVIEW_SEEDS + 1))
         for loop in (session.head.before, gains.loop)
     )
     done = Previewed(present, proposed)

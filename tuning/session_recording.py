@@ -1,17 +1,15 @@
 """A session as a Rerun recording with its own blueprint: experiment, fit, residual, candidates, before and after."""
 
-from typing import Any
-
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
+from membrane_ctrl.model.arrays import AnyArray
 from membrane_ctrl.sessions.folder import SessionFolder
 from tuning import session
 from tuning.identification import loop_model, records
 
-Values = NDArray[np.floating[Any]]
+Values = AnyArray
 
 _TIMELINE = "session_time"
 

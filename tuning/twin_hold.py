@@ -9,10 +9,8 @@ from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model import shape_estimate, states, telemetry
 from membrane_ctrl.model.events import CommandTaken, Event
 from membrane_ctrl.sessions.live_hold import HoldError, News
+from membrane_ctrl.sim import plant, truth_shape, virtual_bench
 from membrane_ctrl.sim.events import Event as TwinEvent
-from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.truth_shape import TruthShape
-from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 _NEWS_S = 0.5
 _HELD_WITHIN_S = 120.0
@@ -40,8 +38,8 @@ class TwinHold:
 
     def __init__(self, config: Config, events: Sequence[TwinEvent] = ()) -> None:
         self.config = config
-        self.bench = VirtualBench(Plant(config.twin, config.pump, events))
-        source = TruthShape(self.bench, config, config.twin.seed) if config.shape.enabled else None
+        self.bench = virtual_bench.VirtualBench(plant.Plant(config.twin, config.pump, events))
+        source = truth_shape.TruthShape(self.bench, config, config.twin.seed) if config.shape.enabled else None
         self._shapes: list[shape_estimate.ShapeEstimate] = []
 
         def shape(now_s: float) -> shape_estimate.ShapeEstimate | None:

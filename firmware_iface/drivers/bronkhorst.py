@@ -64,40 +64,31 @@ class ParameterPort(Protocol):
     @property
     def name(self) -> str:
         """For messages."""
-        ...
 
     async def connect(self) -> None:
         """Connect, unless that is done."""
-        ...
 
     async def number(self, parameter: InstrumentParameter) -> float:
         """A number, believed only if a flipped bit would have been seen."""
-        ...
 
     async def text(self, parameter: InstrumentParameter) -> str:
         """A text."""
-        ...
 
     async def write(self, parameter: InstrumentParameter, value: int) -> None:
         """Write, and know that the instrument has it."""
-        ...
 
     async def close(self) -> None:
         """Disconnect. Never raises."""
-        ...
 
     def describe(self) -> dict[str, str]:
         """Port, settings, manual."""
-        ...
 
 
 async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> DeviceIdentity:
     """Connect and find out who is there.
 
-    Raises
-    ------
-    DeviceRefusedError
-        Another type of instrument, or another serial number than `serial` (if that is not empty).
+    Raises DeviceRefusedError: another type of instrument, or another serial number than `serial` (if that is not
+    empty).
     """
     await port.connect()
     found = await port.text(DEVICE_TYPE)
@@ -218,7 +209,6 @@ class BronkhorstPressure:
 # Source: manual 9.17.035, section 4.4.6. Bytes and words of process p, parameter n have a register of their own at 32
 # p + n; everything longer is in eight registers from 0x8000 + 256 p + 8 n, the big word first, texts two characters a
 # register.
-
 
 MANUAL = "Bronkhorst 9.17.035, section 4.4.6"
 

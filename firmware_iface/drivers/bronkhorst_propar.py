@@ -155,7 +155,7 @@ class ProparParameters:
 
     Parameters
     ----------
-    port : BytePort
+    port : SerialPort
         The line.
     node : int
         128: whichever instrument is at the end of the cable.
@@ -163,7 +163,7 @@ class ProparParameters:
         For the instrument to answer; the time on the wire comes on top.
     """
 
-    def __init__(self, port: serial_port.BytePort, node: int = 128, timeout_s: float = 0.2) -> None:
+    def __init__(self, port: serial_port.SerialPort, node: int = 128, timeout_s: float = 0.2) -> None:
         self._port = port
         self._node = node
         self._timeout_s = timeout_s

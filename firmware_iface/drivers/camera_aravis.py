@@ -16,13 +16,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from firmware_iface.drivers.frame_lost import FrameLostError, regrab
+from firmware_iface import roles, settings
 from firmware_iface.links import aravis as arv
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, Frame, LinkDownError, LinkError
-
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 # One frame being filled and one to spare; each is copied out at once
 _BUFFERS = 3
@@ -35,42 +31,6 @@ _RANGE_CHECKED = 1  # arvdevice.h; by default the library writes values that the
 _SUCCESS = 0  # ArvBufferStatus
 _GONE = (arv.NOT_CONNECTED, arv.TRANSFER_ERROR, arv.TIMEOUT)
 _TAKEN = (arv.NOT_CONTROLLER, arv.ACCESS_DENIED, arv.BUSY)
-
-
-@dataclass(frozen=True, slots=True)
-class AravisSettings:
-    """How to set the camera.
-
-    Attributes
-    ----------
-    camera_id : str
-        As `membrane-ctrl devices` lists it, or an address; empty: the first that is found.
-    width_px, height_px : int
-        The whole sensor; another size is refused.
-    pixel_format : str
-        A key of `firmware_iface.links.aravis.PIXEL_FORMATS`. Bayer needs no demosaicing: each pixel's phase is
-        independent of its gain.
-    exposure_ms : float
-    gain_db : float
-    packet_bytes : int
-        Of a GigE Vision stream; 0 leaves what the camera has.
-    timeout_s : float
-        For a frame, from the end of its exposure.
-    """
-
-    camera_id: str = ""
-    width_px: int = 2448
-    height_px: int = 2048
-    pixel_format: str = "Mono8"
-    exposure_ms: float = 20.0
-    gain_db: float = 0.0
-    packet_bytes: int = 0
-    timeout_s: float = 1.0
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-        return f"camera {self.camera_id}" if self.camera_id else "camera"
 
 
 @dataclass(slots=True)
@@ -86,67 +46,55 @@ class FrameCounts:
 class AravisCamera:
     """The camera; opened by the first exposure, and again by the next one after its link was lost.
 
-    Parameters
-    ----------
-    settings : AravisSettings
-    now : callable
-        The run's clock.
-    sleep : callable
-        Waits on it.
-
-    Attributes
-    ----------
-    counts : FrameCounts
+    A sensor of another size than `width_px` and `height_px` is refused; `now` and `sleep` are the run's clock.
+    `counts` tells what became of the triggers.
     """
 
     def __init__(
         self,
-        settings: AravisSettings,
+        config: settings.AravisCameraConfig,
+        width_px: int,
+        height_px: int,
         now: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self.settings = settings
+        self.config = config
         self.counts = FrameCounts()
+        self._name = f"camera {config.camera}" if config.camera else "camera"
+        self._size = (width_px, height_px)
         self._now, self._sleep = now, sleep
         self._camera: int | None = None
         self._stream: int | None = None
         self._opened = False
-        self._pending: tuple[float, Pixels | None] | None = None
+        self._pending: tuple[float, roles.Pixels | None] | None = None
 
-    def open(self) -> DeviceIdentity:
+    def open(self) -> roles.DeviceIdentity:
         """Connect, apply the settings, read them back, start the stream.
 
-        Raises
-        ------
-        LinkError
-            No library, no camera, camera in use.
-        DeviceRefusedError
-            A setting that the camera does not take.
+        Raises LinkError (no library, no camera, camera in use), DeviceRefusedError (a setting that the camera does
+        not take).
         """
         self.close()
-        library, settings = arv.aravis(), self.settings
+        library, config = arv.aravis(), self.config
         try:
-            self._camera = library.call("arv_camera_new", settings.camera_id.encode() or None)
+            self._camera = library.call("arv_camera_new", config.camera.encode() or None)
             if not self._camera:
-                raise LinkDownError(f"{settings.name}: not found; see `membrane-ctrl devices`")
+                raise roles.LinkDownError(f"{self._name}: not found; see `membrane-ctrl devices`")
             self._look_whether_ours()
             identity = self._identity()
             self._apply()
             self._start_stream()
-        except LinkError as error:
+        except roles.LinkError as error:
             self.close()
             raise self._told(error, "opening") from None
         self.counts.reconnects += self._opened
         self._opened = True
         return identity
 
-    def expose(self, out: Pixels | None = None) -> None:
+    def expose(self, out: roles.Pixels | None = None) -> None:
         """Trigger, and return when the exposure is over: the screen may change while the frame is transferred.
 
-        Raises
-        ------
-        LinkError
-            No camera.
+        Raises LinkError without a camera.
         """
         if self._stream is None:
             self.open()
@@ -156,62 +104,59 @@ class AravisCamera:
         time_s = self._now()
         try:
             library.call("arv_camera_software_trigger", self._camera)
-        except LinkError as error:
+        except roles.LinkError as error:
             self._abandon()
             raise self._told(error, "trigger") from None
         self._pending = time_s, out
-        self._sleep(max(0.0, time_s + self.settings.exposure_ms / 1000.0 - self._now()))
+        self._sleep(max(0.0, time_s + self.config.exposure_ms / 1000.0 - self._now()))
 
-    def fetch(self) -> Frame:
+    def fetch(self) -> roles.Frame:
         """The frame of the last `expose`, in its `out` if one was given.
 
-        Raises
-        ------
-        FrameLostError
-            It did not come, or not whole: show the pattern again and expose again.
-        LinkError
-            Nothing was exposed.
+        Raises FrameLostError (it did not come, or not whole: show the pattern again and expose again), LinkError
+        (nothing was exposed).
         """
         if self._pending is None or self._stream is None:
-            raise LinkError(f"{self.settings.name}: no exposure to fetch")
+            raise roles.LinkError(f"{self._name}: no exposure to fetch")
         (time_s, out), self._pending = self._pending, None
         library = arv.aravis()
-        timeout_us = round(1e6 * self.settings.timeout_s)
+        timeout_us = round(1e6 * self.config.timeout_s)
         buffer = library.call("arv_stream_timeout_pop_buffer", self._stream, timeout_us)
         if not buffer:
             self.counts.missing += 1
             self._restart()
-            raise FrameLostError(
-                f"{self.settings.name}: no frame within {self.settings.timeout_s:g} s of its trigger"
-            )
+            raise roles.FrameLostError(f"{self._name}: no frame within {self.config.timeout_s:g} s of its trigger")
         try:
             status = library.call("arv_buffer_get_status", buffer)
             if status != _SUCCESS:
                 self.counts.incomplete += 1
-                raise FrameLostError(
-                    f"{self.settings.name}: frame not whole (aravis status {status}); "
-                    "cable, packet size, other traffic?"
+                raise roles.FrameLostError(
+                    f"{self._name}: frame not whole (aravis status {status}); cable, packet size, other traffic?"
                 )
-            frame = Frame(self._pixels(buffer, out), time_s)
+            frame = roles.Frame(self._pixels(buffer, out), time_s)
         finally:
             library.call("arv_stream_push_buffer", self._stream, buffer)
         self.counts.taken += 1
         return frame
 
-    def grab(self, out: Pixels | None = None) -> Frame:
+    def grab(self, out: roles.Pixels | None = None) -> roles.Frame:
         """One exposure, taken again when it is lost.
+
+        Raises LinkError (no camera, or three frames lost in a row).
 
         Parameters
         ----------
         out : (height, width) array, optional
             Where the pixels go; else a new array.
-
-        Raises
-        ------
-        LinkError
-            No camera, or three frames lost in a row.
         """
-        return regrab(self, out)
+        for _ in range(roles.TRIES - 1):
+            self.expose(out)
+            try:
+                return self.fetch()
+            except roles.FrameLostError:
+                continue
+        self.expose(out)
+        return self.fetch()
 
     def close(self) -> None:
         """Give the camera back. Never raises."""
@@ -229,23 +174,23 @@ class AravisCamera:
 
     def describe(self) -> dict[str, str]:
         """For people: where, settings, what was lost."""
-        settings, counts = self.settings, self.counts
+        config, counts = self.config, self.counts
         return {
-            "port": settings.camera_id or "first GenICam camera",
-            "settings": f"{settings.width_px} x {settings.height_px} {settings.pixel_format}, "
-            f"{settings.exposure_ms:g} ms, {settings.gain_db:g} dB",
+            "port": config.camera or "first GenICam camera",
+            "settings": f"{self._size[0]} x {self._size[1]} {config.pixel_format}, "
+            f"{config.exposure_ms:g} ms, {config.gain_db:g} dB",
             "frames": f"{counts.taken} taken, {counts.incomplete} incomplete, {counts.missing} missing, "
             f"{counts.reconnects} reconnects",
             "manual": "GenICam SFNC 2.7; aravis 0.8",
         }
 
-    def _identity(self) -> DeviceIdentity:
+    def _identity(self) -> roles.DeviceIdentity:
         words = (
             arv.aravis().text(f"arv_camera_get_{word}", self._camera)
             for word in ("vendor_name", "model_name", "device_serial_number")
         )
         vendor, model, serial = words
-        return DeviceIdentity(f"{vendor} {model}", serial, "", self.describe()["settings"])
+        return roles.DeviceIdentity(f"{vendor} {model}", serial, "", self.describe()["settings"])
 
     def _look_whether_ours(self) -> None:
         """A GigE Vision camera lets everyone read, and everyone but its one controller write into the void."""
@@ -256,21 +201,21 @@ class AravisCamera:
             raise arv.AravisError("another controller", arv.NOT_CONTROLLER)
 
     def _apply(self) -> None:
-        call, camera, settings = arv.aravis().call, self._camera, self.settings
+        call, camera, config = arv.aravis().call, self._camera, self.config
         sensor = [ctypes.c_int() for _ in range(2)]
         call("arv_camera_get_sensor_size", camera, *map(ctypes.byref, sensor))
-        if (found := (sensor[0].value, sensor[1].value)) != (settings.width_px, settings.height_px):
-            raise DeviceRefusedError(
+        if (found := (sensor[0].value, sensor[1].value)) != self._size:
+            raise roles.DeviceRefusedError(
                 f"its sensor has {found[0]} x {found[1]} pixels, [optics.camera] says "
-                f"{settings.width_px} x {settings.height_px}"
+                f"{self._size[0]} x {self._size[1]}"
             )
-        call("arv_camera_set_pixel_format_from_string", camera, settings.pixel_format.encode())
+        call("arv_camera_set_pixel_format_from_string", camera, config.pixel_format.encode())
         self._must_be("pixel_format", call("arv_camera_get_pixel_format", camera), self._format)
-        call("arv_camera_set_region", camera, 0, 0, settings.width_px, settings.height_px)
+        call("arv_camera_set_region", camera, 0, 0, *self._size)
         region = [ctypes.c_int() for _ in range(4)]
         call("arv_camera_get_region", camera, *map(ctypes.byref, region))
         size = tuple(number.value for number in region)
-        self._must_be("x, y, width and height in px", size, (0, 0, settings.width_px, settings.height_px))
+        self._must_be("x, y, width and height in px", size, (0, 0, *self._size))
         call("arv_camera_set_acquisition_mode", camera, _CONTINUOUS)
         # every trigger that the camera has is cleared first; which selector there is (FrameStart, or only
         # FrameBurstStart as on Hikrobot's cameras) is the library's to find
@@ -278,37 +223,37 @@ class AravisCamera:
         self._must_be("trigger source", call("arv_camera_get_trigger_source", camera), b"Software")
         if call("arv_camera_is_exposure_auto_available", camera):
             call("arv_camera_set_exposure_time_auto", camera, _AUTO_OFF)
-        call("arv_camera_set_exposure_time", camera, 1000.0 * settings.exposure_ms)
+        call("arv_camera_set_exposure_time", camera, 1000.0 * config.exposure_ms)
         exposure_ms = call("arv_camera_get_exposure_time", camera) / 1000.0
-        if abs(exposure_ms - settings.exposure_ms) > max(0.02 * settings.exposure_ms, 0.02):  # sensors count in lines
-            self._must_be("exposure_ms", exposure_ms, settings.exposure_ms)
+        if abs(exposure_ms - config.exposure_ms) > max(0.02 * config.exposure_ms, 0.02):  # sensors count in lines
+            self._must_be("exposure_ms", exposure_ms, config.exposure_ms)
         if call("arv_camera_is_gain_auto_available", camera):
             call("arv_camera_set_gain_auto", camera, _AUTO_OFF)
         if call("arv_camera_is_gain_available", camera):
-            call("arv_camera_set_gain", camera, settings.gain_db)
+            call("arv_camera_set_gain", camera, config.gain_db)
             gain_db = call("arv_camera_get_gain", camera)
-            if abs(gain_db - settings.gain_db) > 0.1:
-                self._must_be("gain_db", gain_db, settings.gain_db)
+            if abs(gain_db - config.gain_db) > 0.1:
+                self._must_be("gain_db", gain_db, config.gain_db)
 
     def _must_be(self, name: str, found: Any, wanted: Any) -> None:
         if found != wanted:
-            raise DeviceRefusedError(f"{name} = {found} after {wanted} was written")
+            raise roles.DeviceRefusedError(f"{name} = {found} after {wanted} was written")
 
     @property
     def _format(self) -> int:
-        return arv.PIXEL_FORMATS[self.settings.pixel_format]
+        return arv.PIXEL_FORMATS[self.config.pixel_format]
 
     def _start_stream(self) -> None:
         library, camera = arv.aravis(), self._camera
         gige = bool(library.call("arv_camera_is_gv_device", camera))
         if gige:
             library.call("arv_camera_gv_set_stream_options", camera, _NO_PACKET_SOCKET)  # that one wants root
-            if self.settings.packet_bytes:
+            if self.config.packet_bytes:
                 library.call("arv_camera_gv_set_packet_size_adjustment", camera, _ADJUST_NEVER)
-                library.call("arv_camera_gv_set_packet_size", camera, self.settings.packet_bytes)
+                library.call("arv_camera_gv_set_packet_size", camera, self.config.packet_bytes)
         self._stream = library.call("arv_camera_create_stream", camera, None, None)
         if not self._stream:
-            raise LinkError("no stream")
+            raise roles.LinkError("no stream")
         if gige:
             library.fix_socket_buffer(self._stream, _SOCKET_BYTES)
         payload_bytes = library.call("arv_camera_get_payload", camera)
@@ -323,7 +268,7 @@ class AravisCamera:
         """The first frame after a start may be exposed up to 0.1 s after its trigger, with the next pattern lit."""
         library = arv.aravis()
         library.call("arv_camera_software_trigger", self._camera)
-        wait_us = round(1e6 * (self.settings.timeout_s + self.settings.exposure_ms / 1000.0))
+        wait_us = round(1e6 * (self.config.timeout_s + self.config.exposure_ms / 1000.0))
         if buffer := library.call("arv_stream_timeout_pop_buffer", self._stream, wait_us):
             library.call("arv_stream_push_buffer", self._stream, buffer)
 
@@ -331,7 +276,7 @@ class AravisCamera:
         if self._stream is None:
             return
         library = arv.aravis()
-        with suppress(LinkError):
+        with suppress(roles.LinkError):
             library.call("arv_camera_stop_acquisition", self._camera)
         library.call("g_object_unref", self._stream)
         self._stream = None
@@ -341,26 +286,27 @@ class AravisCamera:
         self._stop_stream()
         try:
             self._start_stream()
-        except LinkError:
+        except roles.LinkError:
             self._abandon()
 
-    def _pixels(self, buffer: int, out: Pixels | None) -> Pixels:
+    def _pixels(self, buffer: int, out: roles.Pixels | None) -> roles.Pixels:
         """Copy a whole frame's pixels."""
-        library, settings = arv.aravis(), self.settings
+        library = arv.aravis()
         found = tuple(
             library.call(f"arv_buffer_get_image_{word}", buffer) for word in ("height", "width", "pixel_format")
         )
-        if found != (settings.height_px, settings.width_px, self._format):
-            raise LinkError(f"{settings.name}: sent a frame of {found[1]} x {found[0]}, format {found[2]:#x}")
+        height_px, width_px = self._size[::-1]
+        if found != (height_px, width_px, self._format):
+            raise roles.LinkError(f"{self._name}: sent a frame of {found[1]} x {found[0]}, format {found[2]:#x}")
         wide = (self._format >> 16) & 0xFF > 8  # bits a pixel, in the format's number
         dtype: np.dtype[Any] = np.dtype(np.uint16 if wide else np.uint8)
         size = ctypes.c_size_t()
         start = library.call("arv_buffer_get_data", buffer, ctypes.byref(size))
-        count = settings.height_px * settings.width_px
+        count = height_px * width_px
         if size.value < count * dtype.itemsize:
-            raise LinkError(f"{settings.name}: sent {size.value} bytes instead of {count * dtype.itemsize}")
+            raise roles.LinkError(f"{self._name}: sent {size.value} bytes instead of {count * dtype.itemsize}")
         memory = memoryview((ctypes.c_char * (count * dtype.itemsize)).from_address(start))
-        seen: Pixels = np.ndarray(count, dtype, memory).reshape(settings.height_px, settings.width_px)
+        seen: roles.Pixels = np.ndarray(count, dtype, memory).reshape(height_px, width_px)
         if out is None:
             return seen.copy()
         if out.shape != seen.shape or out.dtype != seen.dtype:
@@ -368,16 +314,18 @@ class AravisCamera:
         np.copyto(out, seen)
         return out
 
-    def _told(self, error: LinkError, doing: str) -> LinkError:
+    def _told(self, error: roles.LinkError, doing: str) -> roles.LinkError:
         """The error with the camera's name and the remedy."""
-        name, message = self.settings.name, str(error)
+        name, message = self._name, str(error)
         code = error.code if isinstance(error, arv.AravisError) else -1
         if code in _TAKEN:
-            return LinkError(f"{name}: in use by another program ({message}); close it, then try again")
+            return roles.LinkError(f"{name}: in use by another program ({message}); close it, then try again")
         if code == arv.NOT_FOUND:
-            return LinkDownError(f"{name}: not found; is it on and plugged in? `membrane-ctrl devices` lists what is")
+            return roles.LinkDownError(
+                f"{name}: not found; is it on and plugged in? `membrane-ctrl devices` lists what is"
+            )
         if code in _GONE:
-            return LinkDownError(f"{name}: {doing}: no answer ({message}); is it on and plugged in?")
-        if isinstance(error, LinkDownError) or message == arv.MISSING:
+            return roles.LinkDownError(f"{name}: {doing}: no answer ({message}); is it on and plugged in?")
+        if isinstance(error, roles.LinkDownError) or message == arv.MISSING:
             return error
-        return DeviceRefusedError(f"{name}: {doing}: {message}; see [devices.camera]")
+        return roles.DeviceRefusedError(f"{name}: {doing}: {message}; see [devices.camera]")

@@ -9,11 +9,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, Frame, LinkError, Pattern
+from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, Frame, LinkError, Pattern, Pixels
 
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm")
 
 

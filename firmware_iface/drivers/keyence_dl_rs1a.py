@@ -13,12 +13,10 @@ import asyncio
 import math
 import re
 
-from firmware_iface.drivers.linked_device import LinkedDevice, StepGate
+from firmware_iface import roles, settings
+from firmware_iface.drivers.linked_device import LineDriver, StepGate
 from firmware_iface.links import exchange, serial_port
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, DisplacementSample, LinkError
 
-MANUAL = "DL-RS1A user's manual, IL edition, pages 7-16"
-BAUDS = (2400, 4800, 9600, 19_200, 38_400)  # page 7
 _VALUE = r"[+-](?:\d\d\.\d{3}|\d{3}\.\d\d|\d{4}\.\d|E{2}\.E{3}|E{3}\.E{2}|E{4}\.E)"
 _ALL = re.compile(rf"(?:M0((?:,{_VALUE})+)|ER,M0,(\d\d))\r\n?")
 _ALL_CHARS = 4 + 15 * 8
@@ -36,127 +34,72 @@ _NOT_READABLE = "22"
 _STEPS_UM = {3: 1.0, 2: 10.0, 1: 100.0}  # decimals of the millimetre
 
 
-class KeyenceDlRs1a(LinkedDevice):
-    """A `DisplacementSensor`.
+class KeyenceDlRs1a(LineDriver):
+    """A `DisplacementSensor`; `port` stands in for the configured one. Displacement = direction * (value - zero)."""
 
-    Displacement = direction * (value - zero).
+    manual = "DL-RS1A user's manual, IL edition, pages 7-16"
 
-    Parameters
-    ----------
-    port : str or BytePort
-        A path or `usb:VID:PID[:SERIAL]`.
-    baud, parity
-        As set by the unit's switches; the factory's 9600 without parity is good for 25 readings a second, 38400 with
-        even parity for 80.
-    amplifier : int
-        0 is the main unit, 1..14 are expansions.
-    zero_mm : float
-        Value at displacement 0.
-    direction : int
-        -1 when the value falls as the bowl deepens (a head behind the mirror that counts up with distance), else 1.
-    step_max_um : float
-        A reading farther than this from both before it is not believed.
-    timeout_s : float
-        For an answer.
-
-    Raises
-    ------
-    ValueError
-        Settings that the unit does not have.
-    """
-
-    def __init__(
-        self,
-        port: str | serial_port.BytePort,
-        baud: int = 9600,
-        parity: str = "N",
-        amplifier: int = 0,
-        zero_mm: float = 0.0,
-        direction: int = -1,
-        step_max_um: float = 10.0,
-        timeout_s: float = 0.1,
-    ) -> None:
-        if baud not in BAUDS:
-            raise ValueError(f"baud = {baud}: the unit has {', '.join(map(str, BAUDS))}")
-        if not 0 <= amplifier <= 14:
-            raise ValueError(f"amplifier = {amplifier}: wanted 0 .. 14")
-        if direction not in (-1, 1):
-            raise ValueError(f"direction = {direction}: wanted 1 or -1")
-        self._settings = serial_port.SerialSettings(baud, parity=parity)
-        self._amplifier, self._zero_mm, self._direction = amplifier, zero_mm, direction
-        self._step_max_um = step_max_um
-        number = f"{amplifier:02d}"
+    def __init__(self, config: settings.KeyenceDlRs1aConfig, port: serial_port.SerialPort | None = None) -> None:
+        self._config = config
+        number = f"{config.amplifier:02d}"
         self._read_command = f"SR,{number},038"
         self._read_answer = re.compile(rf"(?:SR,{number},038,({_VALUE})|ER,SR,(\d\d))\r\n?")
         self._errors_command = f"SR,{number},033"
         self._errors_answer = re.compile(rf"(?:SR,{number},033,(\d{{5}})|ER,SR,(\d\d))\r\n?")
         # the fence has to differ from a reading also when it is refused, as when the amplifier is pulled off: `M0`
-        self._link = exchange.LineLink(
-            serial_port.as_port(port, self._settings), "\r\n", timeout_s, exchange.LineFence("M0", _ALL, _ALL_CHARS)
-        )
-        super().__init__(self._link)
-        self._gate = StepGate(step_max_um)
+        fence = exchange.LineFence("M0", _ALL, _ALL_CHARS)
+        settings = serial_port.SerialSettings(config.baud, parity=config.parity)
+        super().__init__(port or serial_port.SerialPort(config.port, settings), "\r\n", config.timeout_s, fence)
+        self._gate = StepGate(config.step_max_um)
         self._decimals = 3
         self._readings = 0
 
-    async def open(self) -> DeviceIdentity:
+    async def open(self) -> roles.DeviceIdentity:
         """Open the port, see that the amplifier is there and well. The unit has no settings of its own to apply.
 
-        Raises
-        ------
-        LinkError
-            No valid answer; LinkDownError without a port.
-        DeviceRefusedError
-            No such amplifier, one in error, or one with steps coarser than `step_max_um`.
+        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (no such amplifier, one
+        in error, or one with steps coarser than `step_max_um`).
         """
         await self._link.close()
-        self._gate = StepGate(self._step_max_um)
-        self._link.connect()
-        try:
-            return await self._identify()
-        except LinkError:
-            await self._link.close()
-            raise
+        self._gate = StepGate(self._config.step_max_um)
+        return await self._opened(self._identify)
 
-    async def _identify(self) -> DeviceIdentity:
+    async def _identify(self) -> roles.DeviceIdentity:
         every = await self._link.query("M0", _ALL, _ALL_CHARS)
         _refuse(self._link.name, every[2])
         values = every[1][1:].split(",")
-        if self._amplifier >= len(values):
-            raise DeviceRefusedError(
-                f"{self._link.name}: amplifier = {self._amplifier}, but there are only {len(values)} (0 is the first)"
+        if self._config.amplifier >= len(values):
+            raise roles.DeviceRefusedError(
+                f"{self._link.name}: amplifier = {self._config.amplifier}, but there are only {len(values)} "
+                "(0 is the first)"
             )
-        self._decimals = len(values[self._amplifier].partition(".")[2])
-        if _STEPS_UM[self._decimals] > self._step_max_um:
-            raise DeviceRefusedError(f"{self._link.name}: head with steps of {_STEPS_UM[self._decimals]:g} um")
+        self._decimals = len(values[self._config.amplifier].partition(".")[2])
+        if _STEPS_UM[self._decimals] > self._config.step_max_um:
+            raise roles.DeviceRefusedError(f"{self._link.name}: head with steps of {_STEPS_UM[self._decimals]:g} um")
         errors = await self._link.query(self._errors_command, self._errors_answer)
         if errors[2] != _NOT_READABLE:  # amplifiers that do not tell: their head error is seen in the value
             _refuse(self._link.name, errors[2])
         if bits := int(errors[1] or 0):
-            raise DeviceRefusedError(f"{self._link.name}: amplifier in error (state {bits:016b}); see its manual")
+            raise roles.DeviceRefusedError(
+                f"{self._link.name}: amplifier in error (state {bits:016b}); see its manual"
+            )
         await self._reading()  # the first one is confirmed by a second
-        detail = f"amplifier {self._amplifier} of {len(values)}, steps of {_STEPS_UM[self._decimals]:g} um"
-        return DeviceIdentity("Keyence DL-RS1A", "", "", detail)
+        detail = f"amplifier {self._config.amplifier} of {len(values)}, steps of {_STEPS_UM[self._decimals]:g} um"
+        return roles.DeviceIdentity("Keyence DL-RS1A", "", "", detail)
 
-    async def displacement(self) -> DisplacementSample:
+    async def displacement(self) -> roles.DisplacementSample:
         """Ask for the value now.
 
-        Counter and time are the driver's: valid answers so far, time of arrival.
-
-        Raises
-        ------
-        LinkError
-            No valid answer, or a jump that is not believed before it is repeated.
-        LinkDownError
-            The port is gone.
+        Counter and time are the driver's: valid answers so far, time of arrival. Raises LinkError (no valid answer,
+        or a jump that is not believed before it is repeated), LinkDownError (the port is gone).
         """
         quality, displacement_um, passed = await self._reading()
         if not passed:
-            raise LinkError(
+            raise roles.LinkError(
                 f"{self._link.name}: jump to {displacement_um:.0f} um, not believed before it is repeated"
             )
         self._readings += 1
-        return DisplacementSample(displacement_um, quality, self._readings, asyncio.get_running_loop().time())
+        return roles.DisplacementSample(displacement_um, quality, self._readings, asyncio.get_running_loop().time())
 
     async def _reading(self) -> tuple[int, float, bool]:
         """Quality, displacement and whether the gate passed it."""
@@ -164,28 +107,21 @@ class KeyenceDlRs1a(LinkedDevice):
         _refuse(self._link.name, answer[2])
         text = answer[1]
         if len(text.partition(".")[2]) != self._decimals:
-            raise LinkError(f"{self._link.name}: {text} has not {self._decimals} decimals as before")
+            raise roles.LinkError(f"{self._link.name}: {text} has not {self._decimals} decimals as before")
         if "E" in text:
             return QUALITY_AMPLIFIER_ERROR, math.nan, True
         # page 12: beyond the display above or below; one less: no value
         if text[1:].replace(".", "") in ("99999", "99998"):
             return QUALITY_OUT_OF_RANGE, math.nan, True
-        displacement_um = 1000 * self._direction * (float(text) - self._zero_mm)
+        displacement_um = 1000 * self._config.direction * (float(text) - self._config.zero_mm)
         return 0, displacement_um, self._gate.passes(displacement_um)
 
-    async def close(self) -> None:
-        """Close the port. Never raises."""
-        await self._link.close()
-
-    def describe(self) -> dict[str, str]:
-        """For people: port, settings, manual."""
-        return {
-            "port": f"{self._link.name}, {self._settings}",
-            "settings": f"amplifier {self._amplifier}, zero at {self._zero_mm:g} mm, direction {self._direction:+d}",
-            "manual": MANUAL,
-        }
+    @property
+    def _shown(self) -> str:
+        config = self._config
+        return f"amplifier {config.amplifier}, zero at {config.zero_mm:g} mm, direction {config.direction:+d}"
 
 
 def _refuse(name: str, code: str | None) -> None:
     if code is not None:
-        raise DeviceRefusedError(f"{name}: error {code} ({ERRORS.get(int(code), 'unknown')})")
+        raise roles.DeviceRefusedError(f"{name}: error {code} ({ERRORS.get(int(code), 'unknown')})")

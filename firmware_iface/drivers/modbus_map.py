@@ -18,39 +18,18 @@ _FORMATS = {"u16": "H", "i16": "h", "u32": "I", "i32": "i", "f32": "f"}
 
 @dataclass(frozen=True, slots=True)
 class ValueMap:
-    """One value in the registers of a device.
+    """One value in the registers of a device."""
 
-    Attributes
-    ----------
-    address : int
-        Of its first register, counted from 0.
-    value : tuple of float
-        Two values of the role's unit ...
-    raw : tuple of float
-        ... and what the register holds at them; between and beyond them a straight line.
-    limits : tuple of float
-        Values outside are refused, read or written.
-    function : str
-        "holding" or "input".
-    type : str
-        "u16", "i16", "u32", "i32" or "f32".
-    word_order : str
-        Of the two registers of a 32-bit type: "big" word first, or "little".
-    identity : tuple of int or None
-        A holding register and what it must hold, if the device can be told from others so.
-    version_address : int or None
-        A holding register with the device's version, to be shown.
-    """
-
-    address: int
-    value: tuple[float, float]
-    raw: tuple[float, float]
-    limits: tuple[float, float]
-    function: str = "holding"
-    type: str = "u16"
-    word_order: str = "big"
+    address: int  # of its first register, counted from 0
+    value: tuple[float, float]  # two values in the role's unit ...
+    raw: tuple[float, float]  # ... and what the register holds at them; between and beyond them a straight line
+    limits: tuple[float, float]  # values outside are refused, read or written
+    function: str = "holding"  # "holding" or "input"
+    type: str = "u16"  # "u16", "i16", "u32", "i32" or "f32"
+    word_order: str = "big"  # of the two registers of a 32-bit type: "big" word first, or "little"
+    # a holding register and what it must hold, if the device can be told from others so
     identity: tuple[int, int] | None = None
-    version_address: int | None = None
+    version_address: int | None = None  # a holding register with the device's version, to be shown
 
     @property
     def words(self) -> int:
@@ -91,10 +70,7 @@ def preset(name: str) -> dict[str, Any]:
 def make_map(given: dict[str, Any], preset_name: str = "") -> tuple[ValueMap, bool]:
     """A map from what was configured over what the preset says, and whether the device knows function 8.
 
-    Raises
-    ------
-    ValueError
-        An unknown preset, a missing key, an address or a raw value that the device does not have.
+    Raises ValueError (an unknown preset, a missing key, an address or a raw value that the device does not have).
     """
     defaults = preset(preset_name) if preset_name else {}
     raw_limits, address_limits = defaults.pop("raw_limits", None), defaults.pop("address_limits", None)
@@ -155,10 +131,7 @@ class ModbusValue:
     async def open(self) -> DeviceIdentity:
         """Connect, check the identity register if there is one, put an actuator to rest.
 
-        Raises
-        ------
-        DeviceRefusedError
-            The identity register holds something else, or the device has no such registers.
+        Raises DeviceRefusedError (the identity register holds something else, or the device has no such registers).
         """
         if not self._link.connected:
             await self._link.connect()

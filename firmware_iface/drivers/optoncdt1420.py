@@ -7,6 +7,11 @@ before that. It may repeat the command and write a rate as `4`, `4.0` or `4 kHz`
 The sensor streams; a reading is the mean of the middle half of everything since the last one (at 4 kHz and 50 Hz: 40
 of 80 values). A hit byte, which nothing in the protocol shows, is one outlier among many and left out; and unlike the
 median, the mean resolves less than a digital step (0.8 um at 50 mm range).
+
+In the stream (pages 65-67) a value is 18 bits in three bytes of six, marked in their two highest bits: low `00`,
+middle `01`, high `10` for the first value of a measurement and `11` for further ones. Here a measurement is distance
+and measurement counter (`OUTADD_RS422 COUNTER`), six bytes. There is no checksum, and where bytes are lost two
+measurements can join to one that never was: a measurement is trusted only when its counter is the last one plus one.
 """
 
 import asyncio
@@ -17,12 +22,10 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.drivers import linked_device, optoncdt_stream
-from firmware_iface.links.serial_port import BytePort, SerialSettings, as_port
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, DisplacementSample, LinkDownError, LinkError
+from firmware_iface import roles, settings
+from firmware_iface.drivers.linked_device import LinkedDevice, StepGate
+from firmware_iface.links.serial_port import SerialPort, SerialSettings
 
-MANUAL = "optoNCDT 1420 instruction manual, 7.5.2 and appendix A 3"
-RATES_KHZ = (0.25, 0.5, 1.0, 2.0, 4.0)
 _IN_RANGE = (643, 64_877)  # page 65: below and above are reserves, measured but not specified
 _PROMPT = b"->"
 _ERROR = re.compile(r"E(\d{3})([^\r\n]*)")
@@ -30,93 +33,95 @@ _RATE = re.compile(r"(\d+(?:\.\d*)?)(?: ?kHz)?")
 _MIDDLE_MIN = 8  # of fewer values the median
 _BATCHES_MAX = 1024  # of a caller that stays away; old ones go first
 _SILENT_MAX = 3  # readings without a single value: the sensor restarted or lost its power
+_BYTES = 6  # a measurement
+_COUNTER_MODULUS = 2**18
+_RAW_MAX = 65_520  # above it an error code
+_MARKS = (0, 1, 2, 0, 1, 3)
 
 
-class Optoncdt1420(linked_device.LinkedDevice):
-    """A `DisplacementSensor`.
+class StreamParser:
+    """Bytes in any portions to measurements.
+
+    Attributes
+    ----------
+    bytes_lost : int
+        That belonged to no measurement, so far.
+    untrusted : int
+        Measurements that did not follow on the one before, so far.
+    """
+
+    def __init__(self) -> None:
+        self.bytes_lost = 0
+        self.untrusted = 0
+        self._rest = b""
+        self._counter = -1
+
+    def feed(self, data: bytes) -> NDArray[np.int64]:
+        """Digital values or error codes (n,) of the trusted measurements that are complete with these bytes."""
+        stream = np.frombuffer(self._rest + data, np.uint8)
+        marks = stream >> 6
+        starts = np.arange(max(0, len(stream) - _BYTES + 1))
+        found = np.ones(len(starts), bool)
+        for offset, mark in enumerate(_MARKS):
+            found &= marks[offset : offset + len(starts)] == mark
+        starts = starts[found]
+        used = int(starts[-1]) + _BYTES if len(starts) else max(0, len(stream) - _BYTES + 1)
+        self.bytes_lost += used - _BYTES * len(starts)
+        self._rest = stream[used:].tobytes()
+        if not len(starts):
+            return np.empty(0, np.int64)
+        bits = (stream & 0x3F).astype(np.int64)
+        raw = bits[starts] | bits[starts + 1] << 6 | bits[starts + 2] << 12
+        counters = bits[starts + 3] | bits[starts + 4] << 6 | bits[starts + 5] << 12
+        before = np.concatenate(([self._counter], counters[:-1]))
+        trusted = counters == (before + 1) % _COUNTER_MODULUS
+        self._counter = int(counters[-1])
+        self.untrusted += int(np.count_nonzero(~trusted))
+        values: NDArray[np.int64] = raw[trusted]
+        return values
+
+
+def distance_mm(raw: float, range_mm: float) -> float:
+    """Distance from the start of the measuring range (page 65, without mastering): (1.02 x / 65520 - 0.01) range."""
+    return (1.02 * raw / _RAW_MAX - 0.01) * range_mm
+
+
+class Optoncdt1420(LinkedDevice):
+    """A `DisplacementSensor`; `port` stands in for the configured one.
 
     Displacement = direction * (distance - zero). The sensor stands behind the mirror: when the bowl deepens the
     vertex comes nearer, so the default direction is -1. Counter and time are the driver's: trusted values so far,
     time of arrival. A sensor that repeats itself repeats its counter too, and that is no new value.
-
-    Parameters
-    ----------
-    port : str or BytePort
-        A path or `usb:VID:PID[:SERIAL]`.
-    baud : int
-        As the sensor is set (its default is 921600).
-    rate_khz : float
-        Measuring rate: 0.25, 0.5, 1, 2 or 4.
-    range_mm : float or None
-        Refuse a sensor with another measuring range; None takes any.
-    zero_mm : float or None
-        Distance from the start of the range at displacement 0; None: the middle of the range.
-    direction : int
-        -1 when a deeper bowl comes nearer to the sensor, else 1.
-    step_max_um : float
-        A reading farther than this from both before it is not believed.
-    timeout_s : float
-        For an answer, and for a value to come when none has since the last reading.
-
-    Raises
-    ------
-    ValueError
-        A rate the sensor does not have, or that this baud rate cannot carry.
     """
 
-    def __init__(
-        self,
-        port: str | BytePort,
-        baud: int = 921_600,
-        rate_khz: float = 4.0,
-        range_mm: float | None = None,
-        zero_mm: float | None = None,
-        direction: int = -1,
-        step_max_um: float = 50.0,
-        timeout_s: float = 0.2,
-    ) -> None:
-        if rate_khz not in RATES_KHZ:
-            raise ValueError(f"rate_khz = {rate_khz:g}: the sensor has {', '.join(f'{r:g}' for r in RATES_KHZ)}")
-        if direction not in (-1, 1):
-            raise ValueError(f"direction = {direction}: wanted 1 or -1")
-        settings = SerialSettings(baud)
-        if (needed := 1000 * rate_khz * optoncdt_stream.BYTES * settings.char_s) > 0.9:
-            raise ValueError(f"baud = {baud} cannot carry rate_khz = {rate_khz:g} (line {needed:.0%} busy)")
-        self._port = as_port(port, settings)
+    def __init__(self, config: settings.Optoncdt1420Config, port: SerialPort | None = None) -> None:
+        self._config = config
+        self._port = port or SerialPort(config.port, SerialSettings(config.baud))
         super().__init__(self._port)
-        self._rate_khz = rate_khz
-        self._range_wanted_mm, self._zero_wanted_mm = range_mm, zero_mm
-        self._direction = direction
-        self._step_max_um = step_max_um
-        self._timeout_s = timeout_s
         self._settle_anew()
 
     def _settle_anew(self) -> None:
         self._range_mm = self._zero_mm = math.nan
         self._heard: bytes | None = b""  # None while streaming
         self._stir = asyncio.Event()
-        self._parser = optoncdt_stream.StreamParser()
+        self._parser = StreamParser()
         self._batches: list[NDArray[np.int64]] = []
-        self._gate = linked_device.StepGate(self._step_max_um)
+        self._gate = StepGate(self._config.step_max_um)
         self._counted = 0
         self._arrived_s = 0.0
         self._silent = 0
 
-    async def open(self) -> DeviceIdentity:
+    async def open(self) -> roles.DeviceIdentity:
         """Open the port, stop the stream, check who it is, set it and read it back, start the stream.
 
-        Raises
-        ------
-        LinkError
-            No valid answer; LinkDownError without a port.
-        DeviceRefusedError
-            Another device, another range, or a setting that is not taken.
+        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another device, another
+        range, or a setting that is not taken).
         """
         await self.close()
         self._settle_anew()
         self._port.open(self)
         try:
-            with contextlib.suppress(DeviceRefusedError):  # refused with what was said to it half before
+            with contextlib.suppress(roles.DeviceRefusedError):  # refused with what was said to it half before
                 await self._command("OUTPUT NONE")
             await self._command("OUTPUT NONE")
             identity = await self._identify()
@@ -125,7 +130,7 @@ class Optoncdt1420(linked_device.LinkedDevice):
             self._port.write(b"OUTPUT RS422\n")  # what the stream is mixed with the answer to this is skipped
             self._heard = None
             await self._first_readings()
-        except LinkError:
+        except roles.LinkError:
             await self.close()
             raise
         self._port.succeeded()
@@ -133,29 +138,29 @@ class Optoncdt1420(linked_device.LinkedDevice):
 
     def _settings(self) -> list[str]:
         return [
-            f"MEASRATE {self._rate_khz:g}",
+            f"MEASRATE {self._config.rate_khz:g}",
             "LASERPOW FULL",
             "OUTREDUCEDEVICE NONE",
             "OUTHOLD NONE",  # an error is to be seen, not the value before it
             "OUTADD_RS422 COUNTER",
         ]
 
-    async def _identify(self) -> DeviceIdentity:
+    async def _identify(self) -> roles.DeviceIdentity:
         text = await self._command("GETINFO")
         fields = dict(re.findall(r"^\s*([\w. -]+?):\s*(.*?)\s*$", text, re.MULTILINE))
         name, measuring_range = fields.get("Name", ""), fields.get("Measuring range", "")
         found = re.match(r"([\d.]+)\s*mm", measuring_range)
         if "1420" not in name or found is None:
-            raise DeviceRefusedError(f"{self._port.name}: {name or text[:40]!r} is no optoNCDT 1420")
+            raise roles.DeviceRefusedError(f"{self._port.name}: {name or text[:40]!r} is no optoNCDT 1420")
         self._range_mm = float(found[1])
-        if self._range_wanted_mm is not None and self._range_mm != self._range_wanted_mm:
-            raise DeviceRefusedError(
-                f"{self._port.name}: {name} measures {self._range_mm:g} mm, range_mm = {self._range_wanted_mm:g}"
+        if self._config.range_mm is not None and self._range_mm != self._config.range_mm:
+            raise roles.DeviceRefusedError(
+                f"{self._port.name}: {name} measures {self._range_mm:g} mm, range_mm = {self._config.range_mm:g}"
             )
-        self._zero_mm = self._range_mm / 2 if self._zero_wanted_mm is None else self._zero_wanted_mm
-        ends = [1000 * self._direction * (end_mm - self._zero_mm) for end_mm in (0.0, self._range_mm)]
+        self._zero_mm = self._range_mm / 2 if self._config.zero_mm is None else self._config.zero_mm
+        ends = [1000 * self._config.direction * (end_mm - self._zero_mm) for end_mm in (0.0, self._range_mm)]
         serial, version = fields.get("Serial", ""), fields.get("Version", "")
-        return DeviceIdentity(name, serial, version, f"{self._range_mm:g} mm", (min(ends), max(ends)))
+        return roles.DeviceIdentity(name, serial, version, f"{self._range_mm:g} mm", (min(ends), max(ends)))
 
     async def _set(self, setting: str) -> None:
         name = setting.split()[0]
@@ -163,7 +168,7 @@ class Optoncdt1420(linked_device.LinkedDevice):
         text = await self._command(name)
         found = re.search(rf"^\s*{name} +(.+?)\s*$", text, re.MULTILINE)
         if found is None or _plain(found[1]) != _plain(setting.split()[1]):
-            raise DeviceRefusedError(f"{self._port.name}: set {setting!r}, read back {text.strip()[:60]!r}")
+            raise roles.DeviceRefusedError(f"{self._port.name}: set {setting!r}, read back {text.strip()[:60]!r}")
 
     async def _command(self, command: str) -> str:
         """The answer without its prompt. Raises LinkError, DeviceRefusedError."""
@@ -171,18 +176,18 @@ class Optoncdt1420(linked_device.LinkedDevice):
         self._port.write(command.encode("ascii") + b"\n")
         what = f"{self._port.name}: {command}"
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(self._timeout_s):
+            async with asyncio.timeout(self._config.timeout_s):
                 while not self._heard.rstrip().endswith(_PROMPT):
                     await self._stirred()
         if not self._heard.rstrip().endswith(_PROMPT):  # it may have come while this process was kept from running
-            hint = f"no answer within {self._timeout_s:g} s; is it on, wired and set to {self._port.settings}?"
+            hint = f"no answer within {self._config.timeout_s:g} s; is it on, wired and set to {self._port.settings}?"
             if self._heard:
-                hint = f"{len(self._heard)} bytes but no prompt within {self._timeout_s:g} s; wrong baud rate?"
-            raise LinkError(f"{what}: {hint}")
+                hint = f"{len(self._heard)} bytes but no prompt within {self._config.timeout_s:g} s; wrong baud rate?"
+            raise roles.LinkError(f"{what}: {hint}")
         # bytes of a stream that is just being stopped have no text in them that could be an error: see the marks
         text = self._heard.rstrip()[: -len(_PROMPT)].decode("ascii", "replace")
         if error := _ERROR.search(text):
-            raise DeviceRefusedError(f"{what}: E{error[1]}{error[2]}")
+            raise roles.DeviceRefusedError(f"{what}: E{error[1]}{error[2]}")
         return text
 
     async def _first_readings(self) -> None:
@@ -190,58 +195,56 @@ class Optoncdt1420(linked_device.LinkedDevice):
         for _ in range(2):
             await self._wait_for_values()
             values = self._taken()
-            good = values[values <= optoncdt_stream.RAW_MAX]
+            good = values[values <= _RAW_MAX]
             if len(good):
                 self._gate.passes(self._displacement_um(middle(good)))
 
-    async def displacement(self) -> DisplacementSample:
+    async def displacement(self) -> roles.DisplacementSample:
         """Middle of all values since the last call; waits for one when there is none yet.
 
-        Raises
-        ------
-        LinkError
-            No value in time, or one that cannot be: it is dropped.
-        LinkDownError
-            The port is gone, or the sensor stopped streaming: open it again.
+        Raises LinkError (no value in time, or one that cannot be: it is dropped), LinkDownError (the port is gone, or
+        the sensor stopped streaming: open it again).
         """
         try:
             await self._wait_for_values()
-        except LinkDownError:
+        except roles.LinkDownError:
             raise
-        except LinkError as error:
+        except roles.LinkError as error:
             self._silent += 1
             if self._silent < _SILENT_MAX:
                 raise
             await self.close()
-            raise LinkDownError(f"{error}; it restarted or lost its power: open it again") from error
+            raise roles.LinkDownError(f"{error}; it restarted or lost its power: open it again") from error
         self._silent = 0
         self._port.succeeded()
         values = self._taken()
-        good = values[values <= optoncdt_stream.RAW_MAX]
+        good = values[values <= _RAW_MAX]
         if 2 * len(good) <= len(values):
-            codes, counts = np.unique(values[values > optoncdt_stream.RAW_MAX], return_counts=True)
-            return DisplacementSample(math.nan, int(codes[np.argmax(counts)]), self._counted, self._arrived_s)
+            codes, counts = np.unique(values[values > _RAW_MAX], return_counts=True)
+            return roles.DisplacementSample(math.nan, int(codes[np.argmax(counts)]), self._counted, self._arrived_s)
         raw = middle(good)
         displacement_um = self._displacement_um(raw)
         if not self._gate.passes(displacement_um):
-            raise LinkError(
+            raise roles.LinkError(
                 f"{self._port.name}: a jump to {displacement_um:.1f} um is not believed before it is repeated"
             )
         quality = 0 if _IN_RANGE[0] <= raw <= _IN_RANGE[1] else int(raw)
-        return DisplacementSample(math.nan if quality else displacement_um, quality, self._counted, self._arrived_s)
+        return roles.DisplacementSample(
+            math.nan if quality else displacement_um, quality, self._counted, self._arrived_s
+        )
 
     def _displacement_um(self, raw: float) -> float:
-        return 1000 * self._direction * (optoncdt_stream.distance_mm(raw, self._range_mm) - self._zero_mm)
+        return 1000 * self._config.direction * (distance_mm(raw, self._range_mm) - self._zero_mm)
 
     async def _wait_for_values(self) -> None:
         if not self._port.is_open:
-            raise LinkDownError(f"{self._port.name}: not connected")
+            raise roles.LinkDownError(f"{self._port.name}: not connected")
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(self._timeout_s):
+            async with asyncio.timeout(self._config.timeout_s):
                 while not self._batches:
                     await self._stirred()
         if not self._batches:
-            raise LinkError(f"{self._port.name}: no value within {self._timeout_s:g} s")
+            raise roles.LinkError(f"{self._port.name}: no value within {self._config.timeout_s:g} s")
 
     def _taken(self) -> NDArray[np.int64]:
         values = np.concatenate(self._batches)
@@ -253,7 +256,7 @@ class Optoncdt1420(linked_device.LinkedDevice):
         self._stir.clear()
         await self._stir.wait()
         if not self._port.is_open:
-            raise LinkDownError(f"{self._port.name}: the port is gone")
+            raise roles.LinkDownError(f"{self._port.name}: the port is gone")
 
     def received(self, data: bytes) -> None:
         """Bytes came (called by the port)."""
@@ -266,7 +269,7 @@ class Optoncdt1420(linked_device.LinkedDevice):
             del self._batches[:-_BATCHES_MAX]
         self._stir.set()
 
-    def lost(self, error: LinkDownError) -> None:
+    def lost(self, error: roles.LinkDownError) -> None:
         """The port is gone (called by the port)."""
         self._stir.set()
 
@@ -277,12 +280,12 @@ class Optoncdt1420(linked_device.LinkedDevice):
 
     def describe(self) -> dict[str, str]:
         """For people: port, settings, manual."""
-        zero = "middle of the range" if self._zero_wanted_mm is None else f"{self._zero_wanted_mm:g} mm"
+        zero = "middle of the range" if self._config.zero_mm is None else f"{self._config.zero_mm:g} mm"
         return {
             "port": f"{self._port.name}, {self._port.settings}",
-            "settings": f"{self._rate_khz:g} kHz, zero at {zero}, direction {self._direction:+d}",
+            "settings": f"{self._config.rate_khz:g} kHz, zero at {zero}, direction {self._config.direction:+d}",
             "lost": f"{self._parser.bytes_lost} bytes outside of values, {self._parser.untrusted} values untrusted",
-            "manual": MANUAL,
+            "manual": "optoNCDT 1420 instruction manual, 7.5.2 and appendix A 3",
         }
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from firmware_iface import roles
 from firmware_iface.drivers.linked_device import LinkedDevice
-from firmware_iface.links import modbus_links, modbus_rules
+from firmware_iface.links import modbus_rtu, modbus_rules
 from firmware_iface.register_map import Block, default_map, known_maps
 
 _KIND = "membrane pump board"
@@ -31,7 +31,8 @@ class PumpBoard(LinkedDevice):
     then the board keeps the pump off.
 
     `open` claims a board of map version 2 for this object: until it is closed, or its watchdog has run out, the board
-    takes commands from nobody else. A board of map version 1 knows no claim and obeys whoever writes.
+    takes commands from nobody else. A board of map version 1 knows no claim and obeys whoever writes. Raises
+    ValueError (the URL is none, or the board cannot have this watchdog period).
 
     Parameters
     ----------
@@ -45,11 +46,6 @@ class PumpBoard(LinkedDevice):
         The board turns the pump off when it gets no `write` for this long.
     link : ModbusLink, optional
         A link that is there already (one in memory, in virtual time), in place of the URL's.
-
-    Raises
-    ------
-    ValueError
-        The URL is none, or the board cannot have this watchdog period.
     """
 
     def __init__(
@@ -61,7 +57,7 @@ class PumpBoard(LinkedDevice):
         link: modbus_rules.ModbusLink | None = None,
     ) -> None:
         if link is None:
-            link = modbus_links.ModbusLinks().link(url, unit_id, timeout_s)
+            link = modbus_rtu.ModbusLinks().link(url, unit_id, timeout_s)
         self._registers = default_map()  # of the board that answers, once it has said its version
         period = self._registers.register("watchdog_period_s")
         if not period.allows(watchdog_s):
@@ -81,16 +77,9 @@ class PumpBoard(LinkedDevice):
     async def open(self) -> roles.BenchIdentity:
         """Connect, check kind and map version, claim the board, arm its watchdog and read both back.
 
-        The watchdog runs from here on: write within its period, pump 0 too.
-
-        Raises
-        ------
-        LinkError
-            No connection or no valid answer.
-        DeviceBusyError
-            Another program holds the board.
-        DeviceRefusedError
-            Another kind of device, an unknown map version, or a watchdog that does not take its setting.
+        The watchdog runs from here on: write within its period, pump 0 too. Raises LinkError (no connection or no
+        valid answer), DeviceBusyError (another program holds the board), DeviceRefusedError (another kind of device,
+        an unknown map version, or a watchdog that does not take its setting).
         """
         identity = await self.identify()
         try:
@@ -169,12 +158,8 @@ class PumpBoard(LinkedDevice):
     async def read(self) -> roles.BenchReading:
         """One sample of everything, in one transaction.
 
-        Raises
-        ------
-        LinkError
-            No valid answer.
-        LinkDownError
-            No connection, or the board restarted and lost its settings: call `open` again.
+        Raises LinkError (no valid answer), LinkDownError (no connection, or the board restarted and lost its
+        settings: call `open` again).
         """
         values = await self._sensors()
         if self._armed and not values["watchdog_armed"]:
@@ -208,14 +193,8 @@ class PumpBoard(LinkedDevice):
     async def write(self, command: roles.BenchCommand) -> None:
         """Write pump and vent with a new heartbeat, in one transaction: what feeds the watchdog.
 
-        Raises
-        ------
-        ValueError
-            A fraction that is not within 0..1, or NaN; nothing is sent.
-        LinkError
-            No valid answer: the board may or may not have it.
-        DeviceBusyError
-            The board is another program's by now.
+        Raises ValueError (a fraction that is not within 0..1, or NaN; nothing is sent), LinkError (no valid answer:
+        the board may or may not have it), DeviceBusyError (the board is another program's by now).
         """
         for name, fraction in (("pump", command.pump_fraction), ("vent", command.vent_fraction)):
             if not 0.0 <= fraction <= 1.0:

@@ -4,7 +4,7 @@ Source: pygame-ce documentation, `pygame.display`. Patterns are rendered once, w
 out another size than the one asked for without a word, so every size that there is gets compared.
 
 `flip` returns when the picture is queued, not when it is lit: `show` waits the settle time, which is to be measured
-(`firmware_iface.display.measures`).
+(`firmware_iface.display`).
 """
 
 import importlib
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.display.response import DisplayResponse, ScreenRaster, linear_response, pattern_light
+from firmware_iface.display import DisplayResponse, ScreenRaster, linear_response, pattern_light
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkError, Pattern
 
 MISSING = "pygame-ce is not installed: pip install 'membrane-ctrl[screen]'"
@@ -25,24 +25,12 @@ MISSING = "pygame-ce is not installed: pip install 'membrane-ctrl[screen]'"
 
 @dataclass(frozen=True, slots=True)
 class ScreenSettings:
-    """Which display, and how it is used.
+    """Which display, and how it is used."""
 
-    Attributes
-    ----------
-    raster : ScreenRaster
-        Its pixels and the pattern region.
-    patterns : sequence of Pattern
-        What will be shown.
-    display : int
-        Number of the display, from 0.
-    settle_s : float
-        From the command to the light; until it is measured.
-    """
-
-    raster: ScreenRaster
-    patterns: Sequence[Pattern]
-    display: int = 0
-    settle_s: float = 0.3
+    raster: ScreenRaster  # its pixels and the pattern region
+    patterns: Sequence[Pattern]  # what will be shown
+    display: int = 0  # from 0
+    settle_s: float = 0.3  # from the command to the light; until it is measured
 
     @property
     def name(self) -> str:
@@ -55,7 +43,6 @@ class PygameScreen:
 
     Parameters
     ----------
-    settings : ScreenSettings
     response : DisplayResponse
         Makes the patterns' light linear.
     now, sleep : callables
@@ -86,12 +73,7 @@ class PygameScreen:
     def open(self) -> DeviceIdentity:
         """Take the display and render the patterns.
 
-        Raises
-        ------
-        LinkError
-            No pygame, no display.
-        DeviceRefusedError
-            A display of another size.
+        Raises LinkError (no pygame, no display), DeviceRefusedError (a display of another size).
         """
         self.close()
         settings, raster = self._settings, self._settings.raster

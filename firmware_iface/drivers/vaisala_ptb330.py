@@ -13,11 +13,10 @@ import math
 import re
 from dataclasses import dataclass
 
-from firmware_iface.drivers.linked_device import LinkedDevice
+from firmware_iface import roles, settings
+from firmware_iface.drivers.linked_device import LineDriver
 from firmware_iface.links import exchange, serial_port
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
 
-MANUAL = "PTB330 user's guide M210855EN, pages 70-88"
 FORMAT = '4.3 P " " U3 " " ERR " " MCTR " " SN " " CS4 #r #n'
 PA_PER_HPA = 100.0
 RANGE_PA = (50_000.0, 110_000.0)  # of the instrument
@@ -40,89 +39,66 @@ class BarometerMessage:
     serial: str
 
 
-class VaisalaPtb330(LinkedDevice):
-    """A `Barometer`. A task of its own asks as fast as `period_s` says and serves the newest value.
+class VaisalaPtb330(LineDriver):
+    """A `Barometer`. A task of its own asks every `period_s` and serves the newest value.
 
-    Parameters
-    ----------
-    port : str or BytePort
-        A path or `usb:VID:PID[:SERIAL]`.
-    baud : int
-        As the instrument is set.
-    period_s : float
-        Between two questions; at 4800 baud a message alone takes 80 ms.
-    age_max_s : float
-        A value that did not change its running number for this long is none any more (NaN).
-    timeout_s : float
-        For an answer.
+    `port` stands in for the configured one.
     """
 
-    def __init__(
-        self,
-        port: str | serial_port.BytePort,
-        baud: int = 4800,
-        period_s: float = 0.2,
-        age_max_s: float = 3.0,
-        timeout_s: float = 0.3,
-    ) -> None:
-        self._settings = serial_port.SerialSettings(baud, data_bits=7, parity="E")
-        self._link = exchange.LineLink(
-            serial_port.as_port(port, self._settings), "\r\n", timeout_s, exchange.LineFence("VERS", _VERSION)
-        )
-        super().__init__(self._link)
-        self._period_s, self._age_max_s = period_s, age_max_s
+    manual = "PTB330 user's guide M210855EN, pages 70-88"
+
+    def __init__(self, config: settings.VaisalaPtb330Config, port: serial_port.SerialPort | None = None) -> None:
+        settings = serial_port.SerialSettings(config.baud, data_bits=7, parity="E")
+        fence = exchange.LineFence("VERS", _VERSION)
+        super().__init__(port or serial_port.SerialPort(config.port, settings), "\r\n", config.timeout_s, fence)
+        self._period_s, self._age_max_s = config.period_s, config.age_max_s
         self._task: asyncio.Task[None] | None = None
         self._newest = BarometerMessage(math.nan, -1, "")
         self._newest_s = -math.inf
-        self._down: LinkDownError | None = None
-        self._identity: DeviceIdentity | None = None
+        self._down: roles.LinkDownError | None = None
+        self._identity: roles.DeviceIdentity | None = None
 
-    async def open(self) -> DeviceIdentity:
+    async def open(self) -> roles.DeviceIdentity:
         """Open the port, stop what it sends by itself, check who it is, set unit and format, start to ask.
 
-        Raises
-        ------
-        LinkError
-            No valid answer; LinkDownError without a port.
-        DeviceRefusedError
-            Another instrument, or a format that is not taken.
+        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another instrument, or a
+        format that is not taken).
         """
         await self.close()
         self._newest, self._newest_s, self._down = BarometerMessage(math.nan, -1, ""), -math.inf, None
-        self._link.connect("\r\nS\r\nECHO OFF\r\n")
-        try:
-            identity = await self._known_again()
-            if identity is None:
-                identity = await self._identify()
-                await self._apply_settings()
-                self._identity = identity
-                await self._refresh()
-        except LinkError:
-            await self._link.close()
-            raise
+        identity = await self._opened(self._begin, "\r\nS\r\nECHO OFF\r\n")
         self._task = asyncio.create_task(self._run(), name="barometer")
         return identity
 
-    async def _known_again(self) -> DeviceIdentity | None:
+    async def _begin(self) -> roles.DeviceIdentity:
+        identity = await self._known_again()
+        if identity is None:
+            identity = await self._identify()
+            await self._apply_settings()
+            self._identity = identity
+            await self._refresh()
+        return identity
+
+    async def _known_again(self) -> roles.DeviceIdentity | None:
         """Who it was before, if a message of the right form and serial number comes at once: a second saved."""
         if self._identity is not None:
             try:
                 await self._refresh()
-            except LinkDownError:
+            except roles.LinkDownError:
                 raise
-            except LinkError:
+            except roles.LinkError:
                 return None
         return self._identity
 
-    async def _identify(self) -> DeviceIdentity:
+    async def _identify(self) -> roles.DeviceIdentity:
         try:
             about = await self._link.query("?", _IDENTITY, 1000)
-        except LinkDownError:
+        except roles.LinkDownError:
             raise
-        except LinkError as error:
-            raise DeviceRefusedError(f"{error} (or it is not a PTB330)") from error
+        except roles.LinkError as error:
+            raise roles.DeviceRefusedError(f"{error} (or it is not a PTB330)") from error
         errors = await self._link.query("ERRS", _ERRORS, 400)
-        return DeviceIdentity(f"Vaisala {about[1]}", about[3], about[2], errors[1].strip())
+        return roles.DeviceIdentity(f"Vaisala {about[1]}", about[3], about[2], errors[1].strip())
 
     async def _apply_settings(self) -> None:
         await self._link.query("UNIT P hPa", _UNIT, 600)
@@ -130,17 +106,17 @@ class VaisalaPtb330(LinkedDevice):
         found = (await self._link.query("FORM ?", _FORM, 200))[1]
         # it is shown with backslashes for what was given as hash signs
         if found.replace("\\", "#").casefold().split() != FORMAT.casefold().split():
-            raise DeviceRefusedError(f"{self._link.name}: FORM set to {FORMAT!r}, read back {found.strip()!r}")
+            raise roles.DeviceRefusedError(f"{self._link.name}: FORM set to {FORMAT!r}, read back {found.strip()!r}")
 
     async def _run(self) -> None:
         while True:
             await asyncio.sleep(self._period_s)
             try:
                 await self._refresh()
-            except LinkDownError as error:
+            except roles.LinkDownError as error:
                 self._down = error
                 return
-            except LinkError:
+            except roles.LinkError:
                 pass  # the age of the newest value says so
 
     async def _refresh(self) -> None:
@@ -148,7 +124,7 @@ class VaisalaPtb330(LinkedDevice):
         message = decode_message(answer, self._link.name)
         if self._identity is not None and message.serial != self._identity.serial:
             wanted, self._identity = self._identity.serial, None
-            raise LinkError(f"{self._link.name}: this is barometer {message.serial}, before it was {wanted}")
+            raise roles.LinkError(f"{self._link.name}: this is barometer {message.serial}, before it was {wanted}")
         if message.counter == self._newest.counter:
             return
         self._newest, self._newest_s = message, asyncio.get_running_loop().time()
@@ -156,15 +132,12 @@ class VaisalaPtb330(LinkedDevice):
     async def ambient_pressure_pa(self) -> float:
         """The newest value, NaN when it is too old or the instrument has none.
 
-        Raises
-        ------
-        LinkDownError
-            The port is gone: open it again.
+        Raises LinkDownError (the port is gone: open it again).
         """
         if self._down is not None:
-            raise LinkDownError(str(self._down))
-        if not self._link.connected:
-            raise LinkDownError(f"{self._link.name}: not connected")
+            raise roles.LinkDownError(str(self._down))
+        if not self._link.port.is_open:
+            raise roles.LinkDownError(f"{self._link.name}: not connected")
         fresh = asyncio.get_running_loop().time() - self._newest_s <= self._age_max_s
         return self._newest.pressure_pa if fresh else math.nan
 
@@ -176,29 +149,22 @@ class VaisalaPtb330(LinkedDevice):
             await asyncio.wait([task])
         await self._link.close()
 
-    def describe(self) -> dict[str, str]:
-        """For people: port, settings, manual."""
-        return {
-            "port": f"{self._link.name}, {self._settings}",
-            "settings": f"asked every {self._period_s:g} s, NaN when older than {self._age_max_s:g} s",
-            "manual": MANUAL,
-        }
+    @property
+    def _shown(self) -> str:
+        return f"asked every {self._period_s:g} s, NaN when older than {self._age_max_s:g} s"
 
 
 def decode_message(message: re.Match[str], name: str) -> BarometerMessage:
     """Check and convert a message that has the form of `FORMAT`.
 
-    Raises
-    ------
-    LinkError
-        Wrong checksum, or a pressure that the instrument cannot measure.
+    Raises LinkError (wrong checksum, or a pressure that the instrument cannot measure).
     """
     checked, pressure, flags, counter, serial, checksum = message.groups()
     if sum(checked.encode("ascii")) % 2**16 != int(checksum, 16):
-        raise LinkError(f"{name}: wrong checksum; noise on the line")
+        raise roles.LinkError(f"{name}: wrong checksum; noise on the line")
     if "*" in pressure or "1" in flags:
         return BarometerMessage(math.nan, int(counter), serial)
     pressure_pa = float(pressure) * PA_PER_HPA
     if not RANGE_PA[0] <= pressure_pa <= RANGE_PA[1]:
-        raise LinkError(f"{name}: {pressure_pa:.0f} Pa is outside of {RANGE_PA[0]:.0f} .. {RANGE_PA[1]:.0f} Pa")
+        raise roles.LinkError(f"{name}: {pressure_pa:.0f} Pa is outside of {RANGE_PA[0]:.0f} .. {RANGE_PA[1]:.0f} Pa")
     return BarometerMessage(pressure_pa, int(counter), serial)

@@ -10,15 +10,13 @@ its analogue input says, until it is told otherwise. Where gas must stop by itse
 import contextlib
 import re
 
-from firmware_iface.drivers.linked_device import LinkedDevice
+from firmware_iface import roles, settings
+from firmware_iface.drivers.linked_device import LineDriver
 from firmware_iface.links import exchange, serial_port
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
 
-MANUAL = "TN003 Communications Guide; no watchdog: the pump runs on when the host is gone"
 ENABLE, POWER_LIMIT_MW, STREAM, MODE, MANUAL_SOURCE, SET_VALUE, ERROR = 0, 1, 2, 10, 11, 23, 31
 FIRMWARE, DEVICE_TYPE, FIRMWARE_MINOR = 36, 37, 38
 DEVICE_TYPES = {2: "general purpose driver", 3: "smart pump module"}
-POWER_MAX_MW = 1400.0  # the most that any of these pumps is made for
 _MODE_MANUAL, _SOURCE_SET_VALUE, _OFF, _ON = 0, 0, 0, 1
 # what a hit write could change unseen, or a power cycle: read back with every command
 _KEPT = (POWER_LIMIT_MW, MODE, MANUAL_SOURCE)
@@ -27,73 +25,43 @@ _NUMBER = r"-?\d+(?:\.\d+)?"
 _STEP_MW = 0.0011  # values are written with three decimals
 
 
-class Ventus(LinkedDevice):
-    """A `Pump`: the fraction is that of `power_max_mw`.
+class Ventus(LineDriver):
+    """A `Pump`: the fraction is that of `power_max_mw`; `port` stands in for the configured one."""
 
-    Parameters
-    ----------
-    port : str or BytePort
-        A path or `usb:VID:PID[:SERIAL]`.
-    power_max_mw : float
-        Full drive.
-    timeout_s : float
-        For an answer.
+    manual = "TN003 Communications Guide; no watchdog: the pump runs on when the host is gone"
 
-    Raises
-    ------
-    ValueError
-        More power than these pumps are made for.
-    """
-
-    def __init__(
-        self, port: str | serial_port.BytePort, power_max_mw: float = 1000.0, timeout_s: float = 0.1
-    ) -> None:
-        if not 0 < power_max_mw <= POWER_MAX_MW:
-            raise ValueError(f"power_max_mw = {power_max_mw:g}: wanted more than 0, at most {POWER_MAX_MW:g}")
-        self._power_max_mw = power_max_mw
+    def __init__(self, config: settings.VentusConfig, port: serial_port.SerialPort | None = None) -> None:
+        self._power_max_mw = config.power_max_mw
         # streamed lines may be on their way when the stream is switched off
-        fence = exchange.LineFence(
-            f"#R{DEVICE_TYPE}", re.compile(rf"(?:#S[^\n]*\n)*#R{DEVICE_TYPE},({_NUMBER})\r?\n")
-        )
-        self._settings = serial_port.SerialSettings(115_200)
-        self._link = exchange.LineLink(serial_port.as_port(port, self._settings), "\n", timeout_s, fence)
-        super().__init__(self._link)
+        answer = re.compile(rf"(?:#S[^\n]*\n)*#R{DEVICE_TYPE},({_NUMBER})\r?\n")
+        fence = exchange.LineFence(f"#R{DEVICE_TYPE}", answer)
+        port = port or serial_port.SerialPort(config.port, serial_port.SerialSettings(115_200))
+        super().__init__(port, "\n", config.timeout_s, fence)
         self._commanded_mw = 0.0
 
-    async def open(self) -> DeviceIdentity:
+    async def open(self) -> roles.DeviceIdentity:
         """Open the port, stop the pump, check who it is, apply the settings and read them back.
 
-        Raises
-        ------
-        LinkError
-            No valid answer; LinkDownError without a port.
-        DeviceRefusedError
-            Another device, or a setting that is not taken.
+        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another device, or a
+        setting that is not taken).
         """
         await self._link.close()
         # off at once, also when nothing else works; a stream would never leave the line quiet
-        self._link.connect(f"\n#W{ENABLE},{_OFF}\n#W{STREAM},0\n")
-        try:
-            identity = await self._identify()
-            await self._apply_settings()
-            await self.set_pump(0.0)
-        except LinkError:
-            await self._link.close()
-            raise
-        return identity
+        return await self._opened(self._begin, f"\n#W{ENABLE},{_OFF}\n#W{STREAM},0\n")
 
-    async def _identify(self) -> DeviceIdentity:
+    async def _begin(self) -> roles.DeviceIdentity:
         about = await self._write_and_read({}, DEVICE_TYPE, FIRMWARE, FIRMWARE_MINOR)
         kind = int(about[DEVICE_TYPE])
         if kind not in DEVICE_TYPES:
-            raise DeviceRefusedError(f"{self._link.name}: device type {kind} is no Ventus driver (2 or 3)")
-        return DeviceIdentity(f"Ventus {DEVICE_TYPES[kind]}", "", f"{about[FIRMWARE]:g}.{about[FIRMWARE_MINOR]:g}")
-
-    async def _apply_settings(self) -> None:
+            raise roles.DeviceRefusedError(f"{self._link.name}: device type {kind} is no Ventus driver (2 or 3)")
         wanted = self._settings_wanted()
         found = await self._write_and_read(wanted, *wanted)
         if found != wanted:
-            raise DeviceRefusedError(f"{self._link.name}: registers set to {wanted}, read back {found}")
+            raise roles.DeviceRefusedError(f"{self._link.name}: registers set to {wanted}, read back {found}")
+        await self.set_pump(0.0)
+        return roles.DeviceIdentity(
+            f"Ventus {DEVICE_TYPES[kind]}", "", f"{about[FIRMWARE]:g}.{about[FIRMWARE_MINOR]:g}"
+        )
 
     def _settings_wanted(self) -> dict[int, float]:
         return {
@@ -106,14 +74,8 @@ class Ventus(LinkedDevice):
     async def set_pump(self, fraction: float) -> None:
         """Command the pump and read it back.
 
-        Raises
-        ------
-        ValueError
-            Not within 0..1; nothing is sent.
-        LinkError
-            No valid answer: the pump may or may not have it.
-        LinkDownError
-            The port is gone, or the pump does not have what was written: open it again.
+        Raises ValueError (not within 0..1; nothing is sent), LinkError (no valid answer: the pump may or may not have
+        it), LinkDownError (the port is gone, or the pump does not have what was written: open it again).
         """
         if not 0.0 <= fraction <= 1.0:
             raise ValueError(f"pump fraction = {fraction} is not within 0..1")
@@ -124,12 +86,8 @@ class Ventus(LinkedDevice):
     async def pump_fraction(self) -> float:
         """Read back what the pump is set to.
 
-        Raises
-        ------
-        LinkError
-            No valid answer, or the pump reports an error.
-        LinkDownError
-            The port is gone, or the pump is set to something that it was not told: open it again.
+        Raises LinkError (no valid answer, or the pump reports an error), LinkDownError (the port is gone, or the pump
+        is set to something that it was not told: open it again).
         """
         return await self._check(await self._write_and_read({}, *_STATE)) / self._power_max_mw
 
@@ -139,13 +97,13 @@ class Ventus(LinkedDevice):
             state = await self._write_and_read({}, *_STATE)
         if not self._as_commanded(state):
             await self._link.close()
-            raise LinkDownError(
+            raise roles.LinkDownError(
                 f"{self._link.name}: told {self._commanded_mw:.3f} mW, it has {state[SET_VALUE]:g} mW (on: "
                 f"{state[ENABLE]:g}, mode: {state[MODE]:g}, source: {state[MANUAL_SOURCE]:g}, limit: "
                 f"{state[POWER_LIMIT_MW]:g} mW); noise on the line, or it restarted: open it again"
             )
         if error := state[ERROR]:
-            raise LinkError(f"{self._link.name}: the pump reports error {error:g}; see its manual")
+            raise roles.LinkError(f"{self._link.name}: the pump reports error {error:g}; see its manual")
         return state[SET_VALUE] if state[ENABLE] else 0.0
 
     def _as_commanded(self, state: dict[int, float]) -> bool:
@@ -165,18 +123,14 @@ class Ventus(LinkedDevice):
 
     async def close(self) -> None:
         """Switch the pump off and close the port. Never raises."""
-        if self._link.connected:
-            with contextlib.suppress(LinkError):  # out of reach: what then stops the gas is not this program
+        if self._link.port.is_open:
+            with contextlib.suppress(roles.LinkError):  # out of reach: what then stops the gas is not this program
                 await self.set_pump(0.0)
         await self._link.close()
 
-    def describe(self) -> dict[str, str]:
-        """For people: port, settings, manual."""
-        return {
-            "port": f"{self._link.name}, {self._settings}",
-            "settings": f"full drive {self._power_max_mw:g} mW",
-            "manual": MANUAL,
-        }
+    @property
+    def _shown(self) -> str:
+        return f"full drive {self._power_max_mw:g} mW"
 
 
 def _registers(*registers: int) -> re.Pattern[str]:

@@ -147,8 +147,8 @@ class BronkhorstRegisters:
 class ProparDevice(serial_device.SerialDevice):
     """The instrument on a serial line; answers in the form it is asked in, binary or ASCII."""
 
-    def __init__(self, instrument: Instrument, settings: SerialSettings, node: int = 3, seed: int = 0) -> None:
-        super().__init__(settings, seed)
+    def __init__(self, instrument: Instrument, settings: SerialSettings, node: int = 3) -> None:
+        super().__init__(settings)
         self.instrument = instrument
         self._node = node
         self._heard = b""

@@ -22,8 +22,6 @@ class KeyenceDlRs1aEmulator(LineDevice):
         As set by its switches.
     amplifiers : int
         How many there are.
-    seed : int
-        For faults.
 
     Attributes
     ----------
@@ -42,9 +40,8 @@ class KeyenceDlRs1aEmulator(LineDevice):
         baud: int = 9600,
         parity: str = "N",
         amplifiers: int = 1,
-        seed: int = 0,
     ) -> None:
-        super().__init__(SerialSettings(baud, parity=parity), seed)
+        super().__init__(SerialSettings(baud, parity=parity))
         self.error_state = 0
         self.zero_shift_mm = 0.0
         self._displacement_um = displacement_um
@@ -91,7 +88,7 @@ class KeyenceDlRs1aEmulator(LineDevice):
     def _measured_mm(self, amplifier: int) -> float:
         if amplifier:
             return 10.0 + amplifier
-        if not self.faults.frozen:
+        if not self.frozen:
             self._value_mm = self._direction * self._displacement_um() / 1000
         return self._value_mm
 

@@ -4,8 +4,6 @@ Written for itself and not on the client's library: two independent implementati
 server has no way to be silent, late or short. Source: Modbus application protocol 1.1b3 and messaging guide 1.0b.
 """
 
-from __future__ import annotations
-
 import asyncio
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -36,11 +34,9 @@ class RegisterTable(Protocol):
 
     def read(self, address: int, count: int) -> list[int]:
         """Words. Raises RegisterRefusal."""
-        ...
 
     def write(self, address: int, words: Sequence[int]) -> None:
         """All of it or nothing. Raises RegisterRefusal."""
-        ...
 
 
 def respond(pdu: bytes, table: RegisterTable) -> bytes:
@@ -94,24 +90,12 @@ def _words_written(data: bytes, most: int) -> tuple[int, list[int]]:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What goes back for a request.
+    """What goes back for a request."""
 
-    Attributes
-    ----------
-    pdu : bytes
-        Empty: nothing is sent.
-    delay_s : float
-        Sent this much later; later requests of the connection are answered meanwhile.
-    hang_up : bool
-        The connection is dropped instead.
-    transaction_offset : int
-        Added to the transaction id; other than 0 it is a wrong answer.
-    """
-
-    pdu: bytes = b""
-    delay_s: float = 0.0
-    hang_up: bool = False
-    transaction_offset: int = 0
+    pdu: bytes = b""  # empty: nothing is sent
+    delay_s: float = 0.0  # sent this much later; later requests of the connection are answered meanwhile
+    hang_up: bool = False  # the connection is dropped instead
+    transaction_offset: int = 0  # added to the transaction id; other than 0 it is a wrong answer
 
 
 Handler = Callable[[int, bytes], Answer]
@@ -153,14 +137,14 @@ class ModbusTcpServer:
         for connection in tuple(self._connections):
             connection.hang_up()
 
-    def _connection(self) -> _Connection:
+    def _connection(self) -> "_Connection":
         return _Connection(self._handler, self._connections)
 
 
 class _Connection(asyncio.Protocol):
     """One client."""
 
-    def __init__(self, handler: Handler, connections: set[_Connection]) -> None:
+    def __init__(self, handler: Handler, connections: set["_Connection"]) -> None:
         self._handler = handler
         self._connections = connections
         self._buffer = b""
@@ -216,7 +200,6 @@ class _Connection(asyncio.Protocol):
 
 # Any Modbus device as an RTU slave on an emulated serial line, alone or with others on the same bus.
 
-
 _SHORTEST = 4  # unit, function, CRC
 _SILENCE_S = 0.005  # far above the 1.75 ms of the standard: a program's bytes may be held up between two reads
 DIAGNOSTICS = 8
@@ -236,24 +219,10 @@ class RtuBusEmulator(SerialDevice):
         Unit id to what answers it (for example `lambda pdu: respond(pdu, table)`); other units stay silent.
     echo_test : bool
         Whether function 8 ("return query data") is known; otherwise it is refused.
-    seed : int
-        For faults.
-
-    Attributes
-    ----------
-    wrong_unit, wrong_function : bool
-        Faults of the protocol: answers carry the next unit id, or the next function code.
-    exception_code : int
-        Every request is answered with this exception and not carried out; 0: off.
     """
 
-    def __init__(
-        self, settings: SerialSettings, slaves: Mapping[int, PduHandler], echo_test: bool = True, seed: int = 0
-    ) -> None:
-        super().__init__(settings, seed)
-        self.wrong_unit = False
-        self.wrong_function = False
-        self.exception_code = 0
+    def __init__(self, settings: SerialSettings, slaves: Mapping[int, PduHandler], echo_test: bool = True) -> None:
+        super().__init__(settings)
         self._slaves = slaves
         self._echo_test = echo_test
         self._heard = b""
@@ -269,19 +238,14 @@ class RtuBusEmulator(SerialDevice):
             return
         self._heard = b""
         unit, pdu = frame[0], frame[1:-2]
-        if unit not in self._slaves:
-            return
-        if self.exception_code:
-            reply = exception_pdu(pdu, self.exception_code)
-        elif self._echo_test and pdu[0] == DIAGNOSTICS and pdu[1:3] == b"\0\0":
-            reply = pdu
-        else:
-            reply = self._slaves[unit](pdu)
-        if not reply:
-            return
-        reply = bytes([reply[0] + self.wrong_function]) + reply[1:]
-        body = bytes([unit + self.wrong_unit]) + reply
-        self.say(body + struct.pack("<H", bitwise_crc(body)))
+        if unit in self._slaves and (body := self.answer(unit, pdu)):
+            self.say(body + struct.pack("<H", bitwise_crc(body)))
+
+    def answer(self, unit: int, pdu: bytes) -> bytes:
+        """Unit id and answer PDU to a request; empty for none."""
+        echoed = self._echo_test and pdu[0] == DIAGNOSTICS and pdu[1:3] == b"\0\0"
+        reply = pdu if echoed else self._slaves[unit](pdu)
+        return bytes([unit]) + reply if reply else b""
 
 
 def bitwise_crc(data: bytes) -> int:

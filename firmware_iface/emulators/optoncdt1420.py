@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import random
 from collections.abc import Callable
 
 from firmware_iface.emulators.serial_device import LineDevice
@@ -45,8 +46,6 @@ class Optoncdt1420Emulator(LineDevice):
         Standard deviation of a single value.
     name : str
         What it says it is.
-    seed : int
-        For faults.
 
     Attributes
     ----------
@@ -62,9 +61,9 @@ class Optoncdt1420Emulator(LineDevice):
         baud: int = 921_600,
         noise_um: float = 0.0,
         name: str = "",
-        seed: int = 0,
     ) -> None:
-        super().__init__(SerialSettings(baud), seed)
+        super().__init__(SerialSettings(baud))
+        self.random = random.Random(0)
         self.lose_bytes_every = 0
         self._displacement_um = displacement_um
         self._range_mm = range_mm
@@ -141,7 +140,7 @@ class Optoncdt1420Emulator(LineDevice):
         displacement_um = self._displacement_um() if count else math.nan
         data = b"".join(self._measurement(displacement_um) for _ in range(count))
         if self.lose_bytes_every:
-            data = bytes(byte for byte in data if self._random.randrange(self.lose_bytes_every))
+            data = bytes(byte for byte in data if self.random.randrange(self.lose_bytes_every))
         if data:
             self.say(data)
         self._stream = loop.call_later(_PERIOD_S, self._portion)
@@ -157,8 +156,8 @@ class Optoncdt1420Emulator(LineDevice):
         return digital if digital <= 65_520 else NO_PEAK + 2  # peak behind it
 
     def _measurement(self, displacement_um: float) -> bytes:
-        if not self.faults.frozen:
-            self._raw = self._digital(displacement_um + self._random.gauss(0.0, self._noise_um))
+        if not self.frozen:
+            self._raw = self._digital(displacement_um + self.random.gauss(0.0, self._noise_um))
             self._counter = (self._counter + 1) % 2**18
         data = three_bytes(self._raw, first=True)
         if self._register["OUTADD_RS422"] == "COUNTER":

@@ -18,51 +18,25 @@ class BoardPlant(Protocol):
 
     def sample(self) -> board_state.BoardSample:
         """The newest sample of the sensors; called every 10 ms and at every request."""
-        ...
 
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
         """Drive pump and vent, both 0..1; called when one of them changes."""
-        ...
 
 
 @dataclass(slots=True)
 class Faults:
-    """What is wrong with the emulated board; each can be switched on and off while it runs.
+    """What is wrong with the emulated board; each can be switched on and off while it runs."""
 
-    Attributes
-    ----------
-    silent : bool
-        Requests are carried out and not answered.
-    delay_s : float
-        Answers come this much later.
-    frozen : bool
-        The sensor block stays as it was (counter and time too).
-    no_displacement : bool
-        The laser has no value.
-    exception_code : int
-        Every request is answered with this Modbus exception and not carried out; 0: off.
-    map_version : int
-        What the board says of its map; 0: the true one.
-    hang_up : bool
-        The connection is dropped at every request.
-    short_reply : bool
-        Reads answer with one register too few, in a frame that is otherwise right.
-    wrong_function : bool
-        Answers carry function code 23 in place of 3, and 6 in place of 16.
-    wrong_transaction : bool
-        Answers carry another transaction id.
-    """
-
-    silent: bool = False
-    delay_s: float = 0.0
-    frozen: bool = False
-    no_displacement: bool = False
-    exception_code: int = 0
-    map_version: int = 0
-    hang_up: bool = False
-    short_reply: bool = False
-    wrong_function: bool = False
-    wrong_transaction: bool = False
+    silent: bool = False  # requests are carried out and not answered
+    delay_s: float = 0.0  # answers come this much later
+    frozen: bool = False  # the sensor block stays as it was (counter and time too)
+    no_displacement: bool = False  # the laser has no value
+    exception_code: int = 0  # every request is answered with this Modbus exception and not carried out; 0: off
+    map_version: int = 0  # what the board says of its map; 0: the true one
+    hang_up: bool = False  # the connection is dropped at every request
+    short_reply: bool = False  # reads answer with one register too few, in a frame that is otherwise right
+    wrong_function: bool = False  # answers carry function code 23 in place of 3, and 6 in place of 16
+    wrong_transaction: bool = False  # answers carry another transaction id
 
 
 class PumpBoardEmulator:

@@ -1,81 +1,23 @@
-"""The device end of a serial line: paced like the real wire, with faults that can be switched on.
-
-What a device says is kept apart from how its bytes travel: a `PtyWire` carries them through the kernel, a
-`MemoryWire` through nothing, in virtual time.
-"""
+"""The device end of a serial line, paced like the real wire, and the pseudo-terminal that it answers on."""
 
 import asyncio
 import contextlib
 import os
-import random
 import termios
 import tty
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
-from firmware_iface.links.serial_port import Receiver, SerialSettings
-from firmware_iface.roles import LinkDownError
-
-
-@dataclass(slots=True)
-class SerialFaults:
-    """What is wrong with the line or the device; each can be switched on and off while it runs.
-
-    Attributes
-    ----------
-    silent : bool
-        Questions are carried out and not answered.
-    deaf : bool
-        Questions do not arrive.
-    delay_s : float
-        Answers come this much later; longer than the asker waits, it is a late reply. Answers keep their order.
-    garbage_bytes : int
-        So many random bytes in place of each answer.
-    bit_errors : int
-        So many bits of each answer are turned over. On a line with parity, a byte with an odd number of them is
-        dropped, as the receiver does.
-    question_bit_errors : int
-        So many bits of each question are turned over.
-    cut_bytes : int
-        So many bytes are missing at the end of each answer.
-    frozen : bool
-        The measured value stays what it was.
-    """
-
-    silent: bool = False
-    deaf: bool = False
-    delay_s: float = 0.0
-    garbage_bytes: int = 0
-    bit_errors: int = 0
-    question_bit_errors: int = 0
-    cut_bytes: int = 0
-    frozen: bool = False
+from firmware_iface.links.serial_port import SerialSettings
 
 
 class SerialDevice:
-    """Hears bytes, says bytes. A device overrides `received`, and `restart` if it can lose settings.
+    """Hears bytes, says bytes. A device overrides `received`, and `restart` if it can lose settings."""
 
-    Parameters
-    ----------
-    settings : SerialSettings
-        Of the line; its pace.
-    seed : int
-        For garbage and bit errors.
+    frozen = False  # the measured value stays what it was
 
-    Attributes
-    ----------
-    faults : SerialFaults
-        Switches.
-    draw_faults : callable or None
-        When set, called for every question, and for every answer: random faults.
-    """
-
-    def __init__(self, settings: SerialSettings, seed: int = 0) -> None:
+    def __init__(self, settings: SerialSettings) -> None:
         self.settings = settings
-        self.faults = SerialFaults()
-        self.draw_faults: Callable[[], SerialFaults] | None = None
-        self._random = random.Random(seed)
         self._transmit: Callable[[bytes], None] | None = None
         self._free_s = 0.0  # until then the line is taken by what is being said
         self._due: set[asyncio.TimerHandle] = set()
@@ -104,50 +46,25 @@ class SerialDevice:
 
     def hear(self, data: bytes) -> None:
         """Bytes begin to arrive; the device has them when the last one is in."""
-        self._later(asyncio.get_running_loop().time() + len(data) * self.settings.char_s, self._arrived, data)
-
-    def _arrived(self, data: bytes) -> None:
-        faults = self._drawn()
-        if not faults.deaf:
-            self.received(self._hit(data, faults.question_bit_errors))
+        self._later(asyncio.get_running_loop().time() + len(data) * self.settings.char_s, self.arrived, data)
 
     def received(self, data: bytes) -> None:
         """Bytes arrived: for the device to answer with `say`."""
         raise NotImplementedError
 
-    def say(self, answer: bytes) -> None:
-        """Send an answer, as the faults let it."""
-        faults = self._drawn()
-        if faults.silent:
-            return
-        data = self._spoilt(answer, faults)
-        begin_s = max(asyncio.get_running_loop().time() + faults.delay_s, self._free_s)
-        self._free_s = begin_s + len(data) * self.settings.char_s
-        self._later(self._free_s, self._sent, data)
+    def arrived(self, data: bytes) -> None:
+        """All bytes are in."""
+        self.received(data)
+
+    def say(self, answer: bytes, delay_s: float = 0.0) -> None:
+        """Send an answer, behind what is being sent."""
+        begin_s = max(asyncio.get_running_loop().time() + delay_s, self._free_s)
+        self._free_s = begin_s + len(answer) * self.settings.char_s
+        self._later(self._free_s, self._sent, answer)
 
     def _sent(self, data: bytes) -> None:
         if self._transmit is not None and data:
             self._transmit(data)
-
-    def _spoilt(self, answer: bytes, faults: SerialFaults) -> bytes:
-        if faults.garbage_bytes:
-            return self._random.randbytes(faults.garbage_bytes)
-        return self._hit(answer[: max(0, len(answer) - faults.cut_bytes)], faults.bit_errors)
-
-    def _hit(self, data: bytes, bit_errors: int) -> bytes:
-        """With so many bits turned over, as the receiver at the other end gets it."""
-        if not bit_errors:
-            return data
-        spoilt, hits = bytearray(data), bytearray(len(data))
-        for bit in self._random.sample(range(8 * len(data)), min(bit_errors, 8 * len(data))):
-            spoilt[bit // 8] ^= 1 << bit % 8
-            hits[bit // 8] ^= 1
-        if self.settings.parity == "N":
-            return bytes(spoilt)
-        return bytes(byte for byte, odd in zip(spoilt, hits, strict=True) if not odd)
-
-    def _drawn(self) -> SerialFaults:
-        return self.faults if self.draw_faults is None else self.draw_faults()
 
     def _later(self, when_s: float, call: Callable[[bytes], None], data: bytes) -> None:
         def run() -> None:
@@ -163,8 +80,8 @@ class LineDevice(SerialDevice):
 
     end = b"\n"
 
-    def __init__(self, settings: SerialSettings, seed: int = 0) -> None:
-        super().__init__(settings, seed)
+    def __init__(self, settings: SerialSettings) -> None:
+        super().__init__(settings)
         self._heard = b""
 
     def received(self, data: bytes) -> None:
@@ -180,9 +97,6 @@ class LineDevice(SerialDevice):
     def line(self, text: str) -> None:
         """One line arrived."""
         raise NotImplementedError
-
-
-# What lies between a program and an emulated serial device: a pseudo-terminal, or nothing but time.
 
 
 _READ_BYTES = 65_536
@@ -206,7 +120,6 @@ class PtyWire:
     def __init__(self, device: SerialDevice, path: Path) -> None:
         self.path = path
         self._device = device
-        self._random = random.Random(0)
         self._ends: tuple[int, int] | None = None
 
     def plug(self) -> None:
@@ -237,78 +150,19 @@ class PtyWire:
         if self._ends is None:
             return
         data = os.read(self._ends[0], _READ_BYTES)
-        self._device.hear(data if self._same_baud() else self._random.randbytes(len(data)))
+        self._device.hear(self._seen(data))
 
     def _transmit(self, data: bytes) -> None:
         if self._ends is not None:
             with contextlib.suppress(BlockingIOError):  # nobody reads: lost, as on a line without flow control
-                os.write(self._ends[0], data if self._same_baud() else self._random.randbytes(len(data)))
+                os.write(self._ends[0], self._seen(data))
 
-    def _same_baud(self) -> bool:
+    def _seen(self, data: bytes) -> bytes:
+        """What the other end makes of the bytes: at another baud rate, garbage."""
         assert self._ends is not None
-        return bool(termios.tcgetattr(self._ends[0])[_SPEED] == _speed(self._device))
+        same = termios.tcgetattr(self._ends[0])[_SPEED] == _speed(self._device)
+        return data if same else bytes((7 * byte + 0xA5) % 256 for byte in data)
 
 
 def _speed(device: SerialDevice) -> int:
     return int(getattr(termios, f"B{device.settings.baud}"))
-
-
-class MemoryWire:
-    """A `BytePort` with the emulated device at its other end, for runs in virtual time."""
-
-    def __init__(self, device: SerialDevice, name: str = "memory") -> None:
-        self.name = name
-        self.plugged = True
-        self._device = device
-        self._receiver: Receiver | None = None
-        self._opened = 0
-
-    @property
-    def settings(self) -> SerialSettings:
-        """Of the line."""
-        return self._device.settings
-
-    @property
-    def is_open(self) -> bool:
-        """Whether bytes can flow."""
-        return self._receiver is not None
-
-    @property
-    def reconnects(self) -> int:
-        """Times it was opened after the first."""
-        return max(0, self._opened - 1)
-
-    @property
-    def retry_in_s(self) -> float:
-        """It may be tried at any time."""
-        return 0.0
-
-    def open(self, receiver: Receiver) -> None:
-        """Open anew. Raises LinkDownError when it is not plugged in."""
-        if not self.plugged:
-            raise LinkDownError(f"{self.name}: there is no such port")
-        self._receiver = receiver
-        self._opened += 1
-        self._device.attach(receiver.received)
-
-    def write(self, data: bytes) -> None:
-        """Hand over bytes. Raises LinkDownError."""
-        if self._receiver is None:
-            raise LinkDownError(f"{self.name}: not open")
-        self._device.hear(data)
-
-    def unplug(self) -> None:
-        """Pull the plug."""
-        self.plugged = False
-        receiver = self._receiver
-        self.close()
-        if receiver is not None:
-            receiver.lost(LinkDownError(f"{self.name}: the port is gone"))
-
-    def succeeded(self) -> None:
-        """Nothing to do: there is no back-off."""
-
-    def close(self) -> None:
-        """Close."""
-        self._receiver = None
-        self._device.detach()

@@ -26,8 +26,6 @@ class VaisalaPtb330Emulator(LineDevice):
         Whether it was left sending by itself.
     model : str
         What it says it is.
-    seed : int
-        For faults.
 
     Attributes
     ----------
@@ -45,9 +43,8 @@ class VaisalaPtb330Emulator(LineDevice):
         baud: int = 4800,
         running: bool = False,
         model: str = "PTB330",
-        seed: int = 0,
     ) -> None:
-        super().__init__(SerialSettings(baud, data_bits=7, parity="E"), seed)
+        super().__init__(SerialSettings(baud, data_bits=7, parity="E"))
         self.error_flags = "000"
         self.serial = "A1234567"
         self._ambient_pressure_pa = ambient_pressure_pa
@@ -131,7 +128,7 @@ class VaisalaPtb330Emulator(LineDevice):
 
     def _message(self) -> bytes:
         """Table 12 (page 71): number format before a quantity, quoted text as it is, the rest by name."""
-        if not self.faults.frozen:
+        if not self.frozen:
             self._counter = int(asyncio.get_running_loop().time() / _PERIOD_S)
             self._pressure_pa = self._ambient_pressure_pa()
         text, digits, decimals = "", 4, 2

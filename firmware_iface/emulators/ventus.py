@@ -26,8 +26,6 @@ class VentusEmulator(LineDevice):
         What counts as full drive.
     streaming : bool
         Whether it was left streaming.
-    seed : int
-        For faults.
 
     Attributes
     ----------
@@ -40,9 +38,8 @@ class VentusEmulator(LineDevice):
         drive: Callable[[float], None],
         power_max_mw: float = 1000.0,
         streaming: bool = False,
-        seed: int = 0,
     ) -> None:
-        super().__init__(SerialSettings(115_200), seed)
+        super().__init__(SerialSettings(115_200))
         self.registers = dict(_DEFAULTS)
         self.registers[2] = float(streaming)
         self._drive = drive

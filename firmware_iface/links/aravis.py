@@ -135,13 +135,7 @@ class Aravis:
             self._calls[name] = function
 
     def call(self, name: str, *arguments: Any) -> Any:
-        """Call a function without its GError argument.
-
-        Raises
-        ------
-        AravisError
-            What it reported there.
-        """
+        """Call a function without its GError argument. Raises AravisError (what it reported there)."""
         if _ERROR not in _SIGNATURES[name][1]:
             return self._calls[name](*arguments)
         error = POINTER(_GError)()

@@ -17,7 +17,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from firmware_iface.links.serial_port import BytePort
+from firmware_iface.links.serial_port import SerialPort
 from firmware_iface.roles import LinkDownError, LinkError
 
 _SHOWN_BYTES = 24
@@ -28,24 +28,13 @@ _FAILURES_MAX = 5
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is sent, and how its answer is known.
+    """What is sent, and how its answer is known."""
 
-    Attributes
-    ----------
-    data : bytes
-        Sent as it is.
-    take : callable
-        Of all bytes heard so far: the answer, None while more must come. Raises LinkError when they are no answer.
-    answer_bytes : int
-        Length of the longest answer: its time on the wire comes on top of the device's own.
-    what : str
-        For messages: device and what is asked.
-    """
-
-    data: bytes
+    data: bytes  # sent as it is
+    # of all bytes heard so far: the answer, None while more must come. Raises LinkError when they are no answer
     take: Callable[[bytes], bytes | None]
-    answer_bytes: int
-    what: str
+    answer_bytes: int  # length of the longest answer: its time on the wire comes on top of the device's own
+    what: str  # for messages: device and what is asked
 
 
 class SerialExchange:
@@ -53,7 +42,7 @@ class SerialExchange:
 
     Parameters
     ----------
-    port : BytePort
+    port : SerialPort
         The line; this object is its only user.
     gap_s : float
         Silence that the devices want between an answer and the next question.
@@ -63,8 +52,8 @@ class SerialExchange:
         Of these, what comes between answers means nothing, like the LF behind a CR that already ended one.
     """
 
-    def __init__(self, port: BytePort, gap_s: float, quiet_s: float, blank: bytes = b"") -> None:
-        self._port = port
+    def __init__(self, port: SerialPort, gap_s: float, quiet_s: float, blank: bytes = b"") -> None:
+        self.port = port
         self._gap_s = gap_s
         self._quiet_s = quiet_s
         self._blank = blank
@@ -79,43 +68,36 @@ class SerialExchange:
         self._take: Callable[[bytes], bytes | None] | None = None
         self._answer: asyncio.Future[bytes] | None = None
 
-    @property
-    def port(self) -> BytePort:
-        """The line."""
-        return self._port
-
     def connect(self, greeting: bytes = b"") -> None:
         """Open the line; what devices may still owe to an earlier user is not believed.
+
+        Raises LinkDownError (the port does not open).
 
         Parameters
         ----------
         greeting : bytes
             Sent at once, and whatever comes back is thrown away: for a device that talks unasked until told to stop.
-
-        Raises
-        ------
-        LinkDownError
-            The port does not open.
         """
-        self._port.open(self)
+        self.port.open(self)
         self._sure.clear()
         self._failures = 0
         self._noisy = True
         self._last_byte_s = asyncio.get_running_loop().time()
         if greeting:
-            self._port.write(greeting)
+            self.port.write(greeting)
 
     async def close(self) -> None:
         """Close the line; a question in flight fails at once."""
-        self._port.close()
-        self.lost(LinkDownError(f"{self._port.name}: closed"))
+        self.port.close()
+        self.lost(LinkDownError(f"{self.port.name}: closed"))
         if self._in_flight is not None:
             await asyncio.wait([self._in_flight])
 
     async def ask(self, question: Question, timeout_s: float, fence: Question | None, key: int = 0) -> bytes:
         """The answer to a question.
 
-        Devices that wait are served in turn, each with one question.
+        Devices that wait are served in turn, each with one question. Raises LinkError (no valid answer),
+        LinkDownError (the line is closed or went away).
 
         Parameters
         ----------
@@ -127,13 +109,6 @@ class SerialExchange:
             See the module; None for a device that has none, which `quiet_s` alone then protects.
         key : int
             Which device of the line.
-
-        Raises
-        ------
-        LinkError
-            No valid answer.
-        LinkDownError
-            The line is closed or went away.
         """
         async with self._key_turns[key]:
             await self._turn.acquire()  # cancelled while waiting here, a question is never sent
@@ -163,11 +138,11 @@ class SerialExchange:
             self._failures += 1
             if self._failures < _FAILURES_MAX:
                 raise
-            self._port.close()
+            self.port.close()
             raise LinkDownError(f"{error}; the {_FAILURES_MAX}th failure in a row, connection given up") from error
         self._failures = 0
         self._sure.add(key)
-        self._port.succeeded()
+        self.port.succeeded()
         return answer
 
     async def _settle(self, what: str, timeout_s: float) -> None:
@@ -185,11 +160,11 @@ class SerialExchange:
 
     async def _ask(self, question: Question, timeout_s: float) -> bytes:
         self._require_open(question.what)
-        self._port.write(question.data)
+        self.port.write(question.data)
         self._heard, self._take = b"", question.take
         answer: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
         self._answer = answer
-        wire_s = (len(question.data) + question.answer_bytes) * self._port.settings.char_s
+        wire_s = (len(question.data) + question.answer_bytes) * self.port.settings.char_s
         try:
             # not asyncio.timeout: it throws away an answer that has come while this process was kept from running
             await asyncio.wait([answer], timeout=timeout_s + wire_s)
@@ -200,12 +175,12 @@ class SerialExchange:
         return answer.result()
 
     def _require_open(self, what: str) -> None:
-        if not self._port.is_open:
+        if not self.port.is_open:
             raise LinkDownError(f"{what}: not connected")
 
     def _missing(self, timeout_s: float) -> str:
         if not self._heard:
-            return f"no answer within {timeout_s:g} s; is it on, wired and set to {self._port.settings}?"
+            return f"no answer within {timeout_s:g} s; is it on, wired and set to {self.port.settings}?"
         shown = self._heard[:_SHOWN_BYTES]
         return f"no whole answer within {timeout_s:g} s, but {len(self._heard)} bytes ({shown!r}); wrong baud rate?"
 
@@ -232,7 +207,6 @@ class SerialExchange:
 
 # One device that is asked in lines of text.
 
-
 _SHOWN_CHARS = 60
 _LINE_ENDS = b"\r\n"
 
@@ -251,7 +225,7 @@ class LineLink:
 
     Parameters
     ----------
-    port : BytePort
+    port : SerialPort
         The line.
     end : str
         What a command ends in.
@@ -263,7 +237,8 @@ class LineLink:
         Silence after a loss.
     """
 
-    def __init__(self, port: BytePort, end: str, timeout_s: float, fence: LineFence, quiet_s: float = 0.1) -> None:
+    def __init__(self, port: SerialPort, end: str, timeout_s: float, fence: LineFence, quiet_s: float = 0.1) -> None:
+        self.port = port
         self._exchange = SerialExchange(port, gap_s=0.0, quiet_s=quiet_s, blank=_LINE_ENDS)
         self._end = end
         self._timeout_s = timeout_s
@@ -272,22 +247,7 @@ class LineLink:
     @property
     def name(self) -> str:
         """For messages."""
-        return self._exchange.port.name
-
-    @property
-    def connected(self) -> bool:
-        """Whether the line is open."""
-        return self._exchange.port.is_open
-
-    @property
-    def reconnects(self) -> int:
-        """Times the line was opened after the first."""
-        return self._exchange.port.reconnects
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until `connect` will try."""
-        return self._exchange.port.retry_in_s
+        return self.port.name
 
     def connect(self, greeting: str = "") -> None:
         """Open the line; see `SerialExchange.connect`. Raises LinkDownError."""
@@ -300,6 +260,8 @@ class LineLink:
     async def query(self, command: str, answer: re.Pattern[str], longest: int = 80) -> re.Match[str]:
         """The answer to a command, whose whole text has the given form (line ends included).
 
+        Raises LinkError (no answer of this form in time), LinkDownError (the line is gone).
+
         Parameters
         ----------
         command : str
@@ -308,13 +270,6 @@ class LineLink:
             Has to match everything that comes, line ends before it aside, and nothing that is still incomplete.
         longest : int
             Characters of the longest answer; more are no answer.
-
-        Raises
-        ------
-        LinkError
-            No answer of this form in time.
-        LinkDownError
-            The line is gone.
         """
         fence = self._question(self._fence.command, self._fence.answer, self._fence.longest)
         heard = await self._exchange.ask(self._question(command, answer, longest), self._timeout_s, fence)

@@ -7,15 +7,14 @@ exception of function 8, and neither can be taken for anything else.
 Source: Modbus over serial line 1.02, sections 2.5.1 (RTU framing) and 6.2.2 (CRC); application protocol 1.1b3.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from urllib.parse import parse_qsl, urlsplit
 
-from firmware_iface.links import exchange, modbus_rules, serial_port
+from firmware_iface.links import exchange, modbus_rules, modbus_tcp, serial_port
 from firmware_iface.roles import LinkError
 
+DEFAULT_PORT = 502  # of Modbus TCP
 DEFAULT_BAUD = 19_200  # section 2.5.1: the default of the standard
 _FAST_BAUD = 19_200
 _FAST_GAP_S = 1.75e-3  # above 19200 baud the standard fixes the silence between frames
@@ -69,25 +68,25 @@ class RtuBus:
 
     Parameters
     ----------
-    port : BytePort
+    port : SerialPort
         The line.
     quiet_s : float
         Silence after a loss, before the next request: as long as devices are usually late at most.
     """
 
-    def __init__(self, port: serial_port.BytePort, quiet_s: float = 0.2) -> None:
+    def __init__(self, port: serial_port.SerialPort, quiet_s: float = 0.2) -> None:
         baud = port.settings.baud
         gap_s = _FAST_GAP_S if baud > _FAST_BAUD else 3.5 * port.settings.char_s
         self.exchange = exchange.SerialExchange(port, gap_s, quiet_s)
         self._tokens = 0
 
     @classmethod
-    def from_url(cls, url: str) -> RtuBus:
+    def from_url(cls, url: str) -> "RtuBus":
         """The bus at `rtu://...`. Raises ValueError."""
         port, settings = parse_rtu_url(url)
         return cls(serial_port.SerialPort(port, settings))
 
-    def device(self, unit_id: int, timeout_s: float, fence: bool = True) -> GuardedModbusRtu:
+    def device(self, unit_id: int, timeout_s: float, fence: bool = True) -> "GuardedModbusRtu":
         """The device with this unit id (1..247). Raises ValueError."""
         return GuardedModbusRtu(self, unit_id, timeout_s, fence)
 
@@ -167,14 +166,8 @@ class GuardedModbusRtu:
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         """Write holding registers (function code 16) and check the echo.
 
-        Raises
-        ------
-        LinkError
-            No valid reply in time: the device may or may not have carried it out.
-        LinkDownError
-            The port is gone; the same holds.
-        DeviceRefusedError
-            The device refused and changed nothing.
+        Raises LinkError (no valid reply in time: the device may or may not have carried it out), LinkDownError (the
+        port is gone; the same holds), DeviceRefusedError (the device refused and changed nothing).
         """
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
         pdu = struct.pack(
@@ -212,16 +205,42 @@ class GuardedModbusRtu:
         return exchange.Question(rtu_frame(self._unit_id, pdu), take, answer_bytes, what)
 
 
+class ModbusLinks:
+    """Makes links; one per bench, because a serial bus has one owner."""
+
+    def __init__(self) -> None:
+        self._buses: dict[str, RtuBus] = {}
+
+    def link(self, url: str, unit_id: int, timeout_s: float, fence: bool = True) -> modbus_rules.ModbusLink:
+        """The device `unit_id` at `tcp://HOST[:PORT]` or `rtu://PORT[?baud=..&parity=..]`, not yet connected.
+
+        `fence`: see `links.exchange`; of no meaning for TCP. Raises ValueError for a URL that is neither.
+        """
+        if not url.startswith("rtu:"):
+            host, port = parse_tcp_url(url)
+            return modbus_tcp.GuardedModbusTcp(host, port, unit_id, timeout_s)
+        if url not in self._buses:
+            self._buses[url] = RtuBus.from_url(url)
+        return self._buses[url].device(unit_id, timeout_s, fence)
+
+
+def parse_tcp_url(url: str) -> tuple[str, int]:
+    """Host and port of `tcp://HOST[:PORT]`. Raises ValueError."""
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+    except ValueError as error:  # a port that is no number, or above 65535
+        raise ValueError(f"{url}: {error}") from error
+    if parts.scheme != "tcp" or not host or parts.path or parts.query or parts.fragment or parts.username:
+        raise ValueError(f"{url}: wanted tcp://HOST:PORT")
+    return host, DEFAULT_PORT if port is None else port
+
+
 def take_reply(heard: bytes, unit_id: int, function_code: int, answer_bytes: int, what: str) -> bytes | None:
     """The PDU of a whole reply, None while bytes are missing.
 
     The length is known beforehand: silences between bytes, by which RTU frames are delimited on the wire, do not
-    survive the buffers of adapters and kernels.
-
-    Raises
-    ------
-    LinkError
-        Another unit, function, length or CRC.
+    survive the buffers of adapters and kernels. Raises LinkError (another unit, function, length or CRC).
     """
     if heard[0] != unit_id:
         raise LinkError(f"{what}: answer of unit {heard[0]}, asked was {unit_id}")

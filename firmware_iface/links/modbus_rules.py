@@ -27,46 +27,36 @@ class ModbusLink(Protocol):
     @property
     def name(self) -> str:
         """For messages."""
-        ...
 
     @property
     def connected(self) -> bool:
         """Whether the connection stands."""
-        ...
 
     @property
     def reconnects(self) -> int:
         """Connections made after the first."""
-        ...
 
     @property
     def retry_in_s(self) -> float:
         """Time until `connect` will try."""
-        ...
 
     async def connect(self) -> None:
         """Connect anew."""
-        ...
 
     async def read_holding(self, address: int, count: int) -> list[int]:
         """Function code 3."""
-        ...
 
     async def read_input(self, address: int, count: int) -> list[int]:
         """Function code 4."""
-        ...
 
     async def write_register(self, address: int, word: int) -> None:
         """Function code 6; the echo is checked."""
-        ...
 
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         """Function code 16; the echo is checked."""
-        ...
 
     async def close(self) -> None:
         """Close; a request in flight fails at once."""
-        ...
 
 
 def exception_error(what: str, code: int) -> LinkError:

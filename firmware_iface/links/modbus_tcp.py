@@ -78,13 +78,7 @@ class GuardedModbusTcp:
         return self._back_off.remaining_s(self._clock())
 
     async def connect(self) -> None:
-        """Connect anew.
-
-        Raises
-        ------
-        LinkDownError
-            No connection, or not yet time for the next attempt.
-        """
+        """Connect anew. Raises LinkDownError (no connection, or not yet time for the next attempt)."""
         if (wait_s := self.retry_in_s) > 0:
             raise LinkWaitsError(f"{self.name}: next attempt to connect in {wait_s:.1f} s")
         await self.close()
@@ -112,14 +106,8 @@ class GuardedModbusTcp:
     async def read_holding(self, address: int, count: int) -> list[int]:
         """Read `count` holding registers (function code 3).
 
-        Raises
-        ------
-        LinkError
-            No valid reply in time.
-        LinkDownError
-            The connection is gone.
-        DeviceRefusedError
-            The device does not have these registers.
+        Raises LinkError (no valid reply in time), LinkDownError (the connection is gone), DeviceRefusedError (the
+        device does not have these registers).
         """
         return await self._read(modbus_rules.READ_HOLDING, address, count)
 
@@ -142,14 +130,8 @@ class GuardedModbusTcp:
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         """Write holding registers (function code 16) and check the echo.
 
-        Raises
-        ------
-        LinkError
-            No valid reply in time: the device may or may not have carried it out.
-        LinkDownError
-            The connection is gone; the same holds.
-        DeviceRefusedError
-            The device refused and changed nothing.
+        Raises LinkError (no valid reply in time: the device may or may not have carried it out), LinkDownError (the
+        connection is gone; the same holds), DeviceRefusedError (the device refused and changed nothing).
         """
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
         reply = await self._exchange(

@@ -8,16 +8,17 @@ import asyncio
 import contextlib
 import errno
 import os
+import re
 import termios
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import serial
+from serial.tools import list_ports
 
-from firmware_iface.links.usb_ports import check_port_name, port_path
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError, LinkWaitsError
 
 # How long to leave a device alone after a failed attempt to connect.
@@ -99,60 +100,15 @@ class Receiver(Protocol):
 
     def received(self, data: bytes) -> None:
         """Bytes came."""
-        ...
 
     def lost(self, error: LinkDownError) -> None:
         """The port is gone and closed."""
-        ...
-
-
-class BytePort(Protocol):
-    """A two-way stream of bytes that is opened, lost and opened again."""
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-        ...
-
-    @property
-    def settings(self) -> SerialSettings:
-        """Of the line."""
-        ...
-
-    @property
-    def is_open(self) -> bool:
-        """Whether bytes can flow."""
-        ...
-
-    @property
-    def reconnects(self) -> int:
-        """Times it was opened after the first."""
-        ...
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until `open` will try."""
-        ...
-
-    def open(self, receiver: Receiver) -> None:
-        """Open anew. Raises LinkDownError or DeviceRefusedError."""
-        ...
-
-    def write(self, data: bytes) -> None:
-        """Hand over bytes for sending. Raises LinkDownError or LinkError."""
-        ...
-
-    def succeeded(self) -> None:
-        """A valid answer came: the next `open` may be at once."""
-        ...
-
-    def close(self) -> None:
-        """Close; never raises."""
-        ...
 
 
 class SerialPort:
     """A serial port of this machine.
+
+    Raises ValueError (the name is neither).
 
     Parameters
     ----------
@@ -162,11 +118,6 @@ class SerialPort:
         Of the line.
     clock : callable
         Seconds on any axis that does not go back; for the back-off.
-
-    Raises
-    ------
-    ValueError
-        The name is neither.
     """
 
     def __init__(self, port: str, settings: SerialSettings, clock: Callable[[], float] = time.monotonic) -> None:
@@ -208,12 +159,8 @@ class SerialPort:
     def open(self, receiver: Receiver) -> None:
         """Open anew, as the only user of the port.
 
-        Raises
-        ------
-        LinkDownError
-            Not there, busy, not permitted, or not yet time for the next attempt.
-        DeviceRefusedError
-            Several adapters have this USB identity.
+        Raises LinkDownError (not there, busy, not permitted, or not yet time for the next attempt),
+        DeviceRefusedError (several adapters have this USB identity).
         """
         if (wait_s := self.retry_in_s) > 0:
             raise LinkWaitsError(f"{self._port}: next attempt to open in {wait_s:.1f} s")
@@ -228,12 +175,8 @@ class SerialPort:
     def write(self, data: bytes) -> None:
         """Hand over bytes for sending.
 
-        Raises
-        ------
-        LinkDownError
-            The port is closed or just went away.
-        LinkError
-            The kernel's buffer is full: nothing is being sent.
+        Raises LinkDownError (the port is closed or just went away), LinkError (the kernel's buffer is full: nothing
+        is being sent).
         """
         if self._serial is None:
             raise LinkDownError(f"{self._port}: not open")
@@ -296,11 +239,6 @@ class SerialPort:
         return error
 
 
-def as_port(port: str | BytePort, settings: SerialSettings) -> BytePort:
-    """A port of this machine by its name; one that is made already is taken as it is. Raises ValueError."""
-    return SerialPort(port, settings) if isinstance(port, str) else port
-
-
 def _opened(path: str, name: str, settings: SerialSettings) -> Any:
     try:
         port = serial.Serial(
@@ -339,3 +277,58 @@ def _drop_wrong_parity(descriptor: int) -> None:
     attributes = termios.tcgetattr(descriptor)
     attributes[0] |= termios.INPCK | termios.IGNPAR
     termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
+
+
+# Serial ports by what they are (USB identity) instead of where they were plugged in.
+
+_USB_NAME = re.compile(r"usb:([0-9A-Fa-f]{4}):([0-9A-Fa-f]{4})(?::(.+))?")
+
+
+@dataclass(frozen=True, slots=True)
+class PortInfo:
+    """A serial port of this machine: where it is, the name that finds it again after a replug, what it says it is."""
+
+    path: str
+    usb_name: str
+    description: str
+
+
+def serial_ports(comports: Callable[[], Iterable[Any]] = list_ports.comports) -> list[PortInfo]:
+    """The serial ports of this machine, by path; `usb_name` is empty when the port is not on USB."""
+    return sorted((_info(port) for port in comports()), key=lambda port: port.path)
+
+
+def check_port_name(name: str) -> str:
+    """The name itself, when it is a path or `usb:VID:PID[:SERIAL]`. Raises ValueError."""
+    if name.startswith("/") or _USB_NAME.fullmatch(name):
+        return name
+    raise ValueError(f"port {name!r}: wanted a path (/dev/ttyUSB0) or usb:VID:PID[:SERIAL] (usb:0403:6001:A50285BI)")
+
+
+def port_path(name: str, comports: Callable[[], Iterable[Any]] = list_ports.comports) -> str:
+    """Where the port of this name is now.
+
+    Raises LinkDownError (not plugged in), DeviceRefusedError (several adapters answer to the name).
+    """
+    wanted = _USB_NAME.fullmatch(name)
+    if wanted is None:
+        return name
+    vid, pid, serial = int(wanted[1], 16), int(wanted[2], 16), wanted[3]
+    found = [
+        port
+        for port in comports()
+        if (port.vid, port.pid) == (vid, pid) and (serial is None or port.serial_number == serial)
+    ]
+    if not found:
+        raise LinkDownError(f"{name}: no such USB adapter is plugged in")
+    if len(found) > 1:
+        choice = ", ".join(sorted(_info(port).usb_name for port in found))
+        raise DeviceRefusedError(f"{name}: {len(found)} adapters match; name one by its serial number: {choice}")
+    return str(found[0].device)
+
+
+def _info(port: Any) -> PortInfo:
+    usb_name = ""
+    if port.vid is not None:
+        usb_name = f"usb:{port.vid:04X}:{port.pid:04X}" + (f":{port.serial_number}" if port.serial_number else "")
+    return PortInfo(str(port.device), usb_name, str(port.description))

@@ -12,13 +12,13 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from firmware_iface.roles import Pattern, Screen
+from firmware_iface.roles import Pattern, Pixels, Screen
 from membrane_ctrl.acquisition import exposures
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.clock import pause_s
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import TelemetryRow
-from membrane_ctrl.processes.frames import FrameWriter, Pixels
+from membrane_ctrl.processes.frames import FrameWriter
 from membrane_ctrl.processes.ring import RingAddress, RingReader
 
 # A full cycle may be spoilt by a door or by the mirror still moving: take two more at once. Three in a row mean
@@ -31,11 +31,9 @@ class Reconstructor(Protocol):
 
     def full(self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray) -> ShapeEstimate:
         """Figure from sinusoids, Gray codes, white and black, in the order of the full sequence."""
-        ...
 
     def fringes(self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray) -> ShapeEstimate:
         """Figure from the sinusoids alone, tracked against the last absolute phase."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Literal, Protocol, runtime_checkable
 
-from firmware_iface.drivers.frame_lost import TRIES, ExposingCamera, FrameLostError
-from firmware_iface.roles import Frame, Pattern, Screen
-from membrane_ctrl.processes.frames import FrameSlot, FrameWriter, Pixels
+from firmware_iface.roles import TRIES, ExposingCamera, Frame, FrameLostError, Pattern, Pixels, Screen
+from membrane_ctrl.processes.frames import FrameSlot, FrameWriter
 
 # Where a cycle failed: whatever a device or the numerics raise becomes one kind of error that names the stage.
 
@@ -45,11 +44,9 @@ class CycleClock(Protocol):
 
     def now(self) -> float:
         """Seconds since the run's start."""
-        ...
 
     def sleep(self, duration_s: float) -> None:
         """Return after `duration_s` on this clock."""
-        ...
 
 
 class CycleCamera(Protocol):
@@ -57,7 +54,6 @@ class CycleCamera(Protocol):
 
     def grab(self, out: Pixels | None = None) -> Frame:
         """One exposure, in `out` if the camera is able to. Raises LinkError."""
-        ...
 
 
 @runtime_checkable
@@ -66,11 +62,9 @@ class SettlingScreen(Protocol):
 
     def begin(self, pattern: Pattern) -> None:
         """Send the pattern to the display. Raises LinkError."""
-        ...
 
     def wait(self) -> None:
         """Return when what was begun is lit and settled."""
-        ...
 
 
 class Laser(Protocol):
@@ -78,7 +72,6 @@ class Laser(Protocol):
 
     def at(self, time_s: float) -> float:
         """Displacement in um, NaN if unknown."""
-        ...
 
 
 class Exposures:
@@ -114,10 +107,7 @@ class Exposures:
     def take(self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]) -> list[Frame] | None:
         """Frames of these patterns, in their order; None if `stopping` said so before an exposure.
 
-        Raises
-        ------
-        StageError
-            "screen" or "camera", and what went wrong there.
+        Raises StageError ("screen" or "camera", and what went wrong there).
         """
         try:
             return self._take(patterns, cycle, stopping)

@@ -8,12 +8,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.display import response
-from firmware_iface.display.measures import Settling, checkerboard_problem, exposure_problem, settling, share_left
+from firmware_iface import display, roles, settings
 from firmware_iface.drivers import camera_aravis, camera_folder, camera_uvc, screen_pygame
-from firmware_iface.roles import Frame, LinkError
 from membrane_ctrl.acquisition.exposures import CycleClock
-from membrane_ctrl.config import optics as table
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.metrology.phase import full_sequence
 
@@ -21,7 +18,6 @@ from membrane_ctrl.metrology.phase import full_sequence
 
 
 Levels = NDArray[np.uint8]
-Frames = NDArray[np.uint8] | NDArray[np.uint16]
 
 # Longer than any display takes that is fit for this
 LONG_S = 0.5
@@ -33,9 +29,8 @@ _TIMES = 3
 class TestCamera(Protocol):
     """What is needed of the camera."""
 
-    def grab(self) -> Frame:
+    def grab(self) -> roles.Frame:
         """One exposure. Raises LinkError."""
-        ...
 
 
 class TestScreen(Protocol):
@@ -43,7 +38,6 @@ class TestScreen(Protocol):
 
     def show_levels(self, levels: Levels) -> None:
         """Send an image to the display, level for level; not waited for. Raises LinkError."""
-        ...
 
 
 class DisplayTest:
@@ -71,22 +65,19 @@ class DisplayTest:
     def exposure(self, full_scale_adu: int, exposure_ms: float) -> str:
         """What is wrong with the camera's exposure; empty when nothing is."""
         white, black = self._still(self._grey(255)), self._still(self._grey(0))
-        return exposure_problem(white, black, full_scale_adu, exposure_ms)
+        return display.exposure_problem(white, black, full_scale_adu, exposure_ms)
 
     def checkerboard(self) -> str:
         """Whether the screen shows pixel for pixel; empty when it does."""
         white, black = self._still(self._grey(255)), self._still(self._grey(0))
-        return checkerboard_problem(self._still(response.checkerboard(self._size[1], self._size[0])), white, black)
+        return display.checkerboard_problem(
+            self._still(display.checkerboard(self._size[1], self._size[0])), white, black
+        )
 
-    def settling(self) -> Settling:
+    def settling(self) -> display.Settling:
         """Time from a command to the light, over steps both ways between black, white and two greys.
 
-        The greys are there because panels are slowest between them.
-
-        Raises
-        ------
-        ValueError
-            If the display never settles.
+        The greys are there because panels are slowest between them. Raises ValueError if the display never settles.
         """
         delays_s: list[float] = []
         left: list[float] = []
@@ -94,30 +85,30 @@ class DisplayTest:
         for one, other in ((0, 255), (64, 160)):
             pictures = {level: _thin(self._still(self._grey(level))) for level in (one, other)}
             again = _thin(self._still(self._grey(one)))
-            noise = max(noise, share_left(again, pictures[other], pictures[one]))
+            noise = max(noise, display.share_left(again, pictures[other], pictures[one]))
             for before, after in ((one, other), (other, one)) * _TIMES:
                 self._still(self._grey(before))
                 for delay_s, pixels in list(self._follow(self._grey(after))):  # looked at afterwards
                     delays_s.append(delay_s)
-                    left.append(share_left(pixels, pictures[before], pictures[after]))
-        found = settling(delays_s, left, noise)
+                    left.append(display.share_left(pixels, pictures[before], pictures[after]))
+        found = display.settling(delays_s, left, noise)
         self.settle_s = found.settle_s
         return found
 
-    def response(self) -> response.DisplayResponse:
+    def response(self) -> display.DisplayResponse:
         """Light against level. Raises ValueError if the camera sees no ramp."""
-        frames = [self._still(self._grey(level)) for level in response.RAMP_LEVELS]
+        frames = [self._still(self._grey(level)) for level in display.RAMP_LEVELS]
         swing = frames[-1].astype(np.float64) - frames[0]
         lit = swing > 0.5 * np.quantile(swing, 0.99)
-        return response.measured_response(response.RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames])
+        return display.measured_response(display.RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames])
 
-    def _still(self, levels: Levels) -> Frames:
+    def _still(self, levels: Levels) -> roles.Pixels:
         self._screen.show_levels(levels)
         self._clock.sleep(self.settle_s)
         return self._camera.grab().pixels
 
-    def _follow(self, levels: Levels) -> Iterator[tuple[float, Frames]]:
-        """Frames one after the other, each with the time from the command to the start of its exposure."""
+    def _follow(self, levels: Levels) -> Iterator[tuple[float, roles.Pixels]]:
+        """roles.Pixels one after the other, each with the time from the command to the start of its exposure."""
         self._screen.show_levels(levels)
         begun_s = self._clock.now()
         while self._clock.now() - begun_s < _FOLLOWED_S:
@@ -128,7 +119,7 @@ class DisplayTest:
         return np.full(self._size, level, np.uint8)
 
 
-def _thin(pixels: Frames) -> Frames:
+def _thin(pixels: roles.Pixels) -> roles.Pixels:
     """Every fourth pixel both ways (of a Bayer sensor always the same colour): enough for means over blocks."""
     return pixels[::4, ::4].copy()
 
@@ -158,49 +149,34 @@ class OpticalBench:
 def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
     """The drivers that `[devices.camera]` and `[devices.screen]` name, not yet open.
 
-    Raises
-    ------
-    LinkError
-        If the configuration names none, or patterns that do not fit on the screen.
+    Raises LinkError if the configuration names none, or patterns that do not fit on the screen.
     """
     devices = config.devices
     if devices is None or devices.camera is None:
-        raise LinkError("no camera: name one in [devices.camera], or set shape.enabled = false")
+        raise roles.LinkError("no camera: name one in [devices.camera], or set shape.enabled = false")
     camera = _camera(config, devices.camera, clock)
     if devices.screen is None:
         return OpticalBench(camera, camera)  # a folder of frames is both
     screen, pattern = devices.screen, config.optics.pattern
     try:
-        raster = response.ScreenRaster(
+        raster = display.ScreenRaster(
             screen.width_px, screen.height_px, screen.pixel_mm, pattern.periods, pattern.period_mm, screen.centre_px
         )
     except ValueError as error:
-        raise LinkError(f"devices.screen: {error}") from None
-    settings = screen_pygame.ScreenSettings(raster, full_sequence(pattern), screen.display)
-    return OpticalBench(camera, screen_pygame.PygameScreen(settings, now=clock.now, sleep=clock.sleep))
+        raise roles.LinkError(f"devices.screen: {error}") from None
+    shown = screen_pygame.ScreenSettings(raster, full_sequence(pattern), screen.display)
+    return OpticalBench(camera, screen_pygame.PygameScreen(shown, now=clock.now, sleep=clock.sleep))
 
 
-def _camera(config: Config, section: table.CameraTable, clock: CycleClock) -> Any:
-    width_px, height_px = config.optics.camera.width_px, config.optics.camera.height_px
+def _camera(config: Config, section: settings.CameraConfig, clock: CycleClock) -> Any:
+    size_px = config.optics.camera.width_px, config.optics.camera.height_px
     match section:
-        case table.AravisCameraConfig():
-            settings = camera_aravis.AravisSettings(
-                section.camera,
-                width_px,
-                height_px,
-                section.pixel_format,
-                section.exposure_ms,
-                section.gain_db,
-                section.packet_bytes,
-                section.timeout_s,
-            )
-            return camera_aravis.AravisCamera(settings, clock.now, clock.sleep)
-        case table.UvcCameraConfig():
-            return camera_uvc.UvcCamera(
-                camera_uvc.UvcSettings(section.port, width_px, height_px, section.exposure, section.gain), clock.now
-            )
-        case table.FolderCameraConfig():
-            return camera_folder.FolderCamera(Path(section.folder).expanduser(), width_px, height_px, clock.now)
+        case settings.AravisCameraConfig():
+            return camera_aravis.AravisCamera(section, *size_px, clock.now, clock.sleep)
+        case settings.UvcCameraConfig():
+            return camera_uvc.UvcCamera(section, *size_px, clock.now)
+        case settings.FolderCameraConfig():
+            return camera_folder.FolderCamera(Path(section.folder).expanduser(), *size_px, clock.now)
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,20 +191,15 @@ class BenchFindings:
 def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchFindings:
     """Connect camera and screen, and let the camera measure the screen.
 
-    What is found wrong does not keep a run from trying: its cycles are judged one by one.
+    What is found wrong does not keep a run from trying: its cycles are judged one by one. Raises LinkError if one of
+    them is not there or not usable.
 
     Parameters
     ----------
     bench : OpticalBench
         From `configured_bench`.
-    config : Config
     clock : CycleClock
         The run's clock.
-
-    Raises
-    ------
-    LinkError
-        If one of them is not there or not usable.
     """
     identity = bench.camera.open()
     who = " ".join(part for part in (identity.kind, identity.serial, identity.detail) if part)
@@ -253,7 +224,7 @@ def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchF
 
 def _exposure(config: Config, test: DisplayTest) -> str:
     camera = config.devices.camera if config.devices is not None else None
-    if not isinstance(camera, table.AravisCameraConfig):  # another's exposure has no unit
+    if not isinstance(camera, settings.AravisCameraConfig):  # another's exposure has no unit
         return ""
     return told("camera", lambda: test.exposure((1 << config.optics.camera.bits) - 1, camera.exposure_ms))
 

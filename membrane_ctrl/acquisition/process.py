@@ -40,7 +40,6 @@ def limit_threads() -> None:
 
 # The acquisition's line to the process that started it: commands in, small reports out, and whether it lives.
 
-
 AcquisitionState = Literal["preparing", "running", "paused", "retrying", "failed", "stopped"]
 
 _PARENT_CHECK_S = 0.2  # how soon a dead parent is noticed
@@ -161,45 +160,23 @@ _NICENESS = 10  # behind the tick, the recorder and the screen
 
 @dataclass(frozen=True, slots=True)
 class AcquisitionSpec:
-    """What the acquisition needs to know of the run.
-
-    Attributes
-    ----------
-    config : Config
-        The run's configuration.
-    clock : RunClock
-        The run's clock.
-    telemetry : RingAddress
-        Where the laser readings are.
-    shapes : RingAddress
-        Where the estimates go (`estimate.pack_estimate`).
-    truth : RingAddress or None
-        The twin's truth, which its camera renders; None on a real bench.
-    frames : FrameAddress
-        Where the pixels go.
-    run_dir : Path or None
-        Folder of the run, for the frames that are kept.
-    """
+    """What the acquisition needs to know of the run."""
 
     config: Config
     clock: RunClock
-    telemetry: ring.RingAddress
-    shapes: ring.RingAddress
-    truth: ring.RingAddress | None
+    telemetry: ring.RingAddress  # where the laser readings are
+    shapes: ring.RingAddress  # where the estimates go (`estimate.pack_estimate`)
+    truth: ring.RingAddress | None  # the twin's truth, which its camera renders; None on a real bench
     frames: ring.FrameAddress
-    run_dir: Path | None = None
+    run_dir: Path | None = None  # folder of the run, for the frames that are kept
 
 
 def acquisition_main(spec: AcquisitionSpec, control: Connection) -> None:
     """Measure the shape until told to stop: target of a `spawn`ed process.
 
-    Ends on "stop" over `control`, on `processes.STOP`, and when the parent has died.
-    Reports go back over `control` as lines of events (`run_events.AcquisitionState`).
-
-    Raises
-    ------
-    SystemExit
-        With 1 if it cannot work at all (after a report of the reason).
+    Ends on "stop" over `control`, on `processes.STOP`, and when the parent has died. Reports go back over `control`
+    as lines of events (`run_events.AcquisitionState`). Raises SystemExit with 1 if it cannot work at all (after a
+    report of the reason).
     """
     os.nice(max(0, _NICENESS - os.nice(0)))
     signal.signal(signal.SIGINT, signal.SIG_IGN)

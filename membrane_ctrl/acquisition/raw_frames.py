@@ -15,13 +15,13 @@ from typing import Any
 import cv2
 import tomli_w
 
-from firmware_iface.roles import Pattern
+from firmware_iface.roles import Pattern, Pixels
 from membrane_ctrl.acquisition.cycle import CyclePlan
 from membrane_ctrl.config.schema import OpticsConfig, RecordingConfig
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import TelemetryRow
-from membrane_ctrl.processes.frames import FrameHead, FrameReader, Pixels
+from membrane_ctrl.processes.frames import FrameHead, FrameReader
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
 from membrane_ctrl.run_files.disk_budget import PICTURES_FROM
 

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_iface.roles import LinkError, Pattern
-from membrane_ctrl.acquisition import optical_bench, process, raw_frames, worker
-from membrane_ctrl.acquisition.cycle import CyclePlan, LaserHistory, Reconstructor, ShapeCycle
+from firmware_iface.roles import LinkError, Pattern, Pixels
+from membrane_ctrl.acquisition import cycle, optical_bench, process, raw_frames, worker
 from membrane_ctrl.acquisition.exposures import CycleClock
 from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
 from membrane_ctrl.geometry import file, spread_file
@@ -20,7 +19,7 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.processes import child, ring
-from membrane_ctrl.processes.frames import FrameWriter, Pixels
+from membrane_ctrl.processes.frames import FrameWriter
 from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics
 from membrane_ctrl.sim.sensors import Truth
 
@@ -90,7 +89,11 @@ def small(optics: OpticsConfig) -> OpticsConfig:
 
 
 def warm_up(
-    reconstructor: Reconstructor, optics: OpticsConfig, plan: CyclePlan, position: FilmPosition, clock: CycleClock
+    reconstructor: cycle.Reconstructor,
+    optics: OpticsConfig,
+    plan: cycle.CyclePlan,
+    position: FilmPosition,
+    clock: CycleClock,
 ) -> None:
     """A full cycle and two of fringes only, with and without known motion, of a film that stands still.
 
@@ -150,12 +153,8 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
     """Prepare, then measure until told to stop.
 
     Until the first cycle `processes.STOP` simply ends the process, as nothing is held that would need care and a
-    kernel that is being compiled cannot be asked; from then on it ends the cycle at its next exposure.
-
-    Raises
-    ------
-    LinkError
-        If no camera is configured, or its patterns do not fit on the screen.
+    kernel that is being compiled cannot be asked; from then on it ends the cycle at its next exposure. Raises
+    LinkError if no camera is configured, or its patterns do not fit on the screen.
     """
     remote.listen()  # the first word, which promises the next one for when all this is over
     remote.report("preparing", "tracing the first picture, compiling what is not compiled yet")
@@ -163,7 +162,9 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
     geometry = file.geometry_of_run(spec.run_dir, config)
     remote.tell(worker.geometry_event(geometry))
     pattern = geometry.optics.pattern
-    plan = CyclePlan(phase.full_sequence(pattern), phase.fringe_sequence(pattern), config.shape.frame_interval_s)
+    plan = cycle.CyclePlan(
+        phase.full_sequence(pattern), phase.fringe_sequence(pattern), config.shape.frame_interval_s
+    )
     with ExitStack() as stack:
         if spec.truth is None:
             bench = optical_bench.configured_bench(config, clock)
@@ -183,9 +184,9 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
         shapes = stack.enter_context(closing(ring.RingWriter(spec.shapes)))
         frames = stack.enter_context(closing(FrameWriter(spec.frames)))
         stack.callback(bench.close)  # before the ring of frames: an exposure under way holds the pixels of a slot
-        laser = stack.enter_context(closing(LaserHistory(spec.telemetry, config.loop.rate_hz)))
+        laser = stack.enter_context(closing(cycle.LaserHistory(spec.telemetry, config.loop.rate_hz)))
         raw = _raw_frames(spec, geometry.optics, plan, stack, remote)
-        cycle = ShapeCycle(
+        taking = cycle.ShapeCycle(
             bench.camera, bench.screen, reconstructor, plan, frames, clock, laser, stopping=remote.interrupts
         )
 
@@ -203,13 +204,13 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
 
         remote.prepared()
         remote.report("running", "first cycle")
-        worker.keep_cycling(cycle, remote, publish, clock, config.shape.period_s, keep)
+        worker.keep_cycling(taking, remote, publish, clock, config.shape.period_s, keep)
 
 
 def _twin_bench(
     address: ring.RingAddress,
     config: Config,
-    plan: CyclePlan,
+    plan: cycle.CyclePlan,
     clock: WaitingClock,
     remote: process.Remote,
     stack: ExitStack,
@@ -225,7 +226,7 @@ def _twin_bench(
     return optical_bench.OpticalBench(optics.camera, optics.screen)
 
 
-def _warm_up(config: Config, plan: CyclePlan, position: FilmPosition, clock: WaitingClock) -> None:
+def _warm_up(config: Config, plan: cycle.CyclePlan, position: FilmPosition, clock: WaitingClock) -> None:
     coarse = small(config.optics)
     warm_up(live.LiveReconstructor(coarse, config.shape.bin_px), coarse, plan, position, clock)
 
@@ -255,7 +256,11 @@ def _spread(run_dir: Path | None, optics: OpticsConfig) -> GeometrySpread | None
 
 
 def _raw_frames(
-    spec: process.AcquisitionSpec, optics: OpticsConfig, plan: CyclePlan, stack: ExitStack, remote: process.Remote
+    spec: process.AcquisitionSpec,
+    optics: OpticsConfig,
+    plan: cycle.CyclePlan,
+    stack: ExitStack,
+    remote: process.Remote,
 ) -> raw_frames.RawFrames | None:
     """What keeps frames, if there is a place for them."""
     if spec.run_dir is None:

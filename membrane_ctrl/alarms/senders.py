@@ -12,8 +12,7 @@ from typing import Any
 
 from membrane_ctrl.alarms.book import Notice
 from membrane_ctrl.config import port, schema
-from membrane_ctrl.model import clock
-from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
+from membrane_ctrl.model import clock, errors
 
 Send = Callable[[Notice], bool]
 
@@ -74,12 +73,12 @@ def read_urls(path: Path) -> list[str]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
-        raise InputError(f"alarms: {path}: {os_reason(error)}") from None
+        raise errors.InputError(f"alarms: {path}: {errors.os_reason(error)}") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"alarms: {path}: {error}") from None
+        raise errors.InputError(f"alarms: {path}: {error}") from None
     urls = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not urls:
-        raise InputError(f"{path}: no URL in it; one a line, e.g. mailto://user:password@example.org")
+        raise errors.InputError(f"{path}: no URL in it; one a line, e.g. mailto://user:password@example.org")
     return urls
 
 
@@ -89,7 +88,7 @@ def require_sendable(config: port.AlarmsConfig) -> None:
         if name is not None:
             read_urls(Path(name))
     if config.urls_file is not None and importlib.util.find_spec("apprise") is None:
-        raise DeviceError(_MISSING)
+        raise errors.DeviceError(_MISSING)
 
 
 def apprise_senders(config: port.AlarmsConfig, run: str) -> list[Send]:
@@ -131,7 +130,7 @@ def _plugins(apprise: Any, path: Path) -> list[Any]:
     for number, url in enumerate(read_urls(path), start=1):
         plugin = apprise.Apprise.instantiate(url)
         if plugin is None:
-            raise InputError(f"{path}: URL {number} is none that Apprise knows")
+            raise errors.InputError(f"{path}: URL {number} is none that Apprise knows")
         plugins.append(plugin)
     return plugins
 
@@ -140,7 +139,7 @@ def _apprise() -> Any:
     try:
         return importlib.import_module("apprise")
     except ImportError:
-        raise DeviceError(_MISSING) from None
+        raise errors.DeviceError(_MISSING) from None
 
 
 def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json: bool) -> int:
@@ -150,9 +149,9 @@ def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json
     """
     alarms = config.alarms
     if alarms.urls_file is None:
-        raise InputError(f"{source}: alarms.urls_file: missing; name a file with one Apprise URL a line")
+        raise errors.InputError(f"{source}: alarms.urls_file: missing; name a file with one Apprise URL a line")
     if escalated and alarms.escalation_urls_file is None:
-        raise InputError(f"{source}: alarms.escalation_urls_file: missing; there is nobody to escalate to")
+        raise errors.InputError(f"{source}: alarms.escalation_urls_file: missing; there is nobody to escalate to")
     notice = Notice("raised", "test", "warning", "this is a test; nothing is wrong", escalated)
     senders = apprise_senders(alarms, "none, a test")
     files = [alarms.urls_file, alarms.escalation_urls_file][: 2 if escalated else 1]
@@ -160,7 +159,9 @@ def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json
     if as_json:
         print(json.dumps({"sent": not deaf}))
     if deaf:
-        raise DeviceError(f"{' and '.join(map(str, deaf))}: no service took the notice; check addresses and network")
+        raise errors.DeviceError(
+            f"{' and '.join(map(str, deaf))}: no service took the notice; check addresses and network"
+        )
     if not as_json:
         print("sent; look whether it has arrived")
-    return Exit.DONE
+    return errors.Exit.DONE

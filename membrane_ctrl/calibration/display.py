@@ -4,8 +4,7 @@ import json
 
 import numpy as np
 
-from firmware_iface.display.measures import Settling
-from firmware_iface.display.response import DisplayResponse
+from firmware_iface.display import DisplayResponse, Settling
 from firmware_iface.roles import LinkError
 from membrane_ctrl.acquisition import exposures, optical_bench, session
 from membrane_ctrl.config.schema import Config, PatternConfig

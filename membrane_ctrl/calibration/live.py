@@ -19,11 +19,9 @@ from membrane_ctrl.control_port.ctl import Where, socket_path
 from membrane_ctrl.geometry.file import GeometryOrigin, geometry_of_run, origin_of, read_geometry
 from membrane_ctrl.geometry.spread_file import read_prior
 from membrane_ctrl.measure.capture_set import read_head
-from membrane_ctrl.metrology.calibrate import parameters, propagate
-from membrane_ctrl.metrology.calibrate.verdict import GOOD_SPREAD_UM
+from membrane_ctrl.metrology.calibrate import parameters, propagate, verdict
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
-from membrane_ctrl.sessions.live_hold import HoldError, LiveHold
-from membrane_ctrl.sessions.progress import Progress
+from membrane_ctrl.sessions.live_hold import HoldError, LiveHold, Progress
 
 USUAL_SETS = 5
 _NEARLY_ALL = 0.9  # of the good range: more would hardly be better
@@ -66,12 +64,9 @@ def calibrate_live(options: LiveOptions) -> int:
 
 
 def take_sets(link: CaptureLink, session: CalibrationSession | None, options: LiveOptions) -> CalibrationSession:
-    """All sets that are missing, if a person agrees; the mirror comes back to where it was.
+    """Take the missing sets, if a person agrees, and move the mirror back to where it was.
 
-    Raises
-    ------
-    InputError, DeviceError, RejectedError, KeyboardInterrupt
-        The sets so far stay in the session's folder then.
+    Raises InputError, DeviceError, RejectedError or KeyboardInterrupt; the session's folder keeps the sets so far.
     """
     progress = Progress()
     sweep = Sweep(link, link.config.limits, progress)
@@ -163,13 +158,13 @@ def _worth(link: CaptureLink, head: CalibrationHead, held: HeldMirror, options: 
     here = _foreseen(link, held, head.setpoints_um, options)
     line = f"such sets leave of a figure: sag +- {here.sag_um:.1f} um, figure +- {here.figure_rms_um:.1f} um RMS"
     low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
-    if high_um - low_um >= _NEARLY_ALL * GOOD_SPREAD_UM:
+    if high_um - low_um >= _NEARLY_ALL * verdict.GOOD_SPREAD_UM:
         return line
-    ends = (low_um + high_um - GOOD_SPREAD_UM) / 2, (low_um + high_um + GOOD_SPREAD_UM) / 2
+    ends = (low_um + high_um - verdict.GOOD_SPREAD_UM) / 2, (low_um + high_um + verdict.GOOD_SPREAD_UM) / 2
     best = _foreseen(link, held, np.linspace(*ends, len(head.setpoints_um)).tolist(), options)
     reach = reach_of(held, link.config)
     return (
-        f"{line}; {GOOD_SPREAD_UM:.0f} um from first to last would leave {best.sag_um:.1f} and "
+        f"{line}; {verdict.GOOD_SPREAD_UM:.0f} um from first to last would leave {best.sag_um:.1f} and "
         f"{best.figure_rms_um:.1f} ({reach.low_why} and {reach.high_why} have room for "
         f"{reach.high_um - reach.low_um:.0f})"
     )

@@ -22,30 +22,14 @@ _PIECES = 8  # of a way, for its time: the leak grows with the cube of the depth
 
 @dataclass(frozen=True, slots=True)
 class HeldMirror:
-    """The mirror as it is held before anything moves.
+    """The mirror as it is held before anything moves."""
 
-    Attributes
-    ----------
-    setpoint_um : float
-        Without the trim.
-    sag_mm : float
-        As the camera sees it with the geometry in force.
-    pressure_pa : float
-        Of the gauge.
-    leak_um_per_s : float
-        Speed at which the centre sinks without the pump.
-    swing_adu : float
-        Amplitude of the fringes.
-    shape_on : bool
-        Whether the shape loop is on.
-    """
-
-    setpoint_um: float
-    sag_mm: float
-    pressure_pa: float
-    leak_um_per_s: float
-    swing_adu: float
-    shape_on: bool
+    setpoint_um: float  # without the trim
+    sag_mm: float  # as the camera sees it with the geometry in force
+    pressure_pa: float  # of the gauge
+    leak_um_per_s: float  # speed at which the centre sinks without the pump
+    swing_adu: float  # amplitude of the fringes
+    shape_on: bool  # whether the shape loop is on
 
     def sag_at_mm(self, setpoint_um: float) -> float:
         """Sag at another setpoint: the ring stays where it is."""
@@ -82,20 +66,16 @@ def reach_of(held: HeldMirror, config: Config) -> Reach:
 def setpoints_um(held: HeldMirror, reach: Reach, range_um: float | None, sets: int) -> tuple[float, ...]:
     """Setpoints of the sets, evenly spaced about where the mirror is held, nearer end first.
 
+    Raises InputError if there is no room for what is asked, or for less than 1 mm.
+
     Parameters
     ----------
-    held : HeldMirror
     reach : Reach
         The range is moved to fit into it.
     range_um : float or None
         From the first to the last; None: 8 mm, or what there is.
     sets : int
         How many.
-
-    Raises
-    ------
-    InputError
-        If there is no room for what is asked, or for less than 1 mm.
     """
     room_um = reach.high_um - reach.low_um
     allowed = f"{reach.low_why} and {reach.high_why} leave {max(room_um, 0.0):.0f} um"

@@ -11,8 +11,7 @@ import numpy as np
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure import capture_set, measurement
 from membrane_ctrl.metrology import full, reconstruct
-from membrane_ctrl.metrology.calibrate.artefact import general_form
-from membrane_ctrl.metrology.calibrate.parameters import usual_sigma
+from membrane_ctrl.metrology.calibrate import artefact, parameters
 from membrane_ctrl.metrology.calibrate.ring_pose import POSE_NAMES, RingPose, ring_pose
 from membrane_ctrl.metrology.checked import RejectedSetError, check
 from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
@@ -52,7 +51,10 @@ def calibrate_pose(options: PoseOptions) -> int:
     except ValueError as error:
         raise RejectedError(f"{options.folder}: {error}") from None
     sigmas = dict(zip(POSE_NAMES, pose.sigmas.tolist(), strict=True))
-    tables = {"geometry": general_form(pose.bench(stated), optics).model_dump(exclude_none=True), "sigmas": sigmas}
+    tables = {
+        "geometry": artefact.general_form(pose.bench(stated), optics).model_dump(exclude_none=True),
+        "sigmas": sigmas,
+    }
     spread_file.write_prior(options.out, tables, "calibrate-pose", [options.folder.name], pose.rms_px)
     report: dict[str, Any] = {
         "schema": "membrane-calibrate-pose/1",
@@ -97,9 +99,9 @@ def _rim(capture: capture_set.CaptureSet) -> tuple[reconstruct.HeightFunction, f
 def _lines(pose: RingPose, out: Path) -> list[str]:
     lines = ["what              stated wrong by   +-        known before"]
     lines += [
-        f"{name:<18}{value:>+13.4f}  {sigma:<9.4f} {usual_sigma(name):.3g}"
+        f"{name:<18}{value:>+13.4f}  {sigma:<9.4f} {parameters.usual_sigma(name):.3g}"
         for name, value, sigma in zip(POSE_NAMES, pose.values, pose.sigmas, strict=True)
     ]
-    better = max(usual_sigma(name) / sigma for name, sigma in zip(POSE_NAMES, pose.sigmas, strict=True))
+    better = max(parameters.usual_sigma(name) / sigma for name, sigma in zip(POSE_NAMES, pose.sigmas, strict=True))
     lines.append(f"edges are left {pose.rms_px:.3f} px RMS, {pose.points} of them; at best {better:.0f} times better")
     return [*lines, f"written: {out}; use it with calibrate --prior {out}"]

@@ -10,8 +10,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from membrane_ctrl.measure.results import write_figure
-from membrane_ctrl.metrology.calibrate import diagnose, parameters, solve, verdict
-from membrane_ctrl.metrology.calibrate.propagate import condition_number, propagate, weak_combinations
+from membrane_ctrl.metrology.calibrate import diagnose, parameters, propagate, solve, verdict
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import users
 
@@ -30,15 +29,15 @@ def report_of(
     if solution is None or not solution.converged:
         return table
     middle = len(solution.states) // 2
-    claim = propagate(solution, middle, analysis_radius_mm)
+    claim = propagate.propagate(solution, middle, analysis_radius_mm)
     scale = diagnose.laser_scale(solution)
     return table | {
         "iterations": len(solution.changes),
-        "condition": condition_number(solution),
+        "condition": propagate.condition_number(solution),
         "parameters": [_parameter(solution, name) for name in solution.free],
         "not_determined": [
             {"sigma_left": each.left, "height_um": each.height_um, "figure_um": each.figure_um, "says": each.words}
-            for each in weak_combinations(solution, middle, analysis_radius_mm)
+            for each in propagate.weak_combinations(solution, middle, analysis_radius_mm)
         ],
         "uncertainty": {
             "height_rms_um": claim.height_rms_um,

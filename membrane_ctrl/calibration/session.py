@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from membrane_ctrl.config import schema
 from membrane_ctrl.config import toml_file as config_file
-from membrane_ctrl.config.schema import Config, OpticsConfig
 from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, read_geometry
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.model import errors, files
@@ -20,26 +20,15 @@ FORMAT = "membrane-live-calibration/1"
 
 @dataclass(frozen=True, slots=True)
 class CalibrationHead:
-    """`session.json`.
-
-    Attributes
-    ----------
-    format, source, created_utc : str
-        `source` is the run it began on.
-    start_um : float
-        Setpoint to come back to; what was measured by hand is taken to hold for a mirror that stands there.
-    shape_on : bool
-        Whether the shape loop was on.
-    setpoints_um : tuple of float
-        Of the sets, in their order.
-    """
+    """`session.json`."""
 
     format: str
-    source: str
+    source: str  # the run it began on
     created_utc: str
+    # Setpoint to return to; the measurements by hand are taken to hold there
     start_um: float
-    shape_on: bool
-    setpoints_um: tuple[float, ...]
+    shape_on: bool  # whether the shape loop was on
+    setpoints_um: tuple[float, ...]  # of the sets, in their order
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +37,7 @@ class CalibrationSession:
 
     path: Path
     head: CalibrationHead
-    config: Config
+    config: schema.Config
 
     @property
     def sets(self) -> tuple[Path, ...]:
@@ -84,7 +73,7 @@ def head_of(source: str, start_um: float, shape_on: bool, setpoints_um: tuple[fl
     )
 
 
-def begin(logs: Path, name: str, head: CalibrationHead, config: Config) -> CalibrationSession:
+def begin(logs: Path, name: str, head: CalibrationHead, config: schema.Config) -> CalibrationSession:
     """Make a session's folder. Raises InputError for a bad name, DeviceError if it cannot be written."""
     path = fresh_folder(logs / "calibration", name, datetime.fromisoformat(head.created_utc))
     try:
@@ -101,22 +90,16 @@ def resume(path: Path) -> CalibrationSession:
     head = plain.read(path / "session.json", CalibrationHead)
     if head.format != FORMAT:
         raise errors.InputError(f"{path}/session.json: format {head.format!r}, {FORMAT!r} is known")
-    return CalibrationSession(path, head, config_file.load(path / "config.toml", Config))
+    return CalibrationSession(path, head, config_file.load(path / "config.toml", schema.Config))
 
 
 # Old geometry against new, and the exchange of the files.
 
 
-def compared(optics: OpticsConfig, origin: GeometryOrigin, new: GeometryFile) -> list[str]:
+def compared(optics: schema.OpticsConfig, origin: GeometryOrigin, new: GeometryFile) -> list[str]:
     """The geometry in force beside the new one, in the numbers that a person can check with a tape.
 
-    Parameters
-    ----------
-    optics : OpticsConfig
-        As in force, for the sets say what they were taken with.
-    origin : GeometryOrigin
-        Its name.
-    new : GeometryFile
+    `optics` is the bench in force, as the sets state it; `origin` names it.
     """
     old = "by hand" if not origin.calibrated_utc else f"calibrated {origin.calibrated_utc}"
     lines = [
@@ -143,10 +126,7 @@ def _by_tape(geometry: Geometry) -> list[tuple[str, float]]:
 def adopt(new: Path, place: Path) -> Path | None:
     """Put a geometry where the configuration looks for it; returns where the one before it is kept now.
 
-    Raises
-    ------
-    DeviceError
-        If it cannot be written; then the old one is still there.
+    Raises DeviceError if it cannot be written; then the old one is still there.
     """
     try:
         place.parent.mkdir(parents=True, exist_ok=True)

@@ -33,11 +33,8 @@ from membrane_ctrl.model.files import users, write_text_atomic
 def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.SetPhases:
     """The bins inside the analysis radius that the set's own fit kept.
 
-    Parameters
-    ----------
-    optics : OpticsConfig
-        Of the set: camera, pattern, and the stated geometry, which only chooses the bins and tells what averaging
-        over a bin adds to a curved phase (some 1e-3 mm: no calibration changes it).
+    The stated geometry only chooses the bins and corrects the averaging of a curved phase over a bin (some 1e-3 mm,
+    which no calibration changes).
     """
     state, bin_px = checked.state, checked.binned.bin_px
     grid = BinGrid(checked.tracer.geometry, optics.camera, bin_px)
@@ -59,39 +56,18 @@ def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.Se
 
 @dataclass(frozen=True)
 class CalibrateOptions:
-    """What the command was asked for.
+    """What the command was asked for."""
 
-    Attributes
-    ----------
-    folders : sequence of Path
-        Capture sets.
-    geometry : Path or None
-        What was measured by hand, instead of what the sets say.
-    out : Path
-        The new `geometry.toml`.
-    free : sequence of str
-        NAME or NAME=SIGMA; a sigma of 0 holds a parameter.
-    laser_sigma_um : float
-        Of a set's mean reading.
-    as_json : bool
-        Report as JSON.
-    pictures : bool
-        Draw what is left of the screen points, beside the geometry.
-    reference_um : float or None
-        Laser reading for which the hand's measurements hold, if the sets do not say; None: the first set's.
-    priors : sequence of Path
-        What auxiliary calibrations have found; the last one counts.
-    """
-
-    folders: Sequence[Path]
-    geometry: Path | None
-    out: Path
-    free: Sequence[str]
-    laser_sigma_um: float
+    folders: Sequence[Path]  # capture sets
+    geometry: Path | None  # what was measured by hand, instead of what the sets say
+    out: Path  # the new `geometry.toml`
+    free: Sequence[str]  # NAME or NAME=SIGMA; a sigma of 0 holds a parameter
+    laser_sigma_um: float  # of a set's mean reading
     as_json: bool
-    pictures: bool = True
+    pictures: bool = True  # draw what is left of the screen points, beside the geometry
+    # Laser reading for which the hand's measurements hold, if the sets do not say; None: the first set's
     reference_um: float | None = None
-    priors: Sequence[Path] = ()
+    priors: Sequence[Path] = ()  # what auxiliary calibrations have found; the last one counts
 
 
 @dataclass(frozen=True)
@@ -151,12 +127,8 @@ def freed(texts: Sequence[str]) -> dict[str, float]:
 def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: float | None = None) -> Bundle:
     """Read capture sets and their phases.
 
-    Raises
-    ------
-    InputError
-        For a set that is none, or that says it is of another rig than the first.
-    RejectedError
-        For a set that gives no figure.
+    Raises InputError for a set that is none, or that says it is of another rig than the first; RejectedError for a
+    set that gives no figure.
     """
     figures = Figures(None if geometry is None else file.read_geometry(geometry))
     if len(set(folders)) < len(folders):

@@ -13,11 +13,8 @@ from membrane_ctrl.calibration.plan import SETTLE_S, HeldMirror, reach_of, step_
 from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.commands import Command, Kind
-from membrane_ctrl.model import errors, states, telemetry
-from membrane_ctrl.model.events import StateEntered
-from membrane_ctrl.model.run_events import Capture
-from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News
-from membrane_ctrl.sessions.progress import Progress
+from membrane_ctrl.model import errors, events, run_events, states, telemetry
+from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News, Progress
 
 WHY = "calibration of the optics"
 _LOOK_S = 10.0  # at the pressure and the leak, which are noisy
@@ -40,13 +37,7 @@ class CaptureLink(HoldLink, Protocol):
 class Sweep:
     """Moves and looks; every wait ends by itself.
 
-    Parameters
-    ----------
-    link : CaptureLink
-    limits : LimitsConfig
-        For the band.
-    progress : callable
-        Told the seconds of the hold that have passed; may raise KeyboardInterrupt.
+    `progress` is told the seconds of the hold that have passed, and may raise KeyboardInterrupt.
     """
 
     def __init__(self, link: CaptureLink, limits: LimitsConfig, progress: Callable[[float], None]) -> None:
@@ -55,15 +46,7 @@ class Sweep:
         self._why = ""
 
     def look(self) -> HeldMirror:
-        """The mirror as it is held, over some seconds and at least one shape.
-
-        Raises
-        ------
-        HoldError
-            If it is not held.
-        DeviceError
-            If no camera measures it.
-        """
+        """The mirror as held, from some seconds and a shape. Raises HoldError, or DeviceError without a camera."""
         rows: deque[telemetry.TelemetryRow] = deque()
         shape = None
         while shape is None or rows[-1].mono_s - rows[0].mono_s < _LOOK_S:
@@ -94,12 +77,7 @@ class Sweep:
     def go(self, setpoint_um: float, expected_s: float) -> None:
         """Ramp there and settle.
 
-        Raises
-        ------
-        HoldError
-            If the mirror is no longer held, or somebody else moves it.
-        DeviceError
-            If it does not arrive.
+        Raises HoldError if the mirror is no longer held or somebody else moves it; DeviceError if it does not arrive.
         """
         self._ask("setpoint", setpoint_um)
         patience_s = _LATE[0] * expected_s + _LATE[1]
@@ -123,15 +101,10 @@ class Sweep:
                     f"the mirror does not settle at {setpoint_um:g} um in {patience_s:.0f} s; paused, or too tight?"
                 )
 
-    def take(self) -> Capture:
-        """Have a set taken; one that is bad is taken again, once.
+    def take(self) -> run_events.Capture:
+        """Have a set taken; repeat a bad one once.
 
-        Raises
-        ------
-        HoldError
-            If the hold refuses, or the mirror is no longer held.
-        RejectedError
-            If the second is bad, too.
+        Raises HoldError if the hold refuses or the mirror is no longer held; RejectedError if both are bad.
         """
         first = self._capture()
         event = first if first.set else self._capture()
@@ -143,14 +116,14 @@ class Sweep:
         """Switch the shape loop."""
         self._ask("shape_on" if on else "shape_off")
 
-    def _capture(self) -> Capture:
+    def _capture(self) -> run_events.Capture:
         self._ask("capture")
         begin_s = self._last_s
         while self._last_s - begin_s < _SET_WITHIN_S:
-            told = [event for event in self._news().events if isinstance(event, Capture)]
+            told = [event for event in self._news().events if isinstance(event, run_events.Capture)]
             if told:
                 return told[-1]
-        return Capture(failed=f"no set within {_SET_WITHIN_S:.0f} s")
+        return run_events.Capture(failed=f"no set within {_SET_WITHIN_S:.0f} s")
 
     def _inside(self, rows: deque[telemetry.TelemetryRow]) -> bool:
         last = [row.error_um for row in rows if rows[-1].mono_s - row.mono_s <= _MEAN_S]
@@ -163,7 +136,7 @@ class Sweep:
         """What has come; raises HoldError if the mirror is not held any more."""
         news = self._link.news()
         for event in news.events:
-            if isinstance(event, StateEntered):
+            if isinstance(event, events.StateEntered):
                 self._why = f" ({event.why})"
         for row in news.rows:
             if row.state != states.State.HOLD:
@@ -188,23 +161,11 @@ def _mean(values: list[float]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Procedure:
-    """What moves the mirror for a calibration.
-
-    Attributes
-    ----------
-    link : CaptureLink
-        The hold.
-    sweep : Sweep
-        The hand on it.
-    held : HeldMirror
-        The mirror as it was found.
-    progress : Progress
-        For the person who waits.
-    """
+    """What moves the mirror for a calibration."""
 
     link: CaptureLink
-    sweep: Sweep
-    held: HeldMirror
+    sweep: Sweep  # the hand on it
+    held: HeldMirror  # the mirror as it was found
     progress: Progress
 
     def times_s(self, head: CalibrationHead, missing: tuple[int, ...]) -> list[float]:
@@ -229,14 +190,10 @@ class Procedure:
             )
 
     def take(self, session: CalibrationSession) -> None:
-        """Take what is missing, come back.
+        """Take the missing sets and move the mirror back.
 
-        Raises
-        ------
-        HoldError
-            If the mirror is held no more, or somebody else moves it; it is left alone then.
-        DeviceError, RejectedError, KeyboardInterrupt
-            After the mirror has come back.
+        Raises HoldError if the mirror is no longer held or somebody else moves it (it is then left alone);
+        DeviceError, RejectedError or KeyboardInterrupt after the mirror has moved back.
         """
         with self.progress.catching(), self._coming_back(session):
             self.sweep.shape_loop(False)

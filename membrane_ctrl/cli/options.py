@@ -5,8 +5,8 @@ from typing import Annotated, TypeVar
 
 import typer
 
+from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
-from membrane_ctrl.config.section import Section
 
 S = TypeVar("S", bound=Section)
 

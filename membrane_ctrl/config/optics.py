@@ -1,71 +1,11 @@
-"""The tables `[devices.camera]` and `[devices.screen]` of the configuration."""
+"""The screen in the configuration: its pose, and how its face stands off a plane."""
 
-from __future__ import annotations
-
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from membrane_ctrl.config.section import Section
-
-
-class AravisCameraConfig(Section):
-    """A GenICam camera (USB3 Vision or GigE Vision)."""
-
-    driver: Literal["aravis"]
-    camera: str = ""  # as `devices` lists it, or its address; empty: the first that is found
-    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16", "BayerRG8", "BayerGR8", "BayerGB8", "BayerBG8"] = (
-        "Mono8"
-    )
-    exposure_ms: Annotated[float, Field(gt=0, le=10_000)] = 20.0
-    gain_db: Annotated[float, Field(ge=0, le=48)] = 0.0
-    packet_bytes: Annotated[int, Field(ge=0, le=65_000)] = 0  # GigE Vision; 0: as the camera and the network agree
-    timeout_s: Annotated[float, Field(gt=0, le=60)] = 1.0
-
-    @property
-    def bits(self) -> int:
-        """Depth of a pixel."""
-        return int(self.pixel_format[-2:]) if self.pixel_format[-2:].isdigit() else 8
-
-
-class UvcCameraConfig(Section):
-    """A USB camera without GenICam."""
-
-    driver: Literal["uvc"]
-    port: str = "0"
-    exposure: Annotated[float, Field(ge=0)] = 0.0  # in the camera's own unit; 0 leaves it
-    gain: Annotated[float, Field(ge=0)] = 0.0
-    bits: Literal[8] = 8
-
-
-class FolderCameraConfig(Section):
-    """Pictures from a folder instead of a camera and a screen."""
-
-    driver: Literal["folder"]
-    folder: Annotated[str, Field(min_length=1)]
-
-
-class PygameScreenConfig(Section):
-    """The display with the fringes."""
-
-    driver: Literal["pygame"] = "pygame"
-    display: Annotated[int, Field(ge=0, le=15)] = 0
-    width_px: Annotated[int, Field(ge=16, le=16_384)]
-    height_px: Annotated[int, Field(ge=16, le=16_384)]
-    pixel_mm: Annotated[float, Field(gt=0.01, le=10)]
-    centre_px: tuple[float, float] | None = None  # (column, row) of O'; the screen's middle when absent
-    settle_ms: Annotated[float, Field(ge=0, le=5000)] | None = None  # measured at the start when absent
-    linearise: bool = True  # measure the display's response at the start and correct it
-    self_test: bool = True  # exposure and checkerboard at the start
-
-
-CameraTable = Annotated[AravisCameraConfig | UvcCameraConfig | FolderCameraConfig, Field(discriminator="driver")]
-ScreenTable = PygameScreenConfig
-
-
-# The screen in the configuration: its pose, and how its face stands off a plane.
-
+from firmware_iface.settings import Section
 
 Vector3 = tuple[float, float, float]
 Axis = Annotated[tuple[float, ...], Field(min_length=2, max_length=500)]
@@ -86,7 +26,7 @@ class HeightMapConfig(Section):
     heights_mm: tuple[Axis, ...]
 
     @model_validator(mode="after")
-    def _grid(self) -> HeightMapConfig:
+    def _grid(self) -> "HeightMapConfig":
         for name, axis in (("s_x_mm", self.s_x_mm), ("s_y_mm", self.s_y_mm)):
             steps = np.diff(axis)
             if not (steps[0] > 0 and np.ptp(steps) <= _EVEN * steps[0]):
@@ -121,7 +61,7 @@ class ScreenPoseConfig(Section):
         return self.origin_mm, self.s_x, self.s_y
 
     @model_validator(mode="after")
-    def _whole(self) -> ScreenPoseConfig:
+    def _whole(self) -> "ScreenPoseConfig":
         given = [value is not None for value in (self.origin_mm, self.s_x, self.s_y)]
         if any(given) and not all(given):
             raise ValueError("origin_mm, s_x and s_y belong together: give all or none")

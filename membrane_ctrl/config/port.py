@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from membrane_ctrl.config.section import Section
+from firmware_iface.settings import Section
 from membrane_ctrl.model.telemetry import FIELDS
 
 Seconds = Annotated[float, Field(ge=0, le=1e6)]

@@ -12,10 +12,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from firmware_iface.settings import AravisCameraConfig, Section, UvcCameraConfig
 from membrane_ctrl.config.devices import DevicesConfig
-from membrane_ctrl.config.optics import AravisCameraConfig, ScreenPoseConfig, UvcCameraConfig
+from membrane_ctrl.config.optics import ScreenPoseConfig
 from membrane_ctrl.config.port import AlarmsConfig, PortConfig
-from membrane_ctrl.config.section import Section
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]

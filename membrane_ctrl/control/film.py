@@ -99,7 +99,6 @@ class LeakGrowth:
             that lies shifts it; a film that really takes more gas gets more.
         most : float
             Times what the film used to take; infinite where a camera sees that it stands still.
-        dt_s : float
         """
         if not (math.isfinite(leak_um_per_s) and math.isfinite(flow_um_per_s)):
             return ""
@@ -127,7 +126,6 @@ class FilmMonitor:
 
     Parameters
     ----------
-    limits : LimitsConfig
     mirror : MirrorConfig
         Sag, and pressure if it is known, at displacement 0.
     """
@@ -156,7 +154,6 @@ class FilmMonitor:
 
         Parameters
         ----------
-        dt_s : float
         laser_um : float
             Reading of good quality, NaN without.
         trim_um : float

@@ -21,12 +21,7 @@ KICK_S = 0.1
 
 
 class PumpCurve:
-    """The inverse of the pump; it remembers whether it left the pump running.
-
-    Parameters
-    ----------
-    pump : PumpConfig
-    """
+    """The inverse of the pump; it remembers whether it left the pump running."""
 
     def __init__(self, pump: PumpConfig) -> None:
         self._pump = pump
@@ -97,10 +92,6 @@ class FeedForward:
 
     A value that jumps further than the weather can, or that no place where people work has, is a sensor's own, and
     moves nothing.
-
-    Parameters
-    ----------
-    loop : LoopConfig
     """
 
     def __init__(self, loop: LoopConfig) -> None:

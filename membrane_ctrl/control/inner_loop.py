@@ -16,64 +16,32 @@ from membrane_ctrl.control import film_health, filters, gas, pid
 
 @dataclass(frozen=True, slots=True)
 class LoopInput:
-    """What one tick knows.
+    """What one tick knows."""
 
-    Attributes
-    ----------
-    target_um : float
-        Where the setpoint is to go, without the trim.
-    trim_um : float
-        The shape loop's share of the setpoint; it changes slowly and is added behind the ramp.
-    displacement_um : float
-        Laser reading, as read.
-    ambient_pressure_pa, air_temperature_c : float
-        NaN without a sensor.
-    """
-
-    target_um: float
-    trim_um: float
-    displacement_um: float
-    ambient_pressure_pa: float
+    target_um: float  # where the setpoint is to go, without the trim
+    trim_um: float  # the shape loop's share of the setpoint; it changes slowly and is added behind the ramp
+    displacement_um: float  # laser reading, as read
+    ambient_pressure_pa: float  # NaN without a sensor
     air_temperature_c: float
 
 
 @dataclass(frozen=True, slots=True)
 class LoopOutput:
-    """What one tick decided, and from what.
+    """What one tick decided, and from what."""
 
-    Attributes
-    ----------
-    setpoint_um : float
-        Ramp and trim.
-    filtered_um, error_um : float
-        Filtered reading; setpoint minus it.
-    p_um_per_s, i_um_per_s, d_um_per_s, feedforward_um_per_s : float
-        The terms of the flow; the feed-forward holds the ramp's own speed too.
-    flow_wanted_um_per_s, flow_um_per_s : float
-        Before the limits; what the command gives.
-    pump_fraction : float
-        Command, 0..1.
-    saturated : bool
-        More was wanted than the pump has, or less than nothing.
-    leak_um_per_s : float
-        Estimated loss of gas, NaN until there is an estimate.
-    too_tight : bool
-        The mirror loses too little gas to be held within the band.
-    """
-
-    setpoint_um: float
+    setpoint_um: float  # ramp and trim
     filtered_um: float
-    error_um: float
+    error_um: float  # setpoint minus filtered reading
     p_um_per_s: float
     i_um_per_s: float
     d_um_per_s: float
-    feedforward_um_per_s: float
-    flow_wanted_um_per_s: float
+    feedforward_um_per_s: float  # the ramp's own speed included
+    flow_wanted_um_per_s: float  # before the limits
     flow_um_per_s: float
-    pump_fraction: float
-    saturated: bool
-    leak_um_per_s: float
-    too_tight: bool
+    pump_fraction: float  # command, 0..1
+    saturated: bool  # more was wanted than the pump has, or less than nothing
+    leak_um_per_s: float  # estimated loss of gas, NaN until there is an estimate
+    too_tight: bool  # the mirror loses too little gas to be held within the band
 
 
 # of a tick in which the loop has not run
@@ -98,11 +66,6 @@ class InnerLoop:
     """Two-degree-of-freedom PI(D) with feed-forward, on flow as a speed of the mirror's centre.
 
     Call exactly one of `step`, `stale` and `follow` a tick; any may follow any other without a bump.
-
-    Parameters
-    ----------
-    loop : LoopConfig
-    pump : PumpConfig
     """
 
     def __init__(self, loop: LoopConfig, pump: PumpConfig) -> None:
@@ -149,7 +112,6 @@ class InnerLoop:
 
         Parameters
         ----------
-        given : LoopInput
         dt_s : float
             True time since the last tick, > 0, clamped by the caller.
         """
@@ -191,7 +153,6 @@ class InnerLoop:
             The target is not used; a reading that is not finite leaves the last one.
         flow_um_per_s : float
             Put out as it is, within the pump's range.
-        dt_s : float
         """
         if math.isfinite(given.displacement_um):
             self._measured.update(given.displacement_um, dt_s)
@@ -218,7 +179,6 @@ class InnerLoop:
             As for `follow`.
         fraction : float
             Put out as it is, 0..1.
-        dt_s : float
         """
         flow_um_per_s = self._curve.flow(fraction)
         self.follow(given, flow_um_per_s, dt_s)

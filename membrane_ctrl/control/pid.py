@@ -45,7 +45,6 @@ class Pid:
 
     Parameters
     ----------
-    gains : PidGains
     flow_max_um_per_s : float
         Upper end of the integrator; the lower end is 0, for the pump takes no gas away.
     """
@@ -98,7 +97,6 @@ class FlowLimiter:
 
     Parameters
     ----------
-    flow_max_um_per_s : float
     rate_um_per_s2 : float
         Fastest change, either way.
     """

@@ -57,7 +57,6 @@ class Plausibility:
 
     Attributes
     ----------
-    liar : Liar
     changes : Changes
         What the three have seen; NaN until there is a reference.
     """
@@ -87,7 +86,6 @@ class Plausibility:
 
         Parameters
         ----------
-        dt_s : float
         displacement_um : float
             Laser reading of good quality, NaN without.
         gauge_pressure_pa : float

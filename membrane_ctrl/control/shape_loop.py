@@ -112,27 +112,15 @@ def sag_change(
 
 @dataclass(frozen=True, slots=True)
 class ShapeOutput:
-    """What the shape loop does, and why.
-
-    Attributes
-    ----------
-    state : ShapeState
-    reason : str
-        Why it is not tracking, or what holds it back; empty when there is nothing to say.
-    trim_um : float
-        To be added to the setpoint.
-    sag_change_um, sigma_um : float
-        Change of sag since lock as last admitted, and its standard deviation; NaN until there is one.
-    age_s : float
-        Age of the last admitted estimate; NaN until there is one.
-    """
+    """What the shape loop does, and why."""
 
     state: states.ShapeState
-    reason: str
-    trim_um: float
+    reason: str  # why it is not tracking, or what holds it back; empty when there is nothing to say
+    trim_um: float  # to be added to the setpoint
+    # change of sag since lock as last admitted, and its standard deviation; NaN until there is one
     sag_change_um: float
     sigma_um: float
-    age_s: float
+    age_s: float  # age of the last admitted estimate; NaN until there is one
 
 
 class ShapeLoop:
@@ -140,7 +128,6 @@ class ShapeLoop:
 
     Parameters
     ----------
-    config : ShapeConfig
     sensitivity : (36,) array
         Change of the Zernike coefficients per um of sag.
     """

@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from membrane_ctrl.control_port.protocol import encode
-from membrane_ctrl.control_port.sockets import short
+from membrane_ctrl.control_port import protocol, sockets
 from membrane_ctrl.model.errors import DeviceError, os_reason
 
 Message = dict[str, Any]
@@ -55,7 +54,7 @@ class PortClient:
         # would be refused at once.
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TURN)
         try:
-            with short(path) as address:
+            with sockets.short(path) as address:
                 connection.connect(address)
             connection.getpeername()  # a signal ends the wait for one's turn, which Python takes for connected
             connection.settimeout(_ANSWER_S)
@@ -91,7 +90,7 @@ class PortClient:
         """Send a request (`protocol.Request`) and wait for its answer. Raises DeviceError if none comes."""
         self._number += 1
         try:
-            self._connection.sendall(encode({**request, "number": self._number}))
+            self._connection.sendall(protocol.encode({**request, "number": self._number}))
         except OSError as error:
             raise DeviceError(f"{self._where}: {os_reason(error)}") from None
         for message in self.messages():

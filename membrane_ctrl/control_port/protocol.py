@@ -14,7 +14,8 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
-from membrane_ctrl.config import section, toml_file
+from firmware_iface.settings import Section
+from membrane_ctrl.config import toml_file
 from membrane_ctrl.controller.commands import TABLE, Kind
 
 VERSION = 1
@@ -51,7 +52,7 @@ def _words(most_bytes: int) -> AfterValidator:
     return AfterValidator(check)
 
 
-class Request(section.Section):
+class Request(Section):
     """What a client sends."""
 
     number: Annotated[int, Field(ge=0, lt=2**53)] = 0  # chosen by the client, returned with the answer

@@ -15,10 +15,9 @@ from typing import Any
 
 from membrane_ctrl.config import port, schema, toml_file
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.control_port import protocol, sockets
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
-from membrane_ctrl.control_port.protocol import KINDS, VERSION, Request, Wire
 from membrane_ctrl.control_port.session import FREE, Commander, Peer, PortSession, may_not
-from membrane_ctrl.control_port.sockets import Listeners
 from membrane_ctrl.controller import commands, tick
 from membrane_ctrl.model import errors, events, run_events, run_status, states
 
@@ -42,7 +41,7 @@ class RunHooks:
 class Port:
     """Commands in, answers and status out; `run` is the name of the run folder."""
 
-    def __init__(self, config: port.PortConfig, listeners: Listeners, run: str, hooks: RunHooks) -> None:
+    def __init__(self, config: port.PortConfig, listeners: sockets.Listeners, run: str, hooks: RunHooks) -> None:
         self._listeners, self._run, self._hooks = listeners, run, hooks
         self._tell, self._now = hooks.tell, hooks.now
         self._commander = Commander(config.commander_lapses_s)
@@ -121,12 +120,12 @@ class Port:
     async def _welcome_unix(self, connection: socket.socket, let_in: LetIn) -> None:
         assert self._listeners.unix is not None
         peer = self._listeners.unix.peer(connection)
-        await self._serve(await Wire.on(connection), peer)
+        await self._serve(await protocol.Wire.on(connection), peer)
 
     async def _welcome_tls(self, connection: socket.socket, let_in: LetIn) -> None:
         assert self._listeners.tls is not None
         try:
-            wire = await Wire.on(connection, self._listeners.tls.context)
+            wire = await protocol.Wire.on(connection, self._listeners.tls.context)
         except OSError as error:  # no certificate, an expired one, one of a stranger, no TLS at all, too slow
             self._refusals.record("tls:unknown", "", f"handshake: {error}")
             return
@@ -134,14 +133,14 @@ class Port:
         tls, certificate = self._listeners.tls, wire.certificate
         await self._serve(wire, tls.peer(certificate), tls.lasts_s(certificate))
 
-    async def _serve(self, wire: Wire, peer: Peer, lasts_s: float | None = None) -> None:
+    async def _serve(self, wire: protocol.Wire, peer: Peer, lasts_s: float | None = None) -> None:
         self._make_room(peer)
         session = PortSession(wire, peer, self.status)
         self._sessions.append(session)
         loop = asyncio.get_running_loop()
         expiry = None if lasts_s is None else loop.call_later(lasts_s, self._turn_out, session, _EXPIRED)
         greeting = {
-            "membrane_ctrl": VERSION,
+            "membrane_ctrl": protocol.VERSION,
             "run": self._run,
             "you": peer.who,
             "role": peer.role,
@@ -164,7 +163,7 @@ class Port:
         if crowd:
             self._turn_out(min(crowd, key=lambda session: session.heard_s), "too many connections: silent longest")
 
-    async def _answer(self, session: PortSession, request: Request) -> dict[str, Any]:
+    async def _answer(self, session: PortSession, request: protocol.Request) -> dict[str, Any]:
         """Do what is asked, or say why not; the controller records its own refusals."""
         peer = session.peer
         refusal = may_not(peer, request.do) or self._claim_command(peer, request)
@@ -182,7 +181,7 @@ class Port:
             return {"ok": False, "refused": refusal}
         return {"ok": True, "state": status_table(self._status)["state"]}
 
-    def _claim_command(self, peer: Peer, request: Request) -> str:
+    def _claim_command(self, peer: Peer, request: protocol.Request) -> str:
         if request.do in FREE:
             return ""
         former = self._commander.holder(self._now())
@@ -196,7 +195,7 @@ class Port:
                     )
         return refusal
 
-    def _run_errand(self, session: PortSession, request: Request) -> dict[str, Any]:
+    def _run_errand(self, session: PortSession, request: protocol.Request) -> dict[str, Any]:
         who = session.peer.who
         match request.do:
             case "watch":
@@ -208,9 +207,9 @@ class Port:
                 self._tell(run_events.AlarmsAcknowledged(who, request.why))
         return {"ok": True, "status": self.status(), "loop": self._hooks.loop().model_dump()}
 
-    def _command(self, peer: Peer, request: Request) -> commands.Command:
+    def _command(self, peer: Peer, request: protocol.Request) -> commands.Command:
         """The command of a request. Raises InputError for gains or an experiment that are none."""
-        kind = next(kind for kind in KINDS if kind == request.do)
+        kind = next(kind for kind in protocol.KINDS if kind == request.do)
         loop = None if request.loop is None else self._new_loop(request.loop)
         experiment = (
             None if request.experiment is None else toml_file.parse(request.experiment, ExperimentSpec, "tune")
@@ -274,7 +273,7 @@ def _number(value: float) -> str:
 
 async def serve_metrics(connection: socket.socket, text: Callable[[], str]) -> None:
     """Answer one HTTP request: `GET /metrics`, or 404."""
-    wire = await Wire.on(connection)
+    wire = await protocol.Wire.on(connection)
     try:
         with contextlib.suppress(TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError):
             async with asyncio.timeout(_REQUEST_S):

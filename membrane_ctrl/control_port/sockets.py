@@ -15,7 +15,6 @@ import stat
 import struct
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -241,7 +240,7 @@ class Listeners:
         return found
 
 
-def listeners_for(config: PortConfig, logs_dir: Path, stack: ExitStack) -> Listeners:
+def listeners_for(config: PortConfig, logs_dir: Path, stack: contextlib.ExitStack) -> Listeners:
     """Bind what the configuration asks for; the stack closes it. Raises InputError or DeviceError."""
     if not config.enabled:
         return Listeners()

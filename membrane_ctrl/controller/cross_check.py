@@ -13,7 +13,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from firmware_iface.roles import BenchIdentity
-from membrane_ctrl.config.devices import DevicesConfig, VaisalaPtb330Config
+from firmware_iface.settings import VaisalaPtb330Config
+from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller import cross_check_plant, pump_obeys, safety
 from membrane_ctrl.model.errors import FindingsError

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from firmware_iface.roles import BenchIdentity
-from membrane_ctrl.config.devices import ModbusMapConfig, Optoncdt1420Config
+from firmware_iface.settings import ModbusMapConfig, Optoncdt1420Config
 from membrane_ctrl.config.schema import Config, GeometryConfig
 from membrane_ctrl.control import film, gas, inner_loop
 from membrane_ctrl.controller import pump_obeys, safety

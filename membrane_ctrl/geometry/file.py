@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 
 import tomli_w
 
+from firmware_iface.settings import Section
 from membrane_ctrl.config.schema import CameraConfig, Config, GeometryConfig, OpticsConfig
-from membrane_ctrl.config.section import Section
 from membrane_ctrl.config.toml_file import parse, prune, read_toml, with_height_map
 from membrane_ctrl.model import errors, files, plain_json
 
@@ -57,21 +57,11 @@ class CalibrationTable(Section):
 
 @dataclass(frozen=True)
 class GeometryOrigin:
-    """Which geometry a result was made with.
+    """Which geometry a result was made with."""
 
-    Attributes
-    ----------
-    hash : str
-        Of its numbers: that of the file, or of what the set itself states.
-    file : str
-        Where it was read; empty for the set's own.
-    calibrated_utc : str
-        When; empty if it is not a calibrated one.
-    """
-
-    hash: str
-    file: str = ""
-    calibrated_utc: str = ""
+    hash: str  # of its numbers: that of the file, or of what the set itself states
+    file: str = ""  # where it was read; empty for the set's own
+    calibrated_utc: str = ""  # when; empty if it is not a calibrated one
 
     def table(self) -> dict[str, str | None]:
         """For JSON."""
@@ -80,29 +70,15 @@ class GeometryOrigin:
 
 @dataclass(frozen=True)
 class GeometryFile:
-    """A geometry that was read.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    geometry : GeometryConfig
-        Poses.
-    lens, pitch : LensTable, PitchTable or None
-        If they were calibrated.
-    calibration : CalibrationTable or None
-        None for what was written by hand.
-    text : str
-        All that the file says, the screen's height map in it and not beside it.
-    """
+    """A geometry that was read."""
 
     path: Path
-    geometry: GeometryConfig
-    lens: LensTable | None
+    geometry: GeometryConfig  # poses
+    lens: LensTable | None  # if they were calibrated
     pitch: PitchTable | None
-    calibration: CalibrationTable | None
+    calibration: CalibrationTable | None  # None for a file written by hand
     origin: GeometryOrigin
-    text: str
+    text: str  # all that the file says, the screen's height map in it and not beside it
 
     def over(self, optics: OpticsConfig) -> OpticsConfig:
         """The bench with this geometry instead of its own. Raises InputError if it is of another camera."""
@@ -118,10 +94,7 @@ class GeometryFile:
 def read_geometry(path: Path) -> GeometryFile:
     """A geometry file: a `[geometry]` table as in `capture.toml`, its keys alone, or what `calibrate` wrote.
 
-    Raises
-    ------
-    InputError
-        One line with the file and the field; also for calibrated numbers that were changed by hand.
+    Raises InputError, also for calibrated numbers that were changed by hand.
     """
     tables = read_toml(path)
     calibrated = tables.get("schema") == plain_json.SCHEMA
@@ -171,27 +144,13 @@ KEPT = "geometry.toml"  # in the run's folder
 
 @dataclass(frozen=True)
 class InForce:
-    """What the cycles of a run measure with.
+    """What the cycles of a run measure with."""
 
-    Attributes
-    ----------
-    optics : OpticsConfig
-        The configuration's, with the calibrated geometry if there is one.
-    origin : GeometryOrigin
-        Its name.
-    calibration : CalibrationTable or None
-        What a drift is seen against.
-    text : str
-        What the file says; empty without one.
-    note : str
-        Why what the configuration states by hand is used although it names a file.
-    """
-
-    optics: OpticsConfig
-    origin: GeometryOrigin
-    calibration: CalibrationTable | None = None
-    text: str = ""
-    note: str = ""
+    optics: OpticsConfig  # the configuration's, with the calibrated geometry if there is one
+    origin: GeometryOrigin  # its name
+    calibration: CalibrationTable | None = None  # what a drift is seen against
+    text: str = ""  # what the file says; empty without one
+    note: str = ""  # why what the configuration states by hand is used although it names a file
 
     def keep(self, run_dir: Path) -> None:
         """Leave a copy in the run's folder: whoever measures or looks back takes that. Raises InputError."""
@@ -209,10 +168,7 @@ def geometry_in_force(config: Config) -> InForce:
     A file that is not there yet is no error: the first calibration of a bench has to be taken with what was measured
     by hand. The note says so.
 
-    Raises
-    ------
-    InputError
-        If the file is there and cannot be used.
+    Raises InputError if the file is there and cannot be used.
     """
     return _read(config.optics.geometry_file, config)
 

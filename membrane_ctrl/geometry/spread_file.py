@@ -15,9 +15,8 @@ import numpy as np
 import tomli_w
 from pydantic import Field
 
-from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
-from membrane_ctrl.config.section import Section
-from membrane_ctrl.config.toml_file import load, parse, read_toml
+from firmware_iface.settings import Section
+from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.geometry.file import LensTable
 from membrane_ctrl.metrology.calibrate.parameters import NAMES
 from membrane_ctrl.metrology.uncertainty.geometry_spread import PAPER_SPREAD, GeometrySpread, changed, stated_spread
@@ -34,10 +33,10 @@ class CovarianceTable(Section):
 
 def read_spread(path: Path) -> GeometrySpread | None:
     """The covariance that a geometry file gives; None if it has none. Raises InputError."""
-    table = read_toml(path).get("covariance")
+    table = toml_file.read_toml(path).get("covariance")
     if table is None:
         return None
-    content = parse(table, CovarianceTable, f"{path}: covariance")
+    content = toml_file.parse(table, CovarianceTable, f"{path}: covariance")
     if any(len(row) != len(content.names) for row in content.matrix) or len(content.matrix) != len(content.names):
         raise InputError(f"{path}: covariance.matrix: {len(content.names)} names need as many rows and columns")
     try:
@@ -46,16 +45,13 @@ def read_spread(path: Path) -> GeometrySpread | None:
         raise InputError(f"{path}: covariance.{error}") from None
 
 
-def spread_of(geometry: GeometryConfig, file: Path | None) -> tuple[GeometrySpread, str]:
+def spread_of(geometry: schema.GeometryConfig, file: Path | None) -> tuple[GeometrySpread, str]:
     """How well a geometry is known, and where that is said; the first that there is.
 
     The file's covariance, the geometry's own sigmas, the paper's instruments for the short form. A general form
     without a covariance is taken as exact.
 
-    Raises
-    ------
-    InputError
-        If the file's covariance is of the other form.
+    Raises InputError if the file's covariance is of the other form.
     """
     given = None if file is None else read_spread(file)
     if given is not None:
@@ -83,7 +79,7 @@ class PriorFile(Section):
 
     schema_: Annotated[str, Field(alias="schema")]
     camera: LensTable | None = None
-    geometry: GeometryConfig | None = None
+    geometry: schema.GeometryConfig | None = None
     sigmas: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
     made: dict[str, Any] = Field(default_factory=dict)
 
@@ -95,7 +91,7 @@ class Prior:
     path: Path
     content: PriorFile
 
-    def over(self, optics: OpticsConfig) -> OpticsConfig:
+    def over(self, optics: schema.OpticsConfig) -> schema.OpticsConfig:
         """The bench with it. Raises InputError if it is of another camera."""
         if self.content.camera is not None:
             optics = optics.model_copy(update={"camera": self.content.camera.over(optics.camera, self.path)})
@@ -105,12 +101,12 @@ class Prior:
         if geometry.reference_displacement_um is None:
             known = {"reference_displacement_um": optics.geometry.reference_displacement_um}
             geometry = geometry.model_copy(update=known)
-        return parse({**dict(optics), "geometry": geometry}, OpticsConfig, str(self.path))
+        return toml_file.parse({**dict(optics), "geometry": geometry}, schema.OpticsConfig, str(self.path))
 
 
 def read_prior(path: Path) -> Prior:
     """Read one. Raises InputError."""
-    content = load(path, PriorFile)
+    content = toml_file.load(path, PriorFile)
     if content.schema_ != SCHEMA:
         raise errors.InputError(
             f"{path}: schema = {content.schema_}: a prior is {SCHEMA}; a geometry goes by --geometry"

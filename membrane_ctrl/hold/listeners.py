@@ -14,8 +14,7 @@ from functools import partial
 from types import TracebackType
 
 from membrane_ctrl.controller import commands, tick
-from membrane_ctrl.model import run_events, run_status, states
-from membrane_ctrl.model.events import CommandTaken, Event, Fault, Resumed, StateEntered
+from membrane_ctrl.model import events, run_events, run_status, states
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile, ResumeLog
 
 
@@ -42,15 +41,15 @@ class FaultLatch:
         resumes: ResumeLog | None,
         run: str,
         utc: Callable[[float], datetime],
-        tell: Callable[[Event], None],
+        tell: Callable[[events.Event], None],
     ) -> None:
         self._file, self._resumes, self._run, self._utc, self._tell = file, resumes, run, utc, tell
         # one thread, so that a fault and its acknowledgement stay in order; it exists only once there is a fault
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="latched-fault")
-        self._news: deque[Event] = deque()  # from the disk's thread
+        self._news: deque[events.Event] = deque()  # from the disk's thread
         self._failing = False
         self._last: Callable[[], None] = lambda: None
-        self._fault: Fault | None = None
+        self._fault: events.Fault | None = None
 
     @property
     def latched(self) -> str:
@@ -82,16 +81,16 @@ class FaultLatch:
         self._report()
         for event in outputs.events:
             match event:
-                case Fault():
+                case events.Fault():
                     self._fault = event
-                case StateEntered(state="fault"):
+                case events.StateEntered(state="fault"):
                     self._latch(outputs.row.mono_s)
-                case CommandTaken(command="latch", who=who, refused=None) if who != commands.AT_START:
+                case events.CommandTaken(command="latch", who=who, refused=None) if who != commands.AT_START:
                     # what is latched at the start is in the file already
                     self._lock(who, event.text or "", outputs.row.mono_s)
-                case Resumed() if self._resumes is not None:
+                case events.Resumed() if self._resumes is not None:
                     self._disk.submit(self._try, partial(self._resumes.add, self._utc(outputs.row.mono_s)))
-                case StateEntered(from_="fault") | CommandTaken(command="ack", refused=None) if (
+                case events.StateEntered(from_="fault") | events.CommandTaken(command="ack", refused=None) if (
                     self._file is not None
                 ):
                     self._disk.submit(self._try, self._file.clear)
@@ -165,7 +164,7 @@ class SystemdNotify:
         self._send("STOPPING=1")
         self._socket.close()
 
-    def told(self, event: Event) -> None:
+    def told(self, event: events.Event) -> None:
         """Note a child's report for the next status line."""
         self._status = self._status.after_event(event)
 

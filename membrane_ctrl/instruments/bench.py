@@ -4,43 +4,35 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 
-from firmware_iface import role_bench, roles
-from firmware_iface.drivers import (
-    bronkhorst,
-    bronkhorst_propar,
-    keyence_dl_rs1a,
-    modbus_map,
-    optoncdt1420,
-    vaisala_ptb330,
-    ventus,
-)
+from firmware_iface import role_bench, roles, settings
+from firmware_iface.drivers import bronkhorst, bronkhorst_propar, modbus_map
+from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
+from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.links import modbus_links, serial_port
-from membrane_ctrl.config import devices as table
-from membrane_ctrl.config.devices import AnyDriver, DevicesConfig
+from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
+from firmware_iface.drivers.ventus import Ventus
+from firmware_iface.links import modbus_rtu, serial_port
+from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.model.errors import DeviceError, InputError
 
 # From a `[devices.<role>]` table to the driver that fills the role.
 
 
 ACTUATORS = ("pump", "vent")
-_SERIAL_DRIVERS = {
-    "optoncdt1420": optoncdt1420.Optoncdt1420,
-    "keyence_dl_rs1a": keyence_dl_rs1a.KeyenceDlRs1a,
-    "vaisala_ptb330": vaisala_ptb330.VaisalaPtb330,
-    "ventus": ventus.Ventus,
+_SERIAL_DRIVERS: dict[type[settings.Section], Callable[[Any], roles.Device]] = {
+    settings.Optoncdt1420Config: Optoncdt1420,
+    settings.KeyenceDlRs1aConfig: KeyenceDlRs1a,
+    settings.VaisalaPtb330Config: VaisalaPtb330,
+    settings.VentusConfig: Ventus,
 }
 
 
 def role_devices(devices: DevicesConfig) -> role_bench.RoleDevices:
     """The drivers that the tables name, not yet connected; those on one serial bus share it.
 
-    Raises
-    ------
-    InputError
-        A port, URL, preset or setting that the driver does not take.
+    Raises InputError (a port, URL, preset or setting that the driver does not take).
     """
-    links = modbus_links.ModbusLinks()
+    links = modbus_rtu.ModbusLinks()
     made: dict[str, Any] = {}
     for role, section in devices.roles().items():
         try:
@@ -50,20 +42,20 @@ def role_devices(devices: DevicesConfig) -> role_bench.RoleDevices:
     return role_bench.RoleDevices(**made)
 
 
-def _driver(role: str, section: AnyDriver, links: modbus_links.ModbusLinks) -> Any:
+def _driver(role: str, section: settings.AnyDriver, links: modbus_rtu.ModbusLinks) -> Any:
     match section:
-        case table.ModbusMapConfig():
+        case settings.ModbusMapConfig():
             return _modbus_value(role, section, links)
-        case table.BronkhorstModbusConfig():
+        case settings.BronkhorstModbusConfig():
             link = links.link(section.link, section.unit_id, section.timeout_s)
             return _bronkhorst(role, bronkhorst.ModbusParameters(link), section.serial)
-        case table.BronkhorstProparConfig():
+        case settings.BronkhorstProparConfig():
             port = serial_port.SerialPort(section.port, serial_port.SerialSettings(section.baud))
             return _bronkhorst(
                 role, bronkhorst_propar.ProparParameters(port, section.node, section.timeout_s), section.serial
             )
         case _:
-            return _SERIAL_DRIVERS[section.driver](**section.model_dump(exclude={"driver"}))
+            return _SERIAL_DRIVERS[type(section)](section)
 
 
 def _bronkhorst(
@@ -73,14 +65,14 @@ def _bronkhorst(
 
 
 def _modbus_value(
-    role: str, section: table.ModbusMapConfig, links: modbus_links.ModbusLinks
+    role: str, section: settings.ModbusMapConfig, links: modbus_rtu.ModbusLinks
 ) -> modbus_map.ModbusValue:
     value_map, fence = modbus_map.make_map(map_keys(section), section.preset)
     link = links.link(section.link, section.unit_id, section.timeout_s, fence)
     return modbus_map.ModbusValue(link, value_map, rest=0.0 if role in ACTUATORS else None)
 
 
-def map_keys(section: table.ModbusMapConfig) -> dict[str, Any]:
+def map_keys(section: settings.ModbusMapConfig) -> dict[str, Any]:
     """The keys of a map in the words of `drivers.modbus_map`."""
     keys = section.model_dump(include={"function", "type", "word_order", "address", "raw", "value", "limits"})
     if section.identity_address is not None and section.identity_equals is not None:
@@ -114,10 +106,7 @@ def pump_board(devices: DevicesConfig, url: str) -> PumpBoard:
 async def connect(bench: roles.Bench, devices: DevicesConfig) -> roles.BenchIdentity:
     """Open the bench, with patience for a device that is not there yet and none for one that is the wrong one.
 
-    Raises
-    ------
-    DeviceError
-        One line that names the device and what is wrong.
+    Raises DeviceError (one line that names the device and what is wrong).
     """
     return await patiently(bench.open, devices.board or "devices")  # a composed bench names the role itself
 

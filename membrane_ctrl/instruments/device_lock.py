@@ -13,8 +13,8 @@ import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from firmware_iface.links import modbus_links, usb_ports
-from firmware_iface.roles import LinkError
+from firmware_iface import roles, settings
+from firmware_iface.links import modbus_rtu, serial_port
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.terminal import one_line
@@ -30,15 +30,12 @@ _SHOWN = 100  # letters of the holder's command line
 def locked(devices: Iterable[str]) -> Iterator[None]:
     """Have these devices for oneself; given back at the end, or with the process.
 
+    Raises DeviceError (one line: which device another program uses, who that is, and what to do).
+
     Parameters
     ----------
     devices : iterable of str
         As `device_names` or `modbus_names` has them.
-
-    Raises
-    ------
-    DeviceError
-        One line: which device another program uses, who that is, and what to do.
     """
     with contextlib.ExitStack() as stack:
         for device in sorted(set(devices)):
@@ -60,9 +57,10 @@ def device_names(devices: DevicesConfig) -> set[str]:
         return modbus_names(devices.board, devices.unit_id)
     names: set[str] = set()
     for section in devices.roles().values():
-        names |= (
-            {_serial_name(section.port)} if hasattr(section, "port") else modbus_names(section.link, section.unit_id)
-        )
+        if isinstance(section, settings.ON_MODBUS):
+            names |= modbus_names(section.link, section.unit_id)
+        else:
+            names.add(_serial_name(section.port))
     return names
 
 
@@ -71,7 +69,7 @@ def modbus_names(url: str, unit_id: int) -> set[str]:
     if url.startswith("rtu:"):
         return {_serial_name(url.removeprefix("rtu://").partition("?")[0])}
     try:
-        host, port = modbus_links.parse_tcp_url(url)
+        host, port = modbus_rtu.parse_tcp_url(url)
     except ValueError:
         return {url}  # no device can be there: whoever opens it says so
     return {f"{address} port {port} unit {unit_id}" for address in _addresses(host)}
@@ -79,8 +77,8 @@ def modbus_names(url: str, unit_id: int) -> set[str]:
 
 def _serial_name(port: str) -> str:
     try:
-        return os.path.realpath(usb_ports.port_path(port))
-    except LinkError:
+        return os.path.realpath(serial_port.port_path(port))
+    except roles.LinkError:
         return port  # not plugged in, or not to be told from another
 
 

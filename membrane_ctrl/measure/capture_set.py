@@ -14,21 +14,18 @@ from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from firmware_iface.roles import Pattern
+from firmware_iface.settings import Section
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig, PatternConfig
-from membrane_ctrl.config.section import Section
 from membrane_ctrl.config.toml_file import parse, prune, read_toml, with_height_map
 from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, origin_of
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
 from membrane_ctrl.metrology.phase import AXES, GRAY_BITS
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import FloatArray, Image
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.files import read_bytes
-
-Frames = NDArray[np.uint8] | NDArray[np.uint16]
 
 _DEPTHS = (10, 12, 14, 16)  # bits of a sensor in 16-bit files, when the set does not say
 _READERS = 2
@@ -63,43 +60,19 @@ class CaptureFile(Section):
 
 @dataclass(frozen=True)
 class CaptureHead:
-    """What `capture.toml` says, checked and in order.
+    """What `capture.toml` says, checked and in order."""
 
-    Attributes
-    ----------
-    folder : Path
-        Of the set.
-    kind : "full" or "fringes"
-        See INTERFACES section 3.
-    reference : Path or None
-        Of a fringes set: the full set that anchors it.
-    optics : OpticsConfig
-        Geometry, camera, pattern and mirror; `camera.bits` is to be trusted only if `bits_stated`.
-    bits_stated : bool
-        Whether the set says how deep its frames are.
-    files : tuple of str
-        In the order of the patterns.
-    patterns : tuple of Pattern
-        x sinusoids, x Gray bits, y sinusoids, y Gray bits, white, black (of a full set).
-    time_s, displacement_um : (frames,) arrays
-        NaN where the set says nothing.
-    ignored : tuple of str
-        Keys of the file that are not known.
-    geometry : GeometryOrigin
-        Which geometry is in `optics`.
-    """
-
-    folder: Path
+    folder: Path  # of the set
     kind: Literal["full", "fringes"]
-    reference: Path | None
-    optics: OpticsConfig
-    bits_stated: bool
-    files: tuple[str, ...]
-    patterns: tuple[Pattern, ...]
-    time_s: FloatArray
-    displacement_um: FloatArray
-    ignored: tuple[str, ...]
-    geometry: GeometryOrigin
+    reference: Path | None  # of a fringes set: the full set that anchors it
+    optics: OpticsConfig  # geometry, camera, pattern and mirror; `camera.bits` is to be trusted only if `bits_stated`
+    bits_stated: bool  # whether the set says how deep its frames are
+    files: tuple[str, ...]  # in the order of the patterns
+    patterns: tuple[Pattern, ...]  # x sinusoids, x Gray bits, y sinusoids, y Gray bits, white, black (of a full set)
+    time_s: FloatArray  # (frames,): NaN where the set says nothing
+    displacement_um: FloatArray  # (frames,)
+    ignored: tuple[str, ...]  # keys of the file that are not known
+    geometry: GeometryOrigin  # which geometry is in `optics`
 
 
 @dataclass(frozen=True)
@@ -119,25 +92,15 @@ class CaptureSet:
     """
 
     head: CaptureHead
-    frames: Frames
+    frames: Image
     unusable: dict[int, str]
     lost: tuple[int, ...] = ()
 
 
 def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead:
-    """Read `capture.toml`.
+    """Read `capture.toml`. Raises InputError.
 
-    Parameters
-    ----------
-    folder : Path
-        The set.
-    geometry : GeometryFile, optional
-        Used instead of the set's own, with the lens and the pitch that were calibrated with it.
-
-    Raises
-    ------
-    InputError
-        One line with the file and the field.
+    `geometry` replaces the set's own, with the lens and the pitch that were calibrated with it.
     """
     path = folder / "capture.toml"
     if not folder.is_dir():
@@ -191,13 +154,10 @@ def read_set(folder: Path, geometry: GeometryFile | None = None) -> CaptureSet:
     return assemble(head, images)
 
 
-def assemble(head: CaptureHead, images: Sequence[Frames | str]) -> CaptureSet:
+def assemble(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet:
     """Frames of one size and depth in one array; an image that is a text is the reason why there is none.
 
-    Raises
-    ------
-    InputError
-        If no frame is readable, or if most contradict the file's own camera.
+    Raises InputError if no frame is readable, or if most contradict the file's own camera.
     """
     path = head.folder / "capture.toml"
     good = [image for image in images if not isinstance(image, str)]
@@ -210,7 +170,7 @@ def assemble(head: CaptureHead, images: Sequence[Frames | str]) -> CaptureSet:
         raise InputError(
             f"{path}: camera.width_px, height_px: {size[1]} x {size[0]}, but the images are {seen[1]} x {seen[0]}"
         )
-    frames: Frames = np.zeros((len(images), *size), depth)
+    frames: Image = np.zeros((len(images), *size), depth)
     unusable: dict[int, str] = {}
     for k, image in enumerate(images):
         if isinstance(image, str):
@@ -253,7 +213,7 @@ def _with_reference_displacement(optics: OpticsConfig, displacement_um: float | 
     return optics.model_copy(update={"geometry": geometry.model_copy(update=update)})
 
 
-def _read_image(path: Path) -> Frames | str:
+def _read_image(path: Path) -> Image | str:
     """The image, or why there is none."""
     try:
         image = decoded_image(read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_UNCHANGED)
@@ -265,10 +225,10 @@ def _read_image(path: Path) -> Frames | str:
         return f"unreadable: {image.shape[2]} colour channels instead of one"
     if image.dtype not in (np.uint8, np.uint16):
         return f"wrong bit depth: {image.dtype} pixels"
-    return image  # type: ignore[return-value]  # checked above
+    return image
 
 
-def _depth(head: CaptureHead, frames: Frames, path: Path) -> int:
+def _depth(head: CaptureHead, frames: Image, path: Path) -> int:
     """Bits of the sensor: as stated, else the least of the usual ones that holds the brightest pixel."""
     bits = head.optics.camera.bits
     if not head.bits_stated:

@@ -4,7 +4,8 @@ import struct
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from membrane_ctrl.model.arrays import AnyArray
 
 # A file of 16-bit pixels that do not compress.
 IMAGE_BYTES_MAX = 150_000_000
@@ -16,20 +17,11 @@ _WIDTH, _HEIGHT = 256, 257  # tags of a TIFF
 _SHORT = 3  # the type of a 16-bit number in a TIFF
 
 
-def decoded_image(data: bytes, flags: int) -> NDArray[np.generic]:
+def decoded_image(data: bytes, flags: int) -> AnyArray:
     """The pixels of an image file.
 
-    Parameters
-    ----------
-    data : bytes
-        The file's content: PNG, TIFF, BMP, JPEG.
-    flags : int
-        Of `cv2.imdecode`.
-
-    Raises
-    ------
-    ValueError
-        Not an image, cut short, or of more than `PIXELS_MAX`; the message says which.
+    Raises ValueError if it is not an image, is cut short, or has more than `PIXELS_MAX` pixels. `data` is the
+    file's content: PNG, TIFF, BMP or JPEG; `flags` are those of `cv2.imdecode`.
     """
     if data.startswith(_PNG) and b"IEND" not in data[-12:]:
         # the decoder would write to the terminal, and might fill the rest with black

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from membrane_ctrl.geometry.file import read_geometry
+from membrane_ctrl.measure import results, sofast
 from membrane_ctrl.measure.measurement import Measurement, measure_set
-from membrane_ctrl.measure.results import ErrorBars, details_table, error_bars, result_table, write_result
-from membrane_ctrl.measure.sofast import SofastMeasurement, lit_pixels, read_measurement, series_of
 from membrane_ctrl.metrology.frames.series_integrity import SeriesFlag, check_series
 from membrane_ctrl.metrology.optics.geometry import Outline, find_outline
 from membrane_ctrl.metrology.optics.surface import RadialProfile, radial_profile
@@ -33,10 +32,10 @@ def measure_command(
     target = out.resolve() if out else folder / "result"  # a link that a person names is meant
     light, outline = _outline(measurement)
     profile = _profile(measurement)
-    bars = error_bars(measurement, geometry)
+    bars = results.error_bars(measurement, geometry)
     begin = time.perf_counter()
     try:
-        write_result(target, measurement, details_table(measurement, profile, outline, bars), bars)
+        results.write_result(target, measurement, results.details_table(measurement, profile, outline, bars), bars)
         drawn: list[Path] = []
         if pictures:
             from membrane_ctrl.measure.pictures import draw_all
@@ -50,7 +49,7 @@ def measure_command(
         raise InputError(f"{target}: cannot be written: {error.strerror or error}") from None
     print(f"written to {target} in {time.perf_counter() - begin:.1f} s", file=sys.stderr)
     if as_json:
-        print(json.dumps(result_table(measurement)))
+        print(json.dumps(results.result_table(measurement)))
     else:
         print("\n".join(_lines(measurement, profile, outline, bars)))
     return int(Exit.REJECTED if measurement.verdict == "rejected" else Exit.DONE)
@@ -76,7 +75,7 @@ def _profile(measurement: Measurement) -> RadialProfile | None:
 
 
 def _lines(
-    measurement: Measurement, profile: RadialProfile | None, outline: Outline | None, bars: ErrorBars | None
+    measurement: Measurement, profile: RadialProfile | None, outline: Outline | None, bars: results.ErrorBars | None
 ) -> list[str]:
     """What a person wants to read."""
     full = measurement.full
@@ -116,13 +115,13 @@ _LEAST_PIXELS = 200  # fewer tell nothing of a frame
 def facet_command(path: Path, as_json: bool) -> int:
     """Check the frames and say what was found. Returns the exit code; raises InputError for what is no such file."""
     try:
-        measurement = read_measurement(path)
+        measurement = sofast.read_measurement(path)
     except (ValueError, OSError, ImportError) as error:
         raise InputError(str(error)) from None
-    mask = lit_pixels(measurement)
+    mask = sofast.lit_pixels(measurement)
     if np.count_nonzero(mask) < _LEAST_PIXELS:
         raise InputError(f"{path}: only {np.count_nonzero(mask)} pixels see fringes")
-    found = check_series(series_of(measurement, mask), measurement.black[mask], measurement.white[mask])
+    found = check_series(sofast.series_of(measurement, mask), measurement.black[mask], measurement.white[mask])
     flagged = [{"file": _name(measurement, flag), "reason": flag.reason} for flag in found.flags]
     table = {
         "schema": "membrane-frames/1",
@@ -135,7 +134,7 @@ def facet_command(path: Path, as_json: bool) -> int:
     return int(Exit.REJECTED if found.verdict == "rejected" else Exit.DONE)
 
 
-def _name(measurement: SofastMeasurement, flag: SeriesFlag) -> str:
+def _name(measurement: sofast.SofastMeasurement, flag: SeriesFlag) -> str:
     """For a person: axis, periods a screen, step from 0."""
     if flag.axis in ("white", "black"):
         return flag.axis

@@ -98,11 +98,8 @@ def read_anchor(folder: Path, geometry: GeometryFile | None = None) -> tuple[Cap
 def stack_of(capture: CaptureSet) -> frame_stack.FrameStack:
     """The frames for the metrology.
 
-    Raises
-    ------
-    RejectedSetError
-        If a picture is missing or unreadable. It could often be done without, but a set that was not written whole is
-        not to be trusted for the rest of it either.
+    Raises RejectedSetError if a picture is missing or unreadable. It could often be done without, but a set that was
+    not written whole is not to be trusted for the rest of it either.
     """
     if capture.lost:
         flags = tuple(integrity.Flag(k, capture.unusable[k], math.inf) for k in capture.lost)
@@ -195,12 +192,7 @@ class Figures:
     def of(self, folder: Path) -> SetFigure:
         """Read and measure a set.
 
-        Raises
-        ------
-        InputError
-            If the set or its reference is invalid.
-        RejectedError
-            If its frames give no usable figure.
+        Raises InputError if the set or its reference is invalid; RejectedError if its frames give no usable figure.
         """
         capture = read_set(folder, self._geometry)
         anchor = None

@@ -33,24 +33,12 @@ if TYPE_CHECKING:  # matplotlib takes a second to load
 
 @dataclass(frozen=True)
 class ErrorBars:
-    """Covariances (36, 36) in mm^2 of the fit's parameters.
+    """Covariances (36, 36) of the fit's parameters, mm^2."""
 
-    Attributes
-    ----------
-    noise : array
-        From the pixels' noise, or the scatter of the slopes if that is larger.
-    geometry : array
-        From the geometry's spread; zeros if the poses are taken as exact.
-    source : str
-        Where that spread is stated.
-    grid : HeightMap
-        Where `maps_um` has its points.
-    """
-
-    noise: FloatArray
-    geometry: FloatArray
-    source: str
-    grid: monte_carlo.HeightMap
+    noise: FloatArray  # from the pixels' noise, or the scatter of the slopes if that is larger
+    geometry: FloatArray  # from the geometry's spread; zeros if the poses are taken as exact
+    source: str  # where that spread is stated
+    grid: monte_carlo.HeightMap  # where `maps_um` has its points
 
     @property
     def sag_um(self) -> tuple[float, float]:
@@ -68,15 +56,8 @@ class ErrorBars:
 def error_bars(measurement: Measurement, geometry: Path | None) -> ErrorBars | None:
     """Error bars of a measurement; None if it has no figure.
 
-    Parameters
-    ----------
-    geometry : Path, optional
-        The file that the geometry is from, with its covariance.
-
-    Raises
-    ------
-    InputError
-        If that covariance is none, or of the other form of geometry.
+    Raises InputError if that covariance is none, or of the other form of geometry. `geometry` is the file
+    with the covariance.
     """
     full, checked, optics = measurement.full, measurement.checked, measurement.head.optics
     if full is None or checked is None:

@@ -18,26 +18,15 @@ _ELEMENTS_MAX = 100_000_000  # 24 frames of 4 megapixels; each takes eight bytes
 
 @dataclass(frozen=True)
 class SofastMeasurement:
-    """Frames of a measurement.
+    """Frames of a measurement."""
 
-    Attributes
-    ----------
-    frames_x, frames_y : (F, 4, H, W) arrays
-        Fringes that vary along the screen's x and y: frequency, step, row, column.
-    periods_x, periods_y : (F,) arrays
-        Periods a screen.
-    black, white : (H, W) arrays
-    distance_mm : float
-        Facet's measure point to the screen's origin.
-    """
-
-    frames_x: FloatArray
-    frames_y: FloatArray
-    periods_x: FloatArray
-    periods_y: FloatArray
-    black: FloatArray
-    white: FloatArray
-    distance_mm: float
+    frames_x: FloatArray  # (F, 4, H, W): fringes that vary along the screen's x and y: frequency, step, row, column
+    frames_y: FloatArray  # (F, 4, H, W)
+    periods_x: FloatArray  # (F,): periods a screen
+    periods_y: FloatArray  # (F,)
+    black: FloatArray  # (H, W)
+    white: FloatArray  # (H, W)
+    distance_mm: float  # facet's measure point to the screen's origin
 
 
 def read_measurement(path: Path) -> SofastMeasurement:

@@ -75,12 +75,7 @@ def common_size(folders: Iterable[Path]) -> tuple[tuple[int, int], float]:
 
     Sets whose description cannot be read are passed over here; the analysis counts them.
 
-    Raises
-    ------
-    InputError
-        For two sizes in one run, naming a set of each.
-    RejectedError
-        If no description can be read.
+    Raises InputError for two sizes in one run, naming a set of each; RejectedError if no description can be read.
     """
     first: tuple[Path, tuple[int, int], float] | None = None
     reason = ""

@@ -1,7 +1,5 @@
 """The table of a stability run, one line a set, written as the sets pass by and read back thinned for pictures."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -26,12 +24,7 @@ _ZERNIKE = tuple(f"z{j}_um" for j in range(1, 37))
 class SeriesFile:
     """Writes `series.csv`; a set that gave no figure has a line without numbers.
 
-    Parameters
-    ----------
-    path : Path
-        Overwritten.
-    points : sequence of str
-        Names of the points whose height is followed.
+    `path` is overwritten; `points` are the names of the points whose height is followed.
     """
 
     def __init__(self, path: Path, points: Sequence[str]) -> None:
@@ -39,7 +32,7 @@ class SeriesFile:
         self._writer = csv.writer(self._file, lineterminator="\n")
         self._writer.writerow((*_HEAD, *_NUMBERS, *(f"{name}_um" for name in points), *_ZERNIKE))
 
-    def __enter__(self) -> SeriesFile:
+    def __enter__(self) -> "SeriesFile":
         return self
 
     def __exit__(
@@ -164,7 +157,7 @@ def log_stability(
     lines: Sequence[str],
     pictures: Sequence[Path],
 ) -> None:
-    """Write a recording.
+    """Write a recording. Raises OSError if the file cannot be written.
 
     Parameters
     ----------
@@ -182,11 +175,6 @@ def log_stability(
         Map of standard deviations, rows along y, NaN outside.
     lines, pictures
         The report, and what was drawn.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
     """
     terms = [f"Z{j}" for j in range(2, 37)]
     with result_recording(path, "membrane_ctrl_stability", _blueprint(pictures)) as recording:

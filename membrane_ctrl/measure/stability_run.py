@@ -1,7 +1,5 @@
 """What a stability analysis accumulates over its sets, and the files it leaves."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Mapping
@@ -73,7 +71,7 @@ class StabilityRun:
         self._bad_count = 0
         self.degraded = 0
 
-    def __enter__(self) -> StabilityRun:
+    def __enter__(self) -> "StabilityRun":
         return self
 
     def __exit__(

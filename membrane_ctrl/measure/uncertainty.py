@@ -45,6 +45,9 @@ def run_everywhere(
 ) -> FloatArray:
     """Parameters (trials, sets, 36) in mm, with a progress bar on a terminal.
 
+    Raises InputError if Dask is asked for and not installed, or if the spread is too wide for the fit to converge;
+    DeviceError if the scheduler does not answer.
+
     Parameters
     ----------
     benches, spread, seed
@@ -53,13 +56,6 @@ def run_everywhere(
         Processes; chosen by the amount of work if not given.
     scheduler : str, optional
         Address of a Dask scheduler, as tcp://host:8786, to run there instead.
-
-    Raises
-    ------
-    InputError
-        If Dask is asked for and not installed, or if the spread is too wide for the fit to converge.
-    DeviceError
-        If the scheduler does not answer.
     """
     batches = [range(first, min(first + _BATCH, trials)) for first in range(0, trials, _BATCH)]
     job = partial(monte_carlo.run_trials, benches, spread, seed)
@@ -125,14 +121,9 @@ class UncertaintyOptions:
 
 @dataclass(frozen=True)
 class Spread:
-    """Spread of the height of a set, or of its change since another.
+    """Spread of the height of a set, or of its change since another."""
 
-    Attributes
-    ----------
-    covariance, linear, noise : (36, 36) arrays
-        Of the parameters in mm^2: over the trials, from the Jacobian and the noise, from the noise alone.
-    """
-
+    # (36, 36) each, of the parameters in mm^2: over the trials, from the Jacobian and the noise, from the noise alone
     covariance: FloatArray
     linear: FloatArray
     noise: FloatArray

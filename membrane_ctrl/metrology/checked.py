@@ -33,52 +33,24 @@ _BIT_MISMATCH = 0.02
 
 @dataclass(frozen=True)
 class Anchor:
-    """What a full set hands on to the fringes sets that lean on it.
+    """What a full set hands on to the fringes sets that lean on it."""
 
-    Attributes
-    ----------
-    phase_rad : (2, rows, columns) array
-        Absolute phases of the bins; NaN where unknown.
-    light : (rows, columns) array
-        Of the bins.
-    """
-
-    phase_rad: FloatArray
-    light: FloatArray
+    phase_rad: FloatArray  # (2, rows, columns): absolute phases of the bins; NaN where unknown
+    light: FloatArray  # (rows, columns): of the bins
 
 
 @dataclass(frozen=True)
 class Checked:
-    """A set whose frames have been checked and whose bins have been fitted.
+    """A set whose frames have been checked and whose bins have been fitted."""
 
-    Attributes
-    ----------
-    stack : FrameStack
-        The frames, swapped ones put back.
-    binned : Binned
-        The frames over bins.
-    view : BinView
-        What the usable frames say.
-    phase_rad : (2, rows, columns) array
-        Absolute phases of the bins.
-    near : (rows, columns) bool array
-        Bins that may see the mirror.
-    tracer : Tracer
-        The bench, with the vertex where the laser saw it.
-    state : TrackedPoints
-        The bins' points with their surface.
-    flags : tuple of Flag
-        Frames that do not belong.
-    """
-
-    stack: frame_stack.FrameStack
-    binned: frame_stack.Binned
-    view: evidence.BinView
-    phase_rad: FloatArray
-    near: BoolArray
-    tracer: reconstruct.Tracer
-    state: motion.TrackedPoints
-    flags: tuple[integrity.Flag, ...]
+    stack: frame_stack.FrameStack  # the frames, swapped ones put back
+    binned: frame_stack.Binned  # the frames over bins
+    view: evidence.BinView  # what the usable frames say
+    phase_rad: FloatArray  # (2, rows, columns): absolute phases of the bins
+    near: BoolArray  # (rows, columns): bins that may see the mirror
+    tracer: reconstruct.Tracer  # the bench, with the vertex where the laser saw it
+    state: motion.TrackedPoints  # the bins' points with their surface
+    flags: tuple[integrity.Flag, ...]  # frames that do not belong
 
     @property
     def verdict(self) -> tuple[Verdict, str]:
@@ -107,7 +79,7 @@ def vertex_z_mm(optics: OpticsConfig, displacement_um: float) -> float:
 
 
 def check(stack: frame_stack.FrameStack, optics: OpticsConfig, anchor: Anchor | None = None) -> Checked:
-    """Check the frames and fit the bins.
+    """Check the frames and fit the bins. Raises RejectedSetError if the frames do not give a figure.
 
     Parameters
     ----------
@@ -117,11 +89,6 @@ def check(stack: frame_stack.FrameStack, optics: OpticsConfig, anchor: Anchor | 
         Of the set; `camera.bits` tells saturation.
     anchor : Anchor, optional
         For a set without Gray code: where its fringe orders come from.
-
-    Raises
-    ------
-    RejectedSetError
-        If the frames do not give a figure.
     """
     binned = frame_stack.bin_frames(stack, 2**optics.camera.bits - 1)
     try:

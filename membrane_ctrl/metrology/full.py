@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, phase, phasor, reconstruct, zonal
@@ -13,7 +12,7 @@ from membrane_ctrl.metrology.frames.frame_stack import PixelPhases, pixel_phases
 from membrane_ctrl.metrology.motion import combine_steps, sensitivity_mm_per_um, worth_correcting
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import Surface
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 from membrane_ctrl.model.shape_estimate import Quality
 
 LASER_NOISE_UM = 1.0  # repeatability of the bench's laser; motion below twice that is not taken out
@@ -29,42 +28,19 @@ _NO_SLOPE = 4e-3
 
 @dataclass(frozen=True)
 class FullResult:
-    """Everything of one set.
+    """Everything of one set."""
 
-    Attributes
-    ----------
-    fit : Fit
-        The surface: Hencky excess and 36 terms; `changes_mm` of all iterations from the start.
-    index : (n,) int array
-        Pixels inside the analysis radius that gave slopes, counted row by row.
-    field : (6, n) array
-        x, y in mm, measured slopes, fitted slopes.
-    weights : (n,) array
-        What each had to say in the fit.
-    swing_adu : (n,) array
-        The smaller of the two fringe amplitudes.
-    rest_adu : (n,) array
-        What the sinusoids leave of the frames: noise, motion, the display's harmonics.
-    grid : ResidualGrid
-        Mean slope residuals in cells.
-    residual_mm : (m, m) array
-        Height over the fit, 0 at the vertex; NaN where nothing was measured.
-    quality : Quality
-        For the verdict.
-    moved : bool
-        Whether the film's motion was taken out.
-    """
-
-    fit: reconstruct.Fit
-    index: NDArray[np.int64]
-    field: FloatArray
-    weights: FloatArray
-    swing_adu: NDArray[np.float32]
-    rest_adu: NDArray[np.float32]
-    grid: zonal.ResidualGrid
-    residual_mm: FloatArray
-    quality: Quality
-    moved: bool
+    fit: reconstruct.Fit  # the surface: Hencky excess and 36 terms; `changes_mm` of all iterations from the start
+    index: IntArray  # (n,): pixels inside the analysis radius that gave slopes, counted row by row
+    field: FloatArray  # (6, n): x, y in mm, measured slopes, fitted slopes
+    weights: FloatArray  # (n,): what each had to say in the fit
+    swing_adu: Singles  # (n,): the smaller of the two fringe amplitudes
+    # (n,): what the sinusoids leave of the frames: noise, motion, the display's harmonics
+    rest_adu: Singles
+    grid: zonal.ResidualGrid  # mean slope residuals in cells
+    residual_mm: FloatArray  # (m, m): height over the fit, 0 at the vertex; NaN where nothing was measured
+    quality: Quality  # for the verdict
+    moved: bool  # whether the film's motion was taken out
 
     @property
     def surface(self) -> Surface:
@@ -81,10 +57,10 @@ class FullResult:
 class PixelPoints:
     """Pixels that see the pattern, with their screen points."""
 
-    index: NDArray[np.int64]
+    index: IntArray
     points: reconstruct.Points
-    swing_adu: NDArray[np.float32]
-    rest_adu: NDArray[np.float32]
+    swing_adu: Singles
+    rest_adu: Singles
     moved: bool
 
 
@@ -115,7 +91,7 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     return PixelPoints(index[keep], points.subset(keep), swing[keep], rest[keep], moved)
 
 
-def _rays(geometry: Geometry, column: NDArray[np.int64], row: NDArray[np.int64]) -> FloatArray:
+def _rays(geometry: Geometry, column: IntArray, row: IntArray) -> FloatArray:
     """Rays of pixels, in parts: what is needed on the way to them is larger than they are."""
     out = np.empty((3, column.size))
     for start in range(0, column.size, _PART):
@@ -128,8 +104,8 @@ def _axis_phases(
     optics: OpticsConfig,
     checked: Checked,
     axis: int,
-    index: NDArray[np.int64],
-    in_bin: NDArray[np.int64],
+    index: IntArray,
+    in_bin: IntArray,
     sensitivity: FloatArray | None,
 ) -> PixelPhases:
     stack, used = checked.stack, checked.view.used[axis]
@@ -154,10 +130,7 @@ def reconstruct_full(
 ) -> FullResult:
     """Fit the pixels and integrate what the fit leaves.
 
-    Parameters
-    ----------
-    start : height function, optional
-        The starting shape, the paper's parabola of 40 mm if not given.
+    `start` is the starting shape, by default the paper's parabola of 40 mm.
     """
     tracer, points = checked.tracer, pixels.points
     # the way from the start is walked with the bins; the pixels take it up where it is nearly at its end
@@ -223,30 +196,14 @@ def _quality(optics: OpticsConfig, checked: Checked, pixels: PixelPoints, fit: r
 
 @dataclass(frozen=True)
 class BinFigure:
-    """Surface through the bins of one set.
+    """Surface through the bins of one set."""
 
-    Attributes
-    ----------
-    fit : Fit
-        Hencky excess and 36 terms.
-    points : Points
-        The bins' rays and screen points, standing on the surface.
-    index : (n,) int array
-        Their bins.
-    sigma_mm : (2, n) array
-        1 sigma of the screen points from the noise of the pixels.
-    quality : Quality
-        For the verdict.
-    moved : bool
-        Whether the film's motion between the frames was taken out.
-    """
-
-    fit: reconstruct.Fit
-    points: reconstruct.Points
-    index: NDArray[np.int64]
-    sigma_mm: FloatArray
-    quality: Quality
-    moved: bool
+    fit: reconstruct.Fit  # Hencky excess and 36 terms
+    points: reconstruct.Points  # the bins' rays and screen points, standing on the surface
+    index: IntArray  # (n,): their bins
+    sigma_mm: FloatArray  # (2, n): 1 sigma of the screen points from the noise of the pixels
+    quality: Quality  # for the verdict
+    moved: bool  # whether the film's motion between the frames was taken out
 
 
 def bin_figure(optics: OpticsConfig, checked: Checked) -> BinFigure:
@@ -257,7 +214,7 @@ def bin_figure(optics: OpticsConfig, checked: Checked) -> BinFigure:
     steps = [_combination(checked, axis, moved) for axis in range(len(phase.AXES))]
     followed = np.empty_like(state.accepted)
     # the loop takes any numbers: here means over the bins, hence a bin side of 1 in the combinations
-    phasor.track(sums, state.index, steps, state.sensitivity_rad_per_um, state.accepted, followed)  # type: ignore[arg-type]
+    phasor.track(sums, state.index, steps, state.sensitivity_rad_per_um, state.accepted, followed)
     scale = phase.mm_per_rad(optics.pattern)
     points = state.points.subset(np.ones(state.index.size, bool))
     points.screen_mm[:] = followed[:, 0] * scale - state.offset_mm

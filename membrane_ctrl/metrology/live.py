@@ -10,13 +10,12 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, motion, phase, phasor, reconstruct
 from membrane_ctrl.metrology.optics import geometry, hencky, surface, zernike
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
-from membrane_ctrl.model.arrays import BoolArray, FloatArray
+from membrane_ctrl.model.arrays import ArrayLike, BoolArray, FloatArray, Image
 from membrane_ctrl.model.shape_estimate import Quality, ShapeEstimate, judge
 
 Kind = Literal["full", "fringes"]
@@ -89,8 +88,8 @@ class LiveReconstructor:
         self._pixel_sigma_adu = bins.pixel_sigma_adu(optics.camera.noise_adu)
         self._tracked: motion.TrackedPoints | None = None
 
-    def full(self, frames: Sequence[phasor.Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
-        """One full cycle.
+    def full(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
+        """One full cycle. Raises ValueError for a wrong number, size or type of frames.
 
         Parameters
         ----------
@@ -103,11 +102,6 @@ class LiveReconstructor:
         -------
         ShapeEstimate
             Verdict "rejected" with the reason when the images give no figure.
-
-        Raises
-        ------
-        ValueError
-            For a wrong number, size or type of frames.
         """
         times, readings = _per_frame(frames, time_s, displacement_um, self._slots.count, "full")
         sinusoids = np.r_[self._slots.sinusoids].tolist()
@@ -130,7 +124,7 @@ class LiveReconstructor:
             self._geometry_covariance_mm2 = self._from_geometry(self._spread, tracer, state)
         return self._follow("full", state, times, readings)
 
-    def fringes(self, frames: Sequence[phasor.Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
+    def fringes(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
         """One fringes-only cycle of 2 N frames, in the order of `phase.fringe_sequence`; else as `full`.
 
         An estimate with `tracking_lost` asks for a full cycle.
@@ -270,7 +264,7 @@ class LiveReconstructor:
 
 
 def _per_frame(
-    frames: Sequence[phasor.Image], time_s: ArrayLike, displacement_um: ArrayLike, count: int, kind: Kind
+    frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike, count: int, kind: Kind
 ) -> tuple[FloatArray, FloatArray]:
     """Times and readings as arrays. Raises ValueError unless there is one of each for each of `count` frames."""
     times, readings = np.asarray(time_s, float), np.asarray(displacement_um, float)

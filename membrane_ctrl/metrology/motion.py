@@ -81,35 +81,19 @@ _MIN_POINTS = 1000  # far more than 36 unknowns, far fewer than any real view of
 
 @dataclass
 class TrackedPoints:
-    """Points inside the analysis radius, with the last accepted phase of each.
+    """Points inside the analysis radius, with the last accepted phase of each."""
 
-    Attributes
-    ----------
-    index : (n,) int array
-        Bin of each point.
-    points : Points
-        Rays, screen points, weights.
-    offset_mm : (2, n) array
-        To be taken from T phi / (2 pi): the phase at O', and what averaging over a bin adds.
-    sensitivity_rad_per_um : (2, n) array
-        Change of phase per um of displacement.
-    area_mm2 : (n,) array
-        Area of the mirror that a bin sees.
-    surface, normal
-        Last solution, and the normal matrix of the full cycle.
-    accepted, fresh : (2, FOLLOWED_ROWS, n) arrays
-        Rows of `phasor.track` for x and y: of the last accepted cycle, and memory for the next.
-    """
-
-    index: IntArray
-    points: reconstruct.Points
+    index: IntArray  # (n,): bin of each point
+    points: reconstruct.Points  # rays, screen points, weights
+    # (2, n): to be taken from T phi / (2 pi): the phase at O', and what averaging over a bin adds
     offset_mm: FloatArray
-    sensitivity_rad_per_um: FloatArray
-    area_mm2: FloatArray
-    surface: Surface
+    sensitivity_rad_per_um: FloatArray  # (2, n): change of phase per um of displacement
+    area_mm2: FloatArray  # (n,): area of the mirror that a bin sees
+    surface: Surface  # last solution
     normal: reconstruct.NormalMatrix
+    # (2, FOLLOWED_ROWS, n): rows of `phasor.track` for x and y of the last accepted cycle
     accepted: FloatArray
-    fresh: FloatArray
+    fresh: FloatArray  # memory for the next
 
     def accept(self, surface: Surface, usable: BoolArray) -> None:
         """Make the fresh phases the reference; points that gave none keep theirs."""
@@ -129,17 +113,14 @@ def establish(
 ) -> TrackedPoints:
     """Choose the points of a full cycle, fit their surface and work out what must be known of each.
 
+    Raises ValueError if too few bins see the pattern in the mirror to fit a surface.
+
     Parameters
     ----------
     candidates : (n,) int array
         Bins that may see the mirror.
     phase_rad : (2, n) array
         Their absolute phases; NaN where a bin is not usable.
-
-    Raises
-    ------
-    ValueError
-        If too few bins see the pattern in the mirror to fit a surface.
     """
     finite = np.isfinite(phase_rad).all(axis=0)
     index, phase_rad = candidates[finite], phase_rad[:, finite]

@@ -86,21 +86,11 @@ _LEAST_VOTES = 30  # a smaller island cannot outvote its own noise
 
 @dataclass(frozen=True)
 class Orders:
-    """Absolute phase of one axis.
+    """Absolute phase of one axis."""
 
-    Attributes
-    ----------
-    phase_rad : (H, W) array
-        Counted from the low edge's -pi; NaN where not known.
-    agreement : float
-        Share of the pixels whose own Gray bits give the same order.
-    torn : bool
-        The phase is not continuous, or hardly any code agrees with it: the orders are the Gray code's alone.
-    """
-
-    phase_rad: FloatArray
-    agreement: float
-    torn: bool
+    phase_rad: FloatArray  # (H, W): counted from the low edge's -pi; NaN where not known
+    agreement: float  # share of the pixels whose own Gray bits give the same order
+    torn: bool  # the phase is not continuous, or hardly any code agrees with it: the orders are the Gray code's alone
 
 
 def orders(wrapped_rad: FloatArray, bits: BoolArray, mask: BoolArray) -> Orders:

@@ -13,15 +13,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import PatternConfig
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import ArrayLike, BoolArray, ComplexArray, FloatArray, IntArray
 
 
 def step_weights(shifts_rad: Sequence[float] | FloatArray) -> FloatArray:
     """Rows that turn the N intensities of a pixel into A, C and S.
+
+    Raises ValueError if the steps do not determine a phase (fewer than three different ones on the circle).
 
     Parameters
     ----------
@@ -32,11 +33,6 @@ def step_weights(shifts_rad: Sequence[float] | FloatArray) -> FloatArray:
     -------
     (3, N) array
         Pseudo-inverse of the columns [1, cos d, -sin d].
-
-    Raises
-    ------
-    ValueError
-        If the steps do not determine a phase (fewer than three different ones on the circle).
     """
     shifts = np.asarray(shifts_rad, float)
     design = np.stack([np.ones_like(shifts), np.cos(shifts), -np.sin(shifts)], axis=1)
@@ -51,7 +47,7 @@ def equal_shifts(steps: int) -> FloatArray:
     return 2 * math.pi * np.arange(steps) / steps
 
 
-def phasors(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> NDArray[np.complex128]:
+def phasors(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> ComplexArray:
     """Phasor C + iS per pixel from a stack of frames (N, ...)."""
     stack = np.asarray(frames, float)
     _, cosine, sine = step_weights(shifts_rad)
@@ -61,12 +57,12 @@ def phasors(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> NDAr
     return out
 
 
-def wrapped_phase(phasor: NDArray[np.complex128]) -> FloatArray:
+def wrapped_phase(phasor: ComplexArray) -> FloatArray:
     """Phase in (-pi, pi] of C + iS."""
     return np.angle(phasor)
 
 
-def modulation(phasor: NDArray[np.complex128]) -> FloatArray:
+def modulation(phasor: ComplexArray) -> FloatArray:
     """Fringe amplitude B in the units of the frames."""
     return np.abs(phasor)
 
@@ -97,7 +93,7 @@ def phase_sigma_rad(shifts_rad: Sequence[float] | FloatArray, noise_adu: float, 
 # the ends of a period and K1 in the middle, and each is used only where it is a quarter period away from its jumps.
 
 
-def gray_orders(gray: ArrayLike, white: ArrayLike, black: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def gray_orders(gray: ArrayLike, white: ArrayLike, black: ArrayLike) -> tuple[IntArray, IntArray]:
     """Fringe orders from the Gray-code frames.
 
     Parameters
@@ -120,7 +116,7 @@ def gray_orders(gray: ArrayLike, white: ArrayLike, black: ArrayLike) -> tuple[ND
     return k1, (v2 + 1) // 2
 
 
-def absolute_phase(wrapped_rad: FloatArray, k1: NDArray[np.int64], k2: NDArray[np.int64]) -> FloatArray:
+def absolute_phase(wrapped_rad: FloatArray, k1: IntArray, k2: IntArray) -> FloatArray:
     """The paper's eq. 2: phase counted from the low edge's -pi."""
     order = np.where(wrapped_rad <= -math.pi / 2, k2, np.where(wrapped_rad >= math.pi / 2, k2 - 1, k1))
     return wrapped_rad + 2 * math.pi * order
@@ -141,7 +137,7 @@ def screen_mm(absolute_rad: FloatArray, pattern: PatternConfig) -> FloatArray:
     return (absolute_rad - centre_phase_rad(pattern)) * mm_per_rad(pattern)
 
 
-def inside_pattern(absolute_rad: FloatArray, pattern: PatternConfig) -> NDArray[np.bool_]:
+def inside_pattern(absolute_rad: FloatArray, pattern: PatternConfig) -> BoolArray:
     """Whether the phase is one the pattern has; a wrong Gray bit at its rim is not."""
     return np.abs(absolute_rad - centre_phase_rad(pattern)) <= math.pi * pattern.periods
 
@@ -222,35 +218,22 @@ class FullSlots:
 
 @dataclass(frozen=True)
 class Decoded:
-    """Absolute phases of a full cycle.
+    """Absolute phases of a full cycle."""
 
-    Attributes
-    ----------
-    phase_rad : (2, ...) array
-        x and y, counted from the low edge's -pi (see `unwrap`); NaN where not valid.
-    modulation_adu : (2, ...) array
-        Fringe amplitude.
-    valid : (...) bool array
-        Pixels that see the pattern in the mirror.
-    """
-
-    phase_rad: FloatArray
-    modulation_adu: FloatArray
-    valid: NDArray[np.bool_]
+    phase_rad: FloatArray  # (2, ...): x and y, counted from the low edge's -pi (see `unwrap`); NaN where not valid
+    modulation_adu: FloatArray  # (2, ...): fringe amplitude
+    valid: BoolArray  # (...): pixels that see the pattern in the mirror
 
 
 def decode_full(images: FloatArray, pattern: PatternConfig, shifts_rad: FloatArray) -> Decoded:
     """Decode the images of a full cycle (2 (N + 4) + 2, ...), in `patterns.full_sequence`'s order.
 
+    Raises ValueError if there are more or fewer images.
+
     Parameters
     ----------
     shifts_rad : (2, N) array
         Phase steps of x and y.
-
-    Raises
-    ------
-    ValueError
-        If there are more or fewer images.
     """
     slots = FullSlots(pattern.steps)
     if len(images) != slots.count:

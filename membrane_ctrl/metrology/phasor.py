@@ -10,12 +10,9 @@ from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.optics.compiled import kernel, split, step
-from membrane_ctrl.model.arrays import FloatArray
-
-Image = NDArray[np.uint8] | NDArray[np.uint16]
+from membrane_ctrl.model.arrays import AnyArray, FloatArray, Image, IntArray
 
 _BLOCK = 512
 _NEVER = np.uint32(2**32 - 1)  # above any pixel
@@ -125,17 +122,8 @@ class Binner:
     def add(self, frames: Sequence[Image], slots: Sequence[int], watched: Container[int] | None = None) -> None:
         """Sum frames into slots.
 
-        Parameters
-        ----------
-        frames, slots : sequences of the same length
-            Frame k goes to slots[k].
-        watched : container of slots, optional
-            Only these are watched for saturation; all if not given. A white or Gray frame loses nothing by it.
-
-        Raises
-        ------
-        ValueError
-            For a frame of wrong size or type of pixel; nothing is summed then.
+        Raises ValueError for a frame of wrong size or type of pixel; nothing is summed then. Frame k goes to
+        slots[k]. Only `watched` slots, by default all, are watched for saturation: it does not harm white or Gray.
         """
         for frame in frames:
             if frame.shape != self._size:
@@ -157,18 +145,11 @@ class Binner:
 
 @dataclass(frozen=True)
 class StepCombination:
-    """How the frames of one axis become a phasor.
+    """How the frames of one axis become a phasor."""
 
-    Attributes
-    ----------
-    cosine, sine : (N,) arrays
-        Weights of the frames' bin sums for C and S (per pixel: divided by the bin's area).
-    turn, mirror : complex
-        First-order effect of the film's motion per radian and unit of sensitivity (see `motion`); 0 without.
-    """
-
-    cosine: FloatArray
-    sine: FloatArray
+    cosine: FloatArray  # (N,): weights of the frames' bin sums for C and S (per pixel: divided by the bin's area)
+    sine: FloatArray  # (N,)
+    # First-order effect of the film's motion per radian and unit of sensitivity (see `motion`); 0 without
     turn: complex = 0j
     mirror: complex = 0j
 
@@ -243,8 +224,8 @@ def _track(sums, index, cosine, sine, turn, mirror, slope, last, out, start, sto
 
 
 def track(
-    sums: Sequence[NDArray[np.uint32]],
-    index: NDArray[np.int64],
+    sums: Sequence[AnyArray],
+    index: IntArray,
     combined: Sequence[StepCombination],
     sensitivity_rad_per_um: FloatArray,
     last: FloatArray,

@@ -8,8 +8,6 @@ solution on its own surface, whatever matrix stands on the left: so a matrix of 
 kept without moving the end point.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -50,22 +48,15 @@ def _product_index() -> IntArray:
 
 @dataclass(frozen=True)
 class NormalMatrix:
-    """D^T W D, apart for x and y slopes, and its inverse.
+    """D^T W D, apart for x and y slopes, and its inverse."""
 
-    Attributes
-    ----------
-    x, y : (36, 36) arrays
-        Shares of the x and of the y slopes, in 1/mm^2 times weight.
-    inverse : (36, 36) array
-        Of their sum. The condition number is below 1000, and what rounding leaves the next step takes out.
-    """
-
-    x: FloatArray
-    y: FloatArray
+    x: FloatArray  # (36, 36): shares of the x and of the y slopes, in 1/mm^2 times weight
+    y: FloatArray  # (36, 36)
+    # (36, 36), of their sum; the condition number is below 1000, and the next step corrects what rounding leaves
     inverse: FloatArray
 
     @classmethod
-    def from_products(cls, products: FloatArray, radius_mm: float) -> NormalMatrix:
+    def from_products(cls, products: FloatArray, radius_mm: float) -> "NormalMatrix":
         """From the moments of `kernels.product_sums`. Raises ValueError if the points do not determine a surface."""
         x, y = _assemble(products, radius_mm)
         inverse = x + y
@@ -132,33 +123,21 @@ _EXCESS = hencky.excess() / hencky.excess_rms()
 
 @dataclass
 class Points:
-    """What was measured, on any set of points: binned or every pixel.
+    """What was measured, on any set of points: binned or every pixel."""
 
-    Attributes
-    ----------
-    rays : (3, n) array
-        Unit vectors in world, from the pinhole.
-    screen_mm : (2, n) array
-        s_x, s_y seen there, from O'.
-    weights : (n,) array
-        Of both slopes of a point; 0 leaves it out.
-    t_mm : (n,) array
-        Length of each ray to the surface; kept between solutions as the start of the next.
-    """
-
-    rays: FloatArray
-    screen_mm: FloatArray
-    weights: FloatArray
-    t_mm: FloatArray
+    rays: FloatArray  # (3, n): unit vectors in world, from the pinhole
+    screen_mm: FloatArray  # (2, n): s_x, s_y seen there, from O'
+    weights: FloatArray  # (n,): of both slopes of a point; 0 leaves it out
+    t_mm: FloatArray  # (n,): length of each ray to the surface; kept between solutions as the start of the next
 
     @classmethod
-    def of(cls, rays: FloatArray, screen_mm: FloatArray, weights: FloatArray | None = None) -> Points:
+    def of(cls, rays: FloatArray, screen_mm: FloatArray, weights: FloatArray | None = None) -> "Points":
         """Points with unit weights unless given."""
         count = rays.shape[1]
         weights = np.ones(count) if weights is None else weights
         return cls(np.ascontiguousarray(rays), np.ascontiguousarray(screen_mm), weights, np.zeros(count))
 
-    def subset(self, keep: BoolArray) -> Points:
+    def subset(self, keep: BoolArray) -> "Points":
         """Those points where `keep` is set."""
         return Points(
             np.ascontiguousarray(self.rays[:, keep]),
@@ -170,25 +149,15 @@ class Points:
 
 @dataclass(frozen=True)
 class Fit:
-    """Solution and how it was reached.
-
-    Attributes
-    ----------
-    changes_mm : tuple of float
-        Largest change of height of each step over the disc.
-    residual_x, residual_y : float
-        Weighted RMS of measured minus fitted slope (a slope, without unit).
-    weight_sum : float
-        Sum of the weights.
-    """
+    """Solution and how it was reached."""
 
     surface: Surface
     normal: NormalMatrix
-    changes_mm: tuple[float, ...]
+    changes_mm: tuple[float, ...]  # largest change of height of each step over the disc
     converged: bool
-    residual_x: float
+    residual_x: float  # weighted RMS of measured minus fitted slope (a slope, without unit)
     residual_y: float
-    weight_sum: float
+    weight_sum: float  # sum of the weights
 
 
 class Tracer:

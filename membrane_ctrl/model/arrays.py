@@ -1,9 +1,16 @@
 """Types of arrays."""
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
+import numpy as np
+from numpy import typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+ComplexArray = npt.NDArray[np.complex128]
+AnyArray = npt.NDArray[Any]
 Column = FloatArray  # of a table, or as long as one
+Singles = npt.NDArray[np.float32]  # where memory counts
+Image = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]  # one of a camera, or many
+ArrayLike = npt.ArrayLike

@@ -15,12 +15,10 @@ from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from firmware_iface.roles import Pixels
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.processes.ring import FrameAddress
-
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 _ALIGN_BYTES = 64  # a cache line: pixels start on one, and the write counter has one of its own
 _HEAD = struct.Struct("<QddQ24s")  # sequence, time_s, displacement_um, cycle, pattern name in ASCII

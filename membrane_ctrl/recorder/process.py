@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_iface.roles import Pixels
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.run_events import Alive, Ended
 from membrane_ctrl.processes.child import STOP, parent_lives, reporter
-from membrane_ctrl.processes.frames import FrameHead, FrameReader, Pixels
+from membrane_ctrl.processes.frames import FrameHead, FrameReader
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
 
 if TYPE_CHECKING:

@@ -1,11 +1,10 @@
 """The runs there are: listed, filtered, shown, pruned."""
 
 import hashlib
-import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,45 +19,21 @@ _LEVEL_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class RunEntry:
-    """A run in one line.
-
-    Attributes
-    ----------
-    folder : Path
-    started_utc : datetime
-    duration_s : float
-        Of a run that goes on, or whose recorder was killed, as far as its tables go; NaN without any.
-    std_um : float
-        Of the true centre on the twin, else of the reading.
-    in_band : float
-        Share of 1 s means within the band.
-    faults : int
-    exit : str
-        "done", "trip", ...; "open" without a summary.
-    kp_per_s, ti_s : float
-        Gains.
-    configuration : str
-        First 8 digits of the SHA-256 of `config.toml`.
-    size_mb : float
-    marks : int
-        Annotations.
-    kept : bool
-        A file `.keep` is in the folder: it is never pruned.
-    """
+    """A run in one line."""
 
     folder: Path
     started_utc: datetime
-    duration_s: float
-    std_um: float
-    in_band: float
+    duration_s: float  # of a run that goes on, or whose recorder was killed, as far as its tables go; NaN without any
+    std_um: float  # of the true centre on the twin, else of the reading
+    in_band: float  # share of 1 s means within the band
     faults: int
-    exit: str
+    exit: str  # "done", "trip", ...; "open" without a summary
     kp_per_s: float
     ti_s: float
-    configuration: str
+    configuration: str  # first 8 digits of the SHA-256 of `config.toml`
     size_mb: float
-    marks: int
-    kept: bool
+    marks: int  # annotations
+    kept: bool  # the folder has a file `.keep`: it is never pruned
 
     @property
     def name(self) -> str:
@@ -93,10 +68,14 @@ class Filter:
 
 def entries(logs_dir: Path, wanted: Filter | None = None) -> list[RunEntry]:
     """The runs of a folder, oldest first. Raises InputError if there is no such folder."""
-    if not logs_dir.is_dir():
-        raise errors.InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
+    _require_folder(logs_dir)
     found = [_entry_or_why(folder) for folder in _folders(logs_dir)]
     return [item for item in found if wanted is None or wanted.takes(item)]
+
+
+def _require_folder(logs_dir: Path) -> None:
+    if not logs_dir.is_dir():
+        raise errors.InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
 
 
 def _entry_or_why(folder: Path) -> RunEntry:
@@ -136,10 +115,7 @@ def entry(folder: Path) -> RunEntry:
 def resolve(run: Path, logs_dir: Path = Path("logs")) -> Path:
     """The folder meant: a path; a run's name, or the end of it, below `logs`; or `last`.
 
-    Raises
-    ------
-    InputError
-        If no run, or more than one, is meant.
+    Raises InputError if no run, or more than one, is meant.
     """
     if run.exists() or not logs_dir.is_dir():
         return run
@@ -149,9 +125,7 @@ def resolve(run: Path, logs_dir: Path = Path("logs")) -> Path:
     near = [folder for folder in folders if folder.name == str(run)]
     near = near or [folder for folder in folders if str(run) in folder.name]
     if len(near) > 1:
-        raise errors.InputError(
-            f"{run}: more than one run is called so: {', '.join(folder.name for folder in near[:4])}"
-        )
+        raise errors.InputError(f"{run}: several runs match: {', '.join(folder.name for folder in near[:4])}")
     return near[0] if near else run
 
 
@@ -173,10 +147,9 @@ def to_prune(
     logs_dir: Path, now_utc: datetime, keep_days: float | None, keep_gb: float | None
 ) -> list[tuple[disk_budget.OldRun, str]]:
     """The runs that the recorder's retention rule (`recording.retention`) gives up, and why; oldest first."""
-    if not logs_dir.is_dir():
-        raise errors.InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
+    _require_folder(logs_dir)
     if keep_days is None and keep_gb is None:
-        raise errors.InputError("runs prune: say what to keep: --keep-days, --keep-gb or both")
+        raise errors.InputError("runs prune: give --keep-days, --keep-gb or both")
     runs = disk_budget.deletable_runs(logs_dir, logs_dir / "none", now_utc)
     return disk_budget.expired(runs, 0, keep_gb, keep_days, now_utc)
 
@@ -194,9 +167,8 @@ def prune(runs: Sequence[disk_budget.OldRun]) -> dict[Path, str]:
 
 def as_dict(run: RunEntry) -> dict[str, Any]:
     """An entry as plain data."""
-    names = [name for name in RunEntry.__dataclass_fields__ if name not in {"folder", "started_utc"}]
-    table = {name: getattr(run, name) for name in names}
-    return {"name": run.name, "folder": str(run.folder), "started_utc": run.started_utc.isoformat(), **table}
+    texts = {"folder": str(run.folder), "started_utc": run.started_utc.isoformat()}
+    return {"name": run.name} | asdict(run) | texts
 
 
 def _recorded_s(folder: Path) -> float:
@@ -217,16 +189,3 @@ def _hash(path: Path) -> str:
         return hashlib.sha256(files.read_bytes(path, files.SMALL_BYTES)).hexdigest()[:8]
     except OSError:
         return ""
-
-
-def now_utc() -> datetime:
-    """The wall clock: a run's age is counted in days."""
-    return datetime.now(UTC)
-
-
-def dumps(runs: Sequence[RunEntry]) -> str:
-    """JSON of entries; NaN as null."""
-    plain = [
-        {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in as_dict(r).items()} for r in runs
-    ]
-    return json.dumps(plain, indent=1)

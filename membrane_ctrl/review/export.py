@@ -17,8 +17,6 @@ from membrane_ctrl.run_files.column_file import FOLDER
 from membrane_ctrl.run_files.run import Run
 from membrane_ctrl.run_files.streams import STREAMS
 
-# Where review may write: nowhere among what the recorder wrote.
-
 
 def refuse_originals(folder: Path) -> None:
     """Raises InputError if a folder is a run's own, or its tables', whichever run that is.
@@ -34,21 +32,19 @@ def refuse_originals(folder: Path) -> None:
 FORMATS = ("parquet", "csv", "hdf5")
 SHAPES = "shapes"
 EVENTS = "events"
+_SHAPE_COLUMNS = ("hencky_um", "sag_um", "sag_sigma_um", "displacement_um")
 
 
 def export(
-    run: Run,
-    to: str,
-    out: Path,
-    streams: Sequence[str] = (),
-    start_s: float = -math.inf,
-    end_s: float = math.inf,
+    run: Run, to: str, out: Path, streams: Sequence[str] = (), start_s: float = -math.inf, end_s: float = math.inf
 ) -> list[Path]:
     """Write a run's columns.
 
+    Raises InputError if the format or a stream is not known, h5py is missing, the run has nothing of what is wanted,
+    or the folder is one of a run; DeviceError if the folder cannot be written.
+
     Parameters
     ----------
-    run : Run
     to : str
         One of `FORMATS`.
     out : Path
@@ -57,14 +53,6 @@ def export(
         Rerun paths (`/loop/error`), fields (`error_um`), `shapes` or `events`; everything by default.
     start_s, end_s : float
         Part of the run.
-
-    Raises
-    ------
-    InputError
-        If the format or a stream is not known, h5py is missing, the run has nothing of what is wanted, or the folder
-        is one of a run.
-    DeviceError
-        If the folder cannot be written.
     """
     if to not in FORMATS:
         raise InputError(f"--to {to}: known are {', '.join(FORMATS)}")
@@ -119,15 +107,7 @@ def shape_table(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -
     """One row a cycle: time, Z1..Z36 in um, sag, quality, verdict."""
     shapes = run.shapes()
     shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
-    names = (
-        "hencky_um",
-        "sag_um",
-        "sag_sigma_um",
-        "displacement_um",
-        "slope_residual_urad",
-        "valid_fraction",
-        "latency_s",
-    )
+    names = (*_SHAPE_COLUMNS, "slope_residual_urad", "valid_fraction", "latency_s")
     columns: dict[str, object] = {"time_s": shapes.time_s}
     columns |= {f"z{j}_um": np.ascontiguousarray(shapes.coeffs_um[:, j - 1]) for j in range(1, 37)}
     columns |= {name: getattr(shapes, name) for name in names}
@@ -197,7 +177,7 @@ def _hdf5(
         shapes = run.shapes()
         shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
         if SHAPES in extras and len(shapes):
-            for name in ("time_s", "coeffs_um", "hencky_um", "sag_um", "sag_sigma_um", "displacement_um"):
+            for name in ("time_s", "coeffs_um", *_SHAPE_COLUMNS):
                 file.create_dataset(f"shapes/{name}", data=getattr(shapes, name))
         if EVENTS in extras and (lines := _event_lines(run, start_s, end_s)):
             file.create_dataset("events", data=lines, dtype=h5py.string_dtype())

@@ -15,26 +15,9 @@ from membrane_ctrl.model import errors, plain_json, terminal
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.catalogue import Filter, RunEntry, entries, resolve
 from membrane_ctrl.review.export import export
-from membrane_ctrl.review.words import moment_s, number, one_line, span
-from membrane_ctrl.run_files.run import Run, open_run
+from membrane_ctrl.review.words import end_s, moment_s, not_in, number, one_line, part_s, span
+from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_folder import add_mark, event_s
-
-# How long a run is, and what to say of a moment outside it.
-
-
-_LEVEL_S = 60.0
-
-
-def end_s(run: Run) -> float:
-    """End of what a run has, in seconds from its start, rounded up to whole minutes; 0 if it has nothing."""
-    time_s = run.level(_LEVEL_S, names=("rows",))["time_s"]
-    return float(time_s[-1]) + _LEVEL_S if time_s.size else 0.0
-
-
-def not_in(run: Run, asked: str) -> errors.InputError:
-    """That what was asked for lies outside a run."""
-    went = f"{run.utc(0):%Y-%m-%d %H:%M} to {run.utc(end_s(run)):%Y-%m-%d %H:%M} UTC"
-    return errors.InputError(f"{asked}: not in the run, which went from {went}")
 
 
 def list_command(logs: Path, wanted: Filter, since: str | None, until: str | None, json: bool) -> int:
@@ -42,7 +25,7 @@ def list_command(logs: Path, wanted: Filter, since: str | None, until: str | Non
     wanted = replace(wanted, since_utc=_day(since), until_utc=_day(until))
     found = entries(logs, wanted)
     if json:
-        print(catalogue.dumps(found))
+        print(plain_json.dumps([catalogue.as_dict(entry) for entry in found], indent=1))
     else:
         _console().print(_table(found))
     return 0
@@ -54,9 +37,8 @@ def show_command(run: Path, json: bool) -> int:
     opened.look_through()
     entry = catalogue.entry(opened.folder)
     if json:
-        print(
-            plain_json.dumps(catalogue.as_dict(entry) | {"notes": opened.notes, "summary": opened.summary}, indent=1)
-        )
+        table = catalogue.as_dict(entry) | {"notes": opened.notes, "summary": opened.summary}
+        print(plain_json.dumps(table, indent=1))
         return 0
     _console().print(_table([entry]))
     for event in opened.events:
@@ -70,32 +52,30 @@ def show_command(run: Path, json: bool) -> int:
 
 def prune_command(logs: Path, keep_days: float | None, keep_gb: float | None, delete: bool, json: bool) -> int:
     """What the retention rule gives up; deleted only with `delete`."""
-    gone = catalogue.to_prune(logs, catalogue.now_utc(), keep_days, keep_gb)
+    gone = catalogue.to_prune(logs, datetime.now(UTC), keep_days, keep_gb)
     stay = catalogue.prune([run for run, _ in gone]) if delete else {}
     gone = [(run, why) for run, why in gone if run.folder not in stay]
     if json:
         table = [{"name": run.folder.name, "size_bytes": run.size_bytes, "why": why} for run, why in gone]
         print(plain_json.dumps({"deleted": delete, "runs": table}, indent=1))
-        return _said_what_stays(stay)
-    for run, why in gone:
-        print(f"{'deleted' if delete else 'would delete'} {run.folder.name}, {run.size_bytes / 1e6:.0f} MB: {why}")
-    freed_mb = sum(run.size_bytes for run, _ in gone) / 1e6
-    print(f"{len(gone)} runs, {freed_mb:.0f} MB" + ("" if delete or not gone else "; --delete does it"))
-    return _said_what_stays(stay)
-
-
-def _said_what_stays(stay: dict[Path, str]) -> int:
+    else:
+        for run, why in gone:
+            print(
+                f"{'deleted' if delete else 'would delete'} {run.folder.name}, {run.size_bytes / 1e6:.0f} MB: {why}"
+            )
+        freed_mb = sum(run.size_bytes for run, _ in gone) / 1e6
+        print(f"{len(gone)} runs, {freed_mb:.0f} MB" + ("" if delete or not gone else "; --delete deletes them"))
     for folder, why in stay.items():
-        print(f"{folder}: cannot be deleted ({why.lower()}); look at its permissions", file=sys.stderr)
+        print(f"{folder}: cannot be deleted ({why.lower()}); check its permissions", file=sys.stderr)
     return errors.Exit.DEVICE_FAILED if stay else 0
 
 
 def mark_command(words: Sequence[str], at: str | None) -> int:
-    """Add a mark to a run's timeline: the run and what to say, where."""
+    """Add a mark to a run's timeline; the words are the run and the text."""
     if len(words) != 2 or at is None:
         raise errors.InputError("review mark: write `review mark RUN TEXT --at 03:12` (TEXT in quotes)")
     if not words[1].strip():
-        raise errors.InputError("review mark: say something: `review mark RUN TEXT --at 03:12`")
+        raise errors.InputError("review mark: TEXT is empty: write `review mark RUN TEXT --at 03:12`")
     opened = open_run(resolve(Path(words[0])))
     at_s = moment_s(at, opened.origin_utc)
     if not 0 <= at_s <= end_s(opened):
@@ -110,20 +90,13 @@ def export_command(
 ) -> int:
     """Write a run for other programs and say where."""
     opened = open_run(resolve(run))
-    files = export(
-        opened, to, out.resolve() if out else opened.folder / "export", streams, *_part(opened, start, end)
-    )
+    folder = out.resolve() if out else opened.folder / "export"
+    files = export(opened, to, folder, streams, *part_s(opened, start, end))
     for note in opened.notes:
         print(f"note: {note}")
     for path in files:
         print(path)
     return 0
-
-
-def _part(run: Run, start: str | None, end: str | None) -> tuple[float, float]:
-    start_s = -math.inf if start is None else moment_s(start, run.origin_utc)
-    end_s = math.inf if end is None else moment_s(end, run.origin_utc)
-    return start_s, end_s
 
 
 def _day(text: str | None) -> datetime | None:
@@ -144,22 +117,10 @@ def _console() -> Console:
 
 def _table(found: list[RunEntry]) -> Table:
     table = Table(box=None, header_style="bold", pad_edge=False)
-    for title in (
-        "run",
-        "started, UTC",
-        "length",
-        "std µm",
-        "in band",
-        "faults",
-        "Kp",
-        "Ti",
-        "configuration",
-        "MB",
-        "end",
-    ):
-        table.add_column(
-            title, justify="left" if title in {"run", "started, UTC", "configuration", "end"} else "right"
-        )
+    words = {"run", "started, UTC", "configuration", "end"}
+    numbers = ("length", "std µm", "in band", "faults", "Kp", "Ti")
+    for title in ("run", "started, UTC", *numbers, "configuration", "MB", "end"):
+        table.add_column(title, justify="left" if title in words else "right")
     for entry in found:
         table.add_row(
             escape(one_line(entry.name)),

@@ -1,4 +1,4 @@
-"""Times and numbers as people read them."""
+"""Times and numbers as people read and write them."""
 
 import math
 import re
@@ -6,6 +6,9 @@ from datetime import datetime, timedelta
 
 from membrane_ctrl.model.clock import parse_duration_s
 from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.run_files.run import Run
+
+_LEVEL_S = 60.0
 
 
 def span(seconds: float) -> str:
@@ -37,10 +40,7 @@ def moment_s(text: str, origin_utc: datetime) -> float:
 
     A time of the day is the first such after the start of the run.
 
-    Raises
-    ------
-    InputError
-        If it is none of these.
+    Raises InputError if it is none of these.
     """
     text = text.strip()
     if re.fullmatch(r"\+ *0+[dhms]?", text):  # the start: no duration, but a moment
@@ -61,3 +61,24 @@ def moment_s(text: str, origin_utc: datetime) -> float:
     except ValueError:
         raise InputError(f"time {text!r}: write 03:12, 2026-11-21T03:12:00 or +90m from the start (UTC)") from None
     return (moment - origin_utc).total_seconds()
+
+
+def part_s(run: Run, start: str | None, end: str | None) -> tuple[float, float]:
+    """The part of a run between two moments as written; None: unlimited. Raises InputError."""
+    start_s = -math.inf if start is None else moment_s(start, run.origin_utc)
+    until_s = math.inf if end is None else moment_s(end, run.origin_utc)
+    if not start_s < until_s:
+        raise InputError(f"--from {start} is not before {end}")
+    return start_s, until_s
+
+
+def end_s(run: Run) -> float:
+    """End of what a run has, in seconds from its start, rounded up to whole minutes; 0 if it has nothing."""
+    time_s = run.level(_LEVEL_S, names=("rows",))["time_s"]
+    return float(time_s[-1]) + _LEVEL_S if time_s.size else 0.0
+
+
+def not_in(run: Run, asked: str) -> InputError:
+    """The error for a moment outside a run."""
+    went = f"{run.utc(0):%Y-%m-%d %H:%M} to {run.utc(end_s(run)):%Y-%m-%d %H:%M} UTC"
+    return InputError(f"{asked}: not in the run, which lasted from {went}")

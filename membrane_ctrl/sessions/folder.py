@@ -106,7 +106,7 @@ class SessionHead:
     format: str
     name: str
     author: str
-    source: str  # run folder, or the twin
+    source: str  # a run folder, or the twin
     created_utc: str
     before: schema.LoopConfig  # the last good gains when the session began
 

@@ -1,7 +1,5 @@
 """The simulated bench as a process: the plant in real time behind the pump board's own protocol."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os
@@ -22,6 +20,7 @@ from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ri
 from membrane_ctrl.sim.events import Event
 from membrane_ctrl.sim.lab import Lab
 from membrane_ctrl.sim.plant import STEP_S, Plant
+from membrane_ctrl.sim.sensors import TRUTH_BYTES, Truth
 
 _PERIOD_S = 0.004  # below the sensors' 5 ms, so that each of their samples is out on time
 _STEPS_AT_ONCE = 4000  # some 10 ms of work: after a stall, clients are answered while the plant catches up
@@ -29,40 +28,19 @@ _STEPS_AT_ONCE = 4000  # some 10 ms of work: after a stall, clients are answered
 
 @dataclass(frozen=True, slots=True)
 class BenchSpec:
-    """What a bench process needs to know; picklable.
-
-    Attributes
-    ----------
-    twin, pump : TwinConfig, PumpConfig
-        The plant.
-    clock : RunClock
-        The run's clock, on which the truth is stamped.
-    port : int
-        Where to listen; 0: any free port.
-    host : str
-        Address to listen on.
-    speed : float
-        Plant seconds a second.
-    truth : RingAddress or None
-        Where to publish `Truth.pack()` with every sample.
-    linger_s : float
-        How long the bench outlives the process that started it, so that the tripped watchdog can be seen.
-    events : tuple of Event
-        What happens when, in plant time (0 at the start).
-    lab : DevicesConfig or None
-        Serve these instruments in place of the pump board.
-    """
+    """What a bench process needs to know; picklable."""
 
     twin: TwinConfig
     pump: PumpConfig
-    clock: RunClock
-    port: int
+    clock: RunClock  # the run's clock, on which the truth is stamped
+    port: int  # where to listen; 0: any free port
     host: str = "127.0.0.1"
-    speed: float = 1.0
-    truth: RingAddress | None = None
+    speed: float = 1.0  # plant seconds a second
+    truth: RingAddress | None = None  # where to publish `Truth.pack()` with every sample
+    # how long the bench outlives the process that started it, so that the tripped watchdog can be seen
     linger_s: float = 5.0
-    events: tuple[Event, ...] = ()
-    lab: DevicesConfig | None = None
+    events: tuple[Event, ...] = ()  # what happens when, in plant time (0 at the start)
+    lab: DevicesConfig | None = None  # serve these instruments in place of the pump board
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +98,7 @@ async def _serve(spec: BenchSpec, ready: Connection) -> None:
             await served.stop()
 
 
-async def _keep_running(bench: LiveBench, spec: BenchSpec, stop: asyncio.Event) -> None:
+async def _keep_running(bench: "LiveBench", spec: BenchSpec, stop: asyncio.Event) -> None:
     """Step the bench on absolute deadlines until told to stop."""
     orphaned_s: float | None = None
     deadline_s = time.monotonic()
@@ -205,34 +183,25 @@ class LiveBench:
 
 # The twin as a process beside the hold: started, asked for its port, and its truth read for the record.
 
-
 _TRUTHS_KEPT = 64
 _READY_S = 60.0  # importing on a busy machine; a fresh one compiles first
 
 
 @dataclass(frozen=True, slots=True)
 class TwinProcess:
-    """A running simulated bench.
+    """A running simulated bench."""
 
-    Attributes
-    ----------
-    config : Config
-        The run's configuration with the twin's own address as its device.
-    truth : RingAddress
-        Where the twin publishes what its mirror really does.
-    """
-
-    config: Config
-    truth: RingAddress
+    config: Config  # the run's configuration with the twin's own address as its device
+    truth: RingAddress  # where the twin publishes what its mirror really does
 
     @classmethod
-    def started(cls, config: Config, clock: RunClock, stack: contextlib.ExitStack, lab: bool = False) -> TwinProcess:
+    def started(
+        cls, config: Config, clock: RunClock, stack: contextlib.ExitStack, lab: bool = False
+    ) -> "TwinProcess":
         """Start the twin and wait until it listens; the stack ends it. Raises DeviceError, e.g. for a busy port.
 
         With `lab` it answers as the instruments that the configuration names, else as the pump board.
         """
-        from membrane_ctrl.sim.sensors import TRUTH_BYTES
-
         truth = stack.enter_context(ring(_TRUTHS_KEPT, TRUTH_BYTES))
         spec = BenchSpec(
             config.twin, config.pump, clock, config.twin.port, truth=truth, lab=config.devices if lab else None
@@ -250,8 +219,6 @@ class TwinProcess:
 
     def truth_reader(self) -> Callable[[], tuple[float, float]]:
         """A function that returns the newest true displacement and laser bias, in um."""
-        from membrane_ctrl.sim.sensors import Truth
-
         reader = RingReader(self.truth)
 
         def newest() -> tuple[float, float]:
@@ -265,7 +232,6 @@ class TwinProcess:
 
 
 # `twin`: the simulated bench on its real protocol, for any client.
-
 
 _STOPS = {signal.SIGINT, signal.SIGTERM}
 

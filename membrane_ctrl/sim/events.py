@@ -13,28 +13,14 @@ _DAY_S = 86_400.0
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What acts on the bench in each step of a block; arrays (steps,), filled in place.
+    """What acts on the bench in each step of a block; arrays (steps,), filled in place."""
 
-    Attributes
-    ----------
-    time_s : array
-        Plant time of each step.
-    ambient_pa, air_k : array
-        Air pressure and temperature.
-    leak_factor : array
-        Leak over its configured value.
-    laser_bias_um : array
-        What the laser's mount has moved.
-    laser_lost : array
-        1 where the laser gets no light back, else 0.
-    """
-
-    time_s: Series
+    time_s: Series  # plant time of each step
     ambient_pa: Series
     air_k: Series
-    leak_factor: Series
-    laser_bias_um: Series
-    laser_lost: Series
+    leak_factor: Series  # leak over its configured value
+    laser_bias_um: Series  # displacement of the laser's mount
+    laser_lost: Series  # 1 where the laser gets no light back, else 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,35 +4,29 @@ Each serial port of the configuration becomes a pseudo-terminal, each Modbus TCP
 drivers are given these in place of the real ones.
 """
 
-import shutil
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from firmware_iface import settings
 from firmware_iface.drivers.modbus_map import ValueMap, make_map, preset
-from firmware_iface.emulators import (
-    bronkhorst,
-    keyence_dl_rs1a,
-    modbus_map_device,
-    modbus_server,
-    optoncdt1420,
-    pump_board,
-    serial_device,
-    vaisala_ptb330,
-    ventus,
-)
+from firmware_iface.emulators import bronkhorst, modbus_server, pump_board, serial_device
+from firmware_iface.emulators.keyence_dl_rs1a import KeyenceDlRs1aEmulator
+from firmware_iface.emulators.optoncdt1420 import Optoncdt1420Emulator
+from firmware_iface.emulators.vaisala_ptb330 import VaisalaPtb330Emulator
+from firmware_iface.emulators.ventus import VentusEmulator
 from firmware_iface.links import modbus_rtu, serial_port
-from membrane_ctrl.config import devices as table
-from membrane_ctrl.config.devices import AnyDriver, DevicesConfig
+from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.instruments.bench import map_keys
 
 _GATEWAY_NO_RESPONSE = 11
 _PRESSURE_FULL_MBAR = 10.0  # an EL-PRESS of 1 kPa, as the mirror's 600 Pa wants
 _FLOW_FULL_MLN_MIN = 360.0  # 6 mL/s
 _VERSION = 100  # V1.00
+_READ_INPUT = 4
 
 
 class Lab:
@@ -48,7 +42,7 @@ class Lab:
     Attributes
     ----------
     serial : dict
-        By the configuration's port: the emulated device of a serial line, whose faults can be switched on.
+        By the configuration's port: the emulated device of a serial line.
     wires : dict
         By the configuration's port: its pseudo-terminal, which can be unplugged.
     """
@@ -59,15 +53,15 @@ class Lab:
         self._plant = plant
         self._devices = devices
         self._outputs = {"pump": 0.0, "vent": 0.0}
-        self._folder = Path()
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._servers: dict[str, modbus_server.ModbusTcpServer] = {}
         self._tables: defaultdict[str, dict[int, modbus_server.RegisterTable]] = defaultdict(dict)
         for role, section in devices.roles().items():
-            if isinstance(section, table.BronkhorstModbusConfig):
+            if isinstance(section, settings.BronkhorstModbusConfig):
                 self._tables[section.link][section.unit_id] = bronkhorst.BronkhorstRegisters(
                     self._bronkhorst(role, section.serial)
                 )
-            elif not isinstance(section, table.ModbusMapConfig):
+            elif not isinstance(section, settings.ModbusMapConfig):
                 self.serial[section.port] = self._device(role, section)
         self._map_devices()
         self._board: pump_board.PumpBoardEmulator | None = None
@@ -76,17 +70,15 @@ class Lab:
             self._tables[devices.board][devices.unit_id] = self._board.state
         for url, slaves in self._tables.items():
             if url.startswith("rtu:"):
-                _, settings = modbus_rtu.parse_rtu_url(url)
-                handlers = {
-                    unit: partial(modbus_map_device.respond_to_input, table=found) for unit, found in slaves.items()
-                }
-                self.serial[url] = modbus_server.RtuBusEmulator(settings, handlers)
+                _, line = modbus_rtu.parse_rtu_url(url)
+                handlers = {unit: partial(respond_to_input, table=found) for unit, found in slaves.items()}
+                self.serial[url] = modbus_server.RtuBusEmulator(line, handlers)
 
     async def start(self) -> DevicesConfig:
         """Plug everything in; the configuration with the addresses that now answer. Raises OSError."""
-        self._folder = Path(tempfile.mkdtemp(prefix="membrane-lab-"))
+        self._folder = tempfile.TemporaryDirectory(prefix="membrane-lab-")
         for number, (port, device) in enumerate(self.serial.items()):
-            self.wires[port] = serial_device.PtyWire(device, self._folder / f"tty{number}")
+            self.wires[port] = serial_device.PtyWire(device, Path(self._folder.name, f"tty{number}"))
             self.wires[port].plug()
         for url, slaves in self._tables.items():
             if url.startswith("tcp:"):
@@ -107,11 +99,12 @@ class Lab:
             await server.stop()
         if self._board is not None:
             await self._board.stop()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        if self._folder is not None:
+            self._folder.cleanup()
 
-    def _moved(self, section: AnyDriver) -> AnyDriver:
+    def _moved(self, section: settings.AnyDriver) -> settings.AnyDriver:
         """The table with the emulator's address."""
-        if not isinstance(section, (table.ModbusMapConfig, table.BronkhorstModbusConfig)):
+        if not isinstance(section, settings.ON_MODBUS):
             return section.model_copy(update={"port": str(self.wires[section.port].path)})
         return section.model_copy(update={"link": self._address(section.link)})
 
@@ -122,25 +115,25 @@ class Lab:
         _, mark, options = url.partition("?")
         return f"rtu://{self.wires[url].path}{mark}{options}"
 
-    def _device(self, role: str, section: AnyDriver) -> serial_device.SerialDevice:
+    def _device(self, role: str, section: settings.AnyDriver) -> serial_device.SerialDevice:
         match section:
-            case table.Optoncdt1420Config():
-                return optoncdt1420.Optoncdt1420Emulator(
+            case settings.Optoncdt1420Config():
+                return Optoncdt1420Emulator(
                     self._sensor("displacement"), round(section.range_mm or 50), section.direction, section.baud
                 )
-            case table.KeyenceDlRs1aConfig():
-                return keyence_dl_rs1a.KeyenceDlRs1aEmulator(
+            case settings.KeyenceDlRs1aConfig():
+                return KeyenceDlRs1aEmulator(
                     self._sensor("displacement"),
                     section.direction,
                     section.baud,
                     section.parity,
                     section.amplifier + 1,
                 )
-            case table.VaisalaPtb330Config():
-                return vaisala_ptb330.VaisalaPtb330Emulator(self._sensor("barometer"), section.baud)
-            case table.VentusConfig():
-                return ventus.VentusEmulator(self._actuator("pump"), section.power_max_mw)
-            case table.BronkhorstProparConfig():
+            case settings.VaisalaPtb330Config():
+                return VaisalaPtb330Emulator(self._sensor("barometer"), section.baud)
+            case settings.VentusConfig():
+                return VentusEmulator(self._actuator("pump"), section.power_max_mw)
+            case settings.BronkhorstProparConfig():
                 return bronkhorst.ProparDevice(
                     self._bronkhorst(role, section.serial), serial_port.SerialSettings(section.baud)
                 )
@@ -149,9 +142,9 @@ class Lab:
 
     def _map_devices(self) -> None:
         """One device for all maps that name the same unit of the same link."""
-        units: defaultdict[tuple[str, int], list[tuple[str, table.ModbusMapConfig]]] = defaultdict(list)
+        units: defaultdict[tuple[str, int], list[tuple[str, settings.ModbusMapConfig]]] = defaultdict(list)
         for role, section in self._devices.roles().items():
-            if isinstance(section, table.ModbusMapConfig):
+            if isinstance(section, settings.ModbusMapConfig):
                 units[section.link, section.unit_id].append((role, section))
         for (link, unit_id), members in units.items():
             sensors: dict[ValueMap, Callable[[], float]] = {}
@@ -171,7 +164,7 @@ class Lab:
                 if section.preset:
                     low, high = preset(section.preset).get("raw_limits", raw_limits)
                     raw_limits = (low, high)
-            self._tables[link][unit_id] = modbus_map_device.MapDevice(sensors, outputs, constants, raw_limits)
+            self._tables[link][unit_id] = MapDevice(sensors, outputs, constants, raw_limits)
 
     def _bronkhorst(self, role: str, serial: str) -> bronkhorst.Instrument:
         if role == "pump":
@@ -205,4 +198,73 @@ class Lab:
 def _answer(slaves: Mapping[int, Any], unit: int, pdu: bytes) -> modbus_server.Answer:
     if unit not in slaves:
         return modbus_server.Answer(modbus_server.exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
-    return modbus_server.Answer(modbus_map_device.respond_to_input(pdu, slaves[unit]))
+    return modbus_server.Answer(respond_to_input(pdu, slaves[unit]))
+
+
+class MapDevice:
+    """A `RegisterTable` for any server.
+
+    Parameters
+    ----------
+    sensors : mapping
+        Maps of values that are read, each with the function that says the value now.
+    outputs : mapping
+        Maps of values that are written, each with the function that is told.
+    constants : mapping
+        Address to word, for identity and version.
+    raw_limits : tuple of int
+        Words outside are refused with exception 3.
+    """
+
+    def __init__(
+        self,
+        sensors: Mapping[ValueMap, Callable[[], float]],
+        outputs: Mapping[ValueMap, Callable[[float], None]],
+        constants: Mapping[int, int] | None = None,
+        raw_limits: tuple[int, int] = (0, 0xFFFF),
+    ) -> None:
+        self._sensors = sensors
+        self._outputs = outputs
+        self._constants = dict(constants or {})
+        self._raw_limits = raw_limits
+        self.restart()
+
+    def restart(self) -> None:
+        """Power-up: every output at the raw value 0, and the plant is told what that means, if anything."""
+        self._written = {found.address + n: 0 for found in self._outputs for n in range(found.words)}
+        for found, tell in self._outputs.items():
+            self._tell(found, tell)
+
+    def read(self, address: int, count: int) -> list[int]:
+        """Words. Raises RegisterRefusal."""
+        words = {**self._constants, **self._written}
+        for found, value in self._sensors.items():
+            words.update(enumerate(found.encode(value()), found.address))
+        try:
+            return [words[at] for at in range(address, address + count)]
+        except KeyError:
+            raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_ADDRESS) from None
+
+    def write(self, address: int, words: Sequence[int]) -> None:
+        """All or nothing. Raises RegisterRefusal."""
+        places = range(address, address + len(words))
+        if not all(at in self._written for at in places):
+            raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_ADDRESS)
+        if not all(self._raw_limits[0] <= word <= self._raw_limits[1] for word in words):
+            raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_VALUE)
+        self._written.update(zip(places, words, strict=True))
+        for found, tell in self._outputs.items():
+            self._tell(found, tell)
+
+    def _tell(self, found: ValueMap, tell: Callable[[float], None]) -> None:
+        value = found.decode([self._written[found.address + n] for n in range(found.words)])
+        # a current below 4 mA is a broken wire to what hangs on the output: off
+        tell(value if found.allows(value) else 0.0)
+
+
+def respond_to_input(pdu: bytes, table: modbus_server.RegisterTable) -> bytes:
+    """`respond`, and "read input registers" (function 4) answered from the same registers."""
+    if pdu[0] != _READ_INPUT:
+        return modbus_server.respond(pdu, table)
+    reply = modbus_server.respond(bytes([modbus_server.READ_HOLDING]) + pdu[1:], table)
+    return bytes([reply[0] - modbus_server.READ_HOLDING + _READ_INPUT]) + reply[1:]

@@ -26,6 +26,8 @@ TRANSPORT_S = 0.075  # gas in the tube
 class PumpModel:
     """q = q_full (d - dead) / (1 - dead) once running; starts at `start_fraction`, stalls below `stall_fraction`.
 
+    Raises ValueError if the pump delivers nothing at any command.
+
     Parameters
     ----------
     config : PumpConfig
@@ -34,11 +36,6 @@ class PumpModel:
         Flow at command 1.
     step_s : float
         Time step.
-
-    Raises
-    ------
-    ValueError
-        If the pump delivers nothing at any command.
     """
 
     def __init__(self, config: PumpConfig, flow_full_ml_per_s: float, step_s: float) -> None:

@@ -1,7 +1,5 @@
 """What the bench's sensors say of the truth."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import astuple, dataclass, fields
 
@@ -14,44 +12,20 @@ from membrane_ctrl.config.schema import TwinConfig
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """State of the simulated bench at one moment.
+    """State of the simulated bench at one moment."""
 
-    Attributes
-    ----------
-    time_s : float
-        Plant time; on the run's clock once the bench process has published it.
-    displacement_um : float
-        Mirror centre from its nominal sag (600 Pa, settled), positive when the bowl deepens.
-    sag_mm : float
-        Depth of the mirror film.
-    back_sag_mm : float
-        Depth of the other film.
-    gauge_pressure_pa, ambient_pressure_pa : float
-        Pressures.
-    air_temperature_c, gas_temperature_c : float
-        Temperatures.
-    laser_bias_um : float
-        What the laser reads too much, from its mount.
-    laser_lost : float
-        1 while the laser gets no light back.
-    leak_um_per_s : float
-        Speed at which the leak alone lets the centre down.
-    pump_um_per_s, vent_um_per_s : float
-        Speed at which the pump's flow lifts it and the vent's lets it down.
-    """
-
-    time_s: float
-    displacement_um: float
-    sag_mm: float
-    back_sag_mm: float
+    time_s: float  # plant time; on the run's clock once the bench process has published it
+    displacement_um: float  # mirror centre from its nominal sag (600 Pa, settled), positive when the bowl deepens
+    sag_mm: float  # depth of the mirror film
+    back_sag_mm: float  # depth of the other film
     gauge_pressure_pa: float
     ambient_pressure_pa: float
     air_temperature_c: float
     gas_temperature_c: float
-    laser_bias_um: float
-    laser_lost: float
-    leak_um_per_s: float
-    pump_um_per_s: float
+    laser_bias_um: float  # what the laser reads too much, from its mount
+    laser_lost: float  # 1 while the laser gets no light back
+    leak_um_per_s: float  # speed at which the leak alone lets the centre down
+    pump_um_per_s: float  # speed at which the pump's flow lifts it
     vent_um_per_s: float
 
     def pack(self) -> bytes:
@@ -59,7 +33,7 @@ class Truth:
         return _STRUCT.pack(*astuple(self))
 
     @classmethod
-    def unpack(cls, message: bytes) -> Truth:
+    def unpack(cls, message: bytes) -> "Truth":
         """Inverse of `pack`. Raises struct.error on a message of another length."""
         return cls(*_STRUCT.unpack(message))
 

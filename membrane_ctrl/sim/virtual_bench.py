@@ -22,69 +22,29 @@ _LASER_NO_LIGHT = 1
 
 @dataclass(slots=True)
 class Wrong:
-    """What is wrong now; all off at first. Fractions and offsets are NaN or 0 when off.
+    """What is wrong now; all off at first. Fractions and offsets are NaN or 0 when off."""
 
-    Attributes
-    ----------
-    no_light : bool
-        The laser has no reading.
-    laser_offset_um : float
-        It reads this much too much.
-    laser_stuck : bool
-        It repeats its value, with samples that advance.
-    samples_frozen : bool
-        The board answers with the same sample again and again.
-    gauge_lost, barometer_lost, thermometer_lost : bool
-        No value.
-    gauge_offset_pa : float
-        The gauge reads this much too much.
-    gauge_stuck : bool
-        It repeats its value.
-    silent : bool
-        Requests are carried out and not answered.
-    unreachable : bool
-        There is no connection.
-    lost_every : int
-        Every n-th request gets no answer; 0: none is lost.
-    readback_fraction : float
-        What the pump says of itself, whatever it is given.
-    pump_share : float
-        How much of its flow the pump still gives.
-    pump_stuck_fraction, vent_stuck_fraction : float
-        Where the actuator stays, whatever the board wants.
-    stalled : bool
-        The control process does not run: stopped, hung, or starved.
-    late_ms : float
-        Every tick starts so late.
-    dead_task : bool
-        A task of the control process has ended.
-    camera_lost : bool
-        No shape arrives.
-    camera_offset_um : float
-        Shapes show this much more sag.
-    """
-
-    no_light: bool = False
-    laser_offset_um: float = 0.0
-    laser_stuck: bool = False
-    samples_frozen: bool = False
+    no_light: bool = False  # the laser has no reading
+    laser_offset_um: float = 0.0  # it reads this much too much
+    laser_stuck: bool = False  # it repeats its value, with samples that advance
+    samples_frozen: bool = False  # the board answers with the same sample again and again
     gauge_lost: bool = False
     barometer_lost: bool = False
     thermometer_lost: bool = False
-    gauge_offset_pa: float = 0.0
-    gauge_stuck: bool = False
-    silent: bool = False
-    unreachable: bool = False
-    lost_every: int = 0
-    readback_fraction: float = math.nan
-    pump_share: float = 1.0
-    pump_stuck_fraction: float = math.nan
+    gauge_offset_pa: float = 0.0  # the gauge reads this much too much
+    gauge_stuck: bool = False  # it repeats its value
+    silent: bool = False  # requests are carried out and not answered
+    unreachable: bool = False  # there is no connection
+    lost_every: int = 0  # every n-th request gets no answer; 0: none is lost
+    readback_fraction: float = math.nan  # what the pump says of itself, whatever it is given
+    pump_share: float = 1.0  # how much of its flow the pump still gives
+    pump_stuck_fraction: float = math.nan  # where it stays, whatever the board wants
     vent_stuck_fraction: float = math.nan
-    stalled: bool = False
-    late_ms: float = 0.0
-    dead_task: bool = False
-    camera_lost: bool = False
-    camera_offset_um: float = 0.0
+    stalled: bool = False  # the control process does not run: stopped, hung, or starved
+    late_ms: float = 0.0  # every tick starts so late
+    dead_task: bool = False  # a task of the control process has ended
+    camera_lost: bool = False  # no shape arrives
+    camera_offset_um: float = 0.0  # shapes show this much more sag
 
 
 class VirtualBench:

@@ -9,10 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.roles import Frame, LinkError, Pattern
+from firmware_iface.roles import Frame, LinkError, Pattern, Pixels
 from membrane_ctrl.acquisition.cycle import CyclePlan
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, Verdict
-from membrane_ctrl.processes.frames import Pixels
 
 HEIGHT_PX, WIDTH_PX = 4, 6
 FRINGES = [Pattern("sin", axis, k) for axis in "xy" for k in range(4)]

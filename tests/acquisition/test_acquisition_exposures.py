@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from acquisition_fakes import FRINGES, HEIGHT_PX, WIDTH_PX, FakeCamera, FakeLaser, FakeScreen, VirtualClock
 
-from firmware_iface.drivers.frame_lost import FrameLostError
-from firmware_iface.roles import Frame, Pattern
+from firmware_iface.roles import Frame, FrameLostError, Pattern, Pixels
 from membrane_ctrl.acquisition.exposures import Exposures, StageError
-from membrane_ctrl.processes.frames import FrameReader, FrameRing, FrameWriter, Pixels
+from membrane_ctrl.processes.frames import FrameReader, FrameRing, FrameWriter
 
 SETTLE_S, EXPOSE_S, TRANSFER_S = 0.1, 0.01, 0.04
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_iface.display.response import ScreenRaster, pattern_light
+from firmware_iface.display import ScreenRaster, pattern_light
 from firmware_iface.roles import LinkError
 from membrane_ctrl.acquisition.process import AcquisitionSpec, acquisition_main
 from membrane_ctrl.cli import run as command

@@ -31,12 +31,13 @@ from firmware_iface.drivers.bronkhorst_propar import (
     split_binary,
     values,
 )
-from firmware_iface.emulators.bronkhorst import ANALOG_INPUT, BronkhorstRegisters, Instrument, ProparDevice
-from firmware_iface.emulators.modbus_server import RtuBusEmulator, respond
-from firmware_iface.emulators.serial_device import MemoryWire, PtyWire, SerialDevice, SerialFaults
+from firmware_iface.emulators.bronkhorst import ANALOG_INPUT, BronkhorstRegisters, Instrument
+from firmware_iface.emulators.modbus_server import respond
+from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from tests.support.faulty_devices import MemoryWire, ProparDevice, RtuBusEmulator, SerialDevice, SerialFaults
 from tests.support.virtual_time import run_virtual
 
 LINE = SerialSettings(38_400)

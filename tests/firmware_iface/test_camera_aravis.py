@@ -6,23 +6,22 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 
-from firmware_iface.drivers.camera_aravis import AravisCamera, AravisSettings
-from firmware_iface.drivers.frame_lost import FrameLostError
+from firmware_iface.drivers.camera_aravis import AravisCamera
 from firmware_iface.links import aravis
-from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from firmware_iface.roles import DeviceRefusedError, FrameLostError, LinkDownError, LinkError
+from firmware_iface.settings import AravisCameraConfig
 from tests.support.gige_camera import GigeCameraEmulator
 
 pytestmark = pytest.mark.real_time
 
 WIDTH_PX, HEIGHT_PX = 306, 256
-SETTINGS = AravisSettings("127.0.0.1", WIDTH_PX, HEIGHT_PX, exposure_ms=2.0, packet_bytes=8000, timeout_s=0.3)
+SETTINGS = AravisCameraConfig(camera="127.0.0.1", exposure_ms=2.0, packet_bytes=8000, timeout_s=0.3)
 
 
 class Sight:
@@ -60,14 +59,14 @@ def emulator(sight: Sight) -> Iterator[GigeCameraEmulator]:
 
 @pytest.fixture
 def camera(emulator: GigeCameraEmulator) -> Iterator[AravisCamera]:
-    opened = AravisCamera(SETTINGS)
+    opened = AravisCamera(SETTINGS, WIDTH_PX, HEIGHT_PX)
     opened.open()
     yield opened
     opened.close()
 
 
 def test_identity_and_pixels(emulator: GigeCameraEmulator, sight: Sight) -> None:
-    camera = AravisCamera(SETTINGS)
+    camera = AravisCamera(SETTINGS, WIDTH_PX, HEIGHT_PX)
     identity = camera.open()
     assert (identity.kind, identity.serial) == ("Aravis Fake", "EMU1")
     out = np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8)
@@ -100,7 +99,7 @@ def test_the_screen_may_change_between_expose_and_fetch(camera: AravisCamera, si
 
 
 def test_exposure_and_gain_arrive(emulator: GigeCameraEmulator, sight: Sight) -> None:
-    camera = AravisCamera(replace(SETTINGS, exposure_ms=3.0, gain_db=4.0))
+    camera = AravisCamera(SETTINGS.model_copy(update={"exposure_ms": 3.0, "gain_db": 4.0}), WIDTH_PX, HEIGHT_PX)
     camera.grab()
     camera.close()
     assert set(sight.seen) == {(3.0, 4)}
@@ -117,7 +116,7 @@ def test_exposure_and_gain_arrive(emulator: GigeCameraEmulator, sight: Sight) ->
 )
 def test_pixel_formats(emulator: GigeCameraEmulator, sight: Sight, pixel_format: str, dtype: Any, top: int) -> None:
     sight.dtype, sight.top = dtype, top
-    camera = AravisCamera(replace(SETTINGS, pixel_format=pixel_format))
+    camera = AravisCamera(SETTINGS.model_copy(update={"pixel_format": pixel_format}), WIDTH_PX, HEIGHT_PX)
     pixels = camera.grab().pixels
     camera.close()
     assert pixels.dtype == dtype
@@ -166,7 +165,7 @@ def test_a_frame_that_never_comes_is_lost_not_waited_for(
 def test_what_it_does_not_take_is_refused_in_one_line(
     emulator: GigeCameraEmulator, change: dict[str, Any], words: list[str]
 ) -> None:
-    camera = AravisCamera(replace(SETTINGS, **change))
+    camera = AravisCamera(SETTINGS.model_copy(update=change), change.pop("width_px", WIDTH_PX), HEIGHT_PX)
     if not words:
         camera.open()
         camera.close()
@@ -181,7 +180,7 @@ def test_what_it_does_not_take_is_refused_in_one_line(
 
 def test_in_use_by_another(camera: AravisCamera) -> None:
     with pytest.raises(LinkError, match=r"in use by another program.*close it"):
-        AravisCamera(SETTINGS).open()
+        AravisCamera(SETTINGS, WIDTH_PX, HEIGHT_PX).open()
     camera.grab()  # the first one is not disturbed
 
 
@@ -192,7 +191,7 @@ def test_a_buffer_of_another_size_is_a_mistake_of_the_caller(camera: AravisCamer
 
 
 def test_replug(emulator: GigeCameraEmulator, sight: Sight) -> None:
-    camera = AravisCamera(SETTINGS)
+    camera = AravisCamera(SETTINGS, WIDTH_PX, HEIGHT_PX)
     camera.grab()
     emulator.unplug()
     with pytest.raises(LinkDownError, match="plugged in"):
@@ -208,7 +207,7 @@ def test_discovery_names_it(emulator: GigeCameraEmulator) -> None:
     assert [(camera.vendor, camera.model, camera.camera_id) for camera in found] == [
         ("Aravis", "Fake", "Aravis-Fake-EMU1")
     ]
-    named = AravisCamera(replace(SETTINGS, camera_id=found[0].camera_id))
+    named = AravisCamera(SETTINGS.model_copy(update={"camera": found[0].camera_id}), WIDTH_PX, HEIGHT_PX)
     named.grab()
     named.close()
 
@@ -229,6 +228,6 @@ def test_without_the_library_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch
     aravis.aravis.cache_clear()
     try:
         with pytest.raises(LinkError, match=r"apt install libaravis-0\.8-0"):
-            AravisCamera(SETTINGS).open()
+            AravisCamera(SETTINGS, WIDTH_PX, HEIGHT_PX).open()
     finally:
         aravis.aravis.cache_clear()

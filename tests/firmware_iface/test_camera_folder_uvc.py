@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from firmware_iface.drivers.camera_folder import FolderCamera
-from firmware_iface.drivers.camera_uvc import UvcCamera, UvcSettings
+from firmware_iface.drivers.camera_uvc import UvcCamera
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError, Pattern
+from firmware_iface.settings import UvcCameraConfig
 
 
 @pytest.fixture
@@ -75,18 +76,18 @@ class FakeCapture:
         self.released = True
 
 
-def uvc(settings: UvcSettings) -> tuple[UvcCamera, list[FakeCapture]]:
+def uvc(config: UvcCameraConfig, width_px: int = 6) -> tuple[UvcCamera, list[FakeCapture]]:
     made: list[FakeCapture] = []
 
     def make(port: int | str) -> FakeCapture:
         made.append(FakeCapture(port))
         return made[-1]
 
-    return UvcCamera(settings, now=lambda: 1.0, capture=make), made
+    return UvcCamera(config, width_px, 4, now=lambda: 1.0, capture=make), made
 
 
 def test_uvc_throws_away_what_was_begun_before() -> None:
-    camera, made = uvc(UvcSettings("2", 6, 4, exposure=50.0))
+    camera, made = uvc(UvcCameraConfig(port="2", exposure=50.0))
     assert camera.grab().pixels[0, 0] == 3
     out = np.zeros((4, 6), np.uint8)
     assert camera.grab(out).pixels is out
@@ -97,7 +98,7 @@ def test_uvc_throws_away_what_was_begun_before() -> None:
 
 
 def test_uvc_unplugged_is_opened_again() -> None:
-    camera, made = uvc(UvcSettings("/dev/video0", 6, 4))
+    camera, made = uvc(UvcCameraConfig(port="/dev/video0"))
     camera.grab()
     made[0].there = False
     with pytest.raises(LinkDownError, match="unplugged"):
@@ -108,7 +109,7 @@ def test_uvc_unplugged_is_opened_again() -> None:
 
 
 def test_uvc_refuses_another_size() -> None:
-    camera, made = uvc(UvcSettings("0", 1920, 4))
+    camera, made = uvc(UvcCameraConfig(), 1920)
     with pytest.raises(DeviceRefusedError, match="width_px = 8 after 1920"):
         camera.open()
     assert made[0].released

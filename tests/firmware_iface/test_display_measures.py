@@ -10,14 +10,17 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from firmware_iface.display.measures import checkerboard_problem, exposure_problem, settling, share_left
-from firmware_iface.display.response import (
+from firmware_iface.display import (
     RAMP_LEVELS,
     ScreenRaster,
     checkerboard,
+    checkerboard_problem,
+    exposure_problem,
     linear_response,
     measured_response,
     pattern_light,
+    settling,
+    share_left,
 )
 from firmware_iface.roles import Pattern
 from tests.support.panel import EmulatedPanel, PanelResponse

@@ -11,9 +11,10 @@ from typing import Any
 import pytest
 
 from firmware_iface.drivers.keyence_dl_rs1a import QUALITY_AMPLIFIER_ERROR, QUALITY_OUT_OF_RANGE, KeyenceDlRs1a
-from firmware_iface.emulators.keyence_dl_rs1a import KeyenceDlRs1aEmulator
-from firmware_iface.emulators.serial_device import MemoryWire, PtyWire, SerialFaults
+from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from firmware_iface.settings import KeyenceDlRs1aConfig
+from tests.support.faulty_devices import KeyenceDlRs1aEmulator, MemoryWire, SerialFaults
 from tests.support.virtual_time import run_virtual
 
 
@@ -24,7 +25,7 @@ class Bench:
         self.displacement_um = -123.0
         self.emulator = KeyenceDlRs1aEmulator(lambda: self.displacement_um, amplifiers=amplifiers)
         self.wire = MemoryWire(self.emulator)
-        self.driver = KeyenceDlRs1a(self.wire, **settings)
+        self.driver = KeyenceDlRs1a(KeyenceDlRs1aConfig(port="memory", **settings), self.wire)
 
 
 def on_bench(test: Callable[[Bench], Coroutine[Any, Any, None]], **settings: Any) -> None:
@@ -179,24 +180,24 @@ def test_a_pulled_plug() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"baud": 115_200}, "baud = 115200"),
-        ({"amplifier": 15}, "amplifier = 15"),
-        ({"direction": 2}, "direction = 2"),
+        ({"baud": 115_200}, "baud"),
+        ({"amplifier": 15}, "amplifier"),
+        ({"direction": 2}, "direction"),
     ],
 )
 def test_settings_that_cannot_be(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        KeyenceDlRs1a("/dev/null", **settings)
+        KeyenceDlRs1aConfig(port="/dev/null", **settings)
 
 
 async def test_through_the_kernel(tmp_path: Path) -> None:
     wire = PtyWire(KeyenceDlRs1aEmulator(lambda: 5.0, baud=38_400), tmp_path / "tty")
     wire.plug()
-    driver = KeyenceDlRs1a(str(wire.path), baud=38_400)
+    driver = KeyenceDlRs1a(KeyenceDlRs1aConfig(port=str(wire.path), baud=38_400))
     await driver.open()
     assert (await driver.displacement()).displacement_um == 5.0
     await driver.close()
-    wrong = KeyenceDlRs1a(str(wire.path), baud=9600)
+    wrong = KeyenceDlRs1a(KeyenceDlRs1aConfig(port=str(wire.path), baud=9600))
     with pytest.raises(LinkError, match=r"no answer.*set to 9600 8N1"):
         await wrong.open()
     wire.unplug()

@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_iface.drivers.modbus_map import ModbusValue, ValueMap, make_map
-from firmware_iface.emulators.modbus_map_device import MapDevice, respond_to_input
-from firmware_iface.emulators.modbus_server import RtuBusEmulator, bitwise_crc
-from firmware_iface.emulators.serial_device import MemoryWire
+from firmware_iface.emulators.modbus_server import bitwise_crc
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkError
+from membrane_ctrl.sim.lab import MapDevice, respond_to_input
+from tests.support.faulty_devices import MemoryWire, RtuBusEmulator
 from tests.support.virtual_time import run_virtual
 
 LINE = SerialSettings(9600)

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from firmware_iface.emulators.modbus_server import RtuBusEmulator, bitwise_crc, respond
-from firmware_iface.emulators.serial_device import MemoryWire, SerialFaults
+from firmware_iface.emulators.modbus_server import bitwise_crc, respond
 from firmware_iface.links.modbus_rtu import RtuBus, crc16, parse_rtu_url, rtu_frame, take_reply
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from tests.support.faulty_devices import MemoryWire, RtuBusEmulator, SerialFaults
 from tests.support.virtual_time import run_virtual, stand_still
 
 LINE = SerialSettings(115_200)

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 from firmware_iface.drivers.linked_device import StepGate
-from firmware_iface.drivers.optoncdt1420 import Optoncdt1420, middle
-from firmware_iface.drivers.optoncdt_stream import StreamParser, distance_mm
-from firmware_iface.emulators.optoncdt1420 import NO_PEAK, Optoncdt1420Emulator, three_bytes
-from firmware_iface.emulators.serial_device import MemoryWire, PtyWire
+from firmware_iface.drivers.optoncdt1420 import Optoncdt1420, StreamParser, distance_mm, middle
+from firmware_iface.emulators.optoncdt1420 import NO_PEAK, three_bytes
+from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from firmware_iface.settings import Optoncdt1420Config
+from tests.support.faulty_devices import MemoryWire, Optoncdt1420Emulator
 from tests.support.virtual_time import run_virtual, stand_still
 
 STEP_UM = 50_000 * 1.02 / 65_520  # a digital step at 50 mm range
@@ -30,7 +31,7 @@ class Bench:
         self.displacement_um = 12.0
         self.emulator = Optoncdt1420Emulator(lambda: self.displacement_um)
         self.wire = MemoryWire(self.emulator)
-        self.driver = Optoncdt1420(self.wire, **settings)
+        self.driver = Optoncdt1420(Optoncdt1420Config(port="memory", **settings), self.wire)
 
     async def tick(self) -> float:
         await asyncio.sleep(0.02)
@@ -143,7 +144,7 @@ def test_what_came_while_the_process_stood_still_is_taken() -> None:
 def test_the_mean_resolves_less_than_a_step() -> None:
     async def test() -> None:
         emulator = Optoncdt1420Emulator(lambda: 12.3, noise_um=1.0)
-        driver = Optoncdt1420(MemoryWire(emulator))
+        driver = Optoncdt1420(Optoncdt1420Config(port="memory"), MemoryWire(emulator))
         await driver.open()
         found = []
         for _ in range(50):
@@ -159,7 +160,7 @@ def test_the_mean_resolves_less_than_a_step() -> None:
 def test_a_deeper_bowl_is_nearer() -> None:
     async def test() -> None:
         emulator = Optoncdt1420Emulator(lambda: 1000.0, direction=1)
-        driver = Optoncdt1420(MemoryWire(emulator), direction=-1, zero_mm=25.0)
+        driver = Optoncdt1420(Optoncdt1420Config(port="memory", direction=-1, zero_mm=25.0), MemoryWire(emulator))
         await driver.open()
         assert (await driver.displacement()).displacement_um == pytest.approx(-1000.0, abs=STEP_UM)
         await driver.close()
@@ -270,7 +271,8 @@ def test_a_pulled_plug_is_noticed_while_waiting() -> None:
 )
 def test_another_sensor_is_refused(emulator: dict[str, Any], settings: dict[str, Any], message: str) -> None:
     async def test() -> None:
-        driver = Optoncdt1420(MemoryWire(Optoncdt1420Emulator(lambda: 0.0, **emulator)), **settings)
+        wire = MemoryWire(Optoncdt1420Emulator(lambda: 0.0, **emulator))
+        driver = Optoncdt1420(Optoncdt1420Config(port="memory", **settings), wire)
         with pytest.raises(DeviceRefusedError, match=message):
             await driver.open()
 
@@ -308,19 +310,19 @@ def test_open_says_what_is_wrong(faults: dict[str, Any], message: str) -> None:
     [
         ({"rate_khz": 3.0}, "rate_khz = 3"),
         ({"baud": 115_200, "rate_khz": 4.0}, "cannot carry"),
-        ({"direction": 0}, "direction = 0"),
+        ({"direction": 0}, "direction"),
         ({"port": "COM3"}, "usb:VID:PID"),
     ],
 )
 def test_settings_that_cannot_be(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Optoncdt1420(**{"port": "/dev/null", **settings})
+        Optoncdt1420(Optoncdt1420Config(**{"port": "/dev/null", **settings}))
 
 
 async def test_through_the_kernel_with_a_replug(tmp_path: Path) -> None:
     wire = PtyWire(Optoncdt1420Emulator(lambda: 12.0), tmp_path / "tty")
     wire.plug()
-    driver = Optoncdt1420(str(wire.path))
+    driver = Optoncdt1420(Optoncdt1420Config(port=str(wire.path)))
     await driver.open()
     assert (await driver.displacement()).displacement_um == pytest.approx(12.0, abs=STEP_UM)
     wire.unplug()

@@ -9,10 +9,8 @@ import pytest
 from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
 from firmware_iface.drivers.ventus import Ventus
-from firmware_iface.emulators.keyence_dl_rs1a import KeyenceDlRs1aEmulator
-from firmware_iface.emulators.optoncdt1420 import Optoncdt1420Emulator
-from firmware_iface.emulators.serial_device import MemoryWire
-from firmware_iface.emulators.ventus import VentusEmulator
+from firmware_iface.settings import KeyenceDlRs1aConfig, Optoncdt1420Config, VentusConfig
+from tests.support.faulty_devices import KeyenceDlRs1aEmulator, MemoryWire, Optoncdt1420Emulator, VentusEmulator
 from tests.support.virtual_time import run_virtual
 
 BANNER = b"\r\nboot 1.2 \x00\xff ready\r\n"
@@ -43,7 +41,7 @@ def test_a_wordy_optoncdt(rate: str) -> None:
     async def test() -> None:
         emulator = WordyOptoncdt()
         emulator.rate = rate
-        driver = Optoncdt1420(MemoryWire(emulator))
+        driver = Optoncdt1420(Optoncdt1420Config(port="memory"), MemoryWire(emulator))
         assert (await driver.open()).kind == "optoNCDT 1420-50"
         await asyncio.sleep(0.02)
         assert (await driver.displacement()).displacement_um == pytest.approx(12.0, abs=1.0)
@@ -74,7 +72,7 @@ def test_a_terse_keyence(end: tuple[bytes, ...]) -> None:
     async def test() -> None:
         emulator = TerseKeyence(end)
         wire = MemoryWire(emulator)
-        driver = KeyenceDlRs1a(wire, baud=38_400, parity="E")
+        driver = KeyenceDlRs1a(KeyenceDlRs1aConfig(port="memory", baud=38_400, parity="E"), wire)
         opening = asyncio.ensure_future(driver.open())
         await asyncio.sleep(0)
         emulator._sent(BANNER)
@@ -102,7 +100,7 @@ class OtherVentus(VentusEmulator):
 def test_another_ventus() -> None:
     async def test() -> None:
         driven: list[float] = []
-        driver = Ventus(MemoryWire(OtherVentus(driven)))
+        driver = Ventus(VentusConfig(port="memory"), MemoryWire(OtherVentus(driven)))
         await driver.open()
         await driver.set_pump(0.25)
         assert driven[-1] == await driver.pump_fraction() == 0.25

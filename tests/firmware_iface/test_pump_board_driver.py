@@ -13,7 +13,7 @@ from pymodbus.client import AsyncModbusTcpClient
 
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.pump_board import Faults, PumpBoardEmulator
-from firmware_iface.links.modbus_links import parse_tcp_url
+from firmware_iface.links.modbus_rtu import parse_tcp_url
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import (
     ALL_FAULTS,

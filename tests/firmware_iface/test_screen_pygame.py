@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_iface.display.response import DisplayResponse, ScreenRaster, checkerboard, pattern_light
+from firmware_iface.display import DisplayResponse, ScreenRaster, checkerboard, pattern_light
 from firmware_iface.drivers.screen_pygame import PygameScreen, ScreenSettings
 from firmware_iface.roles import DeviceRefusedError, LinkError, Pattern
 from tests.support.virtual_display import screenshot, virtual_display

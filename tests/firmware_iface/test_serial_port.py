@@ -9,12 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from firmware_iface.emulators.modbus_server import RtuBusEmulator
-from firmware_iface.emulators.serial_device import PtyWire, SerialDevice
+from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_rtu import RtuBus
-from firmware_iface.links.serial_port import SerialPort, SerialSettings
-from firmware_iface.links.usb_ports import check_port_name, port_path, serial_ports
+from firmware_iface.links.serial_port import SerialPort, SerialSettings, check_port_name, port_path, serial_ports
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from tests.support.faulty_devices import RtuBusEmulator, SerialDevice
 
 LINE = SerialSettings(115_200)
 GUARD_S = 5.0

@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 
 from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
-from firmware_iface.emulators.serial_device import MemoryWire, PtyWire, SerialFaults
-from firmware_iface.emulators.vaisala_ptb330 import VaisalaPtb330Emulator
+from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from firmware_iface.settings import VaisalaPtb330Config
+from tests.support.faulty_devices import MemoryWire, SerialFaults, VaisalaPtb330Emulator
 from tests.support.virtual_time import run_virtual
 
 
@@ -25,7 +26,7 @@ class Bench:
         self.pressure_pa = 101_325.0
         self.emulator = VaisalaPtb330Emulator(lambda: self.pressure_pa, **emulator)
         self.wire = MemoryWire(self.emulator)
-        self.driver = VaisalaPtb330(self.wire)
+        self.driver = VaisalaPtb330(VaisalaPtb330Config(port="memory"), self.wire)
 
     async def after(self, seconds: float) -> float:
         await asyncio.sleep(seconds)
@@ -193,7 +194,7 @@ def test_silence_is_said() -> None:
 async def test_through_the_kernel(tmp_path: Path) -> None:
     wire = PtyWire(VaisalaPtb330Emulator(lambda: 100_000.0, baud=9600), tmp_path / "tty")
     wire.plug()
-    driver = VaisalaPtb330(str(wire.path), baud=9600)
+    driver = VaisalaPtb330(VaisalaPtb330Config(port=str(wire.path), baud=9600))
     await driver.open()
     assert await driver.ambient_pressure_pa() == pytest.approx(100_000.0)
     await driver.close()

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from firmware_iface.drivers.ventus import Ventus
-from firmware_iface.emulators.serial_device import MemoryWire, PtyWire, SerialFaults
-from firmware_iface.emulators.ventus import VentusEmulator
+from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
+from firmware_iface.settings import VentusConfig
+from tests.support.faulty_devices import MemoryWire, SerialFaults, VentusEmulator
 from tests.support.virtual_time import run_virtual
 
 
@@ -23,7 +24,7 @@ class Bench:
         self.driven: list[float] = []
         self.emulator = VentusEmulator(self.driven.append, streaming=streaming)
         self.wire = MemoryWire(self.emulator)
-        self.driver = Ventus(self.wire, **settings)
+        self.driver = Ventus(VentusConfig(port="memory", **settings), self.wire)
 
 
 def on_bench(test: Callable[[Bench], Coroutine[Any, Any, None]], **settings: Any) -> None:
@@ -191,15 +192,15 @@ def test_another_device_is_refused() -> None:
 
 
 def test_more_power_than_pumps_take_is_refused() -> None:
-    with pytest.raises(ValueError, match="at most 1400"):
-        Ventus("/dev/null", power_max_mw=5000.0)
+    with pytest.raises(ValueError, match="less than or equal to 1400"):
+        VentusConfig(port="/dev/null", power_max_mw=5000.0)
 
 
 async def test_through_the_kernel_with_a_replug(tmp_path: Path) -> None:
     driven: list[float] = []
     wire = PtyWire(VentusEmulator(driven.append), tmp_path / "tty")
     wire.plug()
-    driver = Ventus(str(wire.path))
+    driver = Ventus(VentusConfig(port=str(wire.path)))
     await driver.open()
     await driver.set_pump(0.5)
     wire.unplug()

@@ -14,7 +14,6 @@ from metrology_truth import SMALL
 from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
 from membrane_ctrl.metrology.live import LiveReconstructor
 from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
-from membrane_ctrl.metrology.sliding import SlidingWindow
 from membrane_ctrl.metrology.uncertainty.geometry_spread import PAPER_SPREAD, changed
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
@@ -316,14 +315,6 @@ def test_unequal_steps() -> None:
     estimate = live.fringes(_render_unequal("fringes", 3.0), np.zeros(8), np.full(8, 3.0))
     assert estimate.verdict == "ok"
     assert _error_um(live, estimate, 3.0)[0] < 0.05
-
-
-def test_a_frame_in_a_window_of_unequal_steps() -> None:
-    window = SlidingWindow(OPTICS, 1, shifts_rad=UNEQUAL)
-    window.full(_render_unequal("full", 0.0), np.zeros(18), np.zeros(18))
-    for step, frame in enumerate(_render_unequal("fringes", 3.0)):
-        estimate = window.frame(frame, step, 0.1 * step, 3.0)
-    assert _error_um(window, estimate, 3.0)[0] < 0.05
 
 
 def test_steps_that_determine_no_phase_are_refused() -> None:

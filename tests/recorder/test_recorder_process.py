@@ -97,7 +97,7 @@ def received(status: Connection) -> list[dict[str, Any]]:
     reports = []
     while True:
         try:
-            lambda event: reports.append(event.to_dict())(status.recv())
+            reports.append(status.recv())
         except EOFError:
             break
     assert sum(report["kind"] == "alive" for report in reports) >= 1

@@ -50,7 +50,7 @@ def test_faults_and_missed_ticks_of_a_part_are_its_own(folder: Path) -> None:
     ("part", "whole", "said"),
     [
         (["--from", "+100s", "--to", "+180s"], False, ", same part: Held for 1 min 20 s"),
-        (["--from", "18:02", "--to", "18:04"], True, ", the whole of it: Held for 6 min"),
+        (["--from", "18:02", "--to", "18:04"], True, ", all of it: Held for 6 min"),
         ([], True, "-other: Held for 6 min"),
     ],
 )
@@ -63,4 +63,4 @@ def test_a_part_is_set_against_the_same_part_or_says_that_it_is_not(
     table = json.loads((tmp_path / "o" / "report.json").read_text())["compared_with"]
     assert table["whole_run"] is whole
     page = (tmp_path / "o" / "report.html").read_text()
-    assert ("against the whole of the other" in page) is (whole and bool(part))
+    assert ("Part of this run, all of the other" in page) is (whole and bool(part))

@@ -41,8 +41,8 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 from pydantic import Field, model_validator
 
+from firmware_iface.settings import Section
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.section import Section
 from membrane_ctrl.config.toml_file import load
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick

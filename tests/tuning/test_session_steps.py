@@ -20,7 +20,7 @@ from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGa
 from tuning.identification.loop_model import PlantModel
 from tuning.identification.records import Record
 from tuning.identification.shape_loop import STEP_UM, evaluate
-from tuning.proposal.preview import ModelBench
+from tuning.proposal.design import ModelBench
 from tuning.proposal.verify import SETTLE_LEAST_S, VerificationTrial, centre_std_um, health, look, settle_s
 from tuning.rig import Rig
 

@@ -10,8 +10,17 @@ import pytest
 
 from benchmarks.tuning import Case, TwinBench
 from membrane_ctrl.config.schema import PumpConfig
-from membrane_ctrl.control.experiments.machine import Around, BenchSample, ExcursionGuard, Finished, Patterned
-from membrane_ctrl.control.experiments.patterns import Relay, doublets, multisine, steps
+from membrane_ctrl.control.experiments.machine import (
+    Around,
+    BenchSample,
+    ExcursionGuard,
+    Finished,
+    Patterned,
+    Relay,
+    doublets,
+    multisine,
+    steps,
+)
 from membrane_ctrl.control.experiments.pump_map import PumpMapper
 from membrane_ctrl.sim.events import AmbientChange, LaserDropout
 from tuning.identification.characterise import ExperimentError, characterise

@@ -5,7 +5,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from membrane_ctrl.control.experiments import machine, patterns, trial
+from membrane_ctrl.control.experiments import machine, trial
 from tuning.identification.identify import Identified, identify, independence, prediction_errors, two_gains, whiteness
 from tuning.identification.records import Record
 
@@ -26,34 +26,19 @@ _WORSE_MAX = 1.5  # innovation on new data over that of the fit
 
 @dataclass(frozen=True, slots=True)
 class FitQuality:
-    """Verdict on data and fit.
+    """Verdict on data and fit."""
 
-    Attributes
-    ----------
-    verdict : str
-        "ok"; "degraded": usable, the uncertainty is larger than it should be; "refused": no proposal.
-    reasons : tuple of str
-        What was found, each with what would help.
-    """
-
+    # "ok"; "degraded": usable, the uncertainty is larger than it should be; "refused": no proposal
     verdict: Literal["ok", "degraded", "refused"]
-    reasons: tuple[str, ...]
+    reasons: tuple[str, ...]  # what was found, each with what would help
 
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """A fit on data that were not used for it.
+    """A fit on data that were not used for it."""
 
-    Attributes
-    ----------
-    innovation_ratio : float
-        One-step prediction error there over that of the fit.
-    whiteness_p, independence_p : float
-        As in `Identified`.
-    """
-
-    innovation_ratio: float
-    whiteness_p: float
+    innovation_ratio: float  # one-step prediction error there over that of the fit
+    whiteness_p: float  # as in `Identified`
     independence_p: float
 
 
@@ -149,45 +134,22 @@ class ExperimentRig(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Experiments:
-    """What the experiments left, raw.
+    """What the experiments left, raw."""
 
-    Attributes
-    ----------
-    around : Around
-        Holding flow, laser noise, limits.
-    record : Record
-        Relays, the holds between, doublets, without a gap.
-    relays_s : float
-        How much of it is relays with the holds behind them.
-    pulses_s : tuple of float
-        Start and end of the longest doublets in it.
-    finished : Finished
-        How the last relay ended.
-    """
-
-    around: machine.Around
-    record: Record
-    relays_s: float
-    pulses_s: tuple[float, float]
-    finished: machine.Finished
+    around: machine.Around  # holding flow, laser noise, limits
+    record: Record  # relays, the holds between, doublets, without a gap
+    relays_s: float  # how much of it is relays with the holds behind them
+    pulses_s: tuple[float, float]  # start and end of the longest doublets in it
+    finished: machine.Finished  # how the last relay ended
 
 
 @dataclass(frozen=True, slots=True)
 class Characterised:
-    """What the experiments gave.
-
-    Attributes
-    ----------
-    experiments : Experiments
-    identified : Identified
-        Fit to all of it.
-    quality : FitQuality
-        Verdict; the doublets are predicted with a fit to the relays alone.
-    """
+    """What the experiments gave."""
 
     experiments: Experiments
-    identified: Identified
-    quality: FitQuality
+    identified: Identified  # fit to all of it
+    quality: FitQuality  # verdict; the doublets are predicted with a fit to the relays alone
 
     @property
     def around(self) -> machine.Around:
@@ -234,16 +196,12 @@ def experiment(rig: ExperimentRig, limit_um: float = 10.0) -> Experiments:
     A relay that was stopped is thrown away and repeated: whatever stopped it is no disturbance of the kind that the
     fit knows. Doublets that were stopped are kept.
 
-    Raises
-    ------
-    ExperimentError
-        If no relay could be completed.
-    ValueError
-        If the pump has no room about the holding flow: the mirror is too tight or too leaky.
+    Raises ExperimentError if no relay could be completed; ValueError if the pump has no room about the holding flow:
+    the mirror is too tight or too leaky.
     """
     rig.hold(_SETTLE_S)
     around = rig.around(rig.hold(_QUIET_S), limit_um)
-    patterns.room(around)  # a relay without it would only say that it was stopped
+    machine.room(around)  # a relay without it would only say that it was stopped
     relays, finished = _relays(rig, around)
     gain = identify(relays).model.gain
     whole = relays

@@ -31,30 +31,16 @@ _HANN_LOSS = 35.0 / 18.0  # neighbouring frequencies of a Hann taper share this 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """White noise on a reading and the walk of what it reads.
+    """White noise on a reading and the walk of what it reads."""
 
-    Attributes
-    ----------
-    white : float
-        Standard deviation of a sample.
-    fast, slow : float
-        Intensities of the walks: variance per second.
-    slow_s : float
-        Lag behind which the slow walk comes.
-    white_sigma, fast_sigma, slow_sigma : float
-        Relative standard errors of the variance of each.
-    dt_s : float
-        Sample time that `white` belongs to.
-    """
-
-    white: float
-    fast: float
+    white: float  # standard deviation of a sample
+    fast: float  # intensities of the walks: variance per second
     slow: float
-    slow_s: float
-    white_sigma: float
+    slow_s: float  # lag behind which the slow walk comes
+    white_sigma: float  # relative standard errors of the variance of each
     fast_sigma: float
     slow_sigma: float
-    dt_s: float
+    dt_s: float  # sample time that `white` belongs to
 
     def moving_psd(self, w_rad_per_s: records.Series) -> records.Series:
         """Two-sided spectrum of the true movement, unit^2 s."""
@@ -75,17 +61,8 @@ def undriven_um(record: records.Record, model: loop_model.PlantModel) -> records
 def fit_noise(series: records.Series, dt_s: float, slow_s: float) -> Noise:
     """Intensities of white noise and walks in a series; a straight trend does not matter.
 
-    Parameters
-    ----------
-    series : (n,) array
-    dt_s : float
-    slow_s : float
-        Lag of the slow walk; 0 leaves it out.
-
-    Raises
-    ------
-    ValueError
-        If the series is shorter than two of the slowest periods looked at.
+    Raises ValueError if the series is shorter than two of the slowest periods looked at. `slow_s` is the lag of the
+    slow walk; 0 omits it.
     """
     if series.size * dt_s < 2 * _SLOWEST_S:
         raise ValueError(f"{series.size * dt_s:.0f} s of hold are too short: {2 * _SLOWEST_S:.0f} s at least")
@@ -146,25 +123,13 @@ _BLOCK_S = 0.5  # below a second a barometer's noise hides its signal; above, it
 
 @dataclass(frozen=True, slots=True)
 class WeatherGain:
-    """A gain, its standard error, and how the sensor's quantity wanders.
+    """A gain, its standard error, and how the sensor's quantity wanders."""
 
-    Attributes
-    ----------
-    gain, sigma : float
-        um per Pa or um per K.
-    walk : float
-        Variance per second of the quantity's random walk, Pa^2/s or K^2/s.
-    noise : float
-        Standard deviation of a reading.
-    lag_s : float
-        Lag behind which the quantity reaches the centre.
-    """
-
-    gain: float
+    gain: float  # um per Pa or um per K
     sigma: float
-    walk: float
-    noise: float
-    lag_s: float
+    walk: float  # variance per second of the quantity's random walk, Pa^2/s or K^2/s
+    noise: float  # standard deviation of a reading
+    lag_s: float  # lag behind which the quantity reaches the centre
 
     def agreed(self, configured: float) -> float:
         """Gain to use: the fitted one where the record knows it to 10 %, else the configured one if they agree.
@@ -195,13 +160,7 @@ def lagged(series: records.Series, lag_s: float, dt_s: float) -> records.Series:
 def fit_weather(record: records.Record, model: loop_model.PlantModel, gas_follows_air_s: float) -> WeatherFit:
     """Regress what the pump did not do on the weather.
 
-    Parameters
-    ----------
-    record : Record
-        A quiet hold of some minutes.
-    model : PlantModel
-    gas_follows_air_s : float
-        Lag of the gas behind the air.
+    `record` is a quiet hold of some minutes, `gas_follows_air_s` the lag of the gas behind the air.
     """
     z = undriven_um(record, model)
     channels: list[tuple[records.Series, float]] = []
@@ -261,18 +220,10 @@ def _regress(
 
 @dataclass(frozen=True, slots=True)
 class DisturbanceModel:
-    """What moves the centre, and what the laser adds.
+    """What moves the centre, and what the laser adds."""
 
-    Attributes
-    ----------
-    rest : Noise
-        The laser's noise and the walks that no weather sensor explains.
-    barometer, air : WeatherGain or None
-        What the sensors explain.
-    """
-
-    rest: Noise
-    barometer: WeatherGain | None
+    rest: Noise  # the laser's noise and the walks that no weather sensor explains
+    barometer: WeatherGain | None  # what the sensors explain
     air: WeatherGain | None
 
     @property

@@ -65,38 +65,20 @@ class Sigma:
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """A fitted model and how far it can be trusted.
-
-    Attributes
-    ----------
-    model : PlantModel
-    sigma : Sigma
-        Standard errors.
-    covariance : (4, 4) array
-        Of gain, dead time, lag, leak.
-    noise : NoiseModel
-    pressure_gain_um_per_pa : float
-        Of the barometer, 0 without one. Its noise makes it a little small: a nuisance here, `feedforward_fit` has it.
-    innovation_um : float
-        Standard deviation of the one-step prediction error.
-    whiteness_p, independence_p : float
-        Probability of residuals at least as coloured, and as correlated with past flow, if the model were true.
-    largest_residual : float
-        In standard deviations.
-    residual_um : (n,) array
-        Prediction errors.
-    """
+    """A fitted model and how far it can be trusted."""
 
     model: loop_model.PlantModel
-    sigma: Sigma
-    covariance: records.Series
+    sigma: Sigma  # standard errors
+    covariance: records.Series  # (4, 4): of gain, dead time, lag, leak
     noise: NoiseModel
+    # Of the barometer, 0 without one; a nuisance here, which the barometer's noise makes too small
     pressure_gain_um_per_pa: float
-    innovation_um: float
+    innovation_um: float  # standard deviation of the one-step prediction error
+    # Probability of residuals at least as coloured, and as correlated with past flow, if the model were true
     whiteness_p: float
     independence_p: float
-    largest_residual: float
-    residual_um: records.Series
+    largest_residual: float  # in standard deviations
+    residual_um: records.Series  # (n,): prediction errors
 
 
 def prediction_errors(
@@ -104,13 +86,7 @@ def prediction_errors(
 ) -> records.Series:
     """One-step prediction errors of a model on a record, (n - 1,) um; the first are the filter's start.
 
-    Parameters
-    ----------
-    record : Record
-    model : PlantModel
-    noise : NoiseModel
-    pressure_gain_um_per_pa : float
-        How the barometer moves the centre; 0 leaves it out.
+    `pressure_gain_um_per_pa` is the barometer's effect on the centre; 0 omits it.
     """
     x = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
     moved = np.diff(record.filled_displacement_um()) - model.gain * np.diff(x) + model.leak_um_per_s * record.dt_s
@@ -122,10 +98,7 @@ def prediction_errors(
 def identify(record: records.Record) -> Identified:
     """Fit the model; the barometer, if there is one, takes its share out of the noise.
 
-    Raises
-    ------
-    ValueError
-        If the record is too short, has no reading, or the flow never changed.
+    Raises ValueError if the record is too short, has no reading, or the flow never changed.
     """
     if len(record) < 10 * _LAGS:
         raise ValueError(f"{record.duration_s:.1f} s is too short to identify anything")
@@ -228,19 +201,11 @@ _SAME = 1e-6  # with two flows in the whole record, x_above is x and t but for r
 
 @dataclass(frozen=True, slots=True)
 class TwoGains:
-    """The pump above and below the holding flow.
+    """The pump above and below the holding flow."""
 
-    Attributes
-    ----------
-    below, above : float
-        Gain of either part.
-    difference_sigma : float
-        Standard error of `above - below`; infinite if the flow had two values only.
-    """
-
-    below: float
+    below: float  # gain of either part
     above: float
-    difference_sigma: float
+    difference_sigma: float  # standard error of `above - below`; infinite if the flow had two values only
 
 
 def two_gains(record: records.Record, identified: Identified) -> TwoGains:

@@ -7,17 +7,15 @@ h / 2 is what a command held for a sample comes late on average. A Pade approxim
 much as the designs differ; a frequency response needs none.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import control
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.model.arrays import ComplexArray
 from tuning.identification.records import Series
 
 # The mirror as tuning sees it: an integrator behind the pump's transport delay and lag.
@@ -29,24 +27,13 @@ from tuning.identification.records import Series
 
 @dataclass(frozen=True, slots=True)
 class PlantModel:
-    """Gain, delay and leak.
+    """Gain, delay and leak."""
 
-    Attributes
-    ----------
-    gain : float
-        k, speed of the centre per commanded flow.
-    dead_time_s : float
-        theta, from a reading's tick to the first gas in the mirror (half a sample of holding comes on top).
-    lag_s : float
-        T, of the pump.
-    leak_um_per_s : float
-        What leak and bleed take away.
-    """
-
-    gain: float
+    gain: float  # k, speed of the centre per commanded flow
+    # theta, from a reading's tick to the first gas in the mirror (half a sample of holding comes on top)
     dead_time_s: float
-    lag_s: float
-    leak_um_per_s: float
+    lag_s: float  # T
+    leak_um_per_s: float  # what leak and bleed take away
 
     @property
     def delay_s(self) -> float:
@@ -78,8 +65,6 @@ def driven_um(flow_um_per_s: Series, dead_time_s: float, lag_s: float, dt_s: flo
     ----------
     flow_um_per_s : (n,) array
         v; its first value is taken to have stood for ever.
-    dead_time_s, lag_s : float
-    dt_s : float
 
     Returns
     -------
@@ -98,8 +83,6 @@ def driven_um(flow_um_per_s: Series, dead_time_s: float, lag_s: float, dt_s: flo
     return np.asarray(way + first * dt_s * np.arange(flow_um_per_s.size), dtype=float)
 
 
-Response = NDArray[np.complex128]
-
 _SLOWEST_RAD_PER_S = 1e-4
 
 
@@ -113,7 +96,7 @@ class Gains:
     filter_s: float = 0.0
 
     @classmethod
-    def of(cls, loop: LoopConfig) -> Gains:
+    def of(cls, loop: LoopConfig) -> "Gains":
         """Gains of a configured loop."""
         return cls(loop.kp_per_s, loop.ti_s, loop.td_s, loop.measurement_filter_s)
 
@@ -133,19 +116,19 @@ def frequencies(dt_s: float, points: int = 400) -> Series:
     return np.geomspace(_SLOWEST_RAD_PER_S, np.pi / dt_s, points)
 
 
-def pump_response(model: PlantModel, w_rad_per_s: Series, dt_s: float) -> Response:
+def pump_response(model: PlantModel, w_rad_per_s: Series, dt_s: float) -> ComplexArray:
     """From commanded flow to speed of the centre, without the leak."""
     s = 1j * w_rad_per_s
     return np.asarray(model.gain * np.exp(-s * (model.dead_time_s + dt_s / 2)) / (1 + s * model.lag_s))
 
 
-def controller_response(gains: Gains, w_rad_per_s: Series) -> Response:
+def controller_response(gains: Gains, w_rad_per_s: Series) -> ComplexArray:
     """From error to commanded flow."""
     s = 1j * w_rad_per_s
     return np.asarray(gains.kp_per_s * (1 + 1 / (s * gains.ti_s) + s * gains.td_s) / (1 + s * gains.filter_s))
 
 
-def loop_response(gains: Gains, model: PlantModel, w_rad_per_s: Series, dt_s: float) -> Response:
+def loop_response(gains: Gains, model: PlantModel, w_rad_per_s: Series, dt_s: float) -> ComplexArray:
     """L."""
     integrator = 1 / (1j * w_rad_per_s)
     return controller_response(gains, w_rad_per_s) * pump_response(model, w_rad_per_s, dt_s) * integrator
@@ -160,29 +143,14 @@ _FINE_DT_S = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """Margins of a loop.
+    """Margins of a loop."""
 
-    Attributes
-    ----------
-    ms : float
-        Largest sensitivity, max |1 / (1 + L)|.
-    gain_margin : float
-        Factor on the gain at which the loop oscillates.
-    phase_margin_deg : float
-    delay_margin_s : float
-        Additional dead time at which the loop oscillates.
-    disk_margin : float
-        Balanced disk margin, 2 / max |S - T|: gain and phase may change together within that disk.
-    stable : bool
-        By Nyquist's criterion. The other figures mean nothing where this is false.
-    """
-
-    ms: float
-    gain_margin: float
+    ms: float  # largest sensitivity, max |1 / (1 + L)|
+    gain_margin: float  # factor on the gain at which the loop oscillates
     phase_margin_deg: float
-    delay_margin_s: float
-    disk_margin: float
-    stable: bool
+    delay_margin_s: float  # additional dead time at which the loop oscillates
+    disk_margin: float  # balanced disk margin, 2 / max |S - T|: gain and phase may change together within that disk
+    stable: bool  # by Nyquist's criterion; if false, the other figures mean nothing
 
 
 def margins(gains: Gains, model: PlantModel, dt_s: float) -> Margins:

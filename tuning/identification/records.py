@@ -20,25 +20,13 @@ Series = FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """Evenly sampled readings and the flow that was commanded right after each of them.
+    """Evenly sampled readings and the flow that was commanded right after each of them."""
 
-    Attributes
-    ----------
-    dt_s : float
-        Sample time.
-    flow_um_per_s : (n,) array
-        Commanded flow as the pump's nominal curve has it, from each reading until the next.
-    displacement_um : (n,) array
-        Laser readings; NaN where one was lost.
-    ambient_pressure_pa, air_temperature_c : (n,) array
-        All NaN without the sensor.
-    """
-
-    dt_s: float
-    flow_um_per_s: Series
-    displacement_um: Series
-    ambient_pressure_pa: Series
-    air_temperature_c: Series
+    dt_s: float  # sample time
+    flow_um_per_s: Series  # (n,): commanded flow as the pump's nominal curve has it, from each reading until the next
+    displacement_um: Series  # (n,): laser readings; NaN where one was lost
+    ambient_pressure_pa: Series  # (n,): all NaN without the sensor
+    air_temperature_c: Series  # (n,)
 
     @classmethod
     def from_samples(cls, dt_s: float, flows_um_per_s: Sequence[float], samples: Sequence[BenchSample]) -> Record:

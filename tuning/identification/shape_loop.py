@@ -33,21 +33,11 @@ _DROP = 2.0  # of the log likelihood: 95 % on one side, and some for the grid
 
 @dataclass(frozen=True, slots=True)
 class LocalLevel:
-    """What was found.
+    """What was found."""
 
-    Attributes
-    ----------
-    white : float
-        Standard deviation of the noise.
-    walk : float
-        Variance of the walk a second; where no walk is seen, the most that the data permit.
-    seen : bool
-        The data are much less likely without a walk.
-    """
-
-    white: float
-    walk: float
-    seen: bool
+    white: float  # standard deviation of the noise
+    walk: float  # variance of the walk a second; where no walk is seen, the most that the data permit
+    seen: bool  # the data are much less likely without a walk
 
 
 def fit_local_level(values: FloatArray, times_s: FloatArray) -> LocalLevel:
@@ -93,49 +83,23 @@ _CYCLES_MIN, _TAU_MAX_S = 10.0, 3600.0
 
 @dataclass(frozen=True, slots=True)
 class ShapeLoopFit:
-    """What was found.
+    """What was found."""
 
-    Attributes
-    ----------
-    sensitivity, sensitivity_sigma : (36,) array
-        Change of the coefficients per um of sag, and standard errors.
-    agreement : float
-        Cosine between it and the one assumed, piston left out; 1 is the same direction.
-    scale : float
-        Sag seen by deflectometry per um of the laser's.
-    sigma_um : float
-        Noise of a cycle.
-    cycle_s : float
-        From result to result.
-    drift_um_per_sqrt_h : float
-        Between laser and deflectometry.
-    drift_seen : bool
-        Otherwise no drift was seen, and the figure is the most that there may be.
-    time_constant_s : float
-        Proposed for `shape.time_constant_s`.
-    """
-
-    sensitivity: Series
-    sensitivity_sigma: Series
-    agreement: float
-    scale: float
-    sigma_um: float
-    cycle_s: float
-    drift_um_per_sqrt_h: float
-    drift_seen: bool
-    time_constant_s: float
+    sensitivity: Series  # (36,): change of the coefficients per um of sag, and standard errors
+    sensitivity_sigma: Series  # (36,)
+    agreement: float  # cosine between it and the one assumed, piston left out; 1 is the same direction
+    scale: float  # sag seen by deflectometry per um of the laser's
+    sigma_um: float  # noise of a cycle
+    cycle_s: float  # from result to result
+    drift_um_per_sqrt_h: float  # between laser and deflectometry
+    drift_seen: bool  # otherwise no drift was seen, and the figure is the most that there may be
+    time_constant_s: float  # proposed for `shape.time_constant_s`
 
 
 def step_experiment(rig: HoldRig, setpoint_um: float, restore: bool) -> list[list[ShapeEstimate]]:
     """Hold low, high, low with the shape loop off; the shapes of each level.
 
-    Parameters
-    ----------
-    rig : HoldRig
-    setpoint_um : float
-        The hold's own, which it ends at.
-    restore : bool
-        The shape loop is switched on again.
+    It ends at `setpoint_um`, the hold's own; `restore` switches the shape loop on again.
     """
     levels: list[list[ShapeEstimate]] = []
     rig.shape_loop(False, "shape loop: the step is the session's")
@@ -162,6 +126,8 @@ def evaluate(
 ) -> ShapeLoopFit:
     """Sensitivity from the levels, noise and drift from all shapes of a steady hold.
 
+    Raises ValueError if there are too few shapes to tell noise from drift.
+
     Parameters
     ----------
     levels : three sequences of ShapeEstimate
@@ -170,11 +136,6 @@ def evaluate(
         In a hold; those of the levels count too, for the laser's reading is taken off.
     assumed : (36,) array
         Sensitivity the controller works with.
-
-    Raises
-    ------
-    ValueError
-        If there are too few shapes to tell noise from drift.
     """
     means = [np.mean([shape.coeffs_um for shape in level], axis=0) for level in levels]
     laser_um = [float(np.mean([shape.displacement_um for shape in level])) for level in levels]

@@ -29,31 +29,19 @@ _STEEP = 1e3  # a loop that breaks a demand costs more than any variance
 
 @dataclass(frozen=True, slots=True)
 class Demands:
-    """What every proposal must keep, whatever it does to the variance.
+    """What every proposal must keep, whatever it does to the variance."""
 
-    Attributes
-    ----------
-    ms : float
-        Largest sensitivity.
-    load_step_um_per_s, load_peak_um : float
-        A change of the leak this large must move the centre no further: half the leak of a sound mirror, and the
-        band. Without it a mirror that the weather leaves alone would get no gain at all.
-    recovery_s : float
-        Three integral times at most.
-    pump_sigmas : float
-        Standard deviations of the feedback's flow between the holding flow and none, and of its change in a tick
-        within the rate limit: beyond, the limits cut the noise on one side and a bias is left.
-    activity_weight : float
-        Price of the feedback's flow (share of the holding flow, squared) in the logarithm of the standard deviation.
-        A pump that stalls and starts spoils what the last per cent of prediction promises: 0.3 is what the
-        simulated pump showed.
-    """
-
-    ms: float = 1.4
+    ms: float = 1.4  # largest sensitivity
+    # A change of the leak this large must move the centre no further: half the leak of a sound mirror, and the band.
+    # Without it a mirror that the weather leaves alone would get no gain at all.
     load_step_um_per_s: float = 0.6
     load_peak_um: float = 2.0
-    recovery_s: float = 60.0
+    recovery_s: float = 60.0  # three integral times at most
+    # Standard deviations of the feedback's flow between the holding flow and none, and of its change in a tick within
+    # the rate limit: beyond, the limits cut the noise on one side and a bias is left
     pump_sigmas: float = 1.7
+    # Price of the feedback's flow (share of the holding flow, squared) in the logarithm of the standard deviation;
+    # 0.3 suits the simulated pump, whose stalls and starts spoil the last per cent of prediction
     activity_weight: float = 0.3
 
 
@@ -138,13 +126,7 @@ def least_variance(
 
     No D: at best it takes 1 % off the prediction, for twice the pump's activity, which then costs more than that.
 
-    Parameters
-    ----------
-    model : PlantModel
-    disturbance : DisturbanceModel
-    loop : LoopConfig
-        Its feed-forward counts; its gains do not.
-    demands : Demands
+    Of `loop` only the feed-forward counts, not the gains.
     """
     dt_s = disturbance.rest.dt_s
 

@@ -49,13 +49,7 @@ def least_std_um(
 ) -> float:
     """Bound for the sensors that the loop's feed-forward uses; a weather it does not use is disturbance only.
 
-    Parameters
-    ----------
-    model : PlantModel
-    disturbance : DisturbanceModel
-    loop : LoopConfig
-    write_s : float
-        Time from a reading to its command, if the model's dead time does not hold it.
+    `write_s` is the time from a reading to its command, if the model's dead time does not include it.
     """
     drift, diffusion, centre = _walks(disturbance)
     readings, noises = [centre], [disturbance.rest.white**2]

@@ -18,8 +18,7 @@ from scipy.signal import welch
 
 from membrane_ctrl.config.schema import LoopConfig
 from tuning.gains_file import GainsFile
-from tuning.identification import disturbance, loop_model, records
-from tuning.identification.identify import identify
+from tuning.identification import disturbance, identify, loop_model, records
 from tuning.proposal.prediction import least_std_um, predict
 
 # Time of a stage, and growth that ends the trial there: early on only what is plainly wrong, for a minute of weather
@@ -38,33 +37,16 @@ _BAND = 1.3  # width of a band in frequency, as a factor
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """One look.
-
-    Attributes
-    ----------
-    time_s : float
-    std_um : float
-        Of the centre, from the record.
-    before_um : float
-        What the old gains would have given in this weather.
-    growth, growth_max : float
-        Ratio, and the most that passes.
-    ms : float
-        Sensitivity seen; NaN while the record is too short.
-    lost_fraction : float
-        Readings lost.
-    reason : str
-        Why it fails; empty if it passes.
-    """
+    """One look."""
 
     time_s: float
-    std_um: float
-    before_um: float
-    growth: float
-    growth_max: float
-    ms: float
-    lost_fraction: float
-    reason: str
+    std_um: float  # of the centre, from the record
+    before_um: float  # what the old gains would have given in this weather
+    growth: float  # ratio of the two
+    growth_max: float  # the most that passes
+    ms: float  # sensitivity seen; NaN while the record is too short
+    lost_fraction: float  # readings lost
+    reason: str  # why it fails; empty if it passes
 
 
 def settle_s(loop: LoopConfig) -> float:
@@ -96,7 +78,6 @@ def centre_std_um(off_um: records.Series, trial: VerificationTrial, weather: dis
     ----------
     off_um : (n,) array
         Readings less setpoint.
-    trial : VerificationTrial
     weather : DisturbanceModel
         What the prediction is made with that the readings correct.
     """
@@ -167,34 +148,20 @@ _K_SIGMAS, _K_CHANGE = 3.0, 0.15
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """What a hold shows.
-
-    Attributes
-    ----------
-    std_um, least_std_um : float
-        Of the centre, and the least any controller could reach in this weather.
-    ratio, ratio_designed : float
-        Of the two, now and when the gains were made.
-    gain, gain_sigma : float
-        k from natural excitation; NaN if it could not be fitted.
-    leak_um_per_s : float
-        Mean speed the pump makes up for.
-    suggestions : tuple of str
-        Why a session is due; empty if it is not.
-    """
+    """What a hold shows."""
 
     std_um: float
-    least_std_um: float
-    ratio: float
-    ratio_designed: float
-    gain: float
+    least_std_um: float  # the least that any controller could reach in this weather
+    ratio: float  # of the two, now
+    ratio_designed: float  # when the gains were made
+    gain: float  # k from natural excitation; NaN if it could not be fitted
     gain_sigma: float
-    leak_um_per_s: float
-    suggestions: tuple[str, ...]
+    leak_um_per_s: float  # mean speed the pump makes up for
+    suggestions: tuple[str, ...]  # why a session is due; empty if it is not
 
 
 def health(record: records.Record, setpoint_um: records.Series, loop: LoopConfig, made: GainsFile) -> Health:
-    """Judge a quiet hold against the gains' own file.
+    """Judge a quiet hold against the gains' own file. Raises ValueError if the record is too short.
 
     Parameters
     ----------
@@ -206,11 +173,6 @@ def health(record: records.Record, setpoint_um: records.Series, loop: LoopConfig
         As it runs.
     made : GainsFile
         Where its gains come from.
-
-    Raises
-    ------
-    ValueError
-        If the record is too short.
     """
     if record.duration_s < LEAST_S:
         raise ValueError(f"{record.duration_s:.0f} s of hold are too short to judge a loop: {LEAST_S:.0f} s at least")
@@ -247,7 +209,7 @@ def _natural_gain(record: records.Record, loop: LoopConfig) -> tuple[float, floa
         by_air_um = loop.temperature_gain_um_per_k * gas_k
         record = replace(record, displacement_um=record.displacement_um - by_air_um)
     try:
-        found = identify(record)
+        found = identify.identify(record)
     except ValueError:
         return math.nan, math.nan
     return found.model.gain, found.sigma.gain

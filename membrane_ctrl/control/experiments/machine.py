@@ -10,6 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from membrane_ctrl.control.filters import LowPass
 
 # What an experiment sees of a tick.
@@ -38,25 +40,13 @@ class Finished:
 
 @dataclass(frozen=True, slots=True)
 class Around:
-    """What an experiment is made about.
+    """What an experiment is made about."""
 
-    Attributes
-    ----------
-    holding_flow_um_per_s : float
-        Mean flow of the loop before it.
-    least_flow_um_per_s, full_flow_um_per_s : float
-        The pump's range while it runs.
-    laser_um : float
-        Standard deviation of a reading.
-    limit_um : float
-        Furthest the centre may go from where it stood.
-    """
-
-    holding_flow_um_per_s: float
-    least_flow_um_per_s: float
+    holding_flow_um_per_s: float  # mean flow of the loop before it
+    least_flow_um_per_s: float  # of the pump while it runs
     full_flow_um_per_s: float
-    laser_um: float
-    limit_um: float = 10.0
+    laser_um: float  # standard deviation of a reading
+    limit_um: float = 10.0  # furthest the centre may go from where it stood
 
     def within(self, flow_um_per_s: float) -> float:
         """The nearest flow of a running pump."""
@@ -68,7 +58,6 @@ class Experiment(Protocol):
 
     def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
         """Flow in um/s to put out until the next reading, or the end."""
-        ...
 
 
 class CentreMotion:
@@ -107,21 +96,15 @@ class ExcursionGuard:
     """Lets an experiment run while the centre can still be stopped within the limit.
 
     The centre is judged where it will have come to rest, position + speed x `COAST_S`, with three standard deviations
-    of that figure's own noise in hand.
+    of that figure's own noise in hand. Raises ValueError if the noise kept in hand leaves nothing of the limit; the
+    message says what would help.
 
     Parameters
     ----------
-    experiment : Experiment
-    around : Around
     centre_um : float
         Where the mirror stood before.
     rate_hz : float
         Readings in a second: with fewer, the figure is noisier and more is kept in hand.
-
-    Raises
-    ------
-    ValueError
-        If the noise kept in hand leaves nothing of the limit; the message says what would help.
     """
 
     def __init__(self, experiment: Experiment, around: Around, centre_um: float, rate_hz: float) -> None:
@@ -172,11 +155,8 @@ class Patterned:
 
     Parameters
     ----------
-    around : Around
     pattern : callable
         Time in s to flow in um/s about the holding flow.
-    duration_s : float
-    centre_um : float
     """
 
     PULL_PER_S = 0.15
@@ -200,3 +180,145 @@ class Patterned:
         pattern_um_per_s = self._pattern(self._time_s)
         self._time_s += dt_s
         return self._around.within(self._around.holding_flow_um_per_s + pattern_um_per_s + back_um_per_s)
+
+
+# Flows in time for `Patterned`, sized so that the mirror stays within a few um. Each takes the identified gain: the
+# same excursion on a strong and a weak pump.
+
+Pattern = Callable[[float], float]
+
+_SHARE = 0.25  # of the excursion limit: the weather, the pull and the laser's noise need the rest
+
+
+def steps(around: Around, gain: float, hold_s: float = 2.0) -> Pattern:
+    """Up, back, down, back, each for `hold_s`: what the eye wants to see."""
+    up, down = room(around)
+    size = min(up, down, _SHARE * around.limit_um / (gain * hold_s))
+    levels = (size, 0.0, -size, 0.0)
+    return lambda time_s: levels[int(time_s / hold_s) % 4]
+
+
+def doublets(around: Around, gain: float, pulse_s: float = 0.3) -> Pattern:
+    """Short pulses up, each followed by as much down: many steep edges, which is what tells dead time from lag.
+
+    The way down is as small as the leak, so it takes longer; the mean flow is the holding flow.
+    """
+    up, down = room(around)
+    size = min(up, _SHARE * around.limit_um / (gain * pulse_s))
+    down = min(down, size)
+    period_s = pulse_s * (1 + size / down)
+    return lambda time_s: size if time_s % period_s < pulse_s else -down
+
+
+def multisine(
+    around: Around, gain: float, slowest_rad_per_s: float = 0.3, fastest_rad_per_s: float = 6.0, tones: int = 12
+) -> Pattern:
+    """Sines evenly spaced in the logarithm of frequency, of equal excursion up to the pump's room.
+
+    Phases by Schroeder (1970), -pi n (n - 1) / N, which keep the peak low.
+    """
+    w = np.geomspace(slowest_rad_per_s, fastest_rad_per_s, tones)
+    phases = -math.pi * np.arange(tones) * np.arange(1, tones + 1) / tones
+    amplitudes = np.sqrt(w)  # flow between equal flow and equal excursion
+    time_s = np.arange(0.0, 4 * math.pi / slowest_rad_per_s, 0.05)[:, None]
+    flow = (amplitudes * np.sin(w * time_s + phases)).sum(axis=1)
+    way = (amplitudes / w * np.cos(w * time_s + phases)).sum(axis=1)
+    scale = min(min(room(around)) / np.abs(flow).max(), _SHARE * around.limit_um / (gain * np.abs(way).max()))
+    return lambda now_s: float(scale * (amplitudes * np.sin(w * now_s + phases)).sum())
+
+
+def room(around: Around) -> tuple[float, float]:
+    """Flow above and below the holding flow. Raises ValueError without any: the mirror is too tight or too leaky."""
+    up = around.full_flow_um_per_s - around.holding_flow_um_per_s
+    down = around.holding_flow_um_per_s - around.least_flow_um_per_s
+    if min(up, down) <= 0:
+        raise ValueError(
+            f"no room about the holding flow of {around.holding_flow_um_per_s:.2f} um/s in the pump's range of "
+            f"{around.least_flow_um_per_s:.2f} .. {around.full_flow_um_per_s:.2f} um/s: "
+            + ("open the bleed" if down <= 0 else "find the leak")
+        )
+    return up, down
+
+
+# Bounded asymmetric relay about the holding flow.
+#
+# Asymmetric, because the way down is no faster than the leak and the pump must not stall (its least flow is the lower
+# end), while the way up has most of the pump. The amplitude starts small and grows while the mirror overshoots its
+# threshold by little, so that a pump three times stronger or slower than configured stays within the same bounds.
+
+THRESHOLD_SHARE = 0.25  # of the excursion limit
+OVERSHOOT_SHARE = 0.2
+_GROWTH = 1.6
+_FIRST_MAX_UM_PER_S = 1.5
+_OVERSHOOT_LEAST_UM = 0.2  # smaller ones are noise
+# A half cycle of 5 um takes this long where leak + bleed are 0.06 um/s: nothing can be held there.
+_PATIENCE_S = 90.0
+
+
+class Relay:
+    """Switches between a high and a low flow whenever the centre leaves a band.
+
+    Parameters
+    ----------
+    centre_um : float
+        Middle of the band.
+    """
+
+    def __init__(self, around: Around, centre_um: float, duration_s: float = 120.0) -> None:
+        self._around = around
+        self._centre_um = centre_um
+        self._duration_s = duration_s
+        self._threshold_um = THRESHOLD_SHARE * around.limit_um
+        self._motion = CentreMotion()
+        first = min(around.holding_flow_um_per_s, _FIRST_MAX_UM_PER_S)
+        self._amplitudes_um_per_s = {1: first, -1: first}
+        self._speeds_um_per_s = {1: first, -1: first}
+        self._direction = 1
+        self._time_s = self._since_switch_s = 0.0
+        self._overshoot_um = 0.0
+        self._at_centre_s = math.nan
+        self.crossings = 0
+
+    def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
+        """One tick of the relay."""
+        self._motion.update(measurement.displacement_um, dt_s)
+        if self._time_s >= self._duration_s:
+            return Finished(True, f"{self.crossings} crossings")
+        self._time_s += dt_s
+        self._since_switch_s += dt_s
+        off_um = self._motion.position_um - self._centre_um
+        # beyond the threshold on the side it came from, for the delay after a switch
+        self._overshoot_um = max(self._overshoot_um, -self._direction * off_um - self._threshold_um)
+        if math.isnan(self._at_centre_s) and self._direction * off_um > 0:
+            self._at_centre_s = self._time_s
+        if self._direction * off_um > self._threshold_um:
+            self._switch()
+        elif self._since_switch_s > _PATIENCE_S:
+            way = "rise" if self._direction > 0 else "sink"
+            remedy = "check the pump, its tube and the leak" if self._direction > 0 else "open the bleed"
+            return Finished(
+                False, f"the mirror did not {way} by {self._threshold_um:g} um in {_PATIENCE_S:g} s: {remedy}"
+            )
+        around = self._around
+        swing = self._direction * self._amplitudes_um_per_s[self._direction]
+        return around.within(around.holding_flow_um_per_s + swing)
+
+    def _switch(self) -> None:
+        """Turn round; the way before this one, whose overshoot is now known, is made faster or slower."""
+        wanted_um = OVERSHOOT_SHARE * self._around.limit_um
+        # the guard stops what would coast further than that, however short the true delay
+        fastest_um_per_s = wanted_um / COAST_S
+        if self._time_s > self._at_centre_s:
+            self._speeds_um_per_s[self._direction] = self._threshold_um / (self._time_s - self._at_centre_s)
+        if self.crossings > 0:
+            before = -self._direction
+            factor = min(
+                wanted_um / max(self._overshoot_um, _OVERSHOOT_LEAST_UM),
+                fastest_um_per_s / self._speeds_um_per_s[before],
+            )
+            self._amplitudes_um_per_s[before] *= min(max(factor, 1 / _GROWTH), _GROWTH)
+        self._direction = -self._direction
+        self._overshoot_um = 0.0
+        self._since_switch_s = 0.0
+        self._at_centre_s = math.nan
+        self.crossings += 1

@@ -32,29 +32,15 @@ _RUNS_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class PumpMap:
-    """What was measured.
+    """What was measured."""
 
-    Attributes
-    ----------
-    leak_um_per_s : float
-        Speed at which the mirror sinks with the pump off; the bleed counts.
-    leak_sigma_um_per_s : float
-        Its standard error, from the scatter of the probes.
-    start_fraction, stall_fraction : float
-        Where a standing pump starts and a running one stalls, within 0.01; NaN if it never did.
-    dead_fraction, flow_full_um_per_s : float
-        Of q = q_full (d - dead) / (1 - dead).
-    too_tight : bool
-        The mirror loses too little gas to be held: open the bleed.
-    """
-
-    leak_um_per_s: float
-    leak_sigma_um_per_s: float
-    start_fraction: float
-    stall_fraction: float
-    dead_fraction: float
+    leak_um_per_s: float  # speed at which the mirror sinks with the pump off; the bleed counts
+    leak_sigma_um_per_s: float  # its standard error, from the scatter of the probes
+    start_fraction: float  # where a standing pump starts, within 0.01; NaN if it never did
+    stall_fraction: float  # where a running one stalls, likewise
+    dead_fraction: float  # of q = q_full (d - dead) / (1 - dead)
     flow_full_um_per_s: float
-    too_tight: bool
+    too_tight: bool  # the mirror loses too little gas to be held: open the bleed
 
     @property
     def sticks_by(self) -> float:

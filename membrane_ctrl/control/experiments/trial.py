@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from firmware_iface.settings import Section
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
-from membrane_ctrl.config.section import Section
-from membrane_ctrl.control.experiments import machine, patterns, pump_map
+from membrane_ctrl.control.experiments import machine, pump_map
 from membrane_ctrl.control.gas import PumpCurve
 
 # What may be asked of an experiment: plain data with bounds, so that it can come over a wire.
@@ -33,25 +33,21 @@ class ExperimentSpec(Section):
     gain: Annotated[float, Field(ge=0.02, le=50)] = 1.0  # k, of what was identified so far
 
 
-_PATTERNS = {"steps": patterns.steps, "doublets": patterns.doublets, "multisine": patterns.multisine}
+_PATTERNS = {"steps": machine.steps, "doublets": machine.doublets, "multisine": machine.multisine}
 
 
 class Trial:
     """An experiment inside its guard.
 
+    Raises ValueError if the pump has no room about the holding flow, or the noise none in the limit; the message says
+    what would help.
+
     Parameters
     ----------
-    spec : ExperimentSpec
     loop, pump : LoopConfig, PumpConfig
         The pump's range, as configured.
     centre_um : float
         Where the mirror stands.
-
-    Raises
-    ------
-    ValueError
-        If the pump has no room about the holding flow, or the noise none in the limit; the message says what would
-        help.
     """
 
     def __init__(self, spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre_um: float) -> None:
@@ -71,7 +67,7 @@ class Trial:
     def _machine(self, around: machine.Around, pump: PumpConfig, centre_um: float) -> machine.Experiment:
         spec = self.spec
         if spec.kind == "relay":
-            return patterns.Relay(around, centre_um, spec.duration_s)
+            return machine.Relay(around, centre_um, spec.duration_s)
         if spec.kind == "pump_map":
             share = spec.holding_flow_um_per_s / pump.flow_full_um_per_s
             fraction = pump.dead_fraction + (1 - pump.dead_fraction) * share

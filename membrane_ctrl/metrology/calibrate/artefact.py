@@ -25,43 +25,20 @@ _LENS = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1",
 
 @dataclass(frozen=True)
 class Origin:
-    """What `[calibration]` says of where a geometry comes from.
-
-    Attributes
-    ----------
-    date_utc : str
-        When.
-    sets : tuple of str
-        Sets used.
-    screen_residual_um : float
-        Median over the sets of the RMS of seen minus predicted screen points.
-    slope_residual_urad : float
-        Median over the sets of the RMS that `measure` states with this geometry: what a drift is seen against.
-    slope_noise_urad : float
-        What the camera's noise is in it.
-    condition : float
-        See `determined.condition_number`.
-    notes : tuple of str
-        What was found on the way.
-    """
+    """What `[calibration]` says of where a geometry comes from."""
 
     date_utc: str
     sets: tuple[str, ...]
-    screen_residual_um: float
+    screen_residual_um: float  # median over the sets of the RMS of seen minus predicted screen points
+    # Median over the sets of the RMS that `measure` states with this geometry: what a drift is seen against
     slope_residual_urad: float
-    slope_noise_urad: float
-    condition: float
-    notes: tuple[str, ...] = ()
+    slope_noise_urad: float  # what the camera's noise is in it
+    condition: float  # see `propagate.condition_number`
+    notes: tuple[str, ...] = ()  # what was found on the way
 
 
 def tables_of(solution: solve.Solution, optics: OpticsConfig, origin: Origin) -> dict[str, Any]:
-    """The content of `geometry.toml`.
-
-    Parameters
-    ----------
-    optics : OpticsConfig
-        The stated bench.
-    """
+    """The content of `geometry.toml`; `optics` is the stated bench."""
     free = [parameters.NAMES.index(name) for name in solution.free]
     tables: dict[str, Any] = {
         "schema": SCHEMA,

@@ -22,23 +22,13 @@ _LASER_SIGMA = 1.0  # of its scale when the optics alone shall say it
 
 @dataclass(frozen=True)
 class Suspect:
-    """A held parameter that the sets want to move.
-
-    Attributes
-    ----------
-    value, sigma : float
-        What it would be if it were free.
-    fall : float
-        Of the sum of squares.
-    figure_um : float
-        What freeing it does to a surface, RMS without the best plane.
-    """
+    """A held parameter that the sets want to move."""
 
     name: str
-    value: float
+    value: float  # what it would be if it were free
     sigma: float
-    fall: float
-    figure_um: float
+    fall: float  # of the sum of squares
+    figure_um: float  # what freeing it does to a surface, RMS without the best plane
 
     @property
     def sure(self) -> bool:
@@ -76,21 +66,11 @@ class CameraBump:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """One set against the geometry of all others.
+    """One set against the geometry of all others."""
 
-    Attributes
-    ----------
-    index : int
-        Of the set.
-    fall : float
-        Of the sum of squares, when this set has a geometry and a ring of its own.
-    freedom : int
-        Numbers that the set then determines by itself.
-    """
-
-    index: int
-    fall: float
-    freedom: int
+    index: int  # of the set
+    fall: float  # of the sum of squares, when this set has a geometry and a ring of its own
+    freedom: int  # numbers that the set then determines by itself
 
     @property
     def disagrees(self) -> bool:

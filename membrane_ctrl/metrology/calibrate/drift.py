@@ -39,20 +39,12 @@ def noise_urad(geometry: Geometry, surface: Surface, screen_sigma_mm: float) -> 
 class DriftMonitor:
     """Watches the live residual.
 
-    Parameters
-    ----------
-    calibrated_urad, calibrated_noise_urad : float
-        `slope_residual_urad` and `slope_noise_urad` of the geometry's `[calibration]`.
-
-    Attributes
-    ----------
-    says : str
-        Why it is time to calibrate again; empty while it is not.
+    What it is given are `slope_residual_urad` and `slope_noise_urad` of the geometry's `[calibration]`.
     """
 
     calibrated_urad: float
     calibrated_noise_urad: float
-    says: str = ""
+    says: str = ""  # why it is time to calibrate again; empty while it is not
     _seen: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=CYCLES))
 
     def add(self, residual_urad: float, live_noise_urad: float) -> None:
@@ -86,15 +78,10 @@ class RingMonitor:
     ----------
     calibrated_um : (14,) array
         `ring_um` of the geometry's `[calibration]`.
-
-    Attributes
-    ----------
-    says : str
-        As for `DriftMonitor`.
     """
 
     calibrated_um: FloatArray
-    says: str = ""
+    says: str = ""  # as for `DriftMonitor`
     _seen: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=CYCLES))
 
     def add(self, surface: Surface) -> None:

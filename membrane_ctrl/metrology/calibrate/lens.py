@@ -4,8 +4,6 @@ The model is the one that the self-calibration frees: one focal length, k1, k2, 
 the others (blurred, a corner taken for its neighbour) are left out and named.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,10 +11,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from membrane_ctrl.config.schema import CameraConfig
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import AnyArray, ArrayLike, FloatArray
 
 LEAST_VIEWS = 4  # each has a pose of its own; with fewer the lens hides in the poses
 LEAST_CORNERS = 12  # of a view
@@ -36,42 +33,23 @@ class BoardView:
 
 @dataclass(frozen=True)
 class Lens:
-    """What the views say.
-
-    Attributes
-    ----------
-    focal_px, principal_px, distortion
-        Of the lens; distortion is k1, k2, p1, p2.
-    sigmas : dict of float
-        By the calibration's names of the parameters.
-    rms_px, stated_rms_px : float
-        What is left of a corner (both components), with this lens and with the stated one.
-    used, left_out : tuple of str
-        Names of views.
-    """
+    """What the views say."""
 
     focal_px: float
     principal_px: tuple[float, float]
-    distortion: tuple[float, ...]
-    sigmas: dict[str, float]
-    rms_px: float
+    distortion: tuple[float, ...]  # k1, k2, p1, p2
+    sigmas: dict[str, float]  # by the calibration's names of the parameters
+    rms_px: float  # what is left of a corner (both components), with this lens and with the stated one
     stated_rms_px: float
-    used: tuple[str, ...]
+    used: tuple[str, ...]  # names of views
     left_out: tuple[str, ...]
 
 
 def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
     """Fit the lens.
 
-    Parameters
-    ----------
-    stated : CameraConfig
-        Where to begin, and what the result is compared with.
-
-    Raises
-    ------
-    ValueError
-        With fewer than `LEAST_VIEWS` views of `LEAST_CORNERS` corners, or if nothing fits.
+    Raises ValueError with fewer than `LEAST_VIEWS` views of `LEAST_CORNERS` corners, or if nothing fits. `stated`
+    is where the fit begins, and what the result is compared with.
     """
     good = [view for view in views if len(view.place) >= LEAST_CORNERS]
     while True:
@@ -141,7 +119,7 @@ def _matrix(camera: CameraConfig) -> FloatArray:
 # A board of known squares, on a screen or on a plate: its picture, and its corners in a photograph.
 
 
-Levels = NDArray[np.uint8]
+Levels = AnyArray
 
 # A marker of 4 x 4 bits has a border of one: 6 modules; with a margin of one on each side a square has 8, so that
 # squares of a multiple of 8 pixels have every edge on a pixel's edge
@@ -152,22 +130,14 @@ _MARKERS = 1000  # of the dictionary
 
 @dataclass(frozen=True)
 class Board:
-    """A board.
+    """A board."""
 
-    Attributes
-    ----------
-    kind : "charuco" or "chessboard"
-        With markers (OpenCV's DICT_4X4_1000), of which a part is enough, or plain.
-    columns, rows : int
-        Squares.
-    """
-
-    kind: str
-    columns: int
+    kind: str  # "charuco" or "chessboard": with markers (OpenCV's DICT_4X4_1000), of which a part is enough, or plain
+    columns: int  # squares
     rows: int
 
     @classmethod
-    def parse(cls, text: str) -> Board:
+    def parse(cls, text: str) -> "Board":
         """From "charuco:15x9". Raises ValueError."""
         found = re.fullmatch(r"(charuco|chessboard):(\d{1,3})x(\d{1,3})", text)
         if found is None:

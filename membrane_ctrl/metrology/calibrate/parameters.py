@@ -17,32 +17,21 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.screen_face import BOW_RADIUS_MM
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
 _COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number that may be wrong.
+    """One number that may be wrong."""
 
-    Attributes
-    ----------
-    name : str
-        Ends in the unit.
-    sigma : float
-        What is known of it by hand, in that unit: a ruler, a laser meter, a protractor, a data sheet.
-    says : str
-        For a person.
-    """
-
-    name: str
-    sigma: float
-    says: str
+    name: str  # ends in the unit
+    sigma: float  # what is known of it by hand, in that unit: a ruler, a laser meter, a protractor, a data sheet
+    says: str  # for a person
 
     @property
     def unit(self) -> str:
@@ -84,15 +73,8 @@ OPTICAL = len(POSE) + len(OPTIONAL)  # those that the fringes depend on; the las
 def sigmas(free: Mapping[str, float] | None = None) -> FloatArray:
     """Prior standard deviations in the order of `NAMES`; 0 holds a parameter where it is.
 
-    Parameters
-    ----------
-    free : mapping from name to sigma, optional
-        Changes: another sigma, 0 to hold, more than 0 to free. Without it the poses and the laser's scale are free.
-
-    Raises
-    ------
-    ValueError
-        For a name that is not a parameter, or a sigma below 0.
+    Raises ValueError for a name that is not a parameter, or a sigma below 0. `free` has changes:
+    another sigma, 0 to hold, more than 0 to free. Without it the poses and the laser's scale are free.
     """
     own = {p.name: p.sigma for p in (*POSE, LASER)}
     for name, sigma in (free or {}).items():
@@ -111,28 +93,20 @@ def usual_sigma(name: str) -> float:
 
 @dataclass(frozen=True)
 class BenchGeometry:
-    """A geometry with what `Geometry` cannot say.
+    """A geometry with what `Geometry` cannot say."""
 
-    Attributes
-    ----------
-    geometry : Geometry
-        Camera and screen.
-    pitch : float
-        True length of what the screen calls a millimetre.
-    """
-
-    geometry: Geometry
-    pitch: float = 1.0
+    geometry: Geometry  # camera and screen
+    pitch: float = 1.0  # true length of what the screen calls a millimetre
 
 
 @dataclass(frozen=True)
 class Poses:
     """Pinhole (3,), camera rows (3, 3), screen origin (3,) and screen rows (3, 3): s_x, s_y, normal."""
 
-    pinhole_mm: NDArray[Any]
-    camera: NDArray[Any]
-    origin_mm: NDArray[Any]
-    screen: NDArray[Any]
+    pinhole_mm: AnyArray
+    camera: AnyArray
+    origin_mm: AnyArray
+    screen: AnyArray
 
 
 def bench_at(stated: Geometry, values: FloatArray) -> BenchGeometry:
@@ -156,7 +130,7 @@ def bench_at(stated: Geometry, values: FloatArray) -> BenchGeometry:
     return BenchGeometry(geometry, 1 + pitch)
 
 
-def poses_at(stated: Geometry, values: NDArray[Any]) -> Poses:
+def poses_at(stated: Geometry, values: AnyArray) -> Poses:
     """Poses of a parameter vector (real, or complex for `pose_derivatives`); only the first eleven count."""
     a, b, alpha, x, y, turn_x, turn_y, turn_z, yaw, pitch, roll = _radians(values[: len(POSE)])
     f0, o0 = stated.pinhole_mm, stated.screen_origin_mm
@@ -187,7 +161,7 @@ def pose_derivatives(stated: Geometry, values: FloatArray) -> list[Poses]:
     return out
 
 
-def _radians(values: NDArray[Any]) -> NDArray[Any]:
+def _radians(values: AnyArray) -> AnyArray:
     """Millimetres as they are, degrees as radians."""
     factors = [np.pi / 180 if parameter.unit == "deg" else 1.0 for parameter in POSE]
     return np.asarray(values * factors)
@@ -202,7 +176,7 @@ def _hinge(pinhole_mm: FloatArray, origin_mm: FloatArray) -> FloatArray:
     return across / length
 
 
-def _turn(axis: FloatArray, angle: Any) -> NDArray[Any]:
+def _turn(axis: FloatArray, angle: Any) -> AnyArray:
     """Rodrigues' matrix of a turn about a unit vector."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -20,22 +20,12 @@ from membrane_ctrl.model.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True)
 class Propagated:
-    """Standard deviations that come from the geometry and the laser.
+    """Standard deviations that come from the geometry and the laser."""
 
-    Attributes
-    ----------
-    height_rms_um, figure_rms_um : float
-        Over the analysed disc; the figure is the height without its best plane.
-    sag_um : float
-        Of the rim above the vertex.
-    zernike_um : (36,) array
-        Noll j = 1..36; 2 and 3 are the tilt.
-    """
-
-    height_rms_um: float
+    height_rms_um: float  # over the analysed disc; the figure is the height without its best plane
     figure_rms_um: float
-    sag_um: float
-    zernike_um: FloatArray
+    sag_um: float  # of the rim above the vertex
+    zernike_um: FloatArray  # (36,): Noll j = 1..36; 2 and 3 are the tilt
 
 
 def surface_response(solution: Solution, index: int) -> FloatArray:
@@ -98,25 +88,13 @@ _NOTHING_UM = 0.5
 
 @dataclass(frozen=True)
 class Combination:
-    """A direction in the space of parameters.
+    """A direction in the space of parameters."""
 
-    Attributes
-    ----------
-    left : float
-        Sigma after over sigma before; 1: the sets say nothing.
-    parts : tuple of (name, amount)
-        Of one sigma, in the parameters' units, the largest first.
-    height_um, figure_um : float
-        What one sigma of it does to the surface, RMS, and without the best plane.
-    words : str
-        What that is.
-    """
-
-    left: float
-    parts: tuple[tuple[str, float], ...]
-    height_um: float
+    left: float  # sigma after over sigma before; 1: the sets say nothing
+    parts: tuple[tuple[str, float], ...]  # of one sigma, in the parameters' units, the largest first
+    height_um: float  # what one sigma of it does to the surface, RMS, and without the best plane
     figure_um: float
-    words: str
+    words: str  # what that is
 
 
 def condition_number(solution: Solution) -> float:
@@ -216,6 +194,8 @@ def foresee(
 ) -> Propagated:
     """Standard deviations of a figure that is measured with the geometry of such sets.
 
+    Raises ValueError if no ray of such a set ends on the pattern.
+
     Parameters
     ----------
     optics : OpticsConfig
@@ -228,11 +208,6 @@ def foresee(
         Amplitude of the fringes in the picture.
     laser_sigma_um : float
         Of a set's mean reading.
-
-    Raises
-    ------
-    ValueError
-        If no ray of such a set ends on the pattern.
     """
     geometry, middle_mm = Geometry.from_config(optics), sags_mm[len(sags_mm) // 2]
     sets = [_set(geometry, optics, sag_mm, sag_mm - middle_mm, swing_adu) for sag_mm in sags_mm]

@@ -12,8 +12,6 @@ with X the screen's rows, E the first two, N = (third row) - w_x e_x - w_y e_y t
 w = c s^2 + map (see `metrology.face`) and T = E (1 - u N^T / (N u)), which lets the ray run to the face.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -22,11 +20,8 @@ import numpy as np
 from numpy.polynomial import polynomial as series
 
 from membrane_ctrl.metrology.calibrate.parameters import OPTICAL, POSE, BenchGeometry, Poses
-from membrane_ctrl.metrology.optics import hencky, zernike
-from membrane_ctrl.metrology.optics.compiled import kernel
+from membrane_ctrl.metrology.optics import compiled, hencky, kernels, screen_face, zernike
 from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.kernels import FACE_STEPS
-from membrane_ctrl.metrology.optics.screen_face import BOW_RADIUS_MM
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer
 from membrane_ctrl.model.arrays import FloatArray
@@ -40,7 +35,7 @@ from membrane_ctrl.model.arrays import FloatArray
 _BLOCK = 512  # columns that stay in the second-level cache
 
 
-@kernel
+@compiled.kernel
 def gram(rows):  # type: ignore[no-untyped-def]
     """rows @ rows.T of a (c, n) array with many columns."""
     count, size = rows.shape
@@ -59,7 +54,7 @@ def gram(rows):  # type: ignore[no-untyped-def]
     return out
 
 
-@kernel
+@compiled.kernel
 def multiply(table, rows):  # type: ignore[no-untyped-def]
     """table @ rows of an (a, b) and a (b, n) array with many columns; zeros in the table cost nothing."""
     out = np.zeros((table.shape[0], rows.shape[1]))
@@ -79,30 +74,16 @@ _CHUNK = 8192  # points whose derivatives are in memory at a time: 8 MB
 
 @dataclass(frozen=True)
 class SetPhases:
-    """What one capture set says, as screen points of bins.
-
-    Attributes
-    ----------
-    name : str
-        Of the set, for people.
-    column_px, row_px : (n,) arrays
-        Centres of the bins.
-    screen_mm : (2, n) array
-        s_x, s_y seen there.
-    sigma_mm : (n,) array
-        Expected noise of each of the two.
-    displacement_um : float
-        Mean laser reading of the set; NaN without.
-    """
+    """What one capture set says, as screen points of bins."""
 
     name: str
-    column_px: FloatArray
-    row_px: FloatArray
-    screen_mm: FloatArray
-    sigma_mm: FloatArray
-    displacement_um: float
+    column_px: FloatArray  # (n,): centres of the bins
+    row_px: FloatArray  # (n,)
+    screen_mm: FloatArray  # (2, n): s_x, s_y seen there
+    sigma_mm: FloatArray  # (n,): expected noise of each of the two
+    displacement_um: float  # mean laser reading of the set; NaN without
 
-    def thinned(self, most: int) -> SetPhases:
+    def thinned(self, most: int) -> "SetPhases":
         """Every k-th bin, so that at most `most` are left."""
         keep = slice(None, None, -(-self.column_px.size // most))
         return SetPhases(
@@ -117,20 +98,11 @@ class SetPhases:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Residuals and derivatives of some points.
+    """Residuals and derivatives of some points."""
 
-    Attributes
-    ----------
-    place : slice
-        Which points.
-    residual_mm : (2, m) array
-        Seen minus predicted.
-    derivatives : (2, COLUMNS, m) array
-        Of the prediction: 36 of the surface in mm, the vertex' height in mm, the optical parameters in their units.
-    """
-
-    place: slice
-    residual_mm: FloatArray
+    place: slice  # which points
+    residual_mm: FloatArray  # (2, m): seen minus predicted
+    # (2, COLUMNS, m), of the prediction by: 36 surface terms and the vertex's height, mm; the optical parameters
     derivatives: FloatArray
 
 
@@ -158,13 +130,7 @@ def residual_mm(bench: BenchGeometry, phases: SetPhases, surface: Surface, verte
 def chunks(
     bench: BenchGeometry, turns: list[Poses], phases: SetPhases, surface: Surface, vertex_z_mm: float
 ) -> Iterator[Chunk]:
-    """Residuals with derivatives, some points at a time.
-
-    Parameters
-    ----------
-    turns : list of Poses
-        `pose_derivatives` at the bench's parameters.
-    """
+    """Residuals with derivatives, some points at a time. `turns` are the `pose_derivatives` there."""
     points = place_rays(bench, phases, surface, vertex_z_mm)
     for part in _parts(points.t_mm.size):
         meet = _meet(bench, points, surface, part)
@@ -202,7 +168,7 @@ def _meet(bench: BenchGeometry, points: Points, surface: Surface, part: slice) -
     axes = geometry.screen_axes
     start, along = axes @ (place - geometry.screen_origin_mm[:, None]), axes @ u
     k = -start[2] / along[2]
-    for _ in range(0 if geometry.face.is_plane else FACE_STEPS):
+    for _ in range(0 if geometry.face.is_plane else kernels.FACE_STEPS):
         at = start + k * along
         w, by_x, by_y = geometry.face.heights(at[:2])
         k = k - (at[2] - w) / (along[2] - by_x * along[0] - by_y * along[1])
@@ -248,7 +214,7 @@ def _derivatives(
     first = LOCAL + len(POSE)
     out[:, first : first + len(lens)] = np.einsum("acm,lcm->alm", by_ray, lens)
     square = m.screen_mm[0] ** 2 + m.screen_mm[1] ** 2
-    out[:, -2] = across * square / onto / BOW_RADIUS_MM**2
+    out[:, -2] = across * square / onto / screen_face.BOW_RADIUS_MM**2
     out /= bench.pitch
     out[:, -1] = -m.screen_mm / bench.pitch**2
     return out

@@ -28,22 +28,12 @@ EDGE_SIGMA_PX = 0.1
 
 @dataclass(frozen=True)
 class RingPose:
-    """What the rim says.
+    """What the rim says."""
 
-    Attributes
-    ----------
-    values, sigmas : (5,) arrays
-        Of `POSE_NAMES`, 0 for the stated bench.
-    rms_px : float
-        What is left of an edge.
-    points : int
-        Edges that were used.
-    """
-
-    values: FloatArray
-    sigmas: FloatArray
-    rms_px: float
-    points: int
+    values: FloatArray  # (5,): of `POSE_NAMES`, 0 for the stated bench
+    sigmas: FloatArray  # (5,)
+    rms_px: float  # what is left of an edge
+    points: int  # edges that were used
 
     def bench(self, stated: Geometry) -> Geometry:
         """The stated bench, the camera where the rim says, the screen moved with alpha."""
@@ -60,6 +50,8 @@ def ring_pose(
 ) -> RingPose:
     """Fit the pose, and weigh it with what is known by hand (`parameters.POSE`).
 
+    Raises ValueError if half of the rim, or more, is not to be seen.
+
     Parameters
     ----------
     light : (H, W) array
@@ -74,11 +66,6 @@ def ring_pose(
         Where the rim stands in world; a ring is flat, the rim of a mounted film nearly.
     radius_sigma_mm : float
         How well the radius is known: that goes into `a_mm`.
-
-    Raises
-    ------
-    ValueError
-        If half of the rim, or more, is not to be seen.
     """
     edges = rim_edges(light, rough_px)
     if edges.shape[1] < _LEAST_FOUND * _POINTS:

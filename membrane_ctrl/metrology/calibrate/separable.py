@@ -10,8 +10,6 @@ the rim, z_i e_0 + E q_i, are the same in all sets (a polynomial of degree 7 has
 the laser says: z_i = -(1 + scale) (d_i - reference) / 1000, d_i in um.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 
@@ -37,22 +35,12 @@ class SetState:
 
 @dataclass(frozen=True)
 class References:
-    """What is known beside the fringes.
+    """What is known beside the fringes."""
 
-    Attributes
-    ----------
-    reference_um : float
-        Laser reading at which the vertex stands at z = 0.
-    laser_sigma_um : float
-        Of a set's mean reading.
-    ring_sigma_um : float
-        How far the ring's harmonics may differ from set to set.
-    """
-
-    reference_um: float
-    laser_sigma_um: float = 1.0
+    reference_um: float  # laser reading at which the vertex stands at z = 0
+    laser_sigma_um: float = 1.0  # of a set's mean reading
     # the clamp creeps by less than a micrometre in the minutes that a calibration takes
-    ring_sigma_um: float = 1.0
+    ring_sigma_um: float = 1.0  # how far the ring's harmonics may differ from set to set
 
 
 @dataclass(frozen=True)
@@ -63,12 +51,12 @@ class Trust:
     variance: float
 
     @classmethod
-    def full(cls, phases: residuals.SetPhases) -> Trust:
+    def full(cls, phases: residuals.SetPhases) -> "Trust":
         """Every point as its noise says."""
         return cls(np.ones(phases.sigma_mm.size), 1.0)
 
     @classmethod
-    def seen(cls, phases: residuals.SetPhases, residual_mm: FloatArray) -> Trust:
+    def seen(cls, phases: residuals.SetPhases, residual_mm: FloatArray) -> "Trust":
         """From residuals (2, n): Huber's weights against their own scatter."""
         length = np.hypot(*residual_mm) / phases.sigma_mm
         # the median of a Rayleigh distribution is 1.177 sigma; less noise than the camera must have is not believed
@@ -78,25 +66,14 @@ class Trust:
 
 @dataclass(frozen=True)
 class Equations:
-    """Everything one set says, linearised where its unknowns stand.
+    """Everything one set says, linearised where its unknowns stand."""
 
-    Attributes
-    ----------
-    sums : (LOCAL + COMMON + 1, squared) array
-        J^T W J of the prediction's derivatives, with the residual as one more column: normal matrix, right side and
-        sum of squares in one.
-    residual_mm : (2, n) array
-        Seen minus predicted screen points.
-    trust : Trust
-        The points' weights.
-    residual_rms_mm : float
-        RMS of one component, each point counting by its weight.
-    """
-
+    # (LOCAL + COMMON + 1, squared): J^T W J of the prediction's derivatives, with the residual as one more column:
+    # normal matrix, right side and sum of squares in one
     sums: FloatArray
-    residual_mm: FloatArray
-    trust: Trust
-    residual_rms_mm: float
+    residual_mm: FloatArray  # (2, n): seen minus predicted screen points
+    trust: Trust  # the points' weights
+    residual_rms_mm: float  # RMS of one component, each point counting by its weight
 
     @property
     def variance(self) -> float:

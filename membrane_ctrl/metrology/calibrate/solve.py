@@ -22,61 +22,27 @@ _FREE_RING_MM = 1e3  # the ring's form is not known beforehand
 
 @dataclass(frozen=True)
 class Problem:
-    """What is to be solved.
+    """What is to be solved."""
 
-    Attributes
-    ----------
-    stated : Geometry
-        What was measured by hand.
-    sets : tuple of SetPhases
-        At different sags.
-    sigmas : (len(NAMES),) array
-        Of the hand's measurements; 0 holds a parameter.
-    references : References
-        Laser and ring.
-    radius_mm : float
-        Of the ring.
-    """
-
-    stated: Geometry
-    sets: tuple[residuals.SetPhases, ...]
-    sigmas: FloatArray
-    references: separable.References
-    radius_mm: float
+    stated: Geometry  # what was measured by hand
+    sets: tuple[residuals.SetPhases, ...]  # at different sags
+    sigmas: FloatArray  # (len(NAMES),): of the hand's measurements; 0 holds a parameter
+    references: separable.References  # laser and ring
+    radius_mm: float  # of the ring
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Where the unknowns ended, and the equations there.
+    """Where the unknowns ended, and the equations there."""
 
-    Attributes
-    ----------
-    problem : Problem
-        As given, many bins averaged.
-    values : (len(NAMES),) array
-        Parameters, 0 for the stated bench.
-    common : (COMMON,) array
-        Parameters and ring.
-    states : tuple of SetState
-        Surface and vertex of each set.
-    equations : tuple of Equations
-        Of each set, at the end.
-    covariance : (COMMON, COMMON) array
-        Of the common unknowns; zeros for what was held.
-    changes : tuple of float
-        Largest change of each step, in standard deviations.
-    converged : bool
-        Whether the last step was too small to matter.
-    """
-
-    problem: Problem
-    values: FloatArray
-    common: FloatArray
-    states: tuple[separable.SetState, ...]
-    equations: tuple[separable.Equations, ...]
-    covariance: FloatArray
-    changes: tuple[float, ...]
-    converged: bool
+    problem: Problem  # as given, many bins averaged
+    values: FloatArray  # (len(NAMES),): parameters, 0 for the stated bench
+    common: FloatArray  # (COMMON,): parameters and ring
+    states: tuple[separable.SetState, ...]  # surface and vertex of each set
+    equations: tuple[separable.Equations, ...]  # of each set, at the end
+    covariance: FloatArray  # (COMMON, COMMON): of the common unknowns; zeros for what was held
+    changes: tuple[float, ...]  # largest change of each step, in standard deviations
+    converged: bool  # whether the last step was too small to matter
 
     @property
     def bench(self) -> parameters.BenchGeometry:
@@ -128,17 +94,8 @@ def solve(
 ) -> Solution:
     """Calibrate. Sets of very many bins are solved with some of them first, and then with means of them all.
 
-    Parameters
-    ----------
-    progress : callable, optional
-        Told the number of the step and its largest change in standard deviations.
-    start : Solution, optional
-        Of the same sets: where to begin.
-
-    Raises
-    ------
-    ValueError
-        If there is no set, or if a set's points do not determine a surface.
+    Raises ValueError if there is no set, or if a set's points do not determine a surface. `progress` is told the
+    number of the step and its largest change in standard deviations; `start` is a solution of the same sets.
     """
     if not problem.sets:
         raise ValueError("no capture set to calibrate with")

@@ -21,21 +21,11 @@ _HARMLESS_UM = 2.5
 
 @dataclass(frozen=True)
 class CalibrationFinding:
-    """Something that is not as it should be.
+    """Something that is not as it should be."""
 
-    Attributes
-    ----------
-    fatal : bool
-        Whether the old geometry has to stay in force.
-    says : str
-        One line for a person.
-    sets : tuple of int
-        Sets it is about; empty for all of them.
-    """
-
-    fatal: bool
-    says: str
-    sets: tuple[int, ...] = ()
+    fatal: bool  # whether the old geometry has to stay in force
+    says: str  # one line for a person
+    sets: tuple[int, ...] = ()  # sets it is about; empty for all of them
 
 
 def before(problem: Problem) -> tuple[CalibrationFinding, ...]:

@@ -19,30 +19,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from membrane_ctrl.metrology.phase import step_residual, step_weights
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
 _TINY = 1e-9  # a share of a frame that the model does not explain: below this it is explained whatever it is
 
 
 @dataclass(frozen=True)
 class Closure:
-    """How well N frames agree.
+    """How well N frames agree."""
 
-    Attributes
-    ----------
-    rms_adu : float
-        What the model leaves, per degree of freedom: the noise, if all is well.
-    frame_rms_adu : (N,) array
-        What it leaves of each frame, over all pixels.
-    without_rms_adu : (N,) array
-        What it leaves, per degree of freedom, with that frame left out. NaN where nothing would be left to test.
-    """
-
-    rms_adu: float
-    frame_rms_adu: FloatArray
+    rms_adu: float  # what the model leaves, per degree of freedom: the noise, if all is well
+    frame_rms_adu: FloatArray  # (N,): what it leaves of each frame, over all pixels
+    # (N,): what it leaves, per degree of freedom, without that frame; NaN where nothing would be left to test
     without_rms_adu: FloatArray
 
     @property
@@ -59,17 +49,14 @@ class Closure:
 def closure(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> Closure:
     """Agreement of the frames with a sinusoid of unknown mean, amplitude and phase in each pixel.
 
+    Raises ValueError for fewer than four frames, or steps that determine no phase.
+
     Parameters
     ----------
     frames : (N, ...) array
         Intensities, N >= 4; pixels without fringes left out or masked by the caller.
     shifts_rad : (N,) array
         Phase steps.
-
-    Raises
-    ------
-    ValueError
-        For fewer than four frames, or steps that determine no phase.
     """
     stack, shifts = _checked(frames, shifts_rad)
     residual = step_residual(stack, shifts)

@@ -11,8 +11,6 @@ I = g (lo + (hi - lo) bit); white and black have one. Over thousands of bins noi
 what does not belong there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -30,26 +28,14 @@ _EDGE_RAD = 0.5
 
 @dataclass(frozen=True)
 class SampledBins:
-    """What is known of the sampled bins: (n,) and (2, n) arrays.
+    """What is known of the sampled bins: (n,) and (2, n) arrays."""
 
-    Attributes
-    ----------
-    index : (n,) int array
-        Bins.
-    light : (n,) array
-        Brightness, see `view`.
-    phase_rad : (2, n) array
-        Predicted absolute phase, film at its mean displacement.
-    sensitivity_rad_per_um : (2, n) array
-        Change of phase per um of displacement.
-    """
+    index: IntArray  # (n,): bins
+    light: FloatArray  # (n,): brightness, see `view`
+    phase_rad: FloatArray  # (2, n): predicted absolute phase, film at its mean displacement
+    sensitivity_rad_per_um: FloatArray  # (2, n): change of phase per um of displacement
 
-    index: IntArray
-    light: FloatArray
-    phase_rad: FloatArray
-    sensitivity_rad_per_um: FloatArray
-
-    def thinned(self) -> SampledBins:
+    def thinned(self) -> "SampledBins":
         """Enough of the bins."""
         every = slice(None, None, max(1, self.index.size // _SAMPLE))
         return SampledBins(
@@ -62,35 +48,16 @@ class SampledBins:
 
 @dataclass(frozen=True)
 class Evidence:
-    """One frame; units of light are those of `SampledBins.light`.
+    """One frame; units of light are those of `SampledBins.light`."""
 
-    Attributes
-    ----------
-    level : float
-        m of a sinusoid, hi of a Gray frame, the level of white and black.
-    swing : float
-        b of a sinusoid, hi - lo of a Gray frame, 0 else.
-    step_rad : float
-        delta of a sinusoid: how far its phase step is from the stated one.
-    moved_um : float
-        e of a sinusoid: how far the film is from where the laser says.
-    rest : float
-        RMS of what is left over, as a share of the light.
-    saturated : float
-        Share of bins with a saturated pixel.
-    shows : int
-        Frame whose pattern this one fits best.
-    lit : float
-        Share of the bins where a Gray frame is predicted bright: 0 or 1 where the mirror shows no edge of that bit.
-    """
-
-    level: float
-    swing: float
-    step_rad: float
-    moved_um: float
-    rest: float
-    saturated: float
-    shows: int
+    level: float  # m of a sinusoid, hi of a Gray frame, the level of white and black
+    swing: float  # b of a sinusoid, hi - lo of a Gray frame, 0 else
+    step_rad: float  # delta of a sinusoid: how far its phase step is from the stated one
+    moved_um: float  # e of a sinusoid: how far the film is from where the laser says
+    rest: float  # RMS of what is left over, as a share of the light
+    saturated: float  # share of bins with a saturated pixel
+    shows: int  # frame whose pattern this one fits best
+    # Share of the bins where a Gray frame is predicted bright: 0 or 1 where the mirror shows no edge of that bit
     lit: float = 1.0
 
 
@@ -195,39 +162,24 @@ class NoFigureError(Exception):
 
 @dataclass(frozen=True)
 class BinView:
-    """Arrays over the bins, (rows, columns) each.
+    """Arrays over the bins, (rows, columns) each."""
 
-    Attributes
-    ----------
-    used : two lists of int
-        The sinusoids of x and y that the phases are made of.
-    phase_rad, swing_adu : (2, rows, columns) arrays
-        Wrapped phase and fringe amplitude of x and y.
-    light : array
-        Brightness, in units of the fringes' mean.
-    mask : bool array
-        Bins that see the pattern in the mirror.
-    """
-
-    used: tuple[list[int], list[int]]
-    phase_rad: FloatArray
-    swing_adu: FloatArray
-    light: FloatArray
-    mask: BoolArray
+    used: tuple[list[int], list[int]]  # the sinusoids of x and y that the phases are made of
+    phase_rad: FloatArray  # (2, rows, columns): wrapped phase of x and y
+    swing_adu: FloatArray  # (2, rows, columns): fringe amplitude
+    light: FloatArray  # brightness, in units of the fringes' mean
+    mask: BoolArray  # bins that see the pattern in the mirror
 
 
 def look(stack: FrameStack, binned: Binned, excluded: Collection[int], estimate: FloatArray | None = None) -> BinView:
     """Combine the frames that are not excluded.
 
+    Raises NoFigureError if an axis has fewer than three usable steps, or if there are no fringes.
+
     Parameters
     ----------
     estimate : (rows, columns) array, optional
         The light as another set saw it: the third estimate of a set without white and black.
-
-    Raises
-    ------
-    NoFigureError
-        If an axis has fewer than three usable steps, or if there are no fringes.
     """
     used = tuple([k for k in stack.sinusoids(axis) if k not in excluded] for axis in AXES)
     light, swing, phase, saturated = [], [], [], np.zeros(binned.means.shape[1:], bool)

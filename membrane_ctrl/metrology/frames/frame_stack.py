@@ -1,20 +1,15 @@
 """The frames of one set in memory, and their means over bins."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.metrology.optics.compiled import kernel, split
 from membrane_ctrl.metrology.phase import AXES, step_weights
 from membrane_ctrl.metrology.phasor import Binner, StepCombination, arctan2
-from membrane_ctrl.model.arrays import FloatArray
-
-Frames = NDArray[np.uint8] | NDArray[np.uint16]
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, IntArray, Singles
 
 _ENOUGH_BINS = 50_000  # for 36 terms and for the checks of the frames; more only cost time
 _LARGEST_BIN_PX = 4  # curvature of the phase over a larger bin is no longer small
@@ -22,24 +17,12 @@ _LARGEST_BIN_PX = 4  # curvature of the phase over a larger bin is no longer sma
 
 @dataclass(frozen=True)
 class FrameStack:
-    """Frames of a capture set in the order of their patterns.
+    """Frames of a capture set in the order of their patterns."""
 
-    Attributes
-    ----------
-    frames : (frames, height, width) array
-        uint8 or uint16.
-    patterns : tuple of Pattern
-        What each frame should show; sinusoids with their phase step.
-    displacement_um : (frames,) array
-        Laser reading at each, NaN without.
-    unusable : dict from frame to reason
-        Frames that hold no picture.
-    """
-
-    frames: Frames
-    patterns: tuple[Pattern, ...]
-    displacement_um: FloatArray
-    unusable: dict[int, str]
+    frames: Image  # (frames, height, width): uint8 or uint16
+    patterns: tuple[Pattern, ...]  # what each frame should show; sinusoids with their phase step
+    displacement_um: FloatArray  # (frames,): laser reading at each, NaN without
+    unusable: dict[int, str]  # frames that hold no picture
 
     def sinusoids(self, axis: str) -> list[int]:
         """Frames that show the sinusoids of an axis."""
@@ -57,7 +40,7 @@ class FrameStack:
         """Phase steps of sinusoids."""
         return np.array([self.patterns[k].shift_rad for k in frames])
 
-    def reordered(self, order: list[int]) -> FrameStack:
+    def reordered(self, order: list[int]) -> "FrameStack":
         """The same with other pictures for the patterns: frame k shows what `order[k]` did."""
         return replace(self, frames=self.frames[order])
 
@@ -79,23 +62,13 @@ class FrameStack:
 
 @dataclass(frozen=True)
 class Binned:
-    """Frames as means over bins.
+    """Frames as means over bins."""
 
-    Attributes
-    ----------
-    bin_px : int
-        Side of a bin.
-    means : (frames, rows, columns) float32 array
-        In the frames' units.
-    saturated : (frames, rows, columns) bool array
-        Bins with a saturated pixel.
-    """
+    bin_px: int  # side of a bin
+    means: Singles  # (frames, rows, columns): in the frames' units
+    saturated: BoolArray  # (frames, rows, columns): bins with a saturated pixel
 
-    bin_px: int
-    means: NDArray[np.float32]
-    saturated: NDArray[np.bool_]
-
-    def reordered(self, order: list[int]) -> Binned:
+    def reordered(self, order: list[int]) -> "Binned":
         """As `FrameStack.reordered`."""
         return replace(self, means=self.means[order], saturated=self.saturated[order])
 
@@ -124,24 +97,12 @@ def bin_frames(stack: FrameStack, full_scale_adu: int) -> Binned:
 
 @dataclass(frozen=True)
 class PixelPhases:
-    """One axis at n pixels.
+    """One axis at n pixels."""
 
-    Attributes
-    ----------
-    phase_rad : (n,) array
-        Absolute phase, the period nearest to the reference.
-    swing_adu : (n,) float32 array
-        Fringe amplitude.
-    rest_adu : (n,) float32 array
-        Root of the sum of squares that the sinusoid leaves; 0 for three frames.
-    saturated : (n,) bool array
-        Whether a frame is saturated there.
-    """
-
-    phase_rad: FloatArray
-    swing_adu: NDArray[np.float32]
-    rest_adu: NDArray[np.float32]
-    saturated: NDArray[np.bool_]
+    phase_rad: FloatArray  # (n,): absolute phase, the period nearest to the reference
+    swing_adu: Singles  # (n,): fringe amplitude
+    rest_adu: Singles  # (n,): root of the sum of squares that the sinusoid leaves; 0 for three frames
+    saturated: BoolArray  # (n,): whether a frame is saturated there
 
 
 @kernel
@@ -177,10 +138,10 @@ def _phases(frames, index, weights, shift_cos, shift_sin, turn, mirror, slope, r
 
 
 def pixel_phases(
-    frames: Frames,
+    frames: Image,
     shifts_rad: FloatArray,
     combined: StepCombination,
-    index: NDArray[np.int64],
+    index: IntArray,
     sensitivity_rad_per_um: FloatArray,
     reference_rad: FloatArray,
     full_scale_adu: int,

@@ -37,24 +37,12 @@ _DARK = 0.4  # less than this share of the light is no flicker
 
 @dataclass(frozen=True)
 class Flag:
-    """A frame that does not belong.
-
-    Attributes
-    ----------
-    frame : int
-        Which.
-    reason : str
-        First word: stale, swapped, saturated, dark, flicker, moved, or what could not be read.
-    severity : float
-        Times the limit.
-    swapped_with : int or None
-        The frame that shows this one's pattern while this one shows its.
-    """
+    """A frame that does not belong."""
 
     frame: int
-    reason: str
-    severity: float
-    swapped_with: int | None = None
+    reason: str  # first word: stale, swapped, saturated, dark, flicker, moved, or what could not be read
+    severity: float  # times the limit
+    swapped_with: int | None = None  # the frame that shows this one's pattern while this one shows its
 
 
 def identical_frames(stack: FrameStack) -> dict[int, int]:
@@ -96,12 +84,8 @@ def obvious(stack: FrameStack, binned: Binned) -> list[Flag]:
 def inspect(stack: FrameStack, binned: Binned, scene: SampledBins, excluded: Collection[int]) -> list[Flag]:
     """Judge all readable frames, worst first.
 
-    Parameters
-    ----------
-    scene : SampledBins
-        Prediction from the surface fitted to the frames that are not excluded.
-    excluded : collection of int
-        Frames that the surface was made without; judged too, but no measure for the others.
+    `scene` is predicted from the surface fitted to the frames that are not excluded. Excluded frames are judged too,
+    but are no measure for the others.
     """
     readable = [k for k in range(len(stack.patterns)) if k not in stack.unusable]
     evidence = gather(stack, binned, scene, readable)

@@ -12,8 +12,6 @@ nobody's fault. Three closures:
 Of four steps one can be done without: I0 = I1 + I3 - I2 is what the phase of the other three says, and so on round.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -43,25 +41,15 @@ CONSISTENT_PERIODS = 0.25
 
 @dataclass(frozen=True)
 class Unwrapped:
-    """Positions on the screen from all frequencies.
+    """Positions on the screen from all frequencies."""
 
-    Attributes
-    ----------
-    screens : (...) array
-        Position along the axis, 0 to 1 over the screen, from the finest fringe.
-    step_periods : (F - 1, ...) array
-        e of each step, in periods of the finer fringe, within +-1/2.
-    consistent : (...) bool array
-        All |e| below `CONSISTENT_PERIODS` and the position on the screen.
-    """
-
-    screens: FloatArray
-    step_periods: FloatArray
-    consistent: BoolArray
+    screens: FloatArray  # (...): position along the axis, 0 to 1 over the screen, from the finest fringe
+    step_periods: FloatArray  # (F - 1, ...): e of each step, in periods of the finer fringe, within +-1/2
+    consistent: BoolArray  # (...): all |e| below `CONSISTENT_PERIODS` and the position on the screen
 
 
 def unwrap(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray) -> Unwrapped:
-    """Unwrap in time.
+    """Unwrap in time. Raises ValueError if the periods are not rising from at most one, or do not match the phases.
 
     Parameters
     ----------
@@ -69,11 +57,6 @@ def unwrap(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray) -> Un
         Phase of each frequency, any branch; zero where position 0 is.
     periods : (F,) array
         Periods a screen, rising; the first at most 1.
-
-    Raises
-    ------
-    ValueError
-        If the periods are not rising from at most one, or do not match the phases.
     """
     counts = np.asarray(periods, float)
     if counts.ndim != 1 or len(counts) != len(wrapped_rad):
@@ -114,24 +97,12 @@ BEYOND_SHARE = 0.05  # of pixels that a frame shows brighter than white, or dark
 
 @dataclass(frozen=True)
 class AxisSeries:
-    """One axis of a set.
+    """One axis of a set."""
 
-    Attributes
-    ----------
-    axis : str
-        "x" or "y".
-    frames : (F, 4, n) array
-        Frequency, step, pixel.
-    periods : (F,) array
-        Periods a screen, rising.
-    shifts_rad : (4,) array
-        Phase steps.
-    """
-
-    axis: str
-    frames: FloatArray
-    periods: FloatArray
-    shifts_rad: FloatArray
+    axis: str  # "x" or "y"
+    frames: FloatArray  # (F, 4, n): frequency, step, pixel
+    periods: FloatArray  # (F,): periods a screen, rising
+    shifts_rad: FloatArray  # (4,): phase steps
 
     def phases_rad(self) -> FloatArray:
         """Wrapped phases (F, n)."""
@@ -141,7 +112,7 @@ class AxisSeries:
         """Share of the pixels whose frequencies disagree."""
         return float(np.mean(~unwrap(self.phases_rad(), self.periods).consistent))
 
-    def with_frames(self, index: int, steps: FloatArray) -> AxisSeries:
+    def with_frames(self, index: int, steps: FloatArray) -> "AxisSeries":
         """The same with other frames of one frequency."""
         frames = self.frames.copy()
         frames[index] = steps
@@ -171,17 +142,14 @@ class SeriesCheck:
 def check_series(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatArray) -> SeriesCheck:
     """Check the axes of a set, in the order in which they were taken.
 
+    Raises ValueError if there are no pixels or not four steps.
+
     Parameters
     ----------
     axes : AxisSeries
         Four steps each.
     black, white : (n,) arrays
         Of the same pixels.
-
-    Raises
-    ------
-    ValueError
-        If there are no pixels or not four steps.
     """
     limits = _closure_limits(axes)
     flags: list[SeriesFlag] = _flat_flags(axes, black, white)

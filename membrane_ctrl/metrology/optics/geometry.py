@@ -5,59 +5,36 @@ without roll, image down is world -y, forward is -F / a, and image right is the 
 towards +x: (sin alpha, 0, -cos alpha).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
 from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
 from membrane_ctrl.metrology.optics.screen_face import Face
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
 _UNDONE = 1e-9  # of a tangent: 5e-6 of a pixel of the paper's lens
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Where camera and screen stand and how the lens maps.
+    """Where camera and screen stand and how the lens maps."""
 
-    Attributes
-    ----------
-    pinhole_mm : (3,) array
-        Camera pinhole F in world.
-    rotation : (3, 3) array
-        Rows are the camera's x (right), y (down) and z (forward) in world.
-    focal_px : float
-        Focal length in pixels.
-    principal_px : (column, row)
-        Principal point.
-    distortion : tuple of float
-        OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for a pinhole.
-    screen_origin_mm : (3,) array
-        O' in world.
-    screen_s_x, screen_s_y : (3,) arrays
-        Unit vectors of s_x and s_y in world.
-    face : Face
-        How the screen stands off the plane of s_x and s_y.
-    """
-
-    pinhole_mm: FloatArray
-    rotation: FloatArray
+    pinhole_mm: FloatArray  # (3,): camera pinhole F in world
+    rotation: FloatArray  # (3, 3): rows are the camera's x (right), y (down) and z (forward) in world
     focal_px: float
-    principal_px: tuple[float, float]
-    distortion: tuple[float, ...]
-    screen_origin_mm: FloatArray
-    screen_s_x: FloatArray
-    screen_s_y: FloatArray
-    face: Face
+    principal_px: tuple[float, float]  # column, row
+    distortion: tuple[float, ...]  # OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for a pinhole
+    screen_origin_mm: FloatArray  # (3,): O' in world
+    screen_s_x: FloatArray  # (3,): unit vectors of s_x and s_y in world
+    screen_s_y: FloatArray  # (3,)
+    face: Face  # how the screen stands off the plane of s_x and s_y
 
     @classmethod
-    def from_config(cls, optics: OpticsConfig) -> Geometry:
+    def from_config(cls, optics: OpticsConfig) -> "Geometry":
         """The geometry a configuration describes."""
         camera = optics.camera
         pinhole, rotation, origin, s_x, s_y = _poses(optics.geometry)
@@ -161,25 +138,13 @@ _LEAST_FOUND = 0.4
 
 @dataclass(frozen=True)
 class Outline:
-    """The rim as seen and as expected.
+    """The rim as seen and as expected."""
 
-    Attributes
-    ----------
-    rim_px : (2, n) array
-        Column and row of the rim's points that were found.
-    centre_px, expected_px : (column, row)
-        Middle of the ellipse that fits them, and of the one that the pose predicts.
-    offset_mm : float
-        Distance of the two, on the mirror.
-    size_ratio : float
-        Seen over expected, mean radius.
-    """
-
-    rim_px: FloatArray
-    centre_px: tuple[float, float]
-    expected_px: tuple[float, float]
-    offset_mm: float
-    size_ratio: float
+    rim_px: FloatArray  # (2, n): column and row of the rim's points that were found
+    centre_px: tuple[float, float]  # centre of the ellipse that fits them
+    expected_px: tuple[float, float]  # that of the ellipse which the pose predicts
+    offset_mm: float  # distance of the two, on the mirror
+    size_ratio: float  # seen over expected, mean radius
 
 
 def find_outline(light: FloatArray, geometry: Geometry, rim_mm: float, rim_z_mm: float) -> Outline | None:

@@ -14,9 +14,8 @@ import math
 
 import numpy as np
 
+from membrane_ctrl.metrology.optics import hencky, screen_face
 from membrane_ctrl.metrology.optics.compiled import kernel, step
-from membrane_ctrl.metrology.optics.hencky import EXCESS_TERMS
-from membrane_ctrl.metrology.optics.screen_face import face_height, is_plane
 from membrane_ctrl.metrology.optics.zernike import DEGREE
 
 FACE_STEPS = 6  # see `_onto_face`
@@ -47,7 +46,7 @@ def evaluate(poly, excess, amplitude, x, y):  # type: ignore[no-untyped-def]
     v = x * x + y * y
     e = 0.0
     ev = 0.0
-    for k in range(EXCESS_TERMS - 1, -1, -1):
+    for k in range(hencky.EXCESS_TERMS - 1, -1, -1):
         ev = ev * v + e
         e = e * v + excess[k]
     return h + amplitude * e, hx + 2 * amplitude * ev * x, hy + 2 * amplitude * ev * y, ev
@@ -117,11 +116,11 @@ def measured_slope(rays, t, screen, w, pinhole, plane, p):  # type: ignore[no-un
 @kernel
 def _lift(screen, face, first, count, out):  # type: ignore[no-untyped-def]
     """How far the face stands off at some points; a loop of its own: a look-up in it takes away the vector units."""
-    if is_plane(face):
+    if screen_face.is_plane(face):
         out[:count] = 0.0
         return
     for k in range(count):
-        out[k], _wa, _wb = face_height(face, screen[0, first + k], screen[1, first + k])
+        out[k], _wa, _wb = screen_face.face_height(face, screen[0, first + k], screen[1, first + k])
 
 
 @kernel
@@ -307,13 +306,13 @@ def _onto_face(out, tangents, face, first, count):  # type: ignore[no-untyped-de
     A step leaves the square of the miss times the face's curvature: 1 mm of bow 200 mm wide is met to rounding after
     three, a map of a few millimetres after four or five.
     """
-    if is_plane(face):
+    if screen_face.is_plane(face):
         return
     for k in range(count):
         a, b, ta, tb = out[0, first + k], out[1, first + k], tangents[0, k], tangents[1, k]
         w = 0.0
         for _ in range(FACE_STEPS):
-            height, wa, wb = face_height(face, a + w * ta, b + w * tb)
+            height, wa, wb = screen_face.face_height(face, a + w * ta, b + w * tb)
             w -= (w - height) / (1 - wa * ta - wb * tb)
         out[0, first + k] = a + w * ta
         out[1, first + k] = b + w * tb

@@ -5,8 +5,6 @@ kept as its polynomial in each cell, sum of C[m, n] v^m u^n with u and v from 0 
 needs one look-up and a Horner scheme. Beyond the grid the height of its edge goes on.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -22,25 +20,16 @@ _ORDER = 4  # coefficients of a cubic
 
 
 class Face(NamedTuple):
-    """A face; a named tuple, since compiled loops take one as it is.
+    """A face; a named tuple, since compiled loops take one as it is."""
 
-    Attributes
-    ----------
-    bow_per_mm : float
-        c, in 1/mm.
-    cells_mm : (rows, columns, 4, 4) array
-        Polynomials of the map's cells, along s_y and s_x; without cells there is no map.
-    low_mm, pitch_mm : (2,) arrays
-        First node and distance of the nodes along s_x and s_y.
-    """
-
-    bow_per_mm: float
+    bow_per_mm: float  # c, in 1/mm
+    # (rows, columns, 4, 4): polynomials of the map's cells, along s_y and s_x; without cells there is no map
     cells_mm: FloatArray
-    low_mm: FloatArray
-    pitch_mm: FloatArray
+    low_mm: FloatArray  # (2,): first node along s_x and s_y
+    pitch_mm: FloatArray  # (2,): distance of the nodes
 
     @classmethod
-    def of(cls, screen: ScreenPoseConfig | None) -> Face:
+    def of(cls, screen: ScreenPoseConfig | None) -> "Face":
         """The face that a configuration describes; a plane for None."""
         bow_mm = 0.0 if screen is None else screen.bow_mm
         cells, low, pitch = _cells(None if screen is None else screen.height_map)

@@ -4,8 +4,6 @@ The excess is orthogonal to the 36 terms over the disc, so the coefficients are 
 its amplitude: a shape made of 36 terms has amplitude 0, a true Hencky bowl has its own sag.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache, cached_property
 
@@ -19,30 +17,20 @@ PARAMETERS = 36  # j = 2..36 and the excess; piston follows from h(0) = 0
 
 @dataclass(frozen=True)
 class Surface:
-    """Height above the vertex, h(0, 0) = 0, over a disc.
+    """Height above the vertex, h(0, 0) = 0, over a disc."""
 
-    Attributes
-    ----------
-    coeffs_mm : (36,) array
-        Noll j = 1..36, orthonormal; piston is whatever makes h(0, 0) = 0.
-    hencky_mm : float
-        Amplitude of the excess, as the sag of the Hencky bowl it belongs to.
-    radius_mm : float
-        Radius of the Zernike disc.
-    """
-
-    coeffs_mm: FloatArray
-    hencky_mm: float
-    radius_mm: float
+    coeffs_mm: FloatArray  # (36,): Noll j = 1..36, orthonormal; piston is whatever makes h(0, 0) = 0
+    hencky_mm: float  # amplitude of the excess, as the sag of the Hencky bowl it belongs to
+    radius_mm: float  # radius of the Zernike disc
 
     @classmethod
-    def from_parameters(cls, parameters: FloatArray, radius_mm: float) -> Surface:
+    def from_parameters(cls, parameters: FloatArray, radius_mm: float) -> "Surface":
         """The surface of a parameter vector [a_2..a_36, excess with unit RMS] in mm; piston set for h(0, 0) = 0."""
         hencky_mm = float(parameters[-1]) / hencky.excess_rms()
         return cls(parameter_to_coeffs() @ parameters, hencky_mm, radius_mm)
 
     @classmethod
-    def hencky_bowl(cls, sag_mm: float, radius_mm: float) -> Surface:
+    def hencky_bowl(cls, sag_mm: float, radius_mm: float) -> "Surface":
         """A Hencky bowl of the given sag."""
         return cls(sag_mm * hencky.zernike_projection(), sag_mm, radius_mm)
 
@@ -120,29 +108,15 @@ _RINGS = 48
 
 @dataclass(frozen=True)
 class RadialProfile:
-    """Height over radius.
+    """Height over radius."""
 
-    Attributes
-    ----------
-    radius_mm : (n,) array
-        Middle of the rings.
-    mean_mm, low_mm, high_mm : (n,) arrays
-        Mean over azimuth and the band that holds 95 % of the ring.
-    hencky_mm : (n,) array
-        Hencky's bowl of the sag that fits best.
-    sag_mm : float
-        That sag, at the rim.
-    pressure_pa : float
-        Gauge pressure that bends the paper's film to that sag.
-    """
-
-    radius_mm: FloatArray
-    mean_mm: FloatArray
-    low_mm: FloatArray
-    high_mm: FloatArray
-    hencky_mm: FloatArray
-    sag_mm: float
-    pressure_pa: float
+    radius_mm: FloatArray  # (n,): middle of the rings
+    mean_mm: FloatArray  # (n,): mean over azimuth
+    low_mm: FloatArray  # (n,): ends of the band that holds 95 % of the ring
+    high_mm: FloatArray  # (n,)
+    hencky_mm: FloatArray  # (n,): Hencky's bowl of the sag that fits best
+    sag_mm: float  # that sag, at the rim
+    pressure_pa: float  # gauge pressure that bends the paper's film to that sag
 
 
 def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) -> RadialProfile:

@@ -4,16 +4,13 @@ The short form changes in a, b and alpha. The general form changes in twelve num
 shifted (mm, in world) and turned (rad, a rotation vector in world, about the pinhole and about O').
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, Vector3
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
 SHORT_NAMES = ("a_mm", "b_mm", "alpha_deg")
 GENERAL_NAMES = tuple(
@@ -28,21 +25,11 @@ GENERAL_NAMES = tuple(
 class GeometrySpread:
     """Covariance of a geometry.
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of `SHORT_NAMES` or of `GENERAL_NAMES`; what is not named is exact.
-    covariance : (k, k) array
-        Of their changes, in the units of the names.
-
-    Raises
-    ------
-    ValueError
-        On construction, for unknown or mixed names and for what is no covariance.
+    Raises ValueError on construction, for unknown or mixed names and for what is no covariance.
     """
 
-    names: tuple[str, ...]
-    covariance: FloatArray
+    names: tuple[str, ...]  # of `SHORT_NAMES` or of `GENERAL_NAMES`; what is not named is exact
+    covariance: FloatArray  # (k, k): of their changes, in the units of the names
 
     def __post_init__(self) -> None:
         if len(set(self.names)) != len(self.names):
@@ -60,7 +47,7 @@ class GeometrySpread:
             raise ValueError("matrix: not a covariance (an eigenvalue is negative)")
 
     @classmethod
-    def independent(cls, sigmas: dict[str, float]) -> GeometrySpread:
+    def independent(cls, sigmas: dict[str, float]) -> "GeometrySpread":
         """From one sigma a name."""
         return cls(tuple(sigmas), np.diag(np.square(np.array(list(sigmas.values()), float))))
 
@@ -91,13 +78,7 @@ def stated_spread(geometry: GeometryConfig) -> GeometrySpread | None:
 
 
 def changed(geometry: GeometryConfig, names: tuple[str, ...], change: ArrayLike) -> GeometryConfig:
-    """The geometry changed by (k,) amounts.
-
-    Raises
-    ------
-    ValueError
-        If the names belong to the other form.
-    """
+    """The geometry changed by (k,) amounts. Raises ValueError if the names belong to the other form."""
     amounts = dict(zip(names, np.asarray(change, float).tolist(), strict=True))
     if not amounts:
         return geometry

@@ -10,8 +10,6 @@ Seeds: the geometry of trial t comes from (seed, 0, t), the noise of set s in it
 of the order, of the number of workers and of what else is in the run, and the geometry is common to all sets.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,10 +18,9 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, full, reconstruct
 from membrane_ctrl.metrology.checked import Checked
-from membrane_ctrl.metrology.optics import hencky
+from membrane_ctrl.metrology.optics import hencky, zernike
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, parameter_to_coeffs
-from membrane_ctrl.metrology.optics.zernike import values
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread, changed
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
@@ -33,38 +30,22 @@ TRIAL_POINTS = 6000
 
 @dataclass(frozen=True)
 class TrialBench:
-    """All that the trials of one set need; half a megabyte, so that it can be sent to where they run.
+    """All that the trials of one set need; half a megabyte, so that it can be sent to where they run."""
 
-    Attributes
-    ----------
-    optics : OpticsConfig
-        With the nominal geometry.
-    vertex_z_mm : float
-        Where the vertex stood.
-    column_px, row_px : (n,) arrays
-        The points in the picture.
-    screen_mm, sigma_mm : (2, n) arrays
-        Where the fitted surface sends them, and 1 sigma of noise there.
-    t_mm : (n,) array
-        Lengths of their rays.
-    surface, normal
-        The fit, and the normal matrix of these points.
-    """
-
-    optics: OpticsConfig
-    vertex_z_mm: float
-    column_px: FloatArray
-    row_px: FloatArray
-    screen_mm: FloatArray
-    sigma_mm: FloatArray
-    t_mm: FloatArray
+    optics: OpticsConfig  # with the nominal geometry
+    vertex_z_mm: float  # where the vertex stood
+    column_px: FloatArray  # (n,): the points in the picture
+    row_px: FloatArray  # (n,)
+    screen_mm: FloatArray  # (2, n): where the fitted surface sends them
+    sigma_mm: FloatArray  # (2, n): 1 sigma of noise there
+    t_mm: FloatArray  # (n,): lengths of their rays
     surface: Surface
     normal: reconstruct.NormalMatrix
 
     @classmethod
     def of(
         cls, optics: OpticsConfig, checked: Checked, figure: full.BinFigure, count: int = TRIAL_POINTS
-    ) -> TrialBench:
+    ) -> "TrialBench":
         """Of a set's figure, its points thinned to about `count`."""
         row, column = np.divmod(figure.index, checked.phase_rad.shape[2])
         side = checked.binned.bin_px
@@ -83,7 +64,7 @@ class TrialBench:
         place_px: FloatArray,
         sigma_mm: FloatArray,
         count: int,
-    ) -> TrialBench:
+    ) -> "TrialBench":
         """Of points that stand on a surface, seen at `place_px` (2, n), thinned to about `count`."""
         chosen = _spread_evenly(points.t_mm.size, count)
         thinning = points.t_mm.size / np.count_nonzero(chosen)
@@ -104,10 +85,7 @@ class TrialBench:
     def solve(self, geometry: Geometry, disturbance_mm: FloatArray | float = 0.0) -> FloatArray:
         """Parameters (36,) in mm of the surface under a geometry, the screen points (2, n) off by a disturbance.
 
-        Raises
-        ------
-        ArithmeticError
-            If the fit does not converge: the geometry is not near the nominal one.
+        Raises ArithmeticError if the fit does not converge: the geometry is not near the nominal one.
         """
         tracer = reconstruct.Tracer(geometry, self.surface.radius_mm, self.vertex_z_mm)
         points = reconstruct.Points.of(geometry.rays(self.column_px, self.row_px), self.screen_mm + disturbance_mm)
@@ -186,24 +164,14 @@ MAP_SIDE = 101  # points across a map: 10 mm a cell, far below what 36 terms can
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Points of a square grid inside a radius, and the matrix that makes heights of parameters there.
+    """Points of a square grid inside a radius, and the matrix that makes heights of parameters there."""
 
-    Attributes
-    ----------
-    axis_mm : (n,) array
-        Of x and of y.
-    inside : (n, n) bool array
-        Rows along y.
-    matrix : (points, 36) array
-        Heights, 0 at the vertex, of the points inside.
-    """
-
-    axis_mm: FloatArray
-    inside: BoolArray
-    matrix: FloatArray
+    axis_mm: FloatArray  # (n,): of x and of y
+    inside: BoolArray  # (n, n): rows along y
+    matrix: FloatArray  # (points, 36): heights, 0 at the vertex, of the points inside
 
     @classmethod
-    def over(cls, analysis_radius_mm: float, radius_mm: float, side: int = MAP_SIDE) -> HeightMap:
+    def over(cls, analysis_radius_mm: float, radius_mm: float, side: int = MAP_SIDE) -> "HeightMap":
         """A grid over the analysis radius; `radius_mm` is that of the Zernike disc."""
         axis = np.linspace(-analysis_radius_mm, analysis_radius_mm, side)
         x, y = np.meshgrid(axis, axis)
@@ -225,7 +193,7 @@ class HeightMap:
 def height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> FloatArray:
     """Matrix (points, 36) from parameters to heights, 0 at the vertex."""
     x, y = np.asarray(x_mm) / radius_mm, np.asarray(y_mm) / radius_mm
-    out = np.asarray(values(x, y).T @ parameter_to_coeffs())
+    out = np.asarray(zernike.values(x, y).T @ parameter_to_coeffs())
     out[:, -1] += np.polynomial.polynomial.polyval(x * x + y * y, hencky.excess()) / hencky.excess_rms()
     return out
 
@@ -266,10 +234,7 @@ def geometry_covariance(jacobian: FloatArray, spread: GeometrySpread) -> FloatAr
 def linear_covariance(benches: Sequence[TrialBench], spread: GeometrySpread) -> FloatArray:
     """What the Monte Carlo finds, without it: (36, 36) in mm^2.
 
-    Parameters
-    ----------
-    benches : one or two TrialBench
-        Of two the covariance is that of the change between them: the geometry is common to both, the noise is not.
+    With two benches the covariance is that of the change between them: they share the geometry, not the noise.
     """
     jacobian = geometry_jacobian(benches[0], spread)
     if len(benches) > 1:

@@ -88,39 +88,19 @@ _TOLERANCE = 0.1
 
 @dataclass(frozen=True)
 class Moment:
-    """A set at its time.
+    """A set at its time."""
 
-    Attributes
-    ----------
-    name : str
-        Of the set.
-    time_s : float
-        Its middle on the run's clock.
-    parameters : (36,) array
-        Of its surface, in mm.
-    trials : (trials, 36) array
-        The same under the trials' geometries and noise.
-    """
-
-    name: str
-    time_s: float
-    parameters: FloatArray
-    trials: FloatArray
+    name: str  # of the set
+    time_s: float  # its middle on the run's clock
+    parameters: FloatArray  # (36,): of its surface, in mm
+    trials: FloatArray  # (trials, 36): the same under the trials' geometries and noise
 
 
 @dataclass(frozen=True)
 class FigurePair:
-    """A change of the figure.
+    """A change of the figure."""
 
-    Attributes
-    ----------
-    lag_s : float
-        The lag that was asked for.
-    earlier, later : Moment
-        The two sets.
-    """
-
-    lag_s: float
+    lag_s: float  # the lag that was asked for
     earlier: Moment
     later: Moment
 

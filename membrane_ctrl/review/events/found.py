@@ -1,4 +1,4 @@
-"""Events found by machine: what a person would circle on the timeline, with time, size and confidence."""
+"""Events detected in a run: what a person would circle on the timeline, with time, size and confidence."""
 
 from collections.abc import Callable, Iterable
 
@@ -6,18 +6,8 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import BoolArray
 from membrane_ctrl.model.states import State
-from membrane_ctrl.review.events.laser_and_door import door_steps, glitches, looked_at, update_s
-from membrane_ctrl.review.events.steps import (
-    FoundEvent,
-    Level,
-    confidence,
-    event_around,
-    excursions,
-    runs,
-    shape_jumps,
-    steps,
-    widened,
-)
+from membrane_ctrl.review.events import laser_and_door as doors
+from membrane_ctrl.review.events import steps
 from membrane_ctrl.run_files import summary, tables
 from membrane_ctrl.run_files.shapes import Shapes
 
@@ -49,7 +39,7 @@ SPREAD_LEAST_SIGMAS = 6.0
 SPREAD_HALF_MIN = 10
 
 
-def find_events(level: Level, shapes: Shapes, band_um: float) -> list[FoundEvent]:
+def find_events(level: steps.Level, shapes: Shapes, band_um: float) -> list[steps.FoundEvent]:
     """All events of a run in the order of time.
 
     Parameters
@@ -61,29 +51,32 @@ def find_events(level: Level, shapes: Shapes, band_um: float) -> list[FoundEvent
     band_um : float
         The run's `limits.band_um`: what leaves it for no other reason is an excursion.
     """
-    found: list[FoundEvent] = []
+    found: list[steps.FoundEvent] = []
     if level["time_s"].size:
         even = _even(level)
-        finders: Iterable[Callable[[Level], list[FoundEvent]]] = (
+        finders: Iterable[Callable[[steps.Level], list[steps.FoundEvent]]] = (
             pressure_steps, leak_steps, laser_glitches, laser_losses, weather_losses, lateness_bursts,
             noise_changes,
         )  # fmt: skip
         for finder in finders:
             found += finder(even)
-        found += excursions(even, band_um, found)
-    found += shape_jumps(shapes, summary.held_at(level, shapes.time_s))
+        found += steps.excursions(even, band_um, found)
+    found += steps.shape_jumps(shapes, summary.held_at(level, shapes.time_s))
     return sorted(found, key=lambda event: event.time_s)
 
 
-def pressure_steps(level: Level) -> list[FoundEvent]:
+def pressure_steps(level: steps.Level) -> list[steps.FoundEvent]:
     """Doors: the air pressure steps within some seconds."""
     values = level["mean_ambient_pressure_pa"]
-    found = door_steps(values, level["min_ambient_pressure_pa"], DOOR_LEAST_PA, DOOR_LEAST_SIGMAS)
-    places = looked_at(values.size)
-    return [event_around("pressure step", level, s.row, 1, s.size, "Pa", confidence(s.sigmas, places)) for s in found]
+    found = doors.door_steps(values, level["min_ambient_pressure_pa"], DOOR_LEAST_PA, DOOR_LEAST_SIGMAS)
+    places = values.size * len(doors.LAGS)
+    return [
+        steps.event_around("pressure step", level, s.row, 1, s.size, "Pa", steps.confidence(s.sigmas, places))
+        for s in found
+    ]
 
 
-def leak_steps(level: Level) -> list[FoundEvent]:
+def leak_steps(level: steps.Level) -> list[steps.FoundEvent]:
     """The flow that holds the mirror steps, and the weather (what is fed forward) does not explain it."""
     minutes = tables.coarser_level(_held(level), 60.0)
     whole = minutes["rows"] > 0.5 * np.nanmedian(minutes["rows"])
@@ -91,71 +84,76 @@ def leak_steps(level: Level) -> list[FoundEvent]:
     leak = np.where(whole, leak, np.nan)
     if not np.isfinite(leak).any():
         return []
-    found = steps(leak, half=LEAK_HALF_MIN, skip=1, least=LEAK_LEAST_UM_PER_S, least_sigmas=LEAK_LEAST_SIGMAS)
+    found = steps.steps(leak, half=LEAK_HALF_MIN, skip=1, least=LEAK_LEAST_UM_PER_S, least_sigmas=LEAK_LEAST_SIGMAS)
     before = [float(np.nanmean(leak[max(0, s.row - LEAK_HALF_MIN) : s.row])) for s in found]
     return [
-        event_around("leak step", minutes, s.row, 60, 100 * s.size / old, "%", confidence(s.sigmas, leak.size))
+        steps.event_around(
+            "leak step", minutes, s.row, 60, 100 * s.size / old, "%", steps.confidence(s.sigmas, leak.size)
+        )
         for s, old in zip(found, before, strict=True)
         if old > 0 and abs(s.size) >= LEAK_LEAST_SHARE * old
     ]
 
 
-def laser_glitches(level: Level) -> list[FoundEvent]:
+def laser_glitches(level: steps.Level) -> list[steps.FoundEvent]:
     """Readings that jump and jump back, while neither the air pressure nor a loss of the laser explains it."""
     lost = level["max_displacement_quality"] > 0
     barometer = level["mean_ambient_pressure_pa"]
     stepped = np.zeros(lost.size, dtype=bool)
     stepped[[round(step.time_s - level["time_s"][0]) for step in pressure_steps(level)]] = True
     # a slow barometer tells of a door when it comes to it
-    stepped = widened(stepped, DOOR_MOVES_S + (update_s(barometer) if update_s(barometer) > 1 else 0))
-    usable = (level["state"] == State.HOLD) & ~stepped & ~widened(lost, LOST_MOVES_S)
-    calm = ~widened(~np.isfinite(barometer), DOOR_MOVES_S)
+    slow_s = doors.update_s(barometer)
+    stepped = steps.widened(stepped, DOOR_MOVES_S + (slow_s if slow_s > 1 else 0))
+    usable = (level["state"] == State.HOLD) & ~stepped & ~steps.widened(lost, LOST_MOVES_S)
+    calm = ~steps.widened(~np.isfinite(barometer), DOOR_MOVES_S)
     low_um, mean_um, high_um = (level[f"{kind}_displacement_um"] for kind in ("min", "mean", "max"))
-    found = glitches(low_um, mean_um, high_um, usable, calm)
+    found = doors.glitches(low_um, mean_um, high_um, usable, calm)
     time_s = level["time_s"]
+    spans = [(float(time_s[g.first]), float(time_s[g.last])) for g in found]
     return [
-        FoundEvent("laser glitch", float(time_s[g.first]), float(time_s[g.first]) - 30, float(time_s[g.last]) + 30,
-              g.size_um, "um", confidence(g.sigmas, time_s.size))
-        for g in found
-    ]  # fmt: skip
+        steps.FoundEvent(
+            "laser glitch", a_s, a_s - 30, b_s + 30, g.size_um, "um", steps.confidence(g.sigmas, time_s.size)
+        )
+        for g, (a_s, b_s) in zip(found, spans, strict=True)
+    ]
 
 
-def laser_losses(level: Level) -> list[FoundEvent]:
+def laser_losses(level: steps.Level) -> list[steps.FoundEvent]:
     """The laser said that its reading is no good, or gave none."""
     bad = (level["max_displacement_quality"] > 0) | ~np.isfinite(level["mean_displacement_um"])
     bad &= (level["state"] == State.HOLD) & (level["rows"] > 0)
     return _losses("laser lost", bad, level, 1)
 
 
-def weather_losses(level: Level) -> list[FoundEvent]:
+def weather_losses(level: steps.Level) -> list[steps.FoundEvent]:
     """A barometer or thermometer that has given values gives none: what is fed forward then misses the weather."""
-    found: list[FoundEvent] = []
+    found: list[steps.FoundEvent] = []
     for name, kind in _WEATHER.items():
         there = np.isfinite(level[name])
         found += _losses(kind, ~there & (np.cumsum(there) > 0) & (level["rows"] > 0), level, 5)
     return found
 
 
-def _losses(kind: str, lost: BoolArray, level: Level, join: int) -> list[FoundEvent]:
+def _losses(kind: str, lost: BoolArray, level: steps.Level, join: int) -> list[steps.FoundEvent]:
     time_s = level["time_s"]
-    return [FoundEvent(kind, float(time_s[a]), time_s[a] - 5, time_s[b] + 6, b - a + 1.0, "s", 1.0)
-            for a, b in runs(lost, join)]  # fmt: skip
+    return [steps.FoundEvent(kind, float(time_s[a]), time_s[a] - 5, time_s[b] + 6, b - a + 1.0, "s", 1.0)
+            for a, b in steps.runs(lost, join)]  # fmt: skip
 
 
-def lateness_bursts(level: Level) -> list[FoundEvent]:
+def lateness_bursts(level: steps.Level) -> list[steps.FoundEvent]:
     """Several late ticks close together; a single one is any machine's."""
     worst = level["max_lateness_ms"]
     usual = float(np.nanmedian(worst)) if np.isfinite(worst).any() else 0.0
     late = worst > max(LATE_LEAST_MS, LATE_LEAST_RATIO * usual)
     return [
-        FoundEvent("lateness burst", float(level["time_s"][a]), level["time_s"][a] - 5, level["time_s"][b] + 6,
+        steps.FoundEvent("lateness burst", float(level["time_s"][a]), level["time_s"][a] - 5, level["time_s"][b] + 6,
               float(np.nanmax(worst[a : b + 1])), "ms", 1.0)
-        for a, b in runs(late, int(LATE_BURST_S))
+        for a, b in steps.runs(late, int(LATE_BURST_S))
         if int(late[a : b + 1].sum()) >= LATE_BURST_LEAST
     ]  # fmt: skip
 
 
-def noise_changes(level: Level) -> list[FoundEvent]:
+def noise_changes(level: steps.Level) -> list[steps.FoundEvent]:
     """The spread of the error changes for minutes."""
     held = _held(level)
     minute = np.floor(held["time_s"] / 60).astype(int)
@@ -169,29 +167,31 @@ def noise_changes(level: Level) -> list[FoundEvent]:
     mean = np.bincount(number, error, size) / np.maximum(count, 1)
     spread = np.sqrt(np.bincount(number, (error - mean[number]) ** 2, size) / np.maximum(count, 1))
     value = np.where((count >= 50) & (spread > 0), np.log(np.maximum(spread, 1e-12)), np.nan)
-    found = steps(value, SPREAD_HALF_MIN, 1, least=float(SPREAD_LEAST), least_sigmas=SPREAD_LEAST_SIGMAS)
+    found = steps.steps(value, SPREAD_HALF_MIN, 1, least=float(SPREAD_LEAST), least_sigmas=SPREAD_LEAST_SIGMAS)
     time_s = {"time_s": (first + np.arange(size)) * 60.0}
     return [
-        event_around("noise change", time_s, s.row, 60, float(np.exp(s.size)), "times", confidence(s.sigmas, size))
+        steps.event_around(
+            "noise change", time_s, s.row, 60, float(np.exp(s.size)), "times", steps.confidence(s.sigmas, size)
+        )
         for s in found
     ]
 
 
-def _held(level: Level) -> Level:
+def _held(level: steps.Level) -> steps.Level:
     """The level with NaN where the mirror was not held, so that no step is seen where a hold begins."""
     held = level["state"] == State.HOLD
     kept = {"time_s", "rows", "state"}
     return {name: values if name in kept else np.where(held, values, np.nan) for name, values in level.items()}
 
 
-def _even(level: Level) -> Level:
+def _even(level: steps.Level) -> steps.Level:
     """The level with a row for every second; NaN where the run has none."""
     second = np.rint(level["time_s"]).astype(np.int64)
     place = second - second[0]
     size = int(place[-1]) + 1
     if size == second.size:
         return level
-    even: Level = {}
+    even: steps.Level = {}
     for name, values in level.items():
         even[name] = np.full(size, np.nan)
         even[name][place] = values

@@ -3,10 +3,9 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.arrays import BoolArray, Column, IntArray
 from membrane_ctrl.review.events.steps import FoundStep, differences, local_sigma
 
 # A laser's noise is 1 um; the film makes no spike of a single tick.
@@ -33,9 +32,7 @@ class Glitch:
     sigmas: float
 
 
-def glitches(
-    low_um: Column, mean_um: Column, high_um: Column, usable: NDArray[np.bool_], calm: NDArray[np.bool_]
-) -> list[Glitch]:
+def glitches(low_um: Column, mean_um: Column, high_um: Column, usable: BoolArray, calm: BoolArray) -> list[Glitch]:
     """Spikes and longer glitches, one for each that happened.
 
     Parameters
@@ -74,7 +71,7 @@ def _sized(glitch: Glitch, size_um: Column) -> Glitch:
     return replace(glitch, size_um=float(part[np.nanargmax(np.abs(part))]))
 
 
-def _spikes(size_um: Column, mean_um: Column, usable: NDArray[np.bool_]) -> list[Glitch]:
+def _spikes(size_um: Column, mean_um: Column, usable: BoolArray) -> list[Glitch]:
     """A reading far from where the seconds around it are, while the mirror before and after is where it was."""
     far = np.abs(size_um)
     usual = float(np.nanmedian(far))
@@ -87,7 +84,7 @@ def _spikes(size_um: Column, mean_um: Column, usable: NDArray[np.bool_]) -> list
     return [Glitch(int(row), int(row), float(size_um[row]), float(score[row])) for row in found]
 
 
-def _edges(mean_um: Column, usable: NDArray[np.bool_]) -> list[Glitch]:
+def _edges(mean_um: Column, usable: BoolArray) -> list[Glitch]:
     """Steps of the reading within two seconds, each a glitch without an end; `first` is the second of the step."""
     change = np.full(mean_um.size, np.nan)
     change[1:-1] = mean_um[_EDGE_S:] - mean_um[:-_EDGE_S]
@@ -134,11 +131,8 @@ def _alike(size_um: float, other_um: float) -> bool:
     return size_um * other_um > 0 and _EDGES_ALIKE <= abs(size_um / other_um) <= 1 / _EDGES_ALIKE
 
 
-# Steps of the air pressure: quick or slow ones, seen by quick, slow or coarse barometers.
-
-
 # A door takes up to 5 s, and what begins within a second takes a window more; longer changes are weather.
-_LAGS = (1, 2, 3, 4, 6, 8)
+LAGS = (1, 2, 3, 4, 6, 8)
 # Nine in ten differences are weather: a coarse barometer repeats its value in more than half of the windows.
 _USUAL_SHARE = 0.9
 # The difference of two rounded values has this standard deviation, in steps of the rounding.
@@ -157,8 +151,8 @@ _BEYOND = 1
 class _Candidates:
     """Windows that differ enough: first row, length, difference and its sigmas."""
 
-    row: NDArray[np.intp]
-    lag: NDArray[np.intp]
+    row: IntArray
+    lag: IntArray
     size: Column
     score: Column
 
@@ -172,14 +166,15 @@ def door_steps(mean_pa: Column, reading_pa: Column, least_pa: float, least_sigma
         Means of a second each, NaN where there is none.
     reading_pa : (n,) array
         A single reading of each second, that shows in which steps the barometer counts.
-    least_pa : float
     least_sigmas : float
         Against the differences nearby of windows as long.
     """
     every = update_s(mean_pa)
     floor_pa = _ROUNDING * quantum(reading_pa)
     values = mean_pa[::every]
-    found = _candidates(values, _lags(every), floor_pa, least_pa, least_sigmas)
+    # two values at least: a step may fall on the one between
+    lags = tuple(lag for lag in LAGS if lag <= 2 or lag * every <= LAGS[-1])
+    found = _candidates(values, lags, floor_pa, least_pa, least_sigmas)
     chosen = sorted(_chosen(found, values.size), key=lambda place: int(found.row[place]))
     result = []
     for place in chosen:
@@ -189,11 +184,6 @@ def door_steps(mean_pa: Column, reading_pa: Column, least_pa: float, least_sigma
             FoundStep(_steepest(mean_pa, row * every, (row + lag) * every), size, float(found.score[place]))
         )
     return result
-
-
-def looked_at(rows: int) -> int:
-    """Windows that `door_steps` looks at in so many rows."""
-    return rows * len(_LAGS)
 
 
 def update_s(mean_pa: Column) -> int:
@@ -217,11 +207,6 @@ def quantum(reading_pa: Column) -> float:
     return float(np.quantile(change, _LOW_SHARE)) if change.size else 0.0
 
 
-def _lags(every: int) -> tuple[int, ...]:
-    # two values at least: a step may fall on the one between
-    return tuple(lag for lag in _LAGS if lag <= 2 or lag * every <= _LAGS[-1])
-
-
 def _candidates(
     values: Column, lags: tuple[int, ...], floor_pa: float, least_pa: float, least_sigmas: float
 ) -> _Candidates:
@@ -237,7 +222,7 @@ def _candidates(
 
 def _chosen(found: _Candidates, rows: int) -> list[int]:
     """The windows that stand out most; others nearby with the same sign are of the same step."""
-    reach = _LAGS[-1]
+    reach = LAGS[-1]
     taken = np.zeros((2, rows), dtype=bool)
     chosen = []
     for place in np.argsort(-found.score, kind="stable"):

@@ -17,21 +17,11 @@ _STRETCH = 3600
 
 @dataclass(frozen=True, slots=True)
 class FoundStep:
-    """A step found.
+    """A step found."""
 
-    Attributes
-    ----------
-    row : int
-        Place in the series.
-    size : float
-        After minus before, in the series' unit.
-    sigmas : float
-        Its size over the noise of such differences.
-    """
-
-    row: int
-    size: float
-    sigmas: float
+    row: int  # place in the series
+    size: float  # after minus before, in the series' unit
+    sigmas: float  # its size over the noise of such differences
 
 
 def steps(values: Column, half: int, skip: int, least: float, least_sigmas: float) -> list[FoundStep]:
@@ -80,12 +70,8 @@ def differences(values: Column, half: int, skip: int) -> Column:
 def local_sigma(values: Column, share: float = 0.5) -> Column:
     """(n,) robust standard deviation of stretches of the series, constant within each, about 0.
 
-    Parameters
-    ----------
-    values : (n,) array
-    share : float
-        Of the values that are nothing but noise: what this share of them keeps below is judged by a normal
-        distribution. Half of them (the median) is the most robust, and blind to values that mostly repeat.
+    The quantile `share` of the absolute values is compared with that of a normal distribution. Half (the median) is
+    the most robust, and blind to values that mostly repeat.
     """
     result = np.full(values.size, np.nan)
     sigmas = float(special.ndtri(0.5 * (1 + share)))
@@ -103,39 +89,22 @@ def confidence(sigmas: float, looked_at: int) -> float:
     return float(max(0.0, 1.0 - looked_at * special.erfc(sigmas / np.sqrt(2))))
 
 
-# One event found by machine, and what its finders share.
-
-
 Level = dict[str, FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
 class FoundEvent:
-    """An event that nobody reported.
+    """An event that nobody reported."""
 
-    Attributes
-    ----------
-    kind : str
-        "pressure step", "leak step", "laser glitch", "laser lost", "barometer lost", "thermometer lost",
-        "lateness burst", "noise change", "shape jump" or "excursion".
-    start_s, end_s : float
-        Time range of the run that shows it.
-    time_s : float
-        When it happened.
-    size : float
-        In `unit`.
-    unit : str
-    confidence : float
-        1 minus the chance that noise alone looks like this somewhere in the run.
-    """
-
+    # "pressure step", "leak step", "laser glitch", "laser lost", "barometer lost", "thermometer lost",
+    # "lateness burst", "noise change", "shape jump" or "excursion"
     kind: str
-    time_s: float
-    start_s: float
+    time_s: float  # when it happened
+    start_s: float  # time range of the run that shows it
     end_s: float
-    size: float
+    size: float  # in `unit`
     unit: str
-    confidence: float
+    confidence: float  # 1 minus the chance that noise alone looks like this somewhere in the run
 
 
 def event_around(kind: str, table: Level, row: int, half_s: float, size: float, unit: str, sure: float) -> FoundEvent:
@@ -156,9 +125,6 @@ def runs(flags: BoolArray, join: int) -> list[tuple[int, int]]:
         return []
     parts = np.split(rows, np.flatnonzero(np.diff(rows) > join) + 1)
     return [(int(part[0]), int(part[-1])) for part in parts]
-
-
-# Times out of the band that nothing else of the run explains.
 
 
 # After what explains it: what the loop needs to be back in the band (a leak of 1.2 um/s and 40 um: 32 s).
@@ -189,9 +155,6 @@ def excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -> lis
         found.append(FoundEvent("excursion", float(time_s[a]), float(time_s[a]) - 30, float(time_s[b]) + 30,
                            float(error_um[worst]), "um", 1.0))  # fmt: skip
     return found
-
-
-# Steps of the figure from one cycle to the next.
 
 
 JUMP_LEAST_UM = 0.3

@@ -1,13 +1,11 @@
 """`membrane-ctrl report RUN`: the page, the JSON beside it, and the verdict on the terminal."""
 
-import math
 import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
 
-from membrane_ctrl.model import plain_json
-from membrane_ctrl.model.errors import DeviceError, InputError
+from membrane_ctrl.model import errors, plain_json
 from membrane_ctrl.model.files import make_folder, write_text_atomic
 from membrane_ctrl.review import catalogue, words
 from membrane_ctrl.review.report.html import render
@@ -31,15 +29,14 @@ def report_command(
     """Write `report.html` and `report.json`; see `membrane-ctrl report --help`."""
     began_s = time.monotonic()
     opened = open_run(catalogue.resolve(run))
-    span = _part(opened, start, end)
-    analysis = analyse(opened, *span)
+    analysis = analyse(opened, *words.part_s(opened, start, end))
     other = None if compare_with is None else _other(open_run(catalogue.resolve(compare_with)), start, end)
     differences = [] if other is None else compare(analysis, other)
     table = report_table(analysis)
     if other is not None:
         table["compared_with"] = {
             "run": other.run.name,
-            "whole_run": not any(map(math.isfinite, other.part_s)),
+            "whole_run": not other.is_part,
             "report": report_table(other),
             "differences": [asdict(difference) | {"said": difference.said} for difference in differences],
         }
@@ -53,18 +50,10 @@ def report_command(
     return 0
 
 
-def _part(run: Run, start: str | None, end: str | None) -> tuple[float, float]:
-    start_s = -math.inf if start is None else words.moment_s(start, run.origin_utc)
-    end_s = math.inf if end is None else words.moment_s(end, run.origin_utc)
-    if not start_s < end_s:
-        raise InputError(f"--from {start} is not before --to {end}")
-    return start_s, end_s
-
-
 def _other(run: Run, start: str | None, end: str | None) -> Analysis:
-    """The run compared with: the same part, if it is one from the start; a time of the day is another in each run."""
+    """The run to compare with: its same part if that counts from the start, else all, for times of day differ."""
     from_start = all(text is None or text.strip().startswith("+") for text in (start, end))
-    return analyse(run, *_part(run, start, end)) if from_start else analyse(run)
+    return analyse(run, *words.part_s(run, start, end)) if from_start else analyse(run)
 
 
 def _write(folder: Path, files: dict[str, str]) -> None:
@@ -74,7 +63,9 @@ def _write(folder: Path, files: dict[str, str]) -> None:
             write_text_atomic(folder / name, text)
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
-        raise DeviceError(f"{folder}: cannot be written ({reason}); choose another folder with --out") from None
+        raise errors.DeviceError(
+            f"{folder}: cannot be written ({reason}); choose another folder with --out"
+        ) from None
 
 
 def _say(analysis: Analysis, other: Analysis | None, folder: Path, took_s: float) -> None:
@@ -86,7 +77,6 @@ def _say(analysis: Analysis, other: Analysis | None, folder: Path, took_s: float
     if len(analysis.found) > _LINES_MOST:
         print(f"  and {len(analysis.found) - _LINES_MOST} more in the report")
     if other is not None:
-        whole = not any(map(math.isfinite, other.part_s))
-        part = "" if not any(map(math.isfinite, analysis.part_s)) else ", the whole of it" if whole else ", same part"
+        part = "" if not analysis.is_part else ", same part" if other.is_part else ", all of it"
         print(f"against {other.run.name}{part}: {verdict(other)[1]}")
     print(f"{folder / 'report.html'} ({took_s:.1f} s)")

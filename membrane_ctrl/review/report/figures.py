@@ -18,9 +18,6 @@ from membrane_ctrl.review.statistics import shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis
 from membrane_ctrl.review.words import one_line
 
-# Pictures of a report as SVG text; the style all of them share.
-
-
 BLUE, ORANGE, GREEN, RED, VIOLET, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#8a8f98"
 WIDTH_IN = 10.5
 
@@ -72,8 +69,6 @@ def svg(figure: Figure) -> str:
     return re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1))
 
 
-# Where nothing was measured, no line is drawn.
-
 # A cycle or a second that is left out now and then is no gap.
 _STEPS = 3.0
 _LEAST_S = 5.0
@@ -82,11 +77,7 @@ _LEAST_S = 5.0
 def broken_at_gaps(columns: Mapping[str, Column], time_name: str = "time_s") -> dict[str, Column]:
     """Columns with a row of NaN in every gap, so that a plot does not bridge it with a straight line.
 
-    Parameters
-    ----------
-    columns : mapping of str to (n,) or (n, m) array
-    time_name : str
-        The column of times, s, ascending. A gap is longer than 5 s and three of its usual steps.
+    A gap in the times (s, ascending, in the column `time_name`) is longer than 5 s and three of their usual steps.
     """
     time_s = columns[time_name]
     steps_s = np.diff(time_s)
@@ -109,9 +100,8 @@ _FOUND_COLOURS = {"pressure step": VIOLET, "leak step": ORANGE, "noise change": 
 
 def hours_or_less(time_s: Column | float, span_s: float) -> tuple[Any, str]:
     """Times in the unit that suits the span, and its name."""
-    for seconds, name in ((86400.0 * 3, "d"), (3600.0 * 3, "h"), (60.0 * 5, "min")):
-        if span_s >= seconds:
-            unit_s = {"d": 86400.0, "h": 3600.0, "min": 60.0}[name]
+    for unit_s, least, name in ((86400.0, 3, "d"), (3600.0, 3, "h"), (60.0, 5, "min")):
+        if span_s >= least * unit_s:
             return np.asarray(time_s) / unit_s, name
     return np.asarray(time_s), "s"
 
@@ -123,15 +113,8 @@ def overview(analysis: Analysis) -> str:
     time, unit = hours_or_less(level["time_s"], span_s)
     with picture(2, 1, 4.2, sharex=True, height_ratios=[8, 1.1]) as (figure, (plot, lane)):
         plot.axhspan(-band_um, band_um, color=GREEN, alpha=0.09, lw=0)
-        plot.fill_between(
-            time,
-            level["min_error_um"],
-            level["max_error_um"],
-            color=GREY,
-            alpha=0.35,
-            lw=0,
-            label="least to greatest",
-        )
+        ends = level["min_error_um"], level["max_error_um"]
+        plot.fill_between(time, *ends, color=GREY, alpha=0.35, lw=0, label="minimum to maximum")
         plot.plot(time, level["mean_error_um"], color=BLUE, label=f"error, mean of {analysis.level_s:g} s")
         if np.isfinite(level["mean_true_error_um"]).any():
             plot.plot(time, level["mean_true_error_um"], color=GREEN, lw=0.9, label="true centre (twin)")
@@ -240,10 +223,7 @@ def distributions(analysis: Analysis) -> str:
         return svg(figure)
 
 
-# Pictures of the figure: the paper's stability plots, from the live cycles.
-
-
-# More points than pixels only make the file large.
+# The paper's stability plots, from the live cycles. More points than pixels only make the file large.
 _LINE_POINTS = 1500
 _POINT_COLOURS = {"A": BLUE, "B": ORANGE, "C": VIOLET}
 

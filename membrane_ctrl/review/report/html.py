@@ -1,22 +1,16 @@
 """The report for people: one HTML file with everything in it."""
 
 import html
-import math
 import shlex
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 from membrane_ctrl import __version__
-from membrane_ctrl.review.report import figures as figures_hold
-from membrane_ctrl.review.report import figures as figures_shape
+from membrane_ctrl.review.report import figures
 from membrane_ctrl.review.report.json import timeline, verdict
-from membrane_ctrl.review.statistics import compare, drift, shape_review
+from membrane_ctrl.review.statistics import compare, drift, shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
-from membrane_ctrl.review.statistics.spectra import bands, unseen_s
 from membrane_ctrl.review.words import number, span
-
-# The look of a report; print gives the same.
-
 
 STYLE = """
 :root{color-scheme:light}
@@ -56,16 +50,7 @@ _HIDDEN = {"time_utc", "mono_s", "kind", "exit_code", "made_utc"}
 
 
 def render(analysis: Analysis, other: Analysis | None = None, differences: Sequence[compare.Difference] = ()) -> str:
-    """HTML of a report.
-
-    Parameters
-    ----------
-    analysis : Analysis
-    other : Analysis, optional
-        A run it is set against.
-    differences : sequence of Difference
-        From `compare.compare`, if there is another.
-    """
+    """HTML of a report, if wanted with another run and the differences from it (`compare.compare`)."""
     run = analysis.run
     word, sentence = verdict(analysis)
     parts = [
@@ -74,21 +59,21 @@ def render(analysis: Analysis, other: Analysis | None = None, differences: Seque
         f"{span(analysis.ticks.end_s - analysis.ticks.start_s)}</p></header>",
         f"<p class='verdict {word}'>{_text(sentence)}</p>",
         _anomalies(analysis),
-        f"<figure>{figures_hold.overview(analysis)}</figure>",
-        _section("Found by machine", _found(analysis)),
+        f"<figure>{figures.overview(analysis)}</figure>",
+        _section("Detected events", _found(analysis)),
         _section("How well it was held", _windows(analysis) + _details(analysis)),
-        f"<figure>{figures_hold.distributions(analysis)}</figure>",
+        f"<figure>{figures.distributions(analysis)}</figure>",
         _section("Pump, leak, feed-forward, ticks", _pump(analysis)),
-        f"<figure>{figures_hold.surroundings(analysis)}</figure>",
+        f"<figure>{figures.surroundings(analysis)}</figure>",
     ]
     if analysis.shape is not None:
         parts.append(_section("Figure", _shape(analysis.shape)))
-        parts.append(f"<figure>{figures_shape.stability(analysis.shape)}</figure>")
+        parts.append(f"<figure>{figures.stability(analysis.shape)}</figure>")
         if analysis.shape.pairs:
-            parts.append(f"<figure>{figures_shape.pairs(analysis.shape)}</figure>")
+            parts.append(f"<figure>{figures.pairs(analysis.shape)}</figure>")
     if other is not None:
         parts.append(_section(f"Against {_text(other.run.name)}", _compared(analysis, other, differences)))
-        parts.append(f"<figure>{figures_hold.overview(other)}</figure>")
+        parts.append(f"<figure>{figures.overview(other)}</figure>")
     parts.append(_section("Timeline", _timeline(analysis)))
     parts.append(f"<footer>membrane-ctrl {__version__}, report of {_text(str(run.folder.name))}</footer>")
     return (
@@ -107,8 +92,7 @@ def _anomalies(analysis: Analysis) -> str:
 def _found(analysis: Analysis) -> str:
     if not analysis.found:
         return (
-            "<p>Nothing: no door, leak step, laser glitch, lateness burst, change of noise, excursion or jump "
-            "of the figure.</p>"
+            "<p>None: no door, leak step, laser glitch or loss, lateness burst, noise change, excursion or jump.</p>"
         )
     name = _text(shlex.quote(analysis.run.name))
     rows = [
@@ -125,7 +109,6 @@ def _found(analysis: Analysis) -> str:
 
 
 def _windows(analysis: Analysis) -> str:
-    both = ((READING, analysis.reading), (TRUE, analysis.true))
     rows = [
         [
             name,
@@ -134,7 +117,7 @@ def _windows(analysis: Analysis) -> str:
             *(number(v) for v in (window.mean_um, window.std_um, window.p99_7_um, window.max_um)),
             f"{number(100 * window.in_band, 6)} %",
         ]
-        for name, series in both
+        for name, series in ((READING, analysis.reading), (TRUE, analysis.true))
         for window in (() if series is None else series.windows)
     ]
     band = f"in ±{analysis.run.config.limits.band_um:g} µm"
@@ -146,25 +129,20 @@ def _details(analysis: Analysis) -> str:
     if series is None:
         return ""
     ticks = analysis.ticks
-    return _facts(
-        [
-            (f"drift, {name}", _slope(series.drift, "µm/h")),
-            (
-                "single readings of the laser",
-                f"std {number(ticks.raw_reading.std)} µm, {100 * ticks.raw_in_band:.2f} % in the band; "
-                f"{number(ticks.unread_s)} s held without one",
-            ),
-            (f"RMS by frequency, {name}", _bands(series)),
-        ]
-    )
+    single = f"std {number(ticks.raw_reading.std)} µm, {100 * ticks.raw_in_band:.2f} % within the band"
+    return _facts([
+        (f"drift, {name}", _slope(series.drift, "µm/h")),
+        ("single laser readings", f"{single}; {number(ticks.unread_s)} s held without readings"),
+        (f"RMS by frequency, {name}", _bands(series)),
+    ])  # fmt: skip
 
 
 def _bands(series: ErrorSeries) -> str:
-    there = [band for band in bands(series.spectrum, series.slow) if band.rms_um == band.rms_um]
+    there = [band for band in spectra.bands(series.spectrum, series.slow) if band.rms_um == band.rms_um]
     if not there:
         return "too short to say"
     said = [f"{number(b.from_hz)}–{number(b.high_hz)} Hz: {number(b.rms_um)} µm" for b in there]
-    return f"{'; '.join(said)}; not seen: what is slower than {span(unseen_s(there))}"
+    return f"{'; '.join(said)}; not seen: what is slower than {span(spectra.unseen_s(there))}"
 
 
 def _pump(analysis: Analysis) -> str:
@@ -210,26 +188,14 @@ def _shape(shape: shape_review.ShapeReview) -> str:
 
 def _compared(analysis: Analysis, other: Analysis, differences: Sequence[compare.Difference]) -> str:
     rows = [
-        [
-            d.name,
-            number(d.ours),
-            number(d.theirs),
-            d.unit,
-            d.said,
-            f"{d.p_value:.2g}" if d.p_value == d.p_value else "–",
-            _text(d.note),
-        ]
+        [d.name, number(d.ours), number(d.theirs), d.unit, d.said, number(d.p_value, 2), _text(d.note)]
         for d in differences
     ]
     _, sentence = verdict(other)
-    if _is_part(analysis) and not _is_part(other):
-        sentence = f"A part of this run against the whole of the other. {sentence}"
+    if analysis.is_part and not other.is_part:
+        sentence = f"Part of this run, all of the other. {sentence}"
     table = _table(["", "this run", "other run", "", "difference", "p", ""], rows)
     return f"<p>{_text(sentence)}</p>{table}"
-
-
-def _is_part(analysis: Analysis) -> bool:
-    return any(math.isfinite(moment_s) for moment_s in analysis.part_s)
 
 
 def _timeline(analysis: Analysis) -> str:

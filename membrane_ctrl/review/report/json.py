@@ -9,9 +9,6 @@ from membrane_ctrl.review.statistics import drift, shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
 from membrane_ctrl.review.words import span
 
-# A run in one sentence.
-
-
 Word = Literal["good", "look", "bad"]
 
 # Anomalies that end the claim that the mirror was held.
@@ -49,10 +46,7 @@ def verdict(analysis: Analysis) -> tuple[Word, str]:
 
 
 def _what(names: list[str]) -> str:
-    if not names:
-        return "; nothing out of the ordinary"
-    distinct = list(dict.fromkeys(names))
-    return f"; to look at: {', '.join(distinct)}"
+    return f"; check: {', '.join(dict.fromkeys(names))}" if names else "; nothing unusual"
 
 
 SCHEMA = "membrane-report/1"
@@ -157,14 +151,8 @@ def _shape(shape: shape_review.ShapeReview) -> dict[str, Any]:
         "sag_std_um": float(shape.sag_um.std()),
         "laser_std_um": float(shape.laser_um.std()),
         "pairs": [
-            {
-                "first_s": pair.first_s,
-                "lag_s": pair.lag_s,
-                "rms_um": pair.rms_um,
-                "mean_sigma_um": pair.mean_sigma_um,
-                "all_pairs_rms_um": pair.all_rms_um,
-                "pairs": pair.pairs,
-            }
+            {name: getattr(pair, name) for name in ("first_s", "lag_s", "rms_um", "mean_sigma_um", "pairs")}
+            | {"all_pairs_rms_um": pair.all_rms_um}
             for pair in shape.pairs
         ],
     }

@@ -19,24 +19,15 @@ _STRETCHES = "tests these two stretches of time, not the settings: the weather i
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One quantity of two runs.
-
-    Attributes
-    ----------
-    name, unit : str
-    ours, theirs : float
-    p_value : float
-        Chance of a difference as large between runs that are alike; NaN where there is no test.
-    note : str
-        Why there is none, or what the test does not know; empty: nothing to say.
-    """
+    """One quantity of two runs."""
 
     name: str
     unit: str
     ours: float
     theirs: float
+    # Chance of a difference as large between runs that are alike; NaN where there is no test
     p_value: float = math.nan
-    note: str = ""
+    note: str = ""  # why there is none, or what the test does not know; empty: nothing to say
 
     @property
     def said(self) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 from scipy import special, stats
 
 from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.review.statistics.windows import group_starts
 
 # Rounds of g and of the variance that the line took up: the coverage of short records is right after three, and
 # more leave the shortest no degree of freedom, whose interval then says nothing.
@@ -17,22 +18,12 @@ _TAKEN_MOST = 0.5
 
 @dataclass(frozen=True, slots=True)
 class FittedSlope:
-    """Least-squares slope.
+    """Least-squares slope."""
 
-    Attributes
-    ----------
-    per_hour : float
-        Unit of the values per hour.
-    low, high : float
-        95 % confidence interval.
-    effective_samples : float
-        Independent samples that would say as much; NaN when there are too few values.
-    """
-
-    per_hour: float
-    low: float
+    per_hour: float  # unit of the values per hour
+    low: float  # 95 % confidence interval
     high: float
-    effective_samples: float
+    effective_samples: float  # independent samples that would say as much; NaN when there are too few values
 
     @property
     def significant(self) -> bool:
@@ -94,8 +85,6 @@ def _positive_sum(correlation: Column) -> float:
 
 
 # Whether two series differ, asked of blocks of time that count as independent.
-
-
 # Five minutes forget the weather (30 s) and the air (300 s) well enough to count as independent; a short run is cut
 # into eight, which makes its test a rough one.
 _BLOCK_S = 300.0
@@ -134,7 +123,7 @@ def windowed(time_s: Column, values: Column, window_s: float) -> tuple[Column, C
     if not time_s.size:
         return time_s, values
     number = np.floor(time_s / window_s).astype(np.int64)
-    starts = np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
+    starts = group_starts(number)
     count = np.diff(np.append(starts, number.size))
     whole = count >= 0.9 * window_s
     middles_s = np.asarray((number[starts][whole] + 0.5) * window_s, dtype=np.float64)
@@ -152,7 +141,6 @@ def mean_p(a: Column, b: Column, window_s: float = 1.0, offset: float = 0.0, cor
 
     Parameters
     ----------
-    a, b : (2, n) arrays
     window_s : float
         Of a value.
     offset : float

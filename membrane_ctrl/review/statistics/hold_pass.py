@@ -5,9 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.arrays import BoolArray, Column, IntArray, Singles
 from membrane_ctrl.model.states import State
 from membrane_ctrl.review.statistics import windows
 from membrane_ctrl.run_files import summary, tables
@@ -19,24 +18,18 @@ LEVEL_COLUMNS = ("state", "mean_displacement_um", "mean_true_error_um")
 
 
 class ThinSeconds:
-    """Finds them, over blocks that come in their order.
-
-    Parameters
-    ----------
-    rate_hz : float
-        Ticks a second of the run.
-    """
+    """Finds them, over blocks in order of time."""
 
     def __init__(self, rate_hz: float) -> None:
         self._least = windows.least_ticks(1.0, rate_hz)
         self._parts: list[tuple[windows.Seconds, Column]] = []
 
-    def add(self, time_s: Column, setpoint_um: Column, settled: NDArray[np.bool_]) -> None:
+    def add(self, time_s: Column, setpoint_um: Column, settled: BoolArray) -> None:
         """Take in (n,) times, setpoints and whether each tick is settled."""
         if not time_s.size:
             return
         second = np.floor(time_s + 1e-9).astype(np.int32)
-        starts = _starts(second)
+        starts = windows.group_starts(second)
         rows = np.stack((np.ones(time_s.size), settled.astype(np.float64), setpoint_um))
         sums = np.add.reduceat(rows, starts, axis=1)
         # a second that two blocks share is thin in both
@@ -50,7 +43,7 @@ class ThinSeconds:
         second = np.concatenate([part[0] for part in self._parts])
         if not second.size:
             return second, np.empty(0)
-        starts = _starts(second)
+        starts = windows.group_starts(second)
         ticks, settled, setpoint_um = np.add.reduceat(np.hstack([part[1] for part in self._parts]), starts, axis=1)
         thin = (ticks < self._least) & (settled == ticks)
         return second[starts][thin], setpoint_um[thin] / ticks[thin]
@@ -93,12 +86,6 @@ def filled(seconds: windows.SecondsOf, means: LevelMeans, error_um: Column) -> w
     return joined[order], np.concatenate((counts[kept], ticks))[order], np.stack((errors_um, errors_um * np.nan))
 
 
-def _starts(second: windows.Seconds) -> NDArray[np.intp]:
-    return np.flatnonzero(np.concatenate(([True], second[1:] != second[:-1])))
-
-
-Single = NDArray[np.float32]
-
 NAMES = (
     *summary.FIELDS, "displacement_um", "truth_displacement_um", "feedforward_um_per_s", "flow_wanted_um_per_s",
     "pump_fraction", "lateness_ms", "missed_ticks",
@@ -130,70 +117,35 @@ class PumpActivity:
 
 @dataclass(frozen=True, slots=True)
 class HoldPass:
-    """What single ticks say.
-
-    Attributes
-    ----------
-    ticks, settled : int
-        Of `settled` only those with a reading.
-    unread_s : float
-        Settled time without a reading.
-    missed_ticks : int
-        Within the part.
-    start_s, end_s : float
-    hold_s, settled_s : float
-        Time in `hold`, and that of it which was settled.
-    thin_s : float
-        Settled seconds whose ticks are not all there: their means are those of the level.
-    uncovered_s : float
-        Those whose means the level has not either: no statistics cover them.
-    reading_um, true_um : (n,) float32
-        Setpoint minus laser reading and target minus true centre on a grid of ticks, NaN where not settled.
-    seconds : tuple
-        `SecondSums.result` of the ticks with a reading (`READING`) and of those with a true centre (`TRUE`): rows of
-        sums are the error (`ERROR`) and what the feed-forward kept away (`KEPT_AWAY`: of the true centre, if known).
-    raw_reading, raw_true : Moments
-    raw_in_band : float
-        Share of settled readings within the band.
-    histogram_um, histogram_counts : arrays
-        Edges and counts of the reading error.
-    lateness_ms : LogHistogram
-    pump : PumpActivity
-    """
+    """What single ticks say."""
 
     ticks: int
-    settled: int
-    unread_s: float
-    missed_ticks: int
+    settled: int  # those with a reading
+    unread_s: float  # settled time without a reading
+    missed_ticks: int  # within the part
     start_s: float
     end_s: float
-    hold_s: float
+    hold_s: float  # time in `hold`
     settled_s: float
-    thin_s: float
-    uncovered_s: float
-    reading_um: Single
-    true_um: Single
+    thin_s: float  # settled seconds whose ticks are not all there: their means are those of the level
+    uncovered_s: float  # those whose means the level has not either: no statistics cover them
+    # (n,) each: setpoint minus laser reading, target minus true centre; on a grid of ticks, NaN where not settled
+    reading_um: Singles
+    true_um: Singles
+    # `SecondSums.result` of the ticks with a reading (`READING`) and of those with a true centre (`TRUE`): rows of
+    # sums are the error (`ERROR`) and what the feed-forward kept away (`KEPT_AWAY`: of the true centre, if known)
     seconds: tuple[windows.SecondsOf, windows.SecondsOf]
     raw_reading: summary.Moments
     raw_true: summary.Moments
-    raw_in_band: float
-    histogram_um: Column
-    histogram_counts: NDArray[np.int64]
+    raw_in_band: float  # share of settled readings within the band
+    histogram_um: Column  # edges and counts of the reading error
+    histogram_counts: IntArray
     lateness_ms: summary.LogHistogram
     pump: PumpActivity
 
 
 def hold_pass(run: Run, span_s: tuple[float, float], part_s: tuple[float, float] = (-np.inf, np.inf)) -> HoldPass:
-    """Go through a run once.
-
-    Parameters
-    ----------
-    run : Run
-    span_s : tuple
-        First and last second, from a level.
-    part_s : tuple
-        Part of the run wanted.
-    """
+    """Go once through a run, or a part of it; `span_s` is its first and last second, from a level."""
     collected = _Collector(run, span_s, math.isfinite(part_s[0]))
     for block in run.tick_blocks(NAMES, *part_s):
         collected.add(block)

@@ -19,68 +19,32 @@ _LEAST_CYCLES = 3
 
 @dataclass(frozen=True, slots=True)
 class CyclePair:
-    """Two cycles some time apart.
-
-    Attributes
-    ----------
-    first_s, lag_s : float
-    change_um : (MAP_PX, MAP_PX) array
-        Height change; NaN outside the analysis area.
-    sigma_um : (MAP_PX, MAP_PX) array or None
-        1 sigma of that change from both covariances.
-    rms_um, mean_sigma_um : float
-        Over the area.
-    all_rms_um : float
-        RMS change of all pairs so far apart.
-    pairs : int
-        Of those, how many.
-    """
+    """Two cycles some time apart."""
 
     first_s: float
     lag_s: float
-    change_um: Column
-    sigma_um: Column | None
-    rms_um: float
+    change_um: Column  # (MAP_PX, MAP_PX): height change; NaN outside the analysis area
+    sigma_um: Column | None  # (MAP_PX, MAP_PX): 1 sigma of that change from both covariances
+    rms_um: float  # over the area
     mean_sigma_um: float
-    all_rms_um: float
-    pairs: int
+    all_rms_um: float  # RMS change of all pairs so far apart
+    pairs: int  # of those, how many
 
 
 @dataclass(frozen=True, slots=True)
 class ShapeReview:
-    """Figure of a held mirror over the run.
+    """Figure of a held mirror over the run."""
 
-    Attributes
-    ----------
-    time_s : (n,) array
-        Of the cycles used: held and not rejected.
-    cycles, rejected : int
-        Of the run.
-    points_um : dict
-        (n,) change of height at `POINTS` against the first cycle.
-    sd_um : (MAP_PX, MAP_PX) array
-        Standard deviation of the height.
-    mean_sd_um : float
-        Mean over the area.
-    drift_um_per_hour : list of FittedSlope
-        Of Z2..Z36.
-    sag_um, laser_um : (n,) arrays
-        Changes by camera and by laser since the first cycle.
-    disagreement : FittedSlope
-        Of sag by the camera minus laser: the mount's drift, or the films'.
-    pairs : tuple of CyclePair
-    """
-
-    time_s: Column
-    cycles: int
+    time_s: Column  # (n,): of the cycles used: held and not rejected
+    cycles: int  # of the run
     rejected: int
-    points_um: dict[str, Column]
-    sd_um: Column
-    mean_sd_um: float
-    drift_um_per_hour: tuple[FittedSlope, ...]
-    sag_um: Column
-    laser_um: Column
-    disagreement: FittedSlope
+    points_um: dict[str, Column]  # (n,) change of height at `POINTS` against the first cycle
+    sd_um: Column  # (MAP_PX, MAP_PX): standard deviation of the height
+    mean_sd_um: float  # mean over the area
+    drift_um_per_hour: tuple[FittedSlope, ...]  # of Z2..Z36
+    sag_um: Column  # (n,): changes by camera and by laser since the first cycle
+    laser_um: Column  # (n,)
+    disagreement: FittedSlope  # of sag by the camera minus laser: the mount's drift, or the films'
     pairs: tuple[CyclePair, ...]
 
 

@@ -6,10 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy import signal
 
-from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.arrays import AnyArray, Column, IntArray
 
 # Enough segments for an estimate that is good to a third, and no segment longer than shows one more decade.
 _SEGMENTS = 8
@@ -20,20 +19,11 @@ _BATCH = 32
 
 @dataclass(frozen=True, slots=True)
 class Spectrum:
-    """One-sided density.
+    """One-sided density."""
 
-    Attributes
-    ----------
-    frequency_hz : (k,) array
-    density : (k,) array
-        Unit squared per Hz.
-    segments : int
-        Averaged; 0: nothing was long enough.
-    """
-
-    frequency_hz: Column
-    density: Column
-    segments: int
+    frequency_hz: Column  # (k,)
+    density: Column  # (k,): unit squared per Hz
+    segments: int  # averaged; 0: nothing was long enough
 
     def band_rms(self, low_hz: float, high_hz: float) -> float:
         """RMS between two frequencies, low one excluded; NaN if no frequency lies there."""
@@ -44,14 +34,13 @@ class Spectrum:
         return float(np.sqrt(self.density[inside].sum() * step_hz))
 
 
-def power_spectrum(values: NDArray[np.floating], rate_hz: float, length: int | None = None) -> Spectrum:
+def power_spectrum(values: AnyArray, rate_hz: float, length: int | None = None) -> Spectrum:
     """Welch's estimate: Hann window, half overlapping segments, each without its mean; as `scipy.signal.welch`.
 
     Parameters
     ----------
     values : (n,) array
         NaN where there is a gap: a segment with one is left out.
-    rate_hz : float
     length : int, optional
         Of a segment; by default an eighth of the series, at most 32768.
     """
@@ -77,29 +66,16 @@ def power_spectrum(values: NDArray[np.floating], rate_hz: float, length: int | N
     return Spectrum(frequency_hz, density, count)
 
 
-# Overlapping Allan deviation of a series with gaps.
-
-
 @dataclass(frozen=True, slots=True)
 class Allan:
-    """Overlapping Allan deviation.
+    """Overlapping Allan deviation."""
 
-    Attributes
-    ----------
-    tau_s : (k,) array
-        Averaging times.
-    deviation : (k,) array
-        Same unit as the series.
-    windows : (k,) array of int
-        Differences of neighbouring means that went in.
-    """
-
-    tau_s: Column
-    deviation: Column
-    windows: NDArray[np.int64]
+    tau_s: Column  # (k,): averaging times
+    deviation: Column  # (k,): same unit as the series
+    windows: IntArray  # (k,): differences of neighbouring means that went in
 
 
-def allan_deviation(values: NDArray[np.floating], period_s: float, lengths: NDArray[np.int64] | None = None) -> Allan:
+def allan_deviation(values: AnyArray, period_s: float, lengths: IntArray | None = None) -> Allan:
     """Overlapping Allan deviation of equally spaced values.
 
     With x the running sum of y and m the samples in tau,
@@ -140,7 +116,7 @@ def allan_deviation(values: NDArray[np.floating], period_s: float, lengths: NDAr
 
 
 @njit(cache=True)
-def _second_differences(total: Column, gaps: NDArray[np.int32], m: int) -> tuple[float, int]:
+def _second_differences(total: Column, gaps: AnyArray, m: int) -> tuple[float, int]:
     square = 0.0
     count = 0
     for i in range(total.size - 2 * m):
@@ -149,9 +125,6 @@ def _second_differences(total: Column, gaps: NDArray[np.int32], m: int) -> tuple
             square += difference * difference
             count += 1
     return square, count
-
-
-# RMS by decades of frequency, from the spectrum that resolves each.
 
 
 # Decades of frequency whose RMS is given; the last ends at half the tick rate. The first is that of days.
@@ -164,22 +137,14 @@ _SLOW_MOST_HZ = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """RMS between two frequencies.
-
-    Attributes
-    ----------
-    low_hz, high_hz : float
-    from_hz : float
-        Lowest frequency that was seen: above `low_hz` when the series is too short for the whole band; NaN when it
-        is too short for any of it.
-    rms_um : float
-        NaN if nothing was seen.
-    """
+    """RMS between two frequencies."""
 
     low_hz: float
     high_hz: float
+    # Lowest frequency that was seen: above `low_hz` when the series is too short for the whole band; NaN when it is
+    # too short for any of it
     from_hz: float
-    rms_um: float
+    rms_um: float  # NaN if nothing was seen
 
 
 def bands(fast: Spectrum, slow: Spectrum) -> list[Band]:

@@ -4,14 +4,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
-from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column, IntArray, Singles
 
 # Of a month there are millions: single precision, which counts ticks exactly.
-Seconds = NDArray[np.int32]
-Counts = NDArray[np.float32]
+Seconds = AnyArray
+Counts = Singles
 SecondsOf = tuple[Seconds, Counts, Column]
 
 # A window with fewer of its ticks than this says nothing of its length.
@@ -20,36 +19,24 @@ _LEAST_SHARE = 0.9
 
 @dataclass(frozen=True, slots=True)
 class WindowStatistics:
-    """Statistics of means over windows of one length; NaN without windows, and one alone has no `std_um`.
+    """Statistics of means over windows of one length; NaN without windows, and one alone has no `std_um`."""
 
-    Attributes
-    ----------
-    window_s : float
-        0: single ticks.
-    count : int
-    mean_um, std_um, max_um, p99_7_um : float
-        `max` and `p99_7` of the absolute value.
-    in_band : float
-        Share within the band.
-    """
-
-    window_s: float
+    window_s: float  # 0: single ticks
     count: int
     mean_um: float
     std_um: float
     max_um: float
     p99_7_um: float
-    in_band: float
+    in_band: float  # share within the band
+
+
+def group_starts(number: AnyArray) -> IntArray:
+    """Where each run of equal numbers begins."""
+    return np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
 
 
 class SecondSums:
-    """Sums over whole seconds of the run of several series at once, from blocks that come in their order.
-
-    Parameters
-    ----------
-    series : int
-        How many.
-    """
+    """Sums over whole seconds of the run of several series at once, from blocks in order of time."""
 
     def __init__(self, series: int) -> None:
         self._parts: list[SecondsOf] = []
@@ -60,7 +47,7 @@ class SecondSums:
         if not time_s.size:
             return
         second = np.floor(time_s + 1e-9).astype(np.int32)
-        starts = np.flatnonzero(np.concatenate(([True], second[1:] != second[:-1])))
+        starts = group_starts(second)
         counts = np.diff(np.append(starts, time_s.size)).astype(np.float32)
         self._parts.append((second[starts], counts, np.add.reduceat(values, starts, axis=1)))
 
@@ -68,11 +55,8 @@ class SecondSums:
         """(k,) seconds that have ticks, (k,) their ticks, (series, k) sums."""
         if not self._parts:
             return np.empty(0, dtype=np.int32), np.empty(0, dtype=np.float32), np.empty((self._series, 0))
-        second = np.concatenate([part[0] for part in self._parts])
-        counts = np.concatenate([part[1] for part in self._parts])
-        sums = np.concatenate([part[2] for part in self._parts], axis=1)
-        # a second that two blocks share
-        starts = np.flatnonzero(np.concatenate(([True], second[1:] != second[:-1])))
+        second, counts, sums = (np.concatenate(parts, axis=-1) for parts in zip(*self._parts, strict=True))
+        starts = group_starts(second)  # two blocks may share a second
         return second[starts], np.add.reduceat(counts, starts), np.add.reduceat(sums, starts, axis=1)
 
 
@@ -85,28 +69,18 @@ def least_ticks(window_s: float, rate_hz: float) -> float:
 def window_means(
     second: Seconds, counts: Counts, sums: Column, window_s: int, rate_hz: float
 ) -> tuple[Column, Column]:
-    """Middles (k,) in s and means of the windows that have at least `least_ticks`.
-
-    Parameters
-    ----------
-    second, counts, sums : (n,) arrays
-        From `SecondSums`.
-    window_s : int
-        Length of a window.
-    rate_hz : float
-        Ticks a second.
-    """
+    """Middles (k,) in s and means of the windows that have at least `least_ticks`, from (n,) sums of `SecondSums`."""
     if not second.size:
         return np.empty(0), np.empty(0)
     number = second // window_s
-    starts = np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
+    starts = group_starts(number)
     ticks, total = np.add.reduceat(counts, starts), np.add.reduceat(sums, starts)
     whole = (ticks >= least_ticks(window_s, rate_hz)) & np.isfinite(total)
     return np.asarray((number[starts][whole] + 0.5) * window_s, dtype=np.float64), total[whole] / ticks[whole]
 
 
 def describe(means_um: Column, window_s: float, band_um: float) -> WindowStatistics:
-    """What is said of windows' means."""
+    """Statistics of the means of windows."""
     if not means_um.size:
         return WindowStatistics(window_s, 0, math.nan, math.nan, math.nan, math.nan, math.nan)
     size_um = np.abs(means_um)
@@ -121,9 +95,6 @@ def describe(means_um: Column, window_s: float, band_um: float) -> WindowStatist
     )
 
 
-# How long the mirror was held, by the times of the ticks: not every one of them need be there.
-
-
 # Segments have some rows a second while nothing happens, and now and then one comes late.
 _ROWS_APART = 2.0
 _LEAST_GAP_S = 2.0
@@ -132,10 +103,7 @@ _LEAST_GAP_S = 2.0
 class HeldTime:
     """Sum of the times between ticks whose first is held, over blocks that come in their order.
 
-    Parameters
-    ----------
-    quiet_hz : float
-        Fewest rows a second that are recorded. A gap longer than twice that is a loss: nobody knows what was in it.
+    `quiet_hz` is the lowest rate of recorded rows. A gap longer than two of its periods is a loss.
     """
 
     def __init__(self, quiet_hz: float) -> None:
@@ -143,7 +111,7 @@ class HeldTime:
         self._last = (math.nan, False)
         self.held_s = 0.0
 
-    def add(self, time_s: Column, held: NDArray[np.bool_]) -> None:
+    def add(self, time_s: Column, held: BoolArray) -> None:
         """Take in (n,) times and whether the mirror was held."""
         if not time_s.size:
             return
@@ -157,9 +125,6 @@ class HeldTime:
         return self.held_s + (period_s if self._last[1] else 0.0)
 
 
-# What the feed-forward was worth: the error there would have been without it.
-
-
 class WithoutFeedforward:
     """Adds to the error what the feed-forward's flow kept away, from blocks that come in their order.
 
@@ -170,19 +135,11 @@ class WithoutFeedforward:
 
     here by the bilinear transform. Dead time and pump lag (0.26 s together) are left out: they hardly change what a
     disturbance of tens of seconds does, and make the benefit look a little smaller than it is.
-
-    Parameters
-    ----------
-    kp_per_s, ti_s : float
-        Of the loop as run.
-    period_s : float
-        Of the tick.
     """
 
     def __init__(self, kp_per_s: float, ti_s: float, period_s: float) -> None:
-        self._numerator, self._denominator = signal.bilinear(
-            [1.0, 0.0], [1.0, kp_per_s, kp_per_s / ti_s], 1 / period_s
-        )
+        loop = [1.0, kp_per_s, kp_per_s / ti_s]
+        self._numerator, self._denominator = signal.bilinear([1.0, 0.0], loop, 1 / period_s)
         self._state = np.zeros(2)
 
     def kept_away_um(self, feedforward_um_per_s: Column) -> Column:

@@ -29,7 +29,7 @@ class ReviewBlueprint:
     ) -> None:
         self._prefixes = prefixes
         self._span_s = span_s
-        self._band_um = band_um
+        self._error_span_um = (-3 * band_um, 3 * band_um)
         self._maps_um = maps_um
 
     def made(self, tab: str = "overview") -> rrb.Blueprint:
@@ -67,9 +67,8 @@ class ReviewBlueprint:
         )
 
     def _error(self) -> rrb.TimeSeriesView:
-        span = (-3 * self._band_um, 3 * self._band_um)
         paths = ("/overview/error", "/overview/true", "/loop/band", "/found/marks")
-        return self._plot("Error: least, mean, greatest; red: found by machine, um", *paths, span=span)
+        return self._plot("Error: minimum, mean, maximum; red: detected, um", *paths, span=self._error_span_um)
 
     def _lanes(self) -> rrb.StateTimelineView:
         several = len(self._prefixes) > 1  # there is room for two lanes of each
@@ -91,16 +90,15 @@ class ReviewBlueprint:
                 self._plot("Air pressure, Pa", "/overview/ambient"),
                 self._plot("Air temperature, C", "/overview/temperature"),
             ),
-            rrb.Horizontal(self._log("Found by machine, UTC", "/found"), self._log("Events, UTC", "/events")),
+            rrb.Horizontal(self._log("Detected events, UTC", "/found"), self._log("Events, UTC", "/events")),
             row_shares=[3.6, 2.7, 1.9, 1.8],
             name="overview",
         )
 
     def _loop(self) -> rrb.Vertical:
-        span = (-3 * self._band_um, 3 * self._band_um)
         return rrb.Vertical(
             self._plot("Error, each tick, um (shown for short runs, or with --from and --to)", "/loop/error",
-                       "/loop/band", span=span),
+                       "/loop/band", span=self._error_span_um),
             self._plot("Setpoint, reading, true centre, um", "/loop/position", "/truth/displacement"),
             self._plot("P, I, D, feed-forward, um/s", "/loop/terms"),
             self._plot("Flow and leak, um/s", "/loop/flow"),
@@ -132,16 +130,16 @@ class ReviewBlueprint:
                 self._plot("Ticks missed so far", "/overview/missed"),
                 self._plot("Gauge pressure, Pa", "/overview/gauge"),
             ),
-            rrb.Horizontal(self._log("Events, UTC", "/events"), self._log("Found by machine, UTC", "/found")),
+            rrb.Horizontal(self._log("Events, UTC", "/events"), self._log("Detected events, UTC", "/found")),
             row_shares=[2.2, 3, 2, 2.8],
             name="faults",
         )
 
     def _tuning(self) -> rrb.Vertical:
-        span = (-3 * self._band_um, 3 * self._band_um)
+        paths = ("/loop/error", "/truth/displacement", "/loop/band")
         return rrb.Vertical(
             self._plot("Reading, filtered, setpoint, um", "/loop/position"),
-            self._plot("True and seen error, um", "/loop/error", "/truth/displacement", "/loop/band", span=span),
+            self._plot("True and seen error, um", *paths, span=self._error_span_um),
             rrb.Horizontal(
                 self._plot("P, I, D, feed-forward, um/s", "/loop/terms"),
                 self._plot("Flow wanted and given, um/s", "/loop/flow"),

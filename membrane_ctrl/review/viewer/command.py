@@ -9,9 +9,7 @@ from pathlib import Path
 
 from membrane_ctrl.model import errors, states, terminal
 from membrane_ctrl.review import catalogue, words
-from membrane_ctrl.review.events.steps import FoundEvent
-from membrane_ctrl.review.viewer import viewer
-from membrane_ctrl.review.viewer.blueprints import TABS, ReviewBlueprint
+from membrane_ctrl.review.viewer import blueprints, viewer
 from membrane_ctrl.review.viewer.layer import Layer
 from membrane_ctrl.review.viewer.screenshot import screenshot_of
 from membrane_ctrl.run_files.run import Run, open_run
@@ -76,8 +74,8 @@ def _show(file: Path, options: ReviewOptions, cursor_s: float | None) -> int:
 
 def _require_sense(options: ReviewOptions) -> None:
     """No option that is unknown, or that would be passed over in silence."""
-    if options.tab not in TABS:
-        raise errors.InputError(f"--tab {options.tab}: known are {', '.join(TABS)}")
+    if options.tab not in blueprints.TABS:
+        raise errors.InputError(f"--tab {options.tab}: known are {', '.join(blueprints.TABS)}")
     if options.align not in {"hold", "start", "utc"}:
         raise errors.InputError(f"--align {options.align}: known are hold, start, utc")
     if options.around is not None and not options.around.strip():
@@ -114,11 +112,12 @@ def _require_writable(target: Path, runs: Sequence[Run]) -> None:
 def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> float | None:
     """Write the recording that the viewer opens.
 
+    Raises InputError if a time or an event asked for is not in the first run, or no run has telemetry.
+
     Parameters
     ----------
     runs : sequence of Run
         One, or several that are laid over each other.
-    options : ReviewOptions
     file : Path
         To write.
 
@@ -126,11 +125,6 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> floa
     -------
     float or None
         Second of the timeline that was asked for: the moment, or where the part begins.
-
-    Raises
-    ------
-    InputError
-        If a time or an event asked for is not in the first run, or no run has telemetry.
     """
     runs = _with_telemetry(runs)
     span_s = _span(runs[0], options)
@@ -144,7 +138,7 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> floa
         maps_um.append(layer.add(run, prefix, zero_s, part_s))
         if prefix:
             print(f"{prefix.strip('/')} is {run.name}", file=sys.stderr)
-    blueprint = ReviewBlueprint(prefixes, shown, runs[0].config.limits.band_um, maps_um)
+    blueprint = blueprints.ReviewBlueprint(prefixes, shown, runs[0].config.limits.band_um, maps_um)
     layer.blueprint(blueprint.made(options.tab))
     layer.close()
     if shown is None:
@@ -154,43 +148,33 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> floa
 
 def _with_telemetry(runs: Sequence[Run]) -> list[Run]:
     """The runs that can be shown; of the others it is noted that they cannot."""
-    there = [run for run in runs if run.level(60.0, names=("rows",))["time_s"].size]
+    there = [run for run in runs if words.end_s(run)]
     if not there:
-        raise errors.InputError(
-            f"{', '.join(str(run.folder) for run in runs)}: nothing to show: no telemetry can be read"
-        )
+        raise errors.InputError(f"{', '.join(str(run.folder) for run in runs)}: no telemetry can be read")
     for run in runs:
         if run not in there:
-            run.notes.append("not shown: no telemetry of it can be read")
+            run.notes.append("not shown: its telemetry cannot be read")
     return there
 
 
 def _span(run: Run, options: ReviewOptions) -> tuple[float, float] | None:
     """The part of the run asked for, in its seconds."""
     if options.start is not None or options.end is not None:
-        start_s = 0.0 if options.start is None else words.moment_s(options.start, run.origin_utc)
-        end_s = _end_s(run) if options.end is None else words.moment_s(options.end, run.origin_utc)
-        if options.start is not None and options.end is not None and not start_s < end_s:
-            raise errors.InputError(f"--from {options.start} is not before --to {options.end}")
-        if start_s >= _end_s(run):
-            raise _not_in(run, f"--from {options.start}")
+        start_s, end_s = words.part_s(run, options.start, options.end)
+        if start_s >= words.end_s(run):
+            raise words.not_in(run, f"--from {options.start}")
         if end_s <= 0:
-            raise _not_in(run, f"--to {options.end}")
-        return start_s, end_s
+            raise words.not_in(run, f"--to {options.end}")
+        return (0.0 if options.start is None else start_s), (words.end_s(run) if options.end is None else end_s)
     if options.at is not None:
         at_s = words.moment_s(options.at, run.origin_utc)
-        if not -_AROUND_S <= at_s <= _end_s(run) + _AROUND_S:
-            raise _not_in(run, f"--at {options.at}")
-        return at_s - _AROUND_S, at_s + _AROUND_S
-    if options.around is not None:
+        if not -_AROUND_S <= at_s <= words.end_s(run) + _AROUND_S:
+            raise words.not_in(run, f"--at {options.at}")
+    elif options.around is not None:
         at_s = _around(run, options.around)
-        return at_s - _AROUND_S, at_s + _AROUND_S
-    return None
-
-
-def _not_in(run: Run, asked: str) -> errors.InputError:
-    went = f"{run.utc(0):%Y-%m-%d %H:%M} to {run.utc(_end_s(run)):%Y-%m-%d %H:%M} UTC"
-    return errors.InputError(f"{asked}: not in the run, which went from {went}")
+    else:
+        return None
+    return at_s - _AROUND_S, at_s + _AROUND_S
 
 
 def _around(run: Run, what: str) -> float:
@@ -203,9 +187,7 @@ def _around(run: Run, what: str) -> float:
                 return event_s(event)
     from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 
-    found: list[FoundEvent] = find_events(
-        run.level(1.0, names=LEVEL_COLUMNS), run.shapes(), run.config.limits.band_um
-    )
+    found = find_events(run.level(1.0, names=LEVEL_COLUMNS), run.shapes(), run.config.limits.band_um)
     for item in found:
         if wanted in item.kind:
             return item.time_s
@@ -228,10 +210,5 @@ def _hold_s(run: Run) -> float:
     entered = [e for e in run.events if e.get("kind") == "state" and e.get("state") == "hold"]
     if entered:
         return float(entered[0].get("mono_s") or 0.0)
-    rows = [float(t) for t, code in zip(level["time_s"], level["state"], strict=True) if code == states.State.HOLD]
-    return rows[0] if rows else 0.0
-
-
-def _end_s(run: Run) -> float:
-    time_s = run.level(60.0, names=("rows",))["time_s"]
-    return float(time_s[-1]) + 60.0 if time_s.size else 0.0
+    held_s = level["time_s"][level["state"] == states.State.HOLD]
+    return float(held_s[0]) if held_s.size else 0.0

@@ -1,24 +1,23 @@
 """What the viewer is given: a recording of its own, made from the tables in a second; the run is only read.
 
 Overview levels over the whole run; every tick of the part that is looked at, where that is not too much to draw; the
-figure with maps; states; events, marks and what was found by machine.
+figure with maps; states; events, marks and detected events.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
-from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
 from membrane_ctrl.model.telemetry import FIELDS, changes
 from membrane_ctrl.recorder.blueprint import TELEMETRY_LANES
 from membrane_ctrl.recorder.rerun_streams import event_text, event_time_s
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.review.report.figures import broken_at_gaps
+from membrane_ctrl.review.words import end_s
 from membrane_ctrl.run_files import run_folder, streams, summary
 from membrane_ctrl.run_files.run import Block, Run
 from membrane_ctrl.run_files.shapes import Shapes, height_basis
@@ -33,54 +32,33 @@ _MAP_PX = 96
 _RUN_COLOURS: tuple[streams.Colour, ...] = (streams.BLUE, streams.ORANGE, streams.GREEN, streams.VIOLET, streams.RED)
 
 
-@dataclass(frozen=True, slots=True)
-class Overview:
-    """One plot of a level: signals (column, name, colour) under a path."""
-
-    path: str
-    lines: tuple[tuple[str, str, streams.Colour], ...]
-
-
-OVERVIEWS: tuple[Overview, ...] = (
-    Overview(
-        "/overview/error",
-        (
-            ("min_error_um", "error, least um", streams.GREY),
-            ("mean_error_um", "error, mean um", streams.BLUE),
-            ("max_error_um", "error, greatest um", streams.GREY),
-        ),
+# Plots of a level: signals (column, name, colour) by path.
+OVERVIEWS: dict[str, tuple[tuple[str, str, streams.Colour], ...]] = {
+    "/overview/error": (
+        ("min_error_um", "error, least um", streams.GREY),
+        ("mean_error_um", "error, mean um", streams.BLUE),
+        ("max_error_um", "error, greatest um", streams.GREY),
     ),
-    Overview("/overview/true", (("mean_true_error_um", "true error, mean um", streams.GREEN),)),
-    Overview(
-        "/overview/flow",
-        (("mean_flow_um_per_s", "flow um/s", streams.BLUE), ("mean_leak_um_per_s", "leak um/s", streams.RED)),
+    "/overview/true": (("mean_true_error_um", "true error, mean um", streams.GREEN),),
+    "/overview/flow": (
+        ("mean_flow_um_per_s", "flow um/s", streams.BLUE),
+        ("mean_leak_um_per_s", "leak um/s", streams.RED),
     ),
-    Overview("/overview/pump", (("mean_pump_fraction", "pump", streams.BLUE),)),
-    Overview("/overview/trim", (("mean_trim_um", "trim um", streams.VIOLET),)),
-    Overview("/overview/ambient", (("mean_ambient_pressure_pa", "air pressure Pa", streams.BLUE),)),
-    Overview("/overview/gauge", (("mean_gauge_pressure_pa", "gauge pressure Pa", streams.BLUE),)),
-    Overview("/overview/temperature", (("mean_air_temperature_c", "air C", streams.ORANGE),)),
-    Overview(
-        "/overview/lateness",
-        (
-            ("mean_lateness_ms", "lateness, mean ms", streams.BLUE),
-            ("max_lateness_ms", "lateness, greatest ms", streams.GREY),
-        ),
+    "/overview/pump": (("mean_pump_fraction", "pump", streams.BLUE),),
+    "/overview/trim": (("mean_trim_um", "trim um", streams.VIOLET),),
+    "/overview/ambient": (("mean_ambient_pressure_pa", "air pressure Pa", streams.BLUE),),
+    "/overview/gauge": (("mean_gauge_pressure_pa", "gauge pressure Pa", streams.BLUE),),
+    "/overview/temperature": (("mean_air_temperature_c", "air C", streams.ORANGE),),
+    "/overview/lateness": (
+        ("mean_lateness_ms", "lateness, mean ms", streams.BLUE),
+        ("max_lateness_ms", "lateness, greatest ms", streams.GREY),
     ),
-    Overview("/overview/missed", (("max_missed_ticks", "ticks missed so far", streams.RED),)),
-)
+    "/overview/missed": (("max_missed_ticks", "ticks missed so far", streams.RED),),
+}
 
 
 class Layer:
-    """Writes runs into one recording.
-
-    Parameters
-    ----------
-    path : Path
-        The `.rrd` file to write.
-    name : str
-        Of the recording.
-    """
+    """Writes runs into one recording, the `.rrd` file `path`."""
 
     def __init__(self, path: Path, name: str) -> None:
         self._stream = rr.RecordingStream(APPLICATION, recording_id=name)
@@ -101,11 +79,10 @@ class Layer:
         self._stream.disconnect()
 
     def add(self, run: Run, prefix: str, zero_s: float, part_s: tuple[float, float]) -> float:
-        """Put a run in.
+        """Add a run; returns the scale of its maps: their greatest change of height, um; NaN without maps.
 
         Parameters
         ----------
-        run : Run
         prefix : str
             In front of its paths; empty for a run alone.
         zero_s : float
@@ -113,17 +90,13 @@ class Layer:
         part_s : tuple
             What is looked at: shown tick by tick, if that is not too much, and all that logs and maps hold, since a
             cursor that stands at the end of the recording would show those of the end.
-
-        Returns
-        -------
-        float
-            The scale of its maps: the greatest change of height in them, um; NaN when there are none.
         """
         self._prefix, self._shift_s = prefix, zero_s
         self._label = f"{prefix.strip('/')} " if prefix else ""
         self._number += 1
         self._origin = np.datetime64(run.origin_utc.replace(tzinfo=None), "ns")
-        level_s = _level_for(run)
+        span_s = _end_s(run)
+        level_s = next((w for w in (1.0, 10.0) if span_s / w <= LEVEL_ROWS_MOST), 60.0)
         level = run.level(level_s)
         seconds = level if level_s == 1.0 else run.level(1.0, names=LEVEL_COLUMNS)
         shapes = run.shapes()
@@ -135,11 +108,11 @@ class Layer:
         return self._figure(shapes.select(summary.held_at(level, shapes.time_s)), part_s)
 
     def _overviews(self, level: Block, band_um: float) -> None:
-        for overview in OVERVIEWS:
-            values = np.column_stack([level[name] for name, _, _ in overview.lines])
+        for path, lines in OVERVIEWS.items():
+            values = np.column_stack([level[name] for name, _, _ in lines])
             if np.isfinite(values).any():
-                self._style(overview.path, [(name, colour) for _, name, colour in overview.lines])
-                self._scalars(overview.path, level["time_s"], values)
+                self._style(path, [(name, colour) for _, name, colour in lines])
+                self._scalars(path, level["time_s"], values)
         ends = level["time_s"][[0, -1]] if level["time_s"].size else np.empty(0)
         self._style("/loop/band", [("+band um", streams.GREY), ("-band um", streams.GREY)])
         self._scalars("/loop/band", ends, np.tile([band_um, -band_um], (ends.size, 1)))
@@ -180,7 +153,7 @@ class Layer:
             self._log(run, "/found", np.array([f.time_s for f in seen]), texts, ["WARN"] * len(seen))
         if found:
             times = np.array([f.time_s for f in found])
-            self._style("/found/marks", [("found by machine", streams.RED)], points=True)
+            self._style("/found/marks", [("detected", streams.RED)], points=True)
             self._scalars("/found/marks", times, np.zeros((len(found), 1)))
 
     def _log(self, run: Run, path: str, time_s: Column, texts: list[str], levels: list[str]) -> None:
@@ -224,7 +197,9 @@ class Layer:
             picture = np.zeros((_MAP_PX, _MAP_PX), dtype=np.float32)
             picture[inside] = height
             image = rr.DepthImage(picture, colormap="turbo", depth_range=(-most, most))
-            self._at(float(time_s[row]))
+            at_s = np.array([time_s[row]])
+            self._stream.set_time("run_time", duration=_nanoseconds(at_s - self._shift_s)[0])
+            self._stream.set_time("utc", timestamp=self._origin + _nanoseconds(at_s)[0])
             self._stream.log(self._prefix + "/shape/map", image)
         return most
 
@@ -248,10 +223,6 @@ class Layer:
         ]
         self._stream.send_columns(self._prefix + path, indexes=indexes, columns=columns)
 
-    def _at(self, time_s: float) -> None:
-        self._stream.set_time("run_time", duration=_nanoseconds(np.array([time_s - self._shift_s]))[0])
-        self._stream.set_time("utc", timestamp=self._origin + _nanoseconds(np.array([time_s]))[0])
-
 
 def _of_run(colour: streams.Colour, number: int) -> streams.Colour:
     """Runs that lie over each other differ by colour; what is grey in one alone is the dark shade."""
@@ -259,25 +230,17 @@ def _of_run(colour: streams.Colour, number: int) -> streams.Colour:
     return (red // 2, green // 2, blue // 2) if colour == streams.GREY else (red, green, blue)
 
 
-def _nanoseconds(time_s: Column) -> NDArray[np.timedelta64]:
+def _nanoseconds(time_s: Column) -> AnyArray:
     return np.round(np.asarray(time_s, dtype=np.float64) * 1e9).astype("timedelta64[ns]")
 
 
-def _level_for(run: Run) -> float:
-    span_s = _end_s(run)
-    return next((w for w in (1.0, 10.0) if span_s / w <= LEVEL_ROWS_MOST), 60.0)
-
-
 def _end_s(run: Run) -> float:
-    """How long the run is: its summary, or its last event (a killed run: its last second)."""
+    """How long the run is, by its summary or, of a killed run, its levels."""
     duration = (run.summary or {}).get("duration_s")
-    if isinstance(duration, (int, float)):
-        return float(duration)
-    seconds = run.level(60.0, names=("rows",))["time_s"]
-    return float(seconds[-1]) + 60.0 if seconds.size else 0.0
+    return float(duration) if isinstance(duration, (int, float)) else end_s(run)
 
 
-def _some(count: int, most: int) -> NDArray[np.bool_]:
+def _some(count: int, most: int) -> BoolArray:
     """(count,) true for at most `most` places, evenly spread, the first among them."""
     chosen = np.zeros(count, dtype=bool)
     chosen[:: max(1, -(-count // most))] = True

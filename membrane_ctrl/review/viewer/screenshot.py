@@ -7,7 +7,6 @@ Needs a Vulkan driver; Mesa's software one will do (`apt-get install mesa-vulkan
 
 import argparse
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -15,8 +14,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import ViewerClient
+
+from membrane_ctrl.review.viewer.viewer import free_port, viewer_command
 
 # The viewer is ready when two pictures in a row are the same, which on two cores takes about 7 s for a short run.
 _WAIT_S = 60.0
@@ -26,21 +26,9 @@ _BETWEEN_S = 0.5
 def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:
     """PNG of the whole run, at its end.
 
-    Parameters
-    ----------
-    run_dir : Path
-        Folder of the run; all its segments are opened.
-    tab : str
-        Name of a tab of the blueprint.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no recording in the folder.
-    ValueError
-        If the recording has no such tab.
-    RuntimeError
-        If the viewer does not start (no Vulkan driver) or does not come to rest.
+    Raises FileNotFoundError if there is no recording in the folder; ValueError if the recording has no such tab;
+    RuntimeError if the viewer does not start (no Vulkan driver) or does not come to rest. All segments
+    of the run are opened; `tab` is the name of a tab of the blueprint.
     """
     segments = sorted(str(path.resolve()) for path in run_dir.glob("*.rrd"))
     if not segments:
@@ -93,12 +81,8 @@ def _at_rest(viewer: ViewerClient) -> bytes:
 @contextmanager
 def _viewer() -> Iterator[ViewerClient]:
     """A headless viewer that only this machine can reach; `ViewerClient.spawn` would listen on every interface."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    # the `rerun` command is a Python shim: ending it would leave the viewer behind
-    binary = Path(rerun_cli.__file__).parent / "rerun"
-    command = [str(binary), "--headless", "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"]
+    port = free_port()
+    command = viewer_command("--headless", "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen")
     environment = {**os.environ, "RUST_LOG": "error"}
     with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
         try:

@@ -60,17 +60,8 @@ def put_cursor(process: subprocess.Popen[bytes], port: int, at_s: float, most_s:
 def serve(files: list[Path], bind: str, port: int) -> int:
     """Serve files to browsers until interrupted.
 
-    Parameters
-    ----------
-    bind : str
-        127.0.0.1 unless the network may look: then the address to listen on.
-    port : int
-        Of the page; 0: a free one.
-
-    Raises
-    ------
-    DeviceError
-        If it cannot listen there, or the viewer does not start.
+    Raises DeviceError if it cannot listen there, or the viewer does not start. `bind` is 127.0.0.1, or
+    an address of this machine for viewers elsewhere; `port` is that of the page, 0 for a free one.
     """
     port = port or free_port()
     _require_listening(bind, port)

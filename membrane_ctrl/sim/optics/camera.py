@@ -6,17 +6,13 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from firmware_iface.roles import Frame, LinkError, Pattern
+from firmware_iface.roles import Frame, LinkError, Pattern, Pixels
 from membrane_ctrl.config.schema import OpticsConfig, TwinConfig
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.shade import Light, cubic_weights, level_table, node_positions, normal_quantiles, shade
 from membrane_ctrl.sim.optics.trace import ScreenError, Trace, camera_pose, pixel_directions, screen_pose, trace
-
-# Pictures that the camera takes of the screen in the moving film.
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 # Nodes this far apart on the mirror put a typical film's phase < 1e-4 rad off the exact trace (asserted in the tests)
 _NODE_MM = 4.6
@@ -31,6 +27,7 @@ class OpticsRenderer:
 
     The film is traced at nodes (see `shade`) and, unless `exact`, at displacements _CELL_UM apart: a parabola through
     the three nearest gives the maps at any other, so that a moving film costs nothing until it leaves its cell.
+    Raises ValueError if the film's rim is not the configured one.
 
     Parameters
     ----------
@@ -48,11 +45,6 @@ class OpticsRenderer:
         Trace every pixel at every displacement: slow, for sets that must be true to the last bit.
     seed : int
         Of the pixel noise (`camera.noise_adu`); each picture has its own.
-
-    Raises
-    ------
-    ValueError
-        If the film's rim is not the configured one.
     """
 
     optics: OpticsConfig
@@ -94,6 +86,8 @@ class OpticsRenderer:
     ) -> Pixels:
         """The picture of one pattern, (H, W).
 
+        Raises ValueError if the pattern is unknown or `out` has another shape or type.
+
         Parameters
         ----------
         pattern : Pattern
@@ -104,11 +98,6 @@ class OpticsRenderer:
             Filled and returned (frames in shared memory); otherwise a new one is made.
         gain : float
             Exposure against the nominal one.
-
-        Raises
-        ------
-        ValueError
-            If the pattern is unknown or `out` has another shape or type.
         """
         camera, config = self.optics.camera, self.optics.pattern
         picture = self.blank() if out is None else out
@@ -184,12 +173,10 @@ class FilmPosition(Protocol):
     @property
     def displacement_um(self) -> float:
         """Of the centre, positive when the bowl is deeper."""
-        ...
 
     @property
     def sag_mm(self) -> float:
         """Depth of the bowl."""
-        ...
 
 
 class Clock(Protocol):
@@ -197,7 +184,6 @@ class Clock(Protocol):
 
     def now(self) -> float:
         """Seconds since the run's start."""
-        ...
 
 
 class TwinOptics:
@@ -219,11 +205,6 @@ class TwinOptics:
         Gives the time of exposure.
     film : FilmShape, optional
         Another film; its sag belongs to displacement 0.
-
-    Attributes
-    ----------
-    screen : TwinScreen
-    camera : TwinCamera
     """
 
     def __init__(
@@ -305,10 +286,7 @@ class TwinCamera:
     def grab(self, out: Pixels | None = None) -> Frame:
         """One exposure; the picture lands in `out` (H, W) if given, else in a new array.
 
-        Raises
-        ------
-        LinkError
-            If the camera is closed or the screen shows nothing.
+        Raises LinkError if the camera is closed or the screen shows nothing.
         """
         if not self._open:
             raise LinkError("twin camera: closed")

@@ -61,30 +61,12 @@ class Bump:
 
 @dataclass(frozen=True, slots=True)
 class FilmShape:
-    """The film as the twin knows it.
+    """The film as the twin knows it. Raises ValueError that names the field and what would be right."""
 
-    Attributes
-    ----------
-    sag_mm : float
-        Depth of the bowl (rim above vertex, without the other terms) at displacement 0.
-    radius_mm : float
-        Radius of the rim.
-    bowl : "hencky" or "paraboloid"
-        Form of the bowl.
-    zernike_um : tuple of up to 36 floats
-        Noll j = 1.., orthonormal over `radius_mm`, added to the bowl (piston is without effect).
-    ripples, wrinkles, bumps : tuples
-        What the 36 terms cannot carry.
-
-    Raises
-    ------
-    ValueError
-        On construction, naming the field and what would be right.
-    """
-
-    sag_mm: float
+    sag_mm: float  # depth of the bowl (rim above vertex, without the other terms) at displacement 0
     radius_mm: float = 500.0
     bowl: Literal["hencky", "paraboloid"] = "hencky"
+    # Noll j = 1.., orthonormal over `radius_mm`, added to the bowl (piston is without effect)
     zernike_um: tuple[float, ...] = ()
     ripples: tuple[Ripple, ...] = ()
     wrinkles: tuple[Wrinkle, ...] = ()

@@ -6,14 +6,13 @@ nodes (Lagrange) in each direction; with step 1 every pixel is a node and nothin
 
 from dataclasses import dataclass
 from functools import cache
-from math import ceil, pi
 from statistics import NormalDist
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from firmware_iface.roles import Pattern
+from firmware_iface.roles import Pattern, Pixels
 from membrane_ctrl.config.schema import PatternConfig
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -23,7 +22,7 @@ _LOW_16 = np.uint64(0xFFFF)
 
 def node_positions(pixels: int, step: int) -> FloatArray:
     """Pixel positions of the nodes along one side of the picture."""
-    return np.asarray(np.arange(-1, ceil(pixels / step) + 2) * step, dtype=np.float64)
+    return np.asarray(np.arange(-1, -(-pixels // step) + 2) * step, dtype=np.float64)
 
 
 def cubic_weights(step: int) -> FloatArray:
@@ -101,7 +100,7 @@ def shade(
     scale: FloatArray,
     loss: tuple[FloatArray, FloatArray],
     noise: tuple[NDArray[np.float32], float, int],
-    out: NDArray[np.uint8] | NDArray[np.uint16],
+    out: Pixels,
 ) -> None:
     """Fill `out` (H, W) with the picture of one pattern.
 
@@ -161,7 +160,6 @@ def shade(
 #
 # s is measured from the low edge of the pattern region, a square centred on O'; outside it the screen is dark.
 
-
 _GRAY_BITS = 4
 # linear interpolation of a cosine in this many cells is 2e-8 off at most: below a thousandth of a 16-bit count
 _SINE_CELLS = 16384
@@ -171,29 +169,14 @@ _SINE_CELLS = 16384
 class Light:
     """From the pattern's level to the camera's counts.
 
-    Attributes
-    ----------
-    dark_fraction : float
-        Counts without light, of full scale.
-    white_fraction : float
-        Counts of a white screen in the middle of the picture, of full scale.
-    leak : float
-        Light of a black screen, of a white one.
-    gamma : float
-        The screen's light is level**gamma; 1 is a linear screen.
-    vignetting : float
-        Loss of light at the picture's corner, growing with the square of the distance from its middle.
-
-    Raises
-    ------
-    ValueError
-        On construction, naming the field and what would be right.
+    Raises ValueError that names the field and what would be right.
     """
 
-    dark_fraction: float = 0.02
-    white_fraction: float = 0.80
-    leak: float = 0.02
-    gamma: float = 1.0
+    dark_fraction: float = 0.02  # counts without light, of full scale
+    white_fraction: float = 0.80  # counts of a white screen in the middle of the picture, of full scale
+    leak: float = 0.02  # light of a black screen, of a white one
+    gamma: float = 1.0  # the screen's light is level**gamma; 1 is a linear screen
+    # loss of light at the picture's corner, growing with the square of the distance from its middle
     vignetting: float = 0.15
 
     def __post_init__(self) -> None:
@@ -217,7 +200,7 @@ class LevelTable:
     an end; the other is one value a cell over the whole region.
     """
 
-    values: NDArray[np.float64]
+    values: FloatArray
     cell_mm: float
     smooth: bool
 
@@ -229,13 +212,10 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
     - "gray": bit `index` (1 is the most significant of 4) of gray(V2), V2 = floor(2 s / T), over the region;
     - "white" and "black": 1 and 0 over the region.
 
-    Raises
-    ------
-    ValueError
-        If the pattern's role or Gray bit is unknown.
+    Raises ValueError if the pattern's role or Gray bit is unknown.
     """
     if pattern.role == "sin":
-        phi = np.linspace(0.0, 2.0 * pi, _SINE_CELLS + 1) - pi
+        phi = np.linspace(0.0, 2.0 * np.pi, _SINE_CELLS + 1) - np.pi
         levels = 0.5 + 0.5 * np.cos(phi + pattern.shift_rad)
         return LevelTable(_lit(levels, light), config.period_mm / _SINE_CELLS, smooth=True)
     half_periods = np.arange(2 * config.periods)
@@ -252,21 +232,18 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
 def pattern_sequence(kind: str, config: PatternConfig, shifts_rad: tuple[float, ...] = ()) -> list[Pattern]:
     """The patterns of a set in the order they are shown: x and y sinusoids and Gray bits, white, black.
 
+    Raises ValueError if the kind is unknown.
+
     Parameters
     ----------
     kind : str
         "full" or "fringes" (sinusoids alone).
     shifts_rad : tuple of floats
         One a step; empty: 2 pi k / N.
-
-    Raises
-    ------
-    ValueError
-        If the kind is unknown.
     """
     if kind not in ("full", "fringes"):
         raise ValueError(f"kind = {kind!r} must be full or fringes")
-    shifts = shifts_rad or tuple(2.0 * pi * k / config.steps for k in range(config.steps))
+    shifts = shifts_rad or tuple(2.0 * np.pi * k / config.steps for k in range(config.steps))
     patterns: list[Pattern] = []
     for axis in ("x", "y"):
         patterns += [Pattern("sin", axis, k, shift) for k, shift in enumerate(shifts)]
@@ -275,6 +252,6 @@ def pattern_sequence(kind: str, config: PatternConfig, shifts_rad: tuple[float, 
     return patterns + ([Pattern("white"), Pattern("black")] if kind == "full" else [])
 
 
-def _lit(levels: NDArray[np.float64], light: Light) -> NDArray[np.float64]:
+def _lit(levels: FloatArray, light: Light) -> FloatArray:
     """Share of a white screen's light: gamma, and what leaks through a black screen."""
     return np.asarray(light.leak + (1.0 - light.leak) * np.clip(levels, 0.0, 1.0) ** light.gamma)

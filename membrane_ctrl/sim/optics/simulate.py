@@ -9,10 +9,9 @@ from typing import Any
 import cv2
 import numpy as np
 import tomli_w
-from numpy.typing import NDArray
 
-from firmware_iface.roles import Pattern
-from membrane_ctrl.config.section import Section
+from firmware_iface.roles import Pattern, Pixels
+from firmware_iface.settings import Section
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
@@ -113,7 +112,6 @@ def _frame_row(spec: SimulationSpec, frame: int, reading_um: float) -> dict[str,
     return row
 
 
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 # noise does not compress: harder levels cost time and save nothing
 _PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 
@@ -130,17 +128,14 @@ class _Exposure:
 def simulate_set(folder: Path, spec: SimulationSpec) -> None:
     """Write one capture set and its truth.
 
+    Raises OSError if the folder or a file cannot be written.
+
     Parameters
     ----------
     folder : Path
         Made if it is not there.
     spec : SimulationSpec
         The set.
-
-    Raises
-    ------
-    OSError
-        If the folder or a file cannot be written.
     """
     _write_set(folder, spec, _renderer(spec))
 
@@ -154,6 +149,8 @@ def simulate_run(
 ) -> None:
     """Write a run: `0000` is the full set, the others are fringes that lean on it; one clock and one motion for all.
 
+    Raises ValueError if the first set is not full, lists its displacements, or the sets overlap in time.
+
     Parameters
     ----------
     folder : Path
@@ -166,11 +163,6 @@ def simulate_run(
         From the start of one set to the start of the next.
     on_set : callable, optional
         Told the number of sets written, after each.
-
-    Raises
-    ------
-    ValueError
-        If the first set is not full, lists its displacements, or the sets overlap in time.
     """
     if spec.kind != "full" or spec.displacements_um:
         raise ValueError("kind: the first set of a run must be full, and move by motion, not displacements_um")

@@ -1,7 +1,5 @@
 """What a simulated capture set is made of, checked before anything is written."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from math import isfinite, pi, sin
 from typing import Literal, get_args
@@ -23,23 +21,14 @@ _DEFAULT_AMOUNT: dict[FaultKind, float] = {"saturated": 2.0, "dark": 0.05, "flic
 
 @dataclass(frozen=True, slots=True)
 class FrameFault:
-    """One fault of one frame.
+    """One fault of one frame."""
 
-    Attributes
-    ----------
-    kind : str
-        "stale" (the picture of the frame before, byte for byte), "swapped" (with the frame after), "missing" (listed
-        but not written), "saturated", "dark", "flicker" (wrong exposure), "moved" (the film stood elsewhere and the
-        laser did not say so), "wrong_size" (one row short), "wrong_depth" (8 for 16 bit and the reverse).
-    frame : str
-        The frame's name, as `x_sin_2`.
-    amount : float or None
-        Exposure against nominal, or um for "moved"; None: a usual one.
-    """
-
+    # "stale" (the picture of the frame before, byte for byte), "swapped" (with the frame after), "missing" (listed
+    # but not written), "saturated", "dark", "flicker" (wrong exposure), "moved" (the film stood elsewhere and the
+    # laser did not say so), "wrong_size" (one row short), "wrong_depth" (8 for 16 bit and the reverse)
     kind: FaultKind
-    frame: str
-    amount: float | None = None
+    frame: str  # the frame's name, as `x_sin_2`
+    amount: float | None = None  # exposure against nominal, or um for "moved"; None: a usual one
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(FaultKind):
@@ -53,13 +42,10 @@ class FrameFault:
         return _DEFAULT_AMOUNT[self.kind] if self.amount is None else self.amount
 
     @classmethod
-    def parse(cls, text: str) -> FrameFault:
+    def parse(cls, text: str) -> "FrameFault":
         """Read `kind:frame` or `kind:frame:amount`.
 
-        Raises
-        ------
-        ValueError
-            If the text has another form, names no known kind or its amount is not a number.
+        Raises ValueError if the text has another form, names no known kind or its amount is not a number.
         """
         kind, _, rest = text.partition(":")
         frame, _, amount = rest.partition(":")
@@ -91,60 +77,27 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class SimulationSpec:
-    """One simulated capture set.
+    """One simulated capture set. Raises ValueError that names the field and what would be right."""
 
-    Attributes
-    ----------
-    optics : OpticsConfig
-        The bench as it truly is, with the camera's depth (`bits`) and noise and the pattern's steps.
-    film : FilmShape
-        Its sag belongs to displacement 0.
-    kind : "full" or "fringes"
-        18 frames (for four steps), or the sinusoids alone.
-    reference : str
-        Of a fringes set: the full set whose fringe orders anchor it, as `../0000`.
-    shifts_rad : tuple of floats
-        One phase shift a step, written into each frame; empty: 2 pi k / N, not written.
-    motion : Motion
-        Of the film on the run's clock.
-    displacements_um : tuple of floats
-        Instead of `motion`: one a frame, in the order of `patterns`.
-    start_s, frame_interval_s : float
-        Start of the first exposure on the run's clock, and from one exposure to the next.
-    laser : bool
-        Whether the frames carry the laser's reading.
-    laser_noise_um : float
-        Standard deviation of that reading.
-    stated_geometry : GeometryConfig or None
-        What `capture.toml` says, when it is not the truth.
-    light, screen_error, exact, seed
-        See `OpticsRenderer`.
-    faults : tuple of FrameFault
-        What goes wrong with single frames.
-
-    Raises
-    ------
-    ValueError
-        On construction, naming the field and what would be right.
-    """
-
+    # the bench as it truly is, with the camera's depth (`bits`) and noise and the pattern's steps
     optics: OpticsConfig
-    film: film_shape.FilmShape
-    kind: Literal["full", "fringes"] = "full"
-    reference: str = ""
+    film: film_shape.FilmShape  # its sag belongs to displacement 0
+    kind: Literal["full", "fringes"] = "full"  # 18 frames (for four steps), or the sinusoids alone
+    reference: str = ""  # of a fringes set: the full set whose fringe orders anchor it, as `../0000`
+    # one phase shift a step, written into each frame; empty: 2 pi k / N, not written
     shifts_rad: tuple[float, ...] = ()
-    motion: Motion = Motion()
-    displacements_um: tuple[float, ...] = ()
-    start_s: float = 0.0
+    motion: Motion = Motion()  # of the film on the run's clock
+    displacements_um: tuple[float, ...] = ()  # instead of `motion`: one a frame, in the order of `patterns`
+    start_s: float = 0.0  # start of the first exposure on the run's clock
     frame_interval_s: float = 0.1
-    laser: bool = True
-    laser_noise_um: float = 0.0
-    stated_geometry: GeometryConfig | None = None
+    laser: bool = True  # whether the frames carry the laser's reading
+    laser_noise_um: float = 0.0  # standard deviation of that reading
+    stated_geometry: GeometryConfig | None = None  # what `capture.toml` says, when it is not the truth
     light: shade.Light = field(default_factory=shade.Light)
     screen_error: trace.ScreenError | None = None
     exact: bool = False
     seed: int = 1
-    faults: tuple[FrameFault, ...] = ()
+    faults: tuple[FrameFault, ...] = ()  # what goes wrong with single frames
 
     def __post_init__(self) -> None:
         if self.kind == "fringes" and not self.reference:

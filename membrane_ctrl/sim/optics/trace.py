@@ -129,7 +129,6 @@ def _turned(vector: FloatArray, axis: FloatArray, angle_rad: float) -> FloatArra
 # the plane. On the face w = c (u^2 + v^2) + map(u, v): found by putting one into the other again and again, which
 # gains the product of the face's slope and the tangents, a factor of 50 or more, a time.
 
-
 _TOLERANCE_MM = 1e-11
 _FACE_MAX_STEPS = 50  # a face that a ray grazes may never settle
 

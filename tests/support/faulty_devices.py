@@ -1,0 +1,161 @@
+"""Emulated serial devices with faults that can be switched on, and a wire in virtual time."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from firmware_iface.emulators import bronkhorst, keyence_dl_rs1a, modbus_server, optoncdt1420, serial_device, ventus
+from firmware_iface.emulators import vaisala_ptb330 as vaisala
+from firmware_iface.links.serial_port import Receiver, SerialPort
+from firmware_iface.roles import LinkDownError
+
+
+@dataclass(slots=True)
+class SerialFaults:
+    """What is wrong with the line or the device; each can be switched on and off while it runs."""
+
+    silent: bool = False  # questions are carried out and not answered
+    deaf: bool = False  # questions do not arrive
+    # answers come this much later; longer than the asker waits, it is a late reply. Answers keep their order
+    delay_s: float = 0.0
+    garbage_bytes: int = 0  # so many random bytes in place of each answer
+    # so many bits of each answer are turned over. On a line with parity, a byte with an odd number of them is
+    # dropped, as the receiver does
+    bit_errors: int = 0
+    question_bit_errors: int = 0  # so many bits of each question are turned over
+    cut_bytes: int = 0  # so many bytes are missing at the end of each answer
+    frozen: bool = False  # the measured value stays what it was
+
+
+class SerialDevice(serial_device.SerialDevice):
+    """A device whose answers and questions are spoilt on their way, as `faults` says.
+
+    `draw_faults`, when set, is called for every question, and for every answer: random faults.
+    """
+
+    def __init__(self, *arguments: Any, seed: int = 0, **keywords: Any) -> None:
+        super().__init__(*arguments, **keywords)
+        self.faults = SerialFaults()
+        self.draw_faults: Callable[[], SerialFaults] | None = None
+        self.random = random.Random(seed)
+
+    @property
+    def frozen(self) -> bool:  # type: ignore[override]
+        return self.faults.frozen
+
+    def arrived(self, data: bytes) -> None:
+        faults = self._drawn()
+        if not faults.deaf:
+            super().arrived(self._hit(data, faults.question_bit_errors))
+
+    def say(self, answer: bytes, delay_s: float = 0.0) -> None:
+        faults = self._drawn()
+        if not faults.silent:
+            super().say(self._spoilt(answer, faults), faults.delay_s)
+
+    def _spoilt(self, answer: bytes, faults: SerialFaults) -> bytes:
+        if faults.garbage_bytes:
+            return self.random.randbytes(faults.garbage_bytes)
+        return self._hit(answer[: max(0, len(answer) - faults.cut_bytes)], faults.bit_errors)
+
+    def _hit(self, data: bytes, bit_errors: int) -> bytes:
+        """With so many bits turned over, as the receiver at the other end gets it."""
+        if not bit_errors:
+            return data
+        spoilt, hits = bytearray(data), bytearray(len(data))
+        for bit in self.random.sample(range(8 * len(data)), min(bit_errors, 8 * len(data))):
+            spoilt[bit // 8] ^= 1 << bit % 8
+            hits[bit // 8] ^= 1
+        if self.settings.parity == "N":
+            return bytes(spoilt)
+        return bytes(byte for byte, odd in zip(spoilt, hits, strict=True) if not odd)
+
+    def _drawn(self) -> SerialFaults:
+        return self.faults if self.draw_faults is None else self.draw_faults()
+
+
+class KeyenceDlRs1aEmulator(SerialDevice, keyence_dl_rs1a.KeyenceDlRs1aEmulator):
+    pass
+
+
+class Optoncdt1420Emulator(SerialDevice, optoncdt1420.Optoncdt1420Emulator):
+    pass
+
+
+class VaisalaPtb330Emulator(SerialDevice, vaisala.VaisalaPtb330Emulator):
+    pass
+
+
+class VentusEmulator(SerialDevice, ventus.VentusEmulator):
+    pass
+
+
+class ProparDevice(SerialDevice, bronkhorst.ProparDevice):
+    pass
+
+
+class RtuBusEmulator(SerialDevice, modbus_server.RtuBusEmulator):
+    """A bus whose answers carry the next unit id, the next function code, or an exception (0: off)."""
+
+    wrong_unit = wrong_function = False
+    exception_code = 0
+
+    def answer(self, unit: int, pdu: bytes) -> bytes:
+        if self.exception_code:
+            return bytes([unit]) + modbus_server.exception_pdu(pdu, self.exception_code)
+        if not (body := super().answer(unit, pdu)):
+            return b""
+        return bytes([body[0] + self.wrong_unit, body[1] + self.wrong_function]) + body[2:]
+
+
+class MemoryWire(SerialPort):
+    """A `SerialPort` with the emulated device at its other end, for runs in virtual time."""
+
+    def __init__(self, device: SerialDevice, name: str = "memory") -> None:
+        super().__init__("/memory", device.settings)
+        self._port = name
+        self.plugged = True
+        self._device = device
+
+    @property
+    def is_open(self) -> bool:
+        """Whether bytes can flow."""
+        return self._receiver is not None
+
+    @property
+    def retry_in_s(self) -> float:
+        """It may be tried at any time."""
+        return 0.0
+
+    def open(self, receiver: Receiver) -> None:
+        """Open anew. Raises LinkDownError when it is not plugged in."""
+        if not self.plugged:
+            raise LinkDownError(f"{self.name}: there is no such port")
+        self._receiver = receiver
+        self._opened += 1
+        self._device.attach(receiver.received)
+
+    def write(self, data: bytes) -> None:
+        """Hand over bytes. Raises LinkDownError."""
+        if self._receiver is None:
+            raise LinkDownError(f"{self.name}: not open")
+        self._device.hear(data)
+
+    def unplug(self) -> None:
+        """Pull the plug."""
+        self.plugged = False
+        receiver = self._receiver
+        self.close()
+        if receiver is not None:
+            receiver.lost(LinkDownError(f"{self.name}: the port is gone"))
+
+    def succeeded(self) -> None:
+        """Nothing to do: there is no back-off."""
+
+    def close(self) -> None:
+        """Close."""
+        self._receiver = None
+        self._device.detach()
