@@ -160,8 +160,8 @@ def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json
         print(json.dumps({"sent": not deaf}))
     if deaf:
         raise errors.DeviceError(
-            f"{' and '.join(map(str, deaf))}: no service took the notice; check addresses and network"
+            f"{' and '.join(map(str, deaf))}: no service accepted the notice; check addresses and network"
         )
     if not as_json:
-        print("sent; look whether it has arrived")
+        print("sent; check that it has arrived")
     return errors.Exit.DONE

@@ -15,7 +15,7 @@ _RUNGS = {
 _STATES = {
     State.STANDBY: "pump is off: no hold was requested",
     State.CHECK: "pump is off until every sensor has been good for a while",
-    State.MANUAL: "pump flow is set by hand",
+    State.MANUAL: "pump is set by hand",
     State.TUNE: "pump is driven by a tuning session",
     State.LOWER: "pump is being stopped: the run is ending",
     State.FAULT: "pump is off: a person must clear the latched fault",
