@@ -262,7 +262,7 @@ def test_alarm_test(
         config.read_text() + f'escalation_urls_file = "{urls(tmp_path, "refusing://x", name="more.txt")}"\n'
     )
     assert run(["alarm", "test", "--config", str(config), "--escalated"]) == 4
-    assert "more.txt: no service took the notice" in capsys.readouterr().err
+    assert "more.txt: no service accepted the notice" in capsys.readouterr().err
     urls(tmp_path, "refusing://ann")
     assert run(["alarm", "test", "--config", str(config)]) == 4
     assert run(["alarm", "test"]) == 2
