@@ -1,9 +1,9 @@
-"""The alarms that stand, and what to tell whom about them. Time is passed in: no clock, no I/O.
+"""The alarms that stand, and their notices. Time is passed in: no clock, no I/O.
 
-An alarm is told when its condition has stood for its time; told again, to more people, when nobody acknowledges it;
-brought to mind now and then; and told off when the condition has stayed away. A condition that goes and comes within
-that time is the same alarm, told once; a latched fault is always another one. Several conditions under one name are
-one alarm: a full disk hits all files.
+An alarm is raised when its condition has stood for its time, escalated to more people when nobody acknowledges it,
+repeated as a reminder, and cleared when the condition has stayed away. A condition that returns within that time is
+the same alarm; a latched fault is always a new one. Several conditions under one name are one alarm: a full disk
+affects all files.
 """
 
 import math
@@ -13,13 +13,9 @@ from typing import Literal
 from membrane_ctrl.config.port import AlarmRule, AlarmsConfig
 from membrane_ctrl.model import events, run_events
 
-# What the run's events and telemetry mean as alarms: each sign raises an alarm or takes it away.
-
-
 Severity = Literal["warning", "critical"]
 
-# a fault that holds the flow for a few samples and is over again wakes nobody
-_GLITCH_S = 5.0
+_GLITCH_S = 5.0  # a fault that only holds the flow for a few samples wakes nobody
 _LIARS = {"laser": "the laser", "optics": "the camera"}
 
 
@@ -38,7 +34,7 @@ class Sign:
 
 
 def signs_of(event: events.Event) -> list[Sign]:
-    """What an event says; most say nothing."""
+    """The signs of an event; most have none."""
     match event:
         case events.Fault():
             text = f"{event.name}: {event.cause} ({event.seen}; {event.limit}); {event.remedy}"
@@ -65,13 +61,13 @@ def _signs_of_process(event: events.Event) -> list[Sign]:
         case run_events.Link():
             return [Sign("link", not event.up, "warning", event.message, _GLITCH_S)]
         case run_events.ChildEnded():
-            text = f"the {event.child} process ended with {event.exit_code}; the hold goes on without it"
+            text = f"the {event.child} process ended with {event.exit_code}; the hold goes on"
             return [Sign(f"{event.child}_ended", True, "warning", text, _GLITCH_S)]
         case run_events.ChildSilent():
-            text = f"the {event.child} process does not answer; the hold goes on without it"
+            text = f"the {event.child} process does not answer; the hold goes on"
             return [Sign(f"{event.child}_ended", True, "warning", text, _GLITCH_S)]
         case run_events.ChildGivenUp():
-            text = f"the {event.child} process has ended too often and is left alone for an hour; look at the run"
+            text = f"the {event.child} process has ended too often and is not restarted for an hour; check the run"
             return [Sign(f"{event.child}_ended", True, "warning", text)]
         case run_events.ChildRestarted():
             ended = Sign(f"{event.child}_ended", False)
@@ -96,16 +92,9 @@ def _signs_of_process(event: events.Event) -> list[Sign]:
 
 
 def sign_of_value(rule: AlarmRule, value: float, standing: bool) -> Sign | None:
-    """What a telemetry value says to a rule; None: as before.
+    """The sign of a telemetry value for a rule whose condition was `standing`; None if nothing changes.
 
-    Parameters
-    ----------
-    rule : AlarmRule
-        Its limits; between them nothing changes.
-    value : float
-        Of the rule's field. NaN says nothing: that a value is missing is the safety table's business.
-    standing : bool
-        The alarm's condition was there with the last value.
+    NaN changes nothing: missing values are the safety table's task.
     """
     if math.isnan(value):
         return None
@@ -152,7 +141,7 @@ class _Alarm:
         return math.isfinite(self.told_s)
 
     def end(self, about: str) -> None:
-        """One of its conditions has gone, or all: a reminder names one that still stands."""
+        """End one of its conditions, or all with ""; a reminder names one that still stands."""
         if about:
             self.standing.pop(about, None)
         else:
@@ -162,25 +151,19 @@ class _Alarm:
 
 
 class AlarmBook:
-    """All alarms of a run.
-
-    Parameters
-    ----------
-    config : AlarmsConfig
-        Times.
-    """
+    """All alarms of a run."""
 
     def __init__(self, config: AlarmsConfig) -> None:
         self._config = config
         self._alarms: dict[str, _Alarm] = {}
 
     def standing(self, name: str) -> bool:
-        """The condition of this alarm is there."""
+        """The condition of this alarm stands."""
         alarm = self._alarms.get(name)
         return alarm is not None and math.isinf(alarm.gone_s)
 
     def take(self, sign: Sign, now_s: float) -> None:
-        """Note what a sign says."""
+        """Take a sign."""
         alarm = self._alarms.get(sign.name)
         if alarm is None or (sign.bad and sign.anew and math.isfinite(alarm.gone_s)):
             if sign.bad:
@@ -201,12 +184,12 @@ class AlarmBook:
             alarm.sign = sign
 
     def acknowledge(self) -> None:
-        """Somebody has seen all that stands: no more reminders, nobody else is woken."""
+        """Acknowledge all raised alarms: no more reminders, no escalation."""
         for alarm in self._alarms.values():
             alarm.acknowledged |= alarm.told
 
     def step(self, now_s: float) -> list[Notice]:
-        """What is to be told now."""
+        """The notices that are due."""
         notices: list[Notice] = []
         for name, alarm in list(self._alarms.items()):
             kind = self._due(alarm, now_s)

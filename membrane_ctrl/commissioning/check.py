@@ -2,8 +2,6 @@
 
 import asyncio
 import contextlib
-import json
-import math
 from dataclasses import asdict
 
 from rich.markup import escape
@@ -18,18 +16,13 @@ from membrane_ctrl.control_port import sockets
 from membrane_ctrl.controller.cross_check import cross_check, require_sound
 from membrane_ctrl.geometry.file import geometry_in_force
 from membrane_ctrl.instruments import bench, device_lock
-from membrane_ctrl.model import errors, terminal
+from membrane_ctrl.model import errors, plain_json, terminal
 
 
 def check_config(config: Config, source: str, as_json: bool) -> int:
     """Judge the configuration, probe the devices, and report.
 
-    Raises
-    ------
-    InputError
-        A line for each setting that is refused.
-    DeviceError
-        A device does not answer as it should; after the report.
+    Raises InputError with a line for each bad setting; after the report, DeviceError for a device in trouble.
     """
     findings = dict.fromkeys(require_sound(config, source))  # before a device is touched
     probes = _probed(config)
@@ -37,7 +30,7 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
         findings |= dict.fromkeys(cross_check(config, probe.facts))
     would = _what_would_happen(config)
     if as_json:
-        listed = [{key: _plain(value) for key, value in asdict(probe).items() if key != "facts"} for probe in probes]
+        listed = [{key: value for key, value in asdict(probe).items() if key != "facts"} for probe in probes]
         found = [asdict(finding) for finding in findings]
         report = {
             "schema": "membrane-check/1",
@@ -46,7 +39,7 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
             "findings": found,
             "would": would,
         }
-        print(json.dumps(report))
+        print(plain_json.dumps(report))
     else:
         _show(source, probes, would, [finding.line(source) for finding in findings if finding.severity == "warning"])
     refused = [finding.line(source) for finding in findings if finding.severity == "error"]
@@ -60,13 +53,8 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
     return errors.Exit.DONE
 
 
-def _plain(value: object) -> object:
-    """A value that JSON has: None for NaN."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _probed(config: Config) -> list[DeviceProbe]:
-    """What the devices say; those that another program uses are left alone, and so is the screen it may show on."""
+    """Probe the devices, except those (and the screen) that another program uses."""
     devices = config.devices
     if devices is None:
         return probe_optics(config)
@@ -126,7 +114,7 @@ def _what_would_happen(config: Config) -> dict[str, str]:
 
 
 def _port(port: PortConfig) -> str:
-    """Where a hold could be asked. Raises InputError for certificates that cannot be used."""
+    """Where the control port would listen. Raises InputError for certificates that cannot be used."""
     if not port.enabled:
         return "off"
     ways = [port.socket or f"{sockets.SOCKET_NAME} beside the run folders"]
@@ -139,7 +127,7 @@ def _port(port: PortConfig) -> str:
 
 
 def _alarms(alarms: AlarmsConfig) -> str:
-    """Who would be told. Raises InputError or DeviceError for what could not be sent."""
+    """Who would get alarms. Raises InputError or DeviceError if they could not be sent."""
     require_sendable(alarms)
     if alarms.urls_file is None:
         return "nobody is told: no alarms.urls_file"
@@ -147,7 +135,7 @@ def _alarms(alarms: AlarmsConfig) -> str:
 
 
 def _geometry(config: Config) -> str:
-    """What the cycles would measure with. Raises InputError for a file that cannot be used."""
+    """The geometry of the cycles. Raises InputError for a file that cannot be used."""
     there = geometry_in_force(config)
     origin = there.origin
     if there.note or not origin.file:

@@ -27,7 +27,7 @@ class FoundDevice:
 
 
 def list_devices(as_json: bool) -> int:
-    """Print everything that was found, and what could not be looked for."""
+    """Print all that was found, and what could not be searched."""
     cameras, missing = find_cameras()
     found = [*find_ports(), *cameras, *find_displays()]
     if as_json:
@@ -45,7 +45,7 @@ def list_devices(as_json: bool) -> int:
 
 
 def find_ports() -> list[FoundDevice]:
-    """Serial ports; by their USB identity where they have one, since that survives a replug."""
+    """Serial ports, by their USB identity if they have one: it survives a replug."""
     return [
         FoundDevice("port", f"{port.path}: {port.description}", f'port = "{port.usb_name or port.path}"')
         for port in serial_ports()
@@ -53,7 +53,7 @@ def find_ports() -> list[FoundDevice]:
 
 
 def find_cameras() -> tuple[list[FoundDevice], list[str]]:
-    """GenICam cameras, and a note when they cannot be looked for."""
+    """GenICam cameras, and a note if they cannot be searched."""
     try:
         cameras = list(aravis.find_cameras())
     except roles.LinkError as error:
@@ -65,7 +65,7 @@ def find_cameras() -> tuple[list[FoundDevice], list[str]]:
 
 
 def find_displays(root: Path = _DRM) -> list[FoundDevice]:
-    """Connected displays, as the kernel knows them: works without a running desktop."""
+    """Connected displays, from the kernel: no desktop need run."""
     found = []
     for status in sorted(root.glob("card*-*/status")):
         if status.read_text(encoding="ascii").strip() != "connected":
@@ -79,18 +79,10 @@ def find_displays(root: Path = _DRM) -> list[FoundDevice]:
     return found
 
 
-# `conformance`: whether a board may be trusted with the pump.
-
-
 def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
-    """Test and report; the exit code is that of a rejected measurement when the board fails.
+    """`conformance`: test a board and report; exits with REJECTED if it fails.
 
-    Raises
-    ------
-    InputError
-        The URL is none.
-    DeviceError
-        The board is not there, went away, or is another program's.
+    Raises InputError for a bad URL, DeviceError if the board does not answer or another program uses it.
     """
     try:
         with locked(modbus_names(url, unit_id)):

@@ -1,4 +1,4 @@
-"""Talks to each device of a configuration once: who it is, what it says, how fast, and what is wrong."""
+"""Talks to each device of a configuration once: identity, reading, latency, problems."""
 
 import asyncio
 import math
@@ -17,7 +17,7 @@ from membrane_ctrl.model.clock import RunClock
 
 _READS = 100
 _LONGEST_S = 2.0  # a slow device gets fewer reads
-_BACK_OFF_S = 0.2  # a bus that the device before could not open is left alone for this long
+_BACK_OFF_S = 0.2  # rest for a bus after a device that could not be opened
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class DeviceProbe:
 
 
 async def probe_board(board: PumpBoard, name: str) -> DeviceProbe:
-    """Look at the board, whoever holds it: nothing is written, so its claim and its watchdog stay as they are."""
+    """Probe the board, whoever controls it: nothing is written, claim and watchdog stay as they are."""
     try:
         identity = await board.identify()
         reading, p50_ms, p99_ms = await _timed(board.read)
@@ -66,7 +66,7 @@ def _board_problem(reading: roles.BenchReading) -> str:
 
 
 async def probe_roles(devices: role_bench.RoleDevices) -> list[DeviceProbe]:
-    """Open, read and close each device, one after the other; a failed one does not hide the next."""
+    """Open, read and close each device in turn; a failed one does not hide the next."""
     reads: dict[str, tuple[Callable[[Any], Callable[[], Awaitable[Any]]], str]] = {
         "displacement": (lambda device: device.displacement, "um"),
         "gauge_pressure": (lambda device: device.gauge_pressure_pa, "Pa"),
@@ -121,17 +121,11 @@ async def _timed(read: Callable[[], Awaitable[Any]]) -> tuple[Any, float, float]
     return value, float(np.percentile(took_ms, 50)), float(np.percentile(took_ms, 99))
 
 
-# Opens camera and screen of a configuration once: who they are, how fast, and what the camera finds wrong.
-
-
 _GRABS = 10
 
 
 def probe_optics(config: Config) -> list[DeviceProbe]:
-    """One probe for camera and screen together, since each is tested with the other; none if none is configured.
-
-    For the main thread only (the screen).
-    """
+    """One probe for camera and screen, which are tested together; none without a camera. For the main thread only."""
     if config.devices is None or config.devices.camera is None:
         return []
     clock = session.WaitingClock(RunClock.start())
@@ -158,7 +152,7 @@ def _where(bench: optical_bench.OpticalBench) -> str:
 
 
 def _grab(bench: optical_bench.OpticalBench) -> tuple[float, float, float]:
-    """Times of a few exposures (p50, p99) in ms, and the median count of the last."""
+    """Times of some exposures (p50, p99) in ms, and the median count of the last."""
     took_ms, median_adu = [], math.nan
     for _ in range(_GRABS):
         begin_s = time.monotonic()

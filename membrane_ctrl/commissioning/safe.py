@@ -1,7 +1,7 @@
-"""`safe`: stops the pump, whoever runs it, and keeps it stopped until a person says otherwise.
+"""`safe`: stops the pump, whatever program runs it, and keeps it stopped until a person clears the latch.
 
-For a person in doubt, and for `ExecStopPost`. It works when the control process is long dead or hangs, and takes
-nothing away from who holds the devices: it neither claims them, nor arms a watchdog, nor opens a sensor.
+For a person in doubt, and for `ExecStopPost`. It works when the control process is dead or hangs. It neither claims
+the devices, nor arms a watchdog, nor opens a sensor.
 """
 
 import asyncio
@@ -24,30 +24,21 @@ from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile
 _CAUSE = "made safe by hand"
 _REMEDY = "ask the person who made it safe whether the mirror may move"
 _LOOK_S = 0.1
-_LAPSE_S = 1.0  # after a watchdog period: a pump that still runs is not going to be stopped by the board
+_LAPSE_S = 1.0  # after a watchdog period: then the board is not going to stop the pump
 
 
 def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: bool = True) -> int:
-    """Stop the pump; the vent stays as it is.
+    """Stop the pump of a configuration that came from `source`; the vent stays as it is.
 
-    Parameters
-    ----------
-    config : Config
-        Whose devices are stopped.
-    source : str
-        Where it came from, for messages.
-    logs_dir : Path, optional
-        The folder of the runs, if it is not the configuration's.
-    latch : bool
-        Keep everybody from running the pump again until a person clears it: at the board, at a running hold and for
-        the next one. Without, a program that has the devices is left alone.
+    With `latch` nobody can run the pump again until a person clears it: at the board, in a running hold and in the
+    next one. Without, a program that has the devices is left alone.
 
     Raises
     ------
     InputError
         The configuration names no devices.
     DeviceError
-        The pump could not be stopped, or not be kept so.
+        The pump could not be stopped, or not be latched.
     """
     if config.devices is None:
         raise InputError(f"{source}: devices: missing; there is nothing to make safe")
@@ -71,7 +62,7 @@ def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: 
 
 @dataclass(frozen=True, slots=True)
 class _Stopped:
-    """What became of the pump; `lasts` if the board itself keeps it stopped."""
+    """The result; `lasts` if the board itself keeps the pump stopped."""
 
     words: str = ""
     problem: str = ""
@@ -121,9 +112,10 @@ def _words(devices: DevicesConfig, reading: BenchReading) -> str:
 
 
 async def _after_a_run(devices: DevicesConfig) -> str:
-    """See to it that the pump stands after a hold has ended, without a latch that would keep the next one down.
+    """Make sure that the pump stands after a hold, without a latch; wait for the board's watchdog after a killed
+    hold.
 
-    A hold that was killed leaves the pump to the board's watchdog, which is waited for. Raises DeviceError.
+    Raises DeviceError.
     """
     if devices.board is None:
         return (await _stop_instrument(devices)).words
@@ -140,7 +132,7 @@ async def _after_a_run(devices: DevicesConfig) -> str:
 
 
 async def _standing(board: PumpBoard, watchdog_s: float) -> BenchReading:
-    """The reading of a pump that stands; one that runs on beyond the watchdog is stopped, which latches."""
+    """The reading of a stopped pump; one that runs on beyond the watchdog is stopped, which latches."""
     for _ in range(math.ceil((watchdog_s + _LAPSE_S) / _LOOK_S)):
         if (reading := await board.read()).pump_fraction == 0.0:
             return reading
@@ -150,7 +142,7 @@ async def _standing(board: PumpBoard, watchdog_s: float) -> BenchReading:
 
 
 def _hold_told(config: Config, folder: Path) -> str:
-    """Have a running hold latch; what came of it, empty if none answers."""
+    """Make a running hold latch; returns the result, empty if none answers."""
     path = Path(config.port.socket) if config.port.socket else folder / sockets.SOCKET_NAME
     if not config.port.enabled or not path.exists():
         return ""
@@ -168,7 +160,7 @@ def _hold_told(config: Config, folder: Path) -> str:
 
 
 def _keep(file: LatchedFile) -> None:
-    """No hold before a person clears it. Raises DeviceError."""
+    """Write the latch: no hold before a person clears it. Raises DeviceError."""
     now = datetime.now(UTC).isoformat(timespec="seconds")
     try:
         file.path.parent.mkdir(parents=True, exist_ok=True)

@@ -10,7 +10,7 @@ import tomli_w
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.errors import InputError, os_reason
 from membrane_ctrl.model.files import read_text
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -22,21 +22,9 @@ _QUOTED_PART = re.compile(r"""["']\s*\.""")
 
 
 def load(path: Path, model: type[Model], follow: bool = True) -> Model:
-    """Read and validate a TOML file.
+    """Read a TOML file as `model`; `follow` is False in a folder from an untrusted source (`model.files`).
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    model : type
-        What it must hold (`config.Config` for a run).
-    follow : bool
-        The file is the user's own; False for one in a folder from an untrusted source (`model.files`).
-
-    Raises
-    ------
-    InputError
-        One line that names the file, the field and what would be right.
+    Raises InputError with one line that names the file, the field and what would be right.
     """
     tables = read_toml(path, follow)
     optics = tables.get("optics")
@@ -59,20 +47,15 @@ def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
     except PermissionError:
         raise InputError(f"{path}: no permission to read it") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({_small(error.strerror or str(error))})") from None
+        raise InputError(f"{path}: cannot be read ({os_reason(error)})") from None
     except RecursionError:
         raise InputError(f"{path}: not valid TOML: nested too deep") from None
     except ValueError as error:  # of TOML, of UTF-8, of a number with thousands of digits
         raise InputError(f"{path}: not valid TOML: {error}") from None
 
 
-def _small(text: str) -> str:
-    """The text within a sentence."""
-    return text[:1].lower() + text[1:]
-
-
 def _too_many_parts(line: str) -> bool:
-    """Whether a line may hold such a key: too many dots between commas, which stand in a key only if it is quoted."""
+    """Whether a line may hold such a key: too many dots between commas (a key has commas only in quotes)."""
     if line.count(".") <= _PARTS_MAX or line.lstrip().startswith("#"):
         return False
     dots = max(piece.count(".") for piece in line.split(","))
@@ -80,12 +63,9 @@ def _too_many_parts(line: str) -> bool:
 
 
 def with_height_map(geometry: Any, where: Path, follow: bool = True) -> None:
-    """Put the numbers of `screen.height_map.file` in its place, in the tables of a geometry that came from `where`.
+    """Replace `screen.height_map.file` by its numbers, in the tables of a geometry that came from `where`.
 
-    Raises
-    ------
-    InputError
-        If there is no such file, or if it holds anything but rows of numbers.
+    Raises InputError if the file is missing or holds anything but rows of numbers.
     """
     screen = geometry.get("screen") if isinstance(geometry, dict) else None
     table = screen.get("height_map") if isinstance(screen, dict) else None
@@ -115,7 +95,7 @@ def parse(tables: dict[str, Any], model: type[Model], where: str) -> Model:
 
 
 def prune(table: dict[str, Any], model: type[BaseModel], prefix: str = "") -> tuple[str, ...]:
-    """Take out keys that are not known, so that a newer writer's sets are read; returns their names."""
+    """Remove unknown keys, so that sets of newer versions can be read; returns their names."""
     ignored: list[str] = []
     known = {(field.alias or name): field.annotation for name, field in model.model_fields.items()}
     for key in list(table):
@@ -161,15 +141,15 @@ def _hint(word: str, known: list[str]) -> str:
 
 
 def _telling(errors: list[ErrorDetails]) -> ErrorDetails:
-    """The error that says most: a key that is not known is often the misspelt one that another error misses."""
+    """The most helpful error: an unknown key is often the misspelt one that another error misses."""
     misspelt = [error for error in errors if error["type"] == "extra_forbidden"]
     return misspelt[0] if misspelt and errors[0]["type"] == "missing" else errors[0]
 
 
 def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[int | str], type[BaseModel] | None]:
-    """The path of a key as in the file, and the section that it is in; None if that is not known.
+    """The path of a key as in the file, and its section (None if unknown).
 
-    In a location, the tag of a union's member (`driver = "ventus"`) stands between the table and its key.
+    In `location`, the tag of a union's member (`driver = "ventus"`) stands between the table and its key.
     """
     path: list[int | str] = []
     inside: type[BaseModel] | None = model

@@ -10,20 +10,17 @@ from membrane_ctrl.console.why import duration, why
 from membrane_ctrl.control.film_health import JUDGE_S, TOO_TIGHT_UM_PER_S
 from membrane_ctrl.model import events, run_events, run_status, shape_estimate, states, telemetry
 
-# The last minute of a signal, second by second.
-
-
 MINUTE_S = 60
 
 
 class Trend:
-    """Means over whole seconds of the run's clock, for the last minute."""
+    """The last minute of a signal, by whole seconds of the run's clock."""
 
     def __init__(self) -> None:
         self._seconds: deque[tuple[int, list[float]]] = deque(maxlen=MINUTE_S)
 
     def add(self, mono_s: float, value: float) -> None:
-        """Take one value; NaN leaves a gap."""
+        """Add a value; NaN leaves a gap."""
         second = math.floor(mono_s)
         if not self._seconds or self._seconds[-1][0] != second:
             self._seconds.append((second, []))
@@ -31,7 +28,7 @@ class Trend:
             self._seconds[-1][1].append(value)
 
     def means(self) -> tuple[float, ...]:
-        """Mean of each of the last 60 s, oldest first; NaN where there is none."""
+        """Mean of each of the last 60 s, oldest first; NaN for a gap."""
         if not self._seconds:
             return (math.nan,) * MINUTE_S
         newest = self._seconds[-1][0]
@@ -46,21 +43,17 @@ class Trend:
         return [value for second, values in self._seconds if second >= oldest for value in values]
 
 
-# The tick runs at 50 Hz, the console at 5: a row this old means that the control process stands still.
-SILENT_S = 1.0
+SILENT_S = 1.0  # without a row for so long the control process hangs
 
 
 @dataclass(frozen=True, slots=True)
 class ShapeView:
-    """The last measurement cycle, and the loop that follows it.
-
-    `sag_change_um` is against the first usable estimate of the hold; `note` says what is not as it should be.
-    """
+    """The last measurement cycle and the shape loop; `note` says what is wrong."""
 
     state: states.ShapeState
     estimate: shape_estimate.ShapeEstimate | None
     age_s: float
-    sag_change_um: float
+    sag_change_um: float  # since the first usable estimate of the hold
     trim_um: float
     cycles: int
     rejected: int
@@ -93,7 +86,7 @@ class ConsoleView:
 
 
 class ConsoleModel:
-    """Takes what arrives and remembers what the console needs of it."""
+    """Remembers what the console shows of rows, events and shapes."""
 
     def __init__(self, config: Config, duration_s: float | None = None) -> None:
         self._config = config
@@ -109,7 +102,7 @@ class ConsoleModel:
 
     @property
     def ended(self) -> bool:
-        """The event that ends a run has been seen."""
+        """The event that ends a run has come."""
         return self._status.ended
 
     def take_row(self, row: telemetry.TelemetryRow) -> None:
@@ -198,7 +191,7 @@ def _acquisition_words(said: run_events.AcquisitionState | None) -> str:
 
 
 def text(line: events.EventLine) -> str:
-    """The words of an event for a person: its name if it has one, its reason, and what was seen."""
+    """An event's name, reason and observed value, as far as it has them."""
     name = str(line.get("name", "")).replace("_", " ")
     reason = next((str(line[key]) for key in ("why", "reason", "cause", "message") if line.get(key)), "")
     seen = f" ({line['seen']})" if line.get("seen") else ""

@@ -18,7 +18,7 @@ _EIGHTHS = " ▁▂▃▄▅▆▇█"
 
 
 def level_bar(fraction: float, width: int, style: str = "cyan") -> Text:
-    """A horizontal bar filled to `fraction` (0..1; NaN is empty) of `width` characters."""
+    """A bar of `width` characters, filled to `fraction` (0..1; NaN is empty)."""
     filled = round(min(max(fraction, 0.0), 1.0) * width) if math.isfinite(fraction) else 0
     return Text("█" * filled, style=style) + Text("░" * (width - filled), style="dim")
 
@@ -26,14 +26,8 @@ def level_bar(fraction: float, width: int, style: str = "cyan") -> Text:
 def signed_bars(values: Sequence[float], full: float, band: float) -> tuple[Text, Text]:
     """A history as bars that stand on (upper line) and hang from (lower line) a common zero.
 
-    Parameters
-    ----------
-    values : sequence of float
-        One bar each; NaN is a gap. Zero is the thinnest bar upward, so that it differs from a gap.
-    full : float
-        Value of a bar of full height, to either side.
-    band : float
-        Bars beyond it are red, the others green.
+    `full` is the value of a bar of full height; bars beyond `band` are red, the others green. NaN is a gap, zero the
+    thinnest bar upward.
     """
     upper, lower = Text(), Text()
     for value in values:
@@ -48,7 +42,7 @@ def signed_bars(values: Sequence[float], full: float, band: float) -> tuple[Text
             lower.append(" ")
         else:
             upper.append(" ")
-            # there are no characters that hang: the rest of the cell is drawn in the background's colour instead
+            # no characters hang: the rest of the cell is drawn in the background's colour
             lower.append(_EIGHTHS[8 - eighths], Style(color=colour, reverse=True))
     return upper, lower
 
@@ -119,7 +113,7 @@ def _figures(view: ConsoleView, config: Config) -> Table:
     table.add_row("", "")
     table.add_row("lateness", _lateness(view, row))
     table.add_row("faults", _faults(view))
-    if view.recording:  # one line: of a full disk every file complains, and the faults must stay in sight
+    if view.recording:  # one line: with a full disk every file complains
         table.add_row("recorder", Text(view.recording, style="bold yellow", no_wrap=True, overflow="ellipsis"))
     return table
 

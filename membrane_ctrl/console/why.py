@@ -20,8 +20,7 @@ _STATES = {
     State.LOWER: "pump is being stopped: the run is ending",
     State.FAULT: "pump is off: a person must clear the latched fault",
 }
-# Below this share of the flow that holds the mirror a contribution is not worth naming.
-_WORTH_NAMING = 0.03
+_WORTH_NAMING = 0.03  # of the flow: smaller contributions are not named
 
 
 def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
@@ -51,7 +50,7 @@ def _outside(row: TelemetryRow) -> str:
 
 
 def _balance(row: TelemetryRow) -> str:
-    """What the flow is made of, the largest first."""
+    """The contributions to the flow, the largest first."""
     parts = {
         "leak": row.i_um_per_s,  # in the mean the integrator's part is what leaks
         "error": row.p_um_per_s,

@@ -11,8 +11,7 @@ from dataclasses import replace
 from firmware_iface.roles import ALL_FAULTS, BenchCommand
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control import inner_loop, shape_loop
-from membrane_ctrl.control.experiments.machine import Finished
-from membrane_ctrl.control.experiments.trial import Trial
+from membrane_ctrl.control.experiments import machine, trial
 from membrane_ctrl.controller import (
     commands,
     pump_obeys,
@@ -27,7 +26,6 @@ from membrane_ctrl.controller.scene import Scene, telemetry_row
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.model import arrays, errors
 from membrane_ctrl.model import events as told
-from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.states import Rung, State
 
 # the loop's time step is clamped to this range of the nominal one; beyond it is a missed tick, which safety sees
@@ -74,7 +72,7 @@ class Controller:
     def tick(self, inputs: TickInputs) -> TickOutputs:
         """Run one tick. Never raises: an exception in a handler becomes a fault in the next tick."""
         scene = self._scene
-        events: list[Event] = []
+        events: list[told.Event] = []
         self._begin(inputs, events)
         last = scene.output or inner_loop.NO_OUTPUT
         error_um = last.error_um if self.state in safety_rules.MOVING else math.nan
@@ -127,7 +125,7 @@ class Controller:
             clear_mask=self._clear_mask,
         )
 
-    def _begin(self, inputs: TickInputs, events: list[Event]) -> None:
+    def _begin(self, inputs: TickInputs, events: list[told.Event]) -> None:
         scene = self._scene
         self._ticks += 1
         nominal_s = 1.0 / self._config.loop.rate_hz
@@ -146,7 +144,7 @@ class Controller:
         if self._gains.overdue(scene.now_s):
             self._revert_gains("nobody kept them in time", events)
 
-    def _obey(self, command: commands.Command, obeyed: Collection[str], events: list[Event]) -> bool:
+    def _obey(self, command: commands.Command, obeyed: Collection[str], events: list[told.Event]) -> bool:
         """Do what a command asks, or refuse it; either is recorded with who asked and why."""
         refused = (
             commands.refusal(command, self.state, self._config)
@@ -220,7 +218,7 @@ class Controller:
             return ""
         centre_um = scene.setpoint_um + scene.trim_um
         try:
-            scene.trial = Trial(spec, scene.loop_config, self._config.pump, centre_um)
+            scene.trial = trial.Trial(spec, scene.loop_config, self._config.pump, centre_um)
         except ValueError as error:
             return str(error)
         scene.hold_wanted = False
@@ -230,7 +228,7 @@ class Controller:
         self._scene.loop_config = loop
         self._scene.loop.set_gains(loop)
 
-    def _revert_gains(self, why: str, events: list[Event]) -> None:
+    def _revert_gains(self, why: str, events: list[told.Event]) -> None:
         self._set_gains(self._gains.revert())
         events.append(told.GainsReverted(why))
 
@@ -245,7 +243,7 @@ class Controller:
         scene.resume_possible = resume.possible
         self._clear_mask |= resume.clear_mask
 
-    def _apply(self, verdict: safety.Verdict, events: list[Event]) -> None:
+    def _apply(self, verdict: safety.Verdict, events: list[told.Event]) -> None:
         """Enter the safe level of the verdict; every level below HOLD_FLOW latches the fault."""
         scene, levels = self._scene, self._scene.levels
         rule = verdict.rule
@@ -262,7 +260,7 @@ class Controller:
         if levels.step(scene.now_s) > Rung.HOLD_FLOW and self.state != State.FAULT:
             self._go(State.FAULT, f"{self.fault.name}: {self.fault.cause}", events)
 
-    def _step_shape(self, inputs: TickInputs, events: list[Event]) -> shape_loop.ShapeOutput:
+    def _step_shape(self, inputs: TickInputs, events: list[told.Event]) -> shape_loop.ShapeOutput:
         scene = self._scene
         settled = self.state == State.HOLD and scene.levels.rung == Rung.NONE
         shape = self._shape.step(
@@ -280,7 +278,7 @@ class Controller:
             events.append(told.ShapeLoopState(shape.state.name.lower(), shape.reason))
         return shape
 
-    def _act(self, events: list[Event]) -> None:
+    def _act(self, events: list[told.Event]) -> None:
         """Run the state's handler with everything off unless it says otherwise."""
         scene = self._scene
         scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, 0.0
@@ -301,7 +299,7 @@ class Controller:
         if wanted != self.state:
             self._go(wanted, scene.why, events)
 
-    def _go(self, state: State, why: str, events: list[Event]) -> None:
+    def _go(self, state: State, why: str, events: list[told.Event]) -> None:
         scene = self._scene
         events.append(told.StateEntered(state.name.lower(), self.state.name.lower(), why))
         if self.state == State.TUNE:
@@ -326,14 +324,16 @@ class Controller:
         scene.overdue = scene.unfit = ""
         scene.test = None
 
-    def _tell_trial(self, why: str, events: list[Event]) -> None:
+    def _tell_trial(self, why: str, events: list[told.Event]) -> None:
         """How the experiment ended: by itself, or because the state was left."""
-        trial = self._scene.trial
-        assert trial is not None
-        ended = self._scene.trial_ended or Finished(False, why)
-        events.append(told.ExperimentEnded(trial.spec.kind, ended.completed, ended.reason, trial.pump_map()))
+        experiment = self._scene.trial
+        assert experiment is not None
+        ended = self._scene.trial_ended or machine.Finished(False, why)
+        events.append(
+            told.ExperimentEnded(experiment.spec.kind, ended.completed, ended.reason, experiment.pump_map())
+        )
 
-    def _tell_why(self, events: list[Event]) -> None:
+    def _tell_why(self, events: list[told.Event]) -> None:
         """Report the operator's line when its words (not its numbers) have changed for good."""
         scene = self._scene
         words = scene.why.translate(_NO_DIGITS)

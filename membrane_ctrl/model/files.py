@@ -1,11 +1,9 @@
-"""Files in folders that may come from a stranger: plain files alone, no link followed, nothing read without a bound.
+"""Files in folders that may come from a stranger: plain files only, no link followed, every read bounded.
 
-A run folder or a capture set travels: by mail, on a stick, out of an archive. Whatever lies in one is opened through
-a handle of its folder and without following a link, so that a link in it leads nowhere, neither to read nor to write.
-What is written is the old file or the whole new one, also after a power cut.
+A run folder or a capture set may come by mail or in an archive. Its files are opened through a handle of the folder
+and without following links. A write leaves the old file or the whole new one, also after a power cut.
 
-The folder itself is given by who knows it (a command resolves the path that the user named); its subfolders and
-files are the stranger's.
+The folder itself is trusted (a command resolves the path that the user named); its subfolders and files are not.
 """
 
 import contextlib
@@ -41,18 +39,9 @@ def folder_handle(folder: Path) -> Iterator[int]:
 
 
 def open_plain(path: Path, follow: bool = False) -> BinaryIO:
-    """A plain file, opened for reading.
+    """A plain file, opened for reading; `follow` links of a path that the user named.
 
-    Parameters
-    ----------
-    path : Path
-    follow : bool
-        The path is the user's own (a configuration that was named): links on the way are meant.
-
-    Raises
-    ------
-    OSError
-        Not there, a link, a link in place of its folder, or no plain file; `strerror` says which.
+    Raises OSError if it is missing, a link, in a linked folder, or no plain file; `strerror` says which.
     """
     with contextlib.ExitStack() as stack:
         if follow:
@@ -64,7 +53,7 @@ def open_plain(path: Path, follow: bool = False) -> BinaryIO:
 
 
 def read_bytes(path: Path, most_bytes: int, follow: bool = False) -> bytes:
-    """All of a plain file. Raises OSError as `open_plain`, and for a file of more than `most_bytes`."""
+    """The content of a plain file. Raises OSError as `open_plain`, and for more than `most_bytes`."""
     with open_plain(path, follow) as file:
         size = os.fstat(file.fileno()).st_size
         data = file.read(size) if size <= most_bytes else b""  # of one that grows, what there was
@@ -76,12 +65,12 @@ def read_bytes(path: Path, most_bytes: int, follow: bool = False) -> bytes:
 
 
 def read_text(path: Path, most_bytes: int = SMALL_BYTES, errors: str = "strict", follow: bool = False) -> str:
-    """The same as text. Raises UnicodeDecodeError, too, unless `errors` says otherwise."""
+    """The same as text. Raises UnicodeDecodeError as well, unless `errors` says otherwise."""
     return read_bytes(path, most_bytes, follow).decode("utf-8", errors)
 
 
 def users(path: Path) -> Path:
-    """A path that the user named: links on the way to it are meant. The file itself is replaced, link or not."""
+    """A path that the user named, with the links of its folder resolved; the file itself is replaced, link or not."""
     return path.parent.resolve() / path.name
 
 
@@ -110,7 +99,7 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
 
 
 def fresh_file(path: Path) -> BinaryIO:
-    """A new file for what is written bit by bit, in place of one that is there. Raises OSError."""
+    """A new file for piecewise writing, in place of an old one. Raises OSError."""
     with folder_handle(path.parent) as folder:
         return _fresh(path.name, folder, path)
 
@@ -121,7 +110,7 @@ def fresh_text(path: Path) -> TextIO:
 
 
 def append_text(path: Path, text: str) -> None:
-    """Append to a plain file of one name, made if it is not there. Raises OSError."""
+    """Append to a plain file without hard links; make it if missing. Raises OSError."""
     with folder_handle(path.parent) as folder:
         descriptor = _plain(_opened(path, _APPEND, folder), path)
         with os.fdopen(descriptor, "ab") as file:
@@ -132,7 +121,7 @@ def append_text(path: Path, text: str) -> None:
 
 
 def move(source: Path, target: Path) -> None:
-    """Put a file in the place of another, which may be a link: it goes, what it leads to stays. Raises OSError."""
+    """Replace a file, or a link but not its target, by another file. Raises OSError."""
     with folder_handle(source.parent) as from_folder, folder_handle(target.parent) as folder:
         try:
             os.replace(source.name, target.name, src_dir_fd=from_folder, dst_dir_fd=folder)
@@ -147,7 +136,7 @@ def remove(path: Path) -> None:
 
 
 def make_folder(path: Path) -> Path:
-    """Make a folder, and those above it, unless it is there. Raises OSError for a link in its place."""
+    """Make a folder and its parents, if missing. Raises OSError for a link in its place."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileExistsError):
         path.mkdir()
@@ -157,7 +146,7 @@ def make_folder(path: Path) -> Path:
 
 @contextlib.contextmanager
 def scratch_folder(folder: Path, prefix: str) -> Iterator[Path]:
-    """A folder of nobody else's within a folder, for programs that write by name; gone at the end. Raises OSError."""
+    """A private temporary folder within a folder, for programs that write by name. Raises OSError."""
     with folder_handle(folder), tempfile.TemporaryDirectory(prefix=prefix, dir=folder) as scratch:
         yield Path(scratch)
 
@@ -193,7 +182,7 @@ def _plain(descriptor: int, path: Path) -> int:
 
 
 def _told(error: OSError, path: Path) -> OSError:
-    """What a refused link means; Linux says it in two ways, and names neither folder nor link."""
+    """An error in words: Linux reports a refused link in two ways, and names neither folder nor link."""
     if path.is_symlink():
         return OSError(errno.ELOOP, "a link, and links are not followed here", str(path))
     if error.errno == errno.ENXIO:  # a pipe without a reader, a socket

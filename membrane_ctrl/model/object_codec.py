@@ -1,9 +1,8 @@
 """Objects of our own classes as plain data for JSON, and back, exact to the last bit.
 
-What may come back is what the classes declare: the fields of a dataclass, and of another class the attributes that
-an example has, by the types that its methods annotate (`self.x: T = ...`) or else by those of the example's values. A
-reader makes nothing but these, calls no constructor, and refuses an attribute that is missing, unknown or of another
-type, so that memory of another layout is not half understood.
+The reader makes only what the classes declare: the fields of a dataclass; of another class the attributes of an
+example, by the types that its methods annotate (`self.x: T = ...`) or else by those of the example's values. It calls
+no constructor, and refuses an attribute that is missing, unknown or of another type.
 """
 
 import ast
@@ -101,14 +100,9 @@ def _special(kind: type, specials: Specials) -> Special | None:
 
 
 class Decoder:
-    """Makes objects of `encode`'s data.
+    """Makes objects of `encode`'s data; `examples` has an object of every class that is no dataclass.
 
-    Parameters
-    ----------
-    examples : tuple of objects
-        Of every class that is no dataclass, one. Raises TypeError for an attribute whose type they do not show.
-    specials : mapping
-        As for `encode`.
+    Raises TypeError for an attribute whose type the examples do not show.
     """
 
     def __init__(self, examples: tuple[object, ...], specials: Specials) -> None:
@@ -136,7 +130,7 @@ class Decoder:
                 self._learn(value)
 
     def _learn_hint(self, hint: Any) -> None:
-        """Dataclasses that no example has, such as the result of a test that has not been run."""
+        """Learn dataclasses that no example holds, such as the result of a test that has not run."""
         for part in get_args(hint):
             self._learn_hint(part)
         if not isinstance(hint, type) or hint in self._classes or self._is_leaf(hint) or not is_dataclass(hint):
@@ -235,7 +229,7 @@ def _declared(kind: type) -> dict[str, Any]:
 
 
 def _type_of(value: Any, where: str) -> Any:
-    """The type of an attribute that nobody has declared; what is None or empty does not show it."""
+    """The type of an undeclared attribute, from a value that is neither None nor empty."""
     kind = type(value)
     if kind is tuple and value:
         return tuple[tuple(_type_of(item, where) for item in value)]  # type: ignore[misc]

@@ -1,7 +1,7 @@
-"""JSON that every reader accepts, and reading of JSON that anybody may have written.
+"""JSON for every reader, and safe reading of foreign JSON.
 
-Written: numbers that JSON has no word for (NaN, infinity) are null. Read: what is deeper or longer than anything of
-ours is refused before it takes memory or the stack.
+NaN and infinity are written as null. Text that is deeper or longer than any of ours is refused before it takes memory
+or the stack.
 """
 
 import hashlib
@@ -57,12 +57,9 @@ def _finite(value: Any) -> Any:
     return value
 
 
-# Checksums of the small files of a run, which stay what they were: JSON objects, and a TOML file with a comment.
-#
-# A JSON object gets a last member `crc32`, of its values and not of its spelling: written anew by another program it
-# is still right. The configuration gets a first line, a comment, of the text behind it. What has no checksum (an
-# earlier version, a note made later) is taken as it is.
-
+# Checksums of the small files of a run. A JSON object gets a last member `crc32`, of its values and not of its
+# spelling: another program may rewrite it. The configuration gets a first line, a comment, with that of its text.
+# What has no checksum (of an earlier version, a later note) is accepted.
 
 KEY = "crc32"
 _COMMENT = "# as run; CRC-32 of the text below: "
@@ -76,18 +73,18 @@ def dumps_checked(table: dict[str, Any], indent: int | None = None) -> str:
 
 
 def take_checksum(table: dict[str, Any]) -> bool:
-    """Take the checksum out of an object that was read; whether it was right, or there was none."""
+    """Remove the checksum of an object that was read; True if it was right or missing."""
     said = table.pop(KEY, None)
     return said is None or said == _crc(table)
 
 
 def with_comment(text: str) -> str:
-    """A text behind its checksum."""
+    """The text, with its checksum in front."""
     return f"{_COMMENT}{zlib.crc32(text.encode()):08x}\n{text}"
 
 
 def comment_is_right(text: str) -> bool:
-    """Whether a text is what its first line says; True without such a line."""
+    """Whether the checksum in the first line is right; True without one."""
     line = _LINE.match(text)
     if line is None:
         return not text.startswith(_COMMENT)
@@ -98,15 +95,12 @@ def _crc(table: dict[str, Any]) -> str:
     return f"{zlib.crc32(json.dumps(table, sort_keys=True, separators=(',', ':')).encode()):08x}"
 
 
-# The hash by which results and runs name the geometry that they were made with.
-
-
 SCHEMA = "membrane-geometry/1"
 _HASHED = ("geometry", "covariance", "parameters", "camera", "pattern")
 
 
 def content_hash(tables: Mapping[str, Any]) -> str:
-    """Sixteen digits that stand for the numbers in a geometry's tables, whatever their order or layout."""
+    """Sixteen digits that name a geometry in results and runs, whatever the order or layout of its tables."""
     content = {key: tables[key] for key in _HASHED if key in tables}
     text = json.dumps(content, sort_keys=True, default=list)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

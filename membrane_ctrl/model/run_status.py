@@ -9,8 +9,7 @@ from dataclasses import dataclass, field, replace
 from membrane_ctrl.model import events, run_events, telemetry
 
 _GONE = "no recorder runs"
-# Of one trouble: it goes into one line of a screen and of a log, each second; the event has all of it
-_LONGEST = 300
+_LONGEST = 300  # letters of one trouble in the status; the event has all
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +76,7 @@ def _recording(standing: Mapping[str, str], event: events.Event) -> Mapping[str,
         case run_events.ChildEnded(child="recorder") | run_events.ChildGivenUp(child="recorder"):
             return {**standing, "recorder": _GONE}
         case run_events.ChildRestarted(child="recorder"):
-            return {}  # the next one says anew what still stands
+            return {}  # the next one reports what still stands
     return standing
 
 

@@ -1,8 +1,8 @@
-"""The small result of a measurement cycle, and the bytes in which it crosses to control, recorder and session.
+"""The result of a measurement cycle, and its bytes for control, recorder and sessions.
 
-The ring of shapes and a run's inputs file hold the same bytes: one line of JSON with the numbers and words, then the
-coefficients, then the covariance (of a symmetric one the upper half). A reader checks every length, type and range
-first, because a run folder may come from anywhere.
+The ring of shapes and a run's inputs file hold the same bytes: a line of JSON with numbers and words, the
+coefficients, the covariance (the upper half of a symmetric one). A reader checks every length, type and range first,
+because a run folder may come from anywhere.
 """
 
 import json
@@ -96,7 +96,8 @@ def unpack_estimate(data: bytes) -> ShapeEstimate:
 
 
 def _checked(head: Any) -> tuple[bool, bool]:
-    """Whether the covariance is symmetric and in singles; leaves the estimate's own fields. Raises ValueError."""
+    """Whether the covariance is symmetric and in singles; reduces `head` to the estimate's fields. Raises
+    ValueError."""
     if not isinstance(head, dict) or not set(head) <= _KEYS:
         raise ValueError("shape estimate: its first line names other fields")
     layout = (head.pop("terms", None), head.pop("symmetric", None), head.pop("single", None))
@@ -118,9 +119,6 @@ def _checked(head: Any) -> tuple[bool, bool]:
     if not isinstance(head.setdefault("tracking_lost", False), bool):
         raise ValueError("shape estimate: tracking_lost is neither true nor false")
     return layout[1], layout[2]
-
-
-# What one cycle's numbers say about it: a pure table of limits.
 
 
 # Fringes weaker than this share of the sensor's range: at 2 % (5 of 255) the noise of the phase passes 0.06 rad a

@@ -70,15 +70,12 @@ _STRUCT = struct.Struct(f"<{len(FIELDS)}d")
 ROW_BYTES = _STRUCT.size
 
 
-# Telemetry rows as a table: messages of the telemetry ring in, one NumPy column a field out.
-
-
 Rows = FloatArray
 COLUMN: dict[str, int] = {name: place for place, name in enumerate(FIELDS)}
 
 
 def unpack(messages: Sequence[bytes]) -> Rows:
-    """(n, len(FIELDS)) table of packed `TelemetryRow`s, in their order."""
+    """Packed `TelemetryRow`s as a table (n, len(FIELDS))."""
     return np.frombuffer(b"".join(messages), dtype="<f8").reshape(-1, len(FIELDS))
 
 

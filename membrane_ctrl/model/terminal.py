@@ -1,8 +1,7 @@
-"""What may reach a terminal: text and line ends. The edge through which every command prints.
+"""What may reach a terminal: text and line ends. Every command prints through this module.
 
-Text comes out of files and off the network. A terminal obeys control bytes in it (it moves the cursor, sets the
-title, answers as if typed), and bidirectional marks show a line in another order than it is in. Here each such
-character becomes its JSON escape, so that what is printed as JSON stays JSON and keeps its meaning.
+Text from files and the network may hold control bytes, which a terminal obeys, and bidirectional marks, which change
+the order of a line. Each such character becomes its JSON escape, so that JSON stays JSON and keeps its meaning.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ if TYPE_CHECKING:  # a command that draws no table need not load it
     from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderableType, RenderResult
 
 
-# Control, invisible and direction marks, halves of a pair, and the two line ends that no terminal shows.
+# control, invisible and direction marks, surrogates, and two line ends that terminals do not show
 _REFUSED = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 _KEPT = frozenset("\n\t")
 
@@ -38,7 +37,7 @@ def one_line(text: str) -> str:
 
 @contextlib.contextmanager
 def only_text() -> Iterator[None]:
-    """Within it nothing printed, by whatever part of the program, is more than text."""
+    """Within it, whatever is printed by any part of the program is only text."""
     with (
         contextlib.redirect_stdout(cast("TextIO", _Text(sys.stdout))),
         contextlib.redirect_stderr(cast("TextIO", _Text(sys.stderr))),
@@ -56,7 +55,7 @@ def table_console(stderr: bool = False, width: int | None = None) -> Console:
 
 
 class Plain:
-    """What Rich draws, without control characters; for a `Live`, which draws past a console's hooks."""
+    """What Rich draws, without control characters; for a `Live`, which bypasses a console's hooks."""
 
     def __init__(self, inner: RenderableType) -> None:
         self._inner = inner
@@ -104,14 +103,11 @@ def _escape(letter: str) -> str:
     return "".join(f"\\u{int.from_bytes(units[k : k + 2]):04x}" for k in range(0, len(units), 2))
 
 
-# A command that is ended from outside cleans up behind itself, as it does after Ctrl-C.
-
-
 @contextlib.contextmanager
 def ends_as_by_ctrl_c() -> Iterator[None]:
-    """SIGTERM and SIGHUP raise KeyboardInterrupt inside: temporary files go, viewers end.
+    """SIGTERM and SIGHUP raise KeyboardInterrupt inside, so that the command cleans up.
 
-    A SIGHUP that is ignored stays so: `nohup` asks to go on without the terminal.
+    An ignored SIGHUP stays ignored: `nohup` asks to go on without the terminal.
     """
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
     for number, handler in before.items():

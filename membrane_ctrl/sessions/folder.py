@@ -12,8 +12,7 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from membrane_ctrl.config import schema
-from membrane_ctrl.config import toml_file as config_file
+from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.model import errors, files, plain_json
 
 # Results of steps as plain JSON and back: dataclasses, configuration sections, arrays, tuples and numbers.
@@ -186,7 +185,7 @@ def create_session(
     head = SessionHead(FORMAT, name, author, source, now.isoformat(timespec="seconds"), before)
     try:
         write(path / "session.json", head)
-        files.write_text_atomic(path / "config.toml", config_file.dump(config))
+        files.write_text_atomic(path / "config.toml", toml_file.dump(config))
     except OSError as error:
         raise errors.DeviceError(f"{logs}: cannot be written ({errors.os_reason(error)})") from None
     return SessionFolder(path, head, config)
@@ -197,7 +196,7 @@ def open_session(path: Path) -> SessionFolder:
     head = read(path / "session.json", SessionHead)
     if head.format != FORMAT:
         raise errors.InputError(f"{path}/session.json: format {head.format!r}, {FORMAT!r} is known")
-    return SessionFolder(path, head, config_file.load(path / "config.toml", schema.Config))
+    return SessionFolder(path, head, toml_file.load(path / "config.toml", schema.Config))
 
 
 def sessions_in(logs: Path) -> list[Path]:

@@ -12,8 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Protocol
 
-from membrane_ctrl.config import schema
-from membrane_ctrl.config import toml_file as config_file
+from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model import errors, run_events, shape_estimate, telemetry
@@ -87,7 +86,7 @@ class LiveHold:
         if client.greeting["run"] != run_dir.resolve().name:
             raise errors.InputError(f"{run_dir}: is not running; {client.greeting['run']} is")
         loop = schema.LoopConfig.model_validate(client.ask(do="status")["loop"])
-        config = config_file.load(run_dir / "config.toml", schema.Config)
+        config = toml_file.load(run_dir / "config.toml", schema.Config)
         self.config = config.model_copy(update={"loop": loop})
         self.name, self.run_dir = run_dir.name, run_dir
         try:
