@@ -130,7 +130,7 @@ def _plugins(apprise: Any, path: Path) -> list[Any]:
     for number, url in enumerate(read_urls(path), start=1):
         plugin = apprise.Apprise.instantiate(url)
         if plugin is None:
-            raise errors.InputError(f"{path}: URL {number} is none that Apprise knows")
+            raise errors.InputError(f"{path}: URL {number} is not known to Apprise")
         plugins.append(plugin)
     return plugins
 

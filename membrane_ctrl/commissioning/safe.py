@@ -151,7 +151,7 @@ def _hold_told(config: Config, folder: Path) -> str:
             answer = hold.ask(do="latch", text=_CAUSE, why="membrane-ctrl safe")
             run = str(hold.greeting.get("run", ""))
     except DeviceError as error:
-        print(f"the running hold was not told: {error}", file=sys.stderr)
+        print(f"the running hold could not be latched: {error}", file=sys.stderr)
         return ""
     if not answer.get("ok"):
         print(f"the running hold refused to latch: {answer.get('refused', '')}", file=sys.stderr)
@@ -167,5 +167,5 @@ def _keep(file: LatchedFile) -> None:
         file.add(LatchedFault("locked", _CAUSE, f"by {getpass.getuser()}", _REMEDY, now, "none"))
     except OSError as error:
         reason = os_reason(error)
-        raise DeviceError(f"{file.path}: the pump is stopped, but this could not be written ({reason})") from None
+        raise DeviceError(f"{file.path}: the pump is stopped, but not latched ({reason})") from None
     print(f"{file.path}: no hold before `membrane-ctrl hold --clear-faults` or `ctl ack`", file=sys.stderr)

@@ -32,12 +32,12 @@ class DevicesConfig(settings.Section):
     def _board_or_roles(self) -> "DevicesConfig":
         filled = [role for role in ROLES if getattr(self, role) is not None]
         if self.board is not None and filled:
-            raise ValueError(f"give either board, or one table a role; not board and {filled[0]}")
+            raise ValueError(f"give either board, or a table for each role; not board and {filled[0]}")
         if self.board is None and not filled:
-            raise ValueError('name the pump board, board = "tcp://HOST:PORT", or one table a role')
+            raise ValueError('name the pump board (board = "tcp://HOST:PORT"), or give a table for each role')
         missing = [role for role in NEEDED if role not in filled]
         if self.board is None and missing:
-            raise ValueError(f"no device fills {missing[0]}; needed are {', '.join(NEEDED)}")
+            raise ValueError(f"no device for {missing[0]}; required are {', '.join(NEEDED)}")
         for role in ("pump", "vent"):
             section = getattr(self, role)
             if isinstance(section, settings.ModbusMapConfig) and not _is_fraction(section.limits or section.value):
@@ -56,7 +56,7 @@ class DevicesConfig(settings.Section):
             other, other_link = owners.setdefault(port, (role, link))
             if other != role and not (link and link == other_link):
                 raise ValueError(
-                    f"{other} and {role} name one port, {port}; only Modbus devices of the same link share"
+                    f"{other} and {role} name the same port, {port}; only Modbus devices on one link may share it"
                 )
         return self
 

@@ -51,9 +51,9 @@ class AlarmRule(Section):
     @model_validator(mode="after")
     def _sound(self) -> AlarmRule:
         if self.field not in FIELDS:
-            raise ValueError(f"field: no telemetry field is called {self.field!r}; known are {', '.join(FIELDS)}")
+            raise ValueError(f"field: unknown telemetry field {self.field!r}; known are {', '.join(FIELDS)}")
         if self.raise_at == self.clear_at:
-            raise ValueError("raise_at and clear_at are equal: the alarm would flap")
+            raise ValueError("raise_at and clear_at must differ, or the alarm would flap")
         return self
 
 
@@ -80,7 +80,7 @@ class AlarmsConfig(Section):
     def _names_differ(self) -> AlarmsConfig:
         names = [rule.name for rule in self.rules]
         if len(set(names)) < len(names):
-            raise ValueError("rules: two have the same name")
+            raise ValueError("rules: two rules have the same name")
         if self.escalation_urls_file and not self.urls_file:
-            raise ValueError("escalation_urls_file without urls_file")
+            raise ValueError("escalation_urls_file needs urls_file")
         return self

@@ -151,7 +151,7 @@ class CameraPoseConfig(Section):
         rows = np.array(self.rotation)
         # 1e-6: what rounding to seven digits leaves
         if not np.allclose(rows @ rows.T, np.eye(3), atol=1e-6) or np.linalg.det(rows) < 0:
-            raise ValueError("rotation is not a rotation (rows: right, down, forward in world)")
+            raise ValueError("rotation is not a rotation matrix (rows: right, down, forward in world)")
         return self
 
 

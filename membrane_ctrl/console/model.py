@@ -162,7 +162,7 @@ class ConsoleModel:
     def _why(self) -> str:
         status = self._status
         if status.row is None:
-            return status.why or "starting: the control loop has not ticked yet"
+            return status.why or "starting: no tick yet"
         return why(status.row, status.why, _fault_words(status.fault), self._config)
 
     def _shape(self, now_s: float) -> ShapeView:

@@ -37,7 +37,7 @@ def line(view: model.ConsoleView) -> str:
     """The view in one line."""
     row = view.row
     if view.silent_s or row is None:
-        silent = f"control loop silent for {view.silent_s:.1f} s" if row else view.why
+        silent = f"no tick for {view.silent_s:.1f} s" if row else view.why
         return f"{view.elapsed_s:9.1f} s  {silent}"
     shape = view.shape
     parts = [

@@ -85,7 +85,7 @@ def console_panel(view: ConsoleView, config: Config, run: str) -> Panel:
 def _headline(view: ConsoleView, config: Config) -> Text:
     """Faults first, else why the pump is where it is."""
     if view.silent_s:
-        return Text(f"the control loop has been silent for {view.silent_s:.1f} s", style="bold red")
+        return Text(f"no tick for {view.silent_s:.1f} s", style="bold red")
     outside = view.row is not None and abs(view.row.error_um) > config.limits.band_um
     style = "bold red" if view.fault else "bold yellow" if outside else "bold"
     return Text(view.why, style=style, overflow="fold")

@@ -40,10 +40,10 @@ class PortClient:
         greeting = self._next()
         if greeting is None:  # the hold says why in its record; a refused certificate is the usual reason by TLS
             self.close()
-            raise DeviceError(f"{where}: hung up without a greeting; by TLS: is the certificate valid for this hold?")
+            raise DeviceError(f"{where}: no greeting; with TLS, check the certificate")
         if "membrane_ctrl" not in greeting:
             self.close()
-            raise DeviceError(f"{where}: this is no control port of membrane-ctrl")
+            raise DeviceError(f"{where}: not a control port of membrane-ctrl")
         self.greeting = greeting
 
     @classmethod
@@ -63,7 +63,7 @@ class PortClient:
             raise DeviceError(f"{path}: no hold is listening there; name its run with --run or --socket") from None
         except BlockingIOError:
             connection.close()
-            raise DeviceError(f"{path}: too many wait there to be let in; try again") from None
+            raise DeviceError(f"{path}: too many connections are waiting; try again") from None
         except OSError as error:
             connection.close()
             if error.errno == errno.ENOTCONN:
@@ -138,5 +138,5 @@ class PortClient:
         except ValueError:
             message = None
         if not isinstance(message, dict):
-            raise DeviceError(f"{self._where}: an answer that is no JSON object")
+            raise DeviceError(f"{self._where}: the answer is not a JSON object")
         return message

@@ -119,11 +119,11 @@ def loop_keys(argument: str) -> dict[str, Any]:
         try:
             tables = tomllib.loads(argument)
         except tomllib.TOMLDecodeError as error:
-            raise errors.InputError(f"ctl gains: neither a .toml or .json file nor loop keys: {error}") from None
+            raise errors.InputError(f"ctl gains: give a .toml or .json file, or loop keys: {error}") from None
     if isinstance(tables, dict) and isinstance(tables.get("loop"), dict):
         tables = tables["loop"]
     if not isinstance(tables, dict) or not all(isinstance(value, (bool, int, float)) for value in tables.values()):
-        raise errors.InputError(f"{argument}: not a table of loop keys with numbers")
+        raise errors.InputError(f"{argument}: expected a table of loop keys with numbers")
     return tables
 
 

@@ -147,7 +147,7 @@ class Endpoint:
         task = next(task for task, other in self._strangers.items() if other == most)
         del self._strangers[task]
         task.cancel()
-        self._refused(f"{self._name}:{most}", "did not say who it is, and others wait")
+        self._refused(f"{self._name}:{most}", "did not identify itself, and others wait")
         return len(self._inside) <= _INSIDE_MOST
 
     def _gone(self, task: asyncio.Task[None]) -> None:

@@ -157,7 +157,7 @@ class Wire:
             async with asyncio.timeout(_LINE_S):
                 rest = await self._reader.readuntil(b"\n")
         except asyncio.LimitOverrunError:
-            raise RequestError(f"a message may have {MESSAGE_BYTES} bytes") from None
+            raise RequestError(f"a message may have at most {MESSAGE_BYTES} bytes") from None
         except TimeoutError:
             raise RequestError(f"a message must be complete within {_LINE_S:g} s") from None
         except (asyncio.IncompleteReadError, OSError):
@@ -171,7 +171,7 @@ class Wire:
             return
         if transport.get_write_buffer_size() > _UNREAD_BYTES:
             transport.abort()
-            raise SlowReaderError("does not read")
+            raise SlowReaderError("does not read its messages")
         self._writer.write(encode(message))
 
     async def until(self, end: bytes) -> bytes:

@@ -78,7 +78,7 @@ def _remove_stale(path: Path) -> None:
     except FileNotFoundError:
         return
     if not stat.S_ISSOCK(mode):
-        raise InputError(f"{path}: is there and no socket; remove it, or choose another path with port.socket")
+        raise InputError(f"{path}: exists and is not a socket; remove it, or choose another path with port.socket")
     with socket.socket(socket.AF_UNIX) as probe, short(path) as address:
         probe.settimeout(_SOMEBODY_THERE_S)  # of a listener that hangs the queue may be full
         try:
@@ -105,7 +105,7 @@ def _bound(path: Path, group: str | None) -> socket.socket:
     except KeyError:
         listener.close()
         path.unlink()
-        raise InputError(f"port.group: there is no group {group!r} on this machine") from None
+        raise InputError(f"port.group: this machine has no group {group!r}") from None
     except OSError:
         listener.close()
         raise
@@ -189,7 +189,7 @@ def load_pair(context: ssl.SSLContext, certificate: Path, key: Path) -> None:
     try:
         context.load_cert_chain(certificate, key, password=lambda: "")
     except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
-        raise InputError(f"{certificate}, {key}: no certificate with its unencrypted key ({error})") from None
+        raise InputError(f"{certificate}, {key}: not a certificate with its unencrypted key ({error})") from None
 
 
 def load_authority(context: ssl.SSLContext, authority: Path) -> None:
@@ -198,7 +198,7 @@ def load_authority(context: ssl.SSLContext, authority: Path) -> None:
     try:
         context.load_verify_locations(authority)
     except (OSError, ValueError) as error:
-        raise InputError(f"{authority}: no certificate of an authority ({error})") from None
+        raise InputError(f"{authority}: not a certificate of an authority ({error})") from None
 
 
 def listen_tcp(host: str, port: int, field: str) -> socket.socket:

@@ -55,7 +55,7 @@ def require_sound(
 def _finite(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     """Not a number is refused where a file is read; a program may have put one in since."""
     for field, value in _numbers(config, ""):
-        say.error(not math.isfinite(value), field, "is no number", "give a finite one")
+        say.error(not math.isfinite(value), field, "is not a number", "set a finite one")
 
 
 def _numbers(value: Any, field: str) -> Iterator[tuple[str, float]]:

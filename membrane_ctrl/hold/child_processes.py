@@ -199,7 +199,7 @@ class ChildProcesses:
         if self._acquisition is None:
             return run_events.Capture(failed="no shape measurement in this run")
         if not self._acquisition.send("capture"):
-            return run_events.Capture(failed="the acquisition does not answer; is it being replaced?")
+            return run_events.Capture(failed="the acquisition does not answer; it may be restarting")
         return None
 
     def take_down(self) -> None:

@@ -274,7 +274,7 @@ def _report(run_dir: Path, as_json: bool) -> None:
         print(summary_path.read_text(encoding="utf-8") if summary_path.exists() else "{}")
         return
     if not run_dir.exists():
-        print(f"{run_dir}: removed or moved during the run; nothing of the run is there", file=sys.stderr)
+        print(f"{run_dir}: removed or moved during the run; nothing is left", file=sys.stderr)
         return
     if summary_path.exists():
         summary = json.loads(summary_path.read_text(encoding="utf-8"))
@@ -282,9 +282,9 @@ def _report(run_dir: Path, as_json: bool) -> None:
             print(line, file=sys.stderr)
         anew_s = summary["recorder"].get("folder_anew_s")
         if anew_s is not None:
-            print(f"the run folder was removed or moved; this one begins at {anew_s:.1f} s", file=sys.stderr)
+            print(f"the run folder was removed or moved; the new one begins at {anew_s:.1f} s", file=sys.stderr)
     else:
-        print("the recorder left no summary.json; what it had recorded is still readable", file=sys.stderr)
+        print("summary.json is missing; the recorded data are readable", file=sys.stderr)
     print(f"run folder: {run_dir}", file=sys.stderr)
     if any(run_dir.glob("*.rrd")):
         print(f"open it:    rerun {run_dir}/*.rrd", file=sys.stderr)

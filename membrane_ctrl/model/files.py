@@ -116,7 +116,7 @@ def append_text(path: Path, text: str) -> None:
         with os.fdopen(descriptor, "ab") as file:
             # a second name may be that of a file elsewhere
             if os.fstat(file.fileno()).st_nlink > 1:
-                raise OSError(errno.EMLINK, "has another name elsewhere (a hard link), and is not written", str(path))
+                raise OSError(errno.EMLINK, "has a hard link elsewhere, and is not written", str(path))
             file.write(text.encode("utf-8", "backslashreplace"))
 
 
@@ -177,14 +177,14 @@ def _plain(descriptor: int, path: Path) -> int:
         return descriptor
     os.close(descriptor)
     if stat.S_ISDIR(mode):
-        raise IsADirectoryError(errno.EISDIR, "a folder in place of a file", str(path))
-    raise OSError(errno.EINVAL, "no plain file (a pipe or a device)", str(path))
+        raise IsADirectoryError(errno.EISDIR, "is a folder, not a file", str(path))
+    raise OSError(errno.EINVAL, "not a plain file (a pipe or a device)", str(path))
 
 
 def _told(error: OSError, path: Path) -> OSError:
     """An error in words: Linux reports a refused link in two ways, and names neither folder nor link."""
     if path.is_symlink():
-        return OSError(errno.ELOOP, "a link, and links are not followed here", str(path))
+        return OSError(errno.ELOOP, "is a link, and links are not followed here", str(path))
     if error.errno == errno.ENXIO:  # a pipe without a reader, a socket
-        return OSError(errno.EINVAL, "no plain file (a pipe or a device)", str(path))
+        return OSError(errno.EINVAL, "not a plain file (a pipe or a device)", str(path))
     return type(error)(error.errno, error.strerror, str(path))

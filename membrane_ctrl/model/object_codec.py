@@ -48,7 +48,7 @@ Specials = Mapping[type, Special]
 
 def _estimate(data: Any, _: type) -> ShapeEstimate:
     if type(data) is not str:
-        raise CodecError("a shape estimate is damaged")
+        raise CodecError("the shape estimate is damaged")
     return unpack_estimate(base64.b64decode(data, validate=True))
 
 
@@ -203,7 +203,7 @@ class Decoder:
 
     def _object(self, data: Any, kind: Any, where: str) -> Any:
         if kind not in self._classes:
-            raise CodecError(f"{where}: nothing of this kind can be made")
+            raise CodecError(f"{where}: objects of this kind are not accepted")
         _must(isinstance(data, dict) and data.get(_CLASS) == kind.__qualname__, where, data)
         types = self._classes[kind]
         if changed := (data.keys() - {_CLASS}) ^ types.keys():

@@ -99,23 +99,23 @@ def _checked(head: Any) -> tuple[bool, bool]:
     """Whether the covariance is symmetric and in singles; reduces `head` to the estimate's fields. Raises
     ValueError."""
     if not isinstance(head, dict) or not set(head) <= _KEYS:
-        raise ValueError("shape estimate: its first line names other fields")
+        raise ValueError("shape estimate: unknown fields in the first line")
     layout = (head.pop("terms", None), head.pop("symmetric", None), head.pop("single", None))
     if layout[0] != TERMS or not all(isinstance(flag, bool) for flag in layout[1:]):
         raise ValueError(f"shape estimate: not of {TERMS} terms")
     for name in _NUMBERS:
         value = head.get(name, math.nan)  # what an older version did not know is NaN
         if type(value) not in (float, int) or abs(value) > _LARGEST:
-            raise ValueError(f"shape estimate: {name} is no number")
+            raise ValueError(f"shape estimate: {name} is not a number")
         head[name] = float(value)
     if math.isnan(head["time_s"]):
-        raise ValueError("shape estimate: it has no time")
+        raise ValueError("shape estimate: no time")
     for name, words in _WORDS.items():
         if head.get(name) not in words:
             raise ValueError(f"shape estimate: {name} is none of {', '.join(words)}")
     cycle = head.setdefault("cycle", 0)
     if type(cycle) is not int or not 0 <= cycle < 2**63 or not isinstance(head.setdefault("reason", ""), str):
-        raise ValueError("shape estimate: cycle or reason is of a wrong kind")
+        raise ValueError("shape estimate: cycle or reason has a wrong type")
     if not isinstance(head.setdefault("tracking_lost", False), bool):
         raise ValueError("shape estimate: tracking_lost is neither true nor false")
     return layout[1], layout[2]

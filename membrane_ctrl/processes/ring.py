@@ -52,7 +52,7 @@ class RingAddress:
         """Size of the shared memory. Raises RingError if no ring of ours is like that."""
         size_bytes = _HEADER_BYTES + self.slots * _stride(self.slot_bytes)
         if self.slots < 1 or self.slot_bytes < 0 or size_bytes > _RING_BYTES_MAX:
-            raise RingError(f"no ring has {self.slots} slots of {self.slot_bytes} bytes")
+            raise RingError(f"a ring cannot have {self.slots} slots of {self.slot_bytes} bytes")
         return size_bytes
 
 
@@ -89,7 +89,7 @@ class _Slots:
         self.count, self._stride = address.slots, _stride(address.slot_bytes)
         head = [self.words[word] for word in (_IS_RING, _SLOTS, _SLOT_BYTES)]
         if head != [_MAGIC, address.slots, address.slot_bytes]:
-            raise RingError(f"{address.name}: not the ring of {address.slots} slots that is expected")
+            raise RingError(f"{address.name}: not the expected ring of {address.slots} slots")
 
     @property
     def written(self) -> int:
@@ -268,7 +268,7 @@ def _addresses(path: Path) -> dict[str, RingAddress]:
 def _address(ring: str, values: dict[str, Any]) -> RingAddress:
     name, slots, slot_bytes = values["name"], values["slots"], values["slot_bytes"]
     if ring not in _RINGS or not _NAME.fullmatch(name) or type(slots) is not int or type(slot_bytes) is not int:
-        raise RingError(f"{ring!r:.40} is the address of no ring")
+        raise RingError(f"{ring!r:.40} is not the address of a ring")
     return RingAddress(name, slots, slot_bytes)
 
 
@@ -277,7 +277,7 @@ def _mapped(address: RingAddress) -> mmap:
     with open_plain(_SHARED_MEMORY_FOLDER / address.name) as file:
         found, size_bytes = os.fstat(file.fileno()), address.size_bytes
         if found.st_uid != os.geteuid():
-            raise RingError(f"{address.name} belongs to user {found.st_uid}: tune as that user")
+            raise RingError(f"{address.name} belongs to user {found.st_uid}: run as that user")
         if found.st_size != size_bytes:
             raise RingError(f"{address.name} has {found.st_size} bytes, not the {size_bytes} of the ring")
         return mmap(file.fileno(), size_bytes, prot=PROT_READ)

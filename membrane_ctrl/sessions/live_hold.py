@@ -120,7 +120,7 @@ class LiveHold:
         try:
             found = self._read_rings()
         except (struct.error, ValueError) as error:
-            raise HoldError(f"the rings of {self.name} hold what no hold writes ({error})") from None
+            raise HoldError(f"the rings of {self.name} are not those of a hold ({error})") from None
         now_s = time.monotonic()
         if found.rows:
             self._heard_s = now_s

@@ -96,7 +96,7 @@ def test_the_text_names_value_and_limit() -> None:
 @pytest.mark.parametrize(
     ("alarms", "says"),
     [
-        ({"rules": [{"name": "a", "field": "nothing", "raise_at": 1, "clear_at": 0}]}, "no telemetry field"),
+        ({"rules": [{"name": "a", "field": "nothing", "raise_at": 1, "clear_at": 0}]}, "unknown telemetry field"),
         ({"rules": [{"name": "a", "field": "error_um", "raise_at": 1, "clear_at": 1}]}, "flap"),
         ({"rules": [{"name": "a", "field": "error_um", "raise_at": 1, "clear_at": 0}] * 2}, "same name"),
         ({"escalation_urls_file": "x"}, "without urls_file"),

@@ -132,7 +132,7 @@ def test_what_is_latched_already_is_kept_and_a_folder_that_cannot_be_written_is_
     make_safe(bench.config, "lab.toml")
     assert "other" in file.read_text()
     (tmp_path / "logs").write_text("no folder")
-    with pytest.raises(DeviceError, match=r"the pump is stopped, but this could not be written"):
+    with pytest.raises(DeviceError, match=r"the pump is stopped, but not latched"):
         make_safe(bench.config, "lab.toml", tmp_path / "logs")
     assert bench.read().pump_fraction == 0.0
 

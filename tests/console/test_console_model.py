@@ -54,7 +54,7 @@ def test_last_minute_of_the_error() -> None:
 def test_before_the_first_tick_it_waits() -> None:
     view = model().view(0.5)
     assert view.row is None
-    assert "not ticked yet" in view.why
+    assert "no tick yet" in view.why
     assert math.isnan(view.error_mean_um)
     assert math.isinf(view.left_s)
 

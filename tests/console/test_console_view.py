@@ -100,7 +100,7 @@ def test_trouble_with_the_recording_is_seen_until_it_is_over() -> None:
 
 
 def test_silence_is_the_headline() -> None:
-    assert any("the control loop has been silent for 4.0 s" in row for row in drawn(held(), now_s=78.98))
+    assert any("no tick for 4.0 s" in row for row in drawn(held(), now_s=78.98))
 
 
 def test_before_the_first_tick_and_with_nothing_known() -> None:
@@ -116,8 +116,8 @@ def test_plain_line_has_the_second_in_it() -> None:
     for words in ("75.0 s  hold", "error", "pump  29 %", "leak 1.24 um/s", "shape tracking ok 1 s", "45 s left"):
         assert words in said
     assert "\n" not in said
-    assert "control loop silent for 10.0 s" in line(held().view(84.98))
-    assert line(ConsoleModel(CONFIG).view(0.0)).endswith("the control loop has not ticked yet")
+    assert "no tick for 10.0 s" in line(held().view(84.98))
+    assert line(ConsoleModel(CONFIG).view(0.0)).endswith("no tick yet")
 
 
 def test_plain_events() -> None:

@@ -88,7 +88,7 @@ async def test_newcomers_of_the_strangers_own_address_get_in_too(
     pair = lab.certificate("bob", "operate")
     async with port_run(tmp_path, config) as run, strangers(run, ["127.0.0.1"] * 8):
         assert (await asyncio.to_thread(greet, run, pair, lab.own))["role"] == "operate"
-        assert any(event["reason"].startswith("did not say who it is") for event in run.of_kind("refused"))
+        assert any(event["reason"].startswith("did not identify itself") for event in run.of_kind("refused"))
 
 
 async def test_who_has_shaken_hands_is_no_stranger_any_more(

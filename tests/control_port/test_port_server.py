@@ -316,7 +316,7 @@ def test_a_client_of_something_else(tmp_path: Path) -> None:
             caller.connect(str(path))
             accepted, _ = other.accept()
             accepted.sendall(b'{"hello": 1}\n')
-            with pytest.raises(DeviceError, match="no control port of membrane-ctrl"):
+            with pytest.raises(DeviceError, match="not a control port of membrane-ctrl"):
                 PortClient(caller, "there", print)
             accepted.close()
 

@@ -75,7 +75,7 @@ async def test_an_expired_certificate_stays_out_and_is_recorded(
     dates = ("-startdate", "20200101000000Z", "-enddate", "20200102000000Z")
     pair = lab.certificate("late", "tune", dates)
     async with port_run(tmp_path, config) as run:
-        with pytest.raises(DeviceError, match=r"expired|without a greeting"):
+        with pytest.raises(DeviceError, match=r"expired|no greeting"):
             await asyncio.to_thread(greet, run, pair, lab.own)
         (refused,) = run.of_kind("refused")
         assert "certificate has expired" in refused["reason"]
@@ -176,9 +176,9 @@ def test_files_that_are_none_are_one_line(tmp_path: Path, lab: Authority) -> Non
     empty.write_text("")
     for field, path, says in [
         ("certificate_file", tmp_path / "none.pem", "no such file"),
-        ("certificate_file", empty, "no certificate with its unencrypted key"),
-        ("key_file", lab.folder / "ca.key", "no certificate with its unencrypted key"),
-        ("client_ca_file", empty, "no certificate of an authority"),
+        ("certificate_file", empty, "not a certificate with its unencrypted key"),
+        ("key_file", lab.folder / "ca.key", "not a certificate with its unencrypted key"),
+        ("client_ca_file", empty, "not a certificate of an authority"),
     ]:
         with pytest.raises(InputError, match=says):
             TlsListener(TlsConfig(port=0, **{**good, field: str(path)}))

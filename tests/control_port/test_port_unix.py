@@ -88,7 +88,7 @@ def test_a_hanging_holds_socket_is_busy_too(tmp_path: Path, monkeypatch: pytest.
 def test_a_file_in_the_way_is_not_removed(tmp_path: Path) -> None:
     path = tmp_path / "control.sock"
     path.write_text("precious")
-    with pytest.raises(InputError, match=r"control\.sock: is there and no socket"):
+    with pytest.raises(InputError, match=r"control\.sock: exists and is not a socket"):
         UnixListener(path, None, "operate")
     assert path.read_text() == "precious"
 

@@ -132,7 +132,7 @@ def test_a_linked_folder_is_refused_in_one_line(
         (folder / name).symlink_to(aim)
         words = (words[0], str(folder))
     assert run(list(words)) == code
-    assert "a link, and links are not followed here" in capsys.readouterr().err.splitlines()[-1]
+    assert "is a link, and links are not followed here" in capsys.readouterr().err.splitlines()[-1]
     assert not list(aim.iterdir())
     assert secret.read_text() == "secret"
 
@@ -168,7 +168,7 @@ def test_what_is_no_plain_file_is_noted_and_not_waited_for(
 def test_inputs_that_are_a_pipe_are_one_line(folder: Path, capsys: Said) -> None:
     (folder / "inputs-000.bin").unlink()
     os.mkfifo(folder / "inputs-000.bin")
-    assert "inputs-000.bin: cannot be read (no plain file (a pipe or a device))" in refused(
+    assert "inputs-000.bin: cannot be read (not a plain file (a pipe or a device))" in refused(
         capsys, "replay", str(folder)
     )
 

@@ -95,7 +95,7 @@ def test_what_leads_out_of_the_file_or_is_too_large_is_refused(tmp_path):
     path = tmp_path / "e.h5"
     with h5py.File(path, "w") as file:
         file["Camera/intrinsic_mat"] = h5py.ExternalLink(other.name, "Camera/intrinsic_mat")
-    with pytest.raises(ValueError, match="intrinsic_mat is a link, and links are not followed here"):
+    with pytest.raises(ValueError, match="intrinsic_mat is is a link, and links are not followed here"):
         sofast_facet.read_camera(path)
     with h5py.File(path, "w") as file:
         file["Camera"] = h5py.ExternalLink(other.name, "Camera")

@@ -116,7 +116,7 @@ def test_shared_memory_that_is_no_ring_is_refused(tmp_path: Path) -> None:
     try:
         memory.buf[:] = random.Random(1).randbytes(len(memory.buf))
         named(tmp_path, name=memory.name, slots=4, slot_bytes=16)
-        with pytest.raises(RingError, match="not the ring"):
+        with pytest.raises(RingError, match="not the expected ring"):
             attach(tmp_path)
     finally:
         memory.close()

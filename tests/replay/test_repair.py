@@ -185,7 +185,7 @@ def test_what_cannot_be_read_is_one_line(folder: Path, capsys: pytest.CaptureFix
     (folder / "events.jsonl").unlink()
     (folder / "events.jsonl").mkdir()
     assert run(["repair", str(folder)]) == Exit.BAD_INPUT
-    assert capsys.readouterr().err.endswith("events.jsonl: a folder in place of a file\n")
+    assert capsys.readouterr().err.endswith("events.jsonl: is a folder, not a file\n")
 
 
 def test_a_run_that_is_still_recorded_is_left_alone(folder: Path) -> None:

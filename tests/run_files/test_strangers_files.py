@@ -50,7 +50,7 @@ def test_what_is_written_is_read(folder: Path) -> None:
 
 def test_a_link_is_not_read_but_where_the_user_named_it(folder: Path, secret: Path) -> None:
     (folder / "a").symlink_to(secret)
-    with pytest.raises(OSError, match="a link, and links are not followed here"):
+    with pytest.raises(OSError, match="is a link, and links are not followed here"):
         read_bytes(folder / "a", 100)
     assert read_text(folder / "a", follow=True) == "secret"
 
@@ -64,7 +64,7 @@ def test_nor_is_a_file_in_a_linked_folder(folder: Path, secret: Path) -> None:
         fresh_file,
         remove,
     ):
-        with pytest.raises(OSError, match="a link, and links are not followed here"):
+        with pytest.raises(OSError, match="is a link, and links are not followed here"):
             act(folder / "columns" / secret.name)
     with pytest.raises(OSError, match="a link"):
         make_folder(folder / "columns")
@@ -106,7 +106,7 @@ def test_a_fresh_file_and_a_moved_one_take_a_links_place(folder: Path, secret: P
 def test_nothing_is_appended_through_a_link_of_either_kind(folder: Path, secret: Path) -> None:
     (folder / "soft").symlink_to(secret)
     (folder / "hard").hardlink_to(secret)
-    for name, why in (("soft", "a link"), ("hard", "another name elsewhere")):
+    for name, why in (("soft", "a link"), ("hard", "a hard link elsewhere")):
         with pytest.raises(OSError, match=why):
             append_text(folder / name, "more")
     assert secret.read_text() == "secret"
@@ -118,7 +118,7 @@ def test_nothing_is_appended_through_a_link_of_either_kind(folder: Path, secret:
 def test_a_pipe_a_folder_and_a_device_are_no_files(folder: Path) -> None:
     os.mkfifo(folder / "pipe")
     (folder / "sub").mkdir()
-    for name, why in (("pipe", "a pipe or a device"), ("sub", "a folder in place of a file")):
+    for name, why in (("pipe", "a pipe or a device"), ("sub", "is a folder, not a file")):
         with pytest.raises(OSError, match=why):
             open_plain(folder / name)  # an ordinary open would wait for ever
         with pytest.raises(OSError, match=r"a pipe|directory|a folder"):
