@@ -157,7 +157,7 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
     LinkError if no camera is configured, or its patterns do not fit on the screen.
     """
     remote.listen()  # the first word, which promises the next one for when all this is over
-    remote.report("preparing", "tracing the first picture, compiling what is not compiled yet")
+    remote.report("preparing", "rendering the first picture, compiling")
     config, clock = spec.config, WaitingClock(spec.clock)
     geometry = file.geometry_of_run(spec.run_dir, config)
     remote.tell(worker.geometry_event(geometry))

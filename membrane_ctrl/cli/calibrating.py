@@ -7,9 +7,6 @@ import typer
 
 from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, PriorOption, SetArgument, configured
 
-# The commands that calibrate a part of the optics by itself, for `calibrate --prior` or for the configuration.
-
-
 BoardOption = Annotated[
     str, typer.Option(help="Board as KIND:COLUMNSxROWS of squares; KIND is charuco or chessboard.")
 ]

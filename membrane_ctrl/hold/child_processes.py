@@ -167,14 +167,30 @@ class ChildProcesses:
     def __init__(
         self, config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str, duration_s: float | None
     ) -> None:
+        from membrane_ctrl.console.process import ConsoleSpec
+        from membrane_ctrl.recorder.process import RecorderSpec
+
         self._clock = clock
         self._summary = run_dir / "summary.json"
-        self._console = ManagedChild(_console(config, clock, rings, run_dir, duration_s))
-        self._recorder = ManagedChild(_recorder(config, clock, rings, run_dir, name))
-        self._acquisition = None
+        console = ConsoleSpec(clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s)
+        recorder = RecorderSpec(
+            run_dir, name, clock, config, rings.telemetry, rings.events, rings.shapes, rings.frames, rings.inputs
+        )
+        self._console = ManagedChild(
+            _makes("screen", "console", 5, lambda n: replace(console, since_s=clock.now()) if n else console)
+        )
+        self._recorder = ManagedChild(_makes("recorder", "recorder", 5, lambda n: replace(recorder, resumes=n)))
+        self._acquisition = self._alarms = None
         if rings.shapes is not None and rings.frames is not None:
-            self._acquisition = ManagedChild(_acquisition(config, clock, rings, rings.shapes, rings.frames, run_dir))
-        self._alarms = ManagedChild(_alarms(config, clock, rings, run_dir.name)) if config.alarms.urls_file else None
+            from membrane_ctrl.acquisition.process import AcquisitionSpec
+
+            cycles = AcquisitionSpec(config, clock, rings.telemetry, rings.shapes, rings.truth, rings.frames, run_dir)
+            self._acquisition = ManagedChild(_makes("acquisition", "acquisition", 10, lambda n: cycles))
+        if config.alarms.urls_file:
+            from membrane_ctrl.alarms.process import AlarmsSpec
+
+            alarms = AlarmsSpec(clock, rings.telemetry, rings.events, config.alarms, run_dir.name)
+            self._alarms = ManagedChild(_makes("alarms", "alarms", 5, lambda n: alarms))
 
     @property
     def _managed(self) -> list[ManagedChild]:
@@ -227,57 +243,11 @@ class ChildProcesses:
             give_back_terminal()
 
 
-def _console(config: Config, clock: RunClock, rings: Rings, run_dir: Path, duration_s: float | None) -> Make:
-    from membrane_ctrl.console.process import ConsoleSpec
-
-    spec = ConsoleSpec(clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s)
+def _makes(name: str, room: str, nice: int, spec: Callable[[int], object]) -> Make:
+    """Makes the children of a room; `spec` gives the argument of the one that comes after so many others."""
 
     def make(count: int) -> tuple[Child, Connection]:
         ours, theirs = pipe()
-        arguments = (replace(spec, since_s=clock.now()) if count else spec, theirs)
-        return Child("screen", "membrane_ctrl.console.process:console_main", arguments, nice=5), ours
-
-    return make
-
-
-def _recorder(config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str) -> Make:
-    from membrane_ctrl.recorder.process import RecorderSpec
-
-    spec = RecorderSpec(
-        run_dir, name, clock, config, rings.telemetry, rings.events, rings.shapes, rings.frames, rings.inputs
-    )
-
-    def make(resumes: int) -> tuple[Child, Connection]:
-        ours, theirs = pipe()
-        arguments = (replace(spec, resumes=resumes), theirs)
-        return Child("recorder", "membrane_ctrl.recorder.process:recorder_main", arguments, nice=5), ours
-
-    return make
-
-
-def _acquisition(
-    config: Config, clock: RunClock, rings: Rings, shapes: RingAddress, frames: FrameAddress, run_dir: Path
-) -> Make:
-    from membrane_ctrl.acquisition.process import AcquisitionSpec
-
-    spec = AcquisitionSpec(config, clock, rings.telemetry, shapes, rings.truth, frames, run_dir)
-
-    def make(_: int) -> tuple[Child, Connection]:
-        ours, theirs = pipe()
-        return Child(
-            "acquisition", "membrane_ctrl.acquisition.process:acquisition_main", (spec, theirs), nice=10
-        ), ours
-
-    return make
-
-
-def _alarms(config: Config, clock: RunClock, rings: Rings, run: str) -> Make:
-    from membrane_ctrl.alarms.process import AlarmsSpec
-
-    spec = AlarmsSpec(clock, rings.telemetry, rings.events, config.alarms, run)
-
-    def make(_: int) -> tuple[Child, Connection]:
-        ours, theirs = pipe()
-        return Child("alarms", "membrane_ctrl.alarms.process:alarms_main", (spec, theirs), nice=5), ours
+        return Child(name, f"membrane_ctrl.{room}.process:{room}_main", (spec(count), theirs), nice), ours
 
     return make

@@ -1,4 +1,4 @@
-"""Events: what the controller tells of, one class a kind; `run_events` has those of the processes around it.
+"""Events of the controller, one class a kind; `run_events` has those of the processes around it.
 
 As JSON they are the lines of `events.jsonl`, without their times. A field is a key of the line (`from_` is "from",
 which is a word of Python). Keys with None as default are left out when there is nothing to say.
@@ -15,7 +15,7 @@ KINDS: dict[str, type["Event"]] = {}
 @dataclass_transform(frozen_default=True)
 @dataclass(frozen=True)
 class Event:
-    """What all kinds have in common; a class derived from it is a frozen dataclass."""
+    """The base of all kinds; a class derived from it is a frozen dataclass."""
 
     _kind: ClassVar[str]
 
@@ -41,11 +41,8 @@ def keys(cls: type[Event]) -> tuple[tuple[Field[Any], str], ...]:
     return tuple((field, field.name.rstrip("_")) for field in fields(cls))
 
 
-# The controller.
-
-
 class StateEntered(Event, kind="state"):
-    """The state machine has gone into another state."""
+    """The state machine entered another state."""
 
     state: str
     from_: str
@@ -53,13 +50,13 @@ class StateEntered(Event, kind="state"):
 
 
 class Why(Event, kind="why"):
-    """The operator's line has changed for good."""
+    """The operator's line has changed."""
 
     why: str
 
 
 class Fault(Event, kind="fault"):
-    """A rule of the safety table has spoken."""
+    """A rule of the safety table has tripped."""
 
     code: int
     name: str
@@ -72,26 +69,26 @@ class Fault(Event, kind="fault"):
 
 
 class Cleared(Event, kind="cleared"):
-    """What held the flow is over."""
+    """The cause of a fault that only held the flow is gone."""
 
     name: str
 
 
 class Resumed(Event, kind="resumed"):
-    """A latched fault has gone by the resume rule."""
+    """A latched fault was cleared by the resume rule."""
 
     name: str
 
 
 class ShapeLoopState(Event, kind="shape"):
-    """The outer loop has another state, or another reason for it."""
+    """The shape loop has another state, or another reason for it."""
 
     state: str
     reason: str
 
 
 class CommandTaken(Event, kind="command"):
-    """A tick has taken up a command: it obeys, or says why not."""
+    """A tick has obeyed or refused a command."""
 
     command: str
     who: str
@@ -104,7 +101,7 @@ class CommandTaken(Event, kind="command"):
 
 
 class GainsReverted(Event, kind="gains_reverted"):
-    """Gains on trial have gone back."""
+    """Gains on trial were reverted."""
 
     why: str
 
@@ -119,21 +116,21 @@ class ExperimentEnded(Event, kind="experiment"):
 
 
 class Plausibility(Event, kind="plausibility"):
-    """Another one of laser, gauge and camera lies, or nobody any more."""
+    """Which of laser, gauge and camera is wrong now, if any."""
 
     liar: str
     seen: str
 
 
 class Maintenance(Event, kind="maintenance"):
-    """Something wears out, or needs a person some day."""
+    """Something wears out, or will need a person."""
 
     name: str
     message: str
 
 
 class MaintenanceOver(Event, kind="maintenance_over"):
-    """It no longer does."""
+    """A maintenance message no longer holds."""
 
     name: str
     message: str

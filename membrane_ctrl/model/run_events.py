@@ -17,7 +17,7 @@ class Started(Event, kind="start"):
 
 
 class Ended(Event, kind="end"):
-    """The run is over; a recorder that is left alone knows only that."""
+    """The run is over; without the control process the recorder knows only `exit`."""
 
     exit: str
     exit_code: int | None = None
@@ -26,26 +26,26 @@ class Ended(Event, kind="end"):
 
 
 class NoClaim(Event, kind="no_claim"):
-    """The board cannot be claimed for one program."""
+    """The board cannot reserve itself for one program."""
 
     message: str
 
 
 class Link(Event, kind="link"):
-    """The link to the board has failed, or is there again."""
+    """The link to the board has failed or is back."""
 
     message: str
     up: bool
 
 
 class InputsNotRecorded(Event, kind="inputs_not_recorded"):
-    """There will be no replay of some ticks."""
+    """Some ticks cannot be replayed."""
 
     message: str
 
 
 class ShapeUnreadable(Event, kind="shape_unreadable"):
-    """A message of the acquisition is none."""
+    """A message of the acquisition is unreadable."""
 
     message: str
 
@@ -57,7 +57,7 @@ class LatchFailed(Event, kind="latch_failed"):
 
 
 class LatchWritten(Event, kind="latch_written"):
-    """Now it could."""
+    """The latched fault's file is written again."""
 
 
 # Child processes.
@@ -77,7 +77,7 @@ class ChildEnded(Event, kind="child_ended"):
 
 
 class ChildSilent(Event, kind="child_silent"):
-    """It has not said that it is alive."""
+    """A child has not reported that it is alive."""
 
     child: str
     overdue_s: float
@@ -85,14 +85,14 @@ class ChildSilent(Event, kind="child_silent"):
 
 
 class ChildRestarted(Event, kind="child_restarted"):
-    """Another one is in its place."""
+    """A child was replaced."""
 
     child: str
     restarts: int
 
 
 class ChildGivenUp(Event, kind="child_given_up"):
-    """It has ended too often in an hour."""
+    """A child has ended too often in an hour."""
 
     child: str
     restarts: int
@@ -102,7 +102,7 @@ class ChildGivenUp(Event, kind="child_given_up"):
 
 
 class AcquisitionState(Event, kind="acquisition"):
-    """What the acquisition does, in words for a person."""
+    """What the acquisition does, in words."""
 
     state: str
     message: str
@@ -111,7 +111,7 @@ class AcquisitionState(Event, kind="acquisition"):
 
 
 class GeometryInForce(Event, kind="geometry"):
-    """Which geometry the cycles measure with."""
+    """The geometry that the cycles use."""
 
     hash: str
     file: str | None
@@ -120,7 +120,7 @@ class GeometryInForce(Event, kind="geometry"):
 
 
 class Capture(Event, kind="capture"):
-    """What became of a set that was asked for: where it is, or why there is none."""
+    """The result of `capture`: where the set is, or why there is none."""
 
     cycle: int | None = None
     set: str | None = None
@@ -141,14 +141,14 @@ class RawFrames(Event, kind="raw_frames"):
 
 
 class RecorderError(Event, kind="recorder_error"):
-    """Something is not recorded; `what` has trouble."""
+    """`what` cannot be recorded."""
 
     what: str
     message: str
 
 
 class DiskLow(Event, kind="disk_low"):
-    """Soon it will not be."""
+    """The disk is almost full."""
 
     what: str
     message: str
@@ -162,14 +162,14 @@ class RecorderRecovered(Event, kind="recorder_recovered"):
 
 
 class RunDeleted(Event, kind="run_deleted"):
-    """An old run has made room."""
+    """An old run was deleted to make room."""
 
     run: str
     message: str
 
 
 class RecorderDone(Event, kind="recorder_done"):
-    """The recorder's account; comes after the last line of the file."""
+    """The recorder's summary; comes after the last line of the file."""
 
     dropped: Any
     segments: Any
@@ -196,7 +196,7 @@ class PortAddresses(Event, kind="port"):
 
 
 class PortFailed(Event, kind="port_failed"):
-    """A listener, or one client of it, is in trouble."""
+    """A listener or one of its clients failed."""
 
     port: str
     message: str
@@ -210,7 +210,7 @@ class PortOpen(Event, kind="port_open"):
 
 
 class Commander(Event, kind="commander"):
-    """Who has the command now, and who had it."""
+    """Who has the command now, and who had it before."""
 
     who: str | None
     former: str | None
@@ -218,7 +218,7 @@ class Commander(Event, kind="commander"):
 
 
 class Refused(Event, kind="refused"):
-    """The port has refused a request, and others that are not recorded."""
+    """The port has refused a request, and perhaps others that are not recorded."""
 
     who: str
     command: str
@@ -228,14 +228,14 @@ class Refused(Event, kind="refused"):
 
 
 class AlarmsAcknowledged(Event, kind="alarms_acknowledged"):
-    """Somebody has seen all that stands."""
+    """Somebody acknowledged all alarms."""
 
     who: str
     why: str
 
 
 class AlarmTold(Event, kind="alarm"):
-    """People were told of an alarm."""
+    """An alarm's notice was sent, or failed."""
 
     alarm: str
     what: str
@@ -246,15 +246,12 @@ class AlarmTold(Event, kind="alarm"):
     escalated: bool
 
 
-# Reading.
-
-
 CONNECTED_AGAIN = "connected again"
 _EMPTY: dict[object, object] = {str: "", int: 0, float: math.nan, bool: False}
 
 
 class UnknownEvent(Event):
-    """Of a kind that a later version may know, or not as that kind is."""
+    """An event of an unknown kind, or with unexpected fields."""
 
     line: EventLine
 
@@ -269,9 +266,9 @@ class UnknownEvent(Event):
 
 
 def from_dict(line: EventLine) -> Event:
-    """The event of a line; never raises, and leaves the line's times to who asks.
+    """The event of a line, without its times; never raises.
 
-    What an earlier version did not write is empty; what cannot be understood is an `UnknownEvent`.
+    Keys that an earlier version did not write are empty; what cannot be understood is an `UnknownEvent`.
     """
     cls = KINDS.get(line["kind"]) if isinstance(line.get("kind"), str) else None
     if cls is None:

@@ -1,9 +1,9 @@
-"""Child processes: started with `spawn`, out of reach of the terminal, and never left behind.
+"""Child processes: started with `spawn`, shielded from the terminal, and never left behind.
 
-Ctrl-C, Ctrl-\\ and a terminal that is closed reach every process of the foreground group, and so does the SIGTERM
-of `timeout` or of a machine that shuts down; only the control process may act on them, as the safe state comes first,
-and the recording and the last alarm come after it. So these signals are blocked from before the children's first
-instruction, and a child is asked to end by another one; examples/membrane-ctrl.service relies on it.
+Ctrl-C, Ctrl-\\, a closed terminal and the SIGTERM of `timeout` or a shutdown reach every process of the group. Only
+the control process may act on them: the safe state comes before the end of recording and alarms. So the children
+block these signals from their first instruction on, and end on another one; examples/membrane-ctrl.service relies on
+it.
 """
 
 import contextlib

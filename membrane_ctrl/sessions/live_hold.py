@@ -20,11 +20,9 @@ from membrane_ctrl.model.events import Event
 from membrane_ctrl.processes.ring import attach
 from membrane_ctrl.run_files import events
 
-# A hold as a session sees it: commands in, ticks and events out. The twin and the control port each give one.
-
 
 class HoldError(Exception):
-    """The hold refuses, or has left its state; the message says which and what to do."""
+    """The hold refuses a command, or has left its state or ended."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +35,7 @@ class News:
 
 
 class HoldLink(Protocol):
-    """What a session needs of a hold."""
+    """A hold as a session sees it: commands in, ticks and events out. The twin and the control port each give one."""
 
     @property
     def config(self) -> schema.Config:
@@ -58,7 +56,7 @@ class HoldLink(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go."""
+        """Hang up."""
         ...
 
 
