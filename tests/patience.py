@@ -14,7 +14,7 @@ from unittest.mock import patch
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.commissioning import check
-from membrane_ctrl.commissioning.probe import DeviceProbe
+from membrane_ctrl.commissioning.check import DeviceProbe
 from membrane_ctrl.config.devices import DevicesConfig
 
 ANSWER_S = 20.0

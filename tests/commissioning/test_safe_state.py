@@ -17,7 +17,7 @@ from firmware_iface.emulators.board_state import BoardSample
 from firmware_iface.emulators.pump_board import PumpBoardEmulator
 from firmware_iface.register_map import known_maps
 from firmware_iface.roles import BenchCommand, BenchReading
-from membrane_ctrl.commissioning.probe import probe_board
+from membrane_ctrl.commissioning.check import probe_board
 from membrane_ctrl.commissioning.safe import make_safe
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config, RecordingConfig
