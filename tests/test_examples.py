@@ -104,18 +104,18 @@ async def test_check_names_every_broken_device_and_the_remedy(
             '[devices]\nboard = "tcp://h"\n[devices.pump]\ndriver = "ventus"\nport = "/dev/x"\n',
             ["not board and pump"],
         ),
-        ('[devices.pump]\ndriver = "ventus"\nport = "/dev/x"\n', ["no device fills displacement"]),
+        ('[devices.pump]\ndriver = "ventus"\nport = "/dev/x"\n', ["no device for displacement"]),
         (
             '[devices.displacement]\ndriver = "optoncdt1420"\nport = "/dev/x"\n'
             '[devices.pump]\ndriver = "bronkhorst_modbus"\nlink = "rtu:///dev/x?baud=19200"\nunit_id = 3\n'
             '[devices.gauge_pressure]\ndriver = "bronkhorst_modbus"\nlink = "rtu:///dev/y"\nunit_id = 5\n',
-            ["displacement and pump name one port, /dev/x"],
+            ["displacement and pump name the same port, /dev/x"],
         ),
         (
             '[devices.displacement]\ndriver = "optoncdt1420"\nport = "/dev/x"\n'
             '[devices.pump]\ndriver = "bronkhorst_modbus"\nlink = "rtu:///dev/y?baud=19200"\nunit_id = 3\n'
             '[devices.gauge_pressure]\ndriver = "bronkhorst_modbus"\nlink = "rtu:///dev/y"\nunit_id = 5\n',
-            ["pump and gauge_pressure name one port, /dev/y"],
+            ["pump and gauge_pressure name the same port, /dev/y"],
         ),
         ("[devices]\n", ["name the pump board"]),
         ('[devices]\nboard = "serial:1"\n', ["devices.board", "tcp://HOST:PORT"]),

@@ -17,6 +17,7 @@ Kind = Literal[
 Role = Literal["read", "operate", "tune"]
 
 AT_START = "command line"  # who asks for what `hold` begins with
+AT_END = "duration"  # and for its `stop`
 TRIAL_MAX_S = 7200.0  # nobody watches a trial for longer
 
 # Of the commands of one tick these come first, in this order: the safest wins

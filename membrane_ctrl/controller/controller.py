@@ -198,7 +198,7 @@ class Controller:
                 self._clear_mask = ALL_FAULTS
             case "stop":
                 scene.way_down = "stop"
-                scene.stop_exit = errors.Exit.DONE if command.who == "duration" else errors.Exit.INTERRUPTED
+                scene.stop_exit = errors.Exit.DONE if command.who == commands.AT_END else errors.Exit.INTERRUPTED
             case "vent" if self.state == State.FAULT:
                 scene.levels.enter(Rung.VENT, scene.now_s)
             case "lower" | "vent":

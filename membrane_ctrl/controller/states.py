@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from membrane_ctrl.control import inner_loop
 from membrane_ctrl.control.experiments.machine import BenchSample, Finished
-from membrane_ctrl.controller import pump_obeys
+from membrane_ctrl.controller import commands, pump_obeys
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.states import Rung, State
@@ -57,8 +57,6 @@ def check(scene: Scene) -> State:
 
 def inflate(scene: Scene) -> State:
     """Ramp from where the mirror is to the setpoint; the ramp waits for a mirror that lags behind."""
-    if (elsewhere := _asked_elsewhere(scene)) is not None:
-        return elsewhere
     lags = scene.output is not None and abs(scene.output.error_um) > scene.config.states.inflate_pause_um
     target_um = scene.output.setpoint_um - scene.trim_um if scene.output is not None and lags else scene.setpoint_um
     output = _drive(scene, target_um)
@@ -74,8 +72,6 @@ def inflate(scene: Scene) -> State:
 
 def settle(scene: Scene) -> State:
     """Stay inside the band for a while before the state is called hold."""
-    if (elsewhere := _asked_elsewhere(scene)) is not None:
-        return elsewhere
     output = _drive(scene, scene.setpoint_um)
     band_um = scene.config.limits.band_um
     settled_s = scene.stay_good(abs(output.error_um) < band_um)
@@ -90,8 +86,6 @@ def settle(scene: Scene) -> State:
 
 def hold(scene: Scene) -> State:
     """The main job."""
-    if (elsewhere := _asked_elsewhere(scene)) is not None:
-        return elsewhere
     if scene.paused:
         scene.give(scene.loop.stale(scene.dt_s))
         scene.why = f"paused by {scene.asked_by}: the pump keeps its mean flow"
@@ -150,7 +144,7 @@ def lower(scene: Scene) -> State:
     scene.hold_wanted = False
     scene.vent_fraction = float(scene.venting)
     stand = scene.standstill
-    scene.why = f"{_way(scene)} requested by {scene.asked_by}: pump off"
+    scene.why = f"{_way(scene)}: pump off"
     if scene.way_down == "stop":
         if stand.silent_s > scene.config.states.lower_timeout_s:
             scene.finished = Exit.DEVICE_FAILED  # nobody can see whether the pump stands
@@ -225,15 +219,20 @@ HANDLERS: dict[State, Callable[[Scene], State]] = {
 
 
 def run_state(state: State, scene: Scene) -> State:
-    """Run the state's handler and return the next state; whoever asked for the way down comes first."""
+    """Run the state's handler and return the next state; a request for another state comes first."""
     if scene.way_down is not None and state not in (State.LOWER, State.FAULT):
-        scene.why = f"{_way(scene)} requested by {scene.asked_by}"
+        scene.why = f"{_way(scene)}"
         return State.LOWER
+    if state in (State.INFLATE, State.SETTLE, State.HOLD) and (elsewhere := _asked_elsewhere(scene)) is not None:
+        return elsewhere
     return HANDLERS[state](scene)
 
 
 def _way(scene: Scene) -> str:
-    return "vent" if scene.venting and scene.way_down == "lower" else str(scene.way_down)
+    if scene.asked_by == commands.AT_END:
+        return "the duration is over"
+    way = "vent" if scene.venting and scene.way_down == "lower" else str(scene.way_down)
+    return f"{way} requested by {scene.asked_by}"
 
 
 def _strayed(scene: Scene) -> bool:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from firmware_iface.roles import Bench, BenchCommand, BenchReading, LinkDownError, LinkError, LinkWaitsError
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.commands import AT_END, Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import remember
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs, pack_tick
@@ -89,7 +89,7 @@ class Supervisor:
                 self.missed_ticks += skipped
                 deadline_s += skipped * self._period_s
                 if now_s >= ends_s:
-                    self.ask(Command("stop", "duration"))
+                    self.ask(Command("stop", AT_END))
                     ends_s = math.inf
                 _, outputs = await self.tick(now_s, now_s - last_s, late_s)
                 last_s = now_s
