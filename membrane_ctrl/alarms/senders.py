@@ -94,12 +94,8 @@ def require_sendable(config: port.AlarmsConfig) -> None:
 def apprise_senders(config: port.AlarmsConfig, run: str) -> list[Send]:
     """One sender for `urls_file`, one for `escalation_urls_file` if it is set; every notice names the run.
 
-    Raises
-    ------
-    DeviceError
-        Apprise is not installed.
-    InputError
-        A bad file or URL; the URL is named by its line only, as it holds passwords.
+    Raises DeviceError without Apprise, InputError for a bad file or URL, which is named by its line, as it may hold a
+    password.
     """
     apprise = _apprise()
     assert config.urls_file is not None

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, PriorOption, SetArgument, configured
+from membrane_ctrl.model.errors import InputError
 
 BoardOption = Annotated[
     str, typer.Option(help="Board as KIND:COLUMNSxROWS of squares; KIND is charuco or chessboard.")
@@ -43,10 +44,9 @@ def calibrate_camera(
     json: JsonOption = False,
 ) -> int:
     """Determine focal length, principal point and distortion from photographs of a board."""
-    from membrane_ctrl.calibration.camera import CameraOptions
-    from membrane_ctrl.calibration.camera import calibrate_camera as run
+    from membrane_ctrl.calibration import camera
 
-    return run(CameraOptions(photographs, board, configured(config), out, json))
+    return camera.calibrate_camera(camera.CameraOptions(photographs, board, configured(config), out, json))
 
 
 def calibrate_pose(
@@ -60,10 +60,9 @@ def calibrate_pose(
     json: JsonOption = False,
 ) -> int:
     """Determine the pose of the camera from the ring's ellipse in a full set."""
-    from membrane_ctrl.calibration.pose import PoseOptions
-    from membrane_ctrl.calibration.pose import calibrate_pose as run
+    from membrane_ctrl.calibration import pose
 
-    return run(PoseOptions(folder, geometry, tuple(prior or ()), radius_sigma_mm, out, json))
+    return pose.calibrate_pose(pose.PoseOptions(folder, geometry, tuple(prior or ()), radius_sigma_mm, out, json))
 
 
 def calibrate_display(config: ConfigArgument, json: JsonOption = False) -> int:
@@ -119,7 +118,6 @@ def calibrate(
 ) -> int:
     """Calibrate the optics: one geometry with its covariance, from sets at several pressures."""
     from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command
-    from membrane_ctrl.model.errors import InputError
 
     names, priors = tuple(free or ()), tuple(prior or ())
     if not live:
@@ -132,12 +130,11 @@ def calibrate(
             CalibrateOptions(folders, geometry, geometry_out, names, laser_sigma_um, json, pictures, priors=priors)
         )
     from membrane_ctrl.calibration.live import LiveOptions, calibrate_live
-    from membrane_ctrl.control_port.ctl import Where
-    from membrane_ctrl.control_port.sockets import SOCKET_NAME
+    from membrane_ctrl.control_port import ctl, sockets
 
     if folders or out:
         raise InputError("calibrate --live takes its sets into its session's folder: leave out SET... and --out")
-    where = Where(socket=logs / SOCKET_NAME if socket is None and run is None else socket, run=run)
+    where = ctl.Where(socket=logs / sockets.SOCKET_NAME if socket is None and run is None else socket, run=run)
     options = LiveOptions(
         where, logs, session, session_name, range_um, sets, yes, take_over,
         geometry, names, laser_sigma_um, json, pictures, priors,

@@ -33,12 +33,7 @@ def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: 
     With `latch` nobody can run the pump again until a person clears it: at the board, in a running hold and in the
     next one. Without, a program that has the devices is left alone.
 
-    Raises
-    ------
-    InputError
-        The configuration names no devices.
-    DeviceError
-        The pump could not be stopped, or not be latched.
+    Raises InputError without devices, DeviceError if the pump could not be stopped or latched.
     """
     if config.devices is None:
         raise InputError(f"{source}: devices: missing; there is nothing to make safe")

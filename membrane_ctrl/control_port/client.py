@@ -20,18 +20,7 @@ _TURN = struct.pack("ll", 10, 0)  # to wait for one's turn: s and us, as the ker
 
 
 class PortClient:
-    """A connection to a running hold; `notice` gets unsolicited notices.
-
-    Attributes
-    ----------
-    greeting : dict
-        `run`, `you`, `role`, `commander`.
-
-    Raises
-    ------
-    DeviceError
-        Nobody answers, or not a hold.
-    """
+    """A connection to a running hold; `notice` gets unsolicited notices. Raises DeviceError if no hold answers."""
 
     def __init__(self, connection: socket.socket, where: str, notice: Callable[[str], None]) -> None:
         self._connection, self._where, self._notice = connection, where, notice
@@ -44,7 +33,7 @@ class PortClient:
         if "membrane_ctrl" not in greeting:
             self.close()
             raise DeviceError(f"{where}: not a control port of membrane-ctrl")
-        self.greeting = greeting
+        self.greeting = greeting  # `run`, `you`, `role`, `commander`
 
     @classmethod
     def unix(cls, path: Path, notice: Callable[[str], None]) -> PortClient:

@@ -142,13 +142,7 @@ class Wire:
         return found or {}
 
     async def line(self) -> bytes | None:
-        """The next line; None when the peer has gone.
-
-        Raises
-        ------
-        RequestError
-            The line is too long or too slow; there is no way to find the next one.
-        """
+        """The next line; None when the peer has gone. Raises RequestError if it is too long or too slow."""
         try:
             first = await self._reader.read(1)  # a peer may think for hours between two lines
             if first in (b"", b"\n"):

@@ -70,17 +70,11 @@ Refused = Callable[[str, str, str], None]
 
 
 class PortSession:
-    """A connection whose peer is known; `watch` streams `status`.
-
-    Attributes
-    ----------
-    heard_s : float
-        When the peer last asked something, on the event loop's clock.
-    """
+    """A connection whose peer is known; `watch` streams `status`."""
 
     def __init__(self, wire: Wire, peer: Peer, status: Callable[[], dict[str, Any]]) -> None:
         self.peer = peer
-        self.heard_s = asyncio.get_running_loop().time()
+        self.heard_s = asyncio.get_running_loop().time()  # when the peer last asked something
         self._wire = wire
         self._status = status
         self._watch: asyncio.Task[None] | None = None

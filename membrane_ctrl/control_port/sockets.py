@@ -34,10 +34,7 @@ _SOMEBODY_THERE_S = 1.0
 class UnixListener:
     """A listening socket file, until `close`; all but its owner and root get `group_role`.
 
-    Raises
-    ------
-    InputError, DeviceError
-        The path is taken or in use, there is no such group, or no permission.
+    Raises InputError or DeviceError if the path is in use, the group does not exist, or permission is missing.
     """
 
     def __init__(self, path: Path, group: str | None, group_role: Role) -> None:
@@ -134,10 +131,7 @@ _ROLES: dict[str, Role] = {"read": "read", "operate": "operate", "tune": "tune"}
 class TlsListener:
     """A listening TCP socket and the context of its handshakes.
 
-    Raises
-    ------
-    InputError, DeviceError
-        A file is no certificate or key, or the address cannot be used.
+    Raises InputError for a bad certificate or key, DeviceError if the address cannot be used.
     """
 
     def __init__(self, config: TlsConfig) -> None:

@@ -59,21 +59,7 @@ class SensorConsistency:
         self.laser_lies = self.camera_lies = self.laser_gauge_apart = self.gas_excess = ""
 
     def ask(self, inputs: tick.TickInputs, state: State, dt_s: float, held: HoldStatus) -> list[Event]:
-        """One tick.
-
-        Parameters
-        ----------
-        inputs : TickInputs
-        state : State
-            Only a held mirror is judged.
-        dt_s : float
-        held : HoldStatus
-
-        Returns
-        -------
-        list of Event
-            What is new.
-        """
+        """Look at a tick, and return what is new; only a held mirror is judged."""
         laser_um, gauge_pa = held.laser_um, held.gauge_pressure_pa
         if held.setpoint_um != self._setpoint_um:
             self._setpoint_um = held.setpoint_um

@@ -52,13 +52,6 @@ class VirtualRun:
         Called with the time every `shape.period_s`; returns an estimate or None.
     alter : callable, optional
         Gets the time and the board's reading, returns what the controller reads.
-
-    Attributes
-    ----------
-    now_s : float
-        The run's clock.
-    finished : Exit or None
-        How the run ended.
     """
 
     def __init__(
@@ -76,7 +69,7 @@ class VirtualRun:
         self._period_s = 1.0 / config.loop.rate_hz
         self._steps = 0
         self._last_s = 0.0
-        self.now_s = 0.0
+        self.now_s = 0.0  # the run's clock
         self.finished: errors.Exit | None = None
         self._supervisor = Supervisor(
             Controller(config, sag_sensitivity),

@@ -65,18 +65,9 @@ _SILENT_S = 5.0  # without a tick a run has ended, or is in worse trouble than a
 
 
 class LiveHold:
-    """A `HoldLink` on a run of this machine.
+    """A `HoldLink` on a run of this machine; with `take_over` its first command takes over from another commander.
 
-    Raises InputError if the folder is not that of the run the client talks to, or its rings are not there.
-
-    Parameters
-    ----------
-    client : PortClient
-        Connected to it.
-    run_dir : Path
-        Its folder.
-    take_over : bool
-        Take the command from whoever has it, at the first command.
+    Raises InputError if `run_dir` is not the folder of the client's run, or has no rings.
     """
 
     def __init__(self, client: PortClient, run_dir: Path, take_over: bool = False) -> None:
