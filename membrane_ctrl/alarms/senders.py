@@ -12,7 +12,7 @@ from typing import Any
 
 from membrane_ctrl.alarms.book import Notice
 from membrane_ctrl.config import port, schema
-from membrane_ctrl.model import clock, errors
+from membrane_ctrl.model import clock, errors, files
 
 Send = Callable[[Notice], bool]
 
@@ -69,9 +69,9 @@ _TYPES = {"raised": "", "escalated": "failure", "reminder": "", "cleared": "succ
 
 
 def read_urls(path: Path) -> list[str]:
-    """The URLs of a file, one a line; empty lines and those after `#` are passed over. Raises InputError."""
+    """The URLs of a file, one a line; empty lines and comments (`#`) are ignored. Raises InputError."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = files.read_text(path, follow=True).splitlines()
     except OSError as error:
         raise errors.InputError(f"alarms: {path}: {errors.os_reason(error)}") from None
     except UnicodeDecodeError as error:
@@ -99,8 +99,8 @@ def apprise_senders(config: port.AlarmsConfig, run: str) -> list[Send]:
     """
     apprise = _apprise()
     assert config.urls_file is not None
-    files = [name for name in (config.urls_file, config.escalation_urls_file) if name is not None]
-    return [partial(_send, _plugins(apprise, Path(name)), run) for name in files]
+    lists = [name for name in (config.urls_file, config.escalation_urls_file) if name is not None]
+    return [partial(_send, _plugins(apprise, Path(name)), run) for name in lists]
 
 
 def _send(targets: Sequence[Any], run: str, notice: Notice) -> bool:
@@ -150,8 +150,8 @@ def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json
         raise errors.InputError(f"{source}: alarms.escalation_urls_file: missing; there is nobody to escalate to")
     notice = Notice("raised", "test", "warning", "this is a test; nothing is wrong", escalated)
     senders = apprise_senders(alarms, "none, a test")
-    files = [alarms.urls_file, alarms.escalation_urls_file][: 2 if escalated else 1]
-    deaf = [file for file, send in zip(files, senders, strict=False) if not send(notice)]
+    lists = [alarms.urls_file, alarms.escalation_urls_file][: 2 if escalated else 1]
+    deaf = [file for file, send in zip(lists, senders, strict=False) if not send(notice)]
     if as_json:
         print(json.dumps({"sent": not deaf}))
     if deaf:

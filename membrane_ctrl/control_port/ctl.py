@@ -10,7 +10,7 @@ from typing import Any
 from membrane_ctrl.config.toml_file import read_toml
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.model import errors
+from membrane_ctrl.model import errors, files, plain_json
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,11 +106,11 @@ def _shown(value: float | None) -> str:
 
 
 def loop_keys(argument: str) -> dict[str, Any]:
-    """Loop keys of a TOML or JSON file, or of the text itself; a [loop] table is looked into. Raises InputError."""
+    """Loop keys, or their [loop] table, of a TOML or JSON file or of the text itself. Raises InputError."""
     path = Path(argument)
     if path.suffix == ".json":
         try:
-            tables = json.loads(path.read_text(encoding="utf-8"))
+            tables = plain_json.loads(files.read_text(path, follow=True))
         except (OSError, ValueError) as error:
             raise errors.InputError(f"{path}: {error}") from None
     elif path.suffix == ".toml":
