@@ -25,15 +25,7 @@ def require(right: bool, problem: str) -> None:
 
 
 class BoardUnderTest:
-    """A board, the claim that the test has on it, and its heartbeat.
-
-    Parameters
-    ----------
-    link : ModbusLink
-        The board, connected.
-    sleep : callable
-        Waits; the board's clock is what counts.
-    """
+    """A board (connected), the claim that the test has on it, and its heartbeat; the board's clock is what counts."""
 
     def __init__(self, link: ModbusLink, sleep: Callable[[float], Awaitable[None]] = asyncio.sleep) -> None:
         self._link = link

@@ -52,17 +52,7 @@ class RoleDevices:
 
 
 class RoleBench:
-    """Reads all sensors at once and drives pump and vent.
-
-    Parameters
-    ----------
-    devices : RoleDevices
-        Not yet open.
-    watchdog_s : float
-        The pump is set to 0 when no `write` came for this long.
-    clock : callable
-        Seconds on any axis that does not go back.
-    """
+    """Reads all sensors at once and drives pump and vent; no `write` for `watchdog_s` sets the pump to 0."""
 
     def __init__(
         self, devices: RoleDevices, watchdog_s: float = 0.5, clock: Callable[[], float] = time.monotonic

@@ -140,14 +140,9 @@ class AravisCamera:
         return frame
 
     def grab(self, out: roles.Pixels | None = None) -> roles.Frame:
-        """One exposure, taken again when it is lost.
+        """One exposure, in `out` (height, width) or a new array; taken again when it is lost.
 
         Raises LinkError (no camera, or three frames lost in a row).
-
-        Parameters
-        ----------
-        out : (height, width) array, optional
-            Where the pixels go; else a new array.
         """
         for _ in range(roles.TRIES - 1):
             self.expose(out)

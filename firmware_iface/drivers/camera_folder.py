@@ -18,14 +18,7 @@ _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm")
 class FolderCamera:
     """The camera, and the screen beside it: after `show(pattern)` the picture of that name comes.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the pictures, 8 or 16 bit grey. `x_sin_0.png` is the picture of the pattern `x_sin_0`.
-    width_px, height_px : int
-        Every picture has to have this size.
-    now : callable
-        The run's clock.
+    The pictures are 8 or 16 bit grey and of one size; `x_sin_0.png` is the picture of the pattern `x_sin_0`.
     """
 
     def __init__(

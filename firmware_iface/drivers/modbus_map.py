@@ -103,16 +103,7 @@ def _check_raw(made: ValueMap, raw_limits: list[float] | None) -> None:
 class ModbusValue:
     """One value of a Modbus device, as whatever role the configuration gives it.
 
-    Parameters
-    ----------
-    link : ModbusLink
-        The device.
-    value_map : ValueMap
-        Where the value is.
-    rest : float or None
-        Of an actuator: what it is left at on opening and closing; None: it is left as it is.
-    clock : callable
-        Time of arrival, for `displacement`.
+    `rest` is what an actuator is left at on opening and closing; None leaves it as it is.
     """
 
     def __init__(

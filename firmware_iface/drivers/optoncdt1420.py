@@ -42,12 +42,8 @@ _MARKS = (0, 1, 2, 0, 1, 3)
 class StreamParser:
     """Bytes in any portions to measurements.
 
-    Attributes
-    ----------
-    bytes_lost : int
-        That belonged to no measurement, so far.
-    untrusted : int
-        Measurements that did not follow on the one before, so far.
+    It counts `bytes_lost`, which belonged to no measurement, and `untrusted` measurements, which did not follow on
+    the one before.
     """
 
     def __init__(self) -> None:

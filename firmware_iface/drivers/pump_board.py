@@ -31,21 +31,11 @@ class PumpBoard(LinkedDevice):
     then the board keeps the pump off.
 
     `open` claims a board of map version 2 for this object: until it is closed, or its watchdog has run out, the board
-    takes commands from nobody else. A board of map version 1 knows no claim and obeys whoever writes. Raises
-    ValueError (the URL is none, or the board cannot have this watchdog period).
+    takes commands from nobody else. A board of map version 1 knows no claim and obeys whoever writes.
 
-    Parameters
-    ----------
-    url : str
-        `tcp://HOST:PORT` (502 when left out) or `rtu:///dev/ttyUSB0?baud=115200`.
-    unit_id : int
-        Modbus unit.
-    timeout_s : float
-        For connecting and for each reply.
-    watchdog_s : float
-        The board turns the pump off when it gets no `write` for this long.
-    link : ModbusLink, optional
-        A link that is there already (one in memory, in virtual time), in place of the URL's.
+    The board turns the pump off when it gets no `write` for `watchdog_s`. The URL is `tcp://HOST:PORT` (502 when left
+    out) or `rtu:///dev/ttyUSB0?baud=115200`; a `link` that is there already takes its place. Raises ValueError (the
+    URL is none, or the board cannot have this watchdog period).
     """
 
     def __init__(

@@ -41,17 +41,7 @@ class ScreenSettings:
 class PygameScreen:
     """The display, fullscreen, from `open` to `close`. For the main thread of a process only (SDL's rule).
 
-    Parameters
-    ----------
-    response : DisplayResponse
-        Makes the patterns' light linear.
-    now, sleep : callables
-        The run's clock.
-
-    Attributes
-    ----------
-    settle_s : float
-        What `show` waits; may be set.
+    `response` makes the patterns' light linear; `show` waits `settle_s`, which may be set.
     """
 
     def __init__(
@@ -129,12 +119,7 @@ class PygameScreen:
         self._sleep(max(0.0, self._shown_s + self.settle_s - self._now()))
 
     def show_levels(self, levels: NDArray[np.uint8]) -> None:
-        """Send an image of the screen's size, level for level, for tests of the display; not waited for.
-
-        Parameters
-        ----------
-        levels : (height, width) array
-        """
+        """Send an image (height, width), level for level, for tests of the display; not waited for."""
         if self._window is None:
             self.open()
         self._flip(self._surface(levels))

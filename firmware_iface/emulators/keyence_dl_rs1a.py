@@ -10,25 +10,9 @@ _WRITABLE = ("001",)
 
 
 class KeyenceDlRs1aEmulator(LineDevice):
-    """One amplifier that sees the mirror, and others beside it that measure nothing of interest.
+    """One amplifier that sees the mirror (NaN: it is in error), and others that measure nothing of interest.
 
-    Parameters
-    ----------
-    displacement_um : callable
-        What amplifier 0 measures; NaN when it is in error.
-    direction : int
-        -1: the value falls as the bowl deepens.
-    baud, parity
-        As set by its switches.
-    amplifiers : int
-        How many there are.
-
-    Attributes
-    ----------
-    error_state : int
-        Data number 033 of all amplifiers.
-    zero_shift_mm : float
-        Of the judgment value.
+    `error_state` is data number 033 of all amplifiers, `zero_shift_mm` that of the judgment value.
     """
 
     end = b"\r"

@@ -30,27 +30,10 @@ _CHOICES = {
 
 
 class Optoncdt1420Emulator(LineDevice):
-    """Sees the mirror from behind.
+    """Sees the mirror from behind, displacement 0 in the middle of its range (NaN: nothing is in sight).
 
-    Parameters
-    ----------
-    displacement_um : callable
-        What it measures; NaN when nothing is in sight.
-    range_mm : int
-        Measuring range; displacement 0 is in its middle.
-    direction : int
-        -1: a deeper bowl is nearer.
-    baud : int
-        As stored in the sensor.
-    noise_um : float
-        Standard deviation of a single value.
-    name : str
-        What it says it is.
-
-    Attributes
-    ----------
-    lose_bytes_every : int
-        One byte in so many is lost from the stream; 0: off.
+    `noise_um` is the standard deviation of a single value; one byte in `lose_bytes_every` is lost from the stream (0:
+    none).
     """
 
     def __init__(

@@ -40,27 +40,11 @@ class Faults:
 
 
 class PumpBoardEmulator:
-    """Serves `plant` on Modbus TCP.
+    """Serves `plant` on Modbus TCP, from the event loop's thread.
 
-    Parameters
-    ----------
-    plant : BoardPlant
-        Called from the event loop's thread only.
-    host, port
-        Where to listen; port 0 takes any free one (see `port` after `start`).
-    clock : callable, optional
-        Seconds on any axis that does not go back; what the watchdog runs on. By default the event loop's.
-    unit_id : int
-        Requests to other units are answered with exception 11, as a gateway does.
-    registers : RegisterMap, optional
-        A board of another map version than the newest.
-
-    Attributes
-    ----------
-    faults : Faults
-        Switches.
-    state : BoardState
-        The board itself.
+    Port 0 takes any free one (see `port` after `start`). The watchdog runs on `clock`, by default the event loop's.
+    Requests to other units are answered with exception 11, as a gateway does. `registers` may be those of an earlier
+    map version.
     """
 
     def __init__(

@@ -106,15 +106,9 @@ _SPEED = 4  # place of the input speed in what tcgetattr gives; the output speed
 class PtyWire:
     """An emulated device behind a pseudo-terminal, to be opened at `path` like any serial port.
 
-    A program that opens it with another baud rate than the device's gets garbage and is not understood, as on a real
-    line. Character size and parity are no properties of a pseudo-terminal.
-
-    Parameters
-    ----------
-    device : SerialDevice
-        Called from the event loop's thread only.
-    path : Path
-        Made as a link to the pseudo-terminal; another one after every replug.
+    `path` is a link to the pseudo-terminal, to another one after every replug. A program that opens it with another
+    baud rate than the device's gets garbage and is not understood, as on a real line. Character size and parity are
+    no properties of a pseudo-terminal.
     """
 
     def __init__(self, device: SerialDevice, path: Path) -> None:

@@ -14,26 +14,7 @@ _DEFAULT_FORMAT = '"P= " 4.2 P " " U3 #r #n'
 
 
 class VaisalaPtb330Emulator(LineDevice):
-    """Feels the air.
-
-    Parameters
-    ----------
-    ambient_pressure_pa : callable
-        What it measures; NaN when it cannot.
-    baud : int
-        As set.
-    running : bool
-        Whether it was left sending by itself.
-    model : str
-        What it says it is.
-
-    Attributes
-    ----------
-    error_flags : str
-        Of its three modules.
-    serial : str
-        Its number.
-    """
+    """Feels the air (NaN: it cannot); `running`: it was left sending. `error_flags` are its three modules'."""
 
     end = b"\r"
 

@@ -16,21 +16,9 @@ _STREAM_PERIOD_S = 0.02
 
 
 class VentusEmulator(LineDevice):
-    """Drives gas.
+    """Drives gas: `drive` is called with the fraction of `power_max_mw` whenever it changes.
 
-    Parameters
-    ----------
-    drive : callable
-        Called with the fraction of `power_max_mw` whenever it changes.
-    power_max_mw : float
-        What counts as full drive.
-    streaming : bool
-        Whether it was left streaming.
-
-    Attributes
-    ----------
-    registers : dict
-        Number to value.
+    `streaming`: it was left streaming.
     """
 
     def __init__(

@@ -38,18 +38,11 @@ class Question:
 
 
 class SerialExchange:
-    """Questions and answers on one line, for one device or several that take turns.
+    """Questions and answers on one line, for one device or several that take turns; its port's only user.
 
-    Parameters
-    ----------
-    port : SerialPort
-        The line; this object is its only user.
-    gap_s : float
-        Silence that the devices want between an answer and the next question.
-    quiet_s : float
-        Silence after a loss. As long as devices are usually late at most; the fence covers the rest.
-    blank : bytes
-        Of these, what comes between answers means nothing, like the LF behind a CR that already ended one.
+    Devices want the silence `gap_s` between an answer and the next question. After a loss it is `quiet_s`, as long as
+    devices are usually late at most; the fence covers the rest. Bytes of `blank` mean nothing between answers, like
+    the LF behind a CR that already ended one.
     """
 
     def __init__(self, port: SerialPort, gap_s: float, quiet_s: float, blank: bytes = b"") -> None:
@@ -71,12 +64,8 @@ class SerialExchange:
     def connect(self, greeting: bytes = b"") -> None:
         """Open the line; what devices may still owe to an earlier user is not believed.
 
-        Raises LinkDownError (the port does not open).
-
-        Parameters
-        ----------
-        greeting : bytes
-            Sent at once, and whatever comes back is thrown away: for a device that talks unasked until told to stop.
+        The greeting is sent at once, and whatever comes back is thrown away: for a device that talks unasked until
+        told to stop. Raises LinkDownError if the port does not open.
         """
         self.port.open(self)
         self._sure.clear()
@@ -94,21 +83,11 @@ class SerialExchange:
             await asyncio.wait([self._in_flight])
 
     async def ask(self, question: Question, timeout_s: float, fence: Question | None, key: int = 0) -> bytes:
-        """The answer to a question.
+        """The answer to a question, which is asked once: nothing is ever sent again by itself.
 
-        Devices that wait are served in turn, each with one question. Raises LinkError (no valid answer),
-        LinkDownError (the line is closed or went away).
-
-        Parameters
-        ----------
-        question : Question
-            Asked once; nothing is ever sent again by itself.
-        timeout_s : float
-            For the device; the time on the wire comes on top.
-        fence : Question or None
-            See the module; None for a device that has none, which `quiet_s` alone then protects.
-        key : int
-            Which device of the line.
+        Devices (`key`) that wait are served in turn, each with one question. The device has `timeout_s`; the time on
+        the wire comes on top. A device that has no fence (None) is protected by `quiet_s` alone. Raises LinkError (no
+        valid answer), LinkDownError (the line is closed or went away).
         """
         async with self._key_turns[key]:
             await self._turn.acquire()  # cancelled while waiting here, a question is never sent
@@ -223,18 +202,7 @@ class LineFence:
 class LineLink:
     """Commands out, lines of text back, each checked as a whole against what it has to look like.
 
-    Parameters
-    ----------
-    port : SerialPort
-        The line.
-    end : str
-        What a command ends in.
-    timeout_s : float
-        For the device; the time on the wire comes on top.
-    fence : LineFence
-        Asked after a loss.
-    quiet_s : float
-        Silence after a loss.
+    A command ends in `end`. The device has `timeout_s`; the time on the wire comes on top.
     """
 
     def __init__(self, port: SerialPort, end: str, timeout_s: float, fence: LineFence, quiet_s: float = 0.1) -> None:
@@ -258,18 +226,11 @@ class LineLink:
         await self._exchange.close()
 
     async def query(self, command: str, answer: re.Pattern[str], longest: int = 80) -> re.Match[str]:
-        """The answer to a command, whose whole text has the given form (line ends included).
+        """The answer to a command (without its end), whose whole text has the given form, line ends included.
 
-        Raises LinkError (no answer of this form in time), LinkDownError (the line is gone).
-
-        Parameters
-        ----------
-        command : str
-            Without its end.
-        answer : re.Pattern
-            Has to match everything that comes, line ends before it aside, and nothing that is still incomplete.
-        longest : int
-            Characters of the longest answer; more are no answer.
+        The pattern has to match everything that comes, line ends before it aside, and nothing that is still
+        incomplete; more than `longest` characters are no answer. Raises LinkError (no answer of this form in time),
+        LinkDownError (the line is gone).
         """
         fence = self._question(self._fence.command, self._fence.answer, self._fence.longest)
         heard = await self._exchange.ask(self._question(command, answer, longest), self._timeout_s, fence)

@@ -66,12 +66,7 @@ def parse_rtu_url(url: str) -> tuple[str, serial_port.SerialSettings]:
 class RtuBus:
     """A serial bus with any number of Modbus devices, served in turn.
 
-    Parameters
-    ----------
-    port : SerialPort
-        The line.
-    quiet_s : float
-        Silence after a loss, before the next request: as long as devices are usually late at most.
+    After a loss it is silent for `quiet_s`, as long as devices are usually late at most.
     """
 
     def __init__(self, port: serial_port.SerialPort, quiet_s: float = 0.2) -> None:
@@ -97,18 +92,10 @@ class RtuBus:
 
 
 class GuardedModbusRtu:
-    """One Modbus RTU device of a bus.
+    """One Modbus RTU device of a bus: whoever connects first opens the bus, whoever closes it closes it for all.
 
-    Parameters
-    ----------
-    bus : RtuBus
-        Shared by all devices of the line: whoever connects first opens it, whoever closes it closes it for all.
-    unit_id : int
-        1..247.
-    timeout_s : float
-        For the device to answer; the time on the wire comes on top.
-    fence : bool
-        False for a device that is silent on function 8 instead of refusing it.
+    The device has `timeout_s`; the time on the wire comes on top. `fence` is False for a device that is silent on
+    function 8 instead of refusing it.
     """
 
     def __init__(self, bus: RtuBus, unit_id: int, timeout_s: float, fence: bool = True) -> None:

@@ -26,22 +26,11 @@ _UNANSWERED_MAX = 3
 
 
 class GuardedModbusTcp:
-    """One Modbus TCP device.
+    """One Modbus TCP device; `timeout_s` is for connecting and for each reply.
 
     One request is in flight at a time. One that was sent when its caller is cancelled still runs to its reply or
     timeout, so that nothing is ever abandoned on the wire. Nothing is sent twice, and nothing reconnects by itself:
     the owner calls `connect`, which refuses to try before its back-off (0.1 s, doubling to 5 s) is over.
-
-    Parameters
-    ----------
-    host, port
-        Of the device or its gateway.
-    unit_id : int
-        Modbus unit.
-    timeout_s : float
-        For connecting and for each reply.
-    clock : callable
-        Seconds on any axis that does not go back; for the back-off.
     """
 
     def __init__(

@@ -108,16 +108,8 @@ class Receiver(Protocol):
 class SerialPort:
     """A serial port of this machine.
 
-    Raises ValueError (the name is neither).
-
-    Parameters
-    ----------
-    port : str
-        A path, or `usb:VID:PID[:SERIAL]`, looked up at every `open` so that a replug in another socket is found.
-    settings : SerialSettings
-        Of the line.
-    clock : callable
-        Seconds on any axis that does not go back; for the back-off.
+    It is a path or `usb:VID:PID[:SERIAL]`, looked up at every `open` so that a replug in another socket is found.
+    Raises ValueError if the name is neither.
     """
 
     def __init__(self, port: str, settings: SerialSettings, clock: Callable[[], float] = time.monotonic) -> None:

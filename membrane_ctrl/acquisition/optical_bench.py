@@ -41,18 +41,9 @@ class TestScreen(Protocol):
 
 
 class DisplayTest:
-    """Measures a display through the camera that looks at it.
+    """Measures a display through the camera that looks at it, both open.
 
-    Parameters
-    ----------
-    screen, camera
-        Open.
-    clock : CycleClock
-        The run's clock.
-    width_px, height_px : int
-        Of the screen.
-    settle_s : float
-        Wait before a still picture; `settling` lowers it.
+    Before a still picture it waits `settle_s`, which `settling` lowers.
     """
 
     def __init__(
@@ -189,17 +180,10 @@ class BenchFindings:
 
 
 def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchFindings:
-    """Connect camera and screen, and let the camera measure the screen.
+    """Connect camera and screen (of `configured_bench`), and let the camera measure the screen.
 
     What is found wrong does not keep a run from trying: its cycles are judged one by one. Raises LinkError if one of
     them is not there or not usable.
-
-    Parameters
-    ----------
-    bench : OpticalBench
-        From `configured_bench`.
-    clock : CycleClock
-        The run's clock.
     """
     identity = bench.camera.open()
     who = " ".join(part for part in (identity.kind, identity.serial, identity.detail) if part)

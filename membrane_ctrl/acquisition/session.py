@@ -27,13 +27,7 @@ from membrane_ctrl.sim.sensors import Truth
 
 
 class TwinTruth:
-    """Where the simulated film is now; call it.
-
-    Parameters
-    ----------
-    address : RingAddress
-        The ring in which the bench process publishes the truth.
-    """
+    """Where the simulated film is now, from the ring in which the bench publishes the truth; call it."""
 
     def __init__(self, address: ring.RingAddress) -> None:
         self._reader = ring.RingReader(address)
@@ -97,18 +91,7 @@ def warm_up(
 ) -> None:
     """A full cycle and two of fringes only, with and without known motion, of a film that stands still.
 
-    Parameters
-    ----------
-    reconstructor : Reconstructor
-        One to be thrown away, for `small(optics)`.
-    optics : OpticsConfig
-        The small ones.
-    plan : CyclePlan
-        The patterns.
-    position : FilmPosition
-        Where the film stands.
-    clock : CycleClock
-        The run's clock.
+    `reconstructor` is for `small(optics)`, as `optics` are, and to be thrown away.
     """
     bench = TwinOptics(optics, TwinConfig(), lambda: position, clock)
 

@@ -88,17 +88,11 @@ class LeakGrowth:
         self._still_s = self._stands_s = 0.0
 
     def step(self, leak_um_per_s: float, flow_um_per_s: float, most: float, dt_s: float) -> str:
-        """One tick of a held mirror; what is wrong, if so.
+        """One tick of a held mirror; what is wrong, if so. NaN for what is not known.
 
-        Parameters
-        ----------
-        leak_um_per_s : float
-            The inner loop's estimate, NaN without.
-        flow_um_per_s : float
-            What the pump gives, NaN without. The estimate is without what the feed-forward adds, and a thermometer
-            that lies shifts it; a film that really takes more gas gets more.
-        most : float
-            Times what the film used to take; infinite where a camera sees that it stands still.
+        The leak is the inner loop's estimate, without what the feed-forward adds, and a thermometer that lies shifts
+        it; a film that really takes more gas gets more. `most`: times what the film used to take; infinite where a
+        camera sees that it stands still.
         """
         if not (math.isfinite(leak_um_per_s) and math.isfinite(flow_um_per_s)):
             return ""
@@ -122,13 +116,7 @@ class LeakGrowth:
 
 
 class FilmMonitor:
-    """Compares laser and gauge on every tick in which the pump may run.
-
-    Parameters
-    ----------
-    mirror : MirrorConfig
-        Sag, and pressure if it is known, at displacement 0.
-    """
+    """Compares laser and gauge on every tick in which the pump may run."""
 
     def __init__(self, limits: LimitsConfig, mirror: MirrorConfig) -> None:
         self._limits = limits
@@ -150,16 +138,9 @@ class FilmMonitor:
         return self._seen_s > 0.0
 
     def step(self, dt_s: float, laser_um: float, trim_um: float, gauge_pressure_pa: float) -> str:
-        """One tick; what laser and gauge have seen, if it does not fit.
+        """One tick; what laser and gauge have seen, if it does not fit. NaN without a (good) reading.
 
-        Parameters
-        ----------
-        laser_um : float
-            Reading of good quality, NaN without.
-        trim_um : float
-            What the shape loop has added to the setpoint: the laser's drift as the camera sees it.
-        gauge_pressure_pa : float
-            NaN without.
+        `trim_um` is what the shape loop has added to the setpoint: the laser's drift as the camera sees it.
         """
         # Both or none: two means that began their lag together differ by no way that the film goes.
         if not (math.isfinite(laser_um) and math.isfinite(gauge_pressure_pa)):

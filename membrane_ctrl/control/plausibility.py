@@ -50,15 +50,8 @@ class Changes:
 class Plausibility:
     """Judges on every tick; says NOBODY without a camera, for two sensors can only disagree.
 
-    Parameters
-    ----------
-    limit_um : float
-        How far laser and camera may be apart (`shape.disagreement_max_um`).
-
-    Attributes
-    ----------
-    changes : Changes
-        What the three have seen; NaN until there is a reference.
+    Laser and camera may be `limit_um` apart (`shape.disagreement_max_um`). `changes` are NaN until there is a
+    reference.
     """
 
     def __init__(self, limit_um: float) -> None:
@@ -82,17 +75,7 @@ class Plausibility:
     def step(
         self, dt_s: float, displacement_um: float, gauge_pressure_pa: float, estimate: ShapeEstimate | None
     ) -> Liar:
-        """One tick of a held mirror.
-
-        Parameters
-        ----------
-        displacement_um : float
-            Laser reading of good quality, NaN without.
-        gauge_pressure_pa : float
-            NaN without.
-        estimate : ShapeEstimate or None
-            In the tick in which it arrives.
-        """
+        """One tick of a held mirror; NaN without a good reading, the estimate in the tick in which it arrives."""
         if math.isfinite(displacement_um):
             self._laser.update(displacement_um, dt_s)
         if math.isfinite(gauge_pressure_pa):

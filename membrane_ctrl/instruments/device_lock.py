@@ -28,14 +28,9 @@ _SHOWN = 100  # letters of the holder's command line
 
 @contextlib.contextmanager
 def locked(devices: Iterable[str]) -> Iterator[None]:
-    """Have these devices for oneself; given back at the end, or with the process.
+    """Have these devices (`device_names`, `modbus_names`) for oneself; given back at the end, or with the process.
 
     Raises DeviceError (one line: which device another program uses, who that is, and what to do).
-
-    Parameters
-    ----------
-    devices : iterable of str
-        As `device_names` or `modbus_names` has them.
     """
     with contextlib.ExitStack() as stack:
         for device in sorted(set(devices)):

@@ -55,14 +55,8 @@ class BenchReport:
 def serve(spec: BenchSpec, ready: Connection) -> None:
     """Serve the bench in a spawned process until `processes.STOP`, or until `linger_s` after the parent's end.
 
-    SIGINT is ignored: Ctrl-C goes to the whole terminal, and the bench must outlive the controller's safe stop.
-
-    Parameters
-    ----------
-    spec : BenchSpec
-        The bench.
-    ready : Connection
-        Gets one BenchReport; a bench that cannot be built or cannot listen says so there and ends.
+    `ready` gets one BenchReport; a bench that cannot be built or cannot listen says so there and ends. SIGINT is
+    ignored: Ctrl-C goes to the whole terminal, and the bench must outlive the controller's safe stop.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if spec.speed <= 1.0:
@@ -126,15 +120,7 @@ def _truth_writer(address: RingAddress | None) -> Iterator[RingWriter | None]:
 
 
 class LiveBench:
-    """The plant on the run's clock, sampled by its device every 5 ms of plant time.
-
-    Parameters
-    ----------
-    spec : BenchSpec
-        Plant, clock, speed.
-    truth : RingWriter or None
-        Where the truth of every sample goes.
-    """
+    """The plant on the run's clock, sampled by its device every 5 ms of plant time; publishes the truth with each."""
 
     def __init__(self, spec: BenchSpec, truth: RingWriter | None) -> None:
         self._plant = Plant(spec.twin, spec.pump, spec.events)

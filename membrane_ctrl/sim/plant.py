@@ -27,15 +27,6 @@ class PumpModel:
     """q = q_full (d - dead) / (1 - dead) once running; starts at `start_fraction`, stalls below `stall_fraction`.
 
     Raises ValueError if the pump delivers nothing at any command.
-
-    Parameters
-    ----------
-    config : PumpConfig
-        Where it starts, stalls and begins to deliver.
-    flow_full_ml_per_s : float
-        Flow at command 1.
-    step_s : float
-        Time step.
     """
 
     def __init__(self, config: PumpConfig, flow_full_ml_per_s: float, step_s: float) -> None:
@@ -105,19 +96,7 @@ class OrnsteinUhlenbeck:
 
 
 class Disturbance:
-    """What the surroundings do, in blocks of consecutive steps.
-
-    Parameters
-    ----------
-    config : TwinConfig
-        Scenario, laser mount drift.
-    events : sequence of Event
-        What happens besides.
-    step_s : float
-        Time step.
-    rng : numpy.random.Generator
-        Source of all chance here.
-    """
+    """What the surroundings do, in blocks of consecutive steps: scenario, drift of the laser's mount, events."""
 
     def __init__(self, config: TwinConfig, events: Sequence[Event], step_s: float, rng: np.random.Generator) -> None:
         pressure, temperature = SCENARIOS[config.scenario]
@@ -173,18 +152,9 @@ def gas_compliance_ml_per_pa() -> float:
 class Plant:
     """The bench without its protocol; equal seeds and equal calls give equal samples.
 
-    It starts inflated, `start_error_um` off its nominal sag, films settled for a day and the pump just holding;
-    or flat and fresh, the pump off (`from_flat`). Commands hold until the next `actuate`. Truth does not depend
-    on how often it is sampled, nor on how time is cut into calls of `advance`.
-
-    Parameters
-    ----------
-    twin : TwinConfig
-        Scenario, seed, noise, start.
-    pump : PumpConfig
-        Flow against command.
-    events : sequence of Event
-        What happens when, in plant time.
+    It starts inflated, `start_error_um` off its nominal sag, films settled for a day and the pump just holding; or
+    flat and fresh, the pump off (`from_flat`). Events are in plant time. Commands hold until the next `actuate`.
+    Truth does not depend on how often it is sampled, nor on how time is cut into calls of `advance`.
     """
 
     def __init__(self, twin: TwinConfig, pump: PumpConfig, events: Sequence[Event] = ()) -> None:

@@ -67,15 +67,7 @@ class PlantSample:
 
 
 class Sensors:
-    """Laser, barometer, gauge and thermometers with independent noise in each sample.
-
-    Parameters
-    ----------
-    config : TwinConfig
-        Noise and resolution.
-    rng : numpy.random.Generator
-        Source of the noise.
-    """
+    """Laser, barometer, gauge and thermometers with independent noise in each sample."""
 
     def __init__(self, config: TwinConfig, rng: np.random.Generator) -> None:
         self._config = config

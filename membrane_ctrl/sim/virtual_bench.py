@@ -50,21 +50,7 @@ class Wrong:
 class VirtualBench:
     """Plant and board, advanced together; the methods of `roles.Bench`, without waiting.
 
-    Parameters
-    ----------
-    plant : Plant
-        The twin's physics.
-    watchdog_s : float
-        As `devices.watchdog_s`.
-
-    Attributes
-    ----------
-    wrong : Wrong
-        Switches.
-    board : BoardState
-        The board itself: what it gives to pump and vent, and what it has latched.
-    truth : Truth
-        What really was when the board last took its sample, or would have.
+    `wrong` are its switches, `truth` is what really was when the board last took its sample, or would have.
     """
 
     def __init__(self, plant: Plant, watchdog_s: float = 0.5) -> None:

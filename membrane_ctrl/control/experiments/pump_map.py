@@ -69,14 +69,7 @@ class PumpProbe:
 class PumpMapper:
     """Step machine of the pump map; its answers are pump commands, 0..1.
 
-    Parameters
-    ----------
-    centre_um : float
-        Where the mirror is brought back to.
-    holding_fraction : float
-        Command that about holds it.
-    holding_flow_um_per_s : float
-        Flow of that command as configured: how fast the mirror will sink without it, to a factor.
+    `holding_fraction` is the command that about holds the mirror; its flow says how fast the mirror sinks without it.
     """
 
     def __init__(

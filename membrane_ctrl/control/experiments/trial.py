@@ -37,17 +37,10 @@ _PATTERNS = {"steps": machine.steps, "doublets": machine.doublets, "multisine": 
 
 
 class Trial:
-    """An experiment inside its guard.
+    """An experiment inside its guard, about `centre_um`.
 
     Raises ValueError if the pump has no room about the holding flow, or the noise none in the limit; the message says
     what would help.
-
-    Parameters
-    ----------
-    loop, pump : LoopConfig, PumpConfig
-        The pump's range, as configured.
-    centre_um : float
-        Where the mirror stands.
     """
 
     def __init__(self, spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre_um: float) -> None:

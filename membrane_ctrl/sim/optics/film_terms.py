@@ -145,17 +145,10 @@ def _monomials(j: int) -> dict[tuple[int, int], float]:
 
 
 def polynomial(coeffs: FloatArray) -> FloatArray:
-    """Sum of Zernike terms as a polynomial of the unit disc's x and y.
+    """Sum of Zernike terms, coefficients (J,) of Noll's j = 1..J, as a polynomial of the unit disc's x and y.
 
-    Parameters
-    ----------
-    coeffs : (J,) array
-        Coefficients of Noll's terms j = 1..J, any unit.
-
-    Returns
-    -------
-    (D + 1, D + 1) array
-        Element (i, k) multiplies x^i y^k, same unit; D is the highest degree that is used.
+    Element (i, k) of the (D + 1, D + 1) array multiplies x^i y^k, in the same unit; D is the highest degree that is
+    used.
     """
     used = [j for j, value in enumerate(coeffs, start=1) if value != 0.0]
     degree = max((noll_orders(j)[0] for j in used), default=0)

@@ -232,14 +232,7 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
 def pattern_sequence(kind: str, config: PatternConfig, shifts_rad: tuple[float, ...] = ()) -> list[Pattern]:
     """The patterns of a set in the order they are shown: x and y sinusoids and Gray bits, white, black.
 
-    Raises ValueError if the kind is unknown.
-
-    Parameters
-    ----------
-    kind : str
-        "full" or "fringes" (sinusoids alone).
-    shifts_rad : tuple of floats
-        One a step; empty: 2 pi k / N.
+    The kind is "full" or "fringes" (sinusoids alone), else ValueError; `shifts_rad` one a step, empty: 2 pi k / N.
     """
     if kind not in ("full", "fringes"):
         raise ValueError(f"kind = {kind!r} must be full or fringes")

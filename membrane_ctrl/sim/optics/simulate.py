@@ -21,15 +21,7 @@ _GRID = 201  # odd, so that the vertex is a point of the truth's map
 
 
 def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, Any]:
-    """The content of `capture.toml` (schema membrane-capture/1).
-
-    Parameters
-    ----------
-    spec : SimulationSpec
-        The set.
-    readings_um : (frames,) array
-        What the laser said at each frame.
-    """
+    """The content of `capture.toml` (schema membrane-capture/1); `readings_um` (frames,) is what the laser said."""
     geometry = _written(spec.stated_geometry or spec.optics.geometry)
     if spec.laser:
         geometry["reference_displacement_um"] = spec.reference_um
@@ -126,17 +118,7 @@ class _Exposure:
 
 
 def simulate_set(folder: Path, spec: SimulationSpec) -> None:
-    """Write one capture set and its truth.
-
-    Raises OSError if the folder or a file cannot be written.
-
-    Parameters
-    ----------
-    folder : Path
-        Made if it is not there.
-    spec : SimulationSpec
-        The set.
-    """
+    """Write one capture set and its truth. Raises OSError if the folder or a file cannot be written."""
     _write_set(folder, spec, _renderer(spec))
 
 
@@ -149,20 +131,9 @@ def simulate_run(
 ) -> None:
     """Write a run: `0000` is the full set, the others are fringes that lean on it; one clock and one motion for all.
 
-    Raises ValueError if the first set is not full, lists its displacements, or the sets overlap in time.
-
-    Parameters
-    ----------
-    folder : Path
-        Gets a folder a set.
-    spec : SimulationSpec
-        The first set; its motion runs on through the others, its faults stay its own.
-    sets : int
-        How many.
-    interval_s : float
-        From the start of one set to the start of the next.
-    on_set : callable, optional
-        Told the number of sets written, after each.
+    Each set has a folder. The first set's motion runs on through the others, its faults stay its own; sets start
+    `interval_s` apart. `on_set` is told the number of sets written, after each. Raises ValueError if the first set is
+    not full, lists its displacements, or the sets overlap in time.
     """
     if spec.kind != "full" or spec.displacements_um:
         raise ValueError("kind: the first set of a run must be full, and move by motion, not displacements_um")
