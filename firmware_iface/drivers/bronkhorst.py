@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from firmware_iface.links.modbus_rules import ModbusLink
+from firmware_iface.links.modbus_tcp import ModbusLink
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
 
 FULL_SCALE = 32_000  # of measure and setpoint: 100 %

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from firmware_iface.links.modbus_rules import ModbusLink
+from firmware_iface.links.modbus_tcp import ModbusLink
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, DisplacementSample, LinkError
 
 PRESETS = Path(__file__).parents[1] / "presets"

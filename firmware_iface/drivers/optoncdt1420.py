@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface import roles, settings
-from firmware_iface.drivers.linked_device import LinkedDevice, StepGate
+from firmware_iface.links.exchange import LinkedDevice, StepGate
 from firmware_iface.links.serial_port import SerialPort, SerialSettings
 
 _IN_RANGE = (643, 64_877)  # page 65: below and above are reserves, measured but not specified

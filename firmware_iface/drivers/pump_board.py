@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from firmware_iface import roles
-from firmware_iface.drivers.linked_device import LinkedDevice
-from firmware_iface.links import modbus_rtu, modbus_rules
+from firmware_iface.links import modbus_rtu, modbus_tcp
+from firmware_iface.links.exchange import LinkedDevice
 from firmware_iface.register_map import Block, default_map, known_maps
 
 _KIND = "membrane pump board"
@@ -44,7 +44,7 @@ class PumpBoard(LinkedDevice):
         unit_id: int = 1,
         timeout_s: float = 0.2,
         watchdog_s: float = 0.5,
-        link: modbus_rules.ModbusLink | None = None,
+        link: modbus_tcp.ModbusLink | None = None,
     ) -> None:
         if link is None:
             link = modbus_rtu.ModbusLinks().link(url, unit_id, timeout_s)

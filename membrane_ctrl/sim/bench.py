@@ -17,9 +17,8 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import DeviceError, Exit
 from membrane_ctrl.processes.child import STOP, Child, parent_lives, pipe, raise_priority
 from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
-from membrane_ctrl.sim.events import Event
 from membrane_ctrl.sim.lab import Lab
-from membrane_ctrl.sim.plant import STEP_S, Plant
+from membrane_ctrl.sim.plant import STEP_S, Event, Plant
 from membrane_ctrl.sim.sensors import TRUTH_BYTES, Truth
 
 _PERIOD_S = 0.004  # below the sensors' 5 ms, so that each of their samples is out on time

@@ -8,13 +8,15 @@ What does not depend on the state (surroundings, creep) is made with NumPy for a
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import accumulate
+from typing import Protocol
 
 import numpy as np
 
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim import film, sensors
-from membrane_ctrl.sim.events import Event, Series, Surroundings
 
 # The diaphragm pump: adds gas only, sticks at low command, answers late.
 
@@ -65,6 +67,7 @@ class PumpModel:
 # Air pressure and temperature of a scenario, and the events on top, a block of steps at a time.
 
 
+Series = FloatArray
 # scenario: (air pressure std Pa, correlation time s), (air temperature std K, correlation time s)
 SCENARIOS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "calm": ((0.0, 30.0), (0.0, 300.0)),
@@ -72,6 +75,25 @@ SCENARIOS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "typical": ((1.2, 30.0), (0.050, 300.0)),
     "gusty": ((4.0, 20.0), (0.100, 300.0)),
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What acts on the bench in each step of a block; arrays (steps,), filled in place."""
+
+    time_s: Series  # plant time of each step
+    ambient_pa: Series
+    air_k: Series
+    leak_factor: Series  # leak over its configured value
+    laser_bias_um: Series  # displacement of the laser's mount
+    laser_lost: Series  # 1 where the laser gets no light back, else 0
+
+
+class Event(Protocol):
+    """Something that happens to the bench at a time; picklable."""
+
+    def apply(self, on: Surroundings) -> None:
+        """Add itself to what the surroundings do."""
 
 
 class OrnsteinUhlenbeck:

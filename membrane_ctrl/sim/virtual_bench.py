@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from firmware_iface import register_map, roles
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators import board_state, modbus_server
-from firmware_iface.links.modbus_rules import exception_error
+from firmware_iface.links.modbus_tcp import exception_error
 from membrane_ctrl.sim.plant import Plant
 
 T = TypeVar("T")

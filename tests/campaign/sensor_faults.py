@@ -22,12 +22,12 @@ from membrane_ctrl.model import events
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.states import Rung, State
 from membrane_ctrl.model.telemetry import TelemetryRow
-from membrane_ctrl.sim.events import AmbientChange, Event
 from membrane_ctrl.sim.film import NOMINAL_PRESSURE_PA
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.sensors import PlantSample, Truth
 from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench
+from tests.support.bench_events import AmbientChange, Event
 
 RATE_HZ = 10.0
 REGISTER_MAX = 2e6  # what does not fit a register of the board is sent as none

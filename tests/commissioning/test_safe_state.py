@@ -21,8 +21,7 @@ from membrane_ctrl.commissioning.probe import probe_board
 from membrane_ctrl.commissioning.safe import make_safe
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config, RecordingConfig
-from membrane_ctrl.instruments.bench import pump_board
-from membrane_ctrl.instruments.device_lock import device_names, locked
+from membrane_ctrl.instruments.bench import device_names, locked, pump_board
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.run_files.latched_fault import LatchedFile
 

@@ -10,7 +10,7 @@ from scipy.interpolate import RectBivariateSpline
 from membrane_ctrl.config.optics import HeightMapConfig, ScreenPoseConfig
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
-from membrane_ctrl.sim.optics.film_terms import FilmTerms, height_and_slopes
+from membrane_ctrl.sim.optics.film_shape import FilmTerms, height_and_slopes
 
 # Camera and screen of the twin as exact poses: rays out of the pinhole, and the plane they end on.
 #
