@@ -54,9 +54,7 @@ class RoleDevices:
 class RoleBench:
     """Reads all sensors at once and drives pump and vent; no `write` for `watchdog_s` sets the pump to 0."""
 
-    def __init__(
-        self, devices: RoleDevices, watchdog_s: float = 0.5, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, devices: RoleDevices, watchdog_s: float = 0.5, clock: roles.Clock = time.monotonic) -> None:
         self._devices = devices
         self._watchdog_s = watchdog_s
         self._clock = clock

@@ -55,7 +55,7 @@ class AravisCamera:
         config: settings.AravisCameraConfig,
         width_px: int,
         height_px: int,
-        now: Callable[[], float] = time.monotonic,
+        now: roles.Clock = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.config = config

@@ -4,13 +4,12 @@ import contextlib
 import struct
 import time
 import tomllib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from firmware_iface.links.modbus_tcp import ModbusLink
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, DisplacementSample, LinkError
+from firmware_iface.roles import Clock, DeviceIdentity, DeviceRefusedError, DisplacementSample, LinkError
 
 PRESETS = Path(__file__).parents[1] / "presets"
 _FORMATS = {"u16": "H", "i16": "h", "u32": "I", "i32": "i", "f32": "f"}
@@ -111,7 +110,7 @@ class ModbusValue:
         link: ModbusLink,
         value_map: ValueMap,
         rest: float | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Clock = time.monotonic,
     ) -> None:
         self._link = link
         self._map = value_map

@@ -6,10 +6,9 @@ import secrets
 from collections.abc import Mapping
 from dataclasses import replace
 
-from firmware_iface import roles
+from firmware_iface import register_map, roles
 from firmware_iface.links import modbus_rtu, modbus_tcp
 from firmware_iface.links.exchange import LinkedDevice
-from firmware_iface.register_map import Block, default_map, known_maps
 
 _KIND = "membrane pump board"
 # of a board of map version 1, for people
@@ -48,7 +47,7 @@ class PumpBoard(LinkedDevice):
     ) -> None:
         if link is None:
             link = modbus_rtu.ModbusLinks().link(url, unit_id, timeout_s)
-        self._registers = default_map()  # of the board that answers, once it has said its version
+        self._registers = register_map.default_map()  # of the board that answers, once it has said its version
         period = self._registers.register("watchdog_period_s")
         if not period.allows(watchdog_s):
             raise ValueError(
@@ -94,19 +93,19 @@ class PumpBoard(LinkedDevice):
 
     async def _identify(self) -> roles.BenchIdentity:
         # these two never move; the rest means something only when they are right
-        identity = default_map().block("identity")
+        identity = register_map.default_map().block("identity")
         kind, version = await self._link.read_holding(identity.address, 2)
-        if kind != default_map().device_kind:
+        if kind != register_map.default_map().device_kind:
             raise roles.DeviceRefusedError(
-                f"{self._link.name}: device kind {kind} is not a {_KIND} ({default_map().device_kind})"
+                f"{self._link.name}: device kind {kind} is not a {_KIND} ({register_map.default_map().device_kind})"
             )
-        if version not in known_maps():
-            known = " and ".join(str(known) for known in known_maps())
+        if version not in register_map.known_maps():
+            known = " and ".join(str(known) for known in register_map.known_maps())
             raise roles.DeviceRefusedError(
                 f"{self._link.name}: register map version {version}, this program knows {known}; "
                 "update the firmware or the program"
             )
-        self._registers = known_maps()[version]
+        self._registers = register_map.known_maps()[version]
         found = await self._read(identity)
         firmware = int(found["firmware_version"])
         return roles.BenchIdentity(
@@ -233,7 +232,7 @@ class PumpBoard(LinkedDevice):
         self._armed = False
         await self._link.close()
 
-    async def _read(self, block: Block) -> dict[str, float]:
+    async def _read(self, block: register_map.Block) -> dict[str, float]:
         return block.decode(await self._link.read_holding(block.address, block.count))
 
     async def _sensors(self) -> dict[str, float]:

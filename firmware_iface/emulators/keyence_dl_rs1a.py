@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable
 
 from firmware_iface.emulators.serial_device import LineDevice
-from firmware_iface.links.serial_port import SerialSettings
 
 _WRITABLE = ("001",)
 
@@ -25,7 +24,7 @@ class KeyenceDlRs1aEmulator(LineDevice):
         parity: str = "N",
         amplifiers: int = 1,
     ) -> None:
-        super().__init__(SerialSettings(baud, parity=parity))
+        super().__init__(baud, parity=parity)
         self.error_state = 0
         self.zero_shift_mm = 0.0
         self._displacement_um = displacement_um

@@ -6,7 +6,6 @@ import random
 from collections.abc import Callable
 
 from firmware_iface.emulators.serial_device import LineDevice
-from firmware_iface.links.serial_port import SerialSettings
 
 NO_PEAK = 262_076
 _PERIOD_S = 0.0025  # between two portions of the stream, as an adapter hands them over
@@ -45,7 +44,7 @@ class Optoncdt1420Emulator(LineDevice):
         noise_um: float = 0.0,
         name: str = "",
     ) -> None:
-        super().__init__(SerialSettings(baud))
+        super().__init__(baud)
         self.random = random.Random(0)
         self.lose_bytes_every = 0
         self._displacement_um = displacement_um

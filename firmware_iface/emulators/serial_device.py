@@ -80,8 +80,8 @@ class LineDevice(SerialDevice):
 
     end = b"\n"
 
-    def __init__(self, settings: SerialSettings) -> None:
-        super().__init__(settings)
+    def __init__(self, baud: int, data_bits: int = 8, parity: str = "N") -> None:
+        super().__init__(SerialSettings(baud, data_bits, parity))
         self._heard = b""
 
     def received(self, data: bytes) -> None:

@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable
 
 from firmware_iface.emulators.serial_device import LineDevice
-from firmware_iface.links.serial_port import SerialSettings
 
 _PERIOD_S = 0.1  # of its measurements
 _WORD = re.compile(r'"[^"]*"|\S+')
@@ -25,7 +24,7 @@ class VaisalaPtb330Emulator(LineDevice):
         running: bool = False,
         model: str = "PTB330",
     ) -> None:
-        super().__init__(SerialSettings(baud, data_bits=7, parity="E"))
+        super().__init__(baud, data_bits=7, parity="E")
         self.error_flags = "000"
         self.serial = "A1234567"
         self._ambient_pressure_pa = ambient_pressure_pa

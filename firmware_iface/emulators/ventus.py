@@ -5,7 +5,6 @@ import re
 from collections.abc import Callable
 
 from firmware_iface.emulators.serial_device import LineDevice
-from firmware_iface.links.serial_port import SerialSettings
 
 _COMMAND = re.compile(r"#(?:W(\d+),(-?\d+(?:\.\d+)?)|R(\d+))")
 _READ_ONLY = (31, 36, 37, 38, 39)
@@ -27,7 +26,7 @@ class VentusEmulator(LineDevice):
         power_max_mw: float = 1000.0,
         streaming: bool = False,
     ) -> None:
-        super().__init__(SerialSettings(115_200))
+        super().__init__(115_200)
         self.registers = dict(_DEFAULTS)
         self.registers[2] = float(streaming)
         self._drive = drive

@@ -16,7 +16,7 @@ from pymodbus.exceptions import ConnectionException, ModbusIOException
 from pymodbus.pdu import ExceptionResponse, ModbusPDU
 
 from firmware_iface.links import serial_port
-from firmware_iface.roles import DeviceBusyError, DeviceRefusedError, LinkDownError, LinkError, LinkWaitsError
+from firmware_iface.roles import Clock, DeviceBusyError, DeviceRefusedError, LinkDownError, LinkError, LinkWaitsError
 
 # What Modbus means, whichever wire it comes over.
 
@@ -96,9 +96,7 @@ class GuardedModbusTcp:
     the owner calls `connect`, which refuses to try before its back-off (0.1 s, doubling to 5 s) is over.
     """
 
-    def __init__(
-        self, host: str, port: int, unit_id: int, timeout_s: float, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, host: str, port: int, unit_id: int, timeout_s: float, clock: Clock = time.monotonic) -> None:
         self._host, self._port = host, port
         self._unit_id = unit_id
         self._timeout_s = timeout_s

@@ -18,8 +18,7 @@ from membrane_ctrl.metrology import live, phase
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.processes import child, ring
-from membrane_ctrl.processes.frames import FrameWriter
+from membrane_ctrl.processes import child, frames, ring
 from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics
 from membrane_ctrl.sim.sensors import Truth
 
@@ -109,9 +108,9 @@ def warm_up(
         (plan.fringes, reconstructor.fringes, moving),
         (plan.fringes, reconstructor.fringes, still),
     ):
-        frames = exposures(patterns)
-        displacement_um = position.displacement_um + np.resize(motion_um, len(frames))
-        reconstruct(frames, 0.1 * np.arange(len(frames), dtype=np.float64), displacement_um)
+        taken = exposures(patterns)
+        displacement_um = position.displacement_um + np.resize(motion_um, len(taken))
+        reconstruct(taken, 0.1 * np.arange(len(taken), dtype=np.float64), displacement_um)
 
 
 _TRUTH_LOOK_S = 0.1
@@ -165,12 +164,12 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
         reconstructor = live.LiveReconstructor(geometry.optics, config.shape.bin_px, spread=spread)
         drift = worker.LiveDrift(geometry, config.shape.bin_px)
         shapes = stack.enter_context(closing(ring.RingWriter(spec.shapes)))
-        frames = stack.enter_context(closing(FrameWriter(spec.frames)))
+        slots = stack.enter_context(closing(frames.FrameWriter(spec.frames)))
         stack.callback(bench.close)  # before the ring of frames: an exposure under way holds the pixels of a slot
         laser = stack.enter_context(closing(cycle.LaserHistory(spec.telemetry, config.loop.rate_hz)))
         raw = _raw_frames(spec, geometry.optics, plan, stack, remote)
         taking = cycle.ShapeCycle(
-            bench.camera, bench.screen, reconstructor, plan, frames, clock, laser, stopping=remote.interrupts
+            bench.camera, bench.screen, reconstructor, plan, slots, clock, laser, stopping=remote.interrupts
         )
 
         def publish(estimate: ShapeEstimate) -> None:

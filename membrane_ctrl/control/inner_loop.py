@@ -8,10 +8,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control import film_health, filters, gas, pid
+from membrane_ctrl.model.arrays import ComplexArray, FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +231,7 @@ _POINTS = 2000
 _ALIASES = 3  # they fall with the third power of the frequency
 
 
-def open_loop(loop: LoopConfig, omega: NDArray[np.float64]) -> NDArray[np.complex128]:
+def open_loop(loop: LoopConfig, omega: FloatArray) -> ComplexArray:
     """Return L of the sampled loop: PID and filter as difference equations, hold, dead time, pump lag, mirror."""
     dt_s = 1 / loop.rate_hz
     z = np.exp(1j * omega * dt_s)

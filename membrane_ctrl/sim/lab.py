@@ -9,7 +9,6 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from firmware_iface import settings
 from firmware_iface.drivers.modbus_map import ValueMap, make_map, preset
@@ -180,7 +179,7 @@ class Lab:
         return drive
 
 
-def _answer(slaves: Mapping[int, Any], unit: int, pdu: bytes) -> modbus_server.Answer:
+def _answer(slaves: Mapping[int, modbus_server.RegisterTable], unit: int, pdu: bytes) -> modbus_server.Answer:
     if unit not in slaves:
         return modbus_server.Answer(modbus_server.exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
     return modbus_server.Answer(respond_to_input(pdu, slaves[unit]))

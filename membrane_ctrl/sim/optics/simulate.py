@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 import tomli_w
 
-from firmware_iface.roles import Pattern, Pixels
-from firmware_iface.settings import Section
+from firmware_iface import roles, settings
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
@@ -86,7 +85,7 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
     (folder / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
 
 
-def _written(section: Section) -> dict[str, Any]:
+def _written(section: settings.Section) -> dict[str, Any]:
     """A configuration table as written: without what is absent, and without lists that are empty."""
     return {key: value for key, value in section.model_dump(mode="json", exclude_none=True).items() if value != []}
 
@@ -112,7 +111,7 @@ _PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWR
 class _Exposure:
     """What truly happened for one file."""
 
-    pattern: Pattern
+    pattern: roles.Pattern
     displacement_um: float
     gain: float = 1.0
 
@@ -173,7 +172,7 @@ def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> 
     noise = np.random.default_rng(spec.seed).normal(0.0, spec.laser_noise_um, len(spec.patterns))
     readings_um = noise + [spec.displacement_um(frame) for frame in range(len(spec.patterns))]
     faults = {(fault.kind, fault.frame) for fault in spec.faults}
-    before: Pixels | None = None
+    before: roles.Pixels | None = None
     for pattern, exposure in zip(spec.patterns, _exposures(spec), strict=True):
         if ("stale", pattern.name) in faults and before is not None:
             picture = before
@@ -206,12 +205,12 @@ def _exposures(spec: SimulationSpec) -> list[_Exposure]:
     return exposures
 
 
-def _other_depth(picture: Pixels) -> Pixels:
+def _other_depth(picture: roles.Pixels) -> roles.Pixels:
     if picture.dtype == np.uint8:
         return picture.astype(np.uint16)
     return picture.astype(np.uint8)
 
 
-def _write_png(path: Path, picture: Pixels) -> None:
+def _write_png(path: Path, picture: roles.Pixels) -> None:
     if not cv2.imwrite(str(path), picture, _PNG_SPEED):
         raise OSError(f"{path}: cannot be written")
