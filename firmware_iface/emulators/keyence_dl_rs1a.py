@@ -1,9 +1,8 @@
 """A Keyence DL-RS1A with amplifiers on it (manual of the IL edition, pages 7-16)."""
 
 import math
-from collections.abc import Callable
 
-from firmware_iface.emulators.serial_device import LineDevice
+from firmware_iface.emulators.serial_device import LineDevice, Sensor
 
 _WRITABLE = ("001",)
 
@@ -18,7 +17,7 @@ class KeyenceDlRs1aEmulator(LineDevice):
 
     def __init__(
         self,
-        displacement_um: Callable[[], float],
+        displacement_um: Sensor,
         direction: int = -1,
         baud: int = 9600,
         parity: str = "N",

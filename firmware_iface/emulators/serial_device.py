@@ -10,6 +10,10 @@ from pathlib import Path
 
 from firmware_iface.links.serial_port import SerialSettings
 
+Sensor = Callable[[], float]  # what a device measures
+Drive = Callable[[float], None]  # what an actuator's fraction does
+Transmit = Callable[[bytes], None]
+
 
 class SerialDevice:
     """Hears bytes, says bytes. A device overrides `received`, and `restart` if it can lose settings."""
@@ -18,11 +22,11 @@ class SerialDevice:
 
     def __init__(self, settings: SerialSettings) -> None:
         self.settings = settings
-        self._transmit: Callable[[bytes], None] | None = None
+        self._transmit: Transmit | None = None
         self._free_s = 0.0  # until then the line is taken by what is being said
         self._due: set[asyncio.TimerHandle] = set()
 
-    def attach(self, transmit: Callable[[bytes], None]) -> None:
+    def attach(self, transmit: Transmit) -> None:
         """The wire is plugged in: what is said goes to `transmit`."""
         self._transmit = transmit
 

@@ -3,9 +3,8 @@
 import asyncio
 import math
 import re
-from collections.abc import Callable
 
-from firmware_iface.emulators.serial_device import LineDevice
+from firmware_iface.emulators.serial_device import LineDevice, Sensor, Transmit
 
 _PERIOD_S = 0.1  # of its measurements
 _WORD = re.compile(r'"[^"]*"|\S+')
@@ -19,7 +18,7 @@ class VaisalaPtb330Emulator(LineDevice):
 
     def __init__(
         self,
-        ambient_pressure_pa: Callable[[], float],
+        ambient_pressure_pa: Sensor,
         baud: int = 4800,
         running: bool = False,
         model: str = "PTB330",
@@ -39,7 +38,7 @@ class VaisalaPtb330Emulator(LineDevice):
         super().restart()
         self._echo = True
 
-    def attach(self, transmit: Callable[[bytes], None]) -> None:
+    def attach(self, transmit: Transmit) -> None:
         """The wire is plugged in."""
         super().attach(transmit)
         if self._running:

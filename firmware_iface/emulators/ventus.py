@@ -2,9 +2,8 @@
 
 import asyncio
 import re
-from collections.abc import Callable
 
-from firmware_iface.emulators.serial_device import LineDevice
+from firmware_iface.emulators.serial_device import Drive, LineDevice, Transmit
 
 _COMMAND = re.compile(r"#(?:W(\d+),(-?\d+(?:\.\d+)?)|R(\d+))")
 _READ_ONLY = (31, 36, 37, 38, 39)
@@ -22,7 +21,7 @@ class VentusEmulator(LineDevice):
 
     def __init__(
         self,
-        drive: Callable[[float], None],
+        drive: Drive,
         power_max_mw: float = 1000.0,
         streaming: bool = False,
     ) -> None:
@@ -34,7 +33,7 @@ class VentusEmulator(LineDevice):
         self._driven = -1.0
         self._stream: asyncio.TimerHandle | None = None
 
-    def attach(self, transmit: Callable[[bytes], None]) -> None:
+    def attach(self, transmit: Transmit) -> None:
         """The wire is plugged in."""
         super().attach(transmit)
         self._act()

@@ -154,16 +154,7 @@ class LiveBench:
             truth = plant.truth()
             self._truth.put(replace(truth, time_s=self._start_s + truth.time_s / self._speed).pack())
         sample = plant.sample()
-        return board_state.BoardSample(
-            displacement_um=sample.displacement_um,
-            displacement_quality=sample.displacement_quality,
-            gauge_pressure_pa=sample.gauge_pressure_pa,
-            ambient_pressure_pa=sample.ambient_pressure_pa,
-            air_temperature_c=sample.air_temperature_c,
-            gas_temperature_c=sample.gas_temperature_c,
-            sample_counter=round(sample.device_time_s / STEP_S) + 1,
-            device_time_s=sample.device_time_s,
-        )
+        return replace(sample, sample_counter=round(sample.device_time_s / STEP_S) + 1)
 
 
 # The twin as a process beside the hold: started, asked for its port, and its truth read for the record.

@@ -14,6 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
+from firmware_iface.emulators.board_state import BoardSample
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim import film, sensors
@@ -224,13 +225,13 @@ class Plant:
             self._run(self._index + 1, self._index + 1 + now)
             steps -= now
 
-    def sample(self) -> sensors.PlantSample:
+    def sample(self) -> BoardSample:
         """What the sensors say now, with noise of its own in each call."""
         return self.sample_of(self.truth())
 
-    def sample_of(self, truth: sensors.Truth) -> sensors.PlantSample:
+    def sample_of(self, truth: sensors.Truth) -> BoardSample:
         """The same, for who has the truth of now already."""
-        return self._sensors.read(truth, self._pump_fraction, self._vent_fraction)
+        return self._sensors.read(truth)
 
     def truth(self) -> sensors.Truth:
         """What really is."""

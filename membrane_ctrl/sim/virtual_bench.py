@@ -127,15 +127,13 @@ class VirtualBench:
         gauge_pa = sample.gauge_pressure_pa + wrong.gauge_offset_pa
         if wrong.gauge_stuck and last is not None:
             gauge_pa = last.gauge_pressure_pa
-        return board_state.BoardSample(
+        return replace(
+            sample,
             displacement_um=math.nan if wrong.no_light else displacement_um,
             displacement_quality=_LASER_NO_LIGHT if wrong.no_light else sample.displacement_quality,
             gauge_pressure_pa=math.nan if wrong.gauge_lost else gauge_pa,
             ambient_pressure_pa=math.nan if wrong.barometer_lost else sample.ambient_pressure_pa,
             air_temperature_c=math.nan if wrong.thermometer_lost else sample.air_temperature_c,
-            gas_temperature_c=sample.gas_temperature_c,
-            sample_counter=sample.sample_counter,
-            device_time_s=sample.device_time_s,
         )
 
 

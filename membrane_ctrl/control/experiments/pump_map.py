@@ -7,7 +7,7 @@ are found by bisection, the leak with the pump off, the curve from two commands 
 
 import math
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -46,6 +46,10 @@ class PumpMap:
     def sticks_by(self) -> float:
         """Stiction: the command between stalling and starting."""
         return self.start_fraction - self.stall_fraction
+
+    def as_plain(self) -> dict[str, float | None]:
+        """As plain data; None for what was not found."""
+        return {name: None if math.isnan(value) else value for name, value in asdict(self).items()}
 
     def applied_to(self, pump: PumpConfig) -> PumpConfig:
         """The pump's configuration with what was measured. Raises pydantic.ValidationError if it is no pump's."""

@@ -1,7 +1,5 @@
 """One experiment of a running hold: made of its specification, stepped in ticks, guarded, with its result."""
 
-import math
-from dataclasses import asdict
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -85,6 +83,4 @@ class Trial:
     def pump_map(self) -> dict[str, float | None] | None:
         """What a map of the pump has measured, as plain data; None for what it did not find."""
         found = self._mapper.result if self._mapper is not None else None
-        if found is None:
-            return None
-        return {name: None if math.isnan(value) else value for name, value in asdict(found).items()}
+        return None if found is None else found.as_plain()
