@@ -28,8 +28,7 @@ from firmware_iface.drivers.ventus import Ventus
 from firmware_iface.emulators.bronkhorst import Instrument
 from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer, respond
 from firmware_iface.links.modbus_rtu import RtuBus
-from firmware_iface.links.modbus_rules import ModbusLink
-from firmware_iface.links.modbus_tcp import GuardedModbusTcp
+from firmware_iface.links.modbus_tcp import GuardedModbusTcp, ModbusLink
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import Device, DisplacementSensor, LinkDownError, LinkError, Pump
 from firmware_iface.settings import KeyenceDlRs1aConfig, Optoncdt1420Config, VaisalaPtb330Config, VentusConfig

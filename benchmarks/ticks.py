@@ -19,10 +19,10 @@ from benchmarks.figures import Figure, at_most
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.board_state import BoardSample
 from firmware_iface.emulators.modbus_server import respond
-from firmware_iface.emulators.pump_board import PumpBoardEmulator
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import BenchCommand
+from tests.support.faulty_board import PumpBoardEmulator
 from tests.support.faulty_devices import RtuBusEmulator
 
 DURATION_S = 30.0

@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 
 from firmware_iface import register_map, roles
-from firmware_iface.links.modbus_rules import ModbusLink
+from firmware_iface.links.modbus_tcp import ModbusLink
 
 PUMP_FRACTION = 0.05  # below what starts a diaphragm pump
 PERIOD_S = 0.3  # watchdog period during the test
@@ -25,15 +25,7 @@ def require(right: bool, problem: str) -> None:
 
 
 class BoardUnderTest:
-    """A board, the claim that the test has on it, and its heartbeat.
-
-    Parameters
-    ----------
-    link : ModbusLink
-        The board, connected.
-    sleep : callable
-        Waits; the board's clock is what counts.
-    """
+    """A board (connected), the claim that the test has on it, and its heartbeat; the board's clock is what counts."""
 
     def __init__(self, link: ModbusLink, sleep: Callable[[float], Awaitable[None]] = asyncio.sleep) -> None:
         self._link = link

@@ -49,16 +49,9 @@ def linear_response() -> DisplayResponse:
 
 
 def measured_response(levels: ArrayLike, seen_adu: ArrayLike) -> DisplayResponse:
-    """The response from a ramp.
+    """The response from a ramp: `levels` (K,) rising from 0 to 255, and `seen_adu` (K,), unsaturated.
 
     Raises ValueError if the camera saw no ramp, with the remedy.
-
-    Parameters
-    ----------
-    levels : (K,) array
-        What was shown, rising, from 0 to 255.
-    seen_adu : (K,) array
-        What the camera saw, unsaturated.
     """
     shown, seen = np.asarray(levels, np.float64), np.asarray(seen_adu, np.float64)
     if (
@@ -187,10 +180,7 @@ class Settling:
 def share_left(frame: ArrayLike, before: ArrayLike, after: ArrayLike) -> float:
     """How much of a step is left in a frame: the worst block's difference from the end, over the largest step.
 
-    Parameters
-    ----------
-    frame, before, after : (H, W) arrays
-        The frame, and the pictures before the step and long after it.
+    Each picture is (H, W); `before` is from before the step, `after` from long after it.
     """
     end = block_means(after)
     step = np.abs(block_means(before) - end)
@@ -201,16 +191,9 @@ def share_left(frame: ArrayLike, before: ArrayLike, after: ArrayLike) -> float:
 def settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settling:
     """Latency, time constant and the time to wait.
 
-    Raises ValueError if the display never settles.
-
-    Parameters
-    ----------
-    delay_s : (K,) array
-        Start of each exposure after the command, of any number of steps together.
-    left : (K,) array
-        What was left of the step (`share_left`).
-    noise : float
-        What `left` is when nothing is left.
+    `delay_s` (K,) are the starts of the exposures after the command, of any number of steps together; `left` (K,)
+    what was left of the step (`share_left`), `noise` what `left` is when nothing is. Raises ValueError if the display
+    never settles.
     """
     delays, shares = np.asarray(delay_s, np.float64), np.asarray(left, np.float64)
     order = np.argsort(delays)
@@ -264,17 +247,7 @@ def exposure_problem(
     full_scale_adu: int,
     exposure_ms: float,
 ) -> str:
-    """What is wrong, with the remedy; empty when nothing is.
-
-    Parameters
-    ----------
-    white, black : (H, W) arrays
-        Frames of a white and of a black screen.
-    full_scale_adu : int
-        Highest count of the camera.
-    exposure_ms : float
-        What they were taken with.
-    """
+    """What is wrong, with the remedy, in frames (H, W) of a white and a black screen; empty when nothing is."""
     saturated = float(np.mean(white >= full_scale_adu))
     bright, dark = float(np.quantile(white, 0.99)), float(np.quantile(black, 0.99))
     if saturated > _SATURATED_SHARE:
@@ -315,13 +288,7 @@ _LARGEST_BAND = 0.10
 
 
 def checkerboard_problem(seen: ArrayLike, white: ArrayLike, black: ArrayLike) -> str:
-    """What is wrong, with the remedy; empty when the screen shows pixel for pixel.
-
-    Parameters
-    ----------
-    seen, white, black : (H, W) arrays
-        Frames of the checkerboard, of a white and of a black screen.
-    """
+    """What is wrong, with the remedy, in frames (H, W) of checkerboard, white and black; empty when nothing is."""
     dark = block_means(black)
     full = block_means(white) - dark
     lit = full > _LIT_SHARE * float(np.max(full))

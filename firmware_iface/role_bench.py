@@ -52,21 +52,9 @@ class RoleDevices:
 
 
 class RoleBench:
-    """Reads all sensors at once and drives pump and vent.
+    """Reads all sensors at once and drives pump and vent; no `write` for `watchdog_s` sets the pump to 0."""
 
-    Parameters
-    ----------
-    devices : RoleDevices
-        Not yet open.
-    watchdog_s : float
-        The pump is set to 0 when no `write` came for this long.
-    clock : callable
-        Seconds on any axis that does not go back.
-    """
-
-    def __init__(
-        self, devices: RoleDevices, watchdog_s: float = 0.5, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, devices: RoleDevices, watchdog_s: float = 0.5, clock: roles.Clock = time.monotonic) -> None:
         self._devices = devices
         self._watchdog_s = watchdog_s
         self._clock = clock

@@ -4,11 +4,14 @@ A driver converts to these units at its edge; nothing behind it knows registers,
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+
+Clock = Callable[[], float]  # seconds on any axis that does not go back
 
 # The mask of `Bench.clear_faults` that clears whatever is latched
 ALL_FAULTS = 0xFFFF
@@ -229,7 +232,8 @@ class Pattern:
         return f"{self.axis}_{self.role}_{self.index}" if self.axis else self.role
 
 
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+Levels = NDArray[np.uint8]  # of a display, or an 8-bit camera
+Pixels = Levels | NDArray[np.uint16]
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from membrane_ctrl.model import shape_estimate, states, telemetry
 from membrane_ctrl.model.events import CommandTaken, Event
 from membrane_ctrl.sessions.live_hold import HoldError, News
 from membrane_ctrl.sim import plant, truth_shape, virtual_bench
-from membrane_ctrl.sim.events import Event as TwinEvent
+from membrane_ctrl.sim.plant import Event as TwinEvent
 
 _NEWS_S = 0.5
 _HELD_WITHIN_S = 120.0

@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from firmware_iface.links.modbus_rules import ModbusLink
+from firmware_iface.links.modbus_tcp import ModbusLink
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
 
 FULL_SCALE = 32_000  # of measure and setpoint: 100 %
@@ -105,16 +105,9 @@ async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> 
 
 
 class BronkhorstFlow:
-    """An EL-FLOW as the pump: fraction 1 is its capacity.
+    """An EL-FLOW as the pump: fraction 1 is its capacity. Any instrument but `serial` is refused; empty: none.
 
     It has no watchdog of its own: without a host it goes on with its last setpoint.
-
-    Parameters
-    ----------
-    port : ParameterPort
-        The way to it.
-    serial : str
-        Refuse any other instrument; empty: whichever answers.
     """
 
     def __init__(self, port: ParameterPort, serial: str = "") -> None:
@@ -153,15 +146,7 @@ class BronkhorstFlow:
 
 
 class BronkhorstPressure:
-    """An EL-PRESS as the gauge pressure sensor.
-
-    Parameters
-    ----------
-    port : ParameterPort
-        The way to it.
-    serial : str
-        Refuse any other instrument; empty: whichever answers.
-    """
+    """An EL-PRESS as the gauge pressure sensor. Any instrument but `serial` is refused; empty: none."""
 
     # below zero a little (noise), above full scale up to what the sensor can show (131.07 % of 32000 is 41942)
     _FRACTIONS = (-0.1, 1.3107)

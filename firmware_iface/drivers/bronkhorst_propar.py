@@ -151,17 +151,7 @@ _FORMATS = {"u8": ">B", "u16": ">H", "f32": ">f"}
 
 
 class ProparParameters:
-    """Parameters of one instrument on a line of its own.
-
-    Parameters
-    ----------
-    port : SerialPort
-        The line.
-    node : int
-        128: whichever instrument is at the end of the cable.
-    timeout_s : float
-        For the instrument to answer; the time on the wire comes on top.
-    """
+    """Parameters of one instrument on a line of its own; node 128 is whichever is at the end of the cable."""
 
     def __init__(self, port: serial_port.SerialPort, node: int = 128, timeout_s: float = 0.2) -> None:
         self._port = port

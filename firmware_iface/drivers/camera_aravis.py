@@ -55,7 +55,7 @@ class AravisCamera:
         config: settings.AravisCameraConfig,
         width_px: int,
         height_px: int,
-        now: Callable[[], float] = time.monotonic,
+        now: roles.Clock = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.config = config
@@ -140,14 +140,9 @@ class AravisCamera:
         return frame
 
     def grab(self, out: roles.Pixels | None = None) -> roles.Frame:
-        """One exposure, taken again when it is lost.
+        """One exposure, in `out` (height, width) or a new array; taken again when it is lost.
 
         Raises LinkError (no camera, or three frames lost in a row).
-
-        Parameters
-        ----------
-        out : (height, width) array, optional
-            Where the pixels go; else a new array.
         """
         for _ in range(roles.TRIES - 1):
             self.expose(out)

@@ -4,13 +4,12 @@ For trying the cycle without a camera: pictures of a bench, or what `membrane-ct
 """
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, Frame, LinkError, Pattern, Pixels
+from firmware_iface.roles import Clock, DeviceIdentity, DeviceRefusedError, Frame, LinkError, Pattern, Pixels
 
 _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm")
 
@@ -18,19 +17,10 @@ _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm")
 class FolderCamera:
     """The camera, and the screen beside it: after `show(pattern)` the picture of that name comes.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the pictures, 8 or 16 bit grey. `x_sin_0.png` is the picture of the pattern `x_sin_0`.
-    width_px, height_px : int
-        Every picture has to have this size.
-    now : callable
-        The run's clock.
+    The pictures are 8 or 16 bit grey and of one size; `x_sin_0.png` is the picture of the pattern `x_sin_0`.
     """
 
-    def __init__(
-        self, folder: Path, width_px: int, height_px: int, now: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, folder: Path, width_px: int, height_px: int, now: Clock = time.monotonic) -> None:
         self._folder, self._size, self._now = folder, (height_px, width_px), now
         self._files: list[Path] = []
         self._next = 0

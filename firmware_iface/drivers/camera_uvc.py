@@ -11,7 +11,6 @@ from typing import Any, Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_iface import roles, settings
 
@@ -50,7 +49,7 @@ class UvcCamera:
         config: settings.UvcCameraConfig,
         width_px: int,
         height_px: int,
-        now: Callable[[], float] = time.monotonic,
+        now: roles.Clock = time.monotonic,
         capture: Callable[[int | str], Capture] = cv2.VideoCapture,  # type: ignore[assignment]  # stubs name differently
     ) -> None:
         self._config, self._size, self._now, self._make = config, (width_px, height_px), now, capture
@@ -86,7 +85,7 @@ class UvcCamera:
                 )
         return roles.DeviceIdentity("UVC camera", "", "", self.describe()["settings"])
 
-    def grab(self, out: NDArray[np.uint8] | None = None) -> roles.Frame:
+    def grab(self, out: roles.Levels | None = None) -> roles.Frame:
         """The next whole frame that was begun after the call, as grey (the green channel of a colour camera).
 
         Raises LinkDownError (the camera went away).
@@ -101,7 +100,7 @@ class UvcCamera:
             if not good:
                 self.close()
                 raise roles.LinkDownError(f"camera {self._config.port}: no frame; unplugged?")
-        pixels: NDArray[np.uint8] = np.asarray(image)
+        pixels: roles.Levels = np.asarray(image)
         if pixels.ndim == 3:
             pixels = pixels[:, :, 1]
         if out is None:

@@ -14,7 +14,6 @@ import math
 import re
 
 from firmware_iface import roles, settings
-from firmware_iface.drivers.linked_device import LineDriver, StepGate
 from firmware_iface.links import exchange, serial_port
 
 _VALUE = r"[+-](?:\d\d\.\d{3}|\d{3}\.\d\d|\d{4}\.\d|E{2}\.E{3}|E{3}\.E{2}|E{4}\.E)"
@@ -34,7 +33,7 @@ _NOT_READABLE = "22"
 _STEPS_UM = {3: 1.0, 2: 10.0, 1: 100.0}  # decimals of the millimetre
 
 
-class KeyenceDlRs1a(LineDriver):
+class KeyenceDlRs1a(exchange.LineDriver):
     """A `DisplacementSensor`; `port` stands in for the configured one. Displacement = direction * (value - zero)."""
 
     manual = "DL-RS1A user's manual, IL edition, pages 7-16"
@@ -50,7 +49,7 @@ class KeyenceDlRs1a(LineDriver):
         fence = exchange.LineFence("M0", _ALL, _ALL_CHARS)
         settings = serial_port.SerialSettings(config.baud, parity=config.parity)
         super().__init__(port or serial_port.SerialPort(config.port, settings), "\r\n", config.timeout_s, fence)
-        self._gate = StepGate(config.step_max_um)
+        self._gate = exchange.StepGate(config.step_max_um)
         self._decimals = 3
         self._readings = 0
 
@@ -61,7 +60,7 @@ class KeyenceDlRs1a(LineDriver):
         in error, or one with steps coarser than `step_max_um`).
         """
         await self._link.close()
-        self._gate = StepGate(self._config.step_max_um)
+        self._gate = exchange.StepGate(self._config.step_max_um)
         return await self._opened(self._identify)
 
     async def _identify(self) -> roles.DeviceIdentity:

@@ -4,13 +4,12 @@ import contextlib
 import struct
 import time
 import tomllib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from firmware_iface.links.modbus_rules import ModbusLink
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, DisplacementSample, LinkError
+from firmware_iface.links.modbus_tcp import ModbusLink
+from firmware_iface.roles import Clock, DeviceIdentity, DeviceRefusedError, DisplacementSample, LinkError
 
 PRESETS = Path(__file__).parents[1] / "presets"
 _FORMATS = {"u16": "H", "i16": "h", "u32": "I", "i32": "i", "f32": "f"}
@@ -103,16 +102,7 @@ def _check_raw(made: ValueMap, raw_limits: list[float] | None) -> None:
 class ModbusValue:
     """One value of a Modbus device, as whatever role the configuration gives it.
 
-    Parameters
-    ----------
-    link : ModbusLink
-        The device.
-    value_map : ValueMap
-        Where the value is.
-    rest : float or None
-        Of an actuator: what it is left at on opening and closing; None: it is left as it is.
-    clock : callable
-        Time of arrival, for `displacement`.
+    `rest` is what an actuator is left at on opening and closing; None leaves it as it is.
     """
 
     def __init__(
@@ -120,7 +110,7 @@ class ModbusValue:
         link: ModbusLink,
         value_map: ValueMap,
         rest: float | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Clock = time.monotonic,
     ) -> None:
         self._link = link
         self._map = value_map

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface import roles, settings
-from firmware_iface.drivers.linked_device import LinkedDevice, StepGate
+from firmware_iface.links.exchange import LinkedDevice, StepGate
 from firmware_iface.links.serial_port import SerialPort, SerialSettings
 
 _IN_RANGE = (643, 64_877)  # page 65: below and above are reserves, measured but not specified
@@ -42,12 +42,8 @@ _MARKS = (0, 1, 2, 0, 1, 3)
 class StreamParser:
     """Bytes in any portions to measurements.
 
-    Attributes
-    ----------
-    bytes_lost : int
-        That belonged to no measurement, so far.
-    untrusted : int
-        Measurements that did not follow on the one before, so far.
+    It counts `bytes_lost`, which belonged to no measurement, and `untrusted` measurements, which did not follow on
+    the one before.
     """
 
     def __init__(self) -> None:

@@ -6,10 +6,8 @@ import secrets
 from collections.abc import Mapping
 from dataclasses import replace
 
-from firmware_iface import roles
-from firmware_iface.drivers.linked_device import LinkedDevice
-from firmware_iface.links import modbus_rtu, modbus_rules
-from firmware_iface.register_map import Block, default_map, known_maps
+from firmware_iface import register_map, roles
+from firmware_iface.links import exchange, modbus_rtu, modbus_tcp
 
 _KIND = "membrane pump board"
 # of a board of map version 1, for people
@@ -23,7 +21,7 @@ _U32_MAX = 2**32 - 1
 _BUSY_WRITES_MAX = 3
 
 
-class PumpBoard(LinkedDevice):
+class PumpBoard(exchange.LinkedDevice):
     """All sensors, pump and vent of the bench on one board.
 
     After a lost link (LinkDownError) call `open` again, as often as wanted: it tries when its back-off allows.
@@ -31,21 +29,11 @@ class PumpBoard(LinkedDevice):
     then the board keeps the pump off.
 
     `open` claims a board of map version 2 for this object: until it is closed, or its watchdog has run out, the board
-    takes commands from nobody else. A board of map version 1 knows no claim and obeys whoever writes. Raises
-    ValueError (the URL is none, or the board cannot have this watchdog period).
+    takes commands from nobody else. A board of map version 1 knows no claim and obeys whoever writes.
 
-    Parameters
-    ----------
-    url : str
-        `tcp://HOST:PORT` (502 when left out) or `rtu:///dev/ttyUSB0?baud=115200`.
-    unit_id : int
-        Modbus unit.
-    timeout_s : float
-        For connecting and for each reply.
-    watchdog_s : float
-        The board turns the pump off when it gets no `write` for this long.
-    link : ModbusLink, optional
-        A link that is there already (one in memory, in virtual time), in place of the URL's.
+    The board turns the pump off when it gets no `write` for `watchdog_s`. The URL is `tcp://HOST:PORT` (502 when left
+    out) or `rtu:///dev/ttyUSB0?baud=115200`; a `link` that is there already takes its place. Raises ValueError (the
+    URL is none, or the board cannot have this watchdog period).
     """
 
     def __init__(
@@ -54,11 +42,11 @@ class PumpBoard(LinkedDevice):
         unit_id: int = 1,
         timeout_s: float = 0.2,
         watchdog_s: float = 0.5,
-        link: modbus_rules.ModbusLink | None = None,
+        link: modbus_tcp.ModbusLink | None = None,
     ) -> None:
         if link is None:
             link = modbus_rtu.ModbusLinks().link(url, unit_id, timeout_s)
-        self._registers = default_map()  # of the board that answers, once it has said its version
+        self._registers = register_map.default_map()  # of the board that answers, once it has said its version
         period = self._registers.register("watchdog_period_s")
         if not period.allows(watchdog_s):
             raise ValueError(
@@ -104,19 +92,19 @@ class PumpBoard(LinkedDevice):
 
     async def _identify(self) -> roles.BenchIdentity:
         # these two never move; the rest means something only when they are right
-        identity = default_map().block("identity")
+        identity = register_map.default_map().block("identity")
         kind, version = await self._link.read_holding(identity.address, 2)
-        if kind != default_map().device_kind:
+        if kind != register_map.default_map().device_kind:
             raise roles.DeviceRefusedError(
-                f"{self._link.name}: device kind {kind} is not a {_KIND} ({default_map().device_kind})"
+                f"{self._link.name}: device kind {kind} is not a {_KIND} ({register_map.default_map().device_kind})"
             )
-        if version not in known_maps():
-            known = " and ".join(str(known) for known in known_maps())
+        if version not in register_map.known_maps():
+            known = " and ".join(str(known) for known in register_map.known_maps())
             raise roles.DeviceRefusedError(
                 f"{self._link.name}: register map version {version}, this program knows {known}; "
                 "update the firmware or the program"
             )
-        self._registers = known_maps()[version]
+        self._registers = register_map.known_maps()[version]
         found = await self._read(identity)
         firmware = int(found["firmware_version"])
         return roles.BenchIdentity(
@@ -243,7 +231,7 @@ class PumpBoard(LinkedDevice):
         self._armed = False
         await self._link.close()
 
-    async def _read(self, block: Block) -> dict[str, float]:
+    async def _read(self, block: register_map.Block) -> dict[str, float]:
         return block.decode(await self._link.read_holding(block.address, block.count))
 
     async def _sensors(self) -> dict[str, float]:

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_iface.display import DisplayResponse, ScreenRaster, linear_response, pattern_light
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkError, Pattern
+from firmware_iface.roles import Clock, DeviceIdentity, DeviceRefusedError, Levels, LinkError, Pattern
 
 MISSING = "pygame-ce is not installed: pip install 'membrane-ctrl[screen]'"
 
@@ -41,24 +40,14 @@ class ScreenSettings:
 class PygameScreen:
     """The display, fullscreen, from `open` to `close`. For the main thread of a process only (SDL's rule).
 
-    Parameters
-    ----------
-    response : DisplayResponse
-        Makes the patterns' light linear.
-    now, sleep : callables
-        The run's clock.
-
-    Attributes
-    ----------
-    settle_s : float
-        What `show` waits; may be set.
+    `response` makes the patterns' light linear; `show` waits `settle_s`, which may be set.
     """
 
     def __init__(
         self,
         settings: ScreenSettings,
         response: DisplayResponse | None = None,
-        now: Callable[[], float] = time.monotonic,
+        now: Clock = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self._settings = settings
@@ -128,13 +117,8 @@ class PygameScreen:
         """Return when what was begun is lit and settled."""
         self._sleep(max(0.0, self._shown_s + self.settle_s - self._now()))
 
-    def show_levels(self, levels: NDArray[np.uint8]) -> None:
-        """Send an image of the screen's size, level for level, for tests of the display; not waited for.
-
-        Parameters
-        ----------
-        levels : (height, width) array
-        """
+    def show_levels(self, levels: Levels) -> None:
+        """Send an image (height, width), level for level, for tests of the display; not waited for."""
         if self._window is None:
             self.open()
         self._flip(self._surface(levels))
@@ -166,7 +150,7 @@ class PygameScreen:
             raise LinkError(f"{self._settings.name}: {error}") from None
         self._shown_s = self._now()
 
-    def _surface(self, levels: NDArray[np.uint8]) -> Any:
+    def _surface(self, levels: Levels) -> Any:
         raster = self._settings.raster
         if levels.shape != (raster.height_px, raster.width_px):
             raise ValueError(f"image is {levels.shape}, the screen {(raster.height_px, raster.width_px)}")

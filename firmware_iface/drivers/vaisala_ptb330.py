@@ -14,7 +14,6 @@ import re
 from dataclasses import dataclass
 
 from firmware_iface import roles, settings
-from firmware_iface.drivers.linked_device import LineDriver
 from firmware_iface.links import exchange, serial_port
 
 FORMAT = '4.3 P " " U3 " " ERR " " MCTR " " SN " " CS4 #r #n'
@@ -39,7 +38,7 @@ class BarometerMessage:
     serial: str
 
 
-class VaisalaPtb330(LineDriver):
+class VaisalaPtb330(exchange.LineDriver):
     """A `Barometer`. A task of its own asks every `period_s` and serves the newest value.
 
     `port` stands in for the configured one.

@@ -11,7 +11,6 @@ import contextlib
 import re
 
 from firmware_iface import roles, settings
-from firmware_iface.drivers.linked_device import LineDriver
 from firmware_iface.links import exchange, serial_port
 
 ENABLE, POWER_LIMIT_MW, STREAM, MODE, MANUAL_SOURCE, SET_VALUE, ERROR = 0, 1, 2, 10, 11, 23, 31
@@ -25,7 +24,7 @@ _NUMBER = r"-?\d+(?:\.\d+)?"
 _STEP_MW = 0.0011  # values are written with three decimals
 
 
-class Ventus(LineDriver):
+class Ventus(exchange.LineDriver):
     """A `Pump`: the fraction is that of `power_max_mw`; `port` stands in for the configured one."""
 
     manual = "TN003 Communications Guide; no watchdog: the pump runs on when the host is gone"

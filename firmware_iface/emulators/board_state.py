@@ -31,15 +31,10 @@ class BoardSample:
 
 
 class BoardState:
-    """The board between two requests, of the map version that `registers` has.
+    """The board between two requests, of the map version that `registers` has; it says that it has `map_version`.
 
-    `advance` is called before every request and every few milliseconds: the watchdog and the pressure limit depend
-    on the time passed in and on nothing else.
-
-    Attributes
-    ----------
-    map_version : int
-        What the board says of itself.
+    `advance` is called before every request and every few milliseconds: the watchdog and the pressure limit depend on
+    the time passed in and on nothing else.
     """
 
     def __init__(self, registers: RegisterMap, sample: BoardSample) -> None:
@@ -87,15 +82,7 @@ class BoardState:
         return 1.0 if self._faults & self._over_pressure_mask else self._settable["vent_command_fraction"]
 
     def advance(self, now_s: float, sample: BoardSample) -> None:
-        """Take a sample, then let the pressure limit and the watchdog act.
-
-        Parameters
-        ----------
-        now_s : float
-            On any axis that does not go back.
-        sample : BoardSample
-            The newest one.
-        """
+        """Take the newest sample at a time (on any axis), then let the pressure limit and the watchdog act."""
         self._now_s = now_s
         self._sample = sample
         if sample.gauge_pressure_pa > GAUGE_PRESSURE_LIMIT_PA:

@@ -17,22 +17,10 @@ _TYPES = {"u8": 0x00, "u16": 0x20, "f32": 0x40, "text": 0x60}
 
 
 class Instrument:
-    """The instrument behind its interfaces.
+    """The instrument behind its interfaces: "DMFC" (EL-FLOW) or "DEPC" (EL-PRESS).
 
-    Parameters
-    ----------
-    device_type : str
-        "DMFC" (EL-FLOW) or "DEPC" (EL-PRESS).
-    serial : str
-        Serial number.
-    capacity : float
-        100 %, in `unit`.
-    unit : str
-        For example "mln/min" or "mbar(g)".
-    measured : callable
-        What its sensor sees, in `unit`; None: a flow controller that sees its own setpoint.
-    actuate : callable
-        Is given the fraction 0..1 that flows, whenever it changes; None for a meter.
+    100 % is `capacity`, in `unit` ("mln/min", "mbar(g)"). `measured` gives what its sensor sees, in `unit`; without
+    it a flow controller sees its own setpoint. `actuate` is given the fraction 0..1 that flows, whenever it changes.
     """
 
     def __init__(

@@ -1,47 +1,29 @@
 """A Keyence DL-RS1A with amplifiers on it (manual of the IL edition, pages 7-16)."""
 
 import math
-from collections.abc import Callable
 
-from firmware_iface.emulators.serial_device import LineDevice
-from firmware_iface.links.serial_port import SerialSettings
+from firmware_iface.emulators.serial_device import LineDevice, Sensor
 
 _WRITABLE = ("001",)
 
 
 class KeyenceDlRs1aEmulator(LineDevice):
-    """One amplifier that sees the mirror, and others beside it that measure nothing of interest.
+    """One amplifier that sees the mirror (NaN: it is in error), and others that measure nothing of interest.
 
-    Parameters
-    ----------
-    displacement_um : callable
-        What amplifier 0 measures; NaN when it is in error.
-    direction : int
-        -1: the value falls as the bowl deepens.
-    baud, parity
-        As set by its switches.
-    amplifiers : int
-        How many there are.
-
-    Attributes
-    ----------
-    error_state : int
-        Data number 033 of all amplifiers.
-    zero_shift_mm : float
-        Of the judgment value.
+    `error_state` is data number 033 of all amplifiers, `zero_shift_mm` that of the judgment value.
     """
 
     end = b"\r"
 
     def __init__(
         self,
-        displacement_um: Callable[[], float],
+        displacement_um: Sensor,
         direction: int = -1,
         baud: int = 9600,
         parity: str = "N",
         amplifiers: int = 1,
     ) -> None:
-        super().__init__(SerialSettings(baud, parity=parity))
+        super().__init__(baud, parity=parity)
         self.error_state = 0
         self.zero_shift_mm = 0.0
         self._displacement_um = displacement_um

@@ -209,16 +209,9 @@ PduHandler = Callable[[bytes], bytes]
 
 
 class RtuBusEmulator(SerialDevice):
-    """All slaves of one bus.
+    """All slaves of one bus, by unit id with what answers them (`lambda pdu: respond(pdu, table)`).
 
-    Parameters
-    ----------
-    settings : SerialSettings
-        Of the line.
-    slaves : mapping
-        Unit id to what answers it (for example `lambda pdu: respond(pdu, table)`); other units stay silent.
-    echo_test : bool
-        Whether function 8 ("return query data") is known; otherwise it is refused.
+    Without `echo_test` function 8 ("return query data") is refused.
     """
 
     def __init__(self, settings: SerialSettings, slaves: Mapping[int, PduHandler], echo_test: bool = True) -> None:

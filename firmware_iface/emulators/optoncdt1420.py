@@ -2,11 +2,8 @@
 
 import asyncio
 import math
-import random
-from collections.abc import Callable
 
-from firmware_iface.emulators.serial_device import LineDevice
-from firmware_iface.links.serial_port import SerialSettings
+from firmware_iface.emulators.serial_device import LineDevice, Sensor, Transmit
 
 NO_PEAK = 262_076
 _PERIOD_S = 0.0025  # between two portions of the stream, as an adapter hands them over
@@ -30,45 +27,20 @@ _CHOICES = {
 
 
 class Optoncdt1420Emulator(LineDevice):
-    """Sees the mirror from behind.
-
-    Parameters
-    ----------
-    displacement_um : callable
-        What it measures; NaN when nothing is in sight.
-    range_mm : int
-        Measuring range; displacement 0 is in its middle.
-    direction : int
-        -1: a deeper bowl is nearer.
-    baud : int
-        As stored in the sensor.
-    noise_um : float
-        Standard deviation of a single value.
-    name : str
-        What it says it is.
-
-    Attributes
-    ----------
-    lose_bytes_every : int
-        One byte in so many is lost from the stream; 0: off.
-    """
+    """Sees the mirror from behind, displacement 0 in the middle of its range (NaN: nothing is in sight)."""
 
     def __init__(
         self,
-        displacement_um: Callable[[], float],
+        displacement_um: Sensor,
         range_mm: int = 50,
         direction: int = -1,
         baud: int = 921_600,
-        noise_um: float = 0.0,
         name: str = "",
     ) -> None:
-        super().__init__(SerialSettings(baud))
-        self.random = random.Random(0)
-        self.lose_bytes_every = 0
+        super().__init__(baud)
         self._displacement_um = displacement_um
         self._range_mm = range_mm
         self._direction = direction
-        self._noise_um = noise_um
         self._name = name or f"ILD1420-{range_mm}"
         self._register = dict(_DEFAULTS)
         self._counter = 0
@@ -89,7 +61,7 @@ class Optoncdt1420Emulator(LineDevice):
         self._stop()
         super().detach()
 
-    def attach(self, transmit: Callable[[bytes], None]) -> None:
+    def attach(self, transmit: Transmit) -> None:
         """The wire is plugged in; it goes on streaming if it was."""
         super().attach(transmit)
         if self._register["OUTPUT"] == "RS422":
@@ -138,14 +110,15 @@ class Optoncdt1420Emulator(LineDevice):
         self._streamed_s = loop.time()
         count, self._owed = int(self._owed), self._owed % 1
         displacement_um = self._displacement_um() if count else math.nan
-        data = b"".join(self._measurement(displacement_um) for _ in range(count))
-        if self.lose_bytes_every:
-            data = bytes(byte for byte in data if self.random.randrange(self.lose_bytes_every))
-        if data:
-            self.say(data)
+        if data := b"".join(self._measurement(displacement_um) for _ in range(count)):
+            self.stream(data)
         self._stream = loop.call_later(_PERIOD_S, self._portion)
 
-    def _digital(self, displacement_um: float) -> int:
+    def stream(self, data: bytes) -> None:
+        """Send measurements."""
+        self.say(data)
+
+    def digital(self, displacement_um: float) -> int:
         """Page 65, without mastering: x = (d / range + 0.01) 65520 / 1.02; page 66 for what has no value."""
         if math.isnan(displacement_um):
             return NO_PEAK
@@ -157,7 +130,7 @@ class Optoncdt1420Emulator(LineDevice):
 
     def _measurement(self, displacement_um: float) -> bytes:
         if not self.frozen:
-            self._raw = self._digital(displacement_um + self.random.gauss(0.0, self._noise_um))
+            self._raw = self.digital(displacement_um)
             self._counter = (self._counter + 1) % 2**18
         data = three_bytes(self._raw, first=True)
         if self._register["OUTADD_RS422"] == "COUNTER":

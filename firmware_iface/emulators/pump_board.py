@@ -1,9 +1,7 @@
-"""The membrane pump board as a Modbus TCP device over any plant, with faults that can be switched on."""
+"""The membrane pump board as a Modbus TCP device over any plant."""
 
 import asyncio
-import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Protocol
 
 from firmware_iface.emulators import board_state, modbus_server
@@ -23,44 +21,12 @@ class BoardPlant(Protocol):
         """Drive pump and vent, both 0..1; called when one of them changes."""
 
 
-@dataclass(slots=True)
-class Faults:
-    """What is wrong with the emulated board; each can be switched on and off while it runs."""
-
-    silent: bool = False  # requests are carried out and not answered
-    delay_s: float = 0.0  # answers come this much later
-    frozen: bool = False  # the sensor block stays as it was (counter and time too)
-    no_displacement: bool = False  # the laser has no value
-    exception_code: int = 0  # every request is answered with this Modbus exception and not carried out; 0: off
-    map_version: int = 0  # what the board says of its map; 0: the true one
-    hang_up: bool = False  # the connection is dropped at every request
-    short_reply: bool = False  # reads answer with one register too few, in a frame that is otherwise right
-    wrong_function: bool = False  # answers carry function code 23 in place of 3, and 6 in place of 16
-    wrong_transaction: bool = False  # answers carry another transaction id
-
-
 class PumpBoardEmulator:
-    """Serves `plant` on Modbus TCP.
+    """Serves `plant` on Modbus TCP, from the event loop's thread.
 
-    Parameters
-    ----------
-    plant : BoardPlant
-        Called from the event loop's thread only.
-    host, port
-        Where to listen; port 0 takes any free one (see `port` after `start`).
-    clock : callable, optional
-        Seconds on any axis that does not go back; what the watchdog runs on. By default the event loop's.
-    unit_id : int
-        Requests to other units are answered with exception 11, as a gateway does.
-    registers : RegisterMap, optional
-        A board of another map version than the newest.
-
-    Attributes
-    ----------
-    faults : Faults
-        Switches.
-    state : BoardState
-        The board itself.
+    Port 0 takes any free one (see `port` after `start`). The watchdog runs on `clock`, by default the event loop's.
+    Requests to other units are answered with exception 11, as a gateway does. `registers` may be those of an earlier
+    map version.
     """
 
     def __init__(
@@ -72,13 +38,11 @@ class PumpBoardEmulator:
         unit_id: int = 1,
         registers: RegisterMap | None = None,
     ) -> None:
-        self.faults = Faults()
         self._plant = plant
         self._clock = clock or (lambda: asyncio.get_running_loop().time())
         self._unit_id = unit_id
         self._sample = plant.sample()
-        self._registers = registers or default_map()
-        self.state = board_state.BoardState(self._registers, self._sample)
+        self.state = board_state.BoardState(registers or default_map(), self._sample)
         self._actuated = (0.0, 0.0)
         self._server = modbus_server.ModbusTcpServer(self._handle, host, port)
         self._task: asyncio.Task[None] | None = None
@@ -121,11 +85,13 @@ class PumpBoardEmulator:
             await asyncio.sleep(_PERIOD_S)
 
     def _advance(self) -> None:
-        if not self.faults.frozen:
-            sample = self._plant.sample()
-            self._sample = replace(sample, displacement_um=math.nan) if self.faults.no_displacement else sample
+        self._sample = self.newest()
         self.state.advance(self._clock(), self._sample)
         self._actuate()
+
+    def newest(self) -> board_state.BoardSample:
+        """The sample of the sensors now."""
+        return self._plant.sample()
 
     def _actuate(self) -> None:
         outputs = (self.state.pump_fraction, self.state.vent_fraction)
@@ -136,19 +102,11 @@ class PumpBoardEmulator:
     def _handle(self, unit: int, pdu: bytes) -> modbus_server.Answer:
         if unit != self._unit_id:
             return modbus_server.Answer(modbus_server.exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
-        faults = self.faults
-        if faults.hang_up:
-            return modbus_server.Answer(hang_up=True)
-        if faults.exception_code:
-            return modbus_server.Answer(modbus_server.exception_pdu(pdu, faults.exception_code), faults.delay_s)
-        self.state.map_version = faults.map_version or self._registers.map_version
+        return self.answer(pdu)
+
+    def answer(self, pdu: bytes) -> modbus_server.Answer:
+        """Carry out a request."""
         self._advance()
         reply = modbus_server.respond(pdu, self.state)
         self._actuate()
-        if faults.silent:
-            return modbus_server.Answer()
-        if faults.short_reply and reply[0] == 3:
-            reply = bytes([3, reply[1] - 2]) + reply[2:-2]
-        if faults.wrong_function:
-            reply = bytes([{3: 23, 16: 6}.get(reply[0], reply[0])]) + reply[1:]
-        return modbus_server.Answer(reply, faults.delay_s, transaction_offset=int(faults.wrong_transaction))
+        return modbus_server.Answer(reply)

@@ -10,6 +10,10 @@ from pathlib import Path
 
 from firmware_iface.links.serial_port import SerialSettings
 
+Sensor = Callable[[], float]  # what a device measures
+Drive = Callable[[float], None]  # what an actuator's fraction does
+Transmit = Callable[[bytes], None]
+
 
 class SerialDevice:
     """Hears bytes, says bytes. A device overrides `received`, and `restart` if it can lose settings."""
@@ -18,11 +22,11 @@ class SerialDevice:
 
     def __init__(self, settings: SerialSettings) -> None:
         self.settings = settings
-        self._transmit: Callable[[bytes], None] | None = None
+        self._transmit: Transmit | None = None
         self._free_s = 0.0  # until then the line is taken by what is being said
         self._due: set[asyncio.TimerHandle] = set()
 
-    def attach(self, transmit: Callable[[bytes], None]) -> None:
+    def attach(self, transmit: Transmit) -> None:
         """The wire is plugged in: what is said goes to `transmit`."""
         self._transmit = transmit
 
@@ -80,8 +84,8 @@ class LineDevice(SerialDevice):
 
     end = b"\n"
 
-    def __init__(self, settings: SerialSettings) -> None:
-        super().__init__(settings)
+    def __init__(self, baud: int, data_bits: int = 8, parity: str = "N") -> None:
+        super().__init__(SerialSettings(baud, data_bits, parity))
         self._heard = b""
 
     def received(self, data: bytes) -> None:
@@ -106,15 +110,9 @@ _SPEED = 4  # place of the input speed in what tcgetattr gives; the output speed
 class PtyWire:
     """An emulated device behind a pseudo-terminal, to be opened at `path` like any serial port.
 
-    A program that opens it with another baud rate than the device's gets garbage and is not understood, as on a real
-    line. Character size and parity are no properties of a pseudo-terminal.
-
-    Parameters
-    ----------
-    device : SerialDevice
-        Called from the event loop's thread only.
-    path : Path
-        Made as a link to the pseudo-terminal; another one after every replug.
+    `path` is a link to the pseudo-terminal, to another one after every replug. A program that opens it with another
+    baud rate than the device's gets garbage and is not understood, as on a real line. Character size and parity are
+    no properties of a pseudo-terminal.
     """
 
     def __init__(self, device: SerialDevice, path: Path) -> None:

@@ -3,10 +3,8 @@
 import asyncio
 import math
 import re
-from collections.abc import Callable
 
-from firmware_iface.emulators.serial_device import LineDevice
-from firmware_iface.links.serial_port import SerialSettings
+from firmware_iface.emulators.serial_device import LineDevice, Sensor, Transmit
 
 _PERIOD_S = 0.1  # of its measurements
 _WORD = re.compile(r'"[^"]*"|\S+')
@@ -14,37 +12,18 @@ _DEFAULT_FORMAT = '"P= " 4.2 P " " U3 #r #n'
 
 
 class VaisalaPtb330Emulator(LineDevice):
-    """Feels the air.
-
-    Parameters
-    ----------
-    ambient_pressure_pa : callable
-        What it measures; NaN when it cannot.
-    baud : int
-        As set.
-    running : bool
-        Whether it was left sending by itself.
-    model : str
-        What it says it is.
-
-    Attributes
-    ----------
-    error_flags : str
-        Of its three modules.
-    serial : str
-        Its number.
-    """
+    """Feels the air (NaN: it cannot); `running`: it was left sending. `error_flags` are its three modules'."""
 
     end = b"\r"
 
     def __init__(
         self,
-        ambient_pressure_pa: Callable[[], float],
+        ambient_pressure_pa: Sensor,
         baud: int = 4800,
         running: bool = False,
         model: str = "PTB330",
     ) -> None:
-        super().__init__(SerialSettings(baud, data_bits=7, parity="E"))
+        super().__init__(baud, data_bits=7, parity="E")
         self.error_flags = "000"
         self.serial = "A1234567"
         self._ambient_pressure_pa = ambient_pressure_pa
@@ -59,7 +38,7 @@ class VaisalaPtb330Emulator(LineDevice):
         super().restart()
         self._echo = True
 
-    def attach(self, transmit: Callable[[bytes], None]) -> None:
+    def attach(self, transmit: Transmit) -> None:
         """The wire is plugged in."""
         super().attach(transmit)
         if self._running:

@@ -2,10 +2,8 @@
 
 import asyncio
 import re
-from collections.abc import Callable
 
-from firmware_iface.emulators.serial_device import LineDevice
-from firmware_iface.links.serial_port import SerialSettings
+from firmware_iface.emulators.serial_device import Drive, LineDevice, Transmit
 
 _COMMAND = re.compile(r"#(?:W(\d+),(-?\d+(?:\.\d+)?)|R(\d+))")
 _READ_ONLY = (31, 36, 37, 38, 39)
@@ -16,30 +14,18 @@ _STREAM_PERIOD_S = 0.02
 
 
 class VentusEmulator(LineDevice):
-    """Drives gas.
+    """Drives gas: `drive` is called with the fraction of `power_max_mw` whenever it changes.
 
-    Parameters
-    ----------
-    drive : callable
-        Called with the fraction of `power_max_mw` whenever it changes.
-    power_max_mw : float
-        What counts as full drive.
-    streaming : bool
-        Whether it was left streaming.
-
-    Attributes
-    ----------
-    registers : dict
-        Number to value.
+    `streaming`: it was left streaming.
     """
 
     def __init__(
         self,
-        drive: Callable[[float], None],
+        drive: Drive,
         power_max_mw: float = 1000.0,
         streaming: bool = False,
     ) -> None:
-        super().__init__(SerialSettings(115_200))
+        super().__init__(115_200)
         self.registers = dict(_DEFAULTS)
         self.registers[2] = float(streaming)
         self._drive = drive
@@ -47,7 +33,7 @@ class VentusEmulator(LineDevice):
         self._driven = -1.0
         self._stream: asyncio.TimerHandle | None = None
 
-    def attach(self, transmit: Callable[[bytes], None]) -> None:
+    def attach(self, transmit: Transmit) -> None:
         """The wire is plugged in."""
         super().attach(transmit)
         self._act()

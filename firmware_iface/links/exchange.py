@@ -14,11 +14,12 @@ next one. Three rules keep them apart.
 import asyncio
 import re
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 from firmware_iface.links.serial_port import SerialPort
-from firmware_iface.roles import LinkDownError, LinkError
+from firmware_iface.roles import DeviceIdentity, LinkDownError, LinkError
 
 _SHOWN_BYTES = 24
 # so many questions in a row without a valid answer, and the line is closed: its owner then opens it again, which also
@@ -38,18 +39,11 @@ class Question:
 
 
 class SerialExchange:
-    """Questions and answers on one line, for one device or several that take turns.
+    """Questions and answers on one line, for one device or several that take turns; its port's only user.
 
-    Parameters
-    ----------
-    port : SerialPort
-        The line; this object is its only user.
-    gap_s : float
-        Silence that the devices want between an answer and the next question.
-    quiet_s : float
-        Silence after a loss. As long as devices are usually late at most; the fence covers the rest.
-    blank : bytes
-        Of these, what comes between answers means nothing, like the LF behind a CR that already ended one.
+    Devices want the silence `gap_s` between an answer and the next question. After a loss it is `quiet_s`, as long as
+    devices are usually late at most; the fence covers the rest. Bytes of `blank` mean nothing between answers, like
+    the LF behind a CR that already ended one.
     """
 
     def __init__(self, port: SerialPort, gap_s: float, quiet_s: float, blank: bytes = b"") -> None:
@@ -71,12 +65,8 @@ class SerialExchange:
     def connect(self, greeting: bytes = b"") -> None:
         """Open the line; what devices may still owe to an earlier user is not believed.
 
-        Raises LinkDownError (the port does not open).
-
-        Parameters
-        ----------
-        greeting : bytes
-            Sent at once, and whatever comes back is thrown away: for a device that talks unasked until told to stop.
+        The greeting is sent at once, and whatever comes back is thrown away: for a device that talks unasked until
+        told to stop. Raises LinkDownError if the port does not open.
         """
         self.port.open(self)
         self._sure.clear()
@@ -94,21 +84,11 @@ class SerialExchange:
             await asyncio.wait([self._in_flight])
 
     async def ask(self, question: Question, timeout_s: float, fence: Question | None, key: int = 0) -> bytes:
-        """The answer to a question.
+        """The answer to a question, which is asked once: nothing is ever sent again by itself.
 
-        Devices that wait are served in turn, each with one question. Raises LinkError (no valid answer),
-        LinkDownError (the line is closed or went away).
-
-        Parameters
-        ----------
-        question : Question
-            Asked once; nothing is ever sent again by itself.
-        timeout_s : float
-            For the device; the time on the wire comes on top.
-        fence : Question or None
-            See the module; None for a device that has none, which `quiet_s` alone then protects.
-        key : int
-            Which device of the line.
+        Devices (`key`) that wait are served in turn, each with one question. The device has `timeout_s`; the time on
+        the wire comes on top. A device that has no fence (None) is protected by `quiet_s` alone. Raises LinkError (no
+        valid answer), LinkDownError (the line is closed or went away).
         """
         async with self._key_turns[key]:
             await self._turn.acquire()  # cancelled while waiting here, a question is never sent
@@ -223,18 +203,7 @@ class LineFence:
 class LineLink:
     """Commands out, lines of text back, each checked as a whole against what it has to look like.
 
-    Parameters
-    ----------
-    port : SerialPort
-        The line.
-    end : str
-        What a command ends in.
-    timeout_s : float
-        For the device; the time on the wire comes on top.
-    fence : LineFence
-        Asked after a loss.
-    quiet_s : float
-        Silence after a loss.
+    A command ends in `end`. The device has `timeout_s`; the time on the wire comes on top.
     """
 
     def __init__(self, port: SerialPort, end: str, timeout_s: float, fence: LineFence, quiet_s: float = 0.1) -> None:
@@ -258,18 +227,11 @@ class LineLink:
         await self._exchange.close()
 
     async def query(self, command: str, answer: re.Pattern[str], longest: int = 80) -> re.Match[str]:
-        """The answer to a command, whose whole text has the given form (line ends included).
+        """The answer to a command (without its end), whose whole text has the given form, line ends included.
 
-        Raises LinkError (no answer of this form in time), LinkDownError (the line is gone).
-
-        Parameters
-        ----------
-        command : str
-            Without its end.
-        answer : re.Pattern
-            Has to match everything that comes, line ends before it aside, and nothing that is still incomplete.
-        longest : int
-            Characters of the longest answer; more are no answer.
+        The pattern has to match everything that comes, line ends before it aside, and nothing that is still
+        incomplete; more than `longest` characters are no answer. Raises LinkError (no answer of this form in time),
+        LinkDownError (the line is gone).
         """
         fence = self._question(self._fence.command, self._fence.answer, self._fence.longest)
         heard = await self._exchange.ask(self._question(command, answer, longest), self._timeout_s, fence)
@@ -293,3 +255,89 @@ class LineLink:
             return None
 
         return Question((command + self._end).encode("ascii"), take, longest, what)
+
+
+# What drivers with a link of their own have in common.
+
+
+class Reconnecting(Protocol):
+    """A link or a port: it connects again after a loss, with back-off, and counts."""
+
+    @property
+    def reconnects(self) -> int:
+        """Times it was opened after the first."""
+
+    @property
+    def retry_in_s(self) -> float:
+        """Time until it will try to open."""
+
+
+class LinkedDevice:
+    """Base of a driver that talks through one link."""
+
+    def __init__(self, link: Reconnecting) -> None:
+        self._reconnecting = link
+
+    @property
+    def reconnects(self) -> int:
+        """Times the link was opened after the first."""
+        return self._reconnecting.reconnects
+
+    @property
+    def retry_in_s(self) -> float:
+        """Time until `open` will try."""
+        return self._reconnecting.retry_in_s
+
+
+class LineDriver(LinkedDevice):
+    """Base of a driver whose device is asked in lines of text on a serial port of its own."""
+
+    manual = ""
+
+    def __init__(self, port: SerialPort, end: str, timeout_s: float, fence: LineFence) -> None:
+        super().__init__(port)
+        self._link = LineLink(port, end, timeout_s, fence)
+
+    async def _opened(self, begin: Callable[[], Awaitable[DeviceIdentity]], greeting: str = "") -> DeviceIdentity:
+        """Open the port and begin; the port is closed again when that fails."""
+        self._link.connect(greeting)
+        try:
+            return await begin()
+        except LinkError:
+            await self._link.close()
+            raise
+
+    async def close(self) -> None:
+        """Close the port. Never raises."""
+        await self._link.close()
+
+    @property
+    def _shown(self) -> str:
+        """The settings in words."""
+        raise NotImplementedError
+
+    def describe(self) -> dict[str, str]:
+        """For people: port, settings, manual."""
+        port = f"{self._link.name}, {self._link.port.settings}"
+        return {"port": port, "settings": self._shown, "manual": self.manual}
+
+
+# Whether a reading can be believed that carries no checksum: it has to be near one of the two before it.
+
+
+class StepGate:
+    """Passes a value within `step` of either of the last two, passed or not.
+
+    A hit reading is alone and is stopped; the good one after it still has the good one before. A true step is stopped
+    once and passes with its second reading. The first value of all has nothing to confirm it and is stopped.
+    """
+
+    def __init__(self, step: float) -> None:
+        self._step = step
+        self._before: tuple[float, ...] = ()
+
+    def passes(self, value: float) -> bool:
+        """Whether to believe it; it is remembered either way."""
+        near = any(abs(value - before) <= self._step for before in self._before)
+        self._before = (value, *self._before[:1])
+        return near

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Sequence
 from urllib.parse import parse_qsl, urlsplit
 
-from firmware_iface.links import exchange, modbus_rules, modbus_tcp, serial_port
+from firmware_iface.links import exchange, modbus_tcp, serial_port
 from firmware_iface.roles import LinkError
 
 DEFAULT_PORT = 502  # of Modbus TCP
@@ -66,12 +66,7 @@ def parse_rtu_url(url: str) -> tuple[str, serial_port.SerialSettings]:
 class RtuBus:
     """A serial bus with any number of Modbus devices, served in turn.
 
-    Parameters
-    ----------
-    port : SerialPort
-        The line.
-    quiet_s : float
-        Silence after a loss, before the next request: as long as devices are usually late at most.
+    After a loss it is silent for `quiet_s`, as long as devices are usually late at most.
     """
 
     def __init__(self, port: serial_port.SerialPort, quiet_s: float = 0.2) -> None:
@@ -97,18 +92,10 @@ class RtuBus:
 
 
 class GuardedModbusRtu:
-    """One Modbus RTU device of a bus.
+    """One Modbus RTU device of a bus: whoever connects first opens the bus, whoever closes it closes it for all.
 
-    Parameters
-    ----------
-    bus : RtuBus
-        Shared by all devices of the line: whoever connects first opens it, whoever closes it closes it for all.
-    unit_id : int
-        1..247.
-    timeout_s : float
-        For the device to answer; the time on the wire comes on top.
-    fence : bool
-        False for a device that is silent on function 8 instead of refusing it.
+    The device has `timeout_s`; the time on the wire comes on top. `fence` is False for a device that is silent on
+    function 8 instead of refusing it.
     """
 
     def __init__(self, bus: RtuBus, unit_id: int, timeout_s: float, fence: bool = True) -> None:
@@ -150,16 +137,16 @@ class GuardedModbusRtu:
 
     async def read_holding(self, address: int, count: int) -> list[int]:
         """Read holding registers (function code 3). Raises LinkError, LinkDownError, DeviceRefusedError."""
-        return await self._read(modbus_rules.READ_HOLDING, address, count)
+        return await self._read(modbus_tcp.READ_HOLDING, address, count)
 
     async def read_input(self, address: int, count: int) -> list[int]:
         """Read input registers (function code 4). Raises as `read_holding`."""
-        return await self._read(modbus_rules.READ_INPUT, address, count)
+        return await self._read(modbus_tcp.READ_INPUT, address, count)
 
     async def write_register(self, address: int, word: int) -> None:
         """Write one holding register (function code 6) and check the echo. Raises as `read_holding`."""
         what = f"{self.name}: writing {address}"
-        pdu = struct.pack(">BHH", modbus_rules.WRITE_SINGLE, address, word)
+        pdu = struct.pack(">BHH", modbus_tcp.WRITE_SINGLE, address, word)
         if (await self._transact(pdu, _WRITE_BYTES, what)) != pdu:
             raise LinkError(f"{what}: the reply confirms something else")
 
@@ -171,7 +158,7 @@ class GuardedModbusRtu:
         """
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
         pdu = struct.pack(
-            f">BHHB{len(words)}H", modbus_rules.WRITE_MULTIPLE, address, len(words), 2 * len(words), *words
+            f">BHHB{len(words)}H", modbus_tcp.WRITE_MULTIPLE, address, len(words), 2 * len(words), *words
         )
         reply = await self._transact(pdu, _WRITE_BYTES, what)
         if reply != pdu[:5]:
@@ -185,20 +172,20 @@ class GuardedModbusRtu:
     async def _transact(self, pdu: bytes, answer_bytes: int, what: str) -> bytes:
         question = self._question(pdu, answer_bytes, what)
         reply = await self._bus.exchange.ask(question, self._timeout_s, self._fence_question(), self._unit_id)
-        if reply[0] & modbus_rules.EXCEPTION_FLAG:
-            raise modbus_rules.exception_error(what, reply[1])
+        if reply[0] & modbus_tcp.EXCEPTION_FLAG:
+            raise modbus_tcp.exception_error(what, reply[1])
         return reply
 
     def _fence_question(self) -> exchange.Question | None:
         if not self._fence:
             return None
-        pdu = struct.pack(">BHH", modbus_rules.DIAGNOSTICS, 0, self._bus.next_token())
+        pdu = struct.pack(">BHH", modbus_tcp.DIAGNOSTICS, 0, self._bus.next_token())
         return self._question(pdu, _WRITE_BYTES, f"{self.name}: echo test after a loss (function 8)", pdu)
 
     def _question(self, pdu: bytes, answer_bytes: int, what: str, exactly: bytes = b"") -> exchange.Question:
         def take(heard: bytes) -> bytes | None:
             reply = take_reply(heard, self._unit_id, pdu[0], answer_bytes, what)
-            if exactly and reply is not None and reply != exactly and not reply[0] & modbus_rules.EXCEPTION_FLAG:
+            if exactly and reply is not None and reply != exactly and not reply[0] & modbus_tcp.EXCEPTION_FLAG:
                 raise LinkError(f"{what}: another echo came back than was sent")
             return reply
 
@@ -211,7 +198,7 @@ class ModbusLinks:
     def __init__(self) -> None:
         self._buses: dict[str, RtuBus] = {}
 
-    def link(self, url: str, unit_id: int, timeout_s: float, fence: bool = True) -> modbus_rules.ModbusLink:
+    def link(self, url: str, unit_id: int, timeout_s: float, fence: bool = True) -> modbus_tcp.ModbusLink:
         """The device `unit_id` at `tcp://HOST[:PORT]` or `rtu://PORT[?baud=..&parity=..]`, not yet connected.
 
         `fence`: see `links.exchange`; of no meaning for TCP. Raises ValueError for a URL that is neither.
@@ -246,14 +233,14 @@ def take_reply(heard: bytes, unit_id: int, function_code: int, answer_bytes: int
         raise LinkError(f"{what}: answer of unit {heard[0]}, asked was {unit_id}")
     if len(heard) < 3:
         return None
-    if heard[1] == function_code | modbus_rules.EXCEPTION_FLAG:
+    if heard[1] == function_code | modbus_tcp.EXCEPTION_FLAG:
         length = _EXCEPTION_BYTES
     elif heard[1] == function_code:
         length = answer_bytes
     else:
         raise LinkError(f"{what}: answer has function code {heard[1]}, asked was {function_code}")
     if (
-        function_code in (modbus_rules.READ_HOLDING, modbus_rules.READ_INPUT)
+        function_code in (modbus_tcp.READ_HOLDING, modbus_tcp.READ_INPUT)
         and length == answer_bytes
         and heard[2] != answer_bytes - 5
     ):

@@ -9,13 +9,76 @@ import asyncio
 import logging
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from typing import Protocol
 
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusIOException
 from pymodbus.pdu import ExceptionResponse, ModbusPDU
 
-from firmware_iface.links import modbus_rules, serial_port
-from firmware_iface.roles import LinkDownError, LinkError, LinkWaitsError
+from firmware_iface.links import serial_port
+from firmware_iface.roles import Clock, DeviceBusyError, DeviceRefusedError, LinkDownError, LinkError, LinkWaitsError
+
+# What Modbus means, whichever wire it comes over.
+
+READ_HOLDING, READ_INPUT, WRITE_SINGLE, DIAGNOSTICS, WRITE_MULTIPLE = 3, 4, 6, 8, 16
+EXCEPTION_FLAG = 0x80
+EXCEPTIONS = {
+    1: "illegal function",
+    2: "illegal address",
+    3: "illegal value",
+    4: "device failure",
+    5: "acknowledged, not done",
+    6: "device busy",
+    10: "gateway path unavailable",
+    11: "no device behind the gateway",
+}
+_REFUSALS = (1, 2, 3)  # the request itself is wrong for this device; the others may pass
+_BUSY = 6
+
+
+class ModbusLink(Protocol):
+    """One Modbus device over any wire: what the drivers need. All raise LinkError kinds."""
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether the connection stands."""
+
+    @property
+    def reconnects(self) -> int:
+        """Connections made after the first."""
+
+    @property
+    def retry_in_s(self) -> float:
+        """Time until `connect` will try."""
+
+    async def connect(self) -> None:
+        """Connect anew."""
+
+    async def read_holding(self, address: int, count: int) -> list[int]:
+        """Function code 3."""
+
+    async def read_input(self, address: int, count: int) -> list[int]:
+        """Function code 4."""
+
+    async def write_register(self, address: int, word: int) -> None:
+        """Function code 6; the echo is checked."""
+
+    async def write_registers(self, address: int, words: Sequence[int]) -> None:
+        """Function code 16; the echo is checked."""
+
+    async def close(self) -> None:
+        """Close; a request in flight fails at once."""
+
+
+def exception_error(what: str, code: int) -> LinkError:
+    """The error for an exception answer."""
+    kind = DeviceRefusedError if code in _REFUSALS else DeviceBusyError if code == _BUSY else LinkError
+    return kind(f"{what}: exception {code} ({EXCEPTIONS.get(code, 'unknown')})")
+
 
 # the library reports in its log what is raised here as well; without a handler it would write into the console
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
@@ -26,27 +89,14 @@ _UNANSWERED_MAX = 3
 
 
 class GuardedModbusTcp:
-    """One Modbus TCP device.
+    """One Modbus TCP device; `timeout_s` is for connecting and for each reply.
 
     One request is in flight at a time. One that was sent when its caller is cancelled still runs to its reply or
     timeout, so that nothing is ever abandoned on the wire. Nothing is sent twice, and nothing reconnects by itself:
     the owner calls `connect`, which refuses to try before its back-off (0.1 s, doubling to 5 s) is over.
-
-    Parameters
-    ----------
-    host, port
-        Of the device or its gateway.
-    unit_id : int
-        Modbus unit.
-    timeout_s : float
-        For connecting and for each reply.
-    clock : callable
-        Seconds on any axis that does not go back; for the back-off.
     """
 
-    def __init__(
-        self, host: str, port: int, unit_id: int, timeout_s: float, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, host: str, port: int, unit_id: int, timeout_s: float, clock: Clock = time.monotonic) -> None:
         self._host, self._port = host, port
         self._unit_id = unit_id
         self._timeout_s = timeout_s
@@ -109,18 +159,18 @@ class GuardedModbusTcp:
         Raises LinkError (no valid reply in time), LinkDownError (the connection is gone), DeviceRefusedError (the
         device does not have these registers).
         """
-        return await self._read(modbus_rules.READ_HOLDING, address, count)
+        return await self._read(READ_HOLDING, address, count)
 
     async def read_input(self, address: int, count: int) -> list[int]:
         """Read `count` input registers (function code 4). Raises as `read_holding`."""
-        return await self._read(modbus_rules.READ_INPUT, address, count)
+        return await self._read(READ_INPUT, address, count)
 
     async def write_register(self, address: int, word: int) -> None:
         """Write one holding register (function code 6) and check the echo. Raises as `write_registers`."""
         what = f"{self.name}: writing {address}"
         reply = await self._exchange(
             lambda client: client.write_register(address, word, device_id=self._unit_id),
-            modbus_rules.WRITE_SINGLE,
+            WRITE_SINGLE,
             what,
         )
         if (reply.address, list(reply.registers)) != (address, [word]):
@@ -136,7 +186,7 @@ class GuardedModbusTcp:
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
         reply = await self._exchange(
             lambda client: client.write_registers(address, list(words), device_id=self._unit_id),
-            modbus_rules.WRITE_MULTIPLE,
+            WRITE_MULTIPLE,
             what,
         )
         if (reply.address, reply.count) != (address, len(words)):
@@ -147,11 +197,7 @@ class GuardedModbusTcp:
         what = f"{self.name}: reading {address}..{address + count - 1}"
 
         def send(client: AsyncModbusTcpClient) -> Awaitable[ModbusPDU]:
-            read = (
-                client.read_input_registers
-                if function_code == modbus_rules.READ_INPUT
-                else client.read_holding_registers
-            )
+            read = client.read_input_registers if function_code == READ_INPUT else client.read_holding_registers
             return read(address, count=count, device_id=self._unit_id)
 
         reply = await self._exchange(send, function_code, what)
@@ -208,7 +254,7 @@ def _check(reply: ModbusPDU, function_code: int, transaction_id: int, what: str)
     if reply.function_code & 0x7F != function_code:
         raise LinkError(f"{what}: answer has function code {reply.function_code}, asked was {function_code}")
     if isinstance(reply, ExceptionResponse):
-        raise modbus_rules.exception_error(what, reply.exception_code)
+        raise exception_error(what, reply.exception_code)
 
 
 def _fail_in_flight(client: AsyncModbusTcpClient, message: str) -> None:

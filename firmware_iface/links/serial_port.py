@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import serial
 from serial.tools import list_ports
 
-from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError, LinkWaitsError
+from firmware_iface.roles import Clock, DeviceRefusedError, LinkDownError, LinkError, LinkWaitsError
 
 # How long to leave a device alone after a failed attempt to connect.
 
@@ -108,19 +108,11 @@ class Receiver(Protocol):
 class SerialPort:
     """A serial port of this machine.
 
-    Raises ValueError (the name is neither).
-
-    Parameters
-    ----------
-    port : str
-        A path, or `usb:VID:PID[:SERIAL]`, looked up at every `open` so that a replug in another socket is found.
-    settings : SerialSettings
-        Of the line.
-    clock : callable
-        Seconds on any axis that does not go back; for the back-off.
+    It is a path or `usb:VID:PID[:SERIAL]`, looked up at every `open` so that a replug in another socket is found.
+    Raises ValueError if the name is neither.
     """
 
-    def __init__(self, port: str, settings: SerialSettings, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, port: str, settings: SerialSettings, clock: Clock = time.monotonic) -> None:
         self._port = check_port_name(port)
         self._settings = settings
         self._clock = clock

@@ -66,18 +66,7 @@ class CycleFailed:
 class ShapeCycle:
     """Takes cycles: a full one first and whenever the fringe orders are lost, else fringes only.
 
-    Parameters
-    ----------
-    camera, screen, laser, reconstructor
-        What the cycle works with.
-    plan : CyclePlan
-        What to show and how fast.
-    frames : FrameWriter
-        Where the pixels go; it must hold a full cycle.
-    clock : CycleClock
-        The run's clock.
-    stopping : callable
-        Asked before every exposure: True ends the cycle without a result.
+    `frames` must hold a full cycle. `stopping` is asked before every exposure: True ends the cycle without a result.
     """
 
     def __init__(
@@ -157,19 +146,9 @@ _KEPT_S = 60.0  # longer than any full cycle takes
 
 
 class LaserHistory:
-    """The last minute of laser readings.
+    """The last minute of laser readings, from rows of `TelemetryRow` that come `rate_hz` times a second.
 
-    Parameters
-    ----------
-    telemetry : RingAddress
-        Rows of `membrane_ctrl.model.telemetry.TelemetryRow`.
-    rate_hz : float
-        How many of them come in a second.
-
-    Attributes
-    ----------
-    half_window_s : float
-        A frame gets the readings from so long before it to so long after.
+    A frame gets the readings from `half_window_s` before it to as long after.
     """
 
     def __init__(self, telemetry: RingAddress, rate_hz: float) -> None:

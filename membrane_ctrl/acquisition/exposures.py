@@ -75,18 +75,9 @@ class Laser(Protocol):
 
 
 class Exposures:
-    """Takes the frames of a cycle into the ring of frames.
+    """Takes the frames of a cycle into the ring of frames, their starts at least `interval_s` apart.
 
-    Parameters
-    ----------
-    camera, screen, laser
-        What it works with; a camera or a screen that knows only its plain role is used step by step.
-    frames : FrameWriter
-        Where the pixels go.
-    clock : CycleClock
-        The run's clock.
-    interval_s : float
-        Least time between the starts of two exposures.
+    A camera or a screen that knows only its plain role is used step by step.
     """
 
     def __init__(

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_iface import display, roles, settings
 from firmware_iface.drivers import camera_aravis, camera_folder, camera_uvc, screen_pygame
@@ -16,8 +15,6 @@ from membrane_ctrl.metrology.phase import full_sequence
 
 # Before the first cycle: exposure, checkerboard, settle time and response of the display, seen by the camera.
 
-
-Levels = NDArray[np.uint8]
 
 # Longer than any display takes that is fit for this
 LONG_S = 0.5
@@ -36,23 +33,14 @@ class TestCamera(Protocol):
 class TestScreen(Protocol):
     """What is needed of the screen."""
 
-    def show_levels(self, levels: Levels) -> None:
+    def show_levels(self, levels: roles.Levels) -> None:
         """Send an image to the display, level for level; not waited for. Raises LinkError."""
 
 
 class DisplayTest:
-    """Measures a display through the camera that looks at it.
+    """Measures a display through the camera that looks at it, both open.
 
-    Parameters
-    ----------
-    screen, camera
-        Open.
-    clock : CycleClock
-        The run's clock.
-    width_px, height_px : int
-        Of the screen.
-    settle_s : float
-        Wait before a still picture; `settling` lowers it.
+    Before a still picture it waits `settle_s`, which `settling` lowers.
     """
 
     def __init__(
@@ -102,12 +90,12 @@ class DisplayTest:
         lit = swing > 0.5 * np.quantile(swing, 0.99)
         return display.measured_response(display.RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames])
 
-    def _still(self, levels: Levels) -> roles.Pixels:
+    def _still(self, levels: roles.Levels) -> roles.Pixels:
         self._screen.show_levels(levels)
         self._clock.sleep(self.settle_s)
         return self._camera.grab().pixels
 
-    def _follow(self, levels: Levels) -> Iterator[tuple[float, roles.Pixels]]:
+    def _follow(self, levels: roles.Levels) -> Iterator[tuple[float, roles.Pixels]]:
         """roles.Pixels one after the other, each with the time from the command to the start of its exposure."""
         self._screen.show_levels(levels)
         begun_s = self._clock.now()
@@ -115,7 +103,7 @@ class DisplayTest:
             frame = self._camera.grab()
             yield frame.time_s - begun_s, _thin(frame.pixels)
 
-    def _grey(self, level: int) -> Levels:
+    def _grey(self, level: int) -> roles.Levels:
         return np.full(self._size, level, np.uint8)
 
 
@@ -189,17 +177,10 @@ class BenchFindings:
 
 
 def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchFindings:
-    """Connect camera and screen, and let the camera measure the screen.
+    """Connect camera and screen (of `configured_bench`), and let the camera measure the screen.
 
     What is found wrong does not keep a run from trying: its cycles are judged one by one. Raises LinkError if one of
     them is not there or not usable.
-
-    Parameters
-    ----------
-    bench : OpticalBench
-        From `configured_bench`.
-    clock : CycleClock
-        The run's clock.
     """
     identity = bench.camera.open()
     who = " ".join(part for part in (identity.kind, identity.serial, identity.detail) if part)

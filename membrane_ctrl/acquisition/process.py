@@ -53,15 +53,7 @@ _PREPARING_S = 900.0
 class Remote:
     """Commands "pause", "resume", "full", "capture" and "stop" over a Connection; reports as dicts.
 
-    Attributes
-    ----------
-    stop, paused : bool
-        What was last asked for. `stop` is also set when the parent has died.
-
-    Parameters
-    ----------
-    control : Connection
-        Both ways.
+    `stop` and `paused` are what was last asked for; `stop` is also set when the parent has died.
     """
 
     def __init__(self, control: Connection) -> None:

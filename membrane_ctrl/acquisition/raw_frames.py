@@ -53,30 +53,10 @@ class _Write:
 
 
 class RawFrames:
-    """Keeps frames.
+    """Keeps frames in `raw` of the run's folder, made when the first set is kept; a fault is seen in the telemetry.
 
-    Parameters
-    ----------
-    folder : Path
-        `raw` of the run's folder; made when the first set is kept.
-    optics : OpticsConfig
-        For the sets' description.
-    plan : CyclePlan
-        The patterns of both kinds of cycle.
-    recording : RecordingConfig
-        How many to keep, and how much disk to leave.
-    frames : FrameAddress
-        The ring of frames.
-    telemetry : RingAddress
-        Where a fault is seen.
-    tell : callable
-        Takes an event of kind "raw_frames" when sets begin to be left out for want of disk: once for each reason,
-        until one is kept again.
-
-    Attributes
-    ----------
-    left_out : int
-        Sets that were not kept for want of time or disk.
+    `tell` gets an event of kind "raw_frames" when sets begin to be left out for want of disk: once for each reason,
+    until one is kept again. `left_out` counts the sets that were not kept for want of time or disk.
     """
 
     def __init__(

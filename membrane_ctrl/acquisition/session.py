@@ -2,24 +2,21 @@
 
 import signal
 import time
-from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from firmware_iface.roles import LinkError, Pattern, Pixels
+from firmware_iface.roles import LinkError
 from membrane_ctrl.acquisition import cycle, optical_bench, process, raw_frames, worker
 from membrane_ctrl.acquisition.exposures import CycleClock
 from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.metrology import live, phase
-from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.processes import child, ring
-from membrane_ctrl.processes.frames import FrameWriter
+from membrane_ctrl.processes import child, frames, ring
 from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics
 from membrane_ctrl.sim.sensors import Truth
 
@@ -27,13 +24,7 @@ from membrane_ctrl.sim.sensors import Truth
 
 
 class TwinTruth:
-    """Where the simulated film is now; call it.
-
-    Parameters
-    ----------
-    address : RingAddress
-        The ring in which the bench process publishes the truth.
-    """
+    """Where the simulated film is now, from the ring in which the bench publishes the truth; call it."""
 
     def __init__(self, address: ring.RingAddress) -> None:
         self._reader = ring.RingReader(address)
@@ -97,28 +88,9 @@ def warm_up(
 ) -> None:
     """A full cycle and two of fringes only, with and without known motion, of a film that stands still.
 
-    Parameters
-    ----------
-    reconstructor : Reconstructor
-        One to be thrown away, for `small(optics)`.
-    optics : OpticsConfig
-        The small ones.
-    plan : CyclePlan
-        The patterns.
-    position : FilmPosition
-        Where the film stands.
-    clock : CycleClock
-        The run's clock.
+    `reconstructor` is for `small(optics)`, as `optics` are, and to be thrown away.
     """
     bench = TwinOptics(optics, TwinConfig(), lambda: position, clock)
-
-    def exposures(patterns: Sequence[Pattern]) -> list[Pixels]:
-        taken: list[Pixels] = []
-        for pattern in patterns:
-            bench.screen.show(pattern)
-            taken.append(bench.camera.grab().pixels)
-        return taken
-
     # displacements that differ by more than noise let the kernels run that take the film's motion out
     still, moving = np.zeros(1), np.array([-10.0, 10.0])
     for patterns, reconstruct, motion_um in (
@@ -126,9 +98,12 @@ def warm_up(
         (plan.fringes, reconstructor.fringes, moving),
         (plan.fringes, reconstructor.fringes, still),
     ):
-        frames = exposures(patterns)
-        displacement_um = position.displacement_um + np.resize(motion_um, len(frames))
-        reconstruct(frames, 0.1 * np.arange(len(frames), dtype=np.float64), displacement_um)
+        taken = []
+        for pattern in patterns:
+            bench.screen.show(pattern)
+            taken.append(bench.camera.grab().pixels)
+        displacement_um = position.displacement_um + np.resize(motion_um, len(taken))
+        reconstruct(taken, 0.1 * np.arange(len(taken), dtype=np.float64), displacement_um)
 
 
 _TRUTH_LOOK_S = 0.1
@@ -178,16 +153,19 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
             stack.callback(bench.close)
         if remote.stop:
             return
-        spread = _spread(spec.run_dir, geometry.optics)
-        reconstructor = live.LiveReconstructor(geometry.optics, config.shape.bin_px, spread=spread)
+        kept = None if spec.run_dir is None else spec.run_dir / file.KEPT
+        stated = geometry.optics.geometry
+        spread, _ = spread_file.spread_of(stated, kept if kept is not None and kept.exists() else None)
+        known = spread if spread.names else None
+        reconstructor = live.LiveReconstructor(geometry.optics, config.shape.bin_px, spread=known)
         drift = worker.LiveDrift(geometry, config.shape.bin_px)
         shapes = stack.enter_context(closing(ring.RingWriter(spec.shapes)))
-        frames = stack.enter_context(closing(FrameWriter(spec.frames)))
+        slots = stack.enter_context(closing(frames.FrameWriter(spec.frames)))
         stack.callback(bench.close)  # before the ring of frames: an exposure under way holds the pixels of a slot
         laser = stack.enter_context(closing(cycle.LaserHistory(spec.telemetry, config.loop.rate_hz)))
         raw = _raw_frames(spec, geometry.optics, plan, stack, remote)
         taking = cycle.ShapeCycle(
-            bench.camera, bench.screen, reconstructor, plan, frames, clock, laser, stopping=remote.interrupts
+            bench.camera, bench.screen, reconstructor, plan, slots, clock, laser, stopping=remote.interrupts
         )
 
         def publish(estimate: ShapeEstimate) -> None:
@@ -246,13 +224,6 @@ def _open(bench: optical_bench.OpticalBench, config: Config, clock: WaitingClock
         again_s = clock.now() + pause_s(failures)
         while not remote.stop and (remaining_s := again_s - clock.now()) > 0:
             remote.listen(remaining_s)
-
-
-def _spread(run_dir: Path | None, optics: OpticsConfig) -> GeometrySpread | None:
-    """How well the run's geometry is known; None if nothing is stated of it."""
-    kept = None if run_dir is None else run_dir / file.KEPT
-    spread, _said = spread_file.spread_of(optics.geometry, kept if kept is not None and kept.exists() else None)
-    return spread if spread.names else None
 
 
 def _raw_frames(

@@ -27,20 +27,9 @@ def keep_cycling(
 ) -> None:
     """Take cycles until told to stop.
 
-    Parameters
-    ----------
-    cycle : ShapeCycle
-        Must end early when `remote.interrupts()`.
-    remote : Remote
-        Commands and reports.
-    publish : callable
-        Gets every estimate, whatever its verdict.
-    clock : CycleClock
-        The run's clock.
-    period_s : float
-        From deadline to deadline. A cycle that takes longer costs the deadlines it covers; they are not made up.
-    keep : callable
-        Writes the frames of a cycle and returns the set's folder; OSError says why not.
+    A cycle must end early when `remote.interrupts()`; one that takes longer than `period_s` costs the deadlines it
+    covers, which are not made up. `publish` gets every estimate, whatever its verdict. `keep` writes the frames of a
+    cycle and returns the set's folder; OSError says why not.
     """
     due_s = clock.now()
     while not remote.stop:
@@ -126,15 +115,7 @@ def geometry_event(geometry: InForce) -> run_events.GeometryInForce:
 
 
 class LiveDrift:
-    """Compares residual and ring of each cycle with the calibrated ones; without a calibration it says nothing.
-
-    Parameters
-    ----------
-    geometry : InForce
-        What the cycles measure with.
-    bin_px : int
-        Side of their bins.
-    """
+    """Compares residual and ring of each cycle with the calibrated ones; without a calibration it says nothing."""
 
     def __init__(self, geometry: InForce, bin_px: int) -> None:
         optics = geometry.optics

@@ -22,7 +22,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.controller.cross_check import cross_check, require_sound
 from membrane_ctrl.geometry.file import geometry_in_force
-from membrane_ctrl.instruments import bench, device_lock
+from membrane_ctrl.instruments import bench
 from membrane_ctrl.model import errors, plain_json, terminal
 from membrane_ctrl.model.clock import RunClock
 
@@ -87,7 +87,7 @@ def _probed(config: Config) -> list[DeviceProbe]:
         return probe_optics(config)
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(device_lock.locked(device_lock.device_names(devices)))
+            stack.enter_context(bench.locked(bench.device_names(devices)))
         except errors.DeviceError as error:
             return [DeviceProbe("board" if devices.board else "devices", devices.name, problem=str(error))]
         return asyncio.run(_probes(devices)) + probe_optics(config)

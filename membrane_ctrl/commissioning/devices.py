@@ -11,7 +11,7 @@ from rich.table import Table
 from firmware_iface import conformance, roles
 from firmware_iface.links import aravis
 from firmware_iface.links.serial_port import serial_ports
-from membrane_ctrl.instruments.device_lock import locked, modbus_names
+from membrane_ctrl.instruments.bench import locked, modbus_names
 from membrane_ctrl.model import errors, terminal
 
 _DRM = Path("/sys/class/drm")

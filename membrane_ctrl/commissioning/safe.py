@@ -17,7 +17,7 @@ from firmware_iface.roles import BenchReading, LinkError
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port import client, sockets
-from membrane_ctrl.instruments import bench, device_lock
+from membrane_ctrl.instruments import bench
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile
 
@@ -38,7 +38,7 @@ def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: 
     if config.devices is None:
         raise InputError(f"{source}: devices: missing; there is nothing to make safe")
     if not latch:
-        with device_lock.locked(device_lock.device_names(config.devices)):
+        with bench.locked(bench.device_names(config.devices)):
             print(asyncio.run(_after_a_run(config.devices)), file=sys.stderr)
         return Exit.DONE
     folder = logs_dir or Path(config.recording.logs_dir)

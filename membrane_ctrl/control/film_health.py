@@ -101,13 +101,7 @@ class Maintenance:
 
 
 class FilmHealth:
-    """Collects a held mirror's hours and warns once of what gets worse.
-
-    Parameters
-    ----------
-    flow_max_um_per_s : float
-        What the pump has.
-    """
+    """Collects a held mirror's hours and warns once of what gets worse; the pump has `flow_max_um_per_s`."""
 
     def __init__(self, flow_max_um_per_s: float) -> None:
         self._flow_max_um_per_s = flow_max_um_per_s

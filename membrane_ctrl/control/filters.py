@@ -9,13 +9,7 @@ def smoothing(dt_s: float, time_constant_s: float) -> float:
 
 
 class LowPass:
-    """First-order lag that starts at its first input.
-
-    Parameters
-    ----------
-    time_constant_s : float
-        0 passes the input through.
-    """
+    """First-order lag that starts at its first input; a time constant of 0 passes the input through."""
 
     def __init__(self, time_constant_s: float) -> None:
         self.time_constant_s = time_constant_s
@@ -36,17 +30,10 @@ class LowPass:
 class LagRate:
     """Rate of change of a signal behind a first-order lag, (x - lag(x)) / T, that survives the signal's absence.
 
-    The mean rate over a step is what the lag moved, divided by the step, so that the rate integrates to exactly
-    the lag's own movement. While the signal is absent (NaN) the last value stands and the rate dies away; when it
-    is back, the lag is placed where the rate goes on from its present value, whatever the signal did meanwhile:
-    neither is a bump. A step that the signal cannot have made is taken for an absence.
-
-    Parameters
-    ----------
-    time_constant_s : float
-        0: the bare difference quotient.
-    step_max : float
-        The largest that the signal can make from one value to the next.
+    The mean rate over a step is what the lag moved, divided by the step, so that the rate integrates to exactly the
+    lag's own movement; T = 0 is the bare difference quotient. While the signal is absent (NaN) the last value stands
+    and the rate dies away; when it is back, the lag is placed where the rate goes on from its present value, whatever
+    the signal did meanwhile: neither is a bump. A step of more than `step_max` is taken for an absence.
     """
 
     def __init__(self, time_constant_s: float, step_max: float = math.inf) -> None:
@@ -121,13 +108,7 @@ class Slope:
 
 
 class DriftTracker:
-    """Value and rate of a drift that is 0 at the beginning.
-
-    Parameters
-    ----------
-    memory_s : float
-        T, the memory's time constant.
-    """
+    """Value and rate of a drift that is 0 at the beginning; T is `memory_s`."""
 
     def __init__(self, memory_s: float) -> None:
         self._memory_s = memory_s

@@ -8,10 +8,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control import film_health, filters, gas, pid
+from membrane_ctrl.model.arrays import ComplexArray, FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,12 +93,7 @@ class InnerLoop:
     def start(self, displacement_um: float, flow_um_per_s: float) -> None:
         """Begin at a reading: the setpoint ramps from there, the integrator stands at the flow.
 
-        Parameters
-        ----------
-        displacement_um : float
-            Laser reading now.
-        flow_um_per_s : float
-            What the pump gives now, or the mean it is known to need.
+        The flow is what the pump gives now, or the mean that it is known to need.
         """
         self._measured.reset(displacement_um)
         self._stand_at(displacement_um)
@@ -108,13 +103,7 @@ class InnerLoop:
         self._leak.pause()
 
     def step(self, given: LoopInput, dt_s: float) -> LoopOutput:
-        """One automatic tick; a reading that is not finite is a missing one (`stale`).
-
-        Parameters
-        ----------
-        dt_s : float
-            True time since the last tick, > 0, clamped by the caller.
-        """
+        """One automatic tick; a reading that is not finite is missing (`stale`). The caller keeps `dt_s` above 0."""
         if not math.isfinite(given.displacement_um):
             return self.stale(dt_s)
         before_um = self._measured.value
@@ -143,16 +132,10 @@ class InnerLoop:
         return self._output(pid.PidTerms(0.0, mean_um_per_s, 0.0), 0.0, mean_um_per_s, fraction)
 
     def follow(self, given: LoopInput, flow_um_per_s: float, dt_s: float) -> LoopOutput:
-        """One tick in which somebody else gives the flow (manual, tuning, ramp-down).
+        """One tick in which somebody else gives the flow (manual, tuning, ramp-down), within the pump's range.
 
-        The setpoint stands at the reading and the integrator at the flow, so that `step` goes on from there.
-
-        Parameters
-        ----------
-        given : LoopInput
-            The target is not used; a reading that is not finite leaves the last one.
-        flow_um_per_s : float
-            Put out as it is, within the pump's range.
+        The setpoint stands at the reading (the last one that was finite) and the integrator at the flow, so that
+        `step` goes on from there; the target is not used.
         """
         if math.isfinite(given.displacement_um):
             self._measured.update(given.displacement_um, dt_s)
@@ -171,15 +154,7 @@ class InnerLoop:
         return self._output(terms, weather_um_per_s, flow_um_per_s, fraction)
 
     def follow_raw(self, given: LoopInput, fraction: float, dt_s: float) -> LoopOutput:
-        """One tick in which somebody else gives the pump's command itself; whether the pump runs is not known.
-
-        Parameters
-        ----------
-        given : LoopInput
-            As for `follow`.
-        fraction : float
-            Put out as it is, 0..1.
-        """
+        """`follow` with the pump's command itself, put out as it is; whether the pump runs is not known."""
         flow_um_per_s = self._curve.flow(fraction)
         self.follow(given, flow_um_per_s, dt_s)
         self._curve.stopped()
@@ -256,7 +231,7 @@ _POINTS = 2000
 _ALIASES = 3  # they fall with the third power of the frequency
 
 
-def open_loop(loop: LoopConfig, omega: NDArray[np.float64]) -> NDArray[np.complex128]:
+def open_loop(loop: LoopConfig, omega: FloatArray) -> ComplexArray:
     """Return L of the sampled loop: PID and filter as difference equations, hold, dead time, pump lag, mirror."""
     dt_s = 1 / loop.rate_hz
     z = np.exp(1j * omega * dt_s)

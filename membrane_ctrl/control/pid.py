@@ -43,10 +43,7 @@ class PidTerms:
 class Pid:
     """The controller's memory: the integrator and the last error and measurement rate (for bumpless changes).
 
-    Parameters
-    ----------
-    flow_max_um_per_s : float
-        Upper end of the integrator; the lower end is 0, for the pump takes no gas away.
+    The integrator stays within 0, for the pump takes no gas away, and `flow_max_um_per_s`.
     """
 
     def __init__(self, gains: PidGains, flow_max_um_per_s: float) -> None:
@@ -93,13 +90,7 @@ class Pid:
 
 
 class FlowLimiter:
-    """Keeps a flow within [0, max] and its change within a rate.
-
-    Parameters
-    ----------
-    rate_um_per_s2 : float
-        Fastest change, either way.
-    """
+    """Keeps a flow within [0, max] and its change, either way, within a rate."""
 
     def __init__(self, flow_max_um_per_s: float, rate_um_per_s2: float) -> None:
         self.flow_max_um_per_s = flow_max_um_per_s
@@ -130,15 +121,7 @@ RAMP_SHARE = 0.8
 
 
 class SetpointRamp:
-    """Setpoint that moves to its target no faster than allowed, and no faster than the pump can take the mirror.
-
-    Parameters
-    ----------
-    rate_um_per_s : float
-        Fastest change.
-    flow_max_um_per_s : float
-        The pump's full flow.
-    """
+    """Setpoint that moves to its target no faster than allowed, and no faster than the pump can take the mirror."""
 
     def __init__(self, rate_um_per_s: float, flow_max_um_per_s: float) -> None:
         self.rate_um_per_s = rate_um_per_s
@@ -161,16 +144,9 @@ class SetpointRamp:
 class SetpointWeight:
     """Proportional setpoint weight b as a filter before the loop, (1 + b Ti s) / (1 + Ti s).
 
-    PI with weight b on the setpoint is the same as PI on the error of the setpoint so filtered
-    (K (b r - y) + K / (Ti s) (r - y) = K (1 + 1 / (Ti s)) (F r - y)). In this form the integrator is the mean flow
-    at any setpoint, so it can be clamped to what the pump can do.
-
-    Parameters
-    ----------
-    weight : float
-        b: 1 follows the ramp, 0 leaves the setpoint to the integrator alone.
-    ti_s : float
-        Integral time.
+    PI with weight b on the setpoint is the same as PI on the error of the setpoint so filtered (K (b r - y) + K / (Ti
+    s) (r - y) = K (1 + 1 / (Ti s)) (F r - y)). In this form the integrator is the mean flow at any setpoint, so it
+    can be clamped to what the pump can do. b = 1 follows the ramp, 0 leaves the setpoint to the integrator alone.
     """
 
     def __init__(self, weight: float, ti_s: float) -> None:

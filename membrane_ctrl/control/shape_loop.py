@@ -92,15 +92,10 @@ def sag_change(
     covariance_um2: FloatArray,
     sensitivity: FloatArray,
 ) -> SagChange:
-    """Sag now minus sag at the reference.
+    """Sag now minus sag at the reference, from coefficients (36,) and their covariance (36, 36).
 
-    Parameters
-    ----------
-    coeffs_um, reference_um : (36,) array
-    covariance_um2 : (36, 36) array
-        Of `coeffs_um`; the reference's is constant, hence no noise of the change.
-    sensitivity : (36,) array
-        Coefficients' change per um of sag.
+    The reference is constant, hence no noise of the change. `sensitivity` (36,) is the coefficients' change per um of
+    sag.
     """
     s = sensitivity[MEASURED]
     covariance = covariance_um2[MEASURED, MEASURED] + MODEL_FLOOR_UM**2 * np.eye(s.size)
@@ -124,13 +119,7 @@ class ShapeOutput:
 
 
 class ShapeLoop:
-    """Trim from shape estimates; off until switched on.
-
-    Parameters
-    ----------
-    sensitivity : (36,) array
-        Change of the Zernike coefficients per um of sag.
-    """
+    """Trim from shape estimates; off until switched on. `sensitivity` as for `sag_change`."""
 
     def __init__(self, config: ShapeConfig, sensitivity: FloatArray) -> None:
         self._config = config
@@ -171,18 +160,8 @@ class ShapeLoop:
     ) -> ShapeOutput:
         """One tick.
 
-        Parameters
-        ----------
-        now_s, dt_s : float
-            The run's clock, and the time since the last tick.
-        estimate : ShapeEstimate or None
-            Only when it is new.
-        displacement_um : float
-            Laser reading now.
-        settled : bool
-            Whether the inner loop holds its setpoint.
-        distrust : str
-            Why the camera is not to be believed, if so.
+        The estimate is given only when it is new; `settled`: the inner loop holds its setpoint; `distrust` says why
+        the camera is not to be believed, if so.
         """
         if not settled:
             self._settled_since_s = math.inf

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.control import film, film_health, gas, plausibility
+from membrane_ctrl.control import film, film_health, gas
 from membrane_ctrl.controller import safety_rules, tick
 from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver, Plausibility
 from membrane_ctrl.model.states import State
@@ -43,7 +43,7 @@ class SensorConsistency:
     """
 
     def __init__(self, config: Config) -> None:
-        self._plausibility = plausibility.Plausibility(config.shape.disagreement_max_um)
+        self._plausibility = film.Plausibility(config.shape.disagreement_max_um)
         self._far_um = config.shape.disagreement_max_um
         self._health = film_health.FilmHealth(min(config.loop.flow_max_um_per_s, config.pump.flow_full_um_per_s))
         self._film = film.FilmMonitor(config.limits, config.optics.mirror)
@@ -53,7 +53,7 @@ class SensorConsistency:
         self._camera_s = -math.inf
         self._sag_um, self._repeats = math.nan, 0
         self._setpoint_um, self._bleed_fraction = config.loop.setpoint_um, config.loop.bleed_fraction
-        self._liar = plausibility.Liar.NOBODY
+        self._liar = film.Liar.NOBODY
         self._weather_s = 0.0
         self._weather_told = False
         self.laser_lies = self.camera_lies = self.laser_gauge_apart = self.gas_excess = ""
@@ -88,7 +88,7 @@ class SensorConsistency:
         self.gas_excess = ""
         if self._plausibility.watching:
             self._plausibility.reset()
-        return self._judge(plausibility.Liar.NOBODY)
+        return self._judge(film.Liar.NOBODY)
 
     def _look_at_camera(self, inputs: tick.TickInputs) -> None:
         """Note when the camera last saw the film, and how often it repeated one shape to the last bit."""
@@ -105,7 +105,7 @@ class SensorConsistency:
             return self._leak_growth_max
         if not inputs.now_s - self._camera_s <= self._fresh_s:
             return self._leak_growth_max
-        return math.inf if self._liar == plausibility.Liar.NOBODY else film.CONTRADICTED_MOST
+        return math.inf if self._liar == film.Liar.NOBODY else film.CONTRADICTED_MOST
 
     def _judge_weather(self, inputs: tick.TickInputs, dt_s: float) -> list[Event]:
         """Report once that a barometer or thermometer cannot be right; the loop ignores it."""
@@ -119,13 +119,13 @@ class SensorConsistency:
         self._weather_told, self._weather_s = bool(failure), 0.0
         return [(Maintenance if failure else MaintenanceOver)("weather_sensor", failure or "the sensor is back")]
 
-    def _judge(self, liar: plausibility.Liar) -> list[Event]:
+    def _judge(self, liar: film.Liar) -> list[Event]:
         repeats = self._repeats >= _REPEATS
-        seen = str(self._plausibility.changes) if liar in (plausibility.Liar.LASER, plausibility.Liar.OPTICS) else ""
-        self.laser_lies = seen if liar == plausibility.Liar.LASER else ""
+        seen = str(self._plausibility.changes) if liar in (film.Liar.LASER, film.Liar.OPTICS) else ""
+        self.laser_lies = seen if liar == film.Liar.LASER else ""
         if repeats:
             self.camera_lies = "the camera repeats one shape to the last bit: restart it"
-        elif liar != plausibility.Liar.OPTICS:
+        elif liar != film.Liar.OPTICS:
             self.camera_lies = ""
         elif not self.camera_lies:  # a reason whose numbers change is not a new one
             self.camera_lies = f"laser and gauge agree that the camera is wrong: {seen}"

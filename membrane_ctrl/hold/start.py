@@ -28,8 +28,7 @@ from membrane_ctrl.geometry.file import geometry_in_force
 from membrane_ctrl.hold import child_processes
 from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
-from membrane_ctrl.instruments.bench import connect, open_bench
-from membrane_ctrl.instruments.device_lock import device_names, locked
+from membrane_ctrl.instruments.bench import connect, device_names, locked, open_bench
 from membrane_ctrl.model import errors, run_events, terminal
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import CommandTaken, Event

@@ -17,9 +17,8 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import DeviceError, Exit
 from membrane_ctrl.processes.child import STOP, Child, parent_lives, pipe, raise_priority
 from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
-from membrane_ctrl.sim.events import Event
 from membrane_ctrl.sim.lab import Lab
-from membrane_ctrl.sim.plant import STEP_S, Plant
+from membrane_ctrl.sim.plant import STEP_S, Event, Plant
 from membrane_ctrl.sim.sensors import TRUTH_BYTES, Truth
 
 _PERIOD_S = 0.004  # below the sensors' 5 ms, so that each of their samples is out on time
@@ -55,14 +54,8 @@ class BenchReport:
 def serve(spec: BenchSpec, ready: Connection) -> None:
     """Serve the bench in a spawned process until `processes.STOP`, or until `linger_s` after the parent's end.
 
-    SIGINT is ignored: Ctrl-C goes to the whole terminal, and the bench must outlive the controller's safe stop.
-
-    Parameters
-    ----------
-    spec : BenchSpec
-        The bench.
-    ready : Connection
-        Gets one BenchReport; a bench that cannot be built or cannot listen says so there and ends.
+    `ready` gets one BenchReport; a bench that cannot be built or cannot listen says so there and ends. SIGINT is
+    ignored: Ctrl-C goes to the whole terminal, and the bench must outlive the controller's safe stop.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if spec.speed <= 1.0:
@@ -126,15 +119,7 @@ def _truth_writer(address: RingAddress | None) -> Iterator[RingWriter | None]:
 
 
 class LiveBench:
-    """The plant on the run's clock, sampled by its device every 5 ms of plant time.
-
-    Parameters
-    ----------
-    spec : BenchSpec
-        Plant, clock, speed.
-    truth : RingWriter or None
-        Where the truth of every sample goes.
-    """
+    """The plant on the run's clock, sampled by its device every 5 ms of plant time; publishes the truth with each."""
 
     def __init__(self, spec: BenchSpec, truth: RingWriter | None) -> None:
         self._plant = Plant(spec.twin, spec.pump, spec.events)
@@ -169,16 +154,7 @@ class LiveBench:
             truth = plant.truth()
             self._truth.put(replace(truth, time_s=self._start_s + truth.time_s / self._speed).pack())
         sample = plant.sample()
-        return board_state.BoardSample(
-            displacement_um=sample.displacement_um,
-            displacement_quality=sample.displacement_quality,
-            gauge_pressure_pa=sample.gauge_pressure_pa,
-            ambient_pressure_pa=sample.ambient_pressure_pa,
-            air_temperature_c=sample.air_temperature_c,
-            gas_temperature_c=sample.gas_temperature_c,
-            sample_counter=round(sample.device_time_s / STEP_S) + 1,
-            device_time_s=sample.device_time_s,
-        )
+        return replace(sample, sample_counter=round(sample.device_time_s / STEP_S) + 1)
 
 
 # The twin as a process beside the hold: started, asked for its port, and its truth read for the record.

@@ -136,20 +136,12 @@ class Gas:
     def step(self, added_ml: float, follow: float, ambient_pa: float, air_k: float, volume: float) -> None:
         """One time step: gas added (or lost), warmed towards the air, and back in balance with the films.
 
-        Ideal gas in films of volume V = c p^(1/3): with u = p^(1/3), (ambient + u^3) c u = P V of the gas.
-        The left side is convex and almost linear in u (u^3 is 0.6 % of ambient), so that one Newton step from
-        the last u is exact to 1e-11 in the twin's small steps; what a sudden jump leaves is gone with the next.
+        Ideal gas in films of volume V = c p^(1/3): with u = p^(1/3), (ambient + u^3) c u = P V of the gas. The left
+        side is convex and almost linear in u (u^3 is 0.6 % of ambient), so that one Newton step from the last u is
+        exact to 1e-11 in the twin's small steps; what a sudden jump leaves is gone with the next.
 
-        Parameters
-        ----------
-        added_ml : float
-            Reference mL in minus out.
-        follow : float
-            Share of the difference to the air temperature that is made up in this step.
-        ambient_pa, air_k : float
-            Surroundings.
-        volume : float
-            c, both films' m^3 per Pa^(1/3).
+        `added_ml` is reference mL in minus out, `follow` the share of the difference to the air temperature that is
+        made up in this step, `volume` the c of both films in m^3 per Pa^(1/3).
         """
         amount_ml = self.amount_ml + added_ml
         self.amount_ml = amount_ml if amount_ml > 0.0 else 0.0  # a third of the time of max(), in every step

@@ -9,7 +9,6 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from firmware_iface import settings
 from firmware_iface.drivers.modbus_map import ValueMap, make_map, preset
@@ -30,22 +29,7 @@ _READ_INPUT = 4
 
 
 class Lab:
-    """Emulated instruments over a plant.
-
-    Parameters
-    ----------
-    plant : BoardPlant
-        What they measure and drive.
-    devices : DevicesConfig
-        Which instruments, by role.
-
-    Attributes
-    ----------
-    serial : dict
-        By the configuration's port: the emulated device of a serial line.
-    wires : dict
-        By the configuration's port: its pseudo-terminal, which can be unplugged.
-    """
+    """Emulated instruments over a plant; `serial` and `wires`: devices and pseudo-terminals by configured port."""
 
     def __init__(self, plant: pump_board.BoardPlant, devices: DevicesConfig) -> None:
         self.serial: dict[str, serial_device.SerialDevice] = {}
@@ -195,25 +179,17 @@ class Lab:
         return drive
 
 
-def _answer(slaves: Mapping[int, Any], unit: int, pdu: bytes) -> modbus_server.Answer:
+def _answer(slaves: Mapping[int, modbus_server.RegisterTable], unit: int, pdu: bytes) -> modbus_server.Answer:
     if unit not in slaves:
         return modbus_server.Answer(modbus_server.exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
     return modbus_server.Answer(respond_to_input(pdu, slaves[unit]))
 
 
 class MapDevice:
-    """A `RegisterTable` for any server.
+    """A `RegisterTable` for any server: maps that are read, each with the value's source, and maps that are written.
 
-    Parameters
-    ----------
-    sensors : mapping
-        Maps of values that are read, each with the function that says the value now.
-    outputs : mapping
-        Maps of values that are written, each with the function that is told.
-    constants : mapping
-        Address to word, for identity and version.
-    raw_limits : tuple of int
-        Words outside are refused with exception 3.
+    `constants` are words by address, for identity and version; words outside `raw_limits` are refused with exception
+    3.
     """
 
     def __init__(

@@ -8,13 +8,16 @@ What does not depend on the state (surroundings, creep) is made with NumPy for a
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import accumulate
+from typing import Protocol
 
 import numpy as np
 
+from firmware_iface.emulators.board_state import BoardSample
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim import film, sensors
-from membrane_ctrl.sim.events import Event, Series, Surroundings
 
 # The diaphragm pump: adds gas only, sticks at low command, answers late.
 
@@ -27,15 +30,6 @@ class PumpModel:
     """q = q_full (d - dead) / (1 - dead) once running; starts at `start_fraction`, stalls below `stall_fraction`.
 
     Raises ValueError if the pump delivers nothing at any command.
-
-    Parameters
-    ----------
-    config : PumpConfig
-        Where it starts, stalls and begins to deliver.
-    flow_full_ml_per_s : float
-        Flow at command 1.
-    step_s : float
-        Time step.
     """
 
     def __init__(self, config: PumpConfig, flow_full_ml_per_s: float, step_s: float) -> None:
@@ -74,6 +68,7 @@ class PumpModel:
 # Air pressure and temperature of a scenario, and the events on top, a block of steps at a time.
 
 
+Series = FloatArray
 # scenario: (air pressure std Pa, correlation time s), (air temperature std K, correlation time s)
 SCENARIOS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "calm": ((0.0, 30.0), (0.0, 300.0)),
@@ -81,6 +76,25 @@ SCENARIOS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "typical": ((1.2, 30.0), (0.050, 300.0)),
     "gusty": ((4.0, 20.0), (0.100, 300.0)),
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What acts on the bench in each step of a block; arrays (steps,), filled in place."""
+
+    time_s: Series  # plant time of each step
+    ambient_pa: Series
+    air_k: Series
+    leak_factor: Series  # leak over its configured value
+    laser_bias_um: Series  # displacement of the laser's mount
+    laser_lost: Series  # 1 where the laser gets no light back, else 0
+
+
+class Event(Protocol):
+    """Something that happens to the bench at a time; picklable."""
+
+    def apply(self, on: Surroundings) -> None:
+        """Add itself to what the surroundings do."""
 
 
 class OrnsteinUhlenbeck:
@@ -105,19 +119,7 @@ class OrnsteinUhlenbeck:
 
 
 class Disturbance:
-    """What the surroundings do, in blocks of consecutive steps.
-
-    Parameters
-    ----------
-    config : TwinConfig
-        Scenario, laser mount drift.
-    events : sequence of Event
-        What happens besides.
-    step_s : float
-        Time step.
-    rng : numpy.random.Generator
-        Source of all chance here.
-    """
+    """What the surroundings do, in blocks of consecutive steps: scenario, drift of the laser's mount, events."""
 
     def __init__(self, config: TwinConfig, events: Sequence[Event], step_s: float, rng: np.random.Generator) -> None:
         pressure, temperature = SCENARIOS[config.scenario]
@@ -173,18 +175,9 @@ def gas_compliance_ml_per_pa() -> float:
 class Plant:
     """The bench without its protocol; equal seeds and equal calls give equal samples.
 
-    It starts inflated, `start_error_um` off its nominal sag, films settled for a day and the pump just holding;
-    or flat and fresh, the pump off (`from_flat`). Commands hold until the next `actuate`. Truth does not depend
-    on how often it is sampled, nor on how time is cut into calls of `advance`.
-
-    Parameters
-    ----------
-    twin : TwinConfig
-        Scenario, seed, noise, start.
-    pump : PumpConfig
-        Flow against command.
-    events : sequence of Event
-        What happens when, in plant time.
+    It starts inflated, `start_error_um` off its nominal sag, films settled for a day and the pump just holding; or
+    flat and fresh, the pump off (`from_flat`). Events are in plant time. Commands hold until the next `actuate`.
+    Truth does not depend on how often it is sampled, nor on how time is cut into calls of `advance`.
     """
 
     def __init__(self, twin: TwinConfig, pump: PumpConfig, events: Sequence[Event] = ()) -> None:
@@ -232,13 +225,13 @@ class Plant:
             self._run(self._index + 1, self._index + 1 + now)
             steps -= now
 
-    def sample(self) -> sensors.PlantSample:
+    def sample(self) -> BoardSample:
         """What the sensors say now, with noise of its own in each call."""
         return self.sample_of(self.truth())
 
-    def sample_of(self, truth: sensors.Truth) -> sensors.PlantSample:
+    def sample_of(self, truth: sensors.Truth) -> BoardSample:
         """The same, for who has the truth of now already."""
-        return self._sensors.read(truth, self._pump_fraction, self._vent_fraction)
+        return self._sensors.read(truth)
 
     def truth(self) -> sensors.Truth:
         """What really is."""

@@ -5,6 +5,7 @@ from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 
+from firmware_iface.emulators.board_state import BoardSample
 from membrane_ctrl.config.schema import TwinConfig
 
 # What really is, beside what the sensors say: for the recording and the optics, never for the controller.
@@ -47,57 +48,28 @@ LASER_GOOD = 0
 LASER_NO_LIGHT = 1
 
 
-@dataclass(frozen=True, slots=True)
-class PlantSample:
-    """One sample of all sensors, in the units of the roles.
-
-    Without light the laser has no reading: `displacement_um` is NaN and `displacement_quality` is not 0.
-    """
-
-    displacement_um: float
-    displacement_quality: int
-    gauge_pressure_pa: float
-    ambient_pressure_pa: float
-    air_temperature_c: float
-    gas_temperature_c: float
-    pump_fraction: float
-    vent_fraction: float
-    sample_counter: int
-    device_time_s: float
-
-
 class Sensors:
-    """Laser, barometer, gauge and thermometers with independent noise in each sample.
-
-    Parameters
-    ----------
-    config : TwinConfig
-        Noise and resolution.
-    rng : numpy.random.Generator
-        Source of the noise.
-    """
+    """Laser, barometer, gauge and thermometers with independent noise in each sample."""
 
     def __init__(self, config: TwinConfig, rng: np.random.Generator) -> None:
         self._config = config
         self._rng = rng
         self._counter = 0
 
-    def read(self, truth: Truth, pump_fraction: float, vent_fraction: float) -> PlantSample:
-        """A new sample; the counter advances by one."""
+    def read(self, truth: Truth) -> BoardSample:
+        """A new sample; the counter advances by one. Without light the displacement is NaN, its quality not 0."""
         config = self._config
         laser, gauge, ambient, air, gas = self._rng.standard_normal(5).tolist()
         lost = truth.laser_lost > 0
         reading_um = truth.displacement_um + truth.laser_bias_um + config.laser_noise_um * laser
         self._counter += 1
-        return PlantSample(
+        return BoardSample(
             displacement_um=float("nan") if lost else _quantised(reading_um, config.laser_resolution_um),
             displacement_quality=LASER_NO_LIGHT if lost else LASER_GOOD,
             gauge_pressure_pa=truth.gauge_pressure_pa + GAUGE_NOISE_PA * gauge,
             ambient_pressure_pa=truth.ambient_pressure_pa + config.barometer_noise_pa * ambient,
             air_temperature_c=truth.air_temperature_c + config.thermometer_noise_k * air,
             gas_temperature_c=truth.gas_temperature_c + config.thermometer_noise_k * gas,
-            pump_fraction=pump_fraction,
-            vent_fraction=vent_fraction,
             sample_counter=self._counter,
             device_time_s=truth.time_s,
         )

@@ -22,16 +22,8 @@ EXPOSURES_S = 0.9  # first to last frame of that cycle: over it the laser's read
 class TruthShape:
     """A `ShapeSource`; equal seeds give equal shapes.
 
-    Parameters
-    ----------
-    bench : VirtualBench
-        What is measured, and what is wrong with camera and laser.
-    config : Config
-        Of the run: noise and rate of the laser readings.
-    seed : int
-        Of the noise.
-    sag_sigma_um : float
-        Standard deviation of a cycle's sag; a bench whose frames are worse than rendered ones has more.
+    `sag_sigma_um` is the standard deviation of a cycle's sag; a bench whose frames are worse than rendered ones has
+    more.
     """
 
     def __init__(self, bench: VirtualBench, config: Config, seed: int, sag_sigma_um: float = SAG_SIGMA_UM) -> None:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from firmware_iface import register_map, roles
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators import board_state, modbus_server
-from firmware_iface.links.modbus_rules import exception_error
+from firmware_iface.links.modbus_tcp import exception_error
 from membrane_ctrl.sim.plant import Plant
 
 T = TypeVar("T")
@@ -50,21 +50,7 @@ class Wrong:
 class VirtualBench:
     """Plant and board, advanced together; the methods of `roles.Bench`, without waiting.
 
-    Parameters
-    ----------
-    plant : Plant
-        The twin's physics.
-    watchdog_s : float
-        As `devices.watchdog_s`.
-
-    Attributes
-    ----------
-    wrong : Wrong
-        Switches.
-    board : BoardState
-        The board itself: what it gives to pump and vent, and what it has latched.
-    truth : Truth
-        What really was when the board last took its sample, or would have.
+    `wrong` are its switches, `truth` is what really was when the board last took its sample, or would have.
     """
 
     def __init__(self, plant: Plant, watchdog_s: float = 0.5) -> None:
@@ -141,15 +127,13 @@ class VirtualBench:
         gauge_pa = sample.gauge_pressure_pa + wrong.gauge_offset_pa
         if wrong.gauge_stuck and last is not None:
             gauge_pa = last.gauge_pressure_pa
-        return board_state.BoardSample(
+        return replace(
+            sample,
             displacement_um=math.nan if wrong.no_light else displacement_um,
             displacement_quality=_LASER_NO_LIGHT if wrong.no_light else sample.displacement_quality,
             gauge_pressure_pa=math.nan if wrong.gauge_lost else gauge_pa,
             ambient_pressure_pa=math.nan if wrong.barometer_lost else sample.ambient_pressure_pa,
             air_temperature_c=math.nan if wrong.thermometer_lost else sample.air_temperature_c,
-            gas_temperature_c=sample.gas_temperature_c,
-            sample_counter=sample.sample_counter,
-            device_time_s=sample.device_time_s,
         )
 
 

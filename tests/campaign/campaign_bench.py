@@ -19,10 +19,10 @@ from typing import Any
 
 import psutil
 
-from firmware_iface.emulators.pump_board import PumpBoardEmulator
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.sim.bench import BenchSpec, LiveBench
+from tests.support.faulty_board import PumpBoardEmulator
 
 PATIENCE_S = 60.0
 WATCHDOG_S = 0.5

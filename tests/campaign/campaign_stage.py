@@ -11,12 +11,12 @@ from campaign_times import TICK_S, WATCHDOG_S
 from campaign_world import WatchedPlant, World
 
 from firmware_iface.drivers.pump_board import PumpBoard
+from firmware_iface.emulators.board_state import BoardSample
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.states import State
-from membrane_ctrl.sim.sensors import PlantSample
 from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench, _MemoryLink
 
@@ -91,7 +91,7 @@ class Stage:
         self.must(abs(off_um) < within_um, f"the mirror is {off_um:.1f} um off")
 
 
-Change = Callable[[PlantSample], PlantSample]
+Change = Callable[[BoardSample], BoardSample]
 
 
 def sensors_say(stage: Stage, change: Change) -> None:

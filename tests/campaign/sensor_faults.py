@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from firmware_iface.emulators.board_state import BoardSample
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
@@ -22,12 +23,12 @@ from membrane_ctrl.model import events
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.states import Rung, State
 from membrane_ctrl.model.telemetry import TelemetryRow
-from membrane_ctrl.sim.events import AmbientChange, Event
 from membrane_ctrl.sim.film import NOMINAL_PRESSURE_PA
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.sensors import PlantSample, Truth
+from membrane_ctrl.sim.sensors import Truth
 from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench
+from tests.support.bench_events import AmbientChange, Event
 
 RATE_HZ = 10.0
 REGISTER_MAX = 2e6  # what does not fit a register of the board is sent as none
@@ -129,7 +130,7 @@ class LyingPlant(Plant):
         tense_pa = NOMINAL_PRESSURE_PA * ((1 - self._linear) * share**3 + self._linear * share)
         return replace(truth, gauge_pressure_pa=tense_pa)
 
-    def sample_of(self, truth: Truth) -> PlantSample:
+    def sample_of(self, truth: Truth) -> BoardSample:
         """What the sensors say of it."""
         sample = super().sample_of(truth)
         values = {name: getattr(sample, field) for name, field in SAMPLED.items()}

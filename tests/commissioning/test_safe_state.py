@@ -14,17 +14,16 @@ import pytest
 
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.board_state import BoardSample
-from firmware_iface.emulators.pump_board import PumpBoardEmulator
 from firmware_iface.register_map import known_maps
 from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.commissioning.check import probe_board
 from membrane_ctrl.commissioning.safe import make_safe
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config, RecordingConfig
-from membrane_ctrl.instruments.bench import pump_board
-from membrane_ctrl.instruments.device_lock import device_names, locked
+from membrane_ctrl.instruments.bench import device_names, locked, pump_board
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.run_files.latched_fault import LatchedFile
+from tests.support.faulty_board import PumpBoardEmulator
 
 STOPPED, WATCHDOG = 0b100, 0b001
 

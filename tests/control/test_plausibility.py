@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from membrane_ctrl.control.plausibility import Liar, Plausibility
+from membrane_ctrl.control.film import Liar, Plausibility
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 RATE_HZ = 10.0

@@ -14,7 +14,6 @@ import pytest
 from patience import slow_machine
 
 from firmware_iface.emulators.board_state import BoardSample
-from firmware_iface.emulators.pump_board import PumpBoardEmulator
 from firmware_iface.roles import BenchIdentity
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config
@@ -22,6 +21,7 @@ from membrane_ctrl.config.toml_file import load, parse
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.controller.safety import TABLE
 from membrane_ctrl.model.errors import InputError
+from tests.support.faulty_board import PumpBoardEmulator
 
 ROOT = Path(__file__).parents[2]
 BOARD = {"board": "tcp://127.0.0.1:1"}

@@ -6,7 +6,7 @@ import asyncio
 import math
 
 from firmware_iface.emulators.board_state import BoardSample
-from firmware_iface.emulators.pump_board import Faults, PumpBoardEmulator
+from firmware_iface.emulators.pump_board import PumpBoardEmulator
 
 
 class Still:
@@ -21,7 +21,7 @@ class Still:
 
 async def main() -> None:
     board = PumpBoardEmulator(Still())
-    board.faults = Faults(map_version=99)
+    board.state.map_version = 99
     await board.start()
     print(board.port, flush=True)
     await asyncio.Event().wait()

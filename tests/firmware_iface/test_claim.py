@@ -13,7 +13,6 @@ from counting_plant import CountingPlant, ManualClock
 from pymodbus.client import AsyncModbusTcpClient
 
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.pump_board import PumpBoardEmulator
 from firmware_iface.roles import (
     FOREIGN_CLAIM,
     FOREIGN_PERIOD,
@@ -23,6 +22,7 @@ from firmware_iface.roles import (
     LinkDownError,
     LinkError,
 )
+from tests.support.faulty_board import PumpBoardEmulator
 
 WATCHDOG_S = 0.5
 ON, OFF = BenchCommand(0.5, 0.25), BenchCommand(0.0, 0.0)

@@ -15,12 +15,12 @@ from firmware_iface.conformance import CheckResult, Conformance, examine
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.board_state import BoardSample, BoardState
 from firmware_iface.emulators.modbus_server import ILLEGAL_VALUE, RegisterRefusal, respond
-from firmware_iface.emulators.pump_board import PumpBoardEmulator
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.register_map import known_maps
 from firmware_iface.roles import BenchCommand, DeviceBusyError, LinkError
+from tests.support.faulty_board import PumpBoardEmulator
 from tests.support.faulty_devices import RtuBusEmulator
 
 PUMP, VENT, HEARTBEAT = 56, 57, 58

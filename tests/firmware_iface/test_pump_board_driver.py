@@ -12,7 +12,6 @@ from counting_plant import CountingPlant, ManualClock
 from pymodbus.client import AsyncModbusTcpClient
 
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.pump_board import Faults, PumpBoardEmulator
 from firmware_iface.links.modbus_rtu import parse_tcp_url
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import (
@@ -24,6 +23,7 @@ from firmware_iface.roles import (
     LinkDownError,
     LinkError,
 )
+from tests.support.faulty_board import Faults, PumpBoardEmulator
 
 WATCHDOG_S = 0.5
 OFF = BenchCommand(0.0, 0.0)

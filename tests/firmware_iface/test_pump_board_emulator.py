@@ -9,9 +9,9 @@ import pytest
 from counting_plant import CountingPlant, ManualClock
 from pymodbus.client import AsyncModbusTcpClient
 
-from firmware_iface.emulators.pump_board import PumpBoardEmulator
 from firmware_iface.generate import DOCS_PATH
 from firmware_iface.register_map import default_map
+from tests.support.faulty_board import PumpBoardEmulator
 
 DOCS = DOCS_PATH.read_text(encoding="utf-8")
 ROW = re.compile(r"\| (\d+) \| `(\w+)` \| (\w\d\d) \| \S+ \| (\d+) \|")

@@ -13,11 +13,11 @@ from pymodbus.client import ModbusSerialClient
 
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.modbus_server import respond
-from firmware_iface.emulators.pump_board import PumpBoardEmulator
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import BenchCommand, LinkDownError
+from tests.support.faulty_board import PumpBoardEmulator
 from tests.support.faulty_devices import RtuBusEmulator
 
 SETTINGS = SerialSettings(115_200, parity="E")

@@ -9,7 +9,6 @@ import pytest
 import pytest_asyncio
 
 from firmware_iface.emulators.board_state import BoardSample
-from firmware_iface.emulators.pump_board import PumpBoardEmulator
 from firmware_iface.register_map import default_map
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config, ResumeConfig
@@ -17,6 +16,7 @@ from membrane_ctrl.hold.start import BoardAtStart, HoldOptions, _identify, _latc
 from membrane_ctrl.instruments.bench import connect, open_bench
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.run_files.latched_fault import NAME, LatchedFile, ResumeLog
+from tests.support.faulty_board import PumpBoardEmulator
 
 WATCHDOG, OVER_PRESSURE = (default_map().fault_mask(name) for name in ("watchdog", "over_pressure"))
 

@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.config.devices import DevicesConfig
-from membrane_ctrl.instruments.device_lock import device_names, locked, modbus_names
+from membrane_ctrl.instruments.bench import device_names, locked, modbus_names
 from membrane_ctrl.model.errors import DeviceError
 
 HOLDS = """
 import sys
-from membrane_ctrl.instruments.device_lock import locked
+from membrane_ctrl.instruments.bench import locked
 with locked([sys.argv[1]]):
     print("held", flush=True)
     sys.stdin.read()

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
-from membrane_ctrl.sim.events import AmbientChange, LaserDrift, LaserDropout
 from membrane_ctrl.sim.plant import SCENARIOS, OrnsteinUhlenbeck, Plant
 from membrane_ctrl.sim.sensors import TRUTH_BYTES, Truth
+from tests.support.bench_events import AmbientChange, LaserDrift, LaserDropout
 
 PUMP = PumpConfig()
 
@@ -109,7 +109,7 @@ def test_samples_are_counted_and_stamped() -> None:
         stamps.append((plant.sample().sample_counter, plant.sample().device_time_s))
     assert [counter for counter, _ in stamps] == [1, 3, 5]
     assert [time_s for _, time_s in stamps] == pytest.approx([0.02, 0.04, 0.06])
-    assert (plant.sample().pump_fraction, plant.sample().vent_fraction) == (0.4, 0.05)
+    assert (plant._pump_fraction, plant._vent_fraction) == (0.4, 0.05)
 
 
 def test_laser_without_light_has_no_reading() -> None:

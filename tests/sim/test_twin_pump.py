@@ -80,7 +80,7 @@ def test_a_fresh_plant_is_just_held() -> None:
     assert before.pump_um_per_s == pytest.approx(before.leak_um_per_s)
     plant.advance(10.0)
     assert plant.truth().displacement_um == pytest.approx(-25.0, abs=0.01)
-    assert plant.sample().pump_fraction == pytest.approx(0.1 + 0.9 * 1.234 / 5.3, abs=0.001)
+    assert plant._pump_fraction == pytest.approx(0.1 + 0.9 * 1.234 / 5.3, abs=0.001)
 
 
 def test_full_flow_lifts_the_centre_by_the_configured_speed() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.sim.events import DailyTemperature, Event, PressureWeather, Surroundings
+from tests.support.bench_events import DailyTemperature, Event, PressureWeather, Surroundings
 
 DAY_S = 86_400.0
 

@@ -82,7 +82,21 @@ class KeyenceDlRs1aEmulator(SerialDevice, keyence_dl_rs1a.KeyenceDlRs1aEmulator)
 
 
 class Optoncdt1420Emulator(SerialDevice, optoncdt1420.Optoncdt1420Emulator):
-    pass
+    """With noise of a single value; one byte in `lose_bytes_every` is lost from the stream (0: none)."""
+
+    lose_bytes_every = 0
+
+    def __init__(self, *arguments: Any, noise_um: float = 0.0, **keywords: Any) -> None:
+        super().__init__(*arguments, **keywords)
+        self._noise_um = noise_um
+
+    def stream(self, data: bytes) -> None:
+        if self.lose_bytes_every:
+            data = bytes(byte for byte in data if self.random.randrange(self.lose_bytes_every))
+        super().stream(data)
+
+    def digital(self, displacement_um: float) -> int:
+        return super().digital(displacement_um + self.random.gauss(0.0, self._noise_um))
 
 
 class VaisalaPtb330Emulator(SerialDevice, vaisala.VaisalaPtb330Emulator):

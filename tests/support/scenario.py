@@ -49,10 +49,10 @@ from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.telemetry import FIELDS
-from membrane_ctrl.sim import events as happenings
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
+from tests.support import bench_events as happenings
 
 _SWITCHES: dict[str, Any] = {field.name: field.default for field in fields(Wrong)}
 _FRACTIONS = ("pump_share", "pump_stuck_fraction", "vent_stuck_fraction")  # beyond them the plant has no answer

@@ -12,8 +12,8 @@ from membrane_ctrl.model.errors import RejectedError
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_hold import HoldError
-from membrane_ctrl.sim.events import AmbientChange
-from membrane_ctrl.sim.events import Event as TwinEvent
+from tests.support.bench_events import AmbientChange
+from tests.support.bench_events import Event as TwinEvent
 from tuning import session
 from tuning.identification.characterise import characterise, spec_of
 from tuning.rig import HoldRig

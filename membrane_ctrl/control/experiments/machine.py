@@ -96,15 +96,8 @@ class ExcursionGuard:
     """Lets an experiment run while the centre can still be stopped within the limit.
 
     The centre is judged where it will have come to rest, position + speed x `COAST_S`, with three standard deviations
-    of that figure's own noise in hand. Raises ValueError if the noise kept in hand leaves nothing of the limit; the
-    message says what would help.
-
-    Parameters
-    ----------
-    centre_um : float
-        Where the mirror stood before.
-    rate_hz : float
-        Readings in a second: with fewer, the figure is noisier and more is kept in hand.
+    of that figure's own noise in hand: more with fewer readings in a second. Raises ValueError if that leaves nothing
+    of the limit; the message says what would help.
     """
 
     def __init__(self, experiment: Experiment, around: Around, centre_um: float, rate_hz: float) -> None:
@@ -148,15 +141,10 @@ class ExcursionGuard:
 
 
 class Patterned:
-    """A flow that follows a pattern in time about the holding flow, with a weak pull back to where it began.
+    """A flow that follows a pattern (s to um/s) about the holding flow, with a weak pull back to where it began.
 
     The pull is there because the holding flow is never quite known and the mirror integrates the difference; it is
     slow enough to leave the pattern alone, and harmless to the identification, which knows the flow.
-
-    Parameters
-    ----------
-    pattern : callable
-        Time in s to flow in um/s about the holding flow.
     """
 
     PULL_PER_S = 0.15
@@ -256,13 +244,7 @@ _PATIENCE_S = 90.0
 
 
 class Relay:
-    """Switches between a high and a low flow whenever the centre leaves a band.
-
-    Parameters
-    ----------
-    centre_um : float
-        Middle of the band.
-    """
+    """Switches between a high and a low flow whenever the centre leaves a band about `centre_um`."""
 
     def __init__(self, around: Around, centre_um: float, duration_s: float = 120.0) -> None:
         self._around = around

@@ -7,7 +7,7 @@ are found by bisection, the leak with the pump off, the curve from two commands 
 
 import math
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -47,6 +47,10 @@ class PumpMap:
         """Stiction: the command between stalling and starting."""
         return self.start_fraction - self.stall_fraction
 
+    def as_plain(self) -> dict[str, float | None]:
+        """As plain data; None for what was not found."""
+        return {name: None if math.isnan(value) else value for name, value in asdict(self).items()}
+
     def applied_to(self, pump: PumpConfig) -> PumpConfig:
         """The pump's configuration with what was measured. Raises pydantic.ValidationError if it is no pump's."""
         measured = {
@@ -69,14 +73,7 @@ class PumpProbe:
 class PumpMapper:
     """Step machine of the pump map; its answers are pump commands, 0..1.
 
-    Parameters
-    ----------
-    centre_um : float
-        Where the mirror is brought back to.
-    holding_fraction : float
-        Command that about holds it.
-    holding_flow_um_per_s : float
-        Flow of that command as configured: how fast the mirror will sink without it, to a factor.
+    `holding_fraction` is the command that about holds the mirror; its flow says how fast the mirror sinks without it.
     """
 
     def __init__(

@@ -1,7 +1,5 @@
 """One experiment of a running hold: made of its specification, stepped in ticks, guarded, with its result."""
 
-import math
-from dataclasses import asdict
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -37,17 +35,10 @@ _PATTERNS = {"steps": machine.steps, "doublets": machine.doublets, "multisine": 
 
 
 class Trial:
-    """An experiment inside its guard.
+    """An experiment inside its guard, about `centre_um`.
 
     Raises ValueError if the pump has no room about the holding flow, or the noise none in the limit; the message says
     what would help.
-
-    Parameters
-    ----------
-    loop, pump : LoopConfig, PumpConfig
-        The pump's range, as configured.
-    centre_um : float
-        Where the mirror stands.
     """
 
     def __init__(self, spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre_um: float) -> None:
@@ -92,6 +83,4 @@ class Trial:
     def pump_map(self) -> dict[str, float | None] | None:
         """What a map of the pump has measured, as plain data; None for what it did not find."""
         found = self._mapper.result if self._mapper is not None else None
-        if found is None:
-            return None
-        return {name: None if math.isnan(value) else value for name, value in asdict(found).items()}
+        return None if found is None else found.as_plain()

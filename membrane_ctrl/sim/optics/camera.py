@@ -27,24 +27,9 @@ class OpticsRenderer:
 
     The film is traced at nodes (see `shade`) and, unless `exact`, at displacements _CELL_UM apart: a parabola through
     the three nearest gives the maps at any other, so that a moving film costs nothing until it leaves its cell.
-    Raises ValueError if the film's rim is not the configured one.
-
-    Parameters
-    ----------
-    optics : OpticsConfig
-        The true geometry, camera, pattern and rim.
-    film : FilmShape
-        Its sag belongs to displacement 0.
-    light : Light
-        Screen and camera as light.
-    reference_um : float
-        Displacement at which the vertex stands at the origin of the geometry.
-    screen_error : ScreenError or None
-        What the screen does beside its pose.
-    exact : bool
-        Trace every pixel at every displacement: slow, for sets that must be true to the last bit.
-    seed : int
-        Of the pixel noise (`camera.noise_adu`); each picture has its own.
+    `exact` traces every pixel at every displacement: slow, for sets that must be true to the last bit. At
+    `reference_um` the vertex stands at the origin of the geometry. Each picture has pixel noise of its own
+    (`camera.noise_adu`). Raises ValueError if the film's rim is not the configured one.
     """
 
     optics: OpticsConfig
@@ -84,20 +69,10 @@ class OpticsRenderer:
     def render(
         self, pattern: Pattern, displacement_um: float, out: Pixels | None = None, gain: float = 1.0
     ) -> Pixels:
-        """The picture of one pattern, (H, W).
+        """The picture of one pattern, (H, W), at a displacement; `gain` is the exposure over the nominal one.
 
-        Raises ValueError if the pattern is unknown or `out` has another shape or type.
-
-        Parameters
-        ----------
-        pattern : Pattern
-            What the screen shows.
-        displacement_um : float
-            Where the film is at the moment of the exposure.
-        out : (H, W) array as of `blank`, optional
-            Filled and returned (frames in shared memory); otherwise a new one is made.
-        gain : float
-            Exposure against the nominal one.
+        `out` (as of `blank`) is filled and returned; otherwise a new array is made. Raises ValueError if the pattern
+        is unknown or `out` has another shape or type.
         """
         camera, config = self.optics.camera, self.optics.pattern
         picture = self.blank() if out is None else out
@@ -187,24 +162,12 @@ class Clock(Protocol):
 
 
 class TwinOptics:
-    """The optical half of the simulated bench: one film, one screen, one camera.
+    """The optical half of the simulated bench: one film, one `screen`, one `camera`.
 
     The film is a Hencky bowl with the figure of `typical_film` drawn from the twin's seed, unless `film` is given.
-    Bowl and rim follow the truth: only the sag at displacement 0 is taken from it, once, at the first look.
-
-    Parameters
-    ----------
-    optics : OpticsConfig
-        The bench's optics, taken as true but for the geometry if `twin` has its own. Without a reference displacement
-        in the geometry, it holds for the film as it was at the first look.
-    twin : TwinConfig
-        For its seed and its true geometry.
-    truth : callable
-        Gives the film's true position now.
-    clock : Clock
-        Gives the time of exposure.
-    film : FilmShape, optional
-        Another film; its sag belongs to displacement 0.
+    Bowl and rim follow the truth: only the sag at displacement 0 is taken from it, once, at the first look. The
+    optics are true but for the geometry if `twin` has its own; without a reference displacement the geometry holds
+    for the film as it was at the first look.
     """
 
     def __init__(
@@ -256,13 +219,7 @@ class TwinOptics:
 
 
 class TwinScreen:
-    """Role Screen: lit and settled at once.
-
-    Attributes
-    ----------
-    shown : Pattern or None
-        What it shows.
-    """
+    """Role Screen: lit and settled at once."""
 
     def __init__(self) -> None:
         self.shown: Pattern | None = None

@@ -10,11 +10,10 @@ from statistics import NormalDist
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern, Pixels
 from membrane_ctrl.config.schema import PatternConfig
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import FloatArray, Singles
 
 _GOLDEN, _MIX_1, _MIX_2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _LOW_16 = np.uint64(0xFFFF)
@@ -40,7 +39,7 @@ def cubic_weights(step: int) -> FloatArray:
 
 
 @cache
-def normal_quantiles() -> NDArray[np.float32]:
+def normal_quantiles() -> Singles:
     """65536 equally likely values of a unit normal distribution: 16 random bits pick one."""
     half = [NormalDist().inv_cdf((k + 0.5) / 65536) for k in range(32768)]
     values = np.concatenate([half, -np.array(half[::-1])])
@@ -99,7 +98,7 @@ def shade(
     side_mm: float,
     scale: FloatArray,
     loss: tuple[FloatArray, FloatArray],
-    noise: tuple[NDArray[np.float32], float, int],
+    noise: tuple[Singles, float, int],
     out: Pixels,
 ) -> None:
     """Fill `out` (H, W) with the picture of one pattern.
@@ -232,14 +231,7 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
 def pattern_sequence(kind: str, config: PatternConfig, shifts_rad: tuple[float, ...] = ()) -> list[Pattern]:
     """The patterns of a set in the order they are shown: x and y sinusoids and Gray bits, white, black.
 
-    Raises ValueError if the kind is unknown.
-
-    Parameters
-    ----------
-    kind : str
-        "full" or "fringes" (sinusoids alone).
-    shifts_rad : tuple of floats
-        One a step; empty: 2 pi k / N.
+    The kind is "full" or "fringes" (sinusoids alone), else ValueError; `shifts_rad` one a step, empty: 2 pi k / N.
     """
     if kind not in ("full", "fringes"):
         raise ValueError(f"kind = {kind!r} must be full or fringes")

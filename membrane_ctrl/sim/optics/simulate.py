@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 import tomli_w
 
-from firmware_iface.roles import Pattern, Pixels
-from firmware_iface.settings import Section
+from firmware_iface import roles, settings
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
@@ -21,15 +20,7 @@ _GRID = 201  # odd, so that the vertex is a point of the truth's map
 
 
 def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, Any]:
-    """The content of `capture.toml` (schema membrane-capture/1).
-
-    Parameters
-    ----------
-    spec : SimulationSpec
-        The set.
-    readings_um : (frames,) array
-        What the laser said at each frame.
-    """
+    """The content of `capture.toml` (schema membrane-capture/1); `readings_um` (frames,) is what the laser said."""
     geometry = _written(spec.stated_geometry or spec.optics.geometry)
     if spec.laser:
         geometry["reference_displacement_um"] = spec.reference_um
@@ -94,7 +85,7 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
     (folder / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
 
 
-def _written(section: Section) -> dict[str, Any]:
+def _written(section: settings.Section) -> dict[str, Any]:
     """A configuration table as written: without what is absent, and without lists that are empty."""
     return {key: value for key, value in section.model_dump(mode="json", exclude_none=True).items() if value != []}
 
@@ -120,23 +111,13 @@ _PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWR
 class _Exposure:
     """What truly happened for one file."""
 
-    pattern: Pattern
+    pattern: roles.Pattern
     displacement_um: float
     gain: float = 1.0
 
 
 def simulate_set(folder: Path, spec: SimulationSpec) -> None:
-    """Write one capture set and its truth.
-
-    Raises OSError if the folder or a file cannot be written.
-
-    Parameters
-    ----------
-    folder : Path
-        Made if it is not there.
-    spec : SimulationSpec
-        The set.
-    """
+    """Write one capture set and its truth. Raises OSError if the folder or a file cannot be written."""
     _write_set(folder, spec, _renderer(spec))
 
 
@@ -149,20 +130,9 @@ def simulate_run(
 ) -> None:
     """Write a run: `0000` is the full set, the others are fringes that lean on it; one clock and one motion for all.
 
-    Raises ValueError if the first set is not full, lists its displacements, or the sets overlap in time.
-
-    Parameters
-    ----------
-    folder : Path
-        Gets a folder a set.
-    spec : SimulationSpec
-        The first set; its motion runs on through the others, its faults stay its own.
-    sets : int
-        How many.
-    interval_s : float
-        From the start of one set to the start of the next.
-    on_set : callable, optional
-        Told the number of sets written, after each.
+    Each set has a folder. The first set's motion runs on through the others, its faults stay its own; sets start
+    `interval_s` apart. `on_set` is told the number of sets written, after each. Raises ValueError if the first set is
+    not full, lists its displacements, or the sets overlap in time.
     """
     if spec.kind != "full" or spec.displacements_um:
         raise ValueError("kind: the first set of a run must be full, and move by motion, not displacements_um")
@@ -202,7 +172,7 @@ def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> 
     noise = np.random.default_rng(spec.seed).normal(0.0, spec.laser_noise_um, len(spec.patterns))
     readings_um = noise + [spec.displacement_um(frame) for frame in range(len(spec.patterns))]
     faults = {(fault.kind, fault.frame) for fault in spec.faults}
-    before: Pixels | None = None
+    before: roles.Pixels | None = None
     for pattern, exposure in zip(spec.patterns, _exposures(spec), strict=True):
         if ("stale", pattern.name) in faults and before is not None:
             picture = before
@@ -235,12 +205,12 @@ def _exposures(spec: SimulationSpec) -> list[_Exposure]:
     return exposures
 
 
-def _other_depth(picture: Pixels) -> Pixels:
+def _other_depth(picture: roles.Pixels) -> roles.Pixels:
     if picture.dtype == np.uint8:
         return picture.astype(np.uint16)
     return picture.astype(np.uint8)
 
 
-def _write_png(path: Path, picture: Pixels) -> None:
+def _write_png(path: Path, picture: roles.Pixels) -> None:
     if not cv2.imwrite(str(path), picture, _PNG_SPEED):
         raise OSError(f"{path}: cannot be written")

@@ -10,7 +10,7 @@ from scipy.interpolate import RectBivariateSpline
 from membrane_ctrl.config.optics import HeightMapConfig, ScreenPoseConfig
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
-from membrane_ctrl.sim.optics.film_terms import FilmTerms, height_and_slopes
+from membrane_ctrl.sim.optics.film_shape import FilmTerms, height_and_slopes
 
 # Camera and screen of the twin as exact poses: rays out of the pinhole, and the plane they end on.
 #
@@ -183,18 +183,9 @@ class Trace:
 def trace(
     camera: CameraPose, directions: FloatArray, film: FilmTerms, sag_mm: float, vertex_z_mm: float, screen: ScreenPose
 ) -> Trace:
-    """Follow rays from the pinhole over the film to the screen.
+    """Follow rays, unit vectors (N, 3) in world, from the pinhole over the film to the screen.
 
-    Parameters
-    ----------
-    camera : CameraPose
-        Where the rays start.
-    directions : (N, 3) array
-        Unit vectors in world.
-    film, sag_mm, vertex_z_mm
-        The surface z = vertex_z_mm + h(x, y), its bowl `sag_mm` deep.
-    screen : ScreenPose
-        Where the rays end.
+    The film is the surface z = vertex_z_mm + h(x, y), its bowl `sag_mm` deep.
     """
     hits = _trace(
         camera.position_mm,

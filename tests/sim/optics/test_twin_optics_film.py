@@ -11,8 +11,16 @@ from numpy.polynomial.polynomial import polyder, polyval
 from scipy.integrate import quad
 
 from membrane_ctrl.sim import film as hencky
-from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple, Wrinkle, typical_film
-from membrane_ctrl.sim.optics.film_terms import height_and_slopes, hencky_series, noll_orders
+from membrane_ctrl.sim.optics.film_shape import (
+    Bump,
+    FilmShape,
+    Ripple,
+    Wrinkle,
+    height_and_slopes,
+    hencky_series,
+    noll_orders,
+    typical_film,
+)
 
 RICH = FilmShape(
     37.1,

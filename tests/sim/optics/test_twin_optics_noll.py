@@ -7,7 +7,7 @@ import pytest
 from numpy.polynomial.polynomial import polyval2d
 from prysm.polynomials import noll_to_nm, zernike_nm
 
-from membrane_ctrl.sim.optics.film_terms import noll_orders, polynomial
+from membrane_ctrl.sim.optics.film_shape import noll_orders, polynomial
 
 
 def _values(j: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -1,26 +1,17 @@
-"""Things that happen to the bench at a time; each adds itself to what the surroundings do."""
+"""Things that happen to the simulated bench at a time; each adds itself to what the surroundings do."""
+
+from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.sim.plant import Event as Event
+from membrane_ctrl.sim.plant import Series
+from membrane_ctrl.sim.plant import Surroundings as Surroundings
 
-Series = FloatArray
 _DAY_S = 86_400.0
-
-
-@dataclass(frozen=True, slots=True)
-class Surroundings:
-    """What acts on the bench in each step of a block; arrays (steps,), filled in place."""
-
-    time_s: Series  # plant time of each step
-    ambient_pa: Series
-    air_k: Series
-    leak_factor: Series  # leak over its configured value
-    laser_bias_um: Series  # displacement of the laser's mount
-    laser_lost: Series  # 1 where the laser gets no light back, else 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,11 +107,6 @@ class PressureWeather:
         for period_s, phase in zip(periods_s, phases, strict=True):
             wave = np.sin(2 * math.pi / period_s * on.time_s + phase) - math.sin(phase)
             on.ambient_pa[:] += self.std_pa * math.sqrt(2 / periods_s.size) * wave
-
-
-Event = (
-    AmbientChange | AirTemperatureChange | LeakChange | LaserDropout | LaserDrift | DailyTemperature | PressureWeather
-)
 
 
 def _progress(time_s: Series, at_s: float, over_s: float) -> Series:
