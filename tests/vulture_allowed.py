@@ -12,7 +12,6 @@ _.geometry_covariance_um2, _.screen_points, gradients  # a library: docs/metrolo
 _.frame_rms_adu, _.step_periods, _.white_sigma, _.fast_sigma, _.slow_sigma, _.sensitivity_sigma  # parts of a result
 _.trace_pixels, _.on_film, _.back_sag_mm, _.pump_um_per_s  # the twin's truth, which tests compare with
 _.power_cycle, _.intrude, _.set_double  # faults that scenarios and tests bring about
-ACTIONS  # every action of the port: a test asks each role for each
 _.__signature__  # Typer reads a command's options from it
 _.failing  # state of an outbox, which tests look at
 _.__init_subclass__  # Python calls it

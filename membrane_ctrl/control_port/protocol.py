@@ -10,7 +10,7 @@ import asyncio
 import json
 import socket
 import ssl
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
@@ -28,9 +28,6 @@ WHO_BYTES, WHY_BYTES, TEXT_BYTES = 64, 300, 500
 
 Errand = Literal["status", "watch", "release", "quiet"]
 Action = Literal[Kind, Errand]
-
-KINDS: tuple[Kind, ...] = get_args(Kind)
-ACTIONS: tuple[str, ...] = (*KINDS, *get_args(Errand))
 
 
 class RequestError(ValueError):

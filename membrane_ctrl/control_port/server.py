@@ -209,7 +209,7 @@ class Port:
 
     def _command(self, peer: Peer, request: protocol.Request) -> commands.Command:
         """The command of a request. Raises InputError for gains or an experiment that are none."""
-        kind = next(kind for kind in protocol.KINDS if kind == request.do)
+        kind = next(kind for kind in commands.TABLE if kind == request.do)
         loop = None if request.loop is None else self._new_loop(request.loop)
         experiment = (
             None if request.experiment is None else toml_file.parse(request.experiment, ExperimentSpec, "tune")

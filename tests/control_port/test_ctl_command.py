@@ -3,7 +3,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from port_run import ROW
@@ -14,6 +14,7 @@ from membrane_ctrl.control_port import ctl as port_ctl
 from membrane_ctrl.control_port import protocol
 from membrane_ctrl.control_port.ctl import Where, socket_path, status_lines
 from membrane_ctrl.control_port.server import status_table
+from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.model.events import MaintenanceOver
 from membrane_ctrl.model.run_events import GeometryInForce, from_dict
 from membrane_ctrl.model.run_status import RunStatus
@@ -34,7 +35,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
 
 def test_there_is_an_action_for_every_command_but_tune() -> None:
     shape = {"shape_on", "shape_off"}
-    assert {*ACTIONS, *shape} == {*protocol.ACTIONS, "shape"} - {"tune"}
+    assert {*ACTIONS, *shape} == {*TABLE, *get_args(protocol.Errand), "shape"} - {"tune"}
 
 
 @pytest.mark.parametrize("action", ACTIONS)

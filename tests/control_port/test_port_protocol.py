@@ -1,26 +1,27 @@
 from __future__ import annotations
 
 import json
+from typing import get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from membrane_ctrl.control_port.protocol import (
-    ACTIONS,
-    KINDS,
     MESSAGE_BYTES,
     TEXT_BYTES,
     WHO_BYTES,
     WHY_BYTES,
+    Errand,
     Request,
     RequestError,
     parse,
 )
 from membrane_ctrl.control_port.session import Peer, may_not
-from membrane_ctrl.controller.commands import TABLE
+from membrane_ctrl.controller.commands import TABLE, Kind
 
 EVENT_SLOT_BYTES = 4096  # of the events ring
+ACTIONS = (*TABLE, *get_args(Errand))
 
 
 def line(**request: object) -> bytes:
@@ -35,8 +36,8 @@ def test_every_command_of_the_table_can_be_asked() -> None:
         "gains": {"loop": {"kp_per_s": 0.5, "feedforward_barometer": False}},
         "tune": {"experiment": {"kind": "relay"}},
     }
-    assert set(KINDS) == set(TABLE)
-    for kind in KINDS:
+    assert set(get_args(Kind)) == set(TABLE)
+    for kind in TABLE:
         assert parse(line(do=kind, number=3, **more.get(kind, {}))).do == kind
 
 
