@@ -77,7 +77,7 @@ def test_options_stand_anywhere(words: list[str], asked: Asked) -> None:
         ("mark", None, "Missing argument 'TEXT'"),
         ("stop", "now", "unexpected extra argument"),
         ("gains", None, "Missing argument 'FILE'"),
-        ("gains", "kp_per_s : 1", "neither"),
+        ("gains", "kp_per_s : 1", "loop keys"),
         ("gains", "kp_per_s = 'much'", "numbers"),
         ("gains", "nowhere.toml", "no such file"),
         ("gains", "nowhere.json", "nowhere.json"),
