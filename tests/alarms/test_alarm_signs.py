@@ -99,7 +99,7 @@ def test_the_text_names_value_and_limit() -> None:
         ({"rules": [{"name": "a", "field": "nothing", "raise_at": 1, "clear_at": 0}]}, "unknown telemetry field"),
         ({"rules": [{"name": "a", "field": "error_um", "raise_at": 1, "clear_at": 1}]}, "flap"),
         ({"rules": [{"name": "a", "field": "error_um", "raise_at": 1, "clear_at": 0}] * 2}, "same name"),
-        ({"escalation_urls_file": "x"}, "without urls_file"),
+        ({"escalation_urls_file": "x"}, "needs urls_file"),
     ],
 )
 def test_rules_that_are_none_are_one_line(alarms: dict[str, object], says: str) -> None:

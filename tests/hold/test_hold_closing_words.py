@@ -19,7 +19,7 @@ def test_a_folder_that_is_gone_is_not_offered(tmp_path: Path, capsys: pytest.Cap
     said = words(tmp_path / "run", capsys)
     assert "removed or moved" in said
     assert "rerun" not in said
-    assert "still readable" not in said
+    assert "are readable" not in said
 
 
 def test_a_folder_begun_anew_says_from_when(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
