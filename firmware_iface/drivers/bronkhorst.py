@@ -94,9 +94,11 @@ async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> 
     found = await port.text(DEVICE_TYPE)
     number = await port.text(SERIAL_NUMBER)
     if found not in types:
-        raise DeviceRefusedError(f"{port.name}: a {found or 'nameless device'} answers, wanted {' or '.join(types)}")
+        raise DeviceRefusedError(
+            f"{port.name}: a {found or 'nameless device'} answers, expected {' or '.join(types)}"
+        )
     if serial and number != serial:
-        raise DeviceRefusedError(f"{port.name}: serial number {number} answers, the configuration names {serial}")
+        raise DeviceRefusedError(f"{port.name}: serial number {number} answers, but the configuration names {serial}")
     firmware = await port.text(FIRMWARE)
     capacity, unit = await port.number(CAPACITY), await port.text(CAPACITY_UNIT)
     if not (math.isfinite(capacity) and capacity > 0):
@@ -121,7 +123,7 @@ class BronkhorstFlow:
         await self._port.write(CONTROL_MODE, BUS_SETPOINT)
         mode = await self._port.number(CONTROL_MODE)
         if mode != BUS_SETPOINT:
-            raise DeviceRefusedError(f"{self._port.name}: control mode stays {mode:g}, wanted {BUS_SETPOINT}")
+            raise DeviceRefusedError(f"{self._port.name}: control mode stays {mode:g}, expected {BUS_SETPOINT}")
         return identity
 
     async def set_pump(self, fraction: float) -> None:

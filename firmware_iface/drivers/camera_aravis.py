@@ -305,7 +305,7 @@ class AravisCamera:
         if out is None:
             return seen.copy()
         if out.shape != seen.shape or out.dtype != seen.dtype:
-            raise ValueError(f"camera gives {seen.shape} {seen.dtype}, wanted are {out.shape} {out.dtype}")
+            raise ValueError(f"camera gives {seen.shape} {seen.dtype}, expected {out.shape} {out.dtype}")
         np.copyto(out, seen)
         return out
 

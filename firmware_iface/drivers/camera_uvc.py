@@ -106,7 +106,7 @@ class UvcCamera:
         if out is None:
             return roles.Frame(pixels.copy(), time_s)
         if out.shape != pixels.shape:
-            raise roles.DeviceRefusedError(f"camera {self._config.port}: sent {pixels.shape}, wanted is {out.shape}")
+            raise roles.DeviceRefusedError(f"camera {self._config.port}: sent {pixels.shape}, expected {out.shape}")
         np.copyto(out, pixels)
         return roles.Frame(out, time_s)
 

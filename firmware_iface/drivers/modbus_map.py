@@ -62,7 +62,7 @@ def preset(name: str) -> dict[str, Any]:
     path = PRESETS / f"{name}.toml"
     if not path.is_file():
         known = ", ".join(sorted(found.stem for found in PRESETS.glob("*.toml")))
-        raise ValueError(f"preset {name!r}: there is none of that name; known are {known}")
+        raise ValueError(f"preset {name!r} is unknown; the presets are {known}")
     return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
@@ -130,7 +130,7 @@ class ModbusValue:
             address, wanted = self._map.identity
             (found,) = await self._link.read_holding(address, 1)
             if found != wanted:
-                raise DeviceRefusedError(f"{self._link.name}: register {address} holds {found}, wanted {wanted}")
+                raise DeviceRefusedError(f"{self._link.name}: register {address} holds {found}, expected {wanted}")
             detail = f"register {address} = {found}"
         if self._map.version_address is not None:
             (number,) = await self._link.read_holding(self._map.version_address, 1)

@@ -147,7 +147,7 @@ class Optoncdt1420(LinkedDevice):
         name, measuring_range = fields.get("Name", ""), fields.get("Measuring range", "")
         found = re.match(r"([\d.]+)\s*mm", measuring_range)
         if "1420" not in name or found is None:
-            raise roles.DeviceRefusedError(f"{self._port.name}: {name or text[:40]!r} is no optoNCDT 1420")
+            raise roles.DeviceRefusedError(f"{self._port.name}: {name or text[:40]!r} is not an optoNCDT 1420")
         self._range_mm = float(found[1])
         if self._config.range_mm is not None and self._range_mm != self._config.range_mm:
             raise roles.DeviceRefusedError(
@@ -222,7 +222,7 @@ class Optoncdt1420(LinkedDevice):
         displacement_um = self._displacement_um(raw)
         if not self._gate.passes(displacement_um):
             raise roles.LinkError(
-                f"{self._port.name}: a jump to {displacement_um:.1f} um is not believed before it is repeated"
+                f"{self._port.name}: a jump to {displacement_um:.1f} um is ignored until it repeats"
             )
         quality = 0 if _IN_RANGE[0] <= raw <= _IN_RANGE[1] else int(raw)
         return roles.DisplacementSample(

@@ -135,7 +135,7 @@ class SerialExchange:
                 self._noisy = False
                 return
             if due_s > give_up_s:
-                raise LinkError(f"{what}: the line is never quiet; wrong baud rate, or someone else talks on it")
+                raise LinkError(f"{what}: the line never goes quiet; wrong baud rate, or another talker")
             await asyncio.sleep(wait_s)
 
     async def _ask(self, question: Question, timeout_s: float) -> bytes:
@@ -162,7 +162,7 @@ class SerialExchange:
         if not self._heard:
             return f"no answer within {timeout_s:g} s; is it on, wired and set to {self.port.settings}?"
         shown = self._heard[:_SHOWN_BYTES]
-        return f"no whole answer within {timeout_s:g} s, but {len(self._heard)} bytes ({shown!r}); wrong baud rate?"
+        return f"incomplete answer within {timeout_s:g} s: {len(self._heard)} bytes ({shown!r}); wrong baud rate?"
 
     def received(self, data: bytes) -> None:
         """Bytes came (called by the port)."""
@@ -251,7 +251,7 @@ class LineLink:
             if answer.fullmatch(text):
                 return heard
             if len(text) > longest:
-                raise LinkError(f"{what}: {text[:_SHOWN_CHARS]!r}... is no answer to this")
+                raise LinkError(f"{what}: {text[:_SHOWN_CHARS]!r}... is not a valid answer")
             return None
 
         return Question((command + self._end).encode("ascii"), take, longest, what)

@@ -202,7 +202,7 @@ class GuardedModbusTcp:
 
         reply = await self._exchange(send, function_code, what)
         if len(reply.registers) != count:
-            raise LinkError(f"{what}: {len(reply.registers)} registers came instead of {count}")
+            raise LinkError(f"{what}: {len(reply.registers)} registers instead of {count}")
         self._back_off.succeeded()
         return list(reply.registers)
 
@@ -250,9 +250,9 @@ class GuardedModbusTcp:
 def _check(reply: ModbusPDU, function_code: int, transaction_id: int, what: str) -> None:
     """Whether this is the answer to that request; raises LinkError or DeviceRefusedError."""
     if reply.transaction_id != transaction_id:
-        raise LinkError(f"{what}: answer to transaction {reply.transaction_id}, asked was {transaction_id}")
+        raise LinkError(f"{what}: answer to transaction {reply.transaction_id}, expected {transaction_id}")
     if reply.function_code & 0x7F != function_code:
-        raise LinkError(f"{what}: answer has function code {reply.function_code}, asked was {function_code}")
+        raise LinkError(f"{what}: answer has function code {reply.function_code}, expected {function_code}")
     if isinstance(reply, ExceptionResponse):
         raise exception_error(what, reply.exception_code)
 

@@ -223,5 +223,5 @@ def _settle(screen: screen_pygame.PygameScreen, test: DisplayTest, measured: lis
 def _linearise(screen: screen_pygame.PygameScreen, test: DisplayTest, measured: list[str]) -> str:
     curve = test.response()
     screen.linearise(curve)
-    measured.append(f"screen's response corrected (gamma {curve.gamma:.2f})")
+    measured.append(f"screen response corrected (gamma {curve.gamma:.2f})")
     return ""

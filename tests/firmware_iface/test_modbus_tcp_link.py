@@ -103,8 +103,8 @@ async def test_an_answer_in_pieces_is_taken(setup: Setup) -> None:
 @pytest.mark.parametrize(
     ("pdu", "message"),
     [
-        (good_read([1]), "1 registers came instead of 2"),
-        (good_read([1, 2, 3]), "3 registers came instead of 2"),
+        (good_read([1]), "1 registers instead of 2"),
+        (good_read([1, 2, 3]), "3 registers instead of 2"),
         (bytes([23, 4, 0, 1, 0, 2]), "function code 23"),
         (struct.pack(">BHH", 16, 0, 2), "function code 16"),
         (bytes([0x90, 2]), "function code 144"),

@@ -265,7 +265,7 @@ def test_a_pulled_plug_is_noticed_while_waiting() -> None:
 @pytest.mark.parametrize(
     ("emulator", "settings", "message"),
     [
-        ({"name": "ILD1750-50"}, {}, "'ILD1750-50' is no optoNCDT 1420"),
+        ({"name": "ILD1750-50"}, {}, "'ILD1750-50' is not an optoNCDT 1420"),
         ({"range_mm": 10}, {"range_mm": 50}, "measures 10 mm, range_mm = 50"),
     ],
 )

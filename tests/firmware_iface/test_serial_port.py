@@ -224,7 +224,7 @@ async def test_a_wrong_baud_rate_is_garbage_and_said_to_be(tmp_path: Path) -> No
     wire.plug()
     device = RtuBus(SerialPort(str(wire.path), LINE), quiet_s=0.02).device(1, timeout_s=0.1)
     await device.connect()
-    with pytest.raises(LinkError, match=r"answer of unit|wrong baud|function code"):
+    with pytest.raises(LinkError, match=r"answer from unit|wrong baud|function code"):
         await device.read_holding(0, 1)
     await device.close()
     wire.unplug()

@@ -37,7 +37,7 @@ _PATTERNS = {"steps": machine.steps, "doublets": machine.doublets, "multisine": 
 class Trial:
     """An experiment inside its guard, about `centre_um`.
 
-    Raises ValueError if the pump has no room about the holding flow, or the noise none in the limit; the message says
+    Raises ValueError if the pump has no room around the holding flow, or the noise fills the limit; the message says
     what would help.
     """
 
