@@ -257,8 +257,8 @@ class Screen(Protocol):
 class Camera(Protocol):
     """Takes frames."""
 
-    def grab(self) -> Frame:
-        """Trigger one exposure and return it. Raises LinkError."""
+    def grab(self, out: Pixels | None = None) -> Frame:
+        """Trigger one exposure and return it, in `out` if the camera is able to. Raises LinkError."""
 
     def close(self) -> None:
         """Give the camera back."""

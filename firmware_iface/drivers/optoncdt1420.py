@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface import roles, settings
-from firmware_iface.links.exchange import LinkedDevice, StepGate
-from firmware_iface.links.serial_port import SerialPort, SerialSettings
+from firmware_iface.links import exchange, serial_port
 
 _IN_RANGE = (643, 64_877)  # page 65: below and above are reserves, measured but not specified
 _PROMPT = b"->"
@@ -82,7 +81,7 @@ def distance_mm(raw: float, range_mm: float) -> float:
     return (1.02 * raw / _RAW_MAX - 0.01) * range_mm
 
 
-class Optoncdt1420(LinkedDevice):
+class Optoncdt1420:
     """A `DisplacementSensor`; `port` stands in for the configured one.
 
     Displacement = direction * (distance - zero). The sensor stands behind the mirror: when the bowl deepens the
@@ -90,10 +89,9 @@ class Optoncdt1420(LinkedDevice):
     time of arrival. A sensor that repeats itself repeats its counter too, and that is no new value.
     """
 
-    def __init__(self, config: settings.Optoncdt1420Config, port: SerialPort | None = None) -> None:
+    def __init__(self, config: settings.Optoncdt1420Config, port: serial_port.SerialPort | None = None) -> None:
         self._config = config
-        self._port = port or SerialPort(config.port, SerialSettings(config.baud))
-        super().__init__(self._port)
+        self._port = port or serial_port.SerialPort(config.port, serial_port.SerialSettings(config.baud))
         self._settle_anew()
 
     def _settle_anew(self) -> None:
@@ -102,7 +100,7 @@ class Optoncdt1420(LinkedDevice):
         self._stir = asyncio.Event()
         self._parser = StreamParser()
         self._batches: list[NDArray[np.int64]] = []
-        self._gate = StepGate(self._config.step_max_um)
+        self._gate = exchange.StepGate(self._config.step_max_um)
         self._counted = 0
         self._arrived_s = 0.0
         self._silent = 0

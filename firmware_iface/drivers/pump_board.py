@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from firmware_iface import register_map, roles
-from firmware_iface.links import exchange, modbus_rtu, modbus_tcp
+from firmware_iface.links import modbus_rtu, modbus_tcp
 
 _KIND = "membrane pump board"
 # of a board of map version 1, for people
@@ -21,7 +21,7 @@ _U32_MAX = 2**32 - 1
 _BUSY_WRITES_MAX = 3
 
 
-class PumpBoard(exchange.LinkedDevice):
+class PumpBoard:
     """All sensors, pump and vent of the bench on one board.
 
     After a lost link (LinkDownError) call `open` again, as often as wanted: it tries when its back-off allows.
@@ -60,7 +60,6 @@ class PumpBoard(exchange.LinkedDevice):
         self._heartbeat = 0
         self._busy_writes = 0  # in a row
         self._link = link
-        super().__init__(self._link)
 
     async def open(self) -> roles.BenchIdentity:
         """Connect, check kind and map version, claim the board, arm its watchdog and read both back.

@@ -16,7 +16,6 @@ import re
 from collections import defaultdict
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 from firmware_iface.links.serial_port import SerialPort
 from firmware_iface.roles import DeviceIdentity, LinkDownError, LinkError
@@ -257,45 +256,12 @@ class LineLink:
         return Question((command + self._end).encode("ascii"), take, longest, what)
 
 
-# What drivers with a link of their own have in common.
-
-
-class Reconnecting(Protocol):
-    """A link or a port: it connects again after a loss, with back-off, and counts."""
-
-    @property
-    def reconnects(self) -> int:
-        """Times it was opened after the first."""
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until it will try to open."""
-
-
-class LinkedDevice:
-    """Base of a driver that talks through one link."""
-
-    def __init__(self, link: Reconnecting) -> None:
-        self._reconnecting = link
-
-    @property
-    def reconnects(self) -> int:
-        """Times the link was opened after the first."""
-        return self._reconnecting.reconnects
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until `open` will try."""
-        return self._reconnecting.retry_in_s
-
-
-class LineDriver(LinkedDevice):
+class LineDriver:
     """Base of a driver whose device is asked in lines of text on a serial port of its own."""
 
     manual = ""
 
     def __init__(self, port: SerialPort, end: str, timeout_s: float, fence: LineFence) -> None:
-        super().__init__(port)
         self._link = LineLink(port, end, timeout_s, fence)
 
     async def _opened(self, begin: Callable[[], Awaitable[DeviceIdentity]], greeting: str = "") -> DeviceIdentity:

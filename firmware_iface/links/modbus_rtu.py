@@ -116,16 +116,6 @@ class GuardedModbusRtu:
         """Whether the bus is open."""
         return self._bus.exchange.port.is_open
 
-    @property
-    def reconnects(self) -> int:
-        """Times the bus was opened after the first."""
-        return self._bus.exchange.port.reconnects
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until `connect` will try."""
-        return 0.0 if self.connected else self._bus.exchange.port.retry_in_s
-
     async def connect(self) -> None:
         """Open the bus, if no other of its devices has. Raises LinkDownError."""
         if not self.connected:

@@ -47,14 +47,6 @@ class ModbusLink(Protocol):
     def connected(self) -> bool:
         """Whether the connection stands."""
 
-    @property
-    def reconnects(self) -> int:
-        """Connections made after the first."""
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until `connect` will try."""
-
     async def connect(self) -> None:
         """Connect anew."""
 
@@ -105,7 +97,6 @@ class GuardedModbusTcp:
         self._turn = asyncio.Lock()  # released when the request has ended, whatever became of its caller
         self._in_flight: asyncio.Task[ModbusPDU] | None = None
         self._back_off = serial_port.BackOff()
-        self._connections = 0
 
     @property
     def name(self) -> str:
@@ -116,11 +107,6 @@ class GuardedModbusTcp:
     def connected(self) -> bool:
         """Whether the connection stands."""
         return self._client is not None and self._client.connected
-
-    @property
-    def reconnects(self) -> int:
-        """Connections made after the first."""
-        return max(0, self._connections - 1)
 
     @property
     def retry_in_s(self) -> float:
@@ -151,7 +137,6 @@ class GuardedModbusTcp:
             client.close()
             raise LinkDownError(f"{self.name}: no connection; is the device on, and is this its address?")
         self._client = client
-        self._connections += 1
 
     async def read_holding(self, address: int, count: int) -> list[int]:
         """Read `count` holding registers (function code 3).

@@ -118,7 +118,6 @@ class SerialPort:
         self._clock = clock
         self._back_off = BackOff()
         self._absent_until_s = float("-inf")
-        self._opened = 0
         self._serial: serial.Serial | None = None
         self._receiver: Receiver | None = None
 
@@ -136,11 +135,6 @@ class SerialPort:
     def is_open(self) -> bool:
         """Whether bytes can flow."""
         return self._serial is not None
-
-    @property
-    def reconnects(self) -> int:
-        """Times it was opened after the first."""
-        return max(0, self._opened - 1)
 
     @property
     def retry_in_s(self) -> float:
@@ -161,7 +155,6 @@ class SerialPort:
         self._back_off.attempted(self._clock())
         self._serial = _opened(path, self._port, self._settings)
         self._receiver = receiver
-        self._opened += 1
         asyncio.get_running_loop().add_reader(self._serial.fileno(), self._readable)
 
     def write(self, data: bytes) -> None:

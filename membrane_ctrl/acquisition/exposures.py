@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Literal, Protocol, runtime_checkable
 
-from firmware_iface.roles import TRIES, ExposingCamera, Frame, FrameLostError, Pattern, Pixels, Screen
+from firmware_iface.roles import TRIES, Camera, ExposingCamera, Frame, FrameLostError, Pattern, Pixels, Screen
 from membrane_ctrl.processes.frames import FrameSlot, FrameWriter
 
 # Where a cycle failed: whatever a device or the numerics raise becomes one kind of error that names the stage.
@@ -49,13 +49,6 @@ class CycleClock(Protocol):
         """Return after `duration_s` on this clock."""
 
 
-class CycleCamera(Protocol):
-    """A camera that can write a frame where it is wanted."""
-
-    def grab(self, out: Pixels | None = None) -> Frame:
-        """One exposure, in `out` if the camera is able to. Raises LinkError."""
-
-
 @runtime_checkable
 class SettlingScreen(Protocol):
     """A screen that leaves its caller free while a pattern settles (`firmware_iface.drivers.screen_pygame`)."""
@@ -82,7 +75,7 @@ class Exposures:
 
     def __init__(
         self,
-        camera: CycleCamera,
+        camera: Camera,
         screen: Screen,
         frames: FrameWriter,
         clock: CycleClock,
@@ -168,7 +161,7 @@ class Exposures:
 class _Grabbing:
     """A camera that is triggered and read in one."""
 
-    def __init__(self, camera: CycleCamera) -> None:
+    def __init__(self, camera: Camera) -> None:
         self._camera = camera
         self._frame: Frame | None = None
 

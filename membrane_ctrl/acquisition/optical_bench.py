@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -23,20 +23,6 @@ _FOLLOWED_S = 0.35
 _TIMES = 3
 
 
-class TestCamera(Protocol):
-    """What is needed of the camera."""
-
-    def grab(self) -> roles.Frame:
-        """One exposure. Raises LinkError."""
-
-
-class TestScreen(Protocol):
-    """What is needed of the screen."""
-
-    def show_levels(self, levels: roles.Levels) -> None:
-        """Send an image to the display, level for level; not waited for. Raises LinkError."""
-
-
 class DisplayTest:
     """Measures a display through the camera that looks at it, both open.
 
@@ -44,7 +30,12 @@ class DisplayTest:
     """
 
     def __init__(
-        self, screen: TestScreen, camera: TestCamera, clock: CycleClock, width_px: int, height_px: int
+        self,
+        screen: screen_pygame.PygameScreen,
+        camera: roles.Camera,
+        clock: CycleClock,
+        width_px: int,
+        height_px: int,
     ) -> None:
         self._screen, self._camera, self._clock = screen, camera, clock
         self._size = (height_px, width_px)

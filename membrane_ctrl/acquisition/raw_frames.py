@@ -18,9 +18,8 @@ import tomli_w
 from firmware_iface.roles import Pattern, Pixels
 from membrane_ctrl.acquisition.cycle import CyclePlan
 from membrane_ctrl.config.schema import OpticsConfig, RecordingConfig
-from membrane_ctrl.model import events, run_events
+from membrane_ctrl.model import events, run_events, telemetry
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.processes.frames import FrameHead, FrameReader
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
 from membrane_ctrl.run_files.disk_budget import PICTURES_FROM
@@ -113,7 +112,7 @@ class RawFrames:
     def look_for_fault(self) -> None:
         """Keep the last cycles if a fault has come up since the last call."""
         message = self._telemetry.latest()
-        fault = message is not None and TelemetryRow.unpack(message).fault > 0
+        fault = message is not None and telemetry.TelemetryRow.unpack(message).fault > 0
         if fault and not self._in_fault and self._recording.raw_before_fault_cycles:
             cycles = sorted({head.cycle for head in self._frames.heads()})
             for cycle in cycles[-self._recording.raw_before_fault_cycles :]:

@@ -141,13 +141,11 @@ class _MemoryLink:
     """A `ModbusLink` that ends at a board in memory: requests take no time."""
 
     name = "virtual board"
-    retry_in_s = 0.0
 
     def __init__(self, bench: VirtualBench) -> None:
         self._bench = bench
         self._requests = 0
         self.connected = False
-        self.reconnects = 0
 
     async def connect(self) -> None:
         if self._bench.wrong.unreachable:
