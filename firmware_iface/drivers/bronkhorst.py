@@ -85,7 +85,7 @@ class ParameterPort(Protocol):
 
 
 async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> DeviceIdentity:
-    """Connect and find out who is there.
+    """Connect and identify the instrument.
 
     Raises DeviceRefusedError: another type of instrument, or another serial number than `serial` (if that is not
     empty).
@@ -107,7 +107,7 @@ async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> 
 
 
 class BronkhorstFlow:
-    """An EL-FLOW as the pump: fraction 1 is its capacity. Any instrument but `serial` is refused; empty: none.
+    """An EL-FLOW as the pump: fraction 1 is its capacity. Only the instrument `serial` is accepted; empty: any.
 
     It has no watchdog of its own: without a host it goes on with its last setpoint.
     """
@@ -148,7 +148,7 @@ class BronkhorstFlow:
 
 
 class BronkhorstPressure:
-    """An EL-PRESS as the gauge pressure sensor. Any instrument but `serial` is refused; empty: none."""
+    """An EL-PRESS as the gauge pressure sensor. Only the instrument `serial` is accepted; empty: any."""
 
     # below zero a little (noise), above full scale up to what the sensor can show (131.07 % of 32000 is 41942)
     _FRACTIONS = (-0.1, 1.3107)

@@ -35,7 +35,7 @@ class Capture(Protocol):
         """A property."""
 
     def release(self) -> None:
-        """Give the camera back."""
+        """Release the camera."""
 
 
 class UvcCamera:
@@ -111,7 +111,7 @@ class UvcCamera:
         return roles.Frame(out, time_s)
 
     def close(self) -> None:
-        """Give the camera back. Never raises."""
+        """Release the camera. Never raises."""
         if self._capture is not None:
             self._capture.release()
             self._capture = None

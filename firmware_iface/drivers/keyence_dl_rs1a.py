@@ -54,7 +54,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
         self._readings = 0
 
     async def open(self) -> roles.DeviceIdentity:
-        """Open the port, see that the amplifier is there and well. The unit has no settings of its own to apply.
+        """Open the port and check that the amplifier is present and without error. The unit has no settings to apply.
 
         Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (no such amplifier, one
         in error, or one with steps coarser than `step_max_um`).

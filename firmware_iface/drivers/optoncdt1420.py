@@ -106,7 +106,7 @@ class Optoncdt1420:
         self._silent = 0
 
     async def open(self) -> roles.DeviceIdentity:
-        """Open the port, stop the stream, check who it is, set it and read it back, start the stream.
+        """Open the port, stop the stream, check its identity, set it and read it back, start the stream.
 
         Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another device, another
         range, or a setting that is not taken).

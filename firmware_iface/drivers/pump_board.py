@@ -90,7 +90,7 @@ class PumpBoard:
             raise
 
     async def _identify(self) -> roles.BenchIdentity:
-        # these two never move; the rest means something only when they are right
+        # these two never move; the other registers are valid only if they match
         identity = register_map.default_map().block("identity")
         kind, version = await self._link.read_holding(identity.address, 2)
         if kind != register_map.default_map().device_kind:
@@ -171,7 +171,7 @@ class PumpBoard:
         )
 
     def _foreign(self, sensors: Mapping[str, float]) -> int:
-        """What of claim and period in force is not as this object set it; a board without claims cannot say."""
+        """Which of claim and period in force differ from what this object set; a board without claims cannot tell."""
         if self._registers.map_version == 1:
             return 0
         taken = sensors["claim_in_force"] != self._claim_id or self._busy_writes >= _BUSY_WRITES_MAX
@@ -216,7 +216,7 @@ class PumpBoard:
             await self._write("stop", {"stop": 1.0})
 
     def dead_guards(self) -> tuple[str, ...]:
-        """None: the watchdog is the board's own, and each reading tells of it."""
+        """None: the watchdog is the board's own, and its state is in each reading."""
         return ()
 
     async def close(self) -> None:

@@ -39,7 +39,7 @@ class Ventus(exchange.LineDriver):
         self._commanded_mw = 0.0
 
     async def open(self) -> roles.DeviceIdentity:
-        """Open the port, stop the pump, check who it is, apply the settings and read them back.
+        """Open the port, stop the pump, check its identity, apply the settings and read them back.
 
         Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another device, or a
         setting that is not taken).

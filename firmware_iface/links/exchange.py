@@ -62,9 +62,9 @@ class SerialExchange:
         self._answer: asyncio.Future[bytes] | None = None
 
     def connect(self, greeting: bytes = b"") -> None:
-        """Open the line; what devices may still owe to an earlier user is not believed.
+        """Open the line; answers that devices still owe to an earlier user are discarded.
 
-        The greeting is sent at once, and whatever comes back is thrown away: for a device that talks unasked until
+        The greeting is sent at once and its answer discarded: for a device that talks unasked until
         told to stop. Raises LinkDownError if the port does not open.
         """
         self.port.open(self)
@@ -288,7 +288,7 @@ class LineDriver:
         return {"port": port, "settings": self._shown, "manual": self.manual}
 
 
-# Whether a reading can be believed that carries no checksum: it has to be near one of the two before it.
+# A reading without a checksum is accepted only near one of the two before it.
 
 
 class StepGate:
@@ -303,7 +303,7 @@ class StepGate:
         self._before: tuple[float, ...] = ()
 
     def passes(self, value: float) -> bool:
-        """Whether to believe it; it is remembered either way."""
+        """Whether to accept the value; it is remembered either way."""
         near = any(abs(value - before) <= self._step for before in self._before)
         self._before = (value, *self._before[:1])
         return near

@@ -1,4 +1,4 @@
-"""Modbus RTU that can be believed: several devices on one serial bus, each with the interface of the TCP link.
+"""Modbus RTU with checked answers: several devices on one serial bus, each with the interface of the TCP link.
 
 RTU has no transaction numbers. What keeps a late answer from being taken for the next one is in `exchange`; the fence
 is "return query data" (function 8, sub-function 0) with a number that counts up: it comes back as sent, or as an
@@ -86,7 +86,7 @@ class RtuBus:
         return GuardedModbusRtu(self, unit_id, timeout_s, fence)
 
     def next_token(self) -> int:
-        """A number that no fence had before it lately."""
+        """A number that no recent fence had."""
         self._tokens = (self._tokens + 1) % _TOKENS
         return self._tokens
 

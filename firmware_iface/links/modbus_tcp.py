@@ -1,6 +1,6 @@
-"""Modbus TCP that can be believed: the library's client with the checks and the promptness that it lacks.
+"""Modbus TCP with the checks and the prompt errors that the library's client lacks.
 
-Of pymodbus' own behaviour (3.16) this closes: a reply with too few registers, of another function or with transaction
+It closes these gaps of pymodbus 3.16: a reply with too few registers, of another function or with transaction
 id 0 is accepted; a connection lost in mid-request waits for the full timeout; a retry sends a write again; a server
 that accepts and hangs up is called ten times a second.
 """

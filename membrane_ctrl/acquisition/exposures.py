@@ -61,7 +61,7 @@ class SettlingScreen(Protocol):
 
 
 class Laser(Protocol):
-    """Knows the displacement at a moment of the near past."""
+    """Gives the displacement at a recent moment."""
 
     def at(self, time_s: float) -> float:
         """Displacement in um, NaN if unknown."""
@@ -70,7 +70,7 @@ class Laser(Protocol):
 class Exposures:
     """Takes the frames of a cycle into the ring of frames, their starts at least `interval_s` apart.
 
-    A camera or a screen that knows only its plain role is used step by step.
+    A camera or screen that has only its plain role is used step by step.
     """
 
     def __init__(

@@ -104,7 +104,7 @@ def _thin(pixels: roles.Pixels) -> roles.Pixels:
 
 
 def told(name: str, measure: Callable[[], str]) -> str:
-    """A finding with the name of what it is about; empty for none. A measurement that failed is a finding."""
+    """A finding with its subject; empty for none. A failed measurement is a finding."""
     try:
         problem = measure()
     except ValueError as error:
@@ -120,7 +120,7 @@ class OpticalBench:
     screen: Any
 
     def close(self) -> None:
-        """Give both back. Never raises."""
+        """Release both. Never raises."""
         self.camera.close()
         self.screen.close()
 

@@ -83,7 +83,7 @@ class RawFrames:
         self.left_out = 0
 
     def after(self, estimate: ShapeEstimate) -> None:
-        """Look at a cycle that is done: is it one to keep?"""
+        """Keep the frames of a finished cycle if they are due."""
         self._collect()
         self.look_for_fault()
         if not (self._recording.raw_every_cycles or self._recording.raw_before_fault_cycles):
@@ -120,7 +120,7 @@ class RawFrames:
         self._in_fault = fault
 
     def close(self) -> None:
-        """Look once more, write what waits, detach."""
+        """Check for a fault once more, write what is pending, detach."""
         self.look_for_fault()
         self._writer.shutdown()
         self._collect()
@@ -147,7 +147,7 @@ class RawFrames:
         return path
 
     def _against(self, found: _Set) -> str:
-        """Why a set cannot go to the disk now; empty if it can."""
+        """Why a set cannot be written now; empty if it can."""
         if len(self._writing) >= _WAITING_SETS:
             return "the disk is slower than the cycles"
         try:
@@ -166,7 +166,7 @@ class RawFrames:
             self._tell(run_events.RawFrames(self.left_out, f"frames are left out: {why}"))
 
     def _collect(self) -> None:
-        """Look at what has been written; a set that was not is none, and nothing may refer to it."""
+        """Collect finished writes; a set that failed is dropped, and nothing may refer to it."""
         done = [write for write in self._writing if write.done.done()]
         self._writing = [write for write in self._writing if write not in done]
         for write in done:

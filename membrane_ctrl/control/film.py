@@ -136,7 +136,7 @@ class FilmMonitor:
 
     @property
     def watching(self) -> bool:
-        """It has seen something since the last `reset`."""
+        """Whether it has had readings since the last `reset`."""
         return self._seen_s > 0.0
 
     def step(self, dt_s: float, laser_um: float, trim_um: float, gauge_pressure_pa: float) -> str:
@@ -191,7 +191,7 @@ CLEARER = 2.0
 
 
 class Liar(IntEnum):
-    """Whose story does not fit."""
+    """Which sensor contradicts the others."""
 
     NOBODY = 0
     UNSURE = 1
@@ -234,7 +234,7 @@ class Plausibility:
 
     @property
     def watching(self) -> bool:
-        """It has seen something since the last `reset`."""
+        """Whether it has had readings since the last `reset`."""
         return math.isfinite(self._laser.value)
 
     def step(

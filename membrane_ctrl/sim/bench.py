@@ -44,7 +44,7 @@ class BenchSpec:
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """What a bench process says once: the devices it serves, or one line why it does not."""
+    """The first report of a bench process: the devices it serves, or why it does not."""
 
     port: int = 0
     error: str = ""
@@ -157,7 +157,7 @@ class LiveBench:
         return replace(sample, sample_counter=round(sample.device_time_s / STEP_S) + 1)
 
 
-# The twin as a process beside the hold: started, asked for its port, and its truth read for the record.
+# The twin as a process beside the hold: its start, its port, and its truth for the record.
 
 _TRUTHS_KEPT = 64
 _READY_S = 60.0  # importing on a busy machine; a fresh one compiles first

@@ -9,7 +9,7 @@ from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments import machine, pump_map
 from membrane_ctrl.control.gas import PumpCurve
 
-# What may be asked of an experiment: plain data with bounds, so that it can come over a wire.
+# Specification of an experiment: plain data with bounds, as it comes over the control port.
 
 
 ExperimentKind = Literal["relay", "steps", "doublets", "multisine", "pump_map"]
