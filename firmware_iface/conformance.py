@@ -99,7 +99,7 @@ class Conformance(board_under_test.BoardUnderTest):
         found = await self._read(self._registers.block("identity"))
         kind, version = int(found["device_kind"]), int(found["map_version"])
         wanted = self._registers.device_kind
-        require(kind == wanted, f"device kind is {kind}, wanted {wanted}")
+        require(kind == wanted, f"device kind is {kind}, expected {wanted}")
         known = " and ".join(str(known) for known in register_map.known_maps())
         require(version in register_map.known_maps(), f"map version is {version}, this test knows {known}")
         self._registers = register_map.known_maps()[version]

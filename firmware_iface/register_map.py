@@ -190,7 +190,7 @@ def load(path: Path) -> RegisterMap:
 def parse(table: Mapping[str, Any]) -> RegisterMap:
     """A map from its TOML table. Raises RegisterMapError."""
     if table.get("schema") != SCHEMA:
-        raise RegisterMapError(f'schema is {table.get("schema")!r}, wanted "{SCHEMA}"')
+        raise RegisterMapError(f'schema is {table.get("schema")!r}, expected "{SCHEMA}"')
     try:
         blocks = tuple(_parse_block(entry) for entry in table["block"])
         faults = tuple(
@@ -206,7 +206,7 @@ def parse(table: Mapping[str, Any]) -> RegisterMap:
 def _parse_block(entry: Mapping[str, Any]) -> Block:
     name, access = entry["name"], entry["access"]
     if access not in ("ro", "rw"):
-        raise RegisterMapError(f'block {name}: access is {access!r}, wanted "ro" or "rw"')
+        raise RegisterMapError(f'block {name}: access is {access!r}, expected "ro" or "rw"')
     registers = [_parse_register(register, access) for register in entry["registers"]]
     if not registers:
         raise RegisterMapError(f"block {name} has no registers")

@@ -26,7 +26,7 @@ class LinkDownError(LinkError):
 
 
 class LinkWaitsError(LinkDownError):
-    """It is not yet time for the next attempt to connect; why the last one failed has been said."""
+    """Too early for the next attempt to connect; why the last one failed was reported."""
 
 
 class DeviceRefusedError(LinkError):
@@ -82,7 +82,7 @@ class BenchCommand:
 
 @dataclass(frozen=True, slots=True)
 class BenchIdentity:
-    """Who answered, how its watchdog is set (read back), and the limits that it has (infinite: none known)."""
+    """Identity of a bench, its watchdog period as read back, and its limits (infinite: unknown)."""
 
     kind: str
     map_version: int
@@ -251,17 +251,17 @@ class Screen(Protocol):
         """Show the pattern; returns when it is lit and settled."""
 
     def close(self) -> None:
-        """Give the screen back."""
+        """Release the screen."""
 
 
 class Camera(Protocol):
     """Takes frames."""
 
-    def grab(self) -> Frame:
-        """Trigger one exposure and return it. Raises LinkError."""
+    def grab(self, out: Pixels | None = None) -> Frame:
+        """Trigger one exposure and return it, in `out` if the camera is able to. Raises LinkError."""
 
     def close(self) -> None:
-        """Give the camera back."""
+        """Release the camera."""
 
 
 # One lost packet spoils a frame; three spoilt in a row are no accident

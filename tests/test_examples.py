@@ -134,7 +134,7 @@ def test_a_wrong_devices_table_is_one_line(
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"preset": "waveshare"}, "known are waveshare_ao8"),
+        ({"preset": "waveshare"}, "the presets are waveshare_ao8"),
         ({"address": 8}, "waveshare_ao8 has 0 .. 7"),
         ({"raw": (0.0, 30_000.0)}, "the device takes 0 .. 20000"),
     ],

@@ -85,7 +85,7 @@ class ParameterPort(Protocol):
 
 
 async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> DeviceIdentity:
-    """Connect and find out who is there.
+    """Connect and identify the instrument.
 
     Raises DeviceRefusedError: another type of instrument, or another serial number than `serial` (if that is not
     empty).
@@ -94,9 +94,11 @@ async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> 
     found = await port.text(DEVICE_TYPE)
     number = await port.text(SERIAL_NUMBER)
     if found not in types:
-        raise DeviceRefusedError(f"{port.name}: a {found or 'nameless device'} answers, wanted {' or '.join(types)}")
+        raise DeviceRefusedError(
+            f"{port.name}: a {found or 'nameless device'} answers, expected {' or '.join(types)}"
+        )
     if serial and number != serial:
-        raise DeviceRefusedError(f"{port.name}: serial number {number} answers, the configuration names {serial}")
+        raise DeviceRefusedError(f"{port.name}: serial number {number} answers, but the configuration names {serial}")
     firmware = await port.text(FIRMWARE)
     capacity, unit = await port.number(CAPACITY), await port.text(CAPACITY_UNIT)
     if not (math.isfinite(capacity) and capacity > 0):
@@ -105,7 +107,7 @@ async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> 
 
 
 class BronkhorstFlow:
-    """An EL-FLOW as the pump: fraction 1 is its capacity. Any instrument but `serial` is refused; empty: none.
+    """An EL-FLOW as the pump: fraction 1 is its capacity. Only the instrument `serial` is accepted; empty: any.
 
     It has no watchdog of its own: without a host it goes on with its last setpoint.
     """
@@ -121,7 +123,7 @@ class BronkhorstFlow:
         await self._port.write(CONTROL_MODE, BUS_SETPOINT)
         mode = await self._port.number(CONTROL_MODE)
         if mode != BUS_SETPOINT:
-            raise DeviceRefusedError(f"{self._port.name}: control mode stays {mode:g}, wanted {BUS_SETPOINT}")
+            raise DeviceRefusedError(f"{self._port.name}: control mode stays {mode:g}, expected {BUS_SETPOINT}")
         return identity
 
     async def set_pump(self, fraction: float) -> None:
@@ -146,7 +148,7 @@ class BronkhorstFlow:
 
 
 class BronkhorstPressure:
-    """An EL-PRESS as the gauge pressure sensor. Any instrument but `serial` is refused; empty: none."""
+    """An EL-PRESS as the gauge pressure sensor. Only the instrument `serial` is accepted; empty: any."""
 
     # below zero a little (noise), above full scale up to what the sensor can show (131.07 % of 32000 is 41942)
     _FRACTIONS = (-0.1, 1.3107)

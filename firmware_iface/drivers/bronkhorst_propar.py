@@ -175,21 +175,21 @@ class ProparParameters:
         first, *others = await self._asked(*[parameter] * _COPIES)
         if any(other != first for other in others):
             came = ", ".join(raw.hex() for raw in (first, *others))
-            raise LinkError(f"{self.name}: {parameter.name} came as {came}; noise")
+            raise LinkError(f"{self.name}: {parameter.name} differs between copies ({came}); noise")
         return float(struct.unpack(_FORMATS[parameter.kind], first)[0])
 
     async def text(self, parameter: InstrumentParameter) -> str:
         """A text that came twice. Raises LinkError."""
         first, second = (await self._asked(parameter))[0], (await self._asked(parameter))[0]
         if first != second:
-            raise LinkError(f"{self.name}: {parameter.name} came as {first!r} and as {second!r}; noise")
+            raise LinkError(f"{self.name}: {parameter.name} read as {first!r}, then as {second!r}; noise")
         return first.split(b"\0")[0].decode("ascii", "replace").strip()
 
     async def write(self, parameter: InstrumentParameter, value: int) -> None:
         """Write, and read back. Raises LinkError."""
         answer = await self._transact(write_data(parameter, value), f"writing {parameter.name}")
         if answer[0] != STATUS:
-            raise LinkError(f"{self.name}: writing {parameter.name}: command {answer[0]} came instead of a status")
+            raise LinkError(f"{self.name}: writing {parameter.name}: command {answer[0]} instead of a status")
         found = await self.number(parameter)
         if found != value:
             raise LinkError(f"{self.name}: {parameter.name} written {value}, read back {found:g}")
@@ -209,14 +209,14 @@ class ProparParameters:
         try:
             found = values(answer)
         except (ValueError, IndexError) as error:
-            raise LinkError(f"{self.name}: {what}: the answer does not add up ({error})") from error
+            raise LinkError(f"{self.name}: {what}: the answer is malformed ({error})") from error
         if answer[0] != VALUES or [(group, index) for group, index, _ in found] != [
             (place, place) for place in range(len(parameters))
         ]:
-            raise LinkError(f"{self.name}: {what}: something else was answered than asked")
+            raise LinkError(f"{self.name}: {what}: the answer is to another question")
         for parameter, (_, _, raw) in zip(parameters, found, strict=True):
             if parameter.kind in _FORMATS and len(raw) != struct.calcsize(_FORMATS[parameter.kind]):
-                raise LinkError(f"{self.name}: {what}: a value of another type was answered")
+                raise LinkError(f"{self.name}: {what}: a value has another type")
         return [raw for _, _, raw in found]
 
     async def _transact(self, data: bytes, what: str) -> bytes:

@@ -154,14 +154,14 @@ class AravisCamera:
         return self.fetch()
 
     def close(self) -> None:
-        """Give the camera back. Never raises."""
+        """Release the camera. Never raises."""
         self._stop_stream()
         if self._camera is not None:
             arv.aravis().call("g_object_unref", self._camera)
         self._camera = self._pending = None
 
     def _abandon(self) -> None:
-        """Let go of a camera that does not answer: the library says goodbye to it for 10 s, so beside the cycle."""
+        """Drop a camera that does not answer, in a thread: the library takes 10 s to close it."""
         left = [instance for instance in (self._stream, self._camera) if instance is not None]
         self._stream = self._camera = self._pending = None
         unref = arv.aravis().call
@@ -188,7 +188,7 @@ class AravisCamera:
         return roles.DeviceIdentity(f"{vendor} {model}", serial, "", self.describe()["settings"])
 
     def _look_whether_ours(self) -> None:
-        """A GigE Vision camera lets everyone read, and everyone but its one controller write into the void."""
+        """A GigE Vision camera lets anyone read, and ignores what others than its controller write."""
         call = arv.aravis().call
         device = call("arv_camera_get_device", self._camera)
         call("arv_device_set_range_check_policy", device, _RANGE_CHECKED)
@@ -305,7 +305,7 @@ class AravisCamera:
         if out is None:
             return seen.copy()
         if out.shape != seen.shape or out.dtype != seen.dtype:
-            raise ValueError(f"camera gives {seen.shape} {seen.dtype}, wanted are {out.shape} {out.dtype}")
+            raise ValueError(f"camera gives {seen.shape} {seen.dtype}, expected {out.shape} {out.dtype}")
         np.copyto(out, seen)
         return out
 

@@ -30,7 +30,7 @@ class FolderCamera:
         if self._folder.is_dir():
             self._files = sorted(path for path in self._folder.iterdir() if path.suffix.lower() in _SUFFIXES)
         if not self._files:
-            raise LinkError(f"camera: {self._folder}: no pictures ({', '.join(_SUFFIXES)}) there")
+            raise LinkError(f"camera: {self._folder}: contains no pictures ({', '.join(_SUFFIXES)})")
         self._read(self._files[0])
         return DeviceIdentity("folder of frames", "", "", f"{len(self._files)} pictures in {self._folder}")
 
@@ -53,7 +53,7 @@ class FolderCamera:
             return Frame(pixels, time_s)
         if out.dtype != pixels.dtype:
             raise LinkError(
-                f"camera: {self._folder}: pictures are {pixels.dtype}, [optics.camera] bits wants {out.dtype}"
+                f"camera: {self._folder}: pictures are {pixels.dtype}, [optics.camera] bits requires {out.dtype}"
             )
         np.copyto(out, pixels)
         return Frame(out, time_s)
@@ -72,7 +72,7 @@ class FolderCamera:
             raise LinkError(f"camera: {path}: cannot be read as a picture")
         if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
             raise DeviceRefusedError(
-                f"camera: {path}: {image.dtype} with {image.ndim} axes; wanted is grey, 8 or 16 bit"
+                f"camera: {path}: {image.dtype} with {image.ndim} axes; expected 8- or 16-bit grey"
             )
         if image.shape != self._size:
             raise DeviceRefusedError(

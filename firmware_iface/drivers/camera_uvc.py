@@ -35,7 +35,7 @@ class Capture(Protocol):
         """A property."""
 
     def release(self) -> None:
-        """Give the camera back."""
+        """Release the camera."""
 
 
 class UvcCamera:
@@ -106,12 +106,12 @@ class UvcCamera:
         if out is None:
             return roles.Frame(pixels.copy(), time_s)
         if out.shape != pixels.shape:
-            raise roles.DeviceRefusedError(f"camera {self._config.port}: sent {pixels.shape}, wanted is {out.shape}")
+            raise roles.DeviceRefusedError(f"camera {self._config.port}: sent {pixels.shape}, expected {out.shape}")
         np.copyto(out, pixels)
         return roles.Frame(out, time_s)
 
     def close(self) -> None:
-        """Give the camera back. Never raises."""
+        """Release the camera. Never raises."""
         if self._capture is not None:
             self._capture.release()
             self._capture = None

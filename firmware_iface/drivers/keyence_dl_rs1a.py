@@ -54,7 +54,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
         self._readings = 0
 
     async def open(self) -> roles.DeviceIdentity:
-        """Open the port, see that the amplifier is there and well. The unit has no settings of its own to apply.
+        """Open the port and check that the amplifier is present and without error. The unit has no settings to apply.
 
         Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (no such amplifier, one
         in error, or one with steps coarser than `step_max_um`).
@@ -90,13 +90,11 @@ class KeyenceDlRs1a(exchange.LineDriver):
         """Ask for the value now.
 
         Counter and time are the driver's: valid answers so far, time of arrival. Raises LinkError (no valid answer,
-        or a jump that is not believed before it is repeated), LinkDownError (the port is gone).
+        or a jump that is ignored until it repeats), LinkDownError (the port is gone).
         """
         quality, displacement_um, passed = await self._reading()
         if not passed:
-            raise roles.LinkError(
-                f"{self._link.name}: jump to {displacement_um:.0f} um, not believed before it is repeated"
-            )
+            raise roles.LinkError(f"{self._link.name}: jump to {displacement_um:.0f} um, ignored until it repeats")
         self._readings += 1
         return roles.DisplacementSample(displacement_um, quality, self._readings, asyncio.get_running_loop().time())
 
@@ -106,7 +104,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
         _refuse(self._link.name, answer[2])
         text = answer[1]
         if len(text.partition(".")[2]) != self._decimals:
-            raise roles.LinkError(f"{self._link.name}: {text} has not {self._decimals} decimals as before")
+            raise roles.LinkError(f"{self._link.name}: {text} does not have {self._decimals} decimals as before")
         if "E" in text:
             return QUALITY_AMPLIFIER_ERROR, math.nan, True
         # page 12: beyond the display above or below; one less: no value

@@ -62,12 +62,12 @@ def preset(name: str) -> dict[str, Any]:
     path = PRESETS / f"{name}.toml"
     if not path.is_file():
         known = ", ".join(sorted(found.stem for found in PRESETS.glob("*.toml")))
-        raise ValueError(f"preset {name!r}: there is none of that name; known are {known}")
+        raise ValueError(f"preset {name!r} is unknown; the presets are {known}")
     return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 def make_map(given: dict[str, Any], preset_name: str = "") -> tuple[ValueMap, bool]:
-    """A map from what was configured over what the preset says, and whether the device knows function 8.
+    """The map, configured keys over those of the preset, and whether the device supports function 8.
 
     Raises ValueError (an unknown preset, a missing key, an address or a raw value that the device does not have).
     """
@@ -100,7 +100,7 @@ def _check_raw(made: ValueMap, raw_limits: list[float] | None) -> None:
 
 
 class ModbusValue:
-    """One value of a Modbus device, as whatever role the configuration gives it.
+    """One value of a Modbus device, in the role that the configuration gives it.
 
     `rest` is what an actuator is left at on opening and closing; None leaves it as it is.
     """
@@ -130,7 +130,7 @@ class ModbusValue:
             address, wanted = self._map.identity
             (found,) = await self._link.read_holding(address, 1)
             if found != wanted:
-                raise DeviceRefusedError(f"{self._link.name}: register {address} holds {found}, wanted {wanted}")
+                raise DeviceRefusedError(f"{self._link.name}: register {address} holds {found}, expected {wanted}")
             detail = f"register {address} = {found}"
         if self._map.version_address is not None:
             (number,) = await self._link.read_holding(self._map.version_address, 1)
@@ -170,7 +170,7 @@ class ModbusValue:
             await self._link.write_registers(self._map.address, words)
 
     async def displacement(self) -> DisplacementSample:
-        """As `DisplacementSensor`; counter and time are of arrival, and a register that stands still is not seen."""
+        """As `DisplacementSensor`; counter and time are of arrival; a frozen register is not detected."""
         value_um = await self._get()
         self._samples += 1
         return DisplacementSample(value_um, 0, self._samples, self._clock())

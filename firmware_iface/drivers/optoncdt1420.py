@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface import roles, settings
-from firmware_iface.links.exchange import LinkedDevice, StepGate
-from firmware_iface.links.serial_port import SerialPort, SerialSettings
+from firmware_iface.links import exchange, serial_port
 
 _IN_RANGE = (643, 64_877)  # page 65: below and above are reserves, measured but not specified
 _PROMPT = b"->"
@@ -82,7 +81,7 @@ def distance_mm(raw: float, range_mm: float) -> float:
     return (1.02 * raw / _RAW_MAX - 0.01) * range_mm
 
 
-class Optoncdt1420(LinkedDevice):
+class Optoncdt1420:
     """A `DisplacementSensor`; `port` stands in for the configured one.
 
     Displacement = direction * (distance - zero). The sensor stands behind the mirror: when the bowl deepens the
@@ -90,10 +89,9 @@ class Optoncdt1420(LinkedDevice):
     time of arrival. A sensor that repeats itself repeats its counter too, and that is no new value.
     """
 
-    def __init__(self, config: settings.Optoncdt1420Config, port: SerialPort | None = None) -> None:
+    def __init__(self, config: settings.Optoncdt1420Config, port: serial_port.SerialPort | None = None) -> None:
         self._config = config
-        self._port = port or SerialPort(config.port, SerialSettings(config.baud))
-        super().__init__(self._port)
+        self._port = port or serial_port.SerialPort(config.port, serial_port.SerialSettings(config.baud))
         self._settle_anew()
 
     def _settle_anew(self) -> None:
@@ -102,13 +100,13 @@ class Optoncdt1420(LinkedDevice):
         self._stir = asyncio.Event()
         self._parser = StreamParser()
         self._batches: list[NDArray[np.int64]] = []
-        self._gate = StepGate(self._config.step_max_um)
+        self._gate = exchange.StepGate(self._config.step_max_um)
         self._counted = 0
         self._arrived_s = 0.0
         self._silent = 0
 
     async def open(self) -> roles.DeviceIdentity:
-        """Open the port, stop the stream, check who it is, set it and read it back, start the stream.
+        """Open the port, stop the stream, check its identity, set it and read it back, start the stream.
 
         Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another device, another
         range, or a setting that is not taken).
@@ -147,7 +145,7 @@ class Optoncdt1420(LinkedDevice):
         name, measuring_range = fields.get("Name", ""), fields.get("Measuring range", "")
         found = re.match(r"([\d.]+)\s*mm", measuring_range)
         if "1420" not in name or found is None:
-            raise roles.DeviceRefusedError(f"{self._port.name}: {name or text[:40]!r} is no optoNCDT 1420")
+            raise roles.DeviceRefusedError(f"{self._port.name}: {name or text[:40]!r} is not an optoNCDT 1420")
         self._range_mm = float(found[1])
         if self._config.range_mm is not None and self._range_mm != self._config.range_mm:
             raise roles.DeviceRefusedError(
@@ -222,7 +220,7 @@ class Optoncdt1420(LinkedDevice):
         displacement_um = self._displacement_um(raw)
         if not self._gate.passes(displacement_um):
             raise roles.LinkError(
-                f"{self._port.name}: a jump to {displacement_um:.1f} um is not believed before it is repeated"
+                f"{self._port.name}: a jump to {displacement_um:.1f} um is ignored until it repeats"
             )
         quality = 0 if _IN_RANGE[0] <= raw <= _IN_RANGE[1] else int(raw)
         return roles.DisplacementSample(

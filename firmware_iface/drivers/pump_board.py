@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from firmware_iface import register_map, roles
-from firmware_iface.links import exchange, modbus_rtu, modbus_tcp
+from firmware_iface.links import modbus_rtu, modbus_tcp
 
 _KIND = "membrane pump board"
 # of a board of map version 1, for people
@@ -21,7 +21,7 @@ _U32_MAX = 2**32 - 1
 _BUSY_WRITES_MAX = 3
 
 
-class PumpBoard(exchange.LinkedDevice):
+class PumpBoard:
     """All sensors, pump and vent of the bench on one board.
 
     After a lost link (LinkDownError) call `open` again, as often as wanted: it tries when its back-off allows.
@@ -60,7 +60,6 @@ class PumpBoard(exchange.LinkedDevice):
         self._heartbeat = 0
         self._busy_writes = 0  # in a row
         self._link = link
-        super().__init__(self._link)
 
     async def open(self) -> roles.BenchIdentity:
         """Connect, check kind and map version, claim the board, arm its watchdog and read both back.
@@ -91,7 +90,7 @@ class PumpBoard(exchange.LinkedDevice):
             raise
 
     async def _identify(self) -> roles.BenchIdentity:
-        # these two never move; the rest means something only when they are right
+        # these two never move; the other registers are valid only if they match
         identity = register_map.default_map().block("identity")
         kind, version = await self._link.read_holding(identity.address, 2)
         if kind != register_map.default_map().device_kind:
@@ -172,7 +171,7 @@ class PumpBoard(exchange.LinkedDevice):
         )
 
     def _foreign(self, sensors: Mapping[str, float]) -> int:
-        """What of claim and period in force is not as this object set it; a board without claims cannot say."""
+        """Which of claim and period in force differ from what this object set; a board without claims cannot tell."""
         if self._registers.map_version == 1:
             return 0
         taken = sensors["claim_in_force"] != self._claim_id or self._busy_writes >= _BUSY_WRITES_MAX
@@ -217,7 +216,7 @@ class PumpBoard(exchange.LinkedDevice):
             await self._write("stop", {"stop": 1.0})
 
     def dead_guards(self) -> tuple[str, ...]:
-        """None: the watchdog is the board's own, and each reading tells of it."""
+        """None: the watchdog is the board's own, and its state is in each reading."""
         return ()
 
     async def close(self) -> None:

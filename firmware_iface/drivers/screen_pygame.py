@@ -124,7 +124,7 @@ class PygameScreen:
         self._flip(self._surface(levels))
 
     def close(self) -> None:
-        """Give the display back. Never raises."""
+        """Release the display. Never raises."""
         self._surfaces = {}
         self._window = None
         if self._pygame is not None:

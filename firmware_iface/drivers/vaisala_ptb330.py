@@ -39,7 +39,7 @@ class BarometerMessage:
 
 
 class VaisalaPtb330(exchange.LineDriver):
-    """A `Barometer`. A task of its own asks every `period_s` and serves the newest value.
+    """A `Barometer`. A task polls it every `period_s`; the newest value is served.
 
     `port` stands in for the configured one.
     """
@@ -58,7 +58,7 @@ class VaisalaPtb330(exchange.LineDriver):
         self._identity: roles.DeviceIdentity | None = None
 
     async def open(self) -> roles.DeviceIdentity:
-        """Open the port, stop what it sends by itself, check who it is, set unit and format, start to ask.
+        """Open the port, stop its own output, check its identity, set unit and format, start to poll.
 
         Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another instrument, or a
         format that is not taken).
@@ -79,7 +79,7 @@ class VaisalaPtb330(exchange.LineDriver):
         return identity
 
     async def _known_again(self) -> roles.DeviceIdentity | None:
-        """Who it was before, if a message of the right form and serial number comes at once: a second saved."""
+        """The known identity, if a message of the right form and serial number comes at once; this saves a second."""
         if self._identity is not None:
             try:
                 await self._refresh()

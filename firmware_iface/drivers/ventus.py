@@ -39,7 +39,7 @@ class Ventus(exchange.LineDriver):
         self._commanded_mw = 0.0
 
     async def open(self) -> roles.DeviceIdentity:
-        """Open the port, stop the pump, check who it is, apply the settings and read them back.
+        """Open the port, stop the pump, check its identity, apply the settings and read them back.
 
         Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another device, or a
         setting that is not taken).
@@ -52,7 +52,7 @@ class Ventus(exchange.LineDriver):
         about = await self._write_and_read({}, DEVICE_TYPE, FIRMWARE, FIRMWARE_MINOR)
         kind = int(about[DEVICE_TYPE])
         if kind not in DEVICE_TYPES:
-            raise roles.DeviceRefusedError(f"{self._link.name}: device type {kind} is no Ventus driver (2 or 3)")
+            raise roles.DeviceRefusedError(f"{self._link.name}: device type {kind} is not a Ventus driver (2 or 3)")
         wanted = self._settings_wanted()
         found = await self._write_and_read(wanted, *wanted)
         if found != wanted:
@@ -97,8 +97,8 @@ class Ventus(exchange.LineDriver):
         if not self._as_commanded(state):
             await self._link.close()
             raise roles.LinkDownError(
-                f"{self._link.name}: told {self._commanded_mw:.3f} mW, it has {state[SET_VALUE]:g} mW (on: "
-                f"{state[ENABLE]:g}, mode: {state[MODE]:g}, source: {state[MANUAL_SOURCE]:g}, limit: "
+                f"{self._link.name}: commanded {self._commanded_mw:.3f} mW, the pump has {state[SET_VALUE]:g} mW "
+                f"(on: {state[ENABLE]:g}, mode: {state[MODE]:g}, source: {state[MANUAL_SOURCE]:g}, limit: "
                 f"{state[POWER_LIMIT_MW]:g} mW); noise on the line, or it restarted: open it again"
             )
         if error := state[ERROR]:

@@ -31,7 +31,7 @@ class BoardSample:
 
 
 class BoardState:
-    """The board between two requests, of the map version that `registers` has; it says that it has `map_version`.
+    """The board between two requests, of the map version of `registers`; it reports `map_version`.
 
     `advance` is called before every request and every few milliseconds: the watchdog and the pressure limit depend on
     the time passed in and on nothing else.
@@ -92,7 +92,7 @@ class BoardState:
 
     @property
     def held(self) -> bool:
-        """Somebody holds a claim and has fed the watchdog in time: nobody else may have the board.
+        """A claim is held and its watchdog was fed in time: no other program may have the board.
 
         Not by the latched fault: who claims a board that is latched holds it as well.
         """

@@ -16,7 +16,6 @@ import re
 from collections import defaultdict
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 from firmware_iface.links.serial_port import SerialPort
 from firmware_iface.roles import DeviceIdentity, LinkDownError, LinkError
@@ -63,9 +62,9 @@ class SerialExchange:
         self._answer: asyncio.Future[bytes] | None = None
 
     def connect(self, greeting: bytes = b"") -> None:
-        """Open the line; what devices may still owe to an earlier user is not believed.
+        """Open the line; answers that devices still owe to an earlier user are discarded.
 
-        The greeting is sent at once, and whatever comes back is thrown away: for a device that talks unasked until
+        The greeting is sent at once and its answer discarded: for a device that talks unasked until
         told to stop. Raises LinkDownError if the port does not open.
         """
         self.port.open(self)
@@ -135,7 +134,7 @@ class SerialExchange:
                 self._noisy = False
                 return
             if due_s > give_up_s:
-                raise LinkError(f"{what}: the line is never quiet; wrong baud rate, or someone else talks on it")
+                raise LinkError(f"{what}: the line never goes quiet; wrong baud rate, or another talker")
             await asyncio.sleep(wait_s)
 
     async def _ask(self, question: Question, timeout_s: float) -> bytes:
@@ -162,7 +161,7 @@ class SerialExchange:
         if not self._heard:
             return f"no answer within {timeout_s:g} s; is it on, wired and set to {self.port.settings}?"
         shown = self._heard[:_SHOWN_BYTES]
-        return f"no whole answer within {timeout_s:g} s, but {len(self._heard)} bytes ({shown!r}); wrong baud rate?"
+        return f"incomplete answer within {timeout_s:g} s: {len(self._heard)} bytes ({shown!r}); wrong baud rate?"
 
     def received(self, data: bytes) -> None:
         """Bytes came (called by the port)."""
@@ -251,51 +250,18 @@ class LineLink:
             if answer.fullmatch(text):
                 return heard
             if len(text) > longest:
-                raise LinkError(f"{what}: {text[:_SHOWN_CHARS]!r}... is no answer to this")
+                raise LinkError(f"{what}: {text[:_SHOWN_CHARS]!r}... is not a valid answer")
             return None
 
         return Question((command + self._end).encode("ascii"), take, longest, what)
 
 
-# What drivers with a link of their own have in common.
-
-
-class Reconnecting(Protocol):
-    """A link or a port: it connects again after a loss, with back-off, and counts."""
-
-    @property
-    def reconnects(self) -> int:
-        """Times it was opened after the first."""
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until it will try to open."""
-
-
-class LinkedDevice:
-    """Base of a driver that talks through one link."""
-
-    def __init__(self, link: Reconnecting) -> None:
-        self._reconnecting = link
-
-    @property
-    def reconnects(self) -> int:
-        """Times the link was opened after the first."""
-        return self._reconnecting.reconnects
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until `open` will try."""
-        return self._reconnecting.retry_in_s
-
-
-class LineDriver(LinkedDevice):
+class LineDriver:
     """Base of a driver whose device is asked in lines of text on a serial port of its own."""
 
     manual = ""
 
     def __init__(self, port: SerialPort, end: str, timeout_s: float, fence: LineFence) -> None:
-        super().__init__(port)
         self._link = LineLink(port, end, timeout_s, fence)
 
     async def _opened(self, begin: Callable[[], Awaitable[DeviceIdentity]], greeting: str = "") -> DeviceIdentity:
@@ -322,7 +288,7 @@ class LineDriver(LinkedDevice):
         return {"port": port, "settings": self._shown, "manual": self.manual}
 
 
-# Whether a reading can be believed that carries no checksum: it has to be near one of the two before it.
+# A reading without a checksum is accepted only near one of the two before it.
 
 
 class StepGate:
@@ -337,7 +303,7 @@ class StepGate:
         self._before: tuple[float, ...] = ()
 
     def passes(self, value: float) -> bool:
-        """Whether to believe it; it is remembered either way."""
+        """Whether to accept the value; it is remembered either way."""
         near = any(abs(value - before) <= self._step for before in self._before)
         self._before = (value, *self._before[:1])
         return near

@@ -1,4 +1,4 @@
-"""Modbus RTU that can be believed: several devices on one serial bus, each with the interface of the TCP link.
+"""Modbus RTU with checked answers: several devices on one serial bus, each with the interface of the TCP link.
 
 RTU has no transaction numbers. What keeps a late answer from being taken for the next one is in `exchange`; the fence
 is "return query data" (function 8, sub-function 0) with a number that counts up: it comes back as sent, or as an
@@ -54,7 +54,7 @@ def parse_rtu_url(url: str) -> tuple[str, serial_port.SerialSettings]:
     options = dict(parse_qsl(parts.query, strict_parsing=True)) if parts.query else {}
     port = parts.netloc + parts.path
     if parts.scheme != "rtu" or not port or not options.keys() <= {"baud", "parity", "data_bits", "stop_bits"}:
-        raise ValueError(f"{url}: wanted rtu:///dev/ttyUSB0?baud=19200&parity=E")
+        raise ValueError(f"{url}: expected rtu:///dev/ttyUSB0?baud=19200&parity=E")
     try:
         numbers = {key: int(value) for key, value in options.items() if key != "parity"}
     except ValueError as error:
@@ -86,7 +86,7 @@ class RtuBus:
         return GuardedModbusRtu(self, unit_id, timeout_s, fence)
 
     def next_token(self) -> int:
-        """A number that no fence had before it lately."""
+        """A number that no recent fence had."""
         self._tokens = (self._tokens + 1) % _TOKENS
         return self._tokens
 
@@ -116,16 +116,6 @@ class GuardedModbusRtu:
         """Whether the bus is open."""
         return self._bus.exchange.port.is_open
 
-    @property
-    def reconnects(self) -> int:
-        """Times the bus was opened after the first."""
-        return self._bus.exchange.port.reconnects
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until `connect` will try."""
-        return 0.0 if self.connected else self._bus.exchange.port.retry_in_s
-
     async def connect(self) -> None:
         """Open the bus, if no other of its devices has. Raises LinkDownError."""
         if not self.connected:
@@ -148,7 +138,7 @@ class GuardedModbusRtu:
         what = f"{self.name}: writing {address}"
         pdu = struct.pack(">BHH", modbus_tcp.WRITE_SINGLE, address, word)
         if (await self._transact(pdu, _WRITE_BYTES, what)) != pdu:
-            raise LinkError(f"{what}: the reply confirms something else")
+            raise LinkError(f"{what}: the reply confirms another write")
 
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         """Write holding registers (function code 16) and check the echo.
@@ -162,7 +152,7 @@ class GuardedModbusRtu:
         )
         reply = await self._transact(pdu, _WRITE_BYTES, what)
         if reply != pdu[:5]:
-            raise LinkError(f"{what}: the reply confirms something else")
+            raise LinkError(f"{what}: the reply confirms another write")
 
     async def _read(self, function_code: int, address: int, count: int) -> list[int]:
         what = f"{self.name}: reading {address}..{address + count - 1}"
@@ -186,7 +176,7 @@ class GuardedModbusRtu:
         def take(heard: bytes) -> bytes | None:
             reply = take_reply(heard, self._unit_id, pdu[0], answer_bytes, what)
             if exactly and reply is not None and reply != exactly and not reply[0] & modbus_tcp.EXCEPTION_FLAG:
-                raise LinkError(f"{what}: another echo came back than was sent")
+                raise LinkError(f"{what}: the echo differs from what was sent")
             return reply
 
         return exchange.Question(rtu_frame(self._unit_id, pdu), take, answer_bytes, what)
@@ -219,7 +209,7 @@ def parse_tcp_url(url: str) -> tuple[str, int]:
     except ValueError as error:  # a port that is no number, or above 65535
         raise ValueError(f"{url}: {error}") from error
     if parts.scheme != "tcp" or not host or parts.path or parts.query or parts.fragment or parts.username:
-        raise ValueError(f"{url}: wanted tcp://HOST:PORT")
+        raise ValueError(f"{url}: expected tcp://HOST:PORT")
     return host, DEFAULT_PORT if port is None else port
 
 
@@ -230,7 +220,7 @@ def take_reply(heard: bytes, unit_id: int, function_code: int, answer_bytes: int
     survive the buffers of adapters and kernels. Raises LinkError (another unit, function, length or CRC).
     """
     if heard[0] != unit_id:
-        raise LinkError(f"{what}: answer of unit {heard[0]}, asked was {unit_id}")
+        raise LinkError(f"{what}: answer from unit {heard[0]}, expected unit {unit_id}")
     if len(heard) < 3:
         return None
     if heard[1] == function_code | modbus_tcp.EXCEPTION_FLAG:
@@ -238,17 +228,17 @@ def take_reply(heard: bytes, unit_id: int, function_code: int, answer_bytes: int
     elif heard[1] == function_code:
         length = answer_bytes
     else:
-        raise LinkError(f"{what}: answer has function code {heard[1]}, asked was {function_code}")
+        raise LinkError(f"{what}: answer has function code {heard[1]}, expected {function_code}")
     if (
         function_code in (modbus_tcp.READ_HOLDING, modbus_tcp.READ_INPUT)
         and length == answer_bytes
         and heard[2] != answer_bytes - 5
     ):
-        raise LinkError(f"{what}: {heard[2] / 2:g} registers came instead of {(answer_bytes - 5) // 2}")
+        raise LinkError(f"{what}: {heard[2] / 2:g} registers instead of {(answer_bytes - 5) // 2}")
     if len(heard) < length:
         return None
     if len(heard) > length:
-        raise LinkError(f"{what}: {len(heard)} bytes came instead of {length}")
+        raise LinkError(f"{what}: {len(heard)} bytes instead of {length}")
     if crc16(heard):  # over a frame with its own CRC the sum is 0
         raise LinkError(f"{what}: wrong checksum; noise on the line, or wrong baud rate")
     return heard[1:-2]

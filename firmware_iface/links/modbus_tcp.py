@@ -1,6 +1,6 @@
-"""Modbus TCP that can be believed: the library's client with the checks and the promptness that it lacks.
+"""Modbus TCP with the checks and the prompt errors that the library's client lacks.
 
-Of pymodbus' own behaviour (3.16) this closes: a reply with too few registers, of another function or with transaction
+It closes these gaps of pymodbus 3.16: a reply with too few registers, of another function or with transaction
 id 0 is accepted; a connection lost in mid-request waits for the full timeout; a retry sends a write again; a server
 that accepts and hangs up is called ten times a second.
 """
@@ -46,14 +46,6 @@ class ModbusLink(Protocol):
     @property
     def connected(self) -> bool:
         """Whether the connection stands."""
-
-    @property
-    def reconnects(self) -> int:
-        """Connections made after the first."""
-
-    @property
-    def retry_in_s(self) -> float:
-        """Time until `connect` will try."""
 
     async def connect(self) -> None:
         """Connect anew."""
@@ -105,7 +97,6 @@ class GuardedModbusTcp:
         self._turn = asyncio.Lock()  # released when the request has ended, whatever became of its caller
         self._in_flight: asyncio.Task[ModbusPDU] | None = None
         self._back_off = serial_port.BackOff()
-        self._connections = 0
 
     @property
     def name(self) -> str:
@@ -116,11 +107,6 @@ class GuardedModbusTcp:
     def connected(self) -> bool:
         """Whether the connection stands."""
         return self._client is not None and self._client.connected
-
-    @property
-    def reconnects(self) -> int:
-        """Connections made after the first."""
-        return max(0, self._connections - 1)
 
     @property
     def retry_in_s(self) -> float:
@@ -151,7 +137,6 @@ class GuardedModbusTcp:
             client.close()
             raise LinkDownError(f"{self.name}: no connection; is the device on, and is this its address?")
         self._client = client
-        self._connections += 1
 
     async def read_holding(self, address: int, count: int) -> list[int]:
         """Read `count` holding registers (function code 3).
@@ -202,7 +187,7 @@ class GuardedModbusTcp:
 
         reply = await self._exchange(send, function_code, what)
         if len(reply.registers) != count:
-            raise LinkError(f"{what}: {len(reply.registers)} registers came instead of {count}")
+            raise LinkError(f"{what}: {len(reply.registers)} registers instead of {count}")
         self._back_off.succeeded()
         return list(reply.registers)
 
@@ -250,9 +235,9 @@ class GuardedModbusTcp:
 def _check(reply: ModbusPDU, function_code: int, transaction_id: int, what: str) -> None:
     """Whether this is the answer to that request; raises LinkError or DeviceRefusedError."""
     if reply.transaction_id != transaction_id:
-        raise LinkError(f"{what}: answer to transaction {reply.transaction_id}, asked was {transaction_id}")
+        raise LinkError(f"{what}: answer to transaction {reply.transaction_id}, expected {transaction_id}")
     if reply.function_code & 0x7F != function_code:
-        raise LinkError(f"{what}: answer has function code {reply.function_code}, asked was {function_code}")
+        raise LinkError(f"{what}: answer has function code {reply.function_code}, expected {function_code}")
     if isinstance(reply, ExceptionResponse):
         raise exception_error(what, reply.exception_code)
 

@@ -84,7 +84,7 @@ class SerialSettings:
         if self.baud not in serial.Serial.BAUDRATES:
             raise ValueError(f"baud = {self.baud}: not a rate that serial ports have")
         if self.data_bits not in (7, 8) or self.parity not in ("N", "E", "O") or self.stop_bits not in (1, 2):
-            raise ValueError(f"{self}: wanted 7 or 8 data bits, parity N, E or O, 1 or 2 stop bits")
+            raise ValueError(f"{self}: expected 7 or 8 data bits, parity N, E or O, 1 or 2 stop bits")
 
     @property
     def char_s(self) -> float:
@@ -118,7 +118,6 @@ class SerialPort:
         self._clock = clock
         self._back_off = BackOff()
         self._absent_until_s = float("-inf")
-        self._opened = 0
         self._serial: serial.Serial | None = None
         self._receiver: Receiver | None = None
 
@@ -136,11 +135,6 @@ class SerialPort:
     def is_open(self) -> bool:
         """Whether bytes can flow."""
         return self._serial is not None
-
-    @property
-    def reconnects(self) -> int:
-        """Times it was opened after the first."""
-        return max(0, self._opened - 1)
 
     @property
     def retry_in_s(self) -> float:
@@ -161,7 +155,6 @@ class SerialPort:
         self._back_off.attempted(self._clock())
         self._serial = _opened(path, self._port, self._settings)
         self._receiver = receiver
-        self._opened += 1
         asyncio.get_running_loop().add_reader(self._serial.fileno(), self._readable)
 
     def write(self, data: bytes) -> None:
@@ -294,7 +287,9 @@ def check_port_name(name: str) -> str:
     """The name itself, when it is a path or `usb:VID:PID[:SERIAL]`. Raises ValueError."""
     if name.startswith("/") or _USB_NAME.fullmatch(name):
         return name
-    raise ValueError(f"port {name!r}: wanted a path (/dev/ttyUSB0) or usb:VID:PID[:SERIAL] (usb:0403:6001:A50285BI)")
+    raise ValueError(
+        f"port {name!r}: expected a path (/dev/ttyUSB0) or usb:VID:PID[:SERIAL] (usb:0403:6001:A50285BI)"
+    )
 
 
 def port_path(name: str, comports: Callable[[], Iterable[Any]] = list_ports.comports) -> str:

@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from firmware_iface.roles import Pattern, Pixels, Screen
+from firmware_iface.roles import Camera, Pattern, Pixels, Screen
 from membrane_ctrl.acquisition import exposures
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.clock import pause_s
@@ -71,7 +71,7 @@ class ShapeCycle:
 
     def __init__(
         self,
-        camera: exposures.CycleCamera,
+        camera: Camera,
         screen: Screen,
         reconstructor: Reconstructor,
         plan: CyclePlan,

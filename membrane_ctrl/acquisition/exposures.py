@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Literal, Protocol, runtime_checkable
 
-from firmware_iface.roles import TRIES, ExposingCamera, Frame, FrameLostError, Pattern, Pixels, Screen
+from firmware_iface.roles import TRIES, Camera, ExposingCamera, Frame, FrameLostError, Pattern, Pixels, Screen
 from membrane_ctrl.processes.frames import FrameSlot, FrameWriter
 
 # Where a cycle failed: whatever a device or the numerics raise becomes one kind of error that names the stage.
@@ -49,13 +49,6 @@ class CycleClock(Protocol):
         """Return after `duration_s` on this clock."""
 
 
-class CycleCamera(Protocol):
-    """A camera that can write a frame where it is wanted."""
-
-    def grab(self, out: Pixels | None = None) -> Frame:
-        """One exposure, in `out` if the camera is able to. Raises LinkError."""
-
-
 @runtime_checkable
 class SettlingScreen(Protocol):
     """A screen that leaves its caller free while a pattern settles (`firmware_iface.drivers.screen_pygame`)."""
@@ -68,7 +61,7 @@ class SettlingScreen(Protocol):
 
 
 class Laser(Protocol):
-    """Knows the displacement at a moment of the near past."""
+    """Gives the displacement at a recent moment."""
 
     def at(self, time_s: float) -> float:
         """Displacement in um, NaN if unknown."""
@@ -77,12 +70,12 @@ class Laser(Protocol):
 class Exposures:
     """Takes the frames of a cycle into the ring of frames, their starts at least `interval_s` apart.
 
-    A camera or a screen that knows only its plain role is used step by step.
+    A camera or screen that has only its plain role is used step by step.
     """
 
     def __init__(
         self,
-        camera: CycleCamera,
+        camera: Camera,
         screen: Screen,
         frames: FrameWriter,
         clock: CycleClock,
@@ -168,7 +161,7 @@ class Exposures:
 class _Grabbing:
     """A camera that is triggered and read in one."""
 
-    def __init__(self, camera: CycleCamera) -> None:
+    def __init__(self, camera: Camera) -> None:
         self._camera = camera
         self._frame: Frame | None = None
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -23,20 +23,6 @@ _FOLLOWED_S = 0.35
 _TIMES = 3
 
 
-class TestCamera(Protocol):
-    """What is needed of the camera."""
-
-    def grab(self) -> roles.Frame:
-        """One exposure. Raises LinkError."""
-
-
-class TestScreen(Protocol):
-    """What is needed of the screen."""
-
-    def show_levels(self, levels: roles.Levels) -> None:
-        """Send an image to the display, level for level; not waited for. Raises LinkError."""
-
-
 class DisplayTest:
     """Measures a display through the camera that looks at it, both open.
 
@@ -44,7 +30,12 @@ class DisplayTest:
     """
 
     def __init__(
-        self, screen: TestScreen, camera: TestCamera, clock: CycleClock, width_px: int, height_px: int
+        self,
+        screen: screen_pygame.PygameScreen,
+        camera: roles.Camera,
+        clock: CycleClock,
+        width_px: int,
+        height_px: int,
     ) -> None:
         self._screen, self._camera, self._clock = screen, camera, clock
         self._size = (height_px, width_px)
@@ -113,7 +104,7 @@ def _thin(pixels: roles.Pixels) -> roles.Pixels:
 
 
 def told(name: str, measure: Callable[[], str]) -> str:
-    """A finding with the name of what it is about; empty for none. A measurement that failed is a finding."""
+    """A finding with its subject; empty for none. A failed measurement is a finding."""
     try:
         problem = measure()
     except ValueError as error:
@@ -129,7 +120,7 @@ class OpticalBench:
     screen: Any
 
     def close(self) -> None:
-        """Give both back. Never raises."""
+        """Release both. Never raises."""
         self.camera.close()
         self.screen.close()
 
@@ -223,5 +214,5 @@ def _settle(screen: screen_pygame.PygameScreen, test: DisplayTest, measured: lis
 def _linearise(screen: screen_pygame.PygameScreen, test: DisplayTest, measured: list[str]) -> str:
     curve = test.response()
     screen.linearise(curve)
-    measured.append(f"screen's response corrected (gamma {curve.gamma:.2f})")
+    measured.append(f"screen response corrected (gamma {curve.gamma:.2f})")
     return ""

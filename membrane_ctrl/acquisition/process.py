@@ -19,7 +19,7 @@ from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.processes import child, ring
 
-# How many threads the numerics of this process may use: the tick of the control process must find a core.
+# Limits on the threads of this process's numerics: the tick of the control process needs a core.
 
 
 # The kernels split their work over two threads by themselves (metrology.threads). Linear algebra is 36 x 36 here:
@@ -38,7 +38,7 @@ def limit_threads() -> None:
     os.environ.update(_LIMITS)
 
 
-# The acquisition's line to the process that started it: commands in, small reports out, and whether it lives.
+# The connection to the parent process: commands in, reports and signs of life out.
 
 AcquisitionState = Literal["preparing", "running", "paused", "retrying", "failed", "stopped"]
 
@@ -100,7 +100,7 @@ class Remote:
     def report(
         self, state: AcquisitionState, message: str = "", cycle: int | None = None, traceback: str | None = None
     ) -> None:
-        """Send a report that says something new; a cycle as good as the last is no news for a record of weeks.
+        """Send a report that differs from the last one: a record of weeks needs no report of each good cycle.
 
         It is dropped when the other end does not read, as the cycle must never wait for it.
         """

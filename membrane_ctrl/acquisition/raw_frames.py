@@ -18,9 +18,8 @@ import tomli_w
 from firmware_iface.roles import Pattern, Pixels
 from membrane_ctrl.acquisition.cycle import CyclePlan
 from membrane_ctrl.config.schema import OpticsConfig, RecordingConfig
-from membrane_ctrl.model import events, run_events
+from membrane_ctrl.model import events, run_events, telemetry
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.processes.frames import FrameHead, FrameReader
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
 from membrane_ctrl.run_files.disk_budget import PICTURES_FROM
@@ -84,7 +83,7 @@ class RawFrames:
         self.left_out = 0
 
     def after(self, estimate: ShapeEstimate) -> None:
-        """Look at a cycle that is done: is it one to keep?"""
+        """Keep the frames of a finished cycle if they are due."""
         self._collect()
         self.look_for_fault()
         if not (self._recording.raw_every_cycles or self._recording.raw_before_fault_cycles):
@@ -113,7 +112,7 @@ class RawFrames:
     def look_for_fault(self) -> None:
         """Keep the last cycles if a fault has come up since the last call."""
         message = self._telemetry.latest()
-        fault = message is not None and TelemetryRow.unpack(message).fault > 0
+        fault = message is not None and telemetry.TelemetryRow.unpack(message).fault > 0
         if fault and not self._in_fault and self._recording.raw_before_fault_cycles:
             cycles = sorted({head.cycle for head in self._frames.heads()})
             for cycle in cycles[-self._recording.raw_before_fault_cycles :]:
@@ -121,7 +120,7 @@ class RawFrames:
         self._in_fault = fault
 
     def close(self) -> None:
-        """Look once more, write what waits, detach."""
+        """Check for a fault once more, write what is pending, detach."""
         self.look_for_fault()
         self._writer.shutdown()
         self._collect()
@@ -148,7 +147,7 @@ class RawFrames:
         return path
 
     def _against(self, found: _Set) -> str:
-        """Why a set cannot go to the disk now; empty if it can."""
+        """Why a set cannot be written now; empty if it can."""
         if len(self._writing) >= _WAITING_SETS:
             return "the disk is slower than the cycles"
         try:
@@ -167,7 +166,7 @@ class RawFrames:
             self._tell(run_events.RawFrames(self.left_out, f"frames are left out: {why}"))
 
     def _collect(self) -> None:
-        """Look at what has been written; a set that was not is none, and nothing may refer to it."""
+        """Collect finished writes; a set that failed is dropped, and nothing may refer to it."""
         done = [write for write in self._writing if write.done.done()]
         self._writing = [write for write in self._writing if write not in done]
         for write in done:

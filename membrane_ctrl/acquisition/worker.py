@@ -72,7 +72,7 @@ def estimate_message(estimate: shape_estimate.ShapeEstimate) -> bytes:
 def _captured(
     result: CycleDone | CycleFailed | None, keep: Callable[[shape_estimate.ShapeEstimate], Path]
 ) -> run_events.Capture:
-    """What became of a set that was asked for; a rejected one is not worth its room on the disk."""
+    """Result of a requested set; a rejected one is not kept."""
     match result:
         case None:
             return run_events.Capture(failed="the cycle was stopped")

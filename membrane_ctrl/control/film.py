@@ -114,7 +114,7 @@ class LeakGrowth:
         self._stands_s += dt_s
         if self._stands_s < LEAK_STANDS_S:
             return ""
-        return f"the film takes {takes_um_per_s:.1f} um/s of gas, before {usual_um_per_s:.1f} um/s"
+        return f"the film takes {takes_um_per_s:.1f} um/s of gas; it used to take {usual_um_per_s:.1f} um/s"
 
 
 class FilmMonitor:
@@ -136,7 +136,7 @@ class FilmMonitor:
 
     @property
     def watching(self) -> bool:
-        """It has seen something since the last `reset`."""
+        """Whether it has had readings since the last `reset`."""
         return self._seen_s > 0.0
 
     def step(self, dt_s: float, laser_um: float, trim_um: float, gauge_pressure_pa: float) -> str:
@@ -172,7 +172,7 @@ class FilmMonitor:
         wanted_pa = self._pressure_pa * max(1 + laser_um / self._sag_um, 0.0) ** 3
         if wanted_pa / NOMINAL_FACTOR - NOMINAL_SLACK_PA <= gauge_pa <= NOMINAL_FACTOR * wanted_pa + NOMINAL_SLACK_PA:
             return ""
-        return f"the gauge reads {gauge_pa:.0f} Pa where the sag wants about {wanted_pa:.0f} Pa"
+        return f"the gauge reads {gauge_pa:.0f} Pa; this sag needs about {wanted_pa:.0f} Pa"
 
 
 # Laser against optics, with the gauge pressure as arbiter: which one is wrong?
@@ -191,7 +191,7 @@ CLEARER = 2.0
 
 
 class Liar(IntEnum):
-    """Whose story does not fit."""
+    """Which sensor contradicts the others."""
 
     NOBODY = 0
     UNSURE = 1
@@ -234,7 +234,7 @@ class Plausibility:
 
     @property
     def watching(self) -> bool:
-        """It has seen something since the last `reset`."""
+        """Whether it has had readings since the last `reset`."""
         return math.isfinite(self._laser.value)
 
     def step(

@@ -1,4 +1,4 @@
-"""Slow changes that end in a failure: seen in hourly means, told ahead. Pure.
+"""Slow changes that lead to a failure, detected early in hourly means. Pure.
 
 leak      mean loss of gas; a seam that opens makes it grow until the pump cannot keep up
 reserve   what the pump has left above the leak
@@ -93,7 +93,7 @@ class Hour:
 
 @dataclass(frozen=True, slots=True)
 class Maintenance:
-    """Something that a person should look at before it fails; or, no longer `bad`, need not any more."""
+    """A maintenance notice; it no longer applies if it is not `bad`."""
 
     name: str
     message: str
@@ -156,7 +156,7 @@ class FilmHealth:
         ]
 
     def _says_leak(self, leak_um_per_s: float) -> str:
-        """How bad, and until when the pump can keep up if it goes on like this."""
+        """The leak, and how long the pump can keep up at this growth."""
         days = (len(self._hours) - 1) / DAY_HOURS
         growth_per_day = (leak_um_per_s - self._hours[0].leak_um_per_s) / days if days else 0.0
         left = (self._flow_max_um_per_s - leak_um_per_s) / growth_per_day if growth_per_day > 0 else math.inf
@@ -164,7 +164,7 @@ class FilmHealth:
         return f"the leak has grown to {leak_um_per_s:.2f} um/s{until}: look for an opening seam"
 
     def _creep_per_day(self) -> float:
-        """Over what there is of the last day; 0 before six hours, for the trend of less is noise."""
+        """Creep over up to a day; 0 before six hours, as a shorter trend is noise."""
         hours = len(self._hours) - 1
         if hours < 6:
             return 0.0

@@ -75,7 +75,7 @@ _TEMPERATURE_C = (-20.0, 60.0)
 
 
 def weather_fault(ambient_pressure_pa: float, air_temperature_c: float) -> str:
-    """Which of the two cannot be what it is said to be; a sensor that is not there (NaN) is none."""
+    """Says which of the two reads something impossible; an absent sensor (NaN) does not."""
     if not _believed(ambient_pressure_pa, _PRESSURE_PA):
         return f"the barometer reads {ambient_pressure_pa:g} Pa: check its unit; the feed-forward does without it"
     if not _believed(air_temperature_c, _TEMPERATURE_C):

@@ -1,4 +1,4 @@
-"""From the configuration's words to a bench of devices, each used by one program."""
+"""Makes the bench of devices that the configuration names; one program at a time may use a device."""
 
 import asyncio
 import contextlib
@@ -112,7 +112,7 @@ def pump_board(devices: DevicesConfig, url: str) -> PumpBoard:
 
 
 async def connect(bench: roles.Bench, devices: DevicesConfig) -> roles.BenchIdentity:
-    """Open the bench, with patience for a device that is not there yet and none for one that is the wrong one.
+    """Open the bench; retry while a device is absent, fail at once if it is the wrong one.
 
     Raises DeviceError (one line that names the device and what is wrong).
     """
@@ -120,7 +120,7 @@ async def connect(bench: roles.Bench, devices: DevicesConfig) -> roles.BenchIden
 
 
 async def patiently(attempt: Callable[[], Awaitable[T]], where: str) -> T:
-    """Connect by this attempt, again and again; see `connect`."""
+    """Repeat an attempt to connect; see `connect`."""
     loop = asyncio.get_running_loop()
     begin_s, patience_s = loop.time(), _PATIENCE_S
     failure = ""
@@ -153,7 +153,7 @@ _SHOWN = 100  # letters of the holder's command line
 
 @contextlib.contextmanager
 def locked(devices: Iterable[str]) -> Iterator[None]:
-    """Have these devices (`device_names`, `modbus_names`) for oneself; given back at the end, or with the process.
+    """Claim these devices (`device_names`, `modbus_names`) until the end of the block or of the process.
 
     Raises DeviceError (one line: which device another program uses, who that is, and what to do).
     """
@@ -172,7 +172,7 @@ def locked(devices: Iterable[str]) -> Iterator[None]:
 
 
 def device_names(devices: DevicesConfig) -> set[str]:
-    """What the board or the instruments are on this machine, whatever the configuration calls them."""
+    """Names of the configured devices on this machine, however the configuration spells them."""
     if devices.board is not None:
         return modbus_names(devices.board, devices.unit_id)
     names: set[str] = set()
@@ -203,7 +203,7 @@ def _serial_name(port: str) -> str:
 
 
 def _addresses(host: str) -> set[str]:
-    """Where a name leads; all ways to this machine itself are one."""
+    """Addresses of a host; all addresses of this machine count as one."""
     try:
         found = {str(entry[4][0]) for entry in socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)}
     except (OSError, UnicodeError):
@@ -222,7 +222,7 @@ def _address(device: str) -> bytes:
 
 
 def _holder(address: bytes) -> str:
-    """Who listens there, as far as it can be told."""
+    """The process that listens there, if it can be found out."""
     with socket.socket(socket.AF_UNIX) as probe:
         probe.setblocking(False)
         try:

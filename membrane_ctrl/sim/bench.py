@@ -44,7 +44,7 @@ class BenchSpec:
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """What a bench process says once: the devices it serves, or one line why it does not."""
+    """The first report of a bench process: the devices it serves, or why it does not."""
 
     port: int = 0
     error: str = ""
@@ -157,10 +157,22 @@ class LiveBench:
         return replace(sample, sample_counter=round(sample.device_time_s / STEP_S) + 1)
 
 
-# The twin as a process beside the hold: started, asked for its port, and its truth read for the record.
+# The twin as a process beside the hold: its start, its port, and its truth for the record.
 
 _TRUTHS_KEPT = 64
 _READY_S = 60.0  # importing on a busy machine; a fresh one compiles first
+
+
+def _started(spec: BenchSpec, stack: contextlib.ExitStack) -> BenchReport:
+    """Start the bench process, which the stack ends, and wait until it listens. Raises DeviceError."""
+    ours, theirs = pipe()
+    child = Child("twin", "membrane_ctrl.sim.bench:serve", (spec, theirs), nice=0)
+    stack.callback(child.stop, 2.0)
+    child.start()
+    report: BenchReport = ours.recv() if ours.poll(_READY_S) else BenchReport(error="the twin did not start")
+    if report.error:
+        raise DeviceError(report.error)
+    return report
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,13 +194,7 @@ class TwinProcess:
         spec = BenchSpec(
             config.twin, config.pump, clock, config.twin.port, truth=truth, lab=config.devices if lab else None
         )
-        ours, theirs = pipe()
-        child = Child("twin", "membrane_ctrl.sim.bench:serve", (spec, theirs), nice=0)
-        stack.callback(child.stop, 2.0)
-        child.start()
-        report = ours.recv() if ours.poll(_READY_S) else BenchReport(error="the twin did not start")
-        if report.error:
-            raise DeviceError(report.error)
+        report = _started(spec, stack)
         watchdog = {} if config.devices is None else config.devices.model_dump(include={"timeout_s", "watchdog_s"})
         devices = report.lab or DevicesConfig(board=f"tcp://127.0.0.1:{report.port}", **watchdog)
         return cls(config.model_copy(update={"devices": devices}), truth)
@@ -214,19 +220,10 @@ _STOPS = {signal.SIGINT, signal.SIGTERM}
 
 def serve_twin(config: Config, speed: float) -> int:
     """Serve until SIGINT or SIGTERM; says on stderr where it listens. Raises DeviceError, e.g. for a busy port."""
-    ours, theirs = pipe()
     spec = BenchSpec(config.twin, config.pump, RunClock.start(), config.twin.port, speed=speed, linger_s=0.0)
-    child = Child("twin", "membrane_ctrl.sim.bench:serve", (spec, theirs), nice=0)
-    child.start()
-    try:
-        report = ours.recv() if ours.poll(60.0) else BenchReport(error="the twin did not start")
-        if report.error:
-            raise DeviceError(report.error)
-        print(
-            f"the twin listens on tcp://127.0.0.1:{report.port}, Modbus unit 1; stop it with Ctrl-C", file=sys.stderr
-        )
+    with contextlib.ExitStack() as stack:
+        url = f"tcp://127.0.0.1:{_started(spec, stack).port}"
+        print(f"the twin listens on {url}, Modbus unit 1; stop it with Ctrl-C", file=sys.stderr)
         signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
         stopped = signal.sigwait(_STOPS)
-    finally:
-        child.stop(2.0)
     return Exit.INTERRUPTED if stopped == signal.SIGINT else Exit.DONE

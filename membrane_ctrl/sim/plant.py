@@ -45,7 +45,7 @@ class PumpModel:
         self._tube = deque([0.0] * round(TRANSPORT_S / step_s))
 
     def hold(self, flow_ml_per_s: float) -> float:
-        """Stand where the pump delivers this flow for ever, and return that command.
+        """Settle at the command that delivers this flow, and return it.
 
         A flow so small that the pump would stall leaves it off.
         """
@@ -226,15 +226,15 @@ class Plant:
             steps -= now
 
     def sample(self) -> BoardSample:
-        """What the sensors say now, with noise of its own in each call."""
+        """A sample of the sensors now; each call has its own noise."""
         return self.sample_of(self.truth())
 
     def sample_of(self, truth: sensors.Truth) -> BoardSample:
-        """The same, for who has the truth of now already."""
+        """The same from a known truth."""
         return self._sensors.read(truth)
 
     def truth(self) -> sensors.Truth:
-        """What really is."""
+        """The true state."""
         i = self._index
         gas, ambient_pa = self._gas, self._ambient_pa[i]
         gauge_pa = gas.gauge_pressure_pa

@@ -1,4 +1,4 @@
-"""What the bench's sensors say of the truth."""
+"""What the bench's sensors read of the true state."""
 
 import struct
 from dataclasses import astuple, dataclass, fields

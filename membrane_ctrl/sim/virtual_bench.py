@@ -77,7 +77,7 @@ class VirtualBench:
         )
 
     def intrude(self, pump_fraction: float, watchdog_s: float = 10.0) -> str:
-        """Another program claims the board, clears its faults and pumps; what it is told, empty if it was obeyed."""
+        """Another program claims the board, clears its faults and pumps; returns the refusal, or nothing."""
         other = PumpBoard("", watchdog_s=watchdog_s, link=_MemoryLink(self))
         try:
             at_once(other.open())
@@ -112,7 +112,7 @@ class VirtualBench:
         at_once(self._driver.clear_faults(mask))
 
     def close(self) -> None:
-        """Disarm if the board allows it, and go."""
+        """Disarm if the board allows it, and disconnect."""
         at_once(self._driver.close())
 
     def _sampled(self, last: board_state.BoardSample | None) -> board_state.BoardSample:
@@ -141,13 +141,11 @@ class _MemoryLink:
     """A `ModbusLink` that ends at a board in memory: requests take no time."""
 
     name = "virtual board"
-    retry_in_s = 0.0
 
     def __init__(self, bench: VirtualBench) -> None:
         self._bench = bench
         self._requests = 0
         self.connected = False
-        self.reconnects = 0
 
     async def connect(self) -> None:
         if self._bench.wrong.unreachable:

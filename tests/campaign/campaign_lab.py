@@ -44,8 +44,6 @@ class Registers:
 class TableLink:
     """A `ModbusLink` that ends at a table in memory; it can be unplugged, and lose single answers."""
 
-    retry_in_s, reconnects = 0.0, 0
-
     def __init__(self, name: str, table: RegisterTable) -> None:
         self.name, self.table = name, table
         self.plugged, self.connected = True, False

@@ -54,7 +54,7 @@ def test_gas_that_nobody_explains_is_told_and_forgotten_with_the_hold() -> None:
     mirror = Seconds()
     mirror.pass_by(600)
     mirror.pass_by(90, leak_um_per_s=3.0)
-    assert "3.0 um/s of gas, before 1.2 um/s" in mirror.consistency.gas_excess
+    assert "3.0 um/s of gas; it used to take 1.2 um/s" in mirror.consistency.gas_excess
     mirror.pass_by(1, leak_um_per_s=3.0, state=State.FAULT)
     assert mirror.consistency.gas_excess == ""
     mirror.pass_by(600, leak_um_per_s=3.0)

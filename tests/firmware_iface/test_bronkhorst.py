@@ -175,8 +175,8 @@ def test_the_pressure_meter_reads_pascals(protocol: Callable[[Instrument], Made]
 @pytest.mark.parametrize(
     ("instrument", "serial", "words"),
     [
-        (pressure(), "", "a DEPC answers, wanted DMFC"),
-        (flow([]), "M999", "serial number M1234567A answers, the configuration names M999"),
+        (pressure(), "", "a DEPC answers, expected DMFC"),
+        (flow([]), "M999", "serial number M1234567A answers, but the configuration names M999"),
     ],
 )
 def test_another_instrument_is_refused(

@@ -228,7 +228,7 @@ async def test_a_claim_whose_answer_was_lost_is_made_again_by_the_same_driver(
     assert claim
     monkeypatch.setattr(board.state, "write", write)
     board.faults.silent = False
-    await asyncio.sleep(driver.retry_in_s)
+    await asyncio.sleep(driver._link.retry_in_s)
     await driver.open()
     assert board.state._claim_key == claim
     await driver.write(ON)

@@ -172,7 +172,6 @@ def test_a_pulled_plug() -> None:
         await bench.driver.open()
         await bench.driver.displacement()
         assert asyncio.get_running_loop().time() - before_s < 1.0
-        assert bench.driver.reconnects == 1
 
     on_bench(test)
 

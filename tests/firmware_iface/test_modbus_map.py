@@ -117,7 +117,7 @@ def test_the_identity_register_decides() -> None:
                 assert (first.displacement_um, first.quality) == (12.0, 0)
                 assert second.sample_counter == first.sample_counter + 1
             else:
-                with pytest.raises(DeviceRefusedError, match="register 9 holds 78, wanted 77"):
+                with pytest.raises(DeviceRefusedError, match="register 9 holds 78, expected 77"):
                     await sensor.open()
             await sensor.close()
 

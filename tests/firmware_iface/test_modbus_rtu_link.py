@@ -120,12 +120,12 @@ GOOD = rtu_frame(1, bytes([3, 4, 0, 1, 0, 2]))
 @pytest.mark.parametrize(
     ("heard", "message"),
     [
-        (rtu_frame(2, GOOD[1:-2]), "answer of unit 2, asked was 1"),
+        (rtu_frame(2, GOOD[1:-2]), "answer from unit 2, expected unit 1"),
         (rtu_frame(1, bytes([4]) + GOOD[2:-2]), "function code 4"),
-        (rtu_frame(1, bytes([3, 2, 0, 1])), "1 registers came instead of 2"),
-        (rtu_frame(1, bytes([3, 6, 0, 1, 0, 2, 0, 3])), "3 registers came instead of 2"),
+        (rtu_frame(1, bytes([3, 2, 0, 1])), "1 registers instead of 2"),
+        (rtu_frame(1, bytes([3, 6, 0, 1, 0, 2, 0, 3])), "3 registers instead of 2"),
         (GOOD[:-1] + b"\0", "wrong checksum"),
-        (GOOD + b"\0", "10 bytes came instead of 9"),
+        (GOOD + b"\0", "10 bytes instead of 9"),
         (rtu_frame(1, bytes([0x83, 2]))[:-1] + b"\0", "wrong checksum"),
     ],
 )
@@ -295,7 +295,7 @@ def test_each_fault_is_an_error_and_passes(faults: SerialFaults) -> None:
 
 @pytest.mark.parametrize(
     ("fault", "message"),
-    [("wrong_unit", "answer of unit 2"), ("wrong_function", "function code 4")],
+    [("wrong_unit", "answer from unit 2"), ("wrong_function", "function code 4")],
 )
 def test_faults_of_the_protocol(fault: str, message: str) -> None:
     async def test(bus: Bus) -> None:
@@ -358,7 +358,7 @@ def test_someone_else_talking_is_not_waited_for() -> None:
                 await asyncio.sleep(0.01)
 
         babbling = asyncio.create_task(babble())
-        with pytest.raises(LinkError, match="never quiet"):
+        with pytest.raises(LinkError, match="never goes quiet"):
             await bus.first.read_holding(0, 1)
         babbling.cancel()
         await asyncio.wait([babbling])

@@ -103,8 +103,8 @@ async def test_an_answer_in_pieces_is_taken(setup: Setup) -> None:
 @pytest.mark.parametrize(
     ("pdu", "message"),
     [
-        (good_read([1]), "1 registers came instead of 2"),
-        (good_read([1, 2, 3]), "3 registers came instead of 2"),
+        (good_read([1]), "1 registers instead of 2"),
+        (good_read([1, 2, 3]), "3 registers instead of 2"),
         (bytes([23, 4, 0, 1, 0, 2]), "function code 23"),
         (struct.pack(">BHH", 16, 0, 2), "function code 16"),
         (bytes([0x90, 2]), "function code 144"),
@@ -290,7 +290,6 @@ async def test_nothing_listening_is_link_down(setup: Setup) -> None:
         await link.connect()
     with pytest.raises(LinkDownError, match=r"next attempt to connect in 0\.1 s"):
         await link.connect()
-    assert link.reconnects == 0
 
 
 async def test_a_server_that_accepts_and_hangs_up_is_not_hammered(setup: Setup) -> None:
@@ -307,7 +306,6 @@ async def test_a_server_that_accepts_and_hangs_up_is_not_hammered(setup: Setup) 
         except LinkDownError:
             setup.clock.now_s += 0.01
     assert 6 <= setup.server.accepted <= 8  # at 0, 0.1, 0.3, 0.7, 1.5, 3.1, 6.3 s
-    assert link.reconnects == setup.server.accepted - 1
 
 
 async def test_a_valid_answer_ends_the_back_off(setup: Setup) -> None:
@@ -317,7 +315,7 @@ async def test_a_valid_answer_ends_the_back_off(setup: Setup) -> None:
     await link.read_holding(0, 1)
     assert link.retry_in_s == 0
     await link.connect()
-    assert (link.reconnects, setup.server.accepted) == (1, 2)
+    assert setup.server.accepted == 2
 
 
 def test_back_off_doubles_up_to_its_longest() -> None:

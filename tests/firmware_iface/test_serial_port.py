@@ -104,7 +104,6 @@ async def test_a_port_that_is_back_is_opened_at_once(tmp_path: Path) -> None:
     assert port.retry_in_s <= 0.1
     now_s += 0.1
     port.open(Ear())
-    assert port.reconnects == 0
     port.close()
     wire.unplug()
 
@@ -120,7 +119,6 @@ async def test_a_port_that_opens_but_never_answers_is_left_alone(wire: PtyWire) 
             pass
         now_s += 0.1
     assert 6 <= opened <= 8  # at 0, 0.1, 0.3, 0.7, 1.5, 3.1, 6.3 s
-    assert port.reconnects == opened - 1
     port.succeeded()
     assert port.retry_in_s == 0
     port.close()
@@ -214,7 +212,6 @@ async def test_modbus_through_the_kernel_and_a_replug(tmp_path: Path) -> None:
     wire.plug()
     await device.connect()
     assert await device.read_holding(0, 1) == [42]
-    assert device.reconnects == 1
     await device.close()
     wire.unplug()
 
@@ -224,7 +221,7 @@ async def test_a_wrong_baud_rate_is_garbage_and_said_to_be(tmp_path: Path) -> No
     wire.plug()
     device = RtuBus(SerialPort(str(wire.path), LINE), quiet_s=0.02).device(1, timeout_s=0.1)
     await device.connect()
-    with pytest.raises(LinkError, match=r"answer of unit|wrong baud|function code"):
+    with pytest.raises(LinkError, match=r"answer from unit|wrong baud|function code"):
         await device.read_holding(0, 1)
     await device.close()
     wire.unplug()

@@ -108,7 +108,7 @@ def test_a_power_cycle_is_seen_and_healed() -> None:
     async def test(bench: Bench) -> None:
         await bench.driver.set_pump(0.5)
         bench.emulator.power_cycle()  # enabled at what an analogue input says
-        with pytest.raises(LinkDownError, match=r"told 500\.000 mW, it has 250 mW.*restarted"):
+        with pytest.raises(LinkDownError, match=r"commanded 500\.000 mW, the pump has 250 mW.*restarted"):
             await bench.driver.pump_fraction()
         await bench.driver.open()
         await bench.driver.set_pump(0.5)

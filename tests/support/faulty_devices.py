@@ -149,7 +149,6 @@ class MemoryWire(SerialPort):
         if not self.plugged:
             raise LinkDownError(f"{self.name}: there is no such port")
         self._receiver = receiver
-        self._opened += 1
         self._device.attach(receiver.received)
 
     def write(self, data: bytes) -> None:

@@ -221,7 +221,7 @@ def room(around: Around) -> tuple[float, float]:
     down = around.holding_flow_um_per_s - around.least_flow_um_per_s
     if min(up, down) <= 0:
         raise ValueError(
-            f"no room about the holding flow of {around.holding_flow_um_per_s:.2f} um/s in the pump's range of "
+            f"no room around the holding flow of {around.holding_flow_um_per_s:.2f} um/s in the pump's range of "
             f"{around.least_flow_um_per_s:.2f} .. {around.full_flow_um_per_s:.2f} um/s: "
             + ("open the bleed" if down <= 0 else "find the leak")
         )

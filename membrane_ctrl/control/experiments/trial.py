@@ -9,7 +9,7 @@ from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments import machine, pump_map
 from membrane_ctrl.control.gas import PumpCurve
 
-# What may be asked of an experiment: plain data with bounds, so that it can come over a wire.
+# Specification of an experiment: plain data with bounds, as it comes over the control port.
 
 
 ExperimentKind = Literal["relay", "steps", "doublets", "multisine", "pump_map"]
@@ -37,7 +37,7 @@ _PATTERNS = {"steps": machine.steps, "doublets": machine.doublets, "multisine": 
 class Trial:
     """An experiment inside its guard, about `centre_um`.
 
-    Raises ValueError if the pump has no room about the holding flow, or the noise none in the limit; the message says
+    Raises ValueError if the pump has no room around the holding flow, or the noise fills the limit; the message says
     what would help.
     """
 
