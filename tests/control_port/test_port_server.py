@@ -341,12 +341,12 @@ def test_an_endpoint_that_is_flooded_is_said(tmp_path: Path, monkeypatch: pytest
         endpoint.bind(str(tmp_path / "control.sock"))
         endpoint.listen(0)
         first.connect(str(tmp_path / "control.sock"))
-        with pytest.raises(DeviceError, match="too many wait"):
+        with pytest.raises(DeviceError, match="too many connections"):
             PortClient.unix(tmp_path / "control.sock", print)
         before = signal.signal(signal.SIGWINCH, lambda *_: None)
         resize = threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGWINCH))  # of the terminal, while one waits
         resize.start()
-        with pytest.raises(DeviceError, match="too many wait"):
+        with pytest.raises(DeviceError, match="too many connections"):
             PortClient.unix(tmp_path / "control.sock", print)
         resize.join()
         signal.signal(signal.SIGWINCH, before)
