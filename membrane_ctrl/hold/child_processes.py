@@ -243,9 +243,7 @@ def _console(config: Config, clock: RunClock, rings: Rings, run_dir: Path, durat
 def _recorder(config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str) -> Make:
     from membrane_ctrl.recorder.process import RecorderSpec
 
-    spec = RecorderSpec(
-        run_dir, name, clock, config, rings.telemetry, rings.events, rings.shapes, rings.frames, rings.inputs
-    )
+    spec = RecorderSpec(run_dir, name, clock, config, rings.inputs, rings.events, rings.shapes, rings.frames)
 
     def make(resumes: int) -> tuple[Child, Connection]:
         ours, theirs = pipe()
