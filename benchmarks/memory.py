@@ -32,7 +32,7 @@ from benchmarks.recorded_hold import RunPart, parts_of
 from membrane_ctrl.alarms.process import AlarmsSpec, watch
 from membrane_ctrl.config.schema import Config, LoopConfig, RecordingConfig, ShapeConfig
 from membrane_ctrl.console.process import ConsoleSpec, console_main
-from membrane_ctrl.controller.tick import MESSAGE_BYTES
+from membrane_ctrl.controller.tick import MESSAGE_BYTES, RECORD, TICK
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import pack_estimate, unpack_estimate
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES
@@ -48,7 +48,6 @@ BETWEEN_S = 60  # 20 minutes in one write make the recorder take memory that a r
 RATE_HZ = 10.0
 _KEPT = round(2.5 * ROUND_S * RATE_HZ)
 _DOUBLE = struct.Struct("<d")
-_TICK_HEAD = struct.Struct("<cqd")  # of an inputs message: kind, tick, now_s
 _TIME, _TICK = FIELDS.index("mono_s"), FIELDS.index("tick")
 
 
@@ -138,9 +137,8 @@ def _children(
 ) -> tuple[list[Child], Connection]:
     ours, theirs = pipe()
     spec = RecorderSpec(
-        run_dir, "week", clock, config, rings["telemetry"], rings["events"], rings["shapes"], None, rings["inputs"],
-        flush_s=0.0,
-    )  # fmt: skip
+        run_dir, "week", clock, config, rings["inputs"], rings["events"], rings["shapes"], flush_s=0.0
+    )
     screen = ConsoleSpec(clock, rings["telemetry"], rings["events"], rings["shapes"], run_dir, config)
     alarms = AlarmsSpec(clock, rings["telemetry"], rings["events"], config.alarms, "week")
     return [
@@ -191,8 +189,14 @@ def _shape_later(message: bytes, by_s: float) -> bytes:
 
 
 def _tick_later(message: bytes, ticks: int, by_s: float) -> bytes:
-    kind, tick, now_s = _TICK_HEAD.unpack_from(message)
-    return message if kind != b"T" else _TICK_HEAD.pack(kind, tick + ticks, now_s + by_s) + message[_TICK_HEAD.size :]
+    if message[:1] != TICK:
+        return message
+    record = np.frombuffer(message[1 : 1 + RECORD.itemsize], dtype=RECORD).copy()
+    row = np.frombuffer(message[1 + RECORD.itemsize :], dtype="<f8").copy()
+    record["tick"] += ticks
+    record["now_s"] += by_s
+    row[[_TIME, _TICK]] += by_s, ticks
+    return TICK + record.tobytes() + row.tobytes()
 
 
 def _wait_for_writes(status: Connection, count: int) -> None:
@@ -203,9 +207,8 @@ def _wait_for_writes(status: Connection, count: int) -> None:
 
 def _thin_out(run_dir: Path) -> None:
     """A week is some GB: what is closed and optimised is not needed here."""
-    for pattern in ("*.rrd", "inputs-*.bin"):
-        for path in sorted(run_dir.glob(pattern))[:-30]:
-            path.unlink()
+    for path in sorted(run_dir.glob("*.rrd"))[:-30]:
+        path.unlink()
 
 
 def _own_mb(children: list[Child]) -> dict[str, float]:

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.controller.tick import RECORD, TICK, TickBatch
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.states import ShapeState, State
 from membrane_ctrl.model.telemetry import COLUMN, FIELDS, Rows
-from membrane_ctrl.run_files.tables import ColumnTables
+from membrane_ctrl.run_files.tables import GIVEN, ColumnTables
 
 RATE_HZ = 10.0
 CONFIG = Config(loop=LoopConfig(rate_hz=RATE_HZ))
@@ -126,6 +127,25 @@ def night(
     rows[:, COLUMN["sample_counter"]] = rows[:, COLUMN["tick"]]
     rows[:, COLUMN["device_time_s"]] = time_s
     return rows, list(_shapes(rng, time_s, rows, events))
+
+
+def batch_of(rows: Rows) -> TickBatch:
+    """Ticks with these rows, and what they were given as far as the rows say it."""
+    records = np.zeros(len(rows), dtype=RECORD)
+    for name, column in GIVEN.items():
+        if (field := column.removeprefix("given_")) in COLUMN:
+            records[name] = (
+                np.nan_to_num(rows[:, COLUMN[field]])
+                if records[name].dtype.kind in "iu"
+                else (rows[:, COLUMN[field]])
+            )
+    return TickBatch(records, rows, {}, {})
+
+
+def messages_of(rows: Rows) -> list[bytes]:
+    """These ticks as they cross to the recorder."""
+    batch = batch_of(rows)
+    return [TICK + record.tobytes() + row.tobytes() for record, row in zip(batch.records, rows, strict=True)]
 
 
 def _wander(rng: np.random.Generator, count: int, sd: float, tau_s: float) -> NDArray[np.float64]:
@@ -241,7 +261,7 @@ def write_run(folder: Path, parts: Iterator[tuple[Rows, list[ShapeEstimate]]]) -
     minute = round(60 * RATE_HZ)
     for rows, shapes in parts:
         for first in range(0, len(rows), minute):
-            tables.add_rows(rows[first : first + minute])
+            tables.add_ticks(batch_of(rows[first : first + minute]))
         for estimate in shapes:
             tables.add_shape(estimate)
         end_s = float(rows[-1, COLUMN["mono_s"]])

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from membrane_ctrl.acquisition.worker import estimate_message
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.tick import pack_tick
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
-from membrane_ctrl.model.shape_estimate import ShapeEstimate, unpack_estimate
+from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.processes.ring import RingWriter
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.truth_shape import TruthShape
@@ -60,7 +59,7 @@ class RealisticShapes:
 
 def ring_trip(estimate: ShapeEstimate) -> ShapeEstimate:
     """As the control process gets it from the ring."""
-    return unpack_estimate(estimate_message(estimate))
+    return unpack_estimate(pack_estimate(estimate))
 
 
 def parts_of(config: Config, duration_s: float, part_s: float) -> Iterator[RunPart]:
@@ -87,5 +86,7 @@ def _take(made: RunPart, tick: VirtualTick, number: int) -> None:
     made.telemetry.append(row)
     made.inputs += pack_tick(number, tick.inputs, tick.outputs, row)
     if tick.inputs.estimate is not None:
-        made.shapes.append(estimate_message(tick.inputs.estimate))
-    made.events += [json.dumps({"mono_s": tick.row.mono_s, **event}, default=str).encode() for event in tick.events]
+        made.shapes.append(pack_estimate(tick.inputs.estimate))
+    made.events += [
+        json.dumps({"mono_s": tick.row.mono_s, **event.to_dict()}, default=str).encode() for event in tick.events
+    ]

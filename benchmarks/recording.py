@@ -16,7 +16,6 @@ from benchmarks.recorded_hold import parts_of
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.telemetry import ROW_BYTES
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
 from membrane_ctrl.recorder.housekeeping import Optimizer
 from membrane_ctrl.recorder.recorder import Recorder
@@ -27,7 +26,6 @@ DAY_S = 86_400.0
 WRITE_S = 0.8  # the recorder's rounds: 0.75 s and a little
 DURATION_S = 3600  # one whole segment
 _RINGS = {
-    "telemetry": (400, ROW_BYTES),
     "inputs": (400, MESSAGE_BYTES),
     "shapes": (16, 1 << 16),
     "events": (64, 4096),
@@ -73,11 +71,10 @@ def _measured(folder: Path, stack: ExitStack) -> list[Figure]:
     recorder.finish(in_haste=True)
     optimising_s = _optimised_s(run_dir)
     days = DURATION_S / DAY_S
-    mb = {pattern: _bytes(run_dir, pattern) / 1e6 / days for pattern in ("*.rrd", "inputs-*.bin", "columns/*")}
+    mb = {pattern: _bytes(run_dir, pattern) / 1e6 / days for pattern in ("*.rrd", "columns/*")}
     return [
-        at_most("recording, optimised, without frames", sum(mb.values()), "MB a day", 1000.0),
+        at_most("recording, optimised, without frames", sum(mb.values()), "MB a day", 550.0),
         at_most("of it Rerun segments", mb["*.rrd"], "MB a day", None, "before optimising", before / 1e6 / days),
-        at_most("of it inputs", mb["inputs-*.bin"], "MB a day"),
         at_most("of it columns", mb["columns/*"], "MB a day"),
         at_most("optimising an hour at the lowest priority", optimising_s, "s"),
         at_most("recorder, share of a core", 100 * busy_s / DURATION_S, "%"),

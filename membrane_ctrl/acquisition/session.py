@@ -15,7 +15,7 @@ from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.metrology import live, phase
 from membrane_ctrl.model.clock import RunClock, pause_s
-from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
 from membrane_ctrl.processes import child, frames, ring
 from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics
 from membrane_ctrl.sim.sensors import Truth
@@ -169,7 +169,7 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
         )
 
         def publish(estimate: ShapeEstimate) -> None:
-            shapes.put(worker.estimate_message(estimate))
+            shapes.put(pack_estimate(estimate))
             if (notice := drift.after(estimate)) is not None:
                 remote.tell(notice)
             if raw is not None:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -57,16 +56,6 @@ def keep_cycling(
 def next_deadline_s(last_s: float, period_s: float, earliest_s: float) -> float:
     """The first moment of `last_s + k period_s`, k >= 1, that is not before `earliest_s`."""
     return last_s + max(1, math.ceil((earliest_s - last_s) / period_s)) * period_s
-
-
-def estimate_message(estimate: shape_estimate.ShapeEstimate) -> bytes:
-    """An estimate as it crosses in the ring of shapes, its covariance in the 24 bits of a single.
-
-    A variance known to 1e-7 is known better than its noise model, and what the controller is given has to be
-    recorded to the last bit: in doubles that would be 0.2 GB a day.
-    """
-    covariance_um2 = estimate.covariance_um2.astype(np.float32).astype(np.float64)
-    return shape_estimate.pack_estimate(replace(estimate, covariance_um2=covariance_um2))
 
 
 def _captured(

@@ -260,7 +260,7 @@ class RecordingConfig(Section):
     raw_every_cycles: Annotated[int, Field(ge=0, le=1_000_000)] = 0  # keep the frames of every n-th cycle; 0: of none
     raw_before_fault_cycles: Annotated[int, Field(ge=0, le=20)] = 2  # and always of the last before a fault
     segment_s: Annotated[float, Field(ge=10, le=86_400)] = 3600.0  # a crash leaves at most this much unoptimised
-    quiet_hz: Annotated[float, Field(ge=0.1, le=200)] = 2.0  # rows for the viewer while nothing happens
+    quiet_hz: Annotated[float, Field(ge=0.1, le=200)] = 1.0  # rows for the viewer while nothing happens
     keep_gb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None  # old runs beyond this are deleted; none: never
     keep_days: Annotated[float, Field(ge=0.1, le=1e5)] | None = None
 

@@ -55,13 +55,13 @@ class TickOutputs:
 
 # The inputs of a tick as bytes, exactly, so that a replay gives the same tick (docs/replay.md).
 #
-# A tick is one fixed record; what is rare (commands, ended tasks) precedes it as JSON, in pieces. A shape estimate is
-# named by its time only: the recorder has it from its own ring. Of the outputs only a checksum is kept: it tells
-# whether a replay is the same, in 4 bytes instead of 280.
+# A tick is one fixed record and its telemetry row; what is rare (commands, ended tasks) precedes it as JSON, in
+# pieces. A shape estimate is named by its time only: the recorder has it from its own ring. A checksum of all outputs
+# tells whether a replay is the same.
 
 # First bytes of the messages of the inputs ring.
 TICK, PIECE, MEMORY = b"T", b"P", b"M"
-MESSAGE_BYTES = 512  # a slot of the ring: a tick takes less, a longer command comes in pieces
+MESSAGE_BYTES = 512  # a slot of the ring: a tick takes 444, a longer command comes in pieces
 
 _FORMATS = {
     "displacement_quality": "i8", "sample_counter": "i8", "latched_faults": "i8", "watchdog_tripped": "u1",
@@ -79,11 +79,21 @@ RECORD = np.dtype(
     ]
 )  # fmt: skip
 Records = NDArray[np.void]
+# Fields of a record that the tick's telemetry row repeats.
+SAME = {
+    "now_s": "mono_s", "pump_fraction": "pump_readback_fraction", "vent_fraction": "vent_readback_fraction",
+    **{name: name for name in (
+        "tick", "lateness_ms", "missed_ticks", "ambient_pressure_pa", "air_temperature_c", "gas_temperature_c",
+        "device_time_s", "truth_displacement_um", "truth_laser_bias_um",
+    )},
+}  # fmt: skip
+_TAIL_LOST = 2**32 - 1  # no tail is that long
 
 # `struct` packs in 2 us what a NumPy record takes 10 us to fill
 _LETTERS = {"<i8": "q", "<f8": "d", "|u1": "B", "<u4": "I"}
 _STRUCT = struct.Struct("<" + "".join(_LETTERS[RECORD[name].str] for name in RECORD.names or ()))
 assert _STRUCT.size == RECORD.itemsize
+_ROW_PLACE = len(TICK) + RECORD.itemsize
 # Tables in, tables out, whatever a command comes to carry; a float keeps its last bit on the way.
 _COMMANDS = TypeAdapter(tuple[Command, ...])
 _reading_values = attrgetter(*_READING)  # ten times as fast as `astuple`
@@ -112,7 +122,16 @@ def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes, m
         output_crc(outputs, row),
         len(tail),
     )
-    return [*_pieces(MEMORY, memory), *_pieces(PIECE, tail), TICK + record]
+    return [*_pieces(MEMORY, memory), *_pieces(PIECE, tail), TICK + record + row]
+
+
+def pack_row(tick: int, row: telemetry.TelemetryRow) -> bytes:
+    """The message of a tick whose inputs cannot be packed: its row, and for a replay a gap."""
+    record = np.zeros(1, dtype=RECORD)
+    for name, field in SAME.items():
+        record[name] = getattr(row, field)
+    record["tick"], record["tail_bytes"] = tick, _TAIL_LOST
+    return TICK + record.tobytes() + row.pack()
 
 
 def _pieces(kind: bytes, data: bytes) -> list[bytes]:
@@ -168,9 +187,10 @@ def unpack_tick(record: np.void, tail: bytes, estimates: Mapping[float, shape_es
 
 @dataclass(frozen=True, slots=True)
 class TickBatch:
-    """Ticks taken from the ring, and the tails and memories of those that have one."""
+    """Ticks taken from the ring: inputs, telemetry rows, and by tick the tails and memories there are."""
 
     records: Records
+    rows: telemetry.Rows
     tails: dict[int, bytes]
     memories: dict[int, bytes]
 
@@ -184,12 +204,14 @@ class TickAssembler:
 
     def take(self, messages: list[bytes]) -> TickBatch:
         """Take in messages in their order; a tick may end in a later call than its pieces begin."""
-        ticks: list[bytes] = []
+        records: list[bytes] = []
+        rows: list[bytes] = []
         tails: dict[int, bytes] = {}
         memories: dict[int, bytes] = {}
         for message in messages:
             if message[:1] == TICK:
-                ticks.append(message[1:])
+                records.append(message[1:_ROW_PLACE])
+                rows.append(message[_ROW_PLACE:])
                 tick = int.from_bytes(message[1:9], "little")
                 for pieces, wholes in ((self._pieces, tails), (self._memory, memories)):
                     if pieces:
@@ -197,4 +219,4 @@ class TickAssembler:
                         pieces.clear()
             else:
                 (self._memory if message[:1] == MEMORY else self._pieces).append(message[1:])
-        return TickBatch(np.frombuffer(b"".join(ticks), dtype=RECORD), tails, memories)
+        return TickBatch(np.frombuffer(b"".join(records), dtype=RECORD), telemetry.unpack(rows), tails, memories)

@@ -173,9 +173,7 @@ class ChildProcesses:
         self._clock = clock
         self._summary = run_dir / "summary.json"
         console = ConsoleSpec(clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s)
-        recorder = RecorderSpec(
-            run_dir, name, clock, config, rings.telemetry, rings.events, rings.shapes, rings.frames, rings.inputs
-        )
+        recorder = RecorderSpec(run_dir, name, clock, config, rings.inputs, rings.events, rings.shapes, rings.frames)
         self._console = ManagedChild(
             _makes("screen", "console", 5, lambda n: replace(console, since_s=clock.now()) if n else console)
         )

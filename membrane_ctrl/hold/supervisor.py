@@ -16,7 +16,7 @@ from firmware_iface.roles import Bench, BenchCommand, BenchReading, LinkDownErro
 from membrane_ctrl.controller.commands import AT_END, Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import remember
-from membrane_ctrl.controller.tick import TickInputs, TickOutputs, pack_tick
+from membrane_ctrl.controller.tick import TickInputs, TickOutputs, pack_row, pack_tick
 from membrane_ctrl.model import errors, run_events, shape_estimate
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event, EventLine
@@ -83,7 +83,7 @@ class Supervisor:
             while True:
                 deadline_s += self._period_s
                 await asyncio.sleep(max(0.0, deadline_s - self._clock.now()))
-                now_s = self._clock.now()
+                now_s = round(self._clock.now(), 6)  # microseconds are recorded in half the bytes
                 late_s = now_s - deadline_s
                 skipped = max(0, int(late_s / self._period_s))
                 self.missed_ticks += skipped
@@ -91,7 +91,7 @@ class Supervisor:
                 if now_s >= ends_s:
                     self.ask(Command("stop", AT_END))
                     ends_s = math.inf
-                _, outputs = await self.tick(now_s, now_s - last_s, late_s)
+                _, outputs = await self.tick(now_s, round(now_s - last_s, 6), late_s)
                 last_s = now_s
                 if outputs.finished is not None:
                     return outputs.finished
@@ -118,7 +118,7 @@ class Supervisor:
             now_s=now_s,
             dt_s=dt_s,
             reading=reading,
-            lateness_ms=1e3 * late_s,
+            lateness_ms=round(1e3 * late_s, 3),
             missed_ticks=self.missed_ticks,
             link_up=self._link_up,
             estimate=self._newest_shape(),
@@ -148,7 +148,7 @@ class Supervisor:
         return remember(self._controller)
 
     def _record(self, inputs: TickInputs, outputs: TickOutputs, memory: bytes) -> None:
-        """Record the row, and the inputs for a replay; a value of a wrong type costs the replay, not the run."""
+        """Record the row, and the inputs for a replay; a value of a wrong type costs the replay, not the row."""
         if self._wiring.telemetry is None:
             return
         row = outputs.row.pack()
@@ -161,7 +161,7 @@ class Supervisor:
             if not self._inputs_error:
                 self._inputs_error = str(error)
                 self.tell(run_events.InputsNotRecorded(self._inputs_error))
-            return
+            messages = [pack_row(self.ticks, outputs.row)]
         for message in messages:
             self._wiring.inputs.put(message)
 

@@ -1,16 +1,19 @@
 """The result of a measurement cycle, and its bytes for control, recorder and sessions.
 
-The ring of shapes and a run's inputs file hold the same bytes: a line of JSON with numbers and words, the
-coefficients, the covariance (the upper half of a symmetric one). A reader checks every length, type and range first,
-because a run folder may come from anywhere.
+One line of JSON with the numbers and words, then the coefficients, then the upper half of the covariance in singles:
+a variance known to 1e-7 is known better than its noise model, and what the controller is given has to be recorded to
+the last bit. Earlier versions also wrote whole matrices and doubles. A reader checks every length, type and range
+first, because a run folder may come from anywhere.
 """
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -49,24 +52,31 @@ class ShapeEstimate:
 _WORDS = {"kind": get_args(Kind), "verdict": get_args(Verdict)}
 _ARRAYS = ("coeffs_um", "covariance_um2")
 _OTHERS = {"reason", "cycle", "tracking_lost"}
-_NUMBERS = tuple(field.name for field in fields(ShapeEstimate) if field.name not in {*_WORDS, *_ARRAYS, *_OTHERS})
-_KEYS = {*_NUMBERS, *_WORDS, *_OTHERS, "terms", "symmetric", "single"}
+NUMBERS = tuple(field.name for field in fields(ShapeEstimate) if field.name not in {*_WORDS, *_ARRAYS, *_OTHERS})
+_KEYS = {*NUMBERS, *_WORDS, *_OTHERS, "terms", "symmetric", "single"}
 _UPPER = np.triu_indices(TERMS)
+UPPER_TERMS = _UPPER[0].size
 _LINE_BYTES_MAX = 8192  # the numbers take 0.5 kB; the rest is room for a reason
 _COEFFS_BYTES = 8 * TERMS
 _LARGEST = 1e300  # no infinity, and no whole number that a float cannot hold
 
 
 def pack_estimate(estimate: ShapeEstimate) -> bytes:
-    """A shape estimate as bytes, exact to the last bit."""
-    covariance = np.asarray(estimate.covariance_um2, dtype="<f8")
-    symmetric = np.array_equal(covariance, covariance.T)
-    values = covariance[_UPPER] if symmetric else covariance.ravel()
-    single = np.array_equal(values, values.astype("<f4"), equal_nan=True)  # as the acquisition sends them
+    """A shape estimate as bytes, exact to the last bit but for the covariance, which is rounded to singles."""
     head = {field.name: getattr(estimate, field.name) for field in fields(ShapeEstimate) if field.name not in _ARRAYS}
-    line = json.dumps({**head, "terms": TERMS, "symmetric": symmetric, "single": single}, default=float)
-    coeffs = np.asarray(estimate.coeffs_um, dtype="<f8")
-    return b"\n".join((line.encode(), coeffs.tobytes() + values.astype("<f4" if single else "<f8").tobytes()))
+    return packed_parts(head, estimate.coeffs_um, upper_half(estimate.covariance_um2))
+
+
+def upper_half(covariance_um2: FloatArray) -> NDArray[np.float32]:
+    """(666,) singles: the upper half of a symmetric (36, 36) matrix, row by row."""
+    return ((covariance_um2 + covariance_um2.T) / 2)[_UPPER].astype("<f4")
+
+
+def packed_parts(head: Mapping[str, Any], coeffs_um: FloatArray, upper_um2: NDArray[np.float32]) -> bytes:
+    """The bytes of an estimate's numbers and words, (36,) coefficients and (666,) upper half."""
+    line = json.dumps({**head, "terms": TERMS, "symmetric": True, "single": True}, default=float)
+    arrays = np.asarray(coeffs_um, dtype="<f8").tobytes() + np.asarray(upper_um2, dtype="<f4").tobytes()
+    return line.encode() + b"\n" + arrays
 
 
 def unpack_estimate(data: bytes) -> ShapeEstimate:
@@ -103,7 +113,7 @@ def _checked(head: Any) -> tuple[bool, bool]:
     layout = (head.pop("terms", None), head.pop("symmetric", None), head.pop("single", None))
     if layout[0] != TERMS or not all(isinstance(flag, bool) for flag in layout[1:]):
         raise ValueError(f"shape estimate: not of {TERMS} terms")
-    for name in _NUMBERS:
+    for name in NUMBERS:
         value = head.get(name, math.nan)  # what an older version did not know is NaN
         if type(value) not in (float, int) or abs(value) > _LARGEST:
             raise ValueError(f"shape estimate: {name} is not a number")

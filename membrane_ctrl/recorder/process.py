@@ -29,7 +29,7 @@ from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
 if TYPE_CHECKING:
     from membrane_ctrl.recorder.sink import Recording
 
-# Rings are emptied this often: the telemetry ring has to hold a few of these.
+# Rings are emptied this often: the ring of ticks has to hold a few of these.
 POLL_S = 0.25
 # A recorder that has not got round for so long is replaced: half of what the rings hold, so that the next one
 # still finds everything. A disk that is slower than this for one second of a run is as good as gone.
@@ -48,16 +48,14 @@ class RecorderSpec:
         Name of the `.rrd` segments.
     clock : RunClock
     config : Config
-    telemetry : RingAddress
-        Packed `TelemetryRow`s.
+    inputs : RingAddress
+        The ticks (`tick.pack_tick`).
     events : RingAddress
         JSON objects with `time_utc`, `mono_s`, `kind`, ...; the one of kind "end" (with `exit`) is the last.
     shapes : RingAddress or None
         `estimate.pack_estimate`.
     frames : FrameAddress or None
         Shared camera frames, for thumbnails.
-    inputs : RingAddress or None
-        What the ticks were given (`tick_record`), for a replay.
     resumes : int
         How many recorders of this run have died before this one; it goes on where they stopped.
     flush_s : float
@@ -68,11 +66,10 @@ class RecorderSpec:
     run_name: str
     clock: RunClock
     config: Config
-    telemetry: RingAddress
+    inputs: RingAddress
     events: RingAddress
     shapes: RingAddress | None = None
     frames: FrameAddress | None = None
-    inputs: RingAddress | None = None
     resumes: int = 0
     flush_s: float = 1.0 - POLL_S
 
@@ -108,12 +105,7 @@ def _record(
     from membrane_ctrl.recorder.recorder import Recorder
     from membrane_ctrl.recorder.sink import Recording
 
-    addresses = {
-        "telemetry": spec.telemetry,
-        "events": spec.events,
-        "shapes": spec.shapes,
-        "inputs": spec.inputs,
-    }
+    addresses = {"inputs": spec.inputs, "events": spec.events, "shapes": spec.shapes}
     rings = {name: RingReader(address) for name, address in addresses.items() if address is not None}
     first = sum(1 for _ in spec.run_dir.glob(f"{spec.run_name}-*.rrd")) if spec.resumes else 0
     recording = Recording(spec.run_dir, spec.run_name, spec.clock, spec.config, first)

@@ -7,15 +7,14 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from membrane_ctrl import __version__
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import TickAssembler
-from membrane_ctrl.model import files, object_codec, plain_json, run_events, shape_estimate, telemetry
+from membrane_ctrl.model import files, object_codec, plain_json, run_events, shape_estimate
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.processes.ring import RingReader
 from membrane_ctrl.recorder import housekeeping, rerun_output, sink
-from membrane_ctrl.run_files import events, inputs_file, tables
+from membrane_ctrl.run_files import events, tables
 from membrane_ctrl.run_files.events import EventsFile
 from membrane_ctrl.run_files.summary import Summary
 
@@ -150,7 +149,7 @@ class Recorder:
     config : Config
         The run's configuration.
     rings : dict
-        Readers by name: "telemetry", "events", "inputs" and, if the shape is measured, "shapes".
+        Readers by name: "inputs" (the ticks), "events" and, if the shape is measured, "shapes".
     recording : Recording
         The Rerun file, no segment begun yet.
     thumbnails : FrameSource or None
@@ -198,13 +197,11 @@ class Recorder:
         self._events_lost = before.events_lost
         self._summary = before.summary
         self._columns = tables.ColumnTables(run_dir, before.windows if resumes else None)
-        self._inputs_file = inputs_file.InputsFile(run_dir, __version__, config.recording.segment_s)
         self._input_ticks_lost = before.input_ticks_lost
         self._assembler = TickAssembler()
         self._resumes = resumes
         self._began_anew = resumes > 0 and handed_on is None
         self._messages: list[bytes] = []
-        self._input_messages: list[bytes] = []
         self._shapes: list[shape_estimate.ShapeEstimate] = []
         self._events: list[EventLine] = []
         self._rows_lost = before.rows_lost
@@ -212,9 +209,7 @@ class Recorder:
 
     def drain(self) -> None:
         """Take in what the rings hold; events go to `events.jsonl` at once."""
-        self._messages += self._feeds["telemetry"].drain()
-        if "inputs" in self._feeds:
-            self._input_messages += self._feeds["inputs"].drain()
+        self._messages += self._feeds["inputs"].drain()
         if "shapes" in self._feeds:
             for message in self._feeds["shapes"].drain():
                 self._errors.guarded("shape estimate", partial(self._take_shape, message))
@@ -239,14 +234,13 @@ class Recorder:
         """Bring what came since the last call to the disk, and see that it got there."""
         now_s = self._clock.now()
         self._errors.guarded("new run folder", lambda: self._see_folder(now_s))
-        rows = telemetry.unpack(self._messages)
-        shapes, new_events = self._shapes, self._events
+        batch = self._assembler.take(self._messages)
+        rows, shapes, new_events = batch.rows, self._shapes, self._events
         self._messages, self._shapes, self._events = [], [], []
         self.urgent = False
         guarded = self._errors.guarded
-        guarded("inputs file", lambda: self._write_inputs(now_s, shapes))
         guarded("summary", lambda: self._summary.add_rows(rows))
-        guarded("tick columns", lambda: self._columns.add_rows(rows))
+        guarded("tick columns", lambda: self._columns.add_ticks(batch))
         guarded("columns", self._columns.sync)
         closed, self._rerun.closed = self._rerun.closed, []
         self._housekeeping.look(now_s, closed)
@@ -263,16 +257,9 @@ class Recorder:
         # never taken back: what is missing stays missing
         what = f"{self._run_dir} was removed or moved, and is begun anew at {now_s:.1f} s"
         self._errors.report_error("run folder", f"{what}; what was recorded before is not in it")
-        self._inputs_file.close()
         self._columns.leave_folder()
         self._rerun.leave_folder()
         self._events_file.begin_anew(self._events)
-
-    def _write_inputs(self, now_s: float, shapes: list[shape_estimate.ShapeEstimate]) -> None:
-        batch = self._assembler.take(self._input_messages)
-        self._input_messages = []
-        self._inputs_file.append(batch, shapes, now_s)
-        self._inputs_file.sync()
 
     def _hand_on(self) -> None:
         """Leave behind what another recorder would need to go on from here."""
@@ -286,7 +273,7 @@ class Recorder:
             self._errors.errors,
             self._rows_lost,
             self._events_lost + self._events_file.lost,
-            self._input_ticks_lost + self._inputs_file.lost_ticks,
+            self._input_ticks_lost + self._columns.lost_ticks,
             self._folder_anew_s,
         )
         save_state(self._run_dir, state)
@@ -308,16 +295,15 @@ class Recorder:
             "rows_lost": self._rows_lost,
             "column_rows_lost": self._columns.lost,
             "events_lost": self._events_lost + self._events_file.lost,
-            "input_ticks_lost": self._input_ticks_lost + self._inputs_file.lost_ticks,
+            "input_ticks_lost": self._input_ticks_lost + self._columns.lost_ticks,
             "restarts": self._resumes,
             "folder_anew_s": self._folder_anew_s,  # None: it is the one that was begun
             # without what the former recorder knew, the statistics begin with what the ring still had
-            "partial": self._began_anew and self._feeds["telemetry"].dropped > 0,
+            "partial": self._began_anew and self._feeds["inputs"].dropped > 0,
         }
         text = plain_json.dumps_checked(self._summary.as_dict(self._dropped(), account), indent=2) + "\n"
         guarded("summary.json", lambda: files.write_text_atomic(self._run_dir / "summary.json", text))
         self._events_file.close()
-        self._inputs_file.close()
         self._folder.close()
         remove_state(self._run_dir)
         # last, as nobody needs it: whoever is in a hurry may kill this process now

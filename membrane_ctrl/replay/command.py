@@ -1,24 +1,86 @@
-"""`replay RUN`: the run's recorded inputs through today's control code, and what is not the same."""
+"""`replay RUN`: the run's recorded inputs through today's control code, and what is not the same.
+
+With `--to-test` a stretch of it becomes an incident: `tests/incidents/<name>/` holds the run's configuration and
+inputs, and `incident.toml` with the decisions expected. Where the incident shows that the controller decided wrongly,
+a person writes there what it should have decided: the test then fails until it does.
+"""
 
 import json
 import math
+import re
+import shutil
 import sys
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import tomli_w
+
+from membrane_ctrl.config import toml_file
+from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.memory import UnknownMemoryError
+from membrane_ctrl.controller.tick import Records, TickBatch
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model import files, plain_json, shape_estimate, telemetry
 from membrane_ctrl.model.errors import Exit, InputError
-from membrane_ctrl.replay.incident import RecordedRun, open_run, write_incident
-from membrane_ctrl.replay.replay import (
-    Replay,
-    differing_fields,
-    recorded_ticks,
-    replay,
-    tick_to_begin_with,
-    unmatched,
-)
+from membrane_ctrl.model.run_events import from_dict
+from membrane_ctrl.replay import replay as replays
+from membrane_ctrl.run_files import inputs_file, run_folder, tables
+
+# What a replay needs of a run folder: configuration, inputs, recorded decisions, recorded rows.
+
+
+# A row is found in the recording by its time, which Rerun keeps in whole nanoseconds.
+_SAME_TIME_S = 2e-9
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedRun:
+    """A run folder, opened for a replay."""
+
+    folder: Path
+    config: Config
+    inputs: inputs_file.InputsReader
+    decisions: list[replays.Decision]
+    told_until_s: float  # the event log ends here, if a crash cut it
+    config_damage: str = ""  # not the configuration that the run had
+
+    def row_at(self, time_s: float) -> telemetry.TelemetryRow | None:
+        """The row that was recorded then; None if the recording does not have it."""
+        from membrane_ctrl.replay.repair import read_rows
+        from membrane_ctrl.run_files.segments import FAULTS
+
+        for path in sorted(self.folder.glob("*.rrd")):
+            try:
+                rows = read_rows(path)
+            except FAULTS:
+                continue
+            near = np.flatnonzero(np.abs(rows[:, 0] - time_s) < _SAME_TIME_S)
+            if near.size:
+                values = rows[near[0]].tolist()
+                return telemetry.TelemetryRow(time_s, *values[1:])
+        return None
+
+
+def open_run(folder: Path) -> RecordedRun:
+    """Open a run. Raises InputError in one line that names the folder and what is missing."""
+    if not (folder / "config.toml").is_file():
+        raise InputError(f"{folder}: not a run folder: there is no config.toml in it")
+    inputs = inputs_file.open_inputs(folder)
+    if not inputs.paths:
+        raise InputError(f"{folder}: no inputs: there is no table of ticks in columns/")
+    events = run_folder.read_events(folder, [])
+    cut = not any(event.get("kind") == "end" for event in events)
+    decisions = replays.decisions_of((run_folder.event_s(line), from_dict(line)) for line in events)
+    told_until_s = max((run_folder.event_s(event) for event in events), default=0.0) if cut else math.inf
+    config = toml_file.load(folder / "config.toml", Config, follow=False)
+    right = plain_json.comment_is_right(files.read_text(folder / "config.toml"))
+    damage = "" if right else "config.toml: does not fit its checksum (damaged or edited)"
+    return RecordedRun(folder, config, inputs, decisions, told_until_s, damage)
+
 
 # An event is stamped when it is told, at the end of its tick.
 DECISION_SLACK_S = 0.5
@@ -62,37 +124,39 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
     return int(Exit.DONE if report["verdict"] == "identical" else Exit.REJECTED)
 
 
-def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, Replay]:
+def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, replays.Replay]:
     """Begin at the last memory before `from_s`; with the run, if there is none or it is not of today's layout."""
     inputs = run.inputs.since(from_s)
-    begin = tick_to_begin_with(inputs, from_s)
+    begin = replays.tick_to_begin_with(inputs, from_s)
     if begin > 1:
         try:
-            return begin, replay(run.config, recorded_ticks(inputs, begin), zernike_projection(), from_s, to_s)
+            return begin, replays.replay(
+                run.config, replays.recorded_ticks(inputs, begin), zernike_projection(), from_s, to_s
+            )
         except UnknownMemoryError as error:
             print(f"from the run's start: {error}", file=sys.stderr)
         finally:
             run.inputs.program = inputs.program
     try:
-        return 1, replay(run.config, recorded_ticks(run.inputs), zernike_projection(), from_s, to_s)
+        return 1, replays.replay(run.config, replays.recorded_ticks(run.inputs), zernike_projection(), from_s, to_s)
     except UnknownMemoryError as error:  # one behind a gap
         print(f"without recorded memories: {error}", file=sys.stderr)
         run.inputs.damage.clear()  # it is told again
-        ticks = recorded_ticks(run.inputs, memories=False)
-        return 1, replay(run.config, ticks, zernike_projection(), from_s, to_s)
+        ticks = replays.recorded_ticks(run.inputs, memories=False)
+        return 1, replays.replay(run.config, ticks, zernike_projection(), from_s, to_s)
 
 
-def _report(run: RecordedRun, found: Replay, begin: int, to_s: float) -> dict[str, Any]:
+def _report(run: RecordedRun, found: replays.Replay, begin: int, to_s: float) -> dict[str, Any]:
     # where the log or the inputs end early, nothing is said of what came then
     end_s = min(to_s, run.told_until_s, found.last_s)
     today = [decision for decision in found.decisions if decision.time_s <= end_s]
     recorded = [d for d in run.decisions if found.begin_s <= d.time_s <= end_s + DECISION_SLACK_S]
     in_time = sum(decision.time_s <= end_s for decision in recorded)
-    decisions = unmatched(recorded[: max(in_time, len(today))], today, DECISION_SLACK_S)
+    decisions = replays.unmatched(recorded[: max(in_time, len(today))], today, DECISION_SLACK_S)
     first = found.first_different
     fields: dict[str, tuple[float, float]] | None = None
     if first is not None and (row := run.row_at(first.mono_s)) is not None:
-        fields = differing_fields(first, row)
+        fields = replays.differing_fields(first, row)
     return {
         "verdict": _verdict(found, bool(decisions), bool(run.inputs.damage)),
         "recorded_by": run.inputs.program,
@@ -111,7 +175,7 @@ def _report(run: RecordedRun, found: Replay, begin: int, to_s: float) -> dict[st
     }
 
 
-def _verdict(found: Replay, decisions_differ: bool, damaged: bool) -> str:
+def _verdict(found: replays.Replay, decisions_differ: bool, damaged: bool) -> str:
     """Identical only if everything was compared; behind a gap another decision says nothing of the code."""
     if found.different or (decisions_differ and not found.gaps):
         return "different"
@@ -143,3 +207,91 @@ def _lines(report: dict[str, Any]) -> list[str]:
         )
     lines += [f"damage     {sentence}" for sentence in report["damage"]]
     return lines
+
+
+SCHEMA = "membrane-incident/1"
+INCIDENTS = Path("tests/incidents")
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
+# An incident lives in the repository: what is larger than this is a recording.
+_BYTES_MAX = 4_000_000
+
+
+def write_incident(
+    run: RecordedRun, found: replays.Replay, name: str, begin: int, to_s: float, incidents: Path = INCIDENTS
+) -> Path:
+    """Make a test of a replay.
+
+    Parameters
+    ----------
+    run : RecordedRun
+        Its inputs are copied.
+    found : Replay
+        Its decisions are what the test expects.
+    name : str
+        Of the folder: small letters, digits, dash and underscore.
+    begin : int
+        Tick the test begins with: the run's first, or one that has the controller's memory with it.
+    to_s : float
+        Where the test ends.
+    incidents : Path
+        Where incidents are.
+
+    Raises
+    ------
+    InputError
+        A name that is none or taken, no such folder, or more than a repository should hold.
+    """
+    if not _NAME.fullmatch(name):
+        raise InputError(f"--to-test {name!r}: use small letters, digits, '-' and '_'")
+    if not incidents.is_dir():
+        raise InputError(f"{incidents}: no such folder; run this in the project's own folder")
+    folder = incidents / name
+    if folder.exists():
+        raise InputError(f"{folder}: is there already; choose another name")
+    folder.mkdir()
+    kept = tables.ColumnTables(folder)
+    for frame in _between(run.inputs.since(found.begin_s), begin, to_s):
+        kept.add_ticks(TickBatch(frame.records, _rows(frame.records), frame.tails, frame.memories))
+        for estimate in frame.estimates.values():
+            kept.add_shape(estimate)
+    kept.close()
+    about = {
+        "schema": SCHEMA,
+        "what": f"replay of {run.folder.resolve().name}",
+        "recorded_by": run.inputs.program,
+        "decisions": [
+            {"time_s": round(d.time_s, 3), "what": d.what} for d in replays.without_repeats(found.decisions)
+        ],
+    }
+    (folder / "incident.toml").write_text(tomli_w.dumps(about), encoding="utf-8")
+    (folder / "config.toml").write_text(toml_file.dump(run.config), encoding="utf-8")
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    if size > _BYTES_MAX:
+        shutil.rmtree(folder)
+        raise InputError(f"--to-test: {size / 1e6:.0f} MB is too much for a test; narrow it with --from and --to")
+    return folder
+
+
+def _rows(records: Records) -> telemetry.Rows:
+    """Telemetry rows as far as they repeat what the ticks were given, NaN otherwise."""
+    rows = np.full((len(records), len(telemetry.FIELDS)), np.nan)
+    for name, column in tables.GIVEN.items():
+        if (field := column.removeprefix("given_")) in telemetry.COLUMN:
+            rows[:, telemetry.COLUMN[field]] = records[name]
+    return rows
+
+
+def _between(frames: inputs_file.InputsReader, begin: int, to_s: float) -> Iterator[inputs_file.InputsFrame]:
+    before: dict[
+        float, shape_estimate.ShapeEstimate
+    ] = {}  # a shape may have come a frame ahead of the tick that used it
+    for frame in frames:
+        if len(frame.records) and frame.records["now_s"][0] > to_s:
+            return
+        wanted = (frame.records["now_s"] <= to_s) & (frame.records["tick"] >= begin)
+        ticks = set(frame.records["tick"][wanted].tolist())
+        tails = {tick: tail for tick, tail in frame.tails.items() if tick in ticks}
+        memories = {tick: memory for tick, memory in frame.memories.items() if tick == begin}
+        if ticks:
+            yield inputs_file.InputsFrame(frame.records[wanted], tails, memories, before | frame.estimates)
+        before = {} if ticks else frame.estimates

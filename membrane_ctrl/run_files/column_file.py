@@ -1,22 +1,23 @@
 """Tables beside the Rerun recording: Arrow streams that a crash leaves readable and that read back at disk speed.
 
-A Rerun segment holds a chunk an entity a second: made for looking, not for a statistic over 2.6e7 ticks. So each
-table is written a second time, as Arrow IPC streams `columns/<table>-000.arrows`, `-001`, ...: whole batches, no
-footer, so that what a killed recorder leaves is good up to its last batch, each under a checksum (`sealed_stream`).
-The batch it was filling is in a journal.
+A table is `columns/<table>-000.arrows`, `-001`, ...: whole batches, no footer, so that what a killed recorder leaves
+is good up to its last batch, each under a checksum (`sealed_stream`). The batch it was filling is in a journal.
 """
 
 import contextlib
 import math
+import os
+from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from membrane_ctrl import __version__
 from membrane_ctrl.model.files import sync_data
+from membrane_ctrl.run_files import column_codec
 from membrane_ctrl.run_files.sealed_stream import SealedStream, whole_batches
 
 # What a table has not written yet, on the disk all the same: a small file beside it that a crash leaves behind.
@@ -35,13 +36,18 @@ class Journal:
         Where it is; there is none while nothing waits.
     schema : pa.Schema
         Of the table.
+
+    Attributes
+    ----------
+    kept : int
+        Batches in it.
     """
 
     def __init__(self, path: Path, schema: pa.Schema) -> None:
         self._path = path
         self._schema = schema
         self._stream: SealedStream | None = None
-        self._kept = 0  # batches in it
+        self.kept = 0
 
     def left_behind(self) -> list[pa.RecordBatch]:
         """Whole batches that a recorder has left; what it was writing when it was killed is not among them."""
@@ -58,26 +64,26 @@ class Journal:
         OSError
             Full disk: the next call begins anew, with all that waits.
         """
-        if self._kept == len(waiting):
+        if self.kept == len(waiting):
             return
         try:
             if self._stream is None:
                 self._begin(waiting)
             else:
-                for batch in waiting[self._kept :]:
+                for batch in waiting[self.kept :]:
                     self._stream.write(batch)
             sync_data(self._path)
         except OSError:
             self.drop()
             raise
-        self._kept = len(waiting)
+        self.kept = len(waiting)
 
     def drop(self) -> None:
         """Nothing waits any more."""
         if self._stream is not None:
             self._stream.abandon()
         self._stream = None
-        self._kept = 0
+        self.kept = 0
         with contextlib.suppress(OSError):
             self._path.unlink(missing_ok=True)
 
@@ -94,8 +100,11 @@ class Journal:
 FOLDER = "columns"
 SUFFIX = ".arrows"
 SCHEMA_NAME = "membrane-columns/1"
-# As the Rerun segments: what is damaged is damaged for six hours at most.
+PROGRAM = f"membrane-ctrl {__version__}"
+# A damaged head costs six hours at most.
 FILE_S = 6 * 3600.0
+# A person who was told that the disk is full makes room.
+WAIT_S = 600.0
 
 
 class ColumnFile:
@@ -112,14 +121,10 @@ class ColumnFile:
     time_name : str
         Seconds of the run, rising.
     batch_s : float
-        Rows wait in memory and in the journal until they span this long.
+        Rows wait in memory and in the journal until they span this long, and `WAIT_S` longer for a full disk.
     resumed : bool
         Go on where another recorder died: with its journal, and without a row that it has written.
 
-    Attributes
-    ----------
-    lost : int
-        Rows given up because the disk would not take them.
     """
 
     def __init__(
@@ -127,17 +132,18 @@ class ColumnFile:
     ) -> None:
         self._folder = run_dir / FOLDER
         self._table = table
-        about = {"schema": SCHEMA_NAME, "table": table, "run": run_dir.name}
+        about = {"schema": SCHEMA_NAME, "table": table, "run": run_dir.name, "program": PROGRAM}
         self._schema = schema.with_metadata(about)
         self._time_name = time_name
         self._batch_s = batch_s
-        self._waiting: list[pa.RecordBatch] = []
+        self._stored = column_codec.stored_schema(self._schema)
+        self._waiting: deque[pa.RecordBatch] = deque()
         self._until_s = -math.inf  # time of the last row taken in
         self._number = 0
-        self._path = self._folder
+        self._path, self._head_bytes = self._folder, 0
         self._file_until_s = 0.0
         self._stream: SealedStream | None = None
-        self.lost = 0
+        self._given_up = 0
         self._journal = Journal(self._folder / f"{table}-waiting{SUFFIX}", self._schema)
         if resumed:
             self._until_s = self._last_written_s()
@@ -150,7 +156,7 @@ class ColumnFile:
         Raises
         ------
         OSError
-            Full disk: the full batch is lost.
+            Full disk: the rows wait for the next call.
         """
         arrays = [pa.array(columns[field.name], type=field.type) for field in self._schema]
         if not self._take(pa.record_batch(arrays, schema=self._schema)):
@@ -173,26 +179,45 @@ class ColumnFile:
     def _first_s(self) -> float:
         return float(self._waiting[0].column(self._time_name)[0].as_py())
 
+    @property
+    def lost(self) -> int:
+        """Rows that no file has: given up, or still waiting for the disk."""
+        return self._given_up + sum(int(batch.num_rows) for batch in list(self._waiting)[self._journal.kept :])
+
     def flush(self) -> None:
         """Write what waits as one batch. Raises OSError as `add`."""
         if not self._waiting:
             return
-        first_s = self._first_s
-        batches, self._waiting = self._waiting, []
-        batch = pa.Table.from_batches(batches).combine_chunks().to_batches()[0]
+        batch = pa.Table.from_batches(self._waiting).combine_chunks().to_batches()[0]
         try:
-            self._open_for(first_s).write(batch)
-            sync_data(self._path)  # before the journal goes
-            self._journal.drop()
+            self._append(batch)
         except OSError:
-            self.lost += batch.num_rows
-            with contextlib.suppress(OSError):
-                self.close_file()
+            while self._until_s - self._first_s > self._batch_s + WAIT_S:
+                self._given_up += self._waiting.popleft().num_rows
+            raise
+        self._waiting.clear()
+        self._journal.drop()
+
+    def _append(self, batch: pa.RecordBatch) -> None:
+        """All of a batch, or nothing. Raises OSError."""
+        stream, whole_bytes = self._open_for(self._first_s), 0
+        try:
+            whole_bytes = self._path.stat().st_size
+            stream.write(*column_codec.encode(batch, self._stored))
+            sync_data(self._path)  # before the journal goes
+        except OSError:
+            stream.abandon()
+            self._stream = None
+            with contextlib.suppress(OSError):  # half a batch is damage to a reader, and what is there is room
+                if whole_bytes > self._head_bytes:
+                    os.truncate(self._path, whole_bytes)
+                else:
+                    self._path.unlink(missing_ok=True)
             raise
 
     def sync(self) -> None:
         """Bring what waits to the journal. Raises OSError (full disk): it goes on waiting."""
-        self._journal.keep(self._waiting)
+        self._journal.keep(list(self._waiting))
 
     def close(self) -> None:
         """Write what waits and end the file. Raises OSError."""
@@ -223,8 +248,12 @@ class ColumnFile:
             self._folder.mkdir(exist_ok=True)
             while (path := self._folder / f"{self._table}-{self._number:03d}{SUFFIX}").exists():
                 self._number += 1  # also those of a recorder that was killed
-            self._path = path
-            self._stream = SealedStream(path, self._schema, "zstd")
+            try:
+                self._stream = SealedStream(path, self._stored, "zstd")
+                self._path, self._head_bytes = path, path.stat().st_size
+            except OSError:
+                path.unlink(missing_ok=True)
+                raise
             self._file_until_s = time_s + FILE_S
         return self._stream
 
@@ -238,75 +267,3 @@ class ColumnFile:
             if last_s > -math.inf:
                 return last_s
         return -math.inf
-
-
-# Tick records as columns that zlib can make something of, and back to the last bit.
-#
-# A column whose values are short decimals (a device counts in tenths of a micrometre, and 12.3 is the double nearest
-# to 123 / 10) goes as the differences of those whole numbers; any other as the exclusive or with the tick before. Of
-# either the bytes are sorted by their place: the first of all ticks, then the second.
-
-
-_AS_IT_IS = 255
-_DIGITS_MAX = 6
-
-
-def encode_columns(records: NDArray[np.void]) -> bytes:
-    """(n,) records as bytes: for each field its code (digits, or 255) and its column."""
-    if not len(records):
-        return b""
-    return b"".join(_encode(np.ascontiguousarray(records[name])) for name in records.dtype.names or ())
-
-
-def decode_columns(data: bytes, kind: np.dtype[np.void], count: int) -> tuple[NDArray[np.void], int]:
-    """(count,) records of a kind, and how many bytes of `data` they took. Raises ValueError if there are too few."""
-    # before the memory is taken: a count may be anything
-    if count * sum(min(4, kind[name].itemsize) for name in kind.names or ()) > len(data):
-        raise ValueError(f"{count} ticks are said to be in {len(data)} bytes")
-    records = np.empty(count, dtype=kind)
-    if not count:
-        return records, 0
-    place = 0
-    for name in kind.names or ():
-        field = kind[name]
-        if place >= len(data):
-            raise ValueError("too short for its ticks")
-        code = data[place]
-        if code != _AS_IT_IS and (code > _DIGITS_MAX or field.kind != "f"):
-            raise ValueError(f"column {name} has no code {code}")
-        size = count * (4 if code != _AS_IT_IS else field.itemsize)
-        records[name] = _decode(code, data[place + 1 : place + 1 + size], field, count)
-        place += 1 + size
-    return records, place
-
-
-def _encode(column: NDArray[Any]) -> bytes:
-    if column.dtype.kind == "f" and np.isfinite(column).all():
-        largest = float(np.abs(column).max())
-        for digits in range(_DIGITS_MAX + 1):
-            if largest * 10.0**digits >= 2**30:
-                break
-            whole = np.rint(column * 10.0**digits).astype("<i4")
-            if _same(whole / 10.0**digits, column):
-                return bytes([digits]) + _by_place(np.diff(whole, prepend=np.int32(0)).astype("<i4"))
-    planes = column.view("u1").reshape(len(column), -1)
-    return bytes([_AS_IT_IS]) + _by_place(np.vstack((planes[:1], planes[1:] ^ planes[:-1])))
-
-
-def _decode(code: int, data: bytes, field: np.dtype[Any], count: int) -> NDArray[Any]:
-    width = 4 if code != _AS_IT_IS else field.itemsize
-    planes = np.frombuffer(data, dtype="u1").reshape(width, count).T
-    if code == _AS_IT_IS:
-        return np.ascontiguousarray(np.bitwise_xor.accumulate(planes, axis=0)).view(field).reshape(count)
-    steps = np.ascontiguousarray(planes).view("<i4").reshape(count)
-    decoded: NDArray[Any] = np.cumsum(steps, dtype=np.int64) / 10.0**code
-    return decoded
-
-
-def _same(values: NDArray[Any], column: NDArray[Any]) -> bool:
-    """To the last bit: minus zero is not zero."""
-    return bool(np.array_equal(values.view("<u8"), column.view("<u8")))
-
-
-def _by_place(values: NDArray[Any]) -> bytes:
-    return np.ascontiguousarray(values.view("u1").reshape(len(values), -1).T).tobytes()

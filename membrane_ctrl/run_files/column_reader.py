@@ -1,4 +1,4 @@
-"""Reads the tables beside a recording (`recording.column_file`); what is damaged is said, the rest is given."""
+"""Reads the tables beside a recording (`column_file`); reports what is damaged and gives the rest."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ import pyarrow as pa
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.files import open_plain, read_bytes
-from membrane_ctrl.run_files import sealed_stream, tables
+from membrane_ctrl.model.shape_estimate import UPPER_TERMS
+from membrane_ctrl.run_files import column_codec, sealed_stream, tables
 from membrane_ctrl.run_files.column_file import FOLDER, SUFFIX
 
 # Times that a file's rows cannot have: a flipped byte makes a second of the year 30 000 000 and a run as long.
@@ -37,7 +38,8 @@ _TIMES = ("mono_s", "time_s")
 _LOOK_BYTES = 1 << 20  # holds the head and a first batch
 # Columns of `shapes` that are no numbers.
 _WORDS = frozenset({"kind", "verdict", "reason"})
-_LISTS = frozenset({"coeffs_um", "covariance_um2"})
+_PLAIN = {"data": pa.binary(), "tracking_lost": pa.bool_()}
+_LISTS = {"coeffs_um": 36, "covariance_um2": 36 * 36, "upper_um2": UPPER_TERMS}
 # What is in memory at a time, whatever a file is: numbers of eight bytes, and what a batch holds besides.
 _PART_CELLS = 24_000_000
 _PART_BYTES = 200_000_000
@@ -80,8 +82,10 @@ def read_file(path: Path, names: Sequence[str] | None, notes: list[str], over: b
     return found[0]
 
 
-def read_parts(path: Path, names: Sequence[str] | None, notes: list[str], over: bool = False) -> Iterator[pa.Table]:
-    """One file's columns, in parts of at most `_PART_CELLS`; none if nothing of it can be read.
+def read_parts(
+    path: Path, names: Sequence[str] | None, notes: list[str], over: bool = False, cells: int = _PART_CELLS
+) -> Iterator[pa.Table]:
+    """One file's columns, in parts of at most so many cells; none if nothing of it can be read.
 
     Parameters
     ----------
@@ -93,6 +97,8 @@ def read_parts(path: Path, names: Sequence[str] | None, notes: list[str], over: 
         Gets a line for a file that is damaged, or of a version without a wanted column.
     over : bool
         The file should have an end: it is its table's last one, and the run was closed.
+    cells : int
+        Of a part that has more than one batch.
     """
     try:
         # a plain read: the pages of a mapped file would count as ours
@@ -101,14 +107,14 @@ def read_parts(path: Path, names: Sequence[str] | None, notes: list[str], over: 
             add_note(notes, f"{path.name}: cannot be read ({'its head is damaged' if content.damage else 'empty'})")
             return
         sealed_stream.require_bounded(content.data)
-        for table in _parts(path, content, names, notes, over):
+        for table in _parts(path, content, names, notes, over, cells):
             yield table if content.sealed else _possible(path, table, notes)
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+    except (pa.ArrowException, OSError, ValueError) as error:
         add_note(notes, f"{path.name}: cannot be read ({_first_line(error)})")
 
 
 def _parts(
-    path: Path, content: sealed_stream.Unsealed, names: Sequence[str] | None, notes: list[str], over: bool
+    path: Path, content: sealed_stream.Unsealed, names: Sequence[str] | None, notes: list[str], over: bool, cells: int
 ) -> Iterator[pa.Table]:
     schema = pa.ipc.open_stream(content.data).schema
     known = [name for name in dict.fromkeys(schema.names) if _is_ours(schema, name)]
@@ -118,30 +124,27 @@ def _parts(
         add_note(notes, f"{path.name}: written by another version, without {', '.join(absent)}")
     if not wanted:
         return
-    # one thread: buffers of a minute are too small to hand around
-    options = pa.ipc.IpcReadOptions(included_fields=[schema.names.index(n) for n in wanted], use_threads=False)
-    reader = pa.ipc.open_stream(content.data, options=options)
     waiting: list[pa.RecordBatch] = []
     spans: list[_Span] = []
-    rows_max = _PART_CELLS // max(len(wanted), len(names or ()))
+    rows_max = cells // max(len(wanted), len(names or ()))
     error: Exception | None = None
     try:
-        for batch in reader:
-            batch.validate(full=True)  # Arrow trusts lengths and offsets otherwise, and reads what is not its own
-            if batch.num_rows > rows_max or any(column.null_count for column in batch.columns):
+        for batch in sealed_stream.decoded_batches(content.data, wanted):
+            if batch.num_rows > _PART_CELLS // len(wanted) or any(column.null_count for column in batch.columns):
                 raise pa.ArrowInvalid("a batch that no recorder writes")
             if waiting and (
                 sum(each.num_rows for each in waiting) + batch.num_rows > rows_max
                 or sum(each.nbytes for each in waiting) + batch.nbytes > _PART_BYTES
             ):
-                yield pa.Table.from_batches(waiting, schema=reader.schema).select(wanted)
+                yield pa.Table.from_batches(waiting)
                 waiting = []
             waiting.append(batch)
             spans.append(_span(batch))
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as found:
+    except (pa.ArrowException, OSError, ValueError) as found:
         error = found
     _note_damage(path, content, spans, notes, over, error)
-    yield pa.Table.from_batches(waiting, schema=reader.schema).select(wanted)
+    if waiting:
+        yield pa.Table.from_batches(waiting)
 
 
 def _note_damage(
@@ -169,12 +172,17 @@ def _is_ours(schema: pa.Schema, name: str) -> bool:
     """Whether a column is of the kind that a recorder writes under its name, and there once."""
     places = schema.get_all_field_indices(name)
     kind = schema.field(places[0]).type
+    stored = column_codec.kind_of(schema.field(places[0]))
     if name in _WORDS:
         right = pa.types.is_string(kind)
+    elif name in _PLAIN:
+        right = stored is None and kind == _PLAIN[name]
     elif name in _LISTS:
-        right = isinstance(kind, (pa.ListType, pa.FixedSizeListType)) and pa.types.is_floating(kind.value_type)
+        listed = isinstance(kind, (pa.ListType, pa.FixedSizeListType)) and pa.types.is_floating(kind.value_type)
+        right = listed if stored is None else stored[0] == _LISTS[name] and stored[1].kind == "f"
     else:
-        right = pa.types.is_floating(kind) or pa.types.is_integer(kind)
+        plain = pa.types.is_floating(kind) or pa.types.is_integer(kind)
+        right = plain if stored is None else stored[0] == 1
     return len(places) == 1 and right
 
 
@@ -201,14 +209,23 @@ def first_column(path: Path, name: str) -> FloatArray:
         with open_plain(path) as file:
             content = sealed_stream.unseal(file.read(_LOOK_BYTES))
         sealed_stream.require_bounded(content.data)
-        reader = pa.ipc.open_stream(content.data)
-        if name not in reader.schema.names or not _is_ours(reader.schema, name):
+        schema = pa.ipc.open_stream(content.data).schema
+        if name not in schema.names or not _is_ours(schema, name):
             return np.empty(0)
-        batch = reader.read_next_batch()
-        batch.validate(full=True)
+        batch = next(sealed_stream.decoded_batches(content.data, [name]))
         return np.asarray(batch.column(name).to_numpy(zero_copy_only=False), dtype=np.float64)
-    except (pa.ArrowException, OSError, StopIteration, UnicodeDecodeError):
+    except (pa.ArrowException, OSError, StopIteration, ValueError):
         return np.empty(0)
+
+
+def written_by(path: Path) -> str:
+    """The program that wrote a file; empty if it does not say."""
+    try:
+        with open_plain(path) as file:
+            schema = pa.ipc.open_stream(sealed_stream.unseal(file.read(_LOOK_BYTES)).data).schema
+        return str((schema.metadata or {}).get(b"program", b"").decode(errors="replace"))
+    except (pa.ArrowException, OSError, ValueError):
+        return ""
 
 
 @dataclass(frozen=True, slots=True)

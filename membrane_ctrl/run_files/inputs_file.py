@@ -1,30 +1,30 @@
-"""`inputs-000.bin`, `-001`, ...: everything the controller was given, for a replay (docs/replay.md).
-
-A file is one line of JSON and then frames, one a second: magic, length, CRC-32, zlib. A frame is whole or it is not
-there: what a crash or a bad sector leaves is read up to the damage and from the next magic on. In a frame the ticks'
-records come first, in columns (`column_codec`), then the rare parts.
-"""
+"""What the controller was given, tick by tick, for a replay (docs/replay.md)."""
 
 from __future__ import annotations
 
-import contextlib
-import errno
-import json
 import math
-import os
 import struct
 import zlib
-from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
 
-from membrane_ctrl.controller.tick import RECORD, Records, TickBatch
+from membrane_ctrl.controller.tick import RECORD, Records
 from membrane_ctrl.model import files, plain_json, shape_estimate
-from membrane_ctrl.run_files.column_file import decode_columns, encode_columns
+from membrane_ctrl.run_files import column_reader, shapes, tables
 
+T = TypeVar("T")
+# A shape is used within seconds of its exposures.
+_SHAPE_BEFORE_S = 60.0
+_NEEDED = ("tick", "now_s", "output_crc", "tail_bytes")
+
+# Files of earlier versions.
 SCHEMA = "membrane-inputs/1"
 _MAGIC = b"MBRNin01"
 _HEAD = struct.Struct("<8sII")  # magic, bytes that follow, their CRC-32
@@ -32,101 +32,12 @@ _COUNT = struct.Struct("<I")
 _PART = struct.Struct("<cqI")  # kind, tick, bytes that follow
 _TAIL, _SHAPE, _MEMORY = b"C", b"S", b"M"
 _LOOK_BYTES = 1 << 20  # holds a first frame, whatever is in it
-# While the disk is full frames wait here, one a second: ten minutes, in which a person who was told makes room; 2 MB.
-WAITING_MAX = 600
 # A file of six hours at 200 Hz is 130 MB, a second 100 kB; a shape with its covariance is 12 kB, a memory 30 kB.
 _FILE_BYTES_MAX = 300_000_000
 _BODY_BYTES_MAX = 16_000_000
 _HEAD_BYTES_MAX = 65_536
 # What a record's fields may be: no objects, no arrays.
 _CODES = {code: code for code in ("<i8", "<f8", "|u1", "<u4")}
-_NEEDED = ("tick", "now_s", "output_crc", "tail_bytes")
-
-
-class InputsFile:
-    """Appends frames; what a full disk does not take waits, and the next call goes on where this one stopped.
-
-    Parameters
-    ----------
-    run_dir : Path
-        Folder of the run.
-    version : str
-        Of the program; a replay by another one says so.
-    segment_s : float
-        Length of a file.
-    """
-
-    def __init__(self, run_dir: Path, version: str, segment_s: float = math.inf) -> None:
-        self._run_dir = run_dir
-        self._segment_s = segment_s
-        self._segment_until_s = math.inf
-        head = {"schema": SCHEMA, "program": f"membrane-ctrl {version}", "fields": [list(f) for f in RECORD.descr]}
-        self._head = json.dumps(head).encode() + b"\n"
-        self._descriptor: int | None = None
-        self._waiting: deque[tuple[int, bytes]] = deque()  # ticks in it, frame
-        self._given_up_ticks = 0
-
-    @property
-    def lost_ticks(self) -> int:
-        """Ticks that no file has: given up, or still waiting for the disk."""
-        return self._given_up_ticks + sum(ticks for ticks, _ in self._waiting)
-
-    def append(self, batch: TickBatch, shapes: list[shape_estimate.ShapeEstimate], now_s: float = 0.0) -> None:
-        """Write one frame, and those still waiting from before. Raises OSError (full disk): it waits."""
-        if len(batch.records) or shapes:
-            self._waiting.append((len(batch.records), _packed(batch, shapes)))
-        while len(self._waiting) > WAITING_MAX:
-            self._given_up_ticks += self._waiting.popleft()[0]
-        while self._waiting:
-            self._write(self._descriptor_at(now_s), self._waiting[0][1])
-            self._waiting.popleft()
-
-    def _descriptor_at(self, now_s: float) -> int:
-        if now_s >= self._segment_until_s:
-            self.close()
-        if self._descriptor is None:
-            number = sum(1 for _ in self._run_dir.glob("inputs-*.bin"))
-            path = self._run_dir / f"inputs-{number:03d}.bin"
-            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
-            self._segment_until_s = now_s + self._segment_s
-        if not os.lseek(self._descriptor, 0, os.SEEK_CUR):
-            self._write(self._descriptor, self._head)
-        return self._descriptor
-
-    @staticmethod
-    def _write(descriptor: int, data: bytes) -> None:
-        """All of it or nothing. Raises OSError."""
-        before = os.lseek(descriptor, 0, os.SEEK_CUR)
-        try:
-            written = os.write(descriptor, data)
-            if written < len(data) and os.write(descriptor, data[written:]) < len(data) - written:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        except OSError:
-            with contextlib.suppress(OSError):  # half a frame is damage to a reader, and what is there is room
-                os.ftruncate(descriptor, before)
-            os.lseek(descriptor, before, os.SEEK_SET)
-            raise
-
-    def sync(self) -> None:
-        """Wait until the disk has it. Raises OSError."""
-        if self._descriptor is not None:
-            os.fdatasync(self._descriptor)
-
-    def close(self) -> None:
-        """Close the file there is."""
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
-
-
-def _packed(batch: TickBatch, shapes: list[shape_estimate.ShapeEstimate]) -> bytes:
-    parts = [(_TAIL, tick, tail) for tick, tail in batch.tails.items()]
-    parts += [(_MEMORY, tick, memory) for tick, memory in batch.memories.items()]
-    parts += [(_SHAPE, 0, shape_estimate.pack_estimate(shape)) for shape in shapes]
-    body = _COUNT.pack(len(batch.records)) + encode_columns(batch.records)
-    body += b"".join(_PART.pack(kind, tick, len(data)) + data for kind, tick, data in parts)
-    packed = zlib.compress(body, 6)
-    return _HEAD.pack(_MAGIC, len(packed), zlib.crc32(packed)) + packed
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,12 +51,14 @@ class InputsFrame:
 
 
 class InputsReader:
-    """Reads the `inputs-*.bin` of a folder frame by frame; damage is listed, not raised.
+    """Reads what the ticks of a run were given; damage is listed, not raised.
 
     Parameters
     ----------
     folder : Path
         Of the run, or of an incident.
+    paths : list of Path
+        Its files.
 
     Attributes
     ----------
@@ -155,14 +68,132 @@ class InputsReader:
         What could not be read so far, one line a place.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, paths: list[Path]) -> None:
         self._folder = folder
-        self.paths = sorted(folder.glob("inputs-*.bin"))
+        self.paths = paths
         self.program = ""
         self.damage: list[str] = []
 
     def __iter__(self) -> Iterator[InputsFrame]:
-        """All frames in order; a tick that was written twice (a recorder that went on) comes once. Raises OSError."""
+        """All frames in order; a tick that was written twice (a recorder that went on) comes once."""
+        raise NotImplementedError
+
+    def since(self, time_s: float) -> InputsReader:
+        """A reader that begins with the last memory before this time of the run, or earlier."""
+        raise NotImplementedError
+
+
+def open_inputs(folder: Path) -> InputsReader:
+    """Reader of a run's inputs: of the tables, or of the `inputs-*.bin` of earlier versions."""
+    earlier = sorted(folder.glob("inputs-*.bin"))
+    if earlier:
+        return FramesReader(folder, earlier)
+    return TablesReader(folder, column_reader.column_files(folder, tables.TICKS))
+
+
+class TablesReader(InputsReader):
+    """Reads the tables `ticks`, `rare` and `shapes`, a batch of ticks after the other."""
+
+    _from_s = -math.inf
+
+    def __iter__(self) -> Iterator[InputsFrame]:
+        """All frames in order, each with the rare parts and shapes up to its end."""
+        last = 0
+        rare = _Ahead((row.time_s, row) for row in self._rare())
+        figures = _Ahead((estimate.time_s, estimate) for estimate in self._estimates())
+        for table in self._tables(tables.TICKS, tuple(tables.GIVEN.values())):
+            records = self._records(table)
+            records = records[(records["tick"] > last) & (records["now_s"] >= self._from_s)]
+            if not len(records):
+                continue
+            last, until_s = int(records["tick"][-1]), float(records["now_s"][-1])
+            parts = list(rare.until(until_s))
+            tails = {row.tick: row.data for row in parts if row.kind == tables.COMMANDS}
+            memories = {row.tick: row.data for row in parts if row.kind == tables.MEMORY}
+            yield InputsFrame(records, tails, memories, {found.time_s: found for found in figures.until(until_s)})
+
+    def since(self, time_s: float) -> InputsReader:
+        """A reader that begins with the last memory before this time of the run."""
+        found = TablesReader(self._folder, self.paths)
+        times_s = [row.time_s for row in found._rare() if row.kind == tables.MEMORY and row.time_s <= time_s]
+        found.damage.clear()  # it is told again when the file is read
+        found._from_s = max(times_s, default=-math.inf)
+        return found
+
+    def _tables(self, table: str, names: Sequence[str], before_s: float = 0.0) -> Iterator[pa.Table]:
+        """A table's batches, without the files that end before the reader begins."""
+        paths = column_reader.column_files(self._folder, table)
+        begin_s = self._from_s - before_s
+        time_name = "mono_s" if table == tables.TICKS else "time_s"
+        for place, path in enumerate(paths):
+            if math.isfinite(begin_s) and place + 1 < len(paths):
+                next_s = column_reader.first_s(paths[place + 1], time_name)
+                if next_s is not None and next_s < begin_s:
+                    continue
+            if table == tables.TICKS:
+                self.program = column_reader.written_by(path) or self.program
+            yield from column_reader.read_parts(path, names, self.damage, cells=0)
+
+    def _records(self, table: pa.Table) -> Records:
+        """The records of a batch: what they lack is NaN or 0; none without what every record has."""
+        names = {tables.GIVEN[name] for name in _NEEDED}
+        records = np.zeros(table.num_rows if names <= set(table.column_names) else 0, dtype=RECORD)
+        for name, column in tables.GIVEN.items() if len(records) else ():
+            with np.errstate(invalid="ignore"):
+                if column in table.column_names:
+                    records[name] = table.column(column).to_numpy()
+                elif RECORD[name].kind == "f":
+                    records[name] = np.nan
+        return records
+
+    def _rare(self) -> Iterator[_Rare]:
+        for table in self._tables(tables.RARE, tables.rare_schema().names):
+            if table.column_names == tables.rare_schema().names:
+                rows = zip(*(table.column(name).to_pylist() for name in table.column_names), strict=True)
+                yield from (row for row in (_Rare(*values) for values in rows) if row.time_s >= self._from_s)
+
+    def _estimates(self) -> Iterator[shape_estimate.ShapeEstimate]:
+        for table in self._tables(tables.SHAPES, shapes.ESTIMATE_COLUMNS, _SHAPE_BEFORE_S):
+            late = table.filter(pc.field("time_s") >= self._from_s - _SHAPE_BEFORE_S)
+            try:
+                yield from shapes.estimates(late)
+            except (ValueError, LookupError) as error:
+                column_reader.add_note(self.damage, f"{tables.SHAPES}: a batch holds no estimates ({error})")
+
+
+@dataclass(frozen=True, slots=True)
+class _Rare:
+    """A row of the table `rare`."""
+
+    time_s: float
+    tick: int
+    kind: str
+    data: bytes
+
+
+class _Ahead(Generic[T]):
+    """Things in the order of their times, given out up to a time."""
+
+    def __init__(self, timed: Iterator[tuple[float, T]]) -> None:
+        self._timed = timed
+        self._next = next(timed, None)
+
+    def until(self, time_s: float) -> Iterator[T]:
+        """Those up to a time that were not given out before."""
+        while self._next is not None and self._next[0] <= time_s:
+            yield self._next[1]
+            self._next = next(self._timed, None)
+
+
+class FramesReader(InputsReader):
+    """Reads the `inputs-*.bin` of an earlier version, frame by frame.
+
+    A file is one line of JSON and then frames, one a second: magic, length, CRC-32, zlib of the number of ticks,
+    their records in columns, then parts of kind `C` (commands and ended tasks), `M` (memory), `S` (shape estimate).
+    """
+
+    def __iter__(self) -> Iterator[InputsFrame]:
+        """All frames in order; a tick that was written twice comes once."""
         last = 0
         for path in self.paths:
             try:
@@ -186,7 +217,7 @@ class InputsReader:
 
     def since(self, time_s: float) -> InputsReader:
         """A reader that begins a file or two before this time of the run."""
-        found = InputsReader(self._folder)
+        found = FramesReader(self._folder, self.paths)
         begun = [place for place, path in enumerate(self.paths) if found._first_s(path) <= time_s]
         found.paths = self.paths[max(0, max(begun, default=0) - 1) :]
         found.damage.clear()  # it is told again when the file is read
@@ -291,3 +322,41 @@ def _known_fields(records: Records) -> Records:
         elif RECORD[name].kind == "f":
             ours[name] = np.nan
     return ours
+
+
+# A column is code and data: code 0 to 6 is the number of decimals of values that are whole numbers over a power of
+# ten, as differences in 4 bytes; 255 is the exclusive or with the tick before. Bytes are sorted by their place.
+_AS_IT_IS = 255
+_DIGITS_MAX = 6
+
+
+def decode_columns(data: bytes, kind: np.dtype[np.void], count: int) -> tuple[NDArray[np.void], int]:
+    """(count,) records of a kind, and how many bytes of `data` they took. Raises ValueError if there are too few."""
+    # before the memory is taken: a count may be anything
+    if count * sum(min(4, kind[name].itemsize) for name in kind.names or ()) > len(data):
+        raise ValueError(f"{count} ticks are said to be in {len(data)} bytes")
+    records = np.empty(count, dtype=kind)
+    if not count:
+        return records, 0
+    place = 0
+    for name in kind.names or ():
+        field = kind[name]
+        if place >= len(data):
+            raise ValueError("too short for its ticks")
+        code = data[place]
+        if code != _AS_IT_IS and (code > _DIGITS_MAX or field.kind != "f"):
+            raise ValueError(f"column {name} has no code {code}")
+        size = count * (4 if code != _AS_IT_IS else field.itemsize)
+        records[name] = _decode(code, data[place + 1 : place + 1 + size], field, count)
+        place += 1 + size
+    return records, place
+
+
+def _decode(code: int, data: bytes, field: np.dtype[Any], count: int) -> NDArray[Any]:
+    width = 4 if code != _AS_IT_IS else field.itemsize
+    planes = np.frombuffer(data, dtype="u1").reshape(width, count).T
+    if code == _AS_IT_IS:
+        return np.ascontiguousarray(np.bitwise_xor.accumulate(planes, axis=0)).view(field).reshape(count)
+    steps = np.ascontiguousarray(planes).view("<i4").reshape(count)
+    decoded: NDArray[Any] = np.cumsum(steps, dtype=np.int64) / 10.0**code
+    return decoded

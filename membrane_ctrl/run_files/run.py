@@ -31,7 +31,9 @@ _FILES_MAX = 100_000  # ten years of hours
 # What a damaged line may say else is no time of a run, and dates end.
 _YEARS = range(1970, 2200)
 _RUN_MAX_S = 1e9
-TABLES = (tables.TICKS, *(tables.level_table(window_s) for window_s in tables.WINDOWS_S), tables.SHAPES)
+TABLES = (
+    tables.TICKS, tables.RARE, *(tables.level_table(window_s) for window_s in tables.WINDOWS_S), tables.SHAPES,
+)  # fmt: skip
 _STAND_IN = "Rerun segments stand in for ticks that the tables lack: without every tick, and without checksums"
 
 

@@ -10,7 +10,7 @@ import io
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 
 from membrane_ctrl.model.files import read_bytes
+from membrane_ctrl.run_files import column_codec
 
 # What an Arrow stream would take of memory, known before any is taken.
 #
@@ -101,7 +102,7 @@ def _u32(head: memoryview, place: int) -> int:
     return int(number)
 
 
-_KEY = b"seal"
+_KEY, _CODES = b"seal", b"codes"
 _BLANK = b"seal:" + 20 * b"0"
 _SEAL = re.compile(rb"seal:([0-9a-f]{4})([0-9a-f]{8})([0-9a-f]{8})")
 _NO_CRC = 8 * b"0"
@@ -138,9 +139,10 @@ class SealedStream:
         self._file = pa.OSFile(str(path), "wb")
         self._file.write(_sealed(schema.serialize().to_pybytes()))
 
-    def write(self, batch: pa.RecordBatch) -> None:
+    def write(self, batch: pa.RecordBatch, codes: bytes | None = None) -> None:
         """Append a batch. Raises OSError (full disk): half of it may be in the file, where readers pass over it."""
-        self._writer.write_batch(batch, custom_metadata={_KEY: _BLANK})
+        about = {_KEY: _BLANK} if codes is None else {_KEY: _BLANK, _CODES: codes}
+        self._writer.write_batch(batch, custom_metadata=about)
         self._file.write(_sealed(self._take()))
 
     def close(self) -> None:
@@ -229,9 +231,30 @@ def whole_batches(path: Path, names: list[str] | None = None) -> Iterator[pa.Rec
     if not data:
         return
     require_bounded(data)
+    yield from decoded_batches(data, names)
+
+
+def decoded_batches(data: bytes, names: Sequence[str] | None = None) -> Iterator[pa.RecordBatch]:
+    """Batches of an Arrow stream, with all columns or some, their numbers decoded.
+
+    Raises
+    ------
+    pa.ArrowException
+        If a batch is not whole, or not as `column_codec.encode` leaves it.
+    """
     schema = pa.ipc.open_stream(data).schema
-    fields = [schema.get_field_index(name) for name in names or schema.names]
-    yield from pa.ipc.open_stream(data, options=pa.ipc.IpcReadOptions(included_fields=fields, use_threads=False))
+    wanted = list(schema.names if names is None else names)
+    fields = [schema.get_field_index(name) for name in column_codec.needed(schema, wanted)]
+    # one thread: buffers of a minute are too small to hand around
+    options = pa.ipc.IpcReadOptions(included_fields=fields, use_threads=False)
+    reader = pa.ipc.open_stream(data, options=options)
+    while True:
+        try:
+            batch, about = reader.read_next_batch_with_custom_metadata()
+        except StopIteration:
+            return
+        batch.validate(full=True)  # Arrow trusts lengths and offsets otherwise, and reads what is not its own
+        yield column_codec.decode(batch, schema, (about or {}).get(_CODES), wanted)
 
 
 def _sealed(message: bytes) -> bytes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
@@ -98,6 +99,30 @@ def from_table(table: pa.Table) -> Shapes:
         covariance_time_s=time_s[kept],
         covariance_um2=covariances,
     )
+
+
+# All of an estimate.
+ESTIMATE_COLUMNS = (
+    *shape_estimate.NUMBERS,
+    "cycle",
+    "tracking_lost",
+    "kind",
+    "verdict",
+    "reason",
+    "coeffs_um",
+    "upper_um2",
+)
+
+
+def estimates(table: pa.Table) -> Iterator[ShapeEstimate]:
+    """The estimates of the recorder's table, as the controller got them. Raises ValueError if they are none."""
+    names = ESTIMATE_COLUMNS[:-2]
+    heads = zip(*(table.column(name).to_pylist() for name in names), strict=True)
+    coeffs = _matrix(table.column("coeffs_um").combine_chunks(), table.num_rows)
+    uppers = table.column("upper_um2").combine_chunks().flatten().to_numpy().reshape(table.num_rows, -1)
+    for head, row, upper in zip(heads, coeffs, uppers, strict=True):
+        named = dict(zip(names, head, strict=True))
+        yield shape_estimate.unpack_estimate(shape_estimate.packed_parts(named, row, upper))
 
 
 def from_columns(columns: Mapping[str, Column]) -> Shapes:

@@ -264,7 +264,7 @@ class Summary:
             "reading_std_um": self._reading_um.std,
             "leak_um_per_s": self._leak_um_per_s,
             "lateness_ms": _quantiles(self._lateness_ms) | {"max": self._lateness_ms.largest},
-            "ticks": self._rows + dropped.get("telemetry", 0),
+            "ticks": self._rows + dropped.get("inputs", 0),
             "missed_ticks": self._missed_ticks,
             "cycles": self._cycles,
             "cycles_rejected": self._rejected,

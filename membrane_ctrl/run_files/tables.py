@@ -1,4 +1,4 @@
-"""What the tables beside the recording hold: every tick, three overview levels, every shape."""
+"""What the tables beside the recording hold: every tick, what it was given, three overview levels, every shape."""
 
 import math
 from collections.abc import Mapping
@@ -10,8 +10,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from membrane_ctrl.controller.tick import RECORD, SAME, TickBatch
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.run_files import column_codec
 from membrane_ctrl.run_files.column_file import ColumnFile
 
 # Overview levels: least, mean and greatest of each signal per 1 s, 10 s and 60 s, so that a month opens in seconds.
@@ -125,16 +127,28 @@ def _mean(values: Column, weights: Column, starts: NDArray[np.intp]) -> Column:
 
 TICKS = "ticks"
 SHAPES = "shapes"
-# Fields for which the 24 bits of a single would lose something: clocks, counters, and 1e5 Pa to the mPa. All others
-# are finer in a single than the sensor behind them (1 mm to 0.1 nm), at half the size and half the reading time.
-_DOUBLES = frozenset({"mono_s", "tick", "sample_counter", "device_time_s", "ambient_pressure_pa"})
+RARE = "rare"
+# By the record's field: the column that holds it, exactly. Where the row has what was made of it, `given_<name>`.
+GIVEN: dict[str, str] = {
+    name: SAME.get(name, f"given_{name}" if name in telemetry.FIELDS else name) for name in RECORD.names or ()
+}
+# What a field of the row nearly always is: stored is how it differs. All others are in singles, finer than the
+# sensors behind them (1 mm to 0.1 nm), at half the size and half the reading time.
+_SUMS = {
+    **{name: column for name, column in GIVEN.items() if column.startswith("given_")},
+    "filtered_um": "setpoint_um -error_um",
+    "flow_wanted_um_per_s": "p_um_per_s i_um_per_s d_um_per_s feedforward_um_per_s",
+    "flow_um_per_s": "flow_wanted_um_per_s",
+}
 _TICK_BATCH_S = 60.0
+_RARE_BATCH_S = 600.0
 # Reading back costs as much a batch as a thousand rows.
 _SHAPE_BATCH_S = 300.0
 # A batch costs about 6 kB whatever is in it: the coarser a level, the longer its rows wait.
 _LEVEL_BATCH_S = {1.0: 300.0, 10.0: 600.0, 60.0: 3600.0}
-# A covariance is 5 kB and changes little from cycle to cycle.
+# Reports take a covariance now and then, which `covariance_um2` has: all of a month would be 3 GB.
 COVARIANCE_INTERVAL_S = 600.0
+COMMANDS, MEMORY = "commands", "memory"
 
 
 def level_table(window_s: float) -> str:
@@ -143,8 +157,27 @@ def level_table(window_s: float) -> str:
 
 
 def tick_schema() -> pa.Schema:
-    """Columns of `ticks`: the fields of a telemetry row."""
-    return pa.schema([(name, pa.float64() if name in _DOUBLES else pa.float32()) for name in telemetry.FIELDS])
+    """Columns of `ticks`: the fields of a telemetry row, then what else the tick was given."""
+    exact = {column.removeprefix("given_") for column in GIVEN.values()}
+    rows = [
+        pa.field(
+            name,
+            pa.float64() if name in exact else pa.float32(),
+            metadata={column_codec.SUM: _SUMS[name]} if name in _SUMS else None,
+        )
+        for name in telemetry.FIELDS
+    ]
+    others = [
+        pa.field(column, pa.from_numpy_dtype(RECORD[name]))
+        for name, column in GIVEN.items()
+        if column not in telemetry.FIELDS
+    ]
+    return pa.schema([*rows, *others])
+
+
+def rare_schema() -> pa.Schema:
+    """Columns of `rare`: the commands and ended tasks of a tick (JSON), the controller's memory before it."""
+    return pa.schema([("time_s", pa.float64()), ("tick", pa.int64()), ("kind", pa.string()), ("data", pa.binary())])
 
 
 def level_schema() -> pa.Schema:
@@ -154,16 +187,18 @@ def level_schema() -> pa.Schema:
 
 
 def shape_schema() -> pa.Schema:
-    """Columns of `shapes`; `covariance_um2` is empty but for one cycle each `COVARIANCE_INTERVAL_S`."""
-    numbers = (
-        "time_s", "cycle", "hencky_um", "sag_um", "sag_sigma_um", "displacement_um", "slope_residual_urad",
-        "valid_fraction", "modulation_median_adu", "saturated_fraction", "latency_s",
-    )  # fmt: skip
+    """Columns of `shapes`: all of an estimate.
+
+    `covariance_um2` is empty but for one cycle each `COVARIANCE_INTERVAL_S`, `upper_um2` has the upper half of each.
+    """
     return pa.schema(
         [
-            *((name, pa.float64()) for name in numbers),
+            *((name, pa.float64()) for name in shape_estimate.NUMBERS),
+            ("cycle", pa.int64()),
+            ("tracking_lost", pa.bool_()),
             *((name, pa.string()) for name in ("kind", "verdict", "reason")),
-            ("coeffs_um", pa.list_(pa.float64(), 36)),
+            ("coeffs_um", pa.list_(pa.float64(), shape_estimate.TERMS)),
+            ("upper_um2", pa.list_(pa.float32(), shape_estimate.UPPER_TERMS)),
             ("covariance_um2", pa.list_(pa.float32())),
         ]
     )
@@ -201,6 +236,7 @@ class ColumnTables:
             return ColumnFile(run_dir, name, schema, time_name, batch_s, resumed is not None)
 
         self._ticks = table(TICKS, tick_schema(), "mono_s", _TICK_BATCH_S)
+        self._rare = table(RARE, rare_schema(), "time_s", _RARE_BATCH_S)
         self._shapes = table(SHAPES, shape_schema(), "time_s", _SHAPE_BATCH_S)
         self._levels = {
             window_s: table(level_table(window_s), level_schema(), "time_s", _LEVEL_BATCH_S[window_s])
@@ -210,23 +246,38 @@ class ColumnTables:
         self._open_ticks, self._open_levels = windows.ticks, dict(windows.levels)
         self._covariance_due_s = -math.inf
 
-    def add_rows(self, rows: telemetry.Rows) -> None:
-        """Take in telemetry rows in their order. Raises OSError (full disk)."""
-        if not len(rows):
+    def add_ticks(self, batch: TickBatch) -> None:
+        """Take in ticks in their order. Raises OSError (full disk)."""
+        if not len(batch.rows):
             return
-        self._ticks.add({name: telemetry.column(rows, name) for name in telemetry.FIELDS})
-        self._advance({name: telemetry.column(rows, name) for name in TICK_FIELDS})
+        row = {name: telemetry.column(batch.rows, name) for name in telemetry.FIELDS}
+        given = {column: batch.records[name] for name, column in GIVEN.items()}
+        try:
+            self._ticks.add({**row, **given})
+        finally:
+            self._advance({name: row[name] for name in TICK_FIELDS})
+            self._add_rare(batch)
+
+    def _add_rare(self, batch: TickBatch) -> None:
+        times_s = dict(zip(batch.records["tick"].tolist(), batch.records["now_s"].tolist(), strict=True))
+        parts = [(tick, MEMORY, data) for tick, data in batch.memories.items()]
+        parts += [(tick, COMMANDS, data) for tick, data in batch.tails.items()]
+        if parts:
+            ticks, kinds, datas = zip(*sorted(parts), strict=True)
+            rare = {"time_s": [times_s[tick] for tick in ticks], "tick": ticks, "kind": kinds, "data": datas}
+            self._rare.add(rare)
 
     def add_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Take in the result of a measurement cycle. Raises OSError (full disk)."""
         row: dict[str, Any] = {
-            field.name: [getattr(estimate, field.name)] for field in shape_schema() if field.name != "covariance_um2"
+            field.name: [getattr(estimate, field.name, None)] for field in shape_schema() if field.name != "upper_um2"
         }
         covariance: list[float] = []
         if estimate.verdict != "rejected" and estimate.time_s >= self._covariance_due_s:
             self._covariance_due_s = estimate.time_s + COVARIANCE_INTERVAL_S
             covariance = list(np.asarray(estimate.covariance_um2, dtype=np.float32).ravel())
         row["coeffs_um"] = [list(estimate.coeffs_um)]
+        row["upper_um2"] = [shape_estimate.upper_half(estimate.covariance_um2)]
         self._shapes.add({**row, "covariance_um2": [covariance]})
 
     @property
@@ -252,18 +303,23 @@ class ColumnTables:
 
     @property
     def lost(self) -> int:
-        """Rows of all tables given up."""
+        """Rows of all tables that no file has."""
         return sum(file.lost for file in self._files)
+
+    @property
+    def lost_ticks(self) -> int:
+        """Ticks that no file has."""
+        return self._ticks.lost
 
     @property
     def files(self) -> dict[str, int]:
         """Files of each table: a reader that finds fewer knows that the last ones are missing."""
         levels = {level_table(window_s): file.files for window_s, file in self._levels.items()}
-        return {TICKS: self._ticks.files, SHAPES: self._shapes.files, **levels}
+        return {TICKS: self._ticks.files, RARE: self._rare.files, SHAPES: self._shapes.files, **levels}
 
     @property
     def _files(self) -> tuple[ColumnFile, ...]:
-        return (self._ticks, self._shapes, *self._levels.values())
+        return (self._ticks, self._rare, self._shapes, *self._levels.values())
 
     def _advance(self, new: Columns | None) -> None:
         """Close the windows that are over (all, if nothing new comes) and hand them to the next coarser level."""

@@ -312,9 +312,9 @@ def test_no_incident_is_made_across_a_gap(
 def test_inputs_of_which_nothing_can_be_read_are_said_to_be_so(
     record: Path, left: bytes, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (record / "inputs-000.bin").write_bytes(left)
+    (record / "columns" / "ticks-000.arrows").write_bytes(left)
     assert run(["replay", str(record)]) == Exit.BAD_INPUT
     said = capsys.readouterr().err
     assert "no tick to replay" in said
-    assert "inputs-000.bin" in said
+    assert "ticks-000.arrows" in said
     assert said.count("\n") == 1

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, TwinConfig
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.controller.commands import Command, refusal
-from membrane_ctrl.controller.tick import RECORD, pack_tick, unpack_tick
+from membrane_ctrl.controller.tick import TickAssembler, pack_tick, unpack_tick
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.events import EventLine
@@ -239,7 +239,7 @@ def test_the_command_survives_its_record() -> None:
     assert tick is not None
     inputs, outputs = replace(tick.inputs, truth_displacement_um=0.0), tick.outputs
     messages = pack_tick(1, inputs, outputs, outputs.row.pack())
-    tail = b"".join(message[1:] for message in messages[:-1])
-    again = unpack_tick(np.frombuffer(messages[-1][1:], dtype=RECORD)[0], tail, {})
+    batch = TickAssembler().take(messages)
+    again = unpack_tick(batch.records[0], batch.tails[1], {})
     assert again.commands[0].experiment == inputs.commands[0].experiment
     assert isinstance(again.commands[1].loop, LoopConfig)

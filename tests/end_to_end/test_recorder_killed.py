@@ -28,7 +28,7 @@ def recorder_of(hold: subprocess.Popen[bytes], run_dir: Path) -> psutil.Process:
     while time.monotonic() < until_s:
         for child in psutil.Process(hold.pid).children():
             try:
-                if any(Path(file.path).name.startswith("inputs-") for file in child.open_files()):
+                if any(Path(file.path).name.startswith("ticks-") for file in child.open_files()):
                     return child
             except psutil.Error:  # it has just ended, or is one of those that may not be looked into
                 continue
@@ -49,7 +49,7 @@ def test_a_killed_recorder_is_replaced_and_every_tick_replayed(
     ) as hold:
         try:
             until_s = time.monotonic() + PATIENCE_S
-            while not list(tmp_path.glob("*-kill/inputs-000.bin")):
+            while not list(tmp_path.glob("*-kill/columns/ticks-waiting.arrows")):
                 assert time.monotonic() < until_s, "no recording has begun"
                 time.sleep(0.05)
             (run_dir,) = tmp_path.glob("*-kill")

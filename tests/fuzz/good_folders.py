@@ -16,9 +16,8 @@ from membrane_ctrl.model.telemetry import unpack
 from membrane_ctrl.recorder.rerun_streams import TelemetryStreams
 from membrane_ctrl.recorder.sink import LAYOUT, Recording
 from membrane_ctrl.run_files.summary import Summary
-from membrane_ctrl.run_files.tables import ColumnTables
-from tests.support.synthetic_run import shape_of
-from tests.support.virtual_record import CONFIG, kept_ticks, memory_at, write_record
+from tests.support.earlier_inputs import write_inputs
+from tests.support.virtual_record import CONFIG, batches_of, kept_ticks, memory_at, write_record
 
 RUN = "20261121T010203Z-night"
 TUNING = "20261121T010203Z-session"
@@ -28,19 +27,15 @@ _SET = ("--shrink", "16")
 
 
 def good_run(logs: Path) -> Path:
-    """A run with configuration, inputs, events, a mark, tables with figures, a Rerun segment and a summary."""
+    """A run with configuration, events, a mark, tables with inputs and figures, a Rerun segment and a summary."""
     folder = logs / RUN
     folder.mkdir(parents=True)
     ticks = kept_ticks(_SECONDS)
     write_record(folder, ticks, memories={101: memory_at(ticks, 101)})
     (folder / "config.toml").write_text(with_comment(dump(CONFIG)))
     rows = unpack([outputs.row.pack() for _, outputs in ticks])
-    tables, summary = ColumnTables(folder), Summary(CONFIG)
-    tables.add_rows(rows)
+    summary = Summary(CONFIG)
     summary.add_rows(rows)
-    for cycle in range(4):
-        tables.add_shape(shape_of(float(cycle), cycle))
-    tables.close()
     _write_segment(folder, rows)
     lines = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
     stamped = [{"time_utc": "2026-11-21T01:02:03+00:00", **line} for line in lines]
@@ -48,11 +43,17 @@ def good_run(logs: Path) -> Path:
     (folder / "events.jsonl").write_text("".join(f"{dumps_checked(line)}\n" for line in stamped))
     for event in stamped:
         summary.add_event(event)
-    counts = {"segments": 1, "tables": tables.files}
+    files = [path.name.rpartition("-")[0] for path in (folder / "columns").iterdir()]
+    counts = {"segments": 1, "tables": {table: files.count(table) for table in files}}
     (folder / "summary.json").write_text(dumps_checked(summary.as_dict({}, counts), indent=2))
     mark = {"mono_s": 1.0, "kind": "mark", "text": "door", "who": "me", "time_utc": "2026-11-21T01:02:04+00:00"}
     (folder / "annotations.jsonl").write_text(json.dumps(mark) + "\n")
     return folder
+
+
+def good_inputs(path: Path) -> None:
+    """What its ticks were given, in a file as an earlier version wrote it."""
+    write_inputs(path, batches_of(kept_ticks(_SECONDS)))
 
 
 def _write_segment(folder: Path, rows: object) -> None:

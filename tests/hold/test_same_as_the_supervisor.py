@@ -22,7 +22,7 @@ from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
-from membrane_ctrl.model.shape_estimate import pack_estimate
+from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
 from membrane_ctrl.sim.plant import Plant
@@ -158,7 +158,13 @@ def supervised(upset: Upset) -> tuple[list[TickOutputs], Exit]:
 def virtual(upset: Upset) -> tuple[list[TickOutputs], Exit | None]:
     """The same without them."""
     timed = made(upset)
-    run = VirtualRun(CONFIG, timed.bench, zernike_projection(), TruthShape(timed.bench, CONFIG, 5))
+    truth = TruthShape(timed.bench, CONFIG, 5)
+
+    def shape(now_s: float) -> ShapeEstimate | None:
+        estimate = truth(now_s)
+        return None if estimate is None else unpack_estimate(pack_estimate(estimate))
+
+    run = VirtualRun(CONFIG, timed.bench, zernike_projection(), shape)
     outputs: list[TickOutputs] = []
     while run.finished is None:
         next_s = run.now_s + 1.0 / RATE_HZ

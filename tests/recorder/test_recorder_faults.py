@@ -11,26 +11,25 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import Config, RecordingConfig
-from membrane_ctrl.controller.tick import MESSAGE_BYTES, RECORD, TICK
+from membrane_ctrl.controller.tick import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.plain_json import dumps_checked
 from membrane_ctrl.model.shape_estimate import pack_estimate
-from membrane_ctrl.model.telemetry import ROW_BYTES
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
 from membrane_ctrl.recorder import recorder as recorder_module
 from membrane_ctrl.recorder.recorder import Recorder
 from membrane_ctrl.recorder.rerun_output import RETRY_S
 from membrane_ctrl.recorder.sink import Recording, RecordingError
-from membrane_ctrl.run_files.inputs_file import InputsFile, InputsReader
+from membrane_ctrl.run_files.column_file import Journal
+from membrane_ctrl.run_files.inputs_file import open_inputs
 from membrane_ctrl.run_files.run_folder import write_config
-from membrane_ctrl.run_files.sealed_stream import whole_batches
+from membrane_ctrl.run_files.sealed_stream import SealedStream, whole_batches
 from tests.support.rrd_reading import scalars
-from tests.support.synthetic_run import STARTED_UTC, rows_of, shape_of
+from tests.support.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
 
 
 class HandClock(RunClock):
@@ -76,7 +75,7 @@ class Bench:
         """One second of rows at its place in the run, and the recorder's work for it."""
         HandClock.moment_s = float(number)
         for row in rows_of(number + 1.0)[-50:]:
-            self.writers["telemetry"].put(row.pack())
+            self.writers["inputs"].put(message_of(row))
         self.recorder.drain()
         self.recorder.write()
 
@@ -93,8 +92,7 @@ def make_bench(run_dir: Path, config: Config) -> Iterator[Bench]:
     HandClock.moment_s = 0.0
     clock = HandClock(0.0, STARTED_UTC)
     with ExitStack() as stack:
-        sizes = {"telemetry": (2000, ROW_BYTES), "events": (64, 4000), "shapes": (8, 30_000)}
-        sizes["inputs"] = (2000, MESSAGE_BYTES)
+        sizes = {"inputs": (2000, MESSAGE_BYTES), "events": (64, 4000), "shapes": (8, 30_000)}
         addresses = {name: stack.enter_context(ring(*size)) for name, size in sizes.items()}
         readers = {name: RingReader(address) for name, address in addresses.items()}
         writers = {name: RingWriter(address) for name, address in addresses.items()}
@@ -228,7 +226,7 @@ def test_segments_are_changed_in_time_without_losing_a_row(bench: Bench) -> None
     bench.second(1)
     HandClock.moment_s = Config().recording.segment_s + 1
     for row in rows_of(3.0)[-50:]:
-        bench.writers["telemetry"].put(row.pack())
+        bench.writers["inputs"].put(message_of(row))
     bench.recorder.drain()
     bench.recorder.write()
     bench.recorder.finish()
@@ -272,27 +270,24 @@ def test_inputs_that_met_a_full_disk_come_later_or_are_counted(
     def full(*_: Any) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    def ticks_of(second: int) -> None:
-        for tick in range(50 * second + 1, 50 * second + 51):
-            record = np.zeros(1, dtype=RECORD)
-            record["tick"] = tick
-            bench.writers["inputs"].put(TICK + record.tobytes())
-        bench.second(second)
+    def seconds(first: int, count: int) -> None:
+        for number in range(first, first + count):
+            bench.second(number)
 
-    ticks_of(0)
+    seconds(0, 3)
     with monkeypatch.context() as patch:
-        patch.setattr(InputsFile, "_write", full)
-        ticks_of(1)
-        ticks_of(2)
+        patch.setattr(SealedStream, "write", full)
+        patch.setattr(Journal, "keep", full)
+        seconds(3, 4)
         if not room_again:
             bench.recorder.finish()
     if room_again:
-        ticks_of(3)
+        seconds(7, 2)
         bench.recorder.finish()
-    found = [int(tick) for frame in InputsReader(bench.run_dir) for tick in frame.records["tick"]]
-    assert found == list(range(1, 201 if room_again else 51))
+    found = [int(tick) for frame in open_inputs(bench.run_dir) for tick in frame.records["tick"]]
     account = json.loads((bench.run_dir / "summary.json").read_text())["recorder"]
-    assert account["input_ticks_lost"] == (0 if room_again else 100)
+    assert found == list(range(1, 450 if room_again else 150))  # what the journal had before
+    assert account["input_ticks_lost"] == (0 if room_again else 200)
 
 
 def test_a_disk_that_runs_low_is_reported_once(tmp_path: Path) -> None:

@@ -22,17 +22,18 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller.tick import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.run_events import RecorderError
 from membrane_ctrl.model.shape_estimate import pack_estimate
-from membrane_ctrl.model.telemetry import COLUMN, ROW_BYTES, unpack
+from membrane_ctrl.model.telemetry import COLUMN, unpack
 from membrane_ctrl.processes.child import STOP, reporter
 from membrane_ctrl.processes.ring import RingWriter, ring
 from membrane_ctrl.recorder.process import RecorderSpec, recorder_main
 from membrane_ctrl.run_files.run_folder import create_run_folder
 from membrane_ctrl.run_files.streams import STREAMS
 from tests.support.rrd_reading import has_footer, scalars, strings
-from tests.support.synthetic_run import rows_of, shape_of
+from tests.support.synthetic_run import message_of, rows_of, shape_of
 
 pytestmark = pytest.mark.real_time
 
@@ -45,7 +46,7 @@ class Feed:
     """The control process' end of the rings."""
 
     spec: RecorderSpec
-    telemetry: RingWriter
+    inputs: RingWriter
     events: RingWriter
     shapes: RingWriter
 
@@ -59,7 +60,8 @@ def feed(tmp_path: Path) -> Iterator[Feed]:
     run_dir = create_run_folder(tmp_path, "test", clock.origin_utc, Config())
     with ExitStack() as stack:
         addresses = [
-            stack.enter_context(ring(slots, size)) for slots, size in ((2000, ROW_BYTES), (64, 4000), (16, 30_000))
+            stack.enter_context(ring(slots, size))
+            for slots, size in ((2000, MESSAGE_BYTES), (64, 4000), (16, 30_000))
         ]
         writers = [RingWriter(address) for address in addresses]
         spec = RecorderSpec(run_dir, "test", clock, Config(), *addresses)
@@ -124,7 +126,7 @@ def test_every_row_event_and_shape_is_found_again(feed: Feed) -> None:
     with recorder(feed.spec) as (process, status):
         feed.event("state", mono_s=0.0, to="standby")
         for row in rows:
-            feed.telemetry.put(row.pack())
+            feed.inputs.put(message_of(row))
         for cycle in range(5):
             feed.shapes.put(pack_estimate(shape_of(2.0 * cycle, cycle, "rejected" if cycle == 3 else "ok")))
         feed.event("fault", mono_s=19.0, cause="over_pressure")
@@ -151,18 +153,18 @@ def test_every_row_event_and_shape_is_found_again(feed: Feed) -> None:
     assert [text.split(":")[0] for _, text in strings(path, "/events", "TextLog:text")] == ["state", "fault", "end"]
     found = summary_of(feed.spec.run_dir)
     assert (found["ticks"], found["cycles"], found["cycles_rejected"], found["exit"]) == (1000, 5, 1, 0)
-    assert found["dropped"] == {"telemetry": 0, "events": 0, "shapes": 0}
+    assert found["dropped"] == {"inputs": 0, "events": 0, "shapes": 0}
     kinds = [json.loads(line)["kind"] for line in (feed.spec.run_dir / "events.jsonl").read_text().splitlines()]
     assert kinds == ["state", "fault", "end"]
 
 
 def test_what_the_ring_overwrote_is_counted(feed: Feed) -> None:
     for row in rows_of(60.0):  # 3000 rows into 2000 slots, before anyone reads
-        feed.telemetry.put(row.pack())
+        feed.inputs.put(message_of(row))
     feed.event("end", mono_s=60.0, exit=0)
     recorder_in_process(feed.spec)
     found = summary_of(feed.spec.run_dir)
-    assert found["dropped"]["telemetry"] == 1000
+    assert found["dropped"]["inputs"] == 1000
     assert found["ticks"] == 3000
 
 
@@ -179,7 +181,7 @@ def recorder_in_process(spec: RecorderSpec) -> list[dict[str, Any]]:
 def test_without_an_end_event_the_run_still_gets_one(feed: Feed, asked: bool, orphan: bool, word: str) -> None:
     from membrane_ctrl.recorder import process
 
-    feed.telemetry.put(rows_of(0.02)[0].pack())
+    feed.inputs.put(message_of(rows_of(0.02)[0]))
     process._record(feed.spec, lambda message: None, lambda: asked, lambda: orphan)
     assert summary_of(feed.spec.run_dir)["exit"] == word
     assert summary_of(feed.spec.run_dir)["ticks"] == 1
@@ -191,7 +193,7 @@ def test_sigint_is_ignored_and_a_stop_finishes(feed: Feed) -> None:
         wait_for((feed.spec.run_dir / "test-000.rrd").exists)
         os.kill(process.pid, signal.SIGINT)
         for row in rows_of(1.0):
-            feed.telemetry.put(row.pack())
+            feed.inputs.put(message_of(row))
         os.kill(process.pid, STOP)
         process.join(DEADLINE_S)
         assert process.exitcode == 0
@@ -204,26 +206,26 @@ import os, signal, sys
 sys.path.insert(0, {tests!r})
 from pathlib import Path
 import multiprocessing
-from tests.support.synthetic_run import rows_of
+from tests.support.synthetic_run import message_of, rows_of
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.processes.ring import Ring, RingWriter
 from membrane_ctrl.processes.child import STOP
 from membrane_ctrl.recorder.process import RecorderSpec, recorder_main
-from membrane_ctrl.model.telemetry import ROW_BYTES
+from membrane_ctrl.controller.tick import MESSAGE_BYTES
 
 if __name__ == "__main__":
-    telemetry, events = Ring(2000, ROW_BYTES), Ring(64, 4000)
-    spec = RecorderSpec(Path({run_dir!r}), "test", RunClock.start(), Config(), telemetry.address, events.address)
+    inputs, events = Ring(2000, MESSAGE_BYTES), Ring(64, 4000)
+    spec = RecorderSpec(Path({run_dir!r}), "test", RunClock.start(), Config(), inputs.address, events.address)
     multiprocessing.get_context("spawn").Process(target=recorder_main, args=(spec,)).start()
-    writer = RingWriter(telemetry.address)
+    writer = RingWriter(inputs.address)
     rows = rows_of(20.0)
     for row in rows[:500]:
-        writer.put(row.pack())
+        writer.put(message_of(row))
     while not (spec.run_dir / "test-000.rrd").exists():
         pass
     for row in rows[500:]:
-        writer.put(row.pack())
+        writer.put(message_of(row))
     os.kill(os.getpid(), signal.SIGKILL)
 """
 
@@ -236,7 +238,7 @@ def test_a_killed_control_process_leaves_a_whole_recording(tmp_path: Path) -> No
         assert parent.wait(DEADLINE_S) == -signal.SIGKILL
         wait_for((run_dir / "summary.json").exists)
     found = summary_of(run_dir)
-    assert (found["exit"], found["ticks"], found["dropped"]["telemetry"]) == ("killed", 1000, 0)
+    assert (found["exit"], found["ticks"], found["dropped"]["inputs"]) == ("killed", 1000, 0)
     assert has_footer(run_dir / "test-000.rrd")
     assert len(scalars(run_dir / "test-000.rrd", "/loop/error")[0]) == 1000
     last = json.loads((run_dir / "events.jsonl").read_text().splitlines()[-1])
@@ -252,7 +254,7 @@ def test_a_writer_that_dies_is_reported_and_the_recording_goes_on(feed: Feed) ->
         while not (run_dir / "test-001.rrd").exists():
             enough_bytes = recorded_bytes(run_dir) + 40_000  # of the 60 000 and more that 100 rows take
             for row in islice(rows, 100):
-                feed.telemetry.put(row.pack())
+                feed.inputs.put(message_of(row))
                 fed.append(row.mono_s)
             wait_for(lambda enough=enough_bytes: recorded_bytes(run_dir) >= enough)
         feed.event("end", mono_s=fed[-1], exit=0)

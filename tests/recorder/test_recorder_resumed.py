@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.recorded_hold import ring_trip
 from membrane_ctrl.config.schema import Config, RecordingConfig
+from membrane_ctrl.controller.tick import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.plain_json import dumps_checked
 from membrane_ctrl.model.shape_estimate import pack_estimate
-from membrane_ctrl.model.telemetry import ROW_BYTES
 from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
 from membrane_ctrl.recorder.housekeeping import Optimizer
 from membrane_ctrl.recorder.recorder import Recorder, load_state, save_state
@@ -25,7 +26,7 @@ from membrane_ctrl.replay.repair import read_rows
 from membrane_ctrl.run_files.disk_budget import DetailLevel
 from membrane_ctrl.run_files.events import EventsFile
 from tests.support.rrd_reading import has_footer, reader, scalars
-from tests.support.synthetic_run import STARTED_UTC, rows_of, shape_of
+from tests.support.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
 
 ROWS = rows_of(12.0)
 
@@ -47,7 +48,7 @@ class Run:
         self.run_dir, self.config = run_dir, config
         self._stack = stack
         self.addresses: dict[str, RingAddress] = {
-            "telemetry": stack.enter_context(ring(rows_kept, ROW_BYTES)),
+            "inputs": stack.enter_context(ring(rows_kept, MESSAGE_BYTES)),
             "events": stack.enter_context(ring(64, 4000)),
             "shapes": stack.enter_context(ring(8, 30_000)),
         }
@@ -73,7 +74,7 @@ class Run:
         """One second of the run; without `write` the recorder dies with it in its hands."""
         HandClock.moment_s = float(number)
         for row in ROWS[50 * number : 50 * number + 50]:
-            self.writers["telemetry"].put(row.pack())
+            self.writers["inputs"].put(message_of(row))
         self.event("mark", number)
         recorder.drain()
         if write:
@@ -119,7 +120,7 @@ def test_the_next_recorder_goes_on_and_everything_is_there_once(tmp_path: Path, 
     assert summary["ticks"] == 600
     assert summary["cycles"] == 1
     assert summary["transitions"] == 3
-    assert summary["dropped"] == {"telemetry": 0, "events": 0, "shapes": 0}
+    assert summary["dropped"] == {"inputs": 0, "events": 0, "shapes": 0}
     assert summary["recorder"]["restarts"] == 1
     assert summary["recorder"]["partial"] is False
     assert sorted(path.name for path in tmp_path.glob("*.rrd")) == ["test-000.rrd", "test-001.rrd"]
@@ -137,7 +138,7 @@ def test_what_is_handed_on_comes_back_to_the_last_bit(tmp_path: Path, stack: Exi
     state = load_state(tmp_path)
     assert state is not None
     assert state.windows.levels
-    state.reference = shape_of(1.0, 1)
+    state.reference = ring_trip(shape_of(1.0, 1))
     save_state(tmp_path, state)
     written = path.read_bytes()
     again = load_state(tmp_path)
@@ -169,7 +170,7 @@ def test_without_what_the_first_knew_the_statistics_begin_with_what_the_ring_has
     second.finish()
     assert run.summary["recorder"]["partial"] is partial
     assert run.summary["ticks"] == ticks
-    assert run.summary["dropped"]["telemetry"] == max(0, 100 - rows_kept)
+    assert run.summary["dropped"]["inputs"] == max(0, 100 - rows_kept)
     assert [json.loads(line)["mono_s"] for line in (tmp_path / "events.jsonl").read_text().splitlines()] == [0, 1, 2]
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.run_files.inputs_file import InputsReader
+from membrane_ctrl.run_files.inputs_file import open_inputs
 
 ARCHIVE = Path(__file__).parents[1] / "fixtures" / "runs" / "20261122T043916Z-earlier.tar.xz"
 TICKS = 702
@@ -25,7 +25,7 @@ def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_tick_shape_and_memory_of_it_is_read(earlier: Path) -> None:
-    reader = InputsReader(earlier)
+    reader = open_inputs(earlier)
     frames = list(reader)
     assert reader.damage == []
     assert sum(len(frame.records) for frame in frames) == TICKS

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.nights import batch_of
 from membrane_ctrl.cli import run
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit, InputError
@@ -144,7 +145,7 @@ def test_the_summary_is_rebuilt_as_the_recorder_would_have_written_it(folder: Pa
     for key in ("exit", "ticks", "cycles", "transitions", "fault_count", "band_1s_windows", "missed_ticks"):
         assert found[key] == wanted[key], key
     for key in ("true_std_um", "true_bias_um", "reading_std_um", "leak_um_per_s"):
-        assert found[key] == pytest.approx(wanted[key], rel=1e-9), key
+        assert found[key] == pytest.approx(wanted[key], rel=1e-4), key  # a table holds singles
     assert [state["state"] for state in found["states"]] == [state["state"] for state in wanted["states"]]
 
 
@@ -165,8 +166,9 @@ def test_an_unreadable_summary_is_an_original_too(folder: Path, text: str) -> No
 
 
 def test_a_run_with_nothing_but_its_configuration_is_no_error(folder: Path) -> None:
-    for path in [*folder.glob("*.rrd"), *folder.glob("inputs-*"), folder / "events.jsonl"]:
+    for path in [*folder.glob("*.rrd"), folder / "events.jsonl"]:
         path.unlink()
+    shutil.rmtree(folder / "columns")
     states = {finding.file: finding.state for finding in repair(folder)}
     assert states == {"events.jsonl": "missing", "summary.json": "missing"}
     assert json.loads((folder / "summary.json").read_text())["ticks"] == 0
@@ -195,7 +197,7 @@ def test_a_run_that_is_still_recorded_is_left_alone(folder: Path) -> None:
 
 
 def test_the_command_says_what_it_did(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cut(folder / "inputs-000.bin", 0.5)
+    cut(folder / "columns" / "ticks-000.arrows", 0.5)
     assert run(["repair", str(folder), "--json"]) == Exit.DONE
     out = capsys.readouterr()
     states = {row["file"]: row["state"] for row in json.loads(out.out)["files"]}
@@ -216,8 +218,9 @@ def test_what_is_thinned_out_in_quiet_is_still_counted(folder: Path) -> None:
 
 
 def test_with_tables_the_statistics_are_of_every_tick(folder: Path) -> None:
+    shutil.rmtree(folder / "columns")
     tables = ColumnTables(folder)
-    tables.add_rows(ROWS)
+    tables.add_ticks(batch_of(ROWS))
     tables.sync()  # and then it was killed
     expected = Summary(CONFIG)
     expected.add_rows(ROWS)

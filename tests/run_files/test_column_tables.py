@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.nights import batch_of
 from membrane_ctrl.model.telemetry import Rows, unpack
 from membrane_ctrl.run_files.column_file import Journal
 from membrane_ctrl.run_files.run import open_run
@@ -30,7 +31,7 @@ def ticks_of(folder: Path) -> np.ndarray:
 
 
 def feed(tables: ColumnTables, number: int) -> None:
-    tables.add_rows(second(number))
+    tables.add_ticks(batch_of(second(number)))
     tables.add_shape(shape_of(float(number), number))
     tables.sync()
 
@@ -89,7 +90,7 @@ def test_a_disk_without_room_for_the_journal_loses_nothing_while_the_recorder_li
     with monkeypatch.context() as patch:
         patch.setattr(Journal, "_begin", full)
         tables._ticks._journal.drop()
-        tables.add_rows(second(1))
+        tables.add_ticks(batch_of(second(1)))
         with pytest.raises(OSError, match="No space"):
             tables.sync()
     feed(tables, 2)

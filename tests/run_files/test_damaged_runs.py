@@ -18,7 +18,7 @@ from membrane_ctrl.model.telemetry import FIELDS, column
 from membrane_ctrl.review import open_run
 from membrane_ctrl.run_files.column_file import FILE_S
 from membrane_ctrl.run_files.column_reader import column_files
-from membrane_ctrl.run_files.sealed_stream import unseal
+from membrane_ctrl.run_files.sealed_stream import unseal, whole_batches
 from tests.support.review_runs import segment, set_summary, tables, written
 
 HOURS = 0.1
@@ -162,7 +162,7 @@ def test_of_a_damaged_journal_the_other_seconds_are_there(tmp_path: Path) -> Non
 def test_a_table_of_an_earlier_version_is_read_as_it_is(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.02)
     path = folder / "columns" / "ticks-000.arrows"
-    table = pa.ipc.open_stream(path.read_bytes()).read_all().replace_schema_metadata(None)
+    table = pa.Table.from_batches(whole_batches(path)).replace_schema_metadata(None)
     with pa.OSFile(str(path), "wb") as file, pa.ipc.new_stream(file, table.schema) as writer:
         writer.write_table(table)
     assert not unseal(path.read_bytes()).sealed

@@ -154,14 +154,14 @@ def test_a_path_that_the_user_named_may_lead_through_links(folder: Path, tmp_pat
 # Who else writes, and why it is no stranger's folder.
 _OWN = {
     # the recorder, in the folder that its run has just made
-    "run_files/sealed_stream.py", "run_files/events.py", "run_files/inputs_file.py", "recorder/recorder.py",
+    "run_files/sealed_stream.py", "run_files/events.py", "recorder/recorder.py",
     "run_files/column_file.py", "recorder/sink.py", "recorder/housekeeping.py", "run_files/run_folder.py",
     "acquisition/raw_frames.py",
     # the logs' own folder, each by its own handle or without following; a socket; a set of one's own run
     "run_files/latched_fault.py", "commissioning/safe.py", "run_files/disk_budget.py", "control_port/sockets.py",
     "sessions/folder.py",
     # a new folder, a temporary one, or a file that the user has named
-    "sim/optics/simulate.py", "replay/incident.py", "run_files/segments.py", "review/viewer/command.py",
+    "sim/optics/simulate.py", "replay/command.py", "run_files/segments.py", "review/viewer/command.py",
     "review/viewer/screenshot.py", "review/export.py", "calibration/session.py", "calibration/camera.py",
     "calibration/sets.py", "geometry/spread_file.py",
     # the project's own pages

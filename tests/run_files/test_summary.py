@@ -68,7 +68,7 @@ def test_counters_states_and_lateness() -> None:
 def test_dropped_rows_are_ticks_too() -> None:
     summary = Summary(Config())
     summary.add_rows(table(rows_of(1.0)))
-    assert summary.as_dict({"telemetry": 7}, {})["ticks"] == 57
+    assert summary.as_dict({"inputs": 7}, {})["ticks"] == 57
 
 
 def test_a_real_bench_has_no_true_figures() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.nights import CONFIG, Planted, night, write_run
+from benchmarks.nights import CONFIG, Planted, batch_of, night, write_run
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import Rows
@@ -49,7 +49,7 @@ def tables(folder: Path, rows: Rows, shapes: list[ShapeEstimate], close: bool = 
     """The tables of a run; without `close` as a killed recorder leaves them."""
     made = ColumnTables(folder)
     for first in range(0, len(rows), 10):
-        made.add_rows(rows[first : first + 10])
+        made.add_ticks(batch_of(rows[first : first + 10]))
     for estimate in shapes:
         made.add_shape(estimate)
     made.sync()

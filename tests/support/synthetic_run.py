@@ -7,9 +7,10 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from benchmarks.nights import messages_of
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, Verdict
 from membrane_ctrl.model.states import Rung, ShapeState, State
-from membrane_ctrl.model.telemetry import TelemetryRow
+from membrane_ctrl.model.telemetry import TelemetryRow, unpack
 
 RATE_HZ = 50.0
 STARTED_UTC = datetime(2026, 11, 21, 1, 23, 45, tzinfo=UTC)
@@ -62,6 +63,11 @@ def _row(k: int, rng: np.random.Generator, truth: bool) -> TelemetryRow:
         "truth_laser_bias_um": 0.01 * time_s if truth else float("nan"),
     }
     return TelemetryRow(**values)
+
+
+def message_of(row: TelemetryRow) -> bytes:
+    """A tick as it crosses to the recorder."""
+    return messages_of(unpack([row.pack()]))[0]
 
 
 def shape_of(time_s: float, cycle: int, verdict: Verdict = "ok", seed: int = 0) -> ShapeEstimate:

@@ -8,21 +8,23 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.recorded_hold import ring_trip
 from firmware_iface.roles import BenchReading
-from membrane_ctrl import __version__
 from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import Config, TwinConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import remember
-from membrane_ctrl.controller.tick import TickAssembler, TickInputs, TickOutputs, pack_tick
+from membrane_ctrl.controller.tick import TickAssembler, TickBatch, TickInputs, TickOutputs, pack_tick
 from membrane_ctrl.hold.virtual_run import Alter, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.run_files.inputs_file import InputsFile
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.run_files.tables import ColumnTables
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.truth_shape import ShapeSource
 from membrane_ctrl.sim.virtual_bench import VirtualBench
+from tests.support.earlier_inputs import write_inputs
 from tests.support.synthetic_shape import shape_at
 
 CONFIG = Config(twin=TwinConfig(laser_noise_um=0.5))
@@ -66,7 +68,12 @@ def run_virtual(
 
 def kept_ticks(duration_s: float, alter: Alter | None = None) -> list[tuple[TickInputs, TickOutputs]]:
     """Inputs and outputs of every tick of a hold of the twin."""
-    run = run_virtual(CONFIG, Plant(CONFIG.twin, CONFIG.pump), duration_s, zernike_projection(), shape_at, alter)
+
+    def shape(now_s: float) -> ShapeEstimate | None:
+        estimate = shape_at(now_s)
+        return None if estimate is None else ring_trip(estimate)
+
+    run = run_virtual(CONFIG, Plant(CONFIG.twin, CONFIG.pump), duration_s, zernike_projection(), shape, alter)
     return [(tick.inputs, tick.outputs) for tick in run]
 
 
@@ -78,16 +85,14 @@ def memory_at(ticks: list[tuple[TickInputs, TickOutputs]], tick: int) -> bytes:
     return remember(controller)
 
 
-def write_record(
-    folder: Path,
-    ticks: list[tuple[TickInputs, TickOutputs]],
-    lost: range = range(0),
-    memories: Mapping[int, bytes] | None = None,
-) -> None:
-    """The run's folder: configuration, inputs a frame a second, events; ticks of `lost` are not in it."""
-    (folder / "config.toml").write_text(config_file.dump(CONFIG))
-    file, assembler = InputsFile(folder, __version__), TickAssembler()
-    lines = []
+Batch = tuple[TickBatch, list[ShapeEstimate]]
+
+
+def batches_of(
+    ticks: list[tuple[TickInputs, TickOutputs]], lost: range = range(0), memories: Mapping[int, bytes] | None = None
+) -> list[Batch]:
+    """What the rings bring, a second at a time; ticks of `lost` are not in it."""
+    assembler, batches = TickAssembler(), []
     for first in range(0, len(ticks), 50):
         messages: list[bytes] = []
         shapes = []
@@ -96,9 +101,45 @@ def write_record(
                 messages += pack_tick(place, inputs, outputs, outputs.row.pack(), (memories or {}).get(place, b""))
             if inputs.estimate is not None:
                 shapes.append(inputs.estimate)
-            lines += [json.dumps({"mono_s": inputs.now_s + 1e-4, **event.to_dict()}) for event in outputs.events]
-        file.append(assembler.take(messages), shapes)
-    file.close()
+        batches.append((assembler.take(messages), shapes))
+    return batches
+
+
+def write_tables(folder: Path, batches: list[Batch]) -> None:
+    """The tables of a run, closed."""
+    tables = ColumnTables(folder)
+    for batch, shapes in batches:
+        for estimate in shapes:
+            tables.add_shape(estimate)
+        tables.add_ticks(batch)
+    tables.close()
+
+
+def write_record(
+    folder: Path,
+    ticks: list[tuple[TickInputs, TickOutputs]],
+    lost: range = range(0),
+    memories: Mapping[int, bytes] | None = None,
+) -> None:
+    """The run's folder: configuration, tables, events; ticks of `lost` are not in it."""
+    write_head(folder, ticks)
+    write_tables(folder, batches_of(ticks, lost, memories))
+
+
+def write_earlier_record(folder: Path, ticks: list[tuple[TickInputs, TickOutputs]]) -> None:
+    """The folder of a run of version 0.1, with its inputs in a file of frames."""
+    write_head(folder, ticks)
+    write_inputs(folder / "inputs-000.bin", batches_of(ticks))
+
+
+def write_head(folder: Path, ticks: list[tuple[TickInputs, TickOutputs]]) -> None:
+    """Configuration and events of a run."""
+    (folder / "config.toml").write_text(config_file.dump(CONFIG))
+    lines = [
+        json.dumps({"mono_s": inputs.now_s + 1e-4, **event.to_dict()})
+        for inputs, outputs in ticks
+        for event in outputs.events
+    ]
     lines.append(json.dumps({"mono_s": ticks[-1][0].now_s + 1e-3, "kind": "end", "exit": "done"}))
     (folder / "events.jsonl").write_text("\n".join(lines) + "\n")
 
