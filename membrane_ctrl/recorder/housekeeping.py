@@ -19,13 +19,7 @@ from membrane_ctrl.run_files import disk_budget, run_folder
 
 
 class FolderWatch:
-    """Holds the folder open: as long as that is so its number is nobody else's, and it cannot be mistaken.
-
-    Parameters
-    ----------
-    run_dir : Path
-        Folder of the run.
-    """
+    """Holds the folder open: as long as that is so its number is nobody else's, and it cannot be mistaken."""
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir
@@ -93,10 +87,7 @@ def quiet_environment() -> dict[str, str]:
 class Optimizer:
     """Works through closed segments beside the recorder; call `poll` now and then.
 
-    Parameters
-    ----------
-    run_dir : Path
-        Where the segments are; what a recorder that was killed has left half done there is removed.
+    What a killed recorder has left half done in the folder is removed.
     """
 
     def __init__(self, run_dir: Path) -> None:
@@ -163,13 +154,7 @@ _RUN = "retention: "  # and the run that cannot be deleted
 
 
 class Housekeeping:
-    """One look each second.
-
-    Attributes
-    ----------
-    detail : DetailLevel
-        What has to be left out.
-    """
+    """One look each second; `detail` says what has to be left out."""
 
     def __init__(self, run_dir: Path, clock: RunClock, config: RecordingConfig, errors: RecorderErrors) -> None:
         self._run_dir = run_dir

@@ -38,40 +38,18 @@ _ROUND_S = 30.0
 
 @dataclass(frozen=True, slots=True)
 class RecorderSpec:
-    """What the recorder's process needs; picklable.
-
-    Attributes
-    ----------
-    run_dir : Path
-        From `run_folder.create_run_folder`.
-    run_name : str
-        Name of the `.rrd` segments.
-    clock : RunClock
-    config : Config
-    inputs : RingAddress
-        The ticks (`tick.pack_tick`).
-    events : RingAddress
-        JSON objects with `time_utc`, `mono_s`, `kind`, ...; the one of kind "end" (with `exit`) is the last.
-    shapes : RingAddress or None
-        `estimate.pack_estimate`.
-    frames : FrameAddress or None
-        Shared camera frames, for thumbnails.
-    resumes : int
-        How many recorders of this run have died before this one; it goes on where they stopped.
-    flush_s : float
-        From one write to the next: with the round it waits for, what a power cut may lose.
-    """
+    """What the recorder's process needs; picklable."""
 
     run_dir: Path
-    run_name: str
+    run_name: str  # of the `.rrd` segments
     clock: RunClock
     config: Config
-    inputs: RingAddress
-    events: RingAddress
+    inputs: RingAddress  # the ticks (`tick.pack_tick`)
+    events: RingAddress  # the one of kind "end" is the last
     shapes: RingAddress | None = None
-    frames: FrameAddress | None = None
-    resumes: int = 0
-    flush_s: float = 1.0 - POLL_S
+    frames: FrameAddress | None = None  # for thumbnails
+    resumes: int = 0  # recorders of this run that have died before; this one goes on where they stopped
+    flush_s: float = 1.0 - POLL_S  # between writes: with the round it waits for, what a power cut may lose
 
 
 def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:

@@ -24,21 +24,8 @@ from membrane_ctrl.run_files.summary import Summary
 class Feed:
     """Counts messages from the ring's first one on, and passes over those a former recorder has brought to the disk.
 
-    Parameters
-    ----------
-    reader : RingReader
-        Fresh: it starts at the oldest message still in the ring.
-    position : int
-        Messages already recorded.
-    dropped : int
-        Messages already known to be lost.
-
-    Attributes
-    ----------
-    position : int
-        Messages recorded or lost so far.
-    dropped : int
-        Lost: overwritten before any recorder got to them.
+    The reader is fresh: it starts at the oldest message still in the ring. `position` messages are recorded or lost,
+    `dropped` of them overwritten before any recorder got to them.
     """
 
     def __init__(self, reader: RingReader, position: int = 0, dropped: int = 0) -> None:
@@ -73,36 +60,19 @@ _SPECIALS: object_codec.Specials = {shape_estimate.ShapeEstimate: object_codec.E
 
 @dataclass(slots=True)
 class RecorderState:
-    """Everything of a recorder that is not in the run's files.
-
-    Attributes
-    ----------
-    summary : Summary
-    positions, dropped : dict
-        Of each ring: messages recorded, messages lost.
-    reference : ShapeEstimate or None
-        What changes of the figure are told against.
-    state : float
-        The controller's state in the last row.
-    windows : OpenWindows
-        Of the overview tables.
-    errors, rows_lost, events_lost, input_ticks_lost : int
-        The recorder's own account.
-    folder_anew_s : float or None
-        When the folder was last begun anew, because somebody had taken it away.
-    """
+    """Everything of a recorder that is not in the run's files."""
 
     summary: Summary
-    positions: dict[str, int] = field(default_factory=dict)
-    dropped: dict[str, int] = field(default_factory=dict)
-    reference: shape_estimate.ShapeEstimate | None = None
-    state: float = math.nan
+    positions: dict[str, int] = field(default_factory=dict)  # of each ring: messages recorded or lost
+    dropped: dict[str, int] = field(default_factory=dict)  # of each ring: messages lost
+    reference: shape_estimate.ShapeEstimate | None = None  # what changes of the figure are told against
+    state: float = math.nan  # the controller's, in the last row
     windows: tables.OpenWindows = field(default_factory=tables.OpenWindows)
     errors: int = 0
     rows_lost: int = 0
     events_lost: int = 0
     input_ticks_lost: int = 0
-    folder_anew_s: float | None = None
+    folder_anew_s: float | None = None  # when somebody had taken the folder away
 
 
 def save_state(run_dir: Path, state: RecorderState) -> None:
@@ -142,20 +112,12 @@ class Recorder:
 
     Parameters
     ----------
-    run_dir : Path
-        Folder of the run.
-    clock : RunClock
-        The run's clock.
-    config : Config
-        The run's configuration.
     rings : dict
         Readers by name: "inputs" (the ticks), "events" and, if the shape is measured, "shapes".
     recording : Recording
         The Rerun file, no segment begun yet.
-    thumbnails : FrameSource or None
-        Thumbnails of frames.
     report : callable
-        Takes a small dict for the supervisor; never blocks, never raises.
+        Takes an event for the supervisor; never blocks, never raises.
     resumes : int
         How many recorders of this run have died before.
 

@@ -22,27 +22,7 @@ class FrameSource(Protocol):
 
 
 class RerunOutput:
-    """Streams and segments.
-
-    Parameters
-    ----------
-    recording : Recording
-        No segment begun yet.
-    config : Config
-        The run's configuration.
-    thumbnails : FrameSource or None
-        Thumbnails of frames.
-    errors : RecorderErrors
-        Where trouble goes.
-
-    Attributes
-    ----------
-    shapes : ShapeStreams
-    state : float
-        The controller's state in the last row.
-    closed : list of Path
-        Segments closed since somebody last took them from here.
-    """
+    """Streams and segments; the recording has no segment yet."""
 
     def __init__(
         self,
@@ -57,8 +37,8 @@ class RerunOutput:
         self._errors = errors
         self._telemetry = rerun_streams.TelemetryStreams(recording, config)
         self.shapes = rerun_streams.ShapeStreams(recording)
-        self.state = math.nan
-        self.closed: list[Path] = []
+        self.state = math.nan  # the controller's, in the last row
+        self.closed: list[Path] = []  # segments, since somebody last took them from here
         self._alive = False
         self._segment_until_s = 0.0
         self._retry_s = 0.0

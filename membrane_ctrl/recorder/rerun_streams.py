@@ -69,12 +69,7 @@ _BEFORE_S = 10.0
 class QuietFilter:
     """Every tick for a minute after a change and ten seconds before it; otherwise `quiet_hz`.
 
-    Parameters
-    ----------
-    rate_hz, quiet_hz : float
-        Ticks, and rows of a quiet second.
-    band_um : float
-        An error beyond it is no quiet.
+    An error beyond `band_um` is no quiet.
     """
 
     def __init__(self, rate_hz: float, quiet_hz: float, band_um: float) -> None:
@@ -169,15 +164,7 @@ _DIFFERENCE_LEAST_UM = 0.5
 
 
 class ShapeStreams:
-    """Sends estimates to a recording. Changes are against the first estimate since `rebase` that was not rejected.
-
-    Attributes
-    ----------
-    reference : ShapeEstimate or None
-        That estimate.
-    pictures : bool
-        Whether maps are sent.
-    """
+    """Sends estimates to a recording. Changes are against the first estimate since `rebase` that was not rejected."""
 
     def __init__(self, recording: sink.Recording) -> None:
         self._recording = recording

@@ -49,27 +49,8 @@ class RecordingError(Exception):
 class Recording:
     """One Rerun recording in segments `<name>-000.rrd`, `-001.rrd`, ...
 
-    Parameters
-    ----------
-    run_dir : Path
-        Folder of the run; its name is the recording's id, so that all segments are one recording.
-    run_name : str
-        In front of the segment's number.
-    clock : RunClock
-        Gives UTC for the run's seconds.
-    config : Config
-        Shown among the recording's properties and used for the blueprint.
-    first_segment : int
-        Number of the first file: not 0 when another recorder has begun the run.
-
-    Attributes
-    ----------
-    segments : int
-        Number of the next file.
-    path : Path or None
-        The file there is.
-    stuck : bool
-        A stream was abandoned: Rerun's exit handler may wait for it for ever.
+    The folder's name is the recording's id, so that all segments are one recording. `first_segment` is not 0 when
+    another recorder has begun the run.
     """
 
     def __init__(self, run_dir: Path, run_name: str, clock: RunClock, config: Config, first_segment: int = 0) -> None:
@@ -78,9 +59,9 @@ class Recording:
         self._origin = np.datetime64(clock.origin_utc.replace(tzinfo=None), "ns")
         self._config = config
         self._stream = self._new_stream()
-        self.stuck = False
-        self.path: Path | None = None
-        self.segments = first_segment
+        self.stuck = False  # a stream was abandoned: Rerun's exit handler may wait for it for ever
+        self.path: Path | None = None  # the file there is
+        self.segments = first_segment  # number of the next file
         self._laid_out = False
 
     def next_segment(self) -> None:
@@ -216,20 +197,7 @@ Report = Callable[[Event], None]
 
 
 class RecorderErrors:
-    """Runs what may fail, and reports what did.
-
-    Parameters
-    ----------
-    report : callable
-        Takes an event for the supervisor; never blocks, never raises.
-    errors : int
-        Of a recorder before this one.
-
-    Attributes
-    ----------
-    errors : int
-        `RecorderError`s reported.
-    """
+    """Runs what may fail, and reports what did; `errors` counts the `RecorderError`s, also of recorders before."""
 
     def __init__(self, report: Report, errors: int = 0) -> None:
         self.report = report

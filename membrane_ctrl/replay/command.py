@@ -219,22 +219,9 @@ _BYTES_MAX = 4_000_000
 def write_incident(
     run: RecordedRun, found: replays.Replay, name: str, begin: int, to_s: float, incidents: Path = INCIDENTS
 ) -> Path:
-    """Make a test of a replay.
+    """Make a test of a replay: the run's inputs up to `to_s`, and the decisions found, which it expects.
 
-    Parameters
-    ----------
-    run : RecordedRun
-        Its inputs are copied.
-    found : Replay
-        Its decisions are what the test expects.
-    name : str
-        Of the folder: small letters, digits, dash and underscore.
-    begin : int
-        Tick the test begins with: the run's first, or one that has the controller's memory with it.
-    to_s : float
-        Where the test ends.
-    incidents : Path
-        Where incidents are.
+    It begins with the tick `begin`: the run's first, or one that has the controller's memory with it.
 
     Raises
     ------

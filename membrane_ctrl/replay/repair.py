@@ -29,22 +29,10 @@ _SCALARS = "Scalars:scalars"
 
 
 def read_rows(path: Path) -> telemetry.Rows:
-    """Telemetry rows of a segment, by time; fields that were left out are NaN.
+    """(n, len(FIELDS)) telemetry rows of a segment, by time in whole nanoseconds; fields that were left out are NaN.
 
-    Parameters
-    ----------
-    path : Path
-        A segment, closed or not. What lies behind damage is not read.
-
-    Returns
-    -------
-    (n, len(FIELDS)) array
-        `mono_s` is the recording's time, in whole nanoseconds.
-
-    Raises
-    ------
-    RuntimeError, ValueError, OSError
-        Rerun's ways to say that nothing can be read.
+    What lies behind damage is not read. Raises RuntimeError, ValueError, OSError: Rerun's ways to say that nothing
+    can be read.
     """
     where = {stream.path: [telemetry.COLUMN[line.field] for line in stream.lines] for stream in streams.STREAMS}
     found: dict[str, tuple[list[IntArray], list[telemetry.Rows]]] = {path: ([], []) for path in where}
@@ -110,13 +98,8 @@ def repair_command(run_dir: Path, in_place: bool, as_json: bool) -> int:
 def repair(run_dir: Path, in_place: bool = False) -> list[FileFinding]:
     """Mend every file of a run that a crash can have torn.
 
-    Parameters
-    ----------
-    run_dir : Path
-        Folder of the run.
-    in_place : bool
-        Repaired files replace the originals; what was cut off the event log stays beside it as `.torn`. Otherwise
-        they go to `repaired/`. A summary that is missing is written to its place in either case.
+    Repaired files go to `repaired/`, or replace the originals; what was cut off the event log stays beside it as
+    `.torn`. A summary that is missing is written to its place in either case.
     """
     if not (run_dir / "config.toml").is_file():
         raise errors.InputError(f"{run_dir}: not a run folder: there is no config.toml in it")

@@ -57,33 +57,12 @@ class Gap:
 
 @dataclass(slots=True)
 class Replay:
-    """What a replay found.
-
-    Attributes
-    ----------
-    begin_s : float
-        Time of the first tick replayed.
-    ticks : int
-        Replayed.
-    compared : int
-        Of these, compared bit by bit.
-    different : int
-        Of these, not the same.
-    first_different : TelemetryRow or None
-        Row of today's code in the first tick that differs.
-    gaps : list of Gap
-    decisions : list of Decision
-        Of today's code.
-    last_s : float
-        Time of the last tick replayed.
-    finished : Exit or None
-        How today's code ended the run.
-    """
+    """What a replay found; rows, decisions and end are those of today's code."""
 
     begin_s: float = math.nan
-    ticks: int = 0
-    compared: int = 0
-    different: int = 0
+    ticks: int = 0  # replayed
+    compared: int = 0  # of these, bit by bit
+    different: int = 0  # of these
     first_different: telemetry.TelemetryRow | None = None
     gaps: list[Gap] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
@@ -98,18 +77,9 @@ def replay(
     from_s: float = 0.0,
     to_s: float = math.inf,
 ) -> Replay:
-    """Run recorded ticks through a new controller.
+    """Run recorded ticks, from the run's first on or from one that has its memory with it, through a new controller.
 
-    Parameters
-    ----------
-    config : Config
-        As the run had it.
-    record : iterable
-        From the run's first tick on, or from one that has its memory with it.
-    sag_sensitivity : (36,) array
-        See `Controller`.
-    from_s, to_s : float
-        What is compared bit by bit; ticks before it run all the same.
+    Compared bit by bit is what lies between `from_s` and `to_s`; ticks before it run all the same.
 
     Raises
     ------

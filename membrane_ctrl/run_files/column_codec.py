@@ -41,13 +41,7 @@ def _stored_field(field: pa.Field) -> pa.Field:
 
 
 def kind_of(field: pa.Field) -> tuple[int, np.dtype[Any]] | None:
-    """Of a stored column: how many numbers a row has, and their kind; None if it is stored as it is.
-
-    Raises
-    ------
-    pa.ArrowInvalid
-        If the column cannot hold them.
-    """
+    """Of a stored column: numbers a row, and their kind; None if it is stored as it is. Raises pa.ArrowInvalid."""
     text = (field.metadata or {}).get(KIND)
     if text is None:
         return None
@@ -63,17 +57,14 @@ def encode(batch: pa.RecordBatch, schema: pa.Schema) -> tuple[pa.RecordBatch, by
     arrays, codes = [], b""
     numbers = {field.name: _numbers(batch.column(field.name)) for field in schema if kind_of(field)}
     for field in schema:
-        column = batch.column(field.name)
-        stored = kind_of(field)
+        code, column, stored = AS_IT_IS, batch.column(field.name), kind_of(field)
         if stored is not None:
             values = numbers[field.name].reshape(batch.num_rows, -1)
             terms = (field.metadata or {}).get(SUM)
             code, words = _words(values, None if terms is None else _sum(terms, numbers, stored[1]))
             planes = words.view("u1").reshape(words.size, -1).T.tobytes()
             column = pa.Array.from_buffers(field.type, batch.num_rows, [None, pa.py_buffer(planes)])
-            codes += code
-        else:
-            codes += AS_IT_IS
+        codes += code
         arrays.append(column)
     return pa.record_batch(arrays, schema=schema), codes
 
@@ -139,23 +130,10 @@ def needed(schema: pa.Schema, names: Sequence[str]) -> list[str]:
 
 
 def decode(batch: pa.RecordBatch, schema: pa.Schema, codes: bytes | None, names: Sequence[str]) -> pa.RecordBatch:
-    """Columns of a stored batch as numbers.
+    """Columns of a batch as numbers; the batch has those `needed`, the schema is of the whole file.
 
-    Parameters
-    ----------
-    batch : pa.RecordBatch
-        With the columns `needed` for the names at least.
-    schema : pa.Schema
-        Of the whole file.
-    codes : bytes or None
-        As the batch came with them; None: of a journal or an earlier version, stored as it is.
-    names : sequence of str
-        Columns wanted.
-
-    Raises
-    ------
-    pa.ArrowInvalid
-        If codes or columns are not those of `encode`.
+    Without codes (of a journal or an earlier version) the columns are as they are. Raises pa.ArrowInvalid if codes or
+    columns are not those of `encode`.
     """
     if codes is None and not any(kind_of(schema.field(name)) for name in names):
         return batch.select(list(names))

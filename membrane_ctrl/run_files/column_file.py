@@ -28,20 +28,7 @@ from membrane_ctrl.run_files.sealed_stream import SealedStream, whole_batches
 
 
 class Journal:
-    """The file of one table.
-
-    Parameters
-    ----------
-    path : Path
-        Where it is; there is none while nothing waits.
-    schema : pa.Schema
-        Of the table.
-
-    Attributes
-    ----------
-    kept : int
-        Batches in it.
-    """
+    """The file of one table at `path`, while something waits; `kept` batches are in it."""
 
     def __init__(self, path: Path, schema: pa.Schema) -> None:
         self._path = path
@@ -57,13 +44,7 @@ class Journal:
         return found
 
     def keep(self, waiting: Sequence[pa.RecordBatch]) -> None:
-        """Add what is not yet in it, and wait until the disk has it.
-
-        Raises
-        ------
-        OSError
-            Full disk: the next call begins anew, with all that waits.
-        """
+        """Add what is not yet in it, and sync. Raises OSError (full disk): the next call begins anew."""
         if self.kept == len(waiting):
             return
         try:
@@ -108,23 +89,10 @@ WAIT_S = 600.0
 
 
 class ColumnFile:
-    """One table, appended to in batches.
+    """One table of a run, appended to in batches; its column `time_name` holds rising seconds of the run.
 
-    Parameters
-    ----------
-    run_dir : Path
-        Folder of the run.
-    table : str
-        Name in front of the number.
-    schema : pa.Schema
-        Of its columns; one of them is `time_name`.
-    time_name : str
-        Seconds of the run, rising.
-    batch_s : float
-        Rows wait in memory and in the journal until they span this long, and `WAIT_S` longer for a full disk.
-    resumed : bool
-        Go on where another recorder died: with its journal, and without a row that it has written.
-
+    Rows wait in memory and in the journal until they span `batch_s`, and `WAIT_S` longer for a full disk. A `resumed`
+    recorder goes on where another died: with its journal, and without a row that it has written.
     """
 
     def __init__(
@@ -151,13 +119,7 @@ class ColumnFile:
                 self._take(batch)
 
     def add(self, columns: Mapping[str, ArrayLike]) -> None:
-        """Take in rows that are later than those before; a full batch goes to the disk.
-
-        Raises
-        ------
-        OSError
-            Full disk: the rows wait for the next call.
-        """
+        """Take in rows that are later than those before. Raises OSError (full disk): they wait for the next call."""
         arrays = [pa.array(columns[field.name], type=field.type) for field in self._schema]
         if not self._take(pa.record_batch(arrays, schema=self._schema)):
             return

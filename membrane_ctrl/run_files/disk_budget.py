@@ -76,17 +76,9 @@ def _may_run(folder: Path, now_utc: datetime) -> bool:
 def expired(
     runs: Sequence[OldRun], present_bytes: int, keep_gb: float | None, keep_days: float | None, now_utc: datetime
 ) -> list[tuple[OldRun, str]]:
-    """Which runs have to go, and why.
+    """Which of the runs (oldest first) have to go, and why; the newest three are never too old.
 
-    Parameters
-    ----------
-    runs : sequence of OldRun
-        Oldest first.
-    present_bytes : int
-        Of the present run; it counts, and stays.
-    keep_gb, keep_days : float or None
-        Limits (1e9 bytes); None: no limit. The newest three are never too old.
-    now_utc : datetime
+    The bytes of the present run count, and it stays. None is no limit.
     """
     total = present_bytes + sum(run.size_bytes for run in runs)
     gone: list[tuple[OldRun, str]] = []
@@ -134,17 +126,7 @@ _HYSTERESIS = 1.1
 
 
 def detail_level(free_mb: float, min_free_mb: float, before: DetailLevel) -> DetailLevel:
-    """How much to record with this much space left.
-
-    Parameters
-    ----------
-    free_mb : float
-        Space left.
-    min_free_mb : float
-        `recording.min_free_mb`.
-    before : DetailLevel
-        As it was.
-    """
+    """How much to record with this much space left, after recording this much before."""
     level = _level(free_mb, min_free_mb)
     return max(level, min(before, _level(free_mb / _HYSTERESIS, min_free_mb)))
 

@@ -31,7 +31,6 @@ _HEAD = struct.Struct("<8sII")  # magic, bytes that follow, their CRC-32
 _COUNT = struct.Struct("<I")
 _PART = struct.Struct("<cqI")  # kind, tick, bytes that follow
 _TAIL, _SHAPE, _MEMORY = b"C", b"S", b"M"
-_LOOK_BYTES = 1 << 20  # holds a first frame, whatever is in it
 # A file of six hours at 200 Hz is 130 MB, a second 100 kB; a shape with its covariance is 12 kB, a memory 30 kB.
 _FILE_BYTES_MAX = 300_000_000
 _BODY_BYTES_MAX = 16_000_000
@@ -51,28 +50,13 @@ class InputsFrame:
 
 
 class InputsReader:
-    """Reads what the ticks of a run were given; damage is listed, not raised.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the run, or of an incident.
-    paths : list of Path
-        Its files.
-
-    Attributes
-    ----------
-    program : str
-        Who recorded the last file that was read.
-    damage : list of str
-        What could not be read so far, one line a place.
-    """
+    """Reads the inputs of a run or an incident; damage is listed, not raised."""
 
     def __init__(self, folder: Path, paths: list[Path]) -> None:
         self._folder = folder
         self.paths = paths
-        self.program = ""
-        self.damage: list[str] = []
+        self.program = ""  # that recorded the last file read
+        self.damage: list[str] = []  # what could not be read so far, one line a place
 
     def __iter__(self) -> Iterator[InputsFrame]:
         """All frames in order; a tick that was written twice (a recorder that went on) comes once."""
@@ -216,23 +200,8 @@ class FramesReader(InputsReader):
                 yield InputsFrame(fresh, frame.tails, frame.memories, frame.estimates)
 
     def since(self, time_s: float) -> InputsReader:
-        """A reader that begins a file or two before this time of the run."""
-        found = FramesReader(self._folder, self.paths)
-        begun = [place for place, path in enumerate(self.paths) if found._first_s(path) <= time_s]
-        found.paths = self.paths[max(0, max(begun, default=0) - 1) :]
-        found.damage.clear()  # it is told again when the file is read
-        return found
-
-    def _first_s(self, path: Path) -> float:
-        try:
-            with files.open_plain(path) as file:
-                data = file.read(_LOOK_BYTES)
-            kind = self._kind_of(data, path.name)
-            body = next(self._bodies(data, path.name), None)
-            frame = None if kind is None or body is None else _frame_of(body, kind)
-        except (OSError, ValueError, struct.error, LookupError, TypeError):  # told when it is read
-            return math.inf
-        return math.inf if frame is None or not len(frame.records) else float(frame.records["now_s"][0])
+        """A reader that begins with the run."""
+        return FramesReader(self._folder, self.paths)
 
     def _kind_of(self, data: bytes, name: str) -> np.dtype[np.void] | None:
         """The file's own record: one of an older program may lack a field, one of a newer have more."""

@@ -41,13 +41,7 @@ class LatchedFault:
 
 
 class LatchedFile:
-    """The file in a folder of runs.
-
-    Parameters
-    ----------
-    logs_dir : Path
-        Where run folders go.
-    """
+    """The file in a folder of runs."""
 
     def __init__(self, logs_dir: Path) -> None:
         self.path = logs_dir / NAME

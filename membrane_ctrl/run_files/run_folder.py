@@ -27,31 +27,16 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 def create_run_folder(logs_dir: Path, name: str, started_utc: datetime, config: Config) -> Path:
-    """Make the run's folder and write `config.toml` into it, every default written out.
+    """Make `<logs_dir>/20261121T012345Z-<name>` with `config.toml`, every default written out.
 
-    Parameters
-    ----------
-    logs_dir : Path
-        Where runs go; made if it is not there.
-    name : str
-        Letters, digits, dot, dash and underscore.
-    started_utc : datetime
-        The run's start, aware.
-    config : Config
-        As run.
-
-    Returns
-    -------
-    Path
-        `<logs_dir>/20261121T012345Z-<name>`; a second run in the same second gets `-2` behind it.
+    A second run in the same second gets `-2` behind it.
 
     Raises
     ------
     InputError
-        If the name is not one.
+        If the name has other characters than letters, digits, dot, dash and underscore.
     DeviceError
-        If the folder cannot be written or the disk has less than `recording.min_free_mb` free: one line that
-        names the folder and the remedy. Nothing is left behind.
+        If the folder cannot be written or the disk has less than `recording.min_free_mb` free: nothing is left.
     """
     if not _NAME.fullmatch(name):
         raise errors.InputError(

@@ -110,21 +110,9 @@ _END = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # Arrow's end of a stream
 
 
 class SealedStream:
-    """Writes one file, a message at a time.
+    """Writes one file, new or replaced, a message at a time; `compression` is `zstd` or `lz4`.
 
-    Parameters
-    ----------
-    path : Path
-        A new file, or one to be replaced.
-    schema : pa.Schema
-        Of the batches.
-    compression : str, optional
-        Of the batches' buffers: `zstd`, `lz4`.
-
-    Raises
-    ------
-    OSError
-        The file cannot be made, or the disk does not take its head.
+    Raises OSError if the file cannot be made, or the disk does not take its head.
     """
 
     def __init__(self, path: Path, schema: pa.Schema, compression: str | None = None) -> None:
@@ -164,40 +152,20 @@ class SealedStream:
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """A stretch of a file that is no whole message.
+    """A stretch of a file that is no whole message."""
 
-    Attributes
-    ----------
-    batches : int
-        Whole batches in front of it.
-    size_bytes : int
-    at_end : bool
-        Nothing whole comes behind it.
-    """
-
-    batches: int
+    batches: int  # whole ones in front of it
     size_bytes: int
-    at_end: bool
+    at_end: bool  # nothing whole comes behind it
 
 
 @dataclass(frozen=True, slots=True)
 class Unsealed:
-    """What of a file may be given to Arrow.
+    """What of a file may be given to Arrow."""
 
-    Attributes
-    ----------
-    data : bytes
-        A stream of whole messages; empty if the file's head, without which no batch can be read, is not whole.
-    sealed : bool
-        False: a file of a version without seals, as it is.
-    ended : bool
-        It was closed, not left by a killed recorder or cut.
-    damage : tuple of Damage
-    """
-
-    data: bytes
-    sealed: bool
-    ended: bool
+    data: bytes  # a stream of whole messages; empty if the head, without which no batch can be read, is not whole
+    sealed: bool  # False: a file of a version without seals, as it is
+    ended: bool  # it was closed, not left by a killed recorder or cut
     damage: tuple[Damage, ...]
 
 
@@ -220,13 +188,7 @@ def unseal(data: bytes) -> Unsealed:
 
 
 def whole_batches(path: Path, names: list[str] | None = None) -> Iterator[pa.RecordBatch]:
-    """Batches of a file that are whole, with all columns or some.
-
-    Raises
-    ------
-    OSError, pa.ArrowException
-        If the file cannot be read; of one without seals, behind the last batch before damage.
-    """
+    """Batches of a file that are whole, with all columns or some. Raises OSError, pa.ArrowException."""
     data = unseal(read_bytes(path, FILE_BYTES_MAX)).data
     if not data:
         return
@@ -235,13 +197,7 @@ def whole_batches(path: Path, names: list[str] | None = None) -> Iterator[pa.Rec
 
 
 def decoded_batches(data: bytes, names: Sequence[str] | None = None) -> Iterator[pa.RecordBatch]:
-    """Batches of an Arrow stream, with all columns or some, their numbers decoded.
-
-    Raises
-    ------
-    pa.ArrowException
-        If a batch is not whole, or not as `column_codec.encode` leaves it.
-    """
+    """Batches of an Arrow stream, with all columns or some, their numbers decoded. Raises pa.ArrowException."""
     schema = pa.ipc.open_stream(data).schema
     wanted = list(schema.names if names is None else names)
     fields = [schema.get_field_index(name) for name in column_codec.needed(schema, wanted)]

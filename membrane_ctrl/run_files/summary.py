@@ -52,21 +52,10 @@ class Moments:
 
 
 class LogHistogram:
-    """Quantiles of positive values from bins of equal ratio.
+    """Quantiles of positive values from bins of equal ratio between `low` and `high`, which have a bin each beyond.
 
-    Parameters
-    ----------
-    low, high : float
-        Range; values outside are counted in the first or last bin.
-    ratio : float
-        Upper edge over lower edge of a bin. A quantile is given as its bin's geometric middle, so its relative
-        error is at most sqrt(ratio) - 1.
-
-    Attributes
-    ----------
-    count : int
-    largest : float
-        Exact; NaN without values.
+    A quantile is given as its bin's geometric middle, so its relative error is at most sqrt(ratio) - 1; `largest` is
+    exact.
     """
 
     def __init__(self, low: float = 1e-3, high: float = 1e5, ratio: float = 1.02) -> None:
@@ -98,12 +87,7 @@ class LogHistogram:
 class SecondMeans:
     """Means over consecutive windows of one second; a window with a gap in it gives none.
 
-    Attributes
-    ----------
-    count, inside : int
-        Windows so far, and those whose mean is within `band`.
-    first, last : float
-        Mean of the first and of the latest window; NaN before there is one.
+    `count` windows so far, `inside` of them with a mean within `band`; means of the `first` and the `last`, or NaN.
     """
 
     def __init__(self, band: float, window_s: float = 1.0, gap_s: float = 0.5) -> None:

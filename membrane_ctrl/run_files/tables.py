@@ -206,30 +206,16 @@ def shape_schema() -> pa.Schema:
 
 @dataclass(frozen=True, slots=True)
 class OpenWindows:
-    """Windows of the overview that are not over: what the recorder after a dead one needs to end them.
+    """Windows of the overview that are not over: what the recorder after a dead one needs to end them."""
 
-    Attributes
-    ----------
-    ticks : dict
-        Rows of the open window of 1 s.
-    levels : dict
-        By the coarser window in s: rows of the finer level that are in its open window.
-    """
-
+    # rows of the open window of 1 s
     ticks: Columns = field(default_factory=lambda: {name: np.empty(0) for name in TICK_FIELDS})
+    # by the coarser window in s: rows of the finer level that are in its open window
     levels: dict[float, Columns] = field(default_factory=dict)
 
 
 class ColumnTables:
-    """All tables of a run; takes in what the recorder takes in.
-
-    Parameters
-    ----------
-    run_dir : Path
-        Folder of the run.
-    resumed : OpenWindows or None
-        From the recorder that died; None at the start of a run.
-    """
+    """All tables of a run; `resumed` is from the recorder that died, None at the start of a run."""
 
     def __init__(self, run_dir: Path, resumed: OpenWindows | None = None) -> None:
         def table(name: str, schema: pa.Schema, time_name: str, batch_s: float) -> ColumnFile:
