@@ -109,11 +109,14 @@ def gray_orders(gray: ArrayLike, white: ArrayLike, black: ArrayLike) -> tuple[In
         floor(s / T) from bits 1-3 and floor((V2 + 1) / 2) from all four, V2 = floor(2 s / T).
     """
     threshold = (np.asarray(white, float) + np.asarray(black, float)) / 2
-    bits = (np.asarray(gray, float) > threshold).astype(np.int64)
-    binary = np.bitwise_xor.accumulate(bits, axis=0)  # Gray to binary: each bit is the xor of all above it
+    return code_orders(np.asarray(gray, float) > threshold)
+
+
+def code_orders(bits: BoolArray) -> tuple[IntArray, IntArray]:
+    """The same from the bits (4, ...)."""
+    binary = np.bitwise_xor.accumulate(bits.astype(np.int64), axis=0)  # each bit is the xor of all above it
     k1 = 4 * binary[0] + 2 * binary[1] + binary[2]
-    v2 = 2 * k1 + binary[3]
-    return k1, (v2 + 1) // 2
+    return k1, (2 * k1 + binary[3] + 1) // 2
 
 
 def absolute_phase(wrapped_rad: FloatArray, k1: IntArray, k2: IntArray) -> FloatArray:

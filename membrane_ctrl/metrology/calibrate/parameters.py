@@ -136,7 +136,7 @@ def poses_at(stated: Geometry, values: AnyArray) -> Poses:
     f0, o0 = stated.pinhole_mm, stated.screen_origin_mm
     hinge = _hinge(f0, o0)
     up, back = _turn(hinge, alpha), _turn(hinge, -alpha)
-    rows = np.stack([stated.screen_s_x, stated.screen_s_y, np.cross(stated.screen_s_x, stated.screen_s_y)])
+    rows = stated.screen_axes
     i, j, k = np.eye(3)
     return Poses(
         pinhole_mm=(1 + a / np.linalg.norm(f0)) * (up @ f0),

@@ -24,7 +24,7 @@ from membrane_ctrl.metrology.optics import compiled, hencky, kernels, screen_fac
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 # Small matrix products as plain loops.
 #
@@ -85,15 +85,12 @@ class SetPhases:
 
     def thinned(self, most: int) -> "SetPhases":
         """Every k-th bin, so that at most `most` are left."""
-        keep = slice(None, None, -(-self.column_px.size // most))
-        return SetPhases(
-            self.name,
-            self.column_px[keep],
-            self.row_px[keep],
-            self.screen_mm[:, keep],
-            self.sigma_mm[keep],
-            self.displacement_um,
-        )
+        return self.subset(slice(None, None, -(-self.column_px.size // most)))
+
+    def subset(self, keep: slice | BoolArray) -> "SetPhases":
+        """Some of the bins."""
+        places = self.column_px[keep], self.row_px[keep]
+        return SetPhases(self.name, *places, self.screen_mm[:, keep], self.sigma_mm[keep], self.displacement_um)
 
 
 @dataclass(frozen=True)
@@ -292,10 +289,8 @@ def curvatures(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> tuple[Fl
     """h_xx, h_xy and h_yy in 1/mm."""
     x, y = x_mm / surface.radius_mm, y_mm / surface.radius_mm
     v = x * x + y * y
-    first, second = (
-        2 * series.polyval(v, series.polyder(surface.excess)),
-        4 * series.polyval(v, series.polyder(surface.excess, 2)),
-    )
+    first = 2 * series.polyval(v, series.polyder(surface.excess))
+    second = 4 * series.polyval(v, series.polyder(surface.excess, 2))
     by_x, by_y = (series.polyder(surface.polynomial, axis=axis) for axis in (0, 1))
     hxx = series.polyval2d(x, y, series.polyder(by_x, axis=0)) + first + second * x * x
     hxy = series.polyval2d(x, y, series.polyder(by_x, axis=1)) + second * x * y

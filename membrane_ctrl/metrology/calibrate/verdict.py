@@ -36,13 +36,11 @@ def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
     spread_um = float(np.ptp(moved[known])) if known.any() else 0.0
     seen_um = float(np.ptp(sag_um))
     if max(spread_um, seen_um) < LEAST_SPREAD_UM:
-        return (
-            CalibrationFinding(
-                True,
-                f"the sets are only {max(spread_um, seen_um):.0f} um apart: they say no more than one of them; "
-                f"at least {LEAST_SPREAD_UM / 1000:.0f} mm are needed, {GOOD_SPREAD_UM / 1000:.0f} mm are good",
-            ),
+        says = (
+            f"the sets are only {max(spread_um, seen_um):.0f} um apart: they say no more than one of them; "
+            f"at least {LEAST_SPREAD_UM / 1000:.0f} mm are needed, {GOOD_SPREAD_UM / 1000:.0f} mm are good"
         )
+        return (CalibrationFinding(True, says),)
     if np.count_nonzero(known) < 2:
         return ()  # nothing to compare
     slope = float(np.polyfit(moved[known], sag_um[known], 1)[0]) if spread_um > 0 else np.inf
@@ -95,16 +93,14 @@ def _astray(solution: Solution) -> CalibrationFinding:
     problem, count = solution.problem, len(solution.problem.sets)
     for k in range(count if count > 2 else 0):
         if _agree(replace(problem, sets=problem.sets[:k] + problem.sets[k + 1 :])):
-            return CalibrationFinding(
-                True, f"{problem.sets[k].name} disagrees with all the others: it is of another bench", (k,)
-            )
+            says = f"{problem.sets[k].name} disagrees with all the others: it is of another bench"
+            return CalibrationFinding(True, says, (k,))
     for k in range(2, count - 1):
         if all(_agree(replace(problem, sets=part)) for part in (problem.sets[:k], problem.sets[k:])):
             says = f"the bench was changed between {problem.sets[k - 1].name} and {problem.sets[k].name}"
             return CalibrationFinding(True, says, tuple(range(k, count)))
-    return CalibrationFinding(
-        True, "the sets do not show one bench: they are of different rigs, or several of them are bad"
-    )
+    says = "the sets do not show one bench: they are of different rigs, or several of them are bad"
+    return CalibrationFinding(True, says)
 
 
 def _agree(problem: Problem) -> bool:
@@ -120,9 +116,8 @@ def _agree(problem: Problem) -> bool:
 def _why(solution: Solution, index: int) -> str:
     """Whether it is one set's laser reading that is wrong, or its fringes."""
     rest, phases = diagnose.without(solution, index), solution.problem.sets[index]
-    vertex_um = 1e3 * (
-        rest.common[len(parameters.NAMES)] - separable.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
-    )
+    rim_mm = separable.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
+    vertex_um = 1e3 * (rest.common[len(parameters.NAMES)] - rim_mm)
     moved_um = phases.displacement_um - solution.problem.references.reference_um
     miss_um = moved_um + vertex_um / (1 + rest.values[parameters.NAMES.index(parameters.LASER.name)])
     if abs(miss_um) > _LASER_SIGMAS * solution.problem.references.laser_sigma_um:
@@ -135,12 +130,8 @@ def _scatter(solution: Solution) -> list[CalibrationFinding]:
     ratios = np.sqrt([each.variance for each in solution.equations])
     worse = np.flatnonzero(ratios > _SCATTER * np.median(ratios))
     names = [phases.name for phases in solution.problem.sets]
-    return [
-        CalibrationFinding(
-            False, f"{names[k]} scatters {ratios[k]:.1f} times as much as its camera should", (int(k),)
-        )
-        for k in worse
-    ]
+    says = "{} scatters {:.1f} times as much as its camera should"
+    return [CalibrationFinding(False, says.format(names[k], ratios[k]), (int(k),)) for k in worse]
 
 
 def _laser(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
@@ -170,11 +161,8 @@ def _spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
     """What the sets could have said if they were others."""
     moved = np.array([phases.displacement_um for phases in solution.problem.sets])
     if np.count_nonzero(np.isfinite(moved)) < 2:
-        return (
-            CalibrationFinding(
-                False, "fewer than two sets carry a laser reading: the sag rests on fringes and ring alone"
-            ),
-        )
+        says = "fewer than two sets carry a laser reading: the sag rests on fringes and ring alone"
+        return (CalibrationFinding(False, says),)
     spread_um = float(np.ptp(moved[np.isfinite(moved)]))
     if spread_um >= GOOD_SPREAD_UM / 2:
         return ()

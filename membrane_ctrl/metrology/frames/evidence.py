@@ -38,12 +38,8 @@ class SampledBins:
     def thinned(self) -> "SampledBins":
         """Enough of the bins."""
         every = slice(None, None, max(1, self.index.size // _SAMPLE))
-        return SampledBins(
-            self.index[every],
-            self.light[every],
-            self.phase_rad[:, every],
-            self.sensitivity_rad_per_um[:, every],
-        )
+        of_axes = self.phase_rad[:, every], self.sensitivity_rad_per_um[:, every]
+        return SampledBins(self.index[every], self.light[every], *of_axes)
 
 
 @dataclass(frozen=True)

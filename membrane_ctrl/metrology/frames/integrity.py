@@ -73,9 +73,8 @@ def obvious(stack: FrameStack, binned: Binned) -> list[Flag]:
     flags = []
     for k in frames:
         if light[k] < _DARK * middle:
-            flags.append(
-                Flag(k, f"dark: {light[k] / middle:.2f} of the light of the others", middle / max(light[k], 1e-9))
-            )
+            says = f"dark: {light[k] / middle:.2f} of the light of the others"
+            flags.append(Flag(k, says, middle / max(light[k], 1e-9)))
         elif burnt[k] > usual + 10 * SATURATED_SHARE:
             flags.append(Flag(k, f"saturated: {burnt[k]:.0%} of the bins", burnt[k] / SATURATED_SHARE))
     return flags

@@ -274,17 +274,10 @@ def _flat_flags(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatArr
     frames = np.concatenate([axis.frames.reshape(-1, black.size) for axis in axes])
     margin = 0.1 * np.ptp(np.percentile(frames, [5, 95]))
     typical_high, typical_low = np.percentile(frames, [90, 10], axis=0)
-    beyond = {
-        "white": float(np.mean(typical_high > white + margin)),
-        "black": float(np.mean(typical_low < black - margin)),
-    }
+    white_share = float(np.mean(typical_high > white + margin))
+    black_share = float(np.mean(typical_low < black - margin))
     return [
-        SeriesFlag(
-            name,
-            0,
-            0,
-            f"not {'brighter' if name == 'white' else 'darker'} than the fringes at {share:.0%} of the pixels",
-        )
-        for name, share in beyond.items()
+        SeriesFlag(name, 0, 0, f"not {word} than the fringes at {share:.0%} of the pixels")
+        for name, word, share in (("white", "brighter", white_share), ("black", "darker", black_share))
         if share > BEYOND_SHARE
     ]

@@ -99,9 +99,8 @@ class TrialBench:
 
     def geometry(self, names: tuple[str, ...], change: FloatArray) -> Geometry:
         """The nominal geometry changed."""
-        return Geometry.from_config(
-            self.optics.model_copy(update={"geometry": changed(self.optics.geometry, names, change)})
-        )
+        moved = {"geometry": changed(self.optics.geometry, names, change)}
+        return Geometry.from_config(self.optics.model_copy(update=moved))
 
     def slope_variance(self) -> FloatArray:
         """(2,) variance of an x and of a y slope from the noise."""
@@ -124,20 +123,10 @@ def run_trials(
     trials: Sequence[int],
     first_set: int = 0,
 ) -> FloatArray:
-    """Parameters (trials, sets, 36) in mm of some trials; all sets share the geometry of a trial.
+    """Parameters (trials, sets, 36) in mm of the trials with these numbers; all sets share the geometry of a trial.
 
-    Parameters
-    ----------
-    benches : sequence of TrialBench
-        One a set; of one bench, that is with the same nominal geometry.
-    spread : GeometrySpread
-        Of the geometry.
-    seed : int
-        Of all that is random.
-    trials : sequence of int
-        Numbers of the trials.
-    first_set : int
-        Number of the first set in its run: noise differs from set to set.
+    The benches, one a set, have the same nominal geometry. `first_set` is the number of the first set in its run:
+    noise differs from set to set.
     """
     out = np.empty((len(trials), len(benches), PARAMETERS))
     for row, trial in enumerate(trials):
