@@ -22,7 +22,7 @@ from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, MirrorConf
 from membrane_ctrl.config.toml_file import parse, prune, read_toml, with_height_map
 from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, origin_of
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
-from membrane_ctrl.metrology.phase import AXES, GRAY_BITS
+from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
 from membrane_ctrl.model.arrays import FloatArray, Image
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.files import read_bytes
@@ -167,9 +167,8 @@ def assemble(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet:
     size, depth = (camera.height_px, camera.width_px), _most([image.dtype for image in good])
     seen = _most([image.shape for image in good])
     if seen != size:
-        raise InputError(
-            f"{path}: camera.width_px, height_px: {size[1]} x {size[0]}, but the images are {seen[1]} x {seen[0]}"
-        )
+        said = f"{size[1]} x {size[0]}, but the images are {seen[1]} x {seen[0]}"
+        raise InputError(f"{path}: camera.width_px, height_px: {said}")
     frames: Image = np.zeros((len(images), *size), depth)
     unusable: dict[int, str] = {}
     for k, image in enumerate(images):
@@ -265,7 +264,7 @@ def _ordered(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]
                 f"{path}: frames: {pattern.name} is there twice ({found[pattern.name][0].file}, {row.file})"
             )
         found[pattern.name] = (row, pattern)
-    names = _sequence_names(content)
+    names = [p.name for p in (full_sequence if content.kind == "full" else fringe_sequence)(content.pattern)]
     if missing := [name for name in names if name not in found]:
         raise InputError(f"{path}: frames: a {content.kind} set of {content.pattern.steps} steps needs {missing[0]}")
     if extra := [name for name in found if name not in names]:
@@ -274,15 +273,6 @@ def _ordered(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]
         if times > 1:
             raise InputError(f"{path}: frames: {name} is given for {times} frames")
     return [found[name] for name in names]
-
-
-def _sequence_names(content: CaptureFile) -> list[str]:
-    names: list[str] = []
-    for axis in AXES:
-        names += [Pattern("sin", axis, k).name for k in range(content.pattern.steps)]
-        if content.kind == "full":
-            names += [Pattern("gray", axis, bit).name for bit in range(1, GRAY_BITS + 1)]
-    return names + (["white", "black"] if content.kind == "full" else [])
 
 
 def _column(values: list[float | None]) -> FloatArray:

@@ -143,9 +143,6 @@ def noise_seen_adu(measurement: Measurement) -> float:
     return float(np.sqrt(np.median(np.square(measurement.full.rest_adu)) / free)) if free else float("nan")
 
 
-# The figure of one capture set on disk from its bins: what the analyses of many sets call.
-
-
 @dataclass(frozen=True)
 class SetFigure:
     """A set that gave a figure.
@@ -176,12 +173,9 @@ class SetFigure:
 
 
 class Figures:
-    """Figures of sets, one after the other; caches the last reference, which most sets of a run share.
+    """Figures of sets, one after the other, if wanted with another geometry than their own.
 
-    Parameters
-    ----------
-    geometry : GeometryFile, optional
-        Used instead of the sets' own.
+    The last reference, which most sets of a run share, is cached.
     """
 
     def __init__(self, geometry: GeometryFile | None = None) -> None:

@@ -108,9 +108,8 @@ def points_mm(given: tuple[str, ...], analysis_radius_mm: float) -> dict[str, tu
         except ValueError:
             raise errors.InputError(f"--point {text}: give NAME=X,Y in mm, as A=100,-200") from None
         if not name or not math.hypot(x, y) <= analysis_radius_mm:
-            raise errors.InputError(
-                f"--point {text}: needs a name and a place within {analysis_radius_mm:g} mm of the vertex"
-            )
+            within = f"within {analysis_radius_mm:g} mm of the vertex"
+            raise errors.InputError(f"--point {text}: needs a name and a place {within}")
         points[name] = (x, y)
     return points or default_points_mm(analysis_radius_mm)
 

@@ -24,21 +24,8 @@ _PAIR_HEAD = ("lag_s", "earlier", "later", "seconds", "change_rms_um", "rmse_mea
 class StabilityRun:
     """Statistics over the sets of a run.
 
-    Parameters
-    ----------
-    out : Path
-        Existing folder for `series.csv`, `pairs.csv`, the SD map and the pictures.
-    points_mm : mapping of name to (x, y)
-        Where the height is followed.
-    trials, seed : int
-        Of the Monte Carlo, for every set.
-    geometry : Path, optional
-        The file that the sets' geometry is from, with its covariance.
-
-    Attributes
-    ----------
-    degraded : int
-        Sets that gave a figure with a reservation.
+    `out` is an existing folder for `series.csv`, `pairs.csv`, the SD map and the pictures; `points_mm` are the places
+    where the height is followed; `geometry` is the file that the sets' geometry is from, with its covariance.
     """
 
     def __init__(
@@ -184,9 +171,11 @@ class StabilityRun:
         stability_results.draw_zernike(drawn[1], times, coeffs)
         if not self._shown:
             return drawn[:2]
-        stability_results.draw_pairs(
-            drawn[2], axis, {lag: self._pair_maps(grid, pair) for lag, pair in self._shown.items()}
-        )
+        maps = {
+            lag: (grid.picture(1e3 * grid.matrix @ pair.change), grid.picture(1e3 * grid.sigma(pair.covariance)))
+            for lag, pair in self._shown.items()
+        }
+        stability_results.draw_pairs(drawn[2], axis, maps)
         return drawn
 
     def record(self, pictures: list[Path]) -> None:
@@ -240,13 +229,8 @@ class StabilityRun:
         for row, (name, (x, y)) in zip(self._point_matrix, self._points_mm.items(), strict=True):
             tally = self._heights[name]
             sd_um = 1e3 * math.sqrt(row @ self._parameters.covariance @ row)
-            table[name] = {
-                "x_mm": x,
-                "y_mm": y,
-                "mean_um": tally.mean,
-                "sd_um": sd_um,
-                "peak_to_peak_um": tally.high - tally.low,
-            }
+            moved = {"mean_um": tally.mean, "sd_um": sd_um, "peak_to_peak_um": tally.high - tally.low}
+            table[name] = {"x_mm": x, "y_mm": y} | moved
         return table
 
     def _pair_table(self, lag_s: float) -> dict[str, Any]:
@@ -256,15 +240,10 @@ class StabilityRun:
             for name, tally in (("change_rms_um", change), ("rmse_um", rmse))
         }
 
-    def _pair_maps(self, grid: monte_carlo.HeightMap, pair: stability.FigurePair) -> tuple[FloatArray, FloatArray]:
-        return grid.picture(1e3 * grid.matrix @ pair.change), grid.picture(1e3 * grid.sigma(pair.covariance))
-
 
 def _pair_line(pair: dict[str, Any]) -> str:
     lag = f"{pair['lag_s'] / 60:g} min"
     if not pair["count"]:
         return f"{lag:9s} no pairs"
-    change, rmse = pair["change_rms_um"], pair["rmse_um"]
-    return (
-        f"{lag:9s} {pair['count']} pairs: change {change['mean']:.4g} um RMS, RMSE {rmse['mean']:.4g} um on average"
-    )
+    change, rmse = pair["change_rms_um"]["mean"], pair["rmse_um"]["mean"]
+    return f"{lag:9s} {pair['count']} pairs: change {change:.4g} um RMS, RMSE {rmse:.4g} um on average"

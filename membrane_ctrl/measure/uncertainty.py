@@ -43,19 +43,11 @@ def run_everywhere(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> FloatArray:
-    """Parameters (trials, sets, 36) in mm, with a progress bar on a terminal.
+    """Parameters (trials, sets, 36) in mm as `monte_carlo.run_trials`, with a progress bar on a terminal.
 
-    Raises InputError if Dask is asked for and not installed, or if the spread is too wide for the fit to converge;
-    DeviceError if the scheduler does not answer.
-
-    Parameters
-    ----------
-    benches, spread, seed
-        See `monte_carlo.run_trials`.
-    workers : int, optional
-        Processes; chosen by the amount of work if not given.
-    scheduler : str, optional
-        Address of a Dask scheduler, as tcp://host:8786, to run there instead.
+    `workers` is the number of processes, by default chosen by the amount of work; `scheduler` the address of a Dask
+    scheduler, as tcp://host:8786, to run there instead. Raises InputError if Dask is wanted and not installed, or the
+    spread is too wide for the fit to converge; DeviceError if the scheduler does not answer.
     """
     batches = [range(first, min(first + _BATCH, trials)) for first in range(0, trials, _BATCH)]
     job = partial(monte_carlo.run_trials, benches, spread, seed)

@@ -17,7 +17,7 @@ from membrane_ctrl.metrology.frames import evidence, frame_stack, integrity
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.orders import gray_bit, orders
 from membrane_ctrl.metrology.phase import AXES, centre_phase_rad, inside_pattern, mm_per_rad
-from membrane_ctrl.model.arrays import BoolArray, FloatArray
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 from membrane_ctrl.model.shape_estimate import RESIDUAL_REJECTED_URAD, Verdict
 
 _ROUNDS = 8
@@ -58,6 +58,11 @@ class Checked:
         if not self.flags:
             return "ok", ""
         return "degraded", f"{len(self.flags)} frame(s) flagged; the figure is made without what they spoil"
+
+    def places_px(self, index: IntArray) -> FloatArray:
+        """Column and row (2, n) of bins' centres."""
+        row, column = np.divmod(index, self.phase_rad.shape[2])
+        return self.binned.bin_px * np.stack([column, row]) + (self.binned.bin_px - 1) / 2
 
     def anchor(self) -> Anchor:
         """For the sets that lean on this one."""

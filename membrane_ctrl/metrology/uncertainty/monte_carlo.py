@@ -47,11 +47,9 @@ class TrialBench:
         cls, optics: OpticsConfig, checked: Checked, figure: full.BinFigure, count: int = TRIAL_POINTS
     ) -> "TrialBench":
         """Of a set's figure, its points thinned to about `count`."""
-        row, column = np.divmod(figure.index, checked.phase_rad.shape[2])
-        side = checked.binned.bin_px
-        place_px = side * np.stack([column, row]) + (side - 1) / 2
+        places_px = checked.places_px(figure.index)
         return cls.of_points(
-            optics, checked.tracer, figure.fit.surface, figure.points, place_px, figure.sigma_mm, count
+            optics, checked.tracer, figure.fit.surface, figure.points, places_px, figure.sigma_mm, count
         )
 
     @classmethod
