@@ -10,12 +10,11 @@ from pathlib import Path
 
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control.film_health import TOO_TIGHT_UM_PER_S
-from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.control_port.ctl import Where, socket_path
+from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, RejectedError
 from membrane_ctrl.sessions import folder as plain
 from membrane_ctrl.sessions.folder import STEPS, SessionFolder, create_session, newest_session, open_session
-from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, LiveHold, Progress
+from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, Progress, live_hold
 from tuning import gains_file, report, session, twin_hold
 from tuning.identification.characterise import TYPICAL_S
 from tuning.proposal.verify import SETTLE_LEAST_S, STAGES, Stage
@@ -271,27 +270,12 @@ def _go_back(rig: HoldRig, before: LoopConfig, progress: Progress) -> None:
     progress.say("the mirror is held with the last good gains")
 
 
-@contextlib.contextmanager
-def _link(options: TuneOptions) -> Iterator[HoldLink]:
-    if options.twin:
-        config = open_session(options.session).config if options.session is not None else options.config
-        link: HoldLink = _asked(lambda: twin_hold.TwinHold(config))
-    else:
-        socket = socket_path(options.where)
-        client = PortClient.unix(socket, lambda text: print(f"notice: {text}", file=sys.stderr))
-        run_dir = options.where.run or socket.parent / str(client.greeting["run"])
-        try:
-            link = LiveHold(client, run_dir, options.take_over)
-        except BaseException:
-            client.close()
-            raise
-    with contextlib.closing(link):
-        yield link
-
-
-def _asked(make: Callable[[], HoldLink]) -> HoldLink:
+def _link(options: TuneOptions) -> contextlib.AbstractContextManager[HoldLink]:
+    if not options.twin:
+        return live_hold(options.where, options.take_over)
+    config = open_session(options.session).config if options.session is not None else options.config
     try:
-        return make()
+        return contextlib.closing(twin_hold.TwinHold(config))
     except HoldError as error:
         raise DeviceError(str(error)) from None
 

@@ -18,9 +18,6 @@ from tuning import gains_file, session, session_recording
 from tuning.identification import disturbance, identify, loop_model, records
 from tuning.session import Design, Verified
 
-# Pictures of a session: the experiments and their fit, the weather, the candidates, and before against after.
-
-
 _DPI = 100
 _SEGMENT_S = 40.0
 
@@ -69,10 +66,9 @@ def draw_weather(
 
 def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt_s: float) -> None:
     """All candidates: predicted standard deviation, sensitivity peak, load peak, pump activity, and |S|."""
-    rows = [row for row in design.candidates if row.predicted is not None]
-    names = [row.name for row in rows]
-    stds = [row.predicted.std_um for row in rows if row.predicted is not None]
-    flows = [row.predicted.flow_std_um_per_s for row in rows if row.predicted is not None]
+    sound = [(row, row.predicted) for row in design.candidates if row.predicted is not None]
+    rows, names = [row for row, _ in sound], [row.name for row, _ in sound]
+    stds, flows = ([getattr(p, name) for _, p in sound] for name in ("std_um", "flow_std_um_per_s"))
     figure = Figure(figsize=(12, 8), layout="constrained")
     (a, b, c), (d, e, f) = figure.subplots(2, 3)
     f.remove()
@@ -111,19 +107,8 @@ def draw_verification(
             continue
         readings = record.filled_displacement_um()
         f, power = welch(readings - readings.mean(), 1 / dt_s, nperseg=min(readings.size, round(_SEGMENT_S / dt_s)))
-        ms = float(
-            np.max(
-                np.abs(
-                    1
-                    / (
-                        1
-                        + loop_model.loop_response(
-                            loop_model.Gains.of(loop), model, loop_model.frequencies(dt_s), dt_s
-                        )
-                    )
-                )
-            )
-        )
+        response = loop_model.loop_response(loop_model.Gains.of(loop), model, loop_model.frequencies(dt_s), dt_s)
+        ms = float(np.max(np.abs(1 / (1 + response))))
         left.loglog(f[1:], power[1:], linewidth=0.8, label=f"{name}, Ms {ms:.2f}")
     left.set(xlabel="frequency (Hz)", ylabel="readings (um^2/Hz)")
     left.legend(loc="best")

@@ -60,9 +60,8 @@ class Rig:
         self, experiment: machine.Experiment, around: machine.Around, centre_um: float
     ) -> tuple[Record, machine.Finished]:
         """The same for an experiment of one's own, inside the guard."""
-        return self._run(
-            machine.ExcursionGuard(experiment, around, centre_um, 1 / self.dt_s), around.holding_flow_um_per_s
-        )
+        guard = machine.ExcursionGuard(experiment, around, centre_um, 1 / self.dt_s)
+        return self._run(guard, around.holding_flow_um_per_s)
 
     def _run(self, guard: machine.Experiment, holding_flow_um_per_s: float) -> tuple[Record, machine.Finished]:
         flows: list[float] = []
@@ -125,28 +124,15 @@ _ANSWER_TICKS = 500  # until the state changes after a command was obeyed: 10 s 
 
 
 class HoldRig:
-    """Holds, experiments and gains on a hold that somebody else runs.
-
-    Parameters
-    ----------
-    who : str
-        Recorded with every command.
-
-    Attributes
-    ----------
-    loop : LoopConfig
-        Gains as they were last set.
-    shapes : list of ShapeEstimate
-        All that came so far.
-    """
+    """Holds, experiments and gains on a hold that somebody else runs; `who` is recorded with every command."""
 
     def __init__(self, link: HoldLink, who: str, progress: Progress = lambda seconds: None) -> None:
         self._link, self._who, self._progress = link, who, progress
         self._rows: deque[telemetry.TelemetryRow] = deque()
         self._events: deque[events.Event] = deque()
-        self.loop = link.config.loop
+        self.loop = link.config.loop  # with the gains as they were last set
         self.dt_s = 1 / self.loop.rate_hz
-        self.shapes: list[shape_estimate.ShapeEstimate] = []
+        self.shapes: list[shape_estimate.ShapeEstimate] = []  # all so far
 
     def hold(self, duration_s: float) -> Record:
         """The next seconds of hold. Raises HoldError if the mirror is not held throughout."""
@@ -228,7 +214,9 @@ class HoldRig:
         return Record.from_samples(self.dt_s, flows, samples)
 
     def _next_held(self) -> telemetry.TelemetryRow:
-        row = self._peek()
+        while not self._rows:
+            self._take()
+        row = self._rows[0]
         if row.state not in _HELD:
             raise HoldError(
                 f"the mirror is not held (state {State(int(row.state)).name.lower()}): {self._why()}; "
@@ -236,11 +224,6 @@ class HoldRig:
             )
         self._progress(self.dt_s)
         return self._rows.popleft()
-
-    def _peek(self) -> telemetry.TelemetryRow:
-        while not self._rows:
-            self._take()
-        return self._rows[0]
 
     def _take(self) -> None:
         news = self._link.news()

@@ -2,7 +2,7 @@
 
 import contextlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,14 +14,14 @@ from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSessio
 from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command, freed, stated_sigmas
 from membrane_ctrl.calibration.sweep import CaptureLink, Procedure, Sweep
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
-from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.control_port.ctl import Where, socket_path
+from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.geometry.file import GeometryOrigin, geometry_of_run, origin_of, read_geometry
 from membrane_ctrl.geometry.spread_file import read_prior
 from membrane_ctrl.measure.capture_set import read_head
 from membrane_ctrl.metrology.calibrate import parameters, propagate, verdict
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
-from membrane_ctrl.sessions.live_hold import HoldError, LiveHold, Progress
+from membrane_ctrl.sessions.folder import now_utc
+from membrane_ctrl.sessions.live_hold import HoldError, Progress, live_hold
 
 USUAL_SETS = 5
 _NEARLY_ALL = 0.9  # of the good range: more would hardly be better
@@ -58,7 +58,7 @@ def calibrate_live(options: LiveOptions) -> int:
             raise InputError("--session has its own setpoints: leave out --range-um and --sets")
         session = sessions.resume(options.session)
     if session is None or session.missing:
-        with _link(options) as link:
+        with live_hold(options.where, options.take_over, "calibrate --live") as link:
             session = take_sets(link, session, options)
     return solve_and_adopt(session, options)
 
@@ -123,7 +123,7 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
 
 def _planned(link: CaptureLink, held: HeldMirror, options: LiveOptions) -> CalibrationHead:
     wanted = setpoints_um(held, reach_of(held, link.config), options.range_um, options.sets or USUAL_SETS)
-    return sessions.head_of(link.name, held.setpoint_um, held.shape_on, wanted)
+    return CalibrationHead(sessions.FORMAT, link.name, now_utc(), held.setpoint_um, held.shape_on, wanted)
 
 
 def _same_bench(link: CaptureLink, session: CalibrationSession) -> None:
@@ -195,26 +195,10 @@ def _origin(session: CalibrationSession, place: Path | None) -> GeometryOrigin:
     return origin_of(optics)
 
 
-@contextlib.contextmanager
-def _link(options: LiveOptions) -> Iterator[LiveHold]:
-    socket = socket_path(options.where)
-    client = PortClient.unix(socket, lambda text: _say(f"notice: {text}"))
-    try:
-        if client.greeting["role"] == "read":
-            raise InputError(f"calibrate --live takes the role operate; {client.greeting['you']} has read")
-        run_dir = options.where.run or socket.parent / str(client.greeting["run"])
-        link = LiveHold(client, run_dir, options.take_over)
-    except BaseException:
-        client.close()
-        raise
-    with contextlib.closing(link):
-        yield link
-
-
 def _agree(question: str, yes: bool) -> None:
     """Raises InputError unless somebody says yes."""
     if not yes and not sys.stdin.isatty():
-        raise InputError(f"{question} There is nobody to ask here: say --yes")
+        raise InputError(f"{question} This is no terminal: confirm with --yes")
     if not _asked(question, yes):
         raise InputError("nothing was moved")
 

@@ -151,21 +151,6 @@ class Characterised:
     identified: Identified  # fit to all of it
     quality: FitQuality  # verdict; the doublets are predicted with a fit to the relays alone
 
-    @property
-    def around(self) -> machine.Around:
-        """Holding flow, laser noise, limits."""
-        return self.experiments.around
-
-    @property
-    def record(self) -> Record:
-        """All that was recorded."""
-        return self.experiments.record
-
-    @property
-    def finished(self) -> machine.Finished:
-        """How the last relay ended."""
-        return self.experiments.finished
-
 
 class ExperimentError(Exception):
     """No relay could be completed; the message is the last one's reason."""

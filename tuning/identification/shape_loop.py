@@ -115,27 +115,16 @@ def step_experiment(rig: HoldRig, setpoint_um: float, restore: bool) -> list[lis
         if restore:
             rig.shape_loop(True, "shape loop: the step is over")
     if min(len(level) for level in levels) < _LEAST_CYCLES:
-        raise HoldError(
-            f"fewer than {_LEAST_CYCLES} shapes a level: is the shape measured at all, and every few seconds?"
-        )
+        raise HoldError(f"fewer than {_LEAST_CYCLES} shapes a level: is the shape measured every few seconds?")
     return levels
 
 
 def evaluate(
     levels: Sequence[Sequence[ShapeEstimate]], steady: Sequence[ShapeEstimate], assumed: Series
 ) -> ShapeLoopFit:
-    """Sensitivity from the levels, noise and drift from all shapes of a steady hold.
+    """Sensitivity from the levels (low, high, low), noise and drift from these and the shapes of a steady hold.
 
-    Raises ValueError if there are too few shapes to tell noise from drift.
-
-    Parameters
-    ----------
-    levels : three sequences of ShapeEstimate
-        Low, high, low.
-    steady : sequence of ShapeEstimate
-        In a hold; those of the levels count too, for the laser's reading is taken off.
-    assumed : (36,) array
-        Sensitivity the controller works with.
+    `assumed` (36,) is the controller's sensitivity. Raises ValueError if there are too few shapes.
     """
     means = [np.mean([shape.coeffs_um for shape in level], axis=0) for level in levels]
     laser_um = [float(np.mean([shape.displacement_um for shape in level])) for level in levels]

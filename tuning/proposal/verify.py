@@ -74,12 +74,7 @@ class VerificationTrial:
 def centre_std_um(off_um: records.Series, trial: VerificationTrial, weather: disturbance.DisturbanceModel) -> float:
     """Standard deviation of the centre without the laser's noise; 0 where less than nothing is left.
 
-    Parameters
-    ----------
-    off_um : (n,) array
-        Readings less setpoint.
-    weather : DisturbanceModel
-        What the prediction is made with that the readings correct.
+    `off_um` (n,) are readings less setpoint; they correct the prediction for this weather.
     """
     dt_s = weather.rest.dt_s
     off = off_um - off_um.mean()
@@ -161,19 +156,7 @@ class Health:
 
 
 def health(record: records.Record, setpoint_um: records.Series, loop: LoopConfig, made: GainsFile) -> Health:
-    """Judge a quiet hold against the gains' own file. Raises ValueError if the record is too short.
-
-    Parameters
-    ----------
-    record : Record
-        At least `LEAST_S` of hold.
-    setpoint_um : (n,) array
-        The loop's setpoint of each sample.
-    loop : LoopConfig
-        As it runs.
-    made : GainsFile
-        Where its gains come from.
-    """
+    """Judge a quiet hold against the file its gains come from. Raises ValueError if it is shorter than `LEAST_S`."""
     if record.duration_s < LEAST_S:
         raise ValueError(f"{record.duration_s:.0f} s of hold are too short to judge a loop: {LEAST_S:.0f} s at least")
     model = made.plant.model
@@ -186,9 +169,8 @@ def health(record: records.Record, setpoint_um: records.Series, loop: LoopConfig
     leak_um_per_s = model.gain * float(record.flow_um_per_s.mean())
     found: list[str] = []
     if std_um / least_um > _RATIO_GROWTH * designed:
-        found.append(
-            f"the centre moves {std_um / (designed * least_um):.1f} times as much as these gains should let it"
-        )
+        ratio = std_um / (designed * least_um)
+        found.append(f"the centre moves {ratio:.1f} times as much as these gains should let it")
     if abs(leak_um_per_s - model.leak_um_per_s) > _LEAK_CHANGE * model.leak_um_per_s:
         found.append(f"the leak is {leak_um_per_s:.2f} um/s, it was {model.leak_um_per_s:.2f} um/s")
     spread = math.hypot(gain_sigma, made.plant.gain_sigma)
