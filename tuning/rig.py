@@ -11,8 +11,7 @@ from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control import gas, inner_loop
 from membrane_ctrl.control.experiments import machine, trial
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.model import events, shape_estimate, telemetry
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model import events, shape_estimate, states, telemetry
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink
 from tuning.identification.records import Record, Series
 
@@ -119,7 +118,7 @@ def laser_noise_um(record: Record) -> float:
 
 
 Progress = Callable[[float], None]  # seconds of the hold that have been recorded since the last call
-_HELD = frozenset({State.HOLD, State.TUNE})
+_HELD = frozenset({states.State.HOLD, states.State.TUNE})
 _ANSWER_TICKS = 500  # until the state changes after a command was obeyed: 10 s at 50 Hz
 
 
@@ -163,9 +162,9 @@ class HoldRig:
         self._link.ask(Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec))
         rows: list[telemetry.TelemetryRow] = []
         begun = False
-        while not begun or rows[-1].state == State.TUNE:
+        while not begun or rows[-1].state == states.State.TUNE:
             rows.append(self._next_held())
-            begun = begun or rows[-1].state == State.TUNE
+            begun = begun or rows[-1].state == states.State.TUNE
             if not begun and len(rows) > _ANSWER_TICKS:
                 raise HoldError("the hold took the experiment and did not begin it")
         told = self._experiment_ended()
@@ -191,7 +190,7 @@ class HoldRig:
     def go_back(self, loop: LoopConfig) -> None:
         """End an experiment that may be running, and set the last good gains."""
         self._take()
-        if self._rows and self._rows[-1].state == State.TUNE:
+        if self._rows and self._rows[-1].state == states.State.TUNE:
             self._link.ask(Command("hold", self._who, "tuning session interrupted"))
         if loop != self.loop:
             self.set_gains(loop, "back to the last good gains")
@@ -219,7 +218,7 @@ class HoldRig:
         row = self._rows[0]
         if row.state not in _HELD:
             raise HoldError(
-                f"the mirror is not held (state {State(int(row.state)).name.lower()}): {self._why()}; "
+                f"the mirror is not held (state {states.State(int(row.state)).name.lower()}): {self._why()}; "
                 "start or resume the hold, then repeat this step"
             )
         self._progress(self.dt_s)

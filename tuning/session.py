@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from membrane_ctrl.config import schema
 from membrane_ctrl.config import toml_file as config_file
-from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments import machine, pump_map
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.sessions import folder, live_hold
@@ -71,8 +71,8 @@ class Verified:
     kept: bool  # the new gains stay
     reason: str
     stages: tuple[verify.Stage, ...]
-    before: LoopConfig
-    after: LoopConfig
+    before: schema.LoopConfig
+    after: schema.LoopConfig
 
 
 def characterise_step(
@@ -188,13 +188,13 @@ def preview_of(session: folder.SessionFolder) -> Previewed:
     return session.result("preview", "preview.json", Previewed)
 
 
-def pump_of(session: folder.SessionFolder) -> PumpConfig:
+def pump_of(session: folder.SessionFolder) -> schema.PumpConfig:
     """The pump as mapped in this session, or as configured."""
     path = session.file("pump.toml")
-    return config_file.load(path, PumpConfig) if path.exists() else session.config.pump
+    return config_file.load(path, schema.PumpConfig) if path.exists() else session.config.pump
 
 
-def checked_gains(session: folder.SessionFolder) -> LoopConfig:
+def checked_gains(session: folder.SessionFolder) -> schema.LoopConfig:
     """The session's gains for its hold. Raises InputError if they must not be applied."""
     session.require("design")
     path = session.file("gains.toml")
@@ -203,7 +203,7 @@ def checked_gains(session: folder.SessionFolder) -> LoopConfig:
     return for_hold(gains.loop, session.head.before)
 
 
-def apply_step(session: folder.SessionFolder, rig: HoldRig) -> LoopConfig:
+def apply_step(session: folder.SessionFolder, rig: HoldRig) -> schema.LoopConfig:
     """Set the gains, on trial: without `verify` they go back by themselves."""
     loop = checked_gains(session)
     session.begin("apply")

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from membrane_ctrl.calibration import plan
 from membrane_ctrl.calibration import session as sessions
-from membrane_ctrl.calibration.plan import HeldMirror, reach_of, setpoints_um
 from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession, adopt, compared
 from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command, freed, stated_sigmas
 from membrane_ctrl.calibration.sweep import CaptureLink, Procedure, Sweep
@@ -121,8 +121,8 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
     return code
 
 
-def _planned(link: CaptureLink, held: HeldMirror, options: LiveOptions) -> CalibrationHead:
-    wanted = setpoints_um(held, reach_of(held, link.config), options.range_um, options.sets or USUAL_SETS)
+def _planned(link: CaptureLink, held: plan.HeldMirror, options: LiveOptions) -> CalibrationHead:
+    wanted = plan.setpoints_um(held, plan.reach_of(held, link.config), options.range_um, options.sets or USUAL_SETS)
     return CalibrationHead(sessions.FORMAT, link.name, now_utc(), held.setpoint_um, held.shape_on, wanted)
 
 
@@ -143,7 +143,7 @@ def _written_out(optics: OpticsConfig) -> tuple[GeometryConfig, CameraConfig]:
     return optics.geometry.model_copy(update={"reference_displacement_um": None}), camera
 
 
-def _plan(head: CalibrationHead, missing: int, held: HeldMirror, minutes: float) -> str:
+def _plan(head: CalibrationHead, missing: int, held: plan.HeldMirror, minutes: float) -> str:
     low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
     return (
         f"{missing} of {len(head.setpoints_um)} sets from {low_um:g} to {high_um:g} um "
@@ -153,7 +153,7 @@ def _plan(head: CalibrationHead, missing: int, held: HeldMirror, minutes: float)
     )
 
 
-def _worth(link: CaptureLink, head: CalibrationHead, held: HeldMirror, options: LiveOptions) -> str:
+def _worth(link: CaptureLink, head: CalibrationHead, held: plan.HeldMirror, options: LiveOptions) -> str:
     """How well the geometry will be determined, and by how much better if there were more room."""
     here = _foreseen(link, held, head.setpoints_um, options)
     line = f"such sets leave of a figure: sag +- {here.sag_um:.1f} um, figure +- {here.figure_rms_um:.1f} um RMS"
@@ -162,7 +162,7 @@ def _worth(link: CaptureLink, head: CalibrationHead, held: HeldMirror, options: 
         return line
     ends = (low_um + high_um - verdict.GOOD_SPREAD_UM) / 2, (low_um + high_um + verdict.GOOD_SPREAD_UM) / 2
     best = _foreseen(link, held, np.linspace(*ends, len(head.setpoints_um)).tolist(), options)
-    reach = reach_of(held, link.config)
+    reach = plan.reach_of(held, link.config)
     return (
         f"{line}; {verdict.GOOD_SPREAD_UM:.0f} um from first to last would leave {best.sag_um:.1f} and "
         f"{best.figure_rms_um:.1f} ({reach.low_why} and {reach.high_why} have room for "
@@ -171,7 +171,7 @@ def _worth(link: CaptureLink, head: CalibrationHead, held: HeldMirror, options: 
 
 
 def _foreseen(
-    link: CaptureLink, held: HeldMirror, setpoints: Sequence[float], options: LiveOptions
+    link: CaptureLink, held: plan.HeldMirror, setpoints: Sequence[float], options: LiveOptions
 ) -> propagate.Propagated:
     optics = geometry_of_run(link.run_dir, link.config).optics
     if options.geometry is not None:

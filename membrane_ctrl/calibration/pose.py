@@ -11,8 +11,7 @@ import numpy as np
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure import capture_set, measurement
 from membrane_ctrl.metrology import full, reconstruct
-from membrane_ctrl.metrology.calibrate import artefact, parameters
-from membrane_ctrl.metrology.calibrate.ring_pose import POSE_NAMES, RingPose, ring_pose
+from membrane_ctrl.metrology.calibrate import artefact, parameters, ring_pose
 from membrane_ctrl.metrology.checked import RejectedSetError, check
 from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
 from membrane_ctrl.model.arrays import FloatArray
@@ -47,10 +46,10 @@ def calibrate_pose(options: PoseOptions) -> int:
     if outline is None:
         raise RejectedError(f"{options.folder}: the rim is not in the picture")
     try:
-        pose = ring_pose(light, stated, outline.rim_px, radius_mm, rim_z, options.radius_sigma_mm)
+        pose = ring_pose.ring_pose(light, stated, outline.rim_px, radius_mm, rim_z, options.radius_sigma_mm)
     except ValueError as error:
         raise RejectedError(f"{options.folder}: {error}") from None
-    sigmas = dict(zip(POSE_NAMES, pose.sigmas.tolist(), strict=True))
+    sigmas = dict(zip(ring_pose.POSE_NAMES, pose.sigmas.tolist(), strict=True))
     tables = {
         "geometry": artefact.general_form(pose.bench(stated), optics).model_dump(exclude_none=True),
         "sigmas": sigmas,
@@ -61,7 +60,7 @@ def calibrate_pose(options: PoseOptions) -> int:
         "out": str(options.out),
         "rms_px": pose.rms_px,
         "edges": pose.points,
-        "values": dict(zip(POSE_NAMES, pose.values.tolist(), strict=True)),
+        "values": dict(zip(ring_pose.POSE_NAMES, pose.values.tolist(), strict=True)),
         "sigmas": sigmas,
     }
     print(json.dumps(report) if options.as_json else "\n".join(_lines(pose, options.out)))
@@ -96,12 +95,14 @@ def _rim(capture: capture_set.CaptureSet) -> tuple[reconstruct.HeightFunction, f
     return height, vertex_mm + surface.sag_mm
 
 
-def _lines(pose: RingPose, out: Path) -> list[str]:
+def _lines(pose: ring_pose.RingPose, out: Path) -> list[str]:
     lines = ["what              stated wrong by   +-        known before"]
     lines += [
         f"{name:<18}{value:>+13.4f}  {sigma:<9.4f} {parameters.usual_sigma(name):.3g}"
-        for name, value, sigma in zip(POSE_NAMES, pose.values, pose.sigmas, strict=True)
+        for name, value, sigma in zip(ring_pose.POSE_NAMES, pose.values, pose.sigmas, strict=True)
     ]
-    better = max(parameters.usual_sigma(name) / sigma for name, sigma in zip(POSE_NAMES, pose.sigmas, strict=True))
+    better = max(
+        parameters.usual_sigma(name) / sigma for name, sigma in zip(ring_pose.POSE_NAMES, pose.sigmas, strict=True)
+    )
     lines.append(f"edges are left {pose.rms_px:.3f} px RMS, {pose.points} of them; at best {better:.0f} times better")
     return [*lines, f"written: {out}; use it with calibrate --prior {out}"]

@@ -18,8 +18,7 @@ from pydantic import Field
 
 from firmware_iface.roles import Pattern
 from firmware_iface.settings import Section
-from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig, PatternConfig
-from membrane_ctrl.config.toml_file import parse, prune, read_toml, with_height_map
+from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, origin_of
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
 from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
@@ -51,10 +50,10 @@ class CaptureFile(Section):
     schema_: Annotated[Literal["membrane-capture/1"], Field(alias="schema")]
     kind: Literal["full", "fringes"]
     reference: str | None = None
-    pattern: PatternConfig
-    geometry: GeometryConfig
-    camera: CameraConfig
-    mirror: MirrorConfig
+    pattern: schema.PatternConfig
+    geometry: schema.GeometryConfig
+    camera: schema.CameraConfig
+    mirror: schema.MirrorConfig
     frames: tuple[FrameRow, ...]
 
 
@@ -65,7 +64,9 @@ class CaptureHead:
     folder: Path  # of the set
     kind: Literal["full", "fringes"]
     reference: Path | None  # of a fringes set: the full set that anchors it
-    optics: OpticsConfig  # geometry, camera, pattern and mirror; `camera.bits` is to be trusted only if `bits_stated`
+    optics: (
+        schema.OpticsConfig
+    )  # geometry, camera, pattern and mirror; `camera.bits` is to be trusted only if `bits_stated`
     bits_stated: bool  # whether the set says how deep its frames are
     files: tuple[str, ...]  # in the order of the patterns
     patterns: tuple[Pattern, ...]  # x sinusoids, x Gray bits, y sinusoids, y Gray bits, white, black (of a full set)
@@ -105,13 +106,13 @@ def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead
     path = folder / "capture.toml"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such capture set")
-    tables = read_toml(path, follow=False)
-    with_height_map(tables.get("geometry"), path, follow=False)
-    ignored = prune(tables, CaptureFile)
+    tables = toml_file.read_toml(path, follow=False)
+    toml_file.with_height_map(tables.get("geometry"), path, follow=False)
+    ignored = toml_file.prune(tables, CaptureFile)
     if geometry is not None:
         tables["geometry"] = geometry.geometry.model_dump(exclude_none=True)
     bits_stated = isinstance(tables.get("camera"), dict) and "bits" in tables["camera"]
-    content = parse(tables, CaptureFile, str(path))
+    content = toml_file.parse(tables, CaptureFile, str(path))
     rows = _ordered(content, path)
     reference = None
     for row in content.frames:
@@ -122,7 +123,7 @@ def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead
         reference = (folder / content.reference).resolve()
     sections = ("geometry", "camera", "pattern", "mirror")
     blamed = path if geometry is None else geometry.path  # what may not fit together is the screen and the pattern
-    optics = parse({name: getattr(content, name) for name in sections}, OpticsConfig, str(blamed))
+    optics = toml_file.parse({name: getattr(content, name) for name in sections}, schema.OpticsConfig, str(blamed))
     if geometry is not None:
         optics = geometry.over(optics)
     return CaptureHead(
@@ -203,7 +204,7 @@ def anchored(head: CaptureHead, reference: CaptureHead) -> CaptureHead:
     return replace(head, optics=_with_reference_displacement(ours, theirs.geometry.reference_displacement_um))
 
 
-def _with_reference_displacement(optics: OpticsConfig, displacement_um: float | None) -> OpticsConfig:
+def _with_reference_displacement(optics: schema.OpticsConfig, displacement_um: float | None) -> schema.OpticsConfig:
     """The same with the displacement for which the geometry holds, unless it states one."""
     geometry = optics.geometry
     if geometry.reference_displacement_um is not None or displacement_um is None:

@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology import bins, phase, phasor, reconstruct, zonal
+from membrane_ctrl.metrology import bins, motion, phase, phasor, reconstruct, zonal
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.frames.frame_stack import PixelPhases, pixel_phases
-from membrane_ctrl.metrology.motion import combine_steps, sensitivity_mm_per_um, worth_correcting
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
@@ -77,10 +76,10 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     del row, column
     points.t_mm[:] = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / points.rays[2]
     tracer.intersect(points, surface, newton=4)
-    moved = worth_correcting(stack.readings_um, LASER_NOISE_UM)
+    moved = motion.worth_correcting(stack.readings_um, LASER_NOISE_UM)
     sensitivity = np.zeros((2, index.size))
     if moved:
-        sensitivity = sensitivity_mm_per_um(tracer, points, surface) / phase.mm_per_rad(optics.pattern)
+        sensitivity = motion.sensitivity_mm_per_um(tracer, points, surface) / phase.mm_per_rad(optics.pattern)
     axes = [_axis_phases(optics, checked, k, index, in_bin, sensitivity[k] if moved else None) for k in range(2)]
     points.screen_mm[:] = phase.screen_mm(np.stack([a.phase_rad for a in axes]), optics.pattern)
     swing = np.minimum(axes[0].swing_adu, axes[1].swing_adu)
@@ -200,7 +199,7 @@ class BinFigure:
 def bin_figure(optics: OpticsConfig, checked: Checked) -> BinFigure:
     """Phases of the bins with the film's motion taken out, and the surface fitted to them."""
     stack, state = checked.stack, checked.state
-    moved = worth_correcting(stack.readings_um, LASER_NOISE_UM)
+    moved = motion.worth_correcting(stack.readings_um, LASER_NOISE_UM)
     sums = [checked.binned.means[used].reshape(len(used), -1) for used in checked.view.used]
     steps = [_combination(checked, axis, moved) for axis in range(len(phase.AXES))]
     followed = np.empty_like(state.accepted)
@@ -224,4 +223,4 @@ def _combination(checked: Checked, axis: int, moved: bool) -> phasor.StepCombina
     used = checked.view.used[axis]
     shifts = checked.stack.shifts_rad(used)
     motion_um = checked.stack.displacement_um[used] - checked.stack.mean_reading_um if moved else None
-    return combine_steps(phase.step_weights(shifts), shifts, 1, motion_um)
+    return motion.combine_steps(phase.step_weights(shifts), shifts, 1, motion_um)
