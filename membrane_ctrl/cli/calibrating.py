@@ -46,10 +46,9 @@ def calibrate_camera(
     json: JsonOption = False,
 ) -> int:
     """Determine focal length, principal point and distortion from photographs of a board."""
-    from membrane_ctrl.calibration.camera import CameraOptions
-    from membrane_ctrl.calibration.camera import calibrate_camera as run
+    from membrane_ctrl.calibration import camera
 
-    return run(CameraOptions(photographs, board, configured(config), out, json))
+    return camera.calibrate_camera(camera.CameraOptions(photographs, board, configured(config), out, json))
 
 
 def calibrate_pose(
@@ -63,10 +62,10 @@ def calibrate_pose(
     json: JsonOption = False,
 ) -> int:
     """Determine the pose of the camera from the ring's ellipse in a full set."""
-    from membrane_ctrl.calibration.pose import PoseOptions
-    from membrane_ctrl.calibration.pose import calibrate_pose as run
+    from membrane_ctrl.calibration import camera
 
-    return run(PoseOptions(folder, geometry, tuple(prior or ()), radius_sigma_mm, out, json))
+    options = camera.PoseOptions(folder, geometry, tuple(prior or ()), radius_sigma_mm, out, json)
+    return camera.calibrate_pose(options)
 
 
 def calibrate_display(config: ConfigArgument, json: JsonOption = False) -> int:

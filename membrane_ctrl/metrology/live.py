@@ -111,7 +111,7 @@ class LiveReconstructor:
         self._binner.add(frames, range(len(frames)), watched=sinusoids)
         optics = self._optics
         images = self._binner.sums.reshape(self._slots.count, -1)[:, self._near] / self._bin_px**2
-        phase_rad = phase.decode_full(images, optics.pattern, self._shifts_rad).phase_rad
+        phase_rad = phase.decode_full(images, optics.pattern, self._shifts_rad)
         phase_rad[:, self._binner.saturated.ravel()[self._near] > 0] = np.nan
         times, readings = times[sinusoids], readings[sinusoids]
         self._tracked = None  # until this cycle is accepted

@@ -20,7 +20,7 @@ from itertools import combinations
 import numpy as np
 
 from membrane_ctrl.metrology.frames.closure import Closure, closure, closure_with_level, closure_with_phase
-from membrane_ctrl.metrology.phase import phasors, wrapped_phase
+from membrane_ctrl.metrology.phase import phasors
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.shape_estimate import Verdict
 
@@ -106,7 +106,7 @@ class AxisSeries:
 
     def phases_rad(self) -> FloatArray:
         """Wrapped phases (F, n)."""
-        return np.stack([wrapped_phase(phasors(steps, self.shifts_rad)) for steps in self.frames])
+        return np.stack([np.angle(phasors(steps, self.shifts_rad)) for steps in self.frames])
 
     def inconsistent_share(self) -> float:
         """Share of the pixels whose frequencies disagree."""
