@@ -28,7 +28,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class PlantSection(Section):
-    """The plant the gains were made for (`plant_model.PlantModel`), with standard errors."""
+    """The plant the gains were made for (`loop_model.PlantModel`), with standard errors."""
 
     gain: Positive
     dead_time_s: Annotated[float, Field(ge=0, le=10)]

@@ -117,7 +117,7 @@ TYPICAL_S = _SETTLE_S + _QUIET_S + _RELAY_S + _DOUBLETS_S + 2 * _BETWEEN_S
 
 
 class ExperimentRig(Protocol):
-    """What characterising needs: `rig.Rig` on a bench, or `hold_rig.HoldRig` on a running hold."""
+    """What characterising needs: `rig.Rig` on a bench, or `rig.HoldRig` on a running hold."""
 
     def hold(self, duration_s: float) -> Record:
         """Hold for a time."""

@@ -9,7 +9,7 @@ u = d - 2 (d n) / (n n) n and meets the screen at S = P + k u. For small changes
     ds = T (dP + k du - dO' + X^T dX (S - O')) + (E u) s^2 dc / (N u)
 
 with X the screen's rows, E the first two, N = (third row) - w_x e_x - w_y e_y the normal of a face that stands off by
-w = c s^2 + map (see `metrology.face`) and T = E (1 - u N^T / (N u)), which lets the ray run to the face.
+w = c s^2 + map (see `screen_face`) and T = E (1 - u N^T / (N u)), which lets the ray run to the face.
 """
 
 from collections.abc import Iterator
