@@ -107,15 +107,13 @@ def adopt(new: Path, place: Path) -> Path | None:
 
     Raises DeviceError if it cannot be written; then the old one is still there.
     """
-    try:
+    with errors.writing(place, errors.DeviceError):
         place.parent.mkdir(parents=True, exist_ok=True)
         place = files.users(place)
         kept = _kept(place) if place.exists() else None
         if kept is not None:
             files.write_bytes_atomic(kept, files.read_bytes(place, files.SMALL_BYTES, follow=True))
         files.write_text_atomic(place, files.read_text(new))
-    except OSError as error:
-        raise errors.DeviceError(f"{place}: cannot be written ({(error.strerror or str(error)).lower()})") from None
     return kept
 
 

@@ -24,7 +24,7 @@ from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, slope_res
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.phase import mm_per_rad, phase_sigma_rad
-from membrane_ctrl.model.errors import Exit, InputError
+from membrane_ctrl.model import errors
 from membrane_ctrl.model.files import users, write_text_atomic
 
 # A capture set's bins as screen points with their noise, for the calibration.
@@ -105,7 +105,7 @@ def calibrate_command(options: CalibrateOptions) -> int:
     print(json.dumps(report) if options.as_json else "\n".join(lines_of(report)))
     if not usable:
         print(f"calibrate: rejected; {options.out} is not written, the old geometry stays in force", file=sys.stderr)
-    return Exit.DONE if usable else Exit.REJECTED
+    return errors.Exit.DONE if usable else errors.Exit.REJECTED
 
 
 def freed(texts: Sequence[str]) -> dict[str, float]:
@@ -114,13 +114,13 @@ def freed(texts: Sequence[str]) -> dict[str, float]:
     for text in texts:
         name, _, amount = text.partition("=")
         if name not in NAMES:
-            raise InputError(f"--free {text}: {name} is not a parameter; known are {', '.join(NAMES)}")
+            raise errors.InputError(f"--free {text}: {name} is not a parameter; known are {', '.join(NAMES)}")
         try:
             out[name] = float(amount) if amount else usual_sigma(name)
         except ValueError:
-            raise InputError(f"--free {text}: {amount} is not a number") from None
+            raise errors.InputError(f"--free {text}: {amount} is not a number") from None
         if not (math.isfinite(out[name]) and out[name] >= 0):
-            raise InputError(f"--free {text}: a sigma is 0 (hold it) or more")
+            raise errors.InputError(f"--free {text}: a sigma is 0 (hold it) or more")
     return out
 
 
@@ -132,7 +132,7 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
     """
     figures = Figures(None if geometry is None else file.read_geometry(geometry))
     if len(set(folders)) < len(folders):
-        raise InputError(f"{next(f for f in folders if list(folders).count(f) > 1)}: given twice")
+        raise errors.InputError(f"{next(f for f in folders if list(folders).count(f) > 1)}: given twice")
     sets: list[residuals.SetPhases] = []
     benches: list[OpticsConfig] = []
     notes: list[str] = []
@@ -184,7 +184,7 @@ def _same_rig(first: Path, optics: OpticsConfig, folder: Path, other: OpticsConf
             if field in ("reference_displacement_um", "steps", "noise_adu"):
                 continue
             if getattr(ours, field) != getattr(theirs, field):
-                raise InputError(
+                raise errors.InputError(
                     f"{folder / 'capture.toml'}: {section}.{field}: not that of {first}; "
                     "sets of one calibration are of one rig"
                 )
@@ -202,7 +202,7 @@ def problem_of(bundle: Bundle, free: dict[str, float], laser_sigma_um: float) ->
     try:
         geometry = Geometry.from_config(bundle.optics)
     except ValueError as error:
-        raise InputError(str(error)) from None
+        raise errors.InputError(str(error)) from None
     references = separable.References(bundle.reference_um, laser_sigma_um)
     if sum(math.isfinite(phases.displacement_um) for phases in bundle.sets) < 2:
         own[LASER.name] = 0.0  # a scale of nothing
@@ -225,11 +225,9 @@ def _write(
         notes=tuple(finding.says for finding in findings),
     )
     tables = artefact.tables_of(solution, bundle.optics, origin)
-    try:
+    with errors.writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text_atomic(users(path), tomli_w.dumps(tables))  # never half a geometry
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
     return str(tables["calibration"]["hash"])
 
 
@@ -240,11 +238,9 @@ def _noise_urad(solution: Solution, phases: residuals.SetPhases, index: int) -> 
 
 def _draw(path: Path, solution: Solution) -> None:
     """The residuals' maps, also of a solution that is refused: there they are wanted most."""
-    try:
+    with errors.writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         draw_residuals(path, solution)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
 def _progress() -> Any:

@@ -156,10 +156,8 @@ class InForce:
         """Leave a copy in the run's folder: whoever measures or looks back takes that. Raises InputError."""
         if not self.text:
             return
-        try:
+        with errors.writing(run_dir / KEPT):
             files.write_text_atomic(run_dir / KEPT, self.text)
-        except OSError as error:
-            raise errors.InputError(f"{run_dir / KEPT}: cannot be written: {error.strerror or error}") from None
 
 
 def geometry_in_force(config: Config) -> InForce:

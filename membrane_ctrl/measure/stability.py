@@ -37,7 +37,7 @@ def stability_command(options: StabilityOptions) -> int:
     folders = set_folders(options.folder, out)
     size_px, analysis_radius_mm = common_size(folders)
     points = points_mm(options.points, analysis_radius_mm)
-    try:
+    with errors.writing(out):
         files.make_folder(out)
         with stability_run.StabilityRun(out, points, options.trials, options.seed, options.geometry) as run:
             _analyse(folders, figures, run)
@@ -50,8 +50,6 @@ def stability_command(options: StabilityOptions) -> int:
         pictures = run.draw()
         if options.rerun:
             run.record(pictures)
-    except OSError as error:
-        raise errors.InputError(f"{out}: cannot be written: {error.strerror or error}") from None
     print(f"written to {out}", file=sys.stderr)
     print(json.dumps(table) if options.as_json else "\n".join(run.lines()))
     return 0

@@ -195,14 +195,12 @@ def _write(
     from membrane_ctrl.measure.stability_results import draw_uncertainty  # matplotlib takes a second to load
 
     rmse = grid.picture(1e3 * grid.sigma(result.covariance))
-    try:
+    with errors.writing(out):
         files.make_folder(out)
         write_json(out / "uncertainty.json", table)
         write_arrays(out / "rmse.npz", x_mm=grid.axis_mm, y_mm=grid.axis_mm, rmse_um=rmse)
         height = grid.picture(height_um)
         draw_uncertainty(out / "uncertainty.png", grid.axis_mm, height, rmse, table["against"] is not None)
-    except OSError as error:
-        raise errors.InputError(f"{out}: cannot be written: {error.strerror or error}") from None
     print(f"written to {out}", file=sys.stderr)
 
 

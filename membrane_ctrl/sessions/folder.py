@@ -202,11 +202,9 @@ H = TypeVar("H", bound=Head)
 def begin_session(parent: Path, name: str, head: Head, config: schema.Config) -> Path:
     """Make the folder of a session. Raises InputError for a bad name, DeviceError if it cannot be written."""
     path = fresh_folder(parent, name, datetime.fromisoformat(head.created_utc))
-    try:
+    with errors.writing(path, errors.DeviceError):
         files.write_text_atomic(path / "config.toml", config_file.dump(config))
         write(path / "session.json", head)
-    except OSError as error:
-        raise errors.DeviceError(f"{path}: cannot be written ({(error.strerror or str(error)).lower()})") from None
     return path
 
 

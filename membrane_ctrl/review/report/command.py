@@ -57,15 +57,10 @@ def _other(run: Run, start: str | None, end: str | None) -> Analysis:
 
 
 def _write(folder: Path, files: dict[str, str]) -> None:
-    try:
+    with errors.writing(folder, errors.DeviceError, "; choose another folder with --out"):
         make_folder(folder)
         for name, text in files.items():
             write_text_atomic(folder / name, text)
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise errors.DeviceError(
-            f"{folder}: cannot be written ({reason}); choose another folder with --out"
-        ) from None
 
 
 def _say(analysis: Analysis, other: Analysis | None, folder: Path, took_s: float) -> None:

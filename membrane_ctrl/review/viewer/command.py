@@ -99,14 +99,11 @@ def _require_writable(target: Path, runs: Sequence[Run]) -> None:
     """Said before the work, not after it."""
     if any(target.resolve().parent == run.folder.resolve() for run in runs):
         raise errors.InputError(f"{target}: lies among what the recorder wrote; choose another folder")
-    try:
+    with errors.writing(target, errors.DeviceError, "; choose another place"):
         new = not target.exists()
         target.open("ab").close()
         if new:
             target.unlink()
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise errors.DeviceError(f"{target}: cannot be written ({reason}); choose another place") from None
 
 
 def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> float | None:

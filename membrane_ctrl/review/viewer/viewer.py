@@ -12,7 +12,7 @@ from typing import IO
 import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import ViewerClient
 
-from membrane_ctrl.model.errors import DeviceError
+from membrane_ctrl.model import errors
 from membrane_ctrl.model.files import open_plain
 from membrane_ctrl.run_files.rrd_reader import segments
 from membrane_ctrl.run_files.segments import first_message_after
@@ -99,7 +99,7 @@ def live(folder: Path, web: bool, port: int = 0) -> int:
                 watched.terminate()
                 served.terminate()
     except OSError as error:
-        raise DeviceError(f"the viewer did not start: {error}") from None
+        raise errors.DeviceError(f"the viewer did not start: {error}") from None
     return 0
 
 
@@ -110,7 +110,7 @@ def _connected(proxy: str) -> subprocess.Popen[bytes]:
 
 def _require_screen() -> None:
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise DeviceError("no screen here: use --web and open the address in a browser, or --screenshot FILE")
+        raise errors.DeviceError("no screen here: use --web and open the address in a browser, or --screenshot FILE")
 
 
 def _say_where(bind: str, port: int, data_port: int) -> None:
@@ -181,10 +181,8 @@ def _require_listening(bind: str, port: int) -> None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((bind, port))
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise DeviceError(
-            f"cannot listen on {bind}, port {port} ({reason}): choose another --port or --bind"
-        ) from None
+        where = f"{bind}, port {port} ({errors.os_reason(error)})"
+        raise errors.DeviceError(f"cannot listen on {where}: choose another --port or --bind") from None
 
 
 def free_port() -> int:
@@ -204,7 +202,7 @@ def _run(command: list[str], started: Callable[[subprocess.Popen[bytes]], None] 
                 viewer.terminate()
                 return 0
     except OSError as error:
-        raise DeviceError(f"the viewer did not start: {error}") from None
+        raise errors.DeviceError(f"the viewer did not start: {error}") from None
 
 
 def _environment() -> dict[str, str]:
