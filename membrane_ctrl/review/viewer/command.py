@@ -11,7 +11,6 @@ from membrane_ctrl.model import errors, states, terminal
 from membrane_ctrl.review import catalogue, words
 from membrane_ctrl.review.viewer import blueprints, viewer
 from membrane_ctrl.review.viewer.layer import Layer
-from membrane_ctrl.review.viewer.screenshot import screenshot_of
 from membrane_ctrl.run_files.run import Run, open_run
 from membrane_ctrl.run_files.run_folder import event_s
 
@@ -62,7 +61,7 @@ def review_command(options: ReviewOptions) -> int:
 def _show(file: Path, options: ReviewOptions, cursor_s: float | None) -> int:
     if options.screenshot is not None:
         try:
-            options.screenshot.write_bytes(screenshot_of([file], cursor_s))
+            options.screenshot.write_bytes(viewer.screenshot_of([file], cursor_s))
         except RuntimeError as error:
             raise errors.DeviceError(f"no picture: {error}") from None
         return 0
