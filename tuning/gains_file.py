@@ -104,7 +104,6 @@ def for_hold(gains: LoopConfig, running: LoopConfig) -> LoopConfig:
 
 # `<logs>/tuning/journal.jsonl`: which gains were kept, taken back or rolled back, when, by whom and why.
 
-
 _FILE = "journal.jsonl"
 What = Literal["kept", "taken_back", "rolled_back"]
 

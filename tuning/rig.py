@@ -116,7 +116,6 @@ def laser_noise_um(record: Record) -> float:
 # Records that follow each other have no gap: each begins with the tick after the last one taken, so that what a
 # session did in between (a fit takes a second) is in the next record and not lost.
 
-
 Progress = Callable[[float], None]  # seconds of the hold that have been recorded since the last call
 _HELD = frozenset({states.State.HOLD, states.State.TUNE})
 _ANSWER_TICKS = 500  # until the state changes after a command was obeyed: 10 s at 50 Hz

@@ -138,7 +138,6 @@ def _part(tables: dict[str, Any], name: str, model: type[Table], path: Path) -> 
 
 # The geometry that a run measures with: that of `optics.geometry_file`, kept in the run's folder as it was.
 
-
 KEPT = "geometry.toml"  # in the run's folder
 
 

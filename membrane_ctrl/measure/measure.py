@@ -106,7 +106,6 @@ def _lines(
 
 # `measure` of a SOFAST file: are its frames what they should be? Slopes need the poses that its own tool finds.
 
-
 _LEAST_PIXELS = 200  # fewer tell nothing of a frame
 
 

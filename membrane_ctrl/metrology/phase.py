@@ -131,7 +131,6 @@ def inside_pattern(absolute_rad: FloatArray, pattern: PatternConfig) -> BoolArra
 # A full cycle is, for x and then for y, N sinusoids and 4 Gray-code bits, then white and black: 18 images for N = 4.
 # A fringes-only cycle is the 2 N sinusoids, x first.
 
-
 GRAY_BITS = 4  # 16 half periods: enough for the 8 periods a configuration may ask for
 AXES = ("x", "y")
 

@@ -18,7 +18,6 @@ from membrane_ctrl.model import errors, files, plain_json
 
 # Results of steps as plain JSON and back: dataclasses, configuration sections, arrays, tuples and numbers.
 
-
 T = TypeVar("T")
 _PLAIN_BYTES_MAX = 64_000_000  # candidates with their curves are some megabytes
 

@@ -11,7 +11,6 @@ from tuning.identification.records import Record
 
 # Whether the data carry a proposal; if not, what was wrong with them and which experiment would help.
 
-
 _LOST_MAX = 0.01
 _GAIN_SIGMA_MAX = 0.10  # k beyond +-20 % (2 sigma) moves Ms and the variance by more than designs differ
 _GAIN_SIGMA_GOOD = 0.03

@@ -109,7 +109,6 @@ def _periodogram(increments: records.Series, dt_s: float) -> tuple[records.Serie
 # filter, which is taken off the diagonal of the normal equations.
 # Source: Fuller, Measurement Error Models (1987), section 2.2.
 
-
 _BLOCK_S = 0.5  # below a second a barometer's noise hides its signal; above, its events blur
 
 

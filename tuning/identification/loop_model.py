@@ -123,7 +123,6 @@ def loop_response(gains: Gains, model: PlantModel, w_rad_per_s: Series, dt_s: fl
 
 # How far a loop is from instability, on the exact frequency response.
 
-
 _POINTS = 3000  # 0.3 % apart: margins to better than 1 %
 _FINE_DT_S = 1e-3
 

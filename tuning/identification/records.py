@@ -89,7 +89,6 @@ class Record:
 
 # Raw data of a session: one compressed file a record, checked by its hash when it is read back.
 
-
 _BYTES_MAX = 200_000_000  # four columns of a day at 50 Hz are 140 MB
 _COLUMNS = ("flow_um_per_s", "displacement_um", "ambient_pressure_pa", "air_temperature_c")
 

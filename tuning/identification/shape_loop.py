@@ -26,7 +26,6 @@ from tuning.rig import HoldRig
 # The likelihood of the local level model by its Kalman filter, with the noise's variance concentrated out, over the
 # ratio of walk to noise. Source: Durbin and Koopman, Time Series Analysis by State Space Methods (2012), chapter 2.
 
-
 _RATIOS = np.geomspace(1e-9, 10.0, 61)  # variance of the walk in a cycle over that of the noise
 _DROP = 2.0  # of the log likelihood: 95 % on one side, and some for the grid
 

@@ -133,7 +133,6 @@ def look(record: records.Record, setpoint_um: records.Series, trial: Verificatio
 #
 # The gain k from natural excitation is known to 10 or 20 % only; that is enough to see a pump that has lost a third.
 
-
 LEAST_S = 300.0
 # Of what these gains should give: they are 1.05 to 1.4 times the bound by design, with feed-forward 2.
 _RATIO_GROWTH = 1.4

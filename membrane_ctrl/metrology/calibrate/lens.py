@@ -118,7 +118,6 @@ def _matrix(camera: CameraConfig) -> FloatArray:
 
 # A board of known squares, on a screen or on a plate: its picture, and its corners in a photograph.
 
-
 Levels = AnyArray
 
 # A marker of 4 x 4 bits has a border of one: 6 modules; with a margin of one on each side a square has 8, so that

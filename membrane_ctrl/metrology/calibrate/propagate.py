@@ -79,7 +79,6 @@ def _rms_um(heights: FloatArray, covariance: FloatArray) -> float:
 # In units of what was known by hand, the covariance has eigenvalues between 0 (the sets know far better) and 1 (they
 # know nothing). A combination near 1 is named by its largest parts and by what one sigma of it does to the surface.
 
-
 WEAK = 0.5  # of the hand's sigma: the sets have not even doubled the knowledge
 _PART = 0.3  # of a unit combination: smaller parts are not named
 _MOSTLY = 0.8  # share of a change's square that its name must explain
@@ -169,7 +168,6 @@ def _effect(solution: Solution, index: int, moved_um: FloatArray, figure_um: Flo
 # A Hencky bowl at each depth is followed to the screen, and the problem is solved from there; its solution is the
 # bowl itself, and its covariance is what sets like these claim: within a tenth of what those of a rippled film do
 # (docs/calibration.md).
-
 
 _ACROSS = 48  # rays along the picture's longer side; twice as many change no claim by a fiftieth
 

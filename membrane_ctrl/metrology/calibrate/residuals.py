@@ -31,7 +31,6 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray
 # A linear algebra library keeps its own threads, and on a machine that the control loop shares they wait for each
 # other: products of 40 by 40 then take five times as long as these loops on one core.
 
-
 _BLOCK = 512  # columns that stay in the second-level cache
 
 

@@ -148,7 +148,6 @@ def _best(seen: FloatArray, templates: dict[int, _Template], light: FloatArray, 
 # fringes' swing likewise. The median of three is right when one of them is wrong, so that one bad frame, whichever it
 # is, does not spoil the picture that all frames are compared with.
 
-
 _LEAST_SWING_ADU = 1.0  # less than a rounding step is no fringe
 
 

@@ -145,7 +145,6 @@ def run_trials(
 # two solutions a number (some ms each); J hardly changes while the film moves by micrometres, so a live loop works it
 # out once a full cycle.
 
-
 MAP_SIDE = 101  # points across a map: 10 mm a cell, far below what 36 terms can change over
 
 

@@ -75,7 +75,6 @@ class Tally:
 # Both sets of a pair were disturbed with the same geometries (see `monte_carlo`), so that what a wrong geometry does
 # to both alike cancels, trial by trial. Only the sets within the longest lag are kept.
 
-
 LAGS_S = (60.0, 600.0)  # the paper's
 # A set this far from the wanted moment still stands for it: a run with a bad set in it has a neighbour there.
 _TOLERANCE = 0.1
