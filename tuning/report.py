@@ -233,9 +233,10 @@ def _verified(folder: SessionFolder) -> list[str]:
         return []
     done = session.verified_of(folder)
     words = "kept" if done.kept else f"taken back: {done.reason}"
+    seen = [f"{s.ms:.2f}" if math.isfinite(s.ms) else "too short to say" for s in done.stages]
     rows = [
-        (f"{s.time_s:.0f} s", f"{s.std_um:.3f}", f"{s.before_um:.3f}", f"{s.growth:.2f}", _seen(s.ms), s.reason)
-        for s in done.stages
+        (f"{s.time_s:.0f} s", f"{s.std_um:.3f}", f"{s.before_um:.3f}", f"{s.growth:.2f}", ms, s.reason)
+        for s, ms in zip(done.stages, seen, strict=True)
     ]
     heads = ("after", "std um", "gains before um", "ratio", "sensitivity seen", "")
     return [
@@ -243,10 +244,6 @@ def _verified(folder: SessionFolder) -> list[str]:
         _table(heads, rows),
         _image(folder, "verify.png"),
     ]
-
-
-def _seen(ms: float) -> str:
-    return f"{ms:.2f}" if math.isfinite(ms) else "too short to say"
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -32,7 +32,8 @@ class Rig:
         self._config, self._pump = loop, pump
         self._loop = inner_loop.InnerLoop(loop, pump)
         self.dt_s = 1 / loop.rate_hz
-        self._last = bench.exchange(self._fraction(leak_um_per_s), loop.bleed_fraction)
+        fraction = gas.PumpCurve(pump).command(leak_um_per_s, self.dt_s) if leak_um_per_s > 0 else 0.0
+        self._last = bench.exchange(fraction, loop.bleed_fraction)
         self._loop.start(self._last.displacement_um, leak_um_per_s)
 
     def set_gains(self, loop: LoopConfig) -> None:
@@ -84,9 +85,6 @@ class Rig:
         return inner_loop.LoopInput(
             target_um, 0.0, now.displacement_um, now.ambient_pressure_pa, now.air_temperature_c
         )
-
-    def _fraction(self, flow_um_per_s: float) -> float:
-        return gas.PumpCurve(self._pump).command(flow_um_per_s, self.dt_s) if flow_um_per_s > 0 else 0.0
 
 
 def around_of(held: Record, loop: LoopConfig, pump: PumpConfig, limit_um: float) -> machine.Around:

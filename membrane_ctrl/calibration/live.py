@@ -73,10 +73,14 @@ def take_sets(link: CaptureLink, session: CalibrationSession | None, options: Li
     try:
         held = sweep.look()
         procedure = Procedure(link, sweep, held, progress)
-        head = session.head if session is not None else _planned(link, held, options)
-        missing = session.missing if session is not None else tuple(range(len(head.setpoints_um)))
         if session is not None:
+            head, missing = session.head, session.missing
             _same_bench(link, session)
+        else:
+            reach, sets = plan.reach_of(held, link.config), options.sets or USUAL_SETS
+            wanted = plan.setpoints_um(held, reach, options.range_um, sets)
+            head = CalibrationHead(sessions.FORMAT, link.name, now_utc(), held.setpoint_um, held.shape_on, wanted)
+            missing = tuple(range(sets))
         procedure.check(head)
         minutes = sum(procedure.times_s(head, missing)) / 60
         progress.say(_plan(head, len(missing), held, minutes))
@@ -119,11 +123,6 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
         before = f"; the one before it is {kept}" if kept else ""
         _say(f"adopted: {place}{before}; the next hold measures with it")
     return code
-
-
-def _planned(link: CaptureLink, held: plan.HeldMirror, options: LiveOptions) -> CalibrationHead:
-    wanted = plan.setpoints_um(held, plan.reach_of(held, link.config), options.range_um, options.sets or USUAL_SETS)
-    return CalibrationHead(sessions.FORMAT, link.name, now_utc(), held.setpoint_um, held.shape_on, wanted)
 
 
 def _same_bench(link: CaptureLink, session: CalibrationSession) -> None:

@@ -99,7 +99,10 @@ def calibrate_command(options: CalibrateOptions) -> int:
     usable = solution is not None and not any(finding.fatal for finding in findings)
     written = _write(options.out, solution, problem, bundle, findings) if usable and solution is not None else ""
     if solution is not None and options.pictures:
-        _draw(options.out.with_name(f"{options.out.stem}-residuals.png"), solution)
+        path = options.out.with_name(f"{options.out.stem}-residuals.png")
+        with errors.writing(path):  # also of a solution that is refused: there it is wanted most
+            path.parent.mkdir(parents=True, exist_ok=True)
+            draw_residuals(path, solution)
     report = report_of(solution, findings, bundle.optics.mirror.analysis_radius_mm)
     report |= {"out": str(options.out) if usable else None, "hash": written or None, "timing_s": timing}
     print(json.dumps(report) if options.as_json else "\n".join(lines_of(report)))
@@ -214,7 +217,10 @@ def _write(
 ) -> str:
     """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
     slopes = [slope_residual(solution, phases, k) for k, phases in enumerate(problem.sets)]
-    noises = [_noise_urad(solution, phases, k) for k, phases in enumerate(problem.sets)]
+    noises = [
+        drift.noise_urad(solution.bench.geometry, state.surface, float(np.sqrt(np.mean(phases.sigma_mm**2))))
+        for state, phases in zip(solution.states, problem.sets, strict=True)
+    ]
     origin = artefact.Origin(
         date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         sets=tuple(phases.name for phases in problem.sets),
@@ -229,18 +235,6 @@ def _write(
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text_atomic(users(path), tomli_w.dumps(tables))  # never half a geometry
     return str(tables["calibration"]["hash"])
-
-
-def _noise_urad(solution: Solution, phases: residuals.SetPhases, index: int) -> float:
-    sigma_mm = float(np.sqrt(np.mean(phases.sigma_mm**2)))
-    return drift.noise_urad(solution.bench.geometry, solution.states[index].surface, sigma_mm)
-
-
-def _draw(path: Path, solution: Solution) -> None:
-    """The residuals' maps, also of a solution that is refused: there they are wanted most."""
-    with errors.writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draw_residuals(path, solution)
 
 
 def _progress() -> Any:

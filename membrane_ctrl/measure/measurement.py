@@ -205,9 +205,10 @@ class Figures:
             raise errors.RejectedError(f"{folder}: rejected: {reason}")
         if verdict == "ok":
             verdict, reason = checked.verdict
-        return SetFigure(
-            capture.head, checked, figure, verdict, reason, _middle_s(capture.head), stack.mean_reading_um
-        )
+        head = capture.head
+        sinusoids = [pattern.role == "sin" for pattern in head.patterns]
+        middle_s = float(head.time_s[sinusoids].mean())
+        return SetFigure(head, checked, figure, verdict, reason, middle_s, stack.mean_reading_um)
 
     def _anchored_by(self, reference: Path) -> tuple[CaptureHead, Anchor]:
         if reference != self._reference:
@@ -219,9 +220,3 @@ class Figures:
         if isinstance(self._anchor, errors.CommandError):
             raise self._anchor
         return self._anchor
-
-
-def _middle_s(head: CaptureHead) -> float:
-    """Mean start of exposure of the sinusoids."""
-    times = np.array([t for t, pattern in zip(head.time_s, head.patterns, strict=True) if pattern.role == "sin"])
-    return float(times.mean()) if times.size else math.nan

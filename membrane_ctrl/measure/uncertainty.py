@@ -140,7 +140,8 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
     grid = monte_carlo.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
     table = _table(options, sets, spread, source, result, grid) | {"timing_s": {"trials": seconds}}
     out = options.out.resolve() if options.out else options.folder / "uncertainty"
-    _write(out, grid, result, _height_um(sets, grid), table)
+    own, *other = (one.figure.fit.surface.parameters for one in sets)
+    _write(out, grid, result, 1e3 * grid.matrix @ (own - other[0] if other else own), table)
     print(json.dumps(table) if options.as_json else "\n".join(_lines(table)))
     return 0
 
@@ -152,13 +153,6 @@ def _spread(
     own = parameters[:, 0] if len(benches) == 1 else parameters[:, 0] - parameters[:, 1]
     noise = np.sum([monte_carlo.noise_covariance(bench) for bench in benches], axis=0)
     return Spread(monte_carlo.trial_covariance(own), monte_carlo.linear_covariance(benches, spread), noise)
-
-
-def _height_um(sets: list[SetFigure], grid: monte_carlo.HeightMap) -> FloatArray:
-    """The height, or its change, at the points of the grid."""
-    own = sets[0].figure.fit.surface.parameters
-    other = sets[1].figure.fit.surface.parameters if len(sets) > 1 else np.zeros_like(own)
-    return np.asarray(1e3 * grid.matrix @ (own - other))
 
 
 def _table(

@@ -132,7 +132,8 @@ def evaluate(
     scatter = np.mean([np.var([s.coeffs_um for s in level], axis=0, ddof=1) / len(level) for level in levels], axis=0)
     shapes = sorted((*steady, *(s for level in levels for s in level)), key=lambda shape: shape.time_s)
     reference = shapes[0]
-    gaps_um = np.array([_sag_um(shape, reference, assumed) - shape.displacement_um for shape in shapes])
+    seen = (sag_change(s.coeffs_um, reference.coeffs_um, s.covariance_um2, assumed).change_um for s in shapes)
+    gaps_um = np.array([sag_um - shape.displacement_um for sag_um, shape in zip(seen, shapes, strict=True)])
     cycle_s = float(np.median(np.diff([shape.time_s for shape in shapes])))
     noise = fit_local_level(gaps_um, np.array([shape.time_s for shape in shapes]))
     best_s = noise.white * math.sqrt(cycle_s / noise.walk)
@@ -148,7 +149,3 @@ def evaluate(
         drift_seen=noise.seen,
         time_constant_s=min(max(best_s, _CYCLES_MIN * cycle_s), _TAU_MAX_S),
     )
-
-
-def _sag_um(shape: ShapeEstimate, reference: ShapeEstimate, sensitivity: Series) -> float:
-    return sag_change(shape.coeffs_um, reference.coeffs_um, shape.covariance_um2, sensitivity).change_um

@@ -132,7 +132,8 @@ def bench_at(stated: Geometry, values: FloatArray) -> BenchGeometry:
 
 def poses_at(stated: Geometry, values: AnyArray) -> Poses:
     """Poses of a parameter vector (real, or complex for `pose_derivatives`); only the first eleven count."""
-    a, b, alpha, x, y, turn_x, turn_y, turn_z, yaw, pitch, roll = _radians(values[: len(POSE)])
+    in_radians = [np.pi / 180 if parameter.unit == "deg" else 1.0 for parameter in POSE]
+    a, b, alpha, x, y, turn_x, turn_y, turn_z, yaw, pitch, roll = values[: len(POSE)] * in_radians
     f0, o0 = stated.pinhole_mm, stated.screen_origin_mm
     hinge = _hinge(f0, o0)
     up, back = _turn(hinge, alpha), _turn(hinge, -alpha)
@@ -159,12 +160,6 @@ def pose_derivatives(stated: Geometry, values: FloatArray) -> list[Poses]:
         parts = (poses.pinhole_mm, poses.camera, poses.origin_mm, poses.screen)
         out.append(Poses(*(np.asarray(part.imag / _COMPLEX_STEP) for part in parts)))
     return out
-
-
-def _radians(values: AnyArray) -> AnyArray:
-    """Millimetres as they are, degrees as radians."""
-    factors = [np.pi / 180 if parameter.unit == "deg" else 1.0 for parameter in POSE]
-    return np.asarray(values * factors)
 
 
 def _hinge(pinhole_mm: FloatArray, origin_mm: FloatArray) -> FloatArray:

@@ -112,7 +112,9 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
         pairs = zip(problem.sets, start.states, strict=True)
         problem = replace(problem, sets=tuple(separable.averaged(start.bench, *pair, _FEW) for pair in pairs))
     states = start.states if start is not None else first_states(problem)
-    common = start.common if start is not None else _common(states)
+    # the parameters as stated, and the ring as the first surfaces have it
+    ring = np.mean([separable.rim_of(state) for state in states], axis=0)
+    common = start.common if start is not None else np.append(np.zeros(len(parameters.NAMES)), ring)
     trust = tuple(separable.Trust.full(phases) for phases in problem.sets)
     free = problem.sigmas > 0
     changes: list[float] = []
@@ -141,11 +143,6 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
         if weighed:
             left = (each.residual_mm for each in linear)
             trust = tuple(separable.Trust.seen(*pair) for pair in zip(problem.sets, left, strict=True))
-
-
-def _common(states: Sequence[separable.SetState]) -> FloatArray:
-    """Parameters as stated, and the ring as the sets' first surfaces have it."""
-    return np.append(np.zeros(len(parameters.NAMES)), np.mean([separable.rim_of(state) for state in states], axis=0))
 
 
 def _linearise(

@@ -119,7 +119,7 @@ def _judge_sinusoid(
     rest = float(np.median([o.rest for o in same]))
     saturated = float(np.median([o.saturated for o in same]))
     worst = {
-        "step": abs(_wrapped(e.step_rad - step)) / step_limit,
+        "step": abs((e.step_rad - step + np.pi) % (2 * np.pi) - np.pi) / step_limit,
         "light": abs(e.level - level) / max(LEVEL_SHARE * level, level_limit),
         "swing": abs(e.swing - swing) / max(SWING_SHARE * swing, swing_limit),
         "moved": abs(e.moved_um - moved_um) / moved_limit,
@@ -213,7 +213,3 @@ def _limit(values: list[float], floor: float) -> tuple[float, float]:
     middle = float(np.median(values))
     scatter = 1.4826 * float(np.median(np.abs(np.array(values) - middle)))
     return max(floor, _SCATTERS * scatter, 1e-9), middle
-
-
-def _wrapped(angle_rad: float) -> float:
-    return float((angle_rad + np.pi) % (2 * np.pi) - np.pi)

@@ -91,9 +91,8 @@ def render(analysis: Analysis, other: Analysis | None = None, differences: Seque
 
 
 def _anomalies(analysis: Analysis) -> str:
-    if not analysis.anomalies:
-        return ""
-    return _list(f"<b>{_text(a.name)}</b> {_text(a.seen)}" for a in analysis.anomalies)
+    items = "".join(f"<li><b>{_text(a.name)}</b> {_text(a.seen)}</li>" for a in analysis.anomalies)
+    return f"<ul class='odd'>{items}</ul>" if items else ""
 
 
 def _found(analysis: Analysis) -> str:
@@ -241,10 +240,6 @@ def _section(title: str, body: str) -> str:
 
 def _facts(facts: Iterable[tuple[str, str]]) -> str:
     return "<dl>" + "".join(f"<dt>{_text(name)}</dt><dd>{said}</dd>" for name, said in facts) + "</dl>"
-
-
-def _list(items: Iterable[str]) -> str:
-    return "<ul class='odd'>" + "".join(f"<li>{item}</li>" for item in items) + "</ul>"
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -127,7 +127,7 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
     found, shape = _found_and_shape(run, seconds, start_s, end_s)
     del seconds  # of a month a quarter of a GB, and what comes needs more
     ticks = hold_pass(run, span_s, (start_s, end_s))
-    level_s = _level_for(span_s[1] - span_s[0])
+    level_s = next((w for w in (1.0, 10.0) if (span_s[1] - span_s[0]) / w <= _PICTURE_ROWS), 60.0)
     level = run.level(level_s, start_s, end_s)
     reading = _series(run, ticks, READING)
     true = _series(run, ticks, TRUE)
@@ -231,10 +231,6 @@ def _tracking(level: Block) -> float:
     state = level["shape_state"][level["state"] == states.State.HOLD]
     state = state[np.isfinite(state)]
     return float((state == states.ShapeState.TRACKING).mean()) if state.size else math.nan
-
-
-def _level_for(span_s: float) -> float:
-    return next((w for w in (1.0, 10.0) if span_s / w <= _PICTURE_ROWS), 60.0)
 
 
 # What is not as it should be, by name and with the figure that says so.

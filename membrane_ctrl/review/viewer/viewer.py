@@ -90,7 +90,8 @@ def live(folder: Path, web: bool, port: int = 0) -> int:
         _require_screen()
     try:
         with subprocess.Popen(server, stdin=subprocess.PIPE, env=_environment()) as served:
-            watched = served if web else _connected(proxy)
+            viewer = viewer_command("--bind", "127.0.0.1", "--port", str(free_port()), "--connect", proxy)
+            watched = served if web else subprocess.Popen(viewer, env=_environment())
             assert served.stdin is not None
             try:
                 follow(folder, served.stdin, lambda: watched.poll() is None)
@@ -103,11 +104,6 @@ def live(folder: Path, web: bool, port: int = 0) -> int:
     except OSError as error:
         raise errors.DeviceError(f"the viewer did not start: {error}") from None
     return 0
-
-
-def _connected(proxy: str) -> subprocess.Popen[bytes]:
-    command = viewer_command("--bind", "127.0.0.1", "--port", str(free_port()), "--connect", proxy)
-    return subprocess.Popen(command, env=_environment())
 
 
 def _require_screen() -> None:
