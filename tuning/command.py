@@ -113,7 +113,7 @@ def outer(options: TuneOptions) -> int:
             raise RejectedError(f"shape loop: {error}") from None
         plain.write(folder.file("outer.json"), found)
         progress.say(
-            f"sag seen per um of the laser's {found.scale:.3f}, noise {found.sigma_um:.2f} um a cycle of "
+            f"optical sag per um of the laser {found.scale:.3f}, noise {found.sigma_um:.2f} um per cycle of "
             f"{found.cycle_s:.1f} s, drift {'' if found.drift_seen else 'below '}"
             f"{found.drift_um_per_sqrt_h:.2f} um/sqrt(h): shape.time_constant_s = {found.time_constant_s:.0f}"
         )
@@ -149,7 +149,7 @@ def watch(options: TuneOptions) -> int:
 
 
 def rollback(options: TuneOptions) -> int:
-    """Back to the gains before those that were kept last."""
+    """Back to the gains before those kept last."""
     kept = gains_file.to_roll_back(options.logs)
     progress = Progress()
     with _link(options) as link:
@@ -171,7 +171,7 @@ def _do(step: str, folder: SessionFolder, rig: HoldRig | None, options: TuneOpti
 
     def told(stage: Stage) -> None:
         progress.say(
-            f"  after {stage.time_s:.0f} s: std {stage.std_um:.3f} um, {stage.growth:.2f} of the gains before"
+            f"  after {stage.time_s:.0f} s: std {stage.std_um:.3f} um, {stage.growth:.2f} of the previous gains"
         )
 
     moving: dict[str, Callable[[HoldRig], object]] = {
@@ -215,7 +215,7 @@ def _in_a_line(step: str, folder: SessionFolder) -> str:
             )
         case "observe":
             weather = session.disturbance_of(folder)
-            return f"laser noise {weather.laser_um:.2f} um a reading"
+            return f"laser noise {weather.laser_um:.2f} um per reading"
         case "design":
             gains = gains_file.load_gains(folder.file("gains.toml"))
             return (
@@ -229,7 +229,7 @@ def _in_a_line(step: str, folder: SessionFolder) -> str:
             return f"on the fitted twin {present:.3f} um with the present gains, {proposed:.3f} um with the new ones"
         case "verify":
             done = session.verified_of(folder)
-            return "kept" if done.kept else f"the old gains are back: {done.reason}"
+            return "kept" if done.kept else f"the previous gains are back: {done.reason}"
         case _:
             return "done"
 
@@ -265,7 +265,7 @@ def _go_back(rig: HoldRig, before: LoopConfig, progress: Progress) -> None:
     try:
         rig.go_back(before)
     except HoldError as error:
-        progress.say(f"the last good gains could not be set ({error}); gains on trial go back by themselves")
+        progress.say(f"the last good gains could not be set ({error}); gains on trial revert by themselves")
         return
     progress.say("the mirror is held with the last good gains")
 

@@ -84,11 +84,11 @@ def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
     dt_s = 1 / gains.loop.rate_hz
     found = loop_model.margins(loop_model.Gains.of(gains.loop), gains.plant.model, dt_s)
     if not found.stable:
-        raise errors.InputError(f"{where}: loop: unstable on the plant of this very file; was it edited by hand?")
+        raise errors.InputError(f"{where}: loop: unstable on the plant of this file; was it edited by hand?")
     if not found.ms <= MS_MAX or math.isnan(found.ms):
         raise errors.InputError(
-            f"{where}: loop: sensitivity {found.ms:.2f} on the plant of this file, {MS_MAX:g} is the most that is "
-            "applied; was it edited by hand?"
+            f"{where}: loop: sensitivity {found.ms:.2f} on the plant of this file, the limit is "
+            f"{MS_MAX:g}; was it edited by hand?"
         )
     if gains.loop.rate_hz != running.rate_hz:
         raise errors.InputError(

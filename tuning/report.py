@@ -54,7 +54,7 @@ def draw_weather(
     frequency_hz, power = welch(np.diff(rest), 1 / record.dt_s, nperseg=round(_SEGMENT_S / record.dt_s))
     w: records.Series = 2 * np.pi * frequency_hz[1:]
     back = 1 / np.abs(1 - np.exp(-1j * w * record.dt_s)) ** 2  # from increments to readings
-    axes.loglog(frequency_hz[1:], power[1:] * back, linewidth=0.7, color="tab:gray", label="readings, pump taken out")
+    axes.loglog(frequency_hz[1:], power[1:] * back, linewidth=0.7, color="tab:gray", label="readings less the pump")
     blind = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
     axes.loglog(frequency_hz[1:], 2 * weather.psd(w, model, blind), label="movement, fitted")  # one-sided
     axes.loglog(frequency_hz[1:], 2 * weather.rest.moving_psd(w), label="movement that no weather sensor explains")
@@ -113,8 +113,8 @@ def draw_verification(
     left.set(xlabel="frequency (Hz)", ylabel="readings (um^2/Hz)")
     left.legend(loc="best")
     times = [stage.time_s for stage in done.stages]
-    right.plot(times, [stage.growth for stage in done.stages], "o-", label="std over that of the gains before")
-    right.plot(times, [stage.growth_max for stage in done.stages], "r--", label="most that passes")
+    right.plot(times, [stage.growth for stage in done.stages], "o-", label="std relative to the previous gains")
+    right.plot(times, [stage.growth_max for stage in done.stages], "r--", label="limit")
     right.set(xlabel="time (s)", title="kept" if done.kept else f"taken back: {done.reason}"[:90])
     right.title.set_fontsize(8)
     right.legend(loc="best")
@@ -200,7 +200,7 @@ def _designed(folder: SessionFolder) -> list[str]:
         return []
     weather = session.disturbance_of(folder)
     parts = [
-        f"<h2>Weather</h2><p>Laser noise {weather.laser_um:.3f} um a reading.</p>",
+        f"<h2>Weather</h2><p>Laser noise {weather.laser_um:.3f} um per reading.</p>",
         _image(folder, "weather.png"),
     ]
     if not folder.done("design"):
@@ -238,7 +238,7 @@ def _verified(folder: SessionFolder) -> list[str]:
         (f"{s.time_s:.0f} s", f"{s.std_um:.3f}", f"{s.before_um:.3f}", f"{s.growth:.2f}", ms, s.reason)
         for s, ms in zip(done.stages, seen, strict=True)
     ]
-    heads = ("after", "std um", "gains before um", "ratio", "sensitivity seen", "")
+    heads = ("after", "std um", "previous um", "ratio", "sensitivity seen", "")
     return [
         f"<h2>Verification</h2><p class={'ok' if done.kept else 'refused'}>{html.escape(words)}</p>",
         _table(heads, rows),

@@ -163,7 +163,7 @@ class HoldRig:
             rows.append(self._next_held())
             begun = begun or rows[-1].state == states.State.TUNE
             if not begun and len(rows) > _ANSWER_TICKS:
-                raise HoldError("the hold took the experiment and did not begin it")
+                raise HoldError("the hold accepted the experiment but did not begin it")
         told = self._experiment_ended()
         return self.record(rows), machine.Finished(told.completed, told.reason), told
 
@@ -234,8 +234,8 @@ class HoldRig:
             if found:
                 return found[-1]
             self._take()
-        raise HoldError("the hold did not tell of the end of the experiment")
+        raise HoldError("the hold did not report the end of the experiment")
 
     def _why(self) -> str:
         said = [event.why for event in self._events if isinstance(event, events.StateEntered)]
-        return said[-1] if said else "no reason was told"
+        return said[-1] if said else "no reason was given"

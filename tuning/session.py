@@ -22,7 +22,7 @@ from tuning.rig import HoldRig
 
 OBSERVE_S = 600.0
 _PREVIEW_SEEDS = 3
-# Time to look at what was applied and to start the verification; then the gains go back by themselves.
+# Time to look at what was applied and to start the verification; then the gains revert by themselves.
 _APPLY_S = 900.0
 _SPARE_S = 120.0
 
@@ -204,7 +204,7 @@ def checked_gains(session: folder.SessionFolder) -> schema.LoopConfig:
 
 
 def apply_step(session: folder.SessionFolder, rig: HoldRig) -> schema.LoopConfig:
-    """Set the gains, on trial: without `verify` they go back by themselves."""
+    """Set the gains, on trial: without `verify` they revert by themselves."""
     loop = checked_gains(session)
     session.begin("apply")
     rig.set_gains(loop, f"session {session.path.name}", _APPLY_S)

@@ -155,7 +155,7 @@ def _plan(head: CalibrationHead, missing: int, held: plan.HeldMirror, minutes: f
 def _worth(link: CaptureLink, head: CalibrationHead, held: plan.HeldMirror, options: LiveOptions) -> str:
     """How well the geometry will be determined, and by how much better if there were more room."""
     here = _foreseen(link, held, head.setpoints_um, options)
-    line = f"such sets leave of a figure: sag +- {here.sag_um:.1f} um, figure +- {here.figure_rms_um:.1f} um RMS"
+    line = f"a figure after such sets: sag +- {here.sag_um:.1f} um, figure +- {here.figure_rms_um:.1f} um RMS"
     low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
     if high_um - low_um >= _NEARLY_ALL * verdict.GOOD_SPREAD_UM:
         return line
@@ -163,8 +163,8 @@ def _worth(link: CaptureLink, head: CalibrationHead, held: plan.HeldMirror, opti
     best = _foreseen(link, held, np.linspace(*ends, len(head.setpoints_um)).tolist(), options)
     reach = plan.reach_of(held, link.config)
     return (
-        f"{line}; {verdict.GOOD_SPREAD_UM:.0f} um from first to last would leave {best.sag_um:.1f} and "
-        f"{best.figure_rms_um:.1f} ({reach.low_why} and {reach.high_why} have room for "
+        f"{line}; {verdict.GOOD_SPREAD_UM:.0f} um from first to last would give {best.sag_um:.1f} and "
+        f"{best.figure_rms_um:.1f} ({reach.low_why} and {reach.high_why} allow "
         f"{reach.high_um - reach.low_um:.0f})"
     )
 

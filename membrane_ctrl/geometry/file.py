@@ -34,7 +34,7 @@ class LensTable(Section):
             if getattr(self, key) != getattr(camera, key):
                 raise errors.InputError(
                     f"{where}: camera.{key} = {getattr(self, key):g}, the frames' camera has "
-                    f"{getattr(camera, key):g}; a calibrated lens is good for its own camera alone"
+                    f"{getattr(camera, key):g}; a calibrated lens is valid for its own camera only"
                 )
         return camera.model_copy(update=self.model_dump())
 

@@ -57,7 +57,7 @@ class Checked:
         """What the frames alone say: "ok", or "degraded" with what was done about the bad ones."""
         if not self.flags:
             return "ok", ""
-        return "degraded", f"{len(self.flags)} frame(s) flagged; the figure is made without what they spoil"
+        return "degraded", f"{len(self.flags)} frame(s) flagged; the figure leaves out what they spoil"
 
     def places_px(self, index: IntArray) -> FloatArray:
         """Column and row (2, n) of bins' centres."""

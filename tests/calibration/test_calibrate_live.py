@@ -65,8 +65,8 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
     assert run([*live, "--range-um", "4000", "--sets", "3"]) == 130
     said = capsys.readouterr().err
     assert "3 of 3 sets from -2000 to 2000 um" in said
-    assert "such sets leave of a figure: sag +-" in said
-    assert "limits.gauge_pressure_max_pa have room for" in said
+    assert "a figure after such sets: sag +-" in said
+    assert "limits.gauge_pressure_max_pa allow" in said
     session = session_in(tmp_path)
     assert f"go on with --session {session}" in said
     assert [path.name for path in (session / "sets").iterdir()] == ["set-1"]
@@ -131,7 +131,7 @@ def test_a_fault_on_the_way_is_left_to_the_safety_table(
     assert run([*live, "--range-um", "1000", "--sets", "2", "--yes"]) == 4
     said = capsys.readouterr().err
     assert "the mirror is not held but in state fault (" in said
-    assert "the mirror is left to whoever has it; the shape loop is off" in said
+    assert "the mirror is left to whoever has the command; the shape loop is off" in said
     assert bench.asked[-1].value == 500.0  # on its way to the second set; nothing was asked for after the fault
 
 

@@ -59,7 +59,7 @@ def judge(record: Record, identified: Identified, validation: Validation | None 
             "the bench changed in between; repeat the relay in steadier weather"
         )
     if validation is not None and validation.independence_p < _P_MIN:
-        degraded.append("the model leaves something of the flow in new data: repeat with the doublets experiment")
+        degraded.append("new residuals still follow the flow: repeat with the doublets experiment")
     verdict: Literal["ok", "degraded", "refused"] = "refused" if refused else "degraded" if degraded else "ok"
     return FitQuality(verdict, (*refused, *degraded))
 
@@ -87,7 +87,7 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
         refused.append(f"the delay is known to {sigma.delay_s:.2f} s only: run the doublets")
     refused.extend(_bent(record, identified))
     if identified.independence_p < _P_MIN:
-        degraded.append("the residuals know the flow (a saturating or sticking pump?): run the pump map")
+        degraded.append("the residuals follow the flow (a saturating or sticking pump?): run the pump map")
     if identified.whiteness_p < _P_MIN:
         degraded.append("the residuals are coloured: something periodic moves the mirror or the reading")
     return refused, degraded

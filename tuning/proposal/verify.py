@@ -43,7 +43,7 @@ class Stage:
     std_um: float  # of the centre, from the record
     before_um: float  # what the old gains would have given in this weather
     growth: float  # ratio of the two
-    growth_max: float  # the most that passes
+    growth_max: float  # the limit
     ms: float  # sensitivity seen; NaN while the record is too short
     lost_fraction: float  # readings lost
     reason: str  # why it fails; empty if it passes
@@ -123,9 +123,9 @@ def look(record: records.Record, setpoint_um: records.Series, trial: Verificatio
     ms = seen_sensitivity(off_um, trial) if record.duration_s >= _RESONANCE_LEAST_S else math.nan
     reason = ""
     if growth > growth_max:
-        reason = f"the standard deviation is {std_um:.3f} um, {growth:.2f} times that of the gains before"
+        reason = f"the standard deviation is {std_um:.3f} um, {growth:.2f} times that of the previous gains"
     elif ms > MS_MAX:
-        reason = f"the readings show a sensitivity of {ms:.1f} ({MS_MAX:g} is the most): less margin than designed"
+        reason = f"the readings show a sensitivity of {ms:.1f} (limit {MS_MAX:g}): less margin than designed"
     return Stage(record.duration_s, std_um, before_um, growth, growth_max, ms, record.lost_fraction, reason)
 
 
@@ -169,7 +169,7 @@ def health(record: records.Record, setpoint_um: records.Series, loop: LoopConfig
     found: list[str] = []
     if std_um / least_um > _RATIO_GROWTH * designed:
         ratio = std_um / (designed * least_um)
-        found.append(f"the centre moves {ratio:.1f} times as much as these gains should let it")
+        found.append(f"the centre moves {ratio:.1f} times as much as these gains should allow")
     if abs(leak_um_per_s - model.leak_um_per_s) > _LEAK_CHANGE * model.leak_um_per_s:
         found.append(f"the leak is {leak_um_per_s:.2f} um/s, it was {model.leak_um_per_s:.2f} um/s")
     spread = math.hypot(gain_sigma, made.plant.gain_sigma)

@@ -7,7 +7,7 @@ import numpy as np
 from membrane_ctrl.metrology.calibrate import diagnose, parameters, separable
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, solve
 
-# Sets closer together than this say no more than one set: the sag's sigma is then twice that of sets 8 mm apart
+# Sets closer together than this tell no more than one set: the sag's sigma is then twice that of sets 8 mm apart
 LEAST_SPREAD_UM = 1000.0
 GOOD_SPREAD_UM = 8000.0
 # A wrong geometry changes the sag's slope against the laser by some per cent at most; a wrong unit or sign by more
@@ -37,7 +37,7 @@ def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
     seen_um = float(np.ptp(sag_um))
     if max(spread_um, seen_um) < LEAST_SPREAD_UM:
         says = (
-            f"the sets are only {max(spread_um, seen_um):.0f} um apart: they say no more than one of them; "
+            f"the sets are only {max(spread_um, seen_um):.0f} um apart: they tell no more than one of them; "
             f"at least {LEAST_SPREAD_UM / 1000:.0f} mm are needed, {GOOD_SPREAD_UM / 1000:.0f} mm are good"
         )
         return (CalibrationFinding(True, says),)
@@ -72,7 +72,7 @@ def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     for bump in diagnose.bumps(solution)[:1]:
         yaw, pitch, roll = bump.turned_deg
         where = f"in {names[bump.sets[0]]}" if len(bump.sets) == 1 else f"from {names[bump.sets[0]]} on"
-        says = f"the camera stood otherwise {where}: yaw {yaw:+.3f}, pitch {pitch:+.3f}, roll {roll:+.3f} degrees"
+        says = f"the camera had moved {where}: yaw {yaw:+.3f}, pitch {pitch:+.3f}, roll {roll:+.3f} degrees"
         out.append((bump.fall - 2 * 3, CalibrationFinding(True, says, bump.sets)))
     worst = max(diagnose.left_out(solution), key=lambda each: each.fall)
     if worst.disagrees:
@@ -166,5 +166,7 @@ def _spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
     spread_um = float(np.ptp(moved[np.isfinite(moved)]))
     if spread_um >= GOOD_SPREAD_UM / 2:
         return ()
-    says = f"the sets are {spread_um / 1000:.1f} mm apart; {GOOD_SPREAD_UM / 1000:.0f} mm would know the sag better"
+    says = (
+        f"the sets are {spread_um / 1000:.1f} mm apart; {GOOD_SPREAD_UM / 1000:.0f} mm would determine the sag better"
+    )
     return (CalibrationFinding(False, says),)

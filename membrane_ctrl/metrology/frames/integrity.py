@@ -139,7 +139,7 @@ def _sinusoid_reason(kind: str, e: Evidence, level: float, moved_um: float) -> s
     if kind == "light" or abs(light - 1) > _FLICKER:
         return f"flicker: {light:.3f} of the light of the others"
     if kind in ("moved", "rest") and abs(e.moved_um - moved_um) > MOVED_UM:
-        return f"moved: the film stood {e.moved_um - moved_um:+.0f} um from where the others saw it"
+        return f"moved: the film was {e.moved_um - moved_um:+.0f} um from where the others saw it"
     if kind == "step":
         return f"stale or wrong picture: its phase step is {e.step_rad:+.2f} rad off"
     return f"differs from its prediction by {e.rest:.1%} of the light"

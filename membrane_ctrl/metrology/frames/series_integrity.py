@@ -167,7 +167,7 @@ def check_series(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatAr
     if failures:
         return SeriesCheck("rejected", failures[0], tuple(flags), tuple(mended))
     if flags:
-        return SeriesCheck("degraded", f"{len(flags)} frame(s) flagged and done without", tuple(flags), tuple(mended))
+        return SeriesCheck("degraded", f"{len(flags)} frame(s) flagged and left out", tuple(flags), tuple(mended))
     return SeriesCheck("ok", "", (), tuple(mended))
 
 

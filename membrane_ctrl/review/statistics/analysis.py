@@ -288,7 +288,7 @@ def _anomalies(
     if ticks.thin_s:
         odd.append(Anomaly("thinned ticks", f"{span(ticks.thin_s)} held {_THIN}"))
     if ticks.uncovered_s:
-        odd.append(Anomaly("thinned ticks", f"{span(ticks.uncovered_s)} held are in no figure: few ticks, no level"))
+        odd.append(Anomaly("thinned ticks", f"{span(ticks.uncovered_s)} held not counted: few ticks, no level"))
     if ticks.lateness_ms.quantile(0.99) > _LATE_P99_MOST_MS:
         odd.append(Anomaly("late ticks", f"p99 is {ticks.lateness_ms.quantile(0.99):.1f} ms"))
     if leak_um_per_s < _LEAK_LEAST_UM_PER_S:
@@ -303,7 +303,7 @@ def _anomalies(
         if shape.rejected > _REJECTED_MOST * shape.cycles:
             odd.append(Anomaly("rejected cycles", f"{shape.rejected} of {shape.cycles}"))
         if shape.disagreement.significant:
-            odd.append(Anomaly("camera and laser part", _of(shape.disagreement, "um/h")))
+            odd.append(Anomaly("camera and laser diverge", _of(shape.disagreement, "um/h")))
     counts = Counter(event.kind for event in found)
     odd += [Anomaly(kind, f"{count} found") for kind, count in counts.most_common()]
     return tuple(odd)

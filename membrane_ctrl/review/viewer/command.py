@@ -89,9 +89,9 @@ def _require_sense(options: ReviewOptions) -> None:
     if len(options.runs) != 1:
         raise errors.InputError("--live: one run at a time")
     if any(part is not None for part in (*moments, options.save, options.screenshot)):
-        raise errors.InputError("--live follows the run as it goes on: leave --at, --from, --save and the like away")
+        raise errors.InputError("--live follows the run as it goes on: leave out --at, --from, --save and the like")
     if options.bind != _THIS_MACHINE:
-        raise errors.InputError("--live serves this machine only: leave --bind away and use the ssh line it prints")
+        raise errors.InputError("--live serves this machine only: leave out --bind and use the ssh line it prints")
 
 
 def _require_writable(target: Path, runs: Sequence[Run]) -> None:
