@@ -24,7 +24,7 @@ from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, slope_res
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.phase import mm_per_rad, phase_sigma_rad
-from membrane_ctrl.model import errors
+from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.model.files import users, write_text_atomic
 
 # A capture set's bins as screen points with their noise, for the calibration.
@@ -139,17 +139,13 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
     sets: list[residuals.SetPhases] = []
     benches: list[OpticsConfig] = []
     notes: list[str] = []
-    for folder in folders:
+    for folder in terminal.counted(folders, "sets"):
         figure = figures.of(folder)
         benches.append(figure.head.optics)
         _same_rig(folders[0], benches[0], folder, benches[-1])
         sets.append(phases_of(folder.name, figure.checked, figure.head.optics))
         files = figure.head.files
         notes += [f"{folder.name}: {files[flag.frame]} left out: {flag.reason}" for flag in figure.checked.flags]
-        if sys.stderr.isatty():
-            print(f"\r{len(sets)} of {len(folders)} sets read", end="", file=sys.stderr)
-    if sys.stderr.isatty():
-        print(file=sys.stderr)
     reference_um = _reference_um(sets, benches, reference_um)
     if not any(math.isfinite(phases.displacement_um) for phases in sets):
         # no laser: the world's origin is the vertex of the first set

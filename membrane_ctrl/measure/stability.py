@@ -7,13 +7,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import Progress
-
 from membrane_ctrl.geometry.file import read_geometry
 from membrane_ctrl.measure import capture_set, measurement, results, stability_run
 from membrane_ctrl.metrology.uncertainty.stability import default_points_mm
-from membrane_ctrl.model import errors, files
+from membrane_ctrl.model import errors, files, terminal
 
 
 @dataclass(frozen=True)
@@ -114,12 +111,9 @@ def points_mm(given: tuple[str, ...], analysis_radius_mm: float) -> dict[str, tu
 
 def _analyse(folders: list[Path], figures: measurement.Figures, run: stability_run.StabilityRun) -> None:
     """Every set, one after the other, with a bar on a terminal; a bad one is named and passed over."""
-    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
-        task = progress.add_task("sets", total=len(folders))
-        for number, folder in enumerate(folders):
-            try:
-                run.add(folder.name, number, figures.of(folder))
-            except errors.CommandError as error:
-                run.skip(folder.name, str(error))
-                print(f"passed over {folder.name}: {error}", file=sys.stderr)
-            progress.update(task, advance=1)
+    for number, folder in enumerate(terminal.counted(folders, "sets")):
+        try:
+            run.add(folder.name, number, figures.of(folder))
+        except errors.CommandError as error:
+            run.skip(folder.name, str(error))
+            print(terminal.one_line(f"passed over {folder.name}: {error}"), file=sys.stderr)

@@ -15,15 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
 
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.measure.results import write_arrays, write_json
 from membrane_ctrl.metrology.optics.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
-from membrane_ctrl.model import errors, files
+from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.arrays import FloatArray
 
 # Runs Monte Carlo trials: here, over the cores, or on a Dask cluster; the numbers are the same wherever they run.
@@ -55,7 +53,7 @@ def run_everywhere(
         workers = (os.cpu_count() or 1) if trials * len(benches) >= _WORTH_PROCESSES else 1
     try:
         with _results(job, batches, min(workers, len(batches)), scheduler) as results:
-            return np.concatenate(list(_shown(results, trials)))
+            return np.concatenate(list(terminal.counted(results, "trials", len(batches))))
     except ArithmeticError as error:
         raise errors.InputError(f"uncertainty: {error}") from None
 
@@ -85,15 +83,6 @@ def _dask_client(address: str) -> Any:
         raise errors.InputError(f"--scheduler {address}: {error}") from None
     except OSError as error:  # a timeout is one
         raise errors.DeviceError(f"--scheduler {address}: does not answer ({error})") from None
-
-
-def _shown(results: Iterator[FloatArray], trials: int) -> Iterator[FloatArray]:
-    """The same, with a bar on stderr if that is a terminal."""
-    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
-        task = progress.add_task("trials", total=trials)
-        for part in results:
-            progress.update(task, advance=len(part))
-            yield part
 
 
 @dataclass(frozen=True)
