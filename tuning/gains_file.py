@@ -129,12 +129,10 @@ def entry(what: What, session: str, author: str, reason: str, before: LoopConfig
 def note(logs: Path, what: GainsEntry) -> None:
     """Append an entry. Raises InputError where it cannot be written: a link in its place is not followed."""
     path = logs / "tuning" / _FILE
-    try:
+    with errors.writing(path):
         files.make_folder(path.parent)
         files.append_text(path, json.dumps(plain.plain(what), allow_nan=False) + "\n")
         files.sync_data(path)
-    except OSError as error:
-        raise errors.InputError(f"{path}: not noted: {error.strerror}") from None
 
 
 def entries(logs: Path) -> list[GainsEntry]:
@@ -145,7 +143,7 @@ def entries(logs: Path) -> list[GainsEntry]:
     except FileNotFoundError:
         return []
     except OSError as error:
-        raise errors.InputError(f"{path}: {error.strerror}") from None
+        raise errors.InputError(f"{path}: {errors.os_reason(error)}") from None
     found: list[GainsEntry] = []
     for line in text.splitlines():
         try:

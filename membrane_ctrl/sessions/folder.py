@@ -159,7 +159,9 @@ class SessionFolder:
                 try:
                     self.file(name).unlink(missing_ok=True)
                 except OSError as error:  # a folder in its place
-                    raise errors.InputError(f"{self.file(name)}: cannot be removed: {error.strerror}") from None
+                    raise errors.InputError(
+                        f"{self.file(name)}: cannot be removed ({errors.os_reason(error)})"
+                    ) from None
 
 
 def fresh_folder(parent: Path, name: str, now: datetime) -> Path:
