@@ -1,9 +1,8 @@
-"""The table of a stability run, one line a set, written as the sets pass by and read back thinned for pictures."""
+"""The table of a stability run, one line a set, read back thinned for pictures; pictures and recording of the run."""
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import rerun as rr
@@ -13,44 +12,15 @@ from matplotlib.figure import Figure
 from membrane_ctrl.measure.pictures import log_pictures, result_recording, show_map
 from membrane_ctrl.measure.results import write_figure
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.files import fresh_text
 
 _HEAD = ("set", "verdict", "reason")
 _NUMBERS = ("time_s", "displacement_um", "sag_um", "slope_residual_urad", "rmse_mean_um")
 _ZERNIKE = tuple(f"z{j}_um" for j in range(1, 37))
 
 
-class SeriesFile:
-    """Writes `series.csv`; a set that gave no figure has a line without numbers.
-
-    `path` is overwritten; `points` are the names of the points whose height is followed.
-    """
-
-    def __init__(self, path: Path, points: Sequence[str]) -> None:
-        self._file = fresh_text(path)
-        self._writer = csv.writer(self._file, lineterminator="\n")
-        self._writer.writerow((*_HEAD, *_NUMBERS, *(f"{name}_um" for name in points), *_ZERNIKE))
-
-    def __enter__(self) -> "SeriesFile":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
-    ) -> None:
-        self._file.close()
-
-    def add(
-        self,
-        name: str,
-        verdict: str,
-        reason: str,
-        numbers: Sequence[float] = (),
-        points_um: Sequence[float] = (),
-        coeffs_um: Sequence[float] = (),
-    ) -> None:
-        """One line; `numbers` are time_s, displacement_um, sag_um, slope_residual_urad, rmse_mean_um."""
-        cells = [f"{value:.12g}" for value in (*numbers, *points_um, *coeffs_um)]
-        self._writer.writerow((name, verdict, reason, *cells))
+def series_head(points: Iterable[str]) -> tuple[str, ...]:
+    """Columns of `series.csv`, with those of the points whose height is followed; a bad set has the first three."""
+    return (*_HEAD, *_NUMBERS, *(f"{name}_um" for name in points), *_ZERNIKE)
 
 
 def read_series(path: Path, points: int, most: int = 4000) -> tuple[FloatArray, FloatArray, FloatArray]:

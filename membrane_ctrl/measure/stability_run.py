@@ -1,8 +1,9 @@
 """What a stability analysis accumulates over its sets, and the files it leaves."""
 
+import contextlib
 import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -39,10 +40,9 @@ class StabilityRun:
         self._out = out
         self._points_mm = dict(points_mm)
         self._trials, self._seed, self._geometry = trials, seed, geometry
-        self._series = stability_results.SeriesFile(out / SERIES, list(points_mm))
-        self._pair_file = files.fresh_text(out / "pairs.csv")
-        self._pair_rows = csv.writer(self._pair_file, lineterminator="\n")
-        self._pair_rows.writerow(_PAIR_HEAD)
+        self._open = contextlib.ExitStack()
+        self._series = self._table(SERIES, stability_results.series_head(points_mm))
+        self._pair_rows = self._table("pairs.csv", _PAIR_HEAD)
         self._grid: monte_carlo.HeightMap | None = None
         self._point_matrix: FloatArray = np.zeros((len(points_mm), PARAMETERS))
         self._spread: geometry_spread.GeometrySpread | None = None
@@ -64,8 +64,12 @@ class StabilityRun:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
     ) -> None:
-        self._series.__exit__(kind, error, at)
-        self._pair_file.close()
+        self._open.close()
+
+    def _table(self, name: str, head: Sequence[str]) -> Any:
+        rows = csv.writer(self._open.enter_context(files.fresh_text(self._out / name)), lineterminator="\n")
+        rows.writerow(head)
+        return rows
 
     @property
     def used(self) -> int:
@@ -82,7 +86,7 @@ class StabilityRun:
         self._bad_count += 1
         if len(self._bad) < _NAMED_BAD:
             self._bad.append({"set": name, "reason": reason})
-        self._series.add(name, "rejected", reason)
+        self._series.writerow((name, "rejected", reason))
 
     def add(self, name: str, number: int, one: measurement.SetFigure) -> None:
         """Count a set; `number` is its place in the run, from which its noise is drawn."""
@@ -104,7 +108,8 @@ class StabilityRun:
         for tally, height in zip(self._heights.values(), heights_um, strict=True):
             tally.add(height)
         numbers = (one.time_s, one.displacement_um, 1e3 * surface.sag_mm, one.figure.quality.residual_urad, rmse_um)
-        self._series.add(name, one.verdict, one.reason, numbers, heights_um, (1e3 * surface.coeffs_mm).tolist())
+        cells = (f"{value:.12g}" for value in (*numbers, *heights_um, *(1e3 * surface.coeffs_mm)))
+        self._series.writerow((name, one.verdict, one.reason, *cells))
         for pair in self._finder.add(stability.Moment(name, one.time_s, parameters, trials)):
             self._add_pair(grid, pair)
 
