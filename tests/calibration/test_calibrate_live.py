@@ -34,10 +34,10 @@ def live(bench: LiveBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> l
     """The command line on the bench instead of a running hold."""
 
     @contextmanager
-    def link(_: LiveOptions) -> Iterator[LiveBench]:
+    def link(*_: object) -> Iterator[LiveBench]:
         yield bench
 
-    monkeypatch.setattr(command, "_link", link)
+    monkeypatch.setattr(command, "live_hold", link)
     return [*WORDS, "--logs", str(tmp_path / "logs")]
 
 
