@@ -12,7 +12,6 @@ import pytest
 from live_bench import CAMERA, TRUE, LiveBench, config
 
 from membrane_ctrl.calibration import live as command
-from membrane_ctrl.calibration.live import LiveOptions
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry.file import read_geometry
