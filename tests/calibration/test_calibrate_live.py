@@ -90,7 +90,7 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
     assert "not adopted; `membrane-ctrl calibrate --live --session" in said.err
     assert (tmp_path / "bench.toml").read_text() == OLD
 
-    monkeypatch.setattr(command, "_link", None)  # all sets are there: no hold is needed
+    monkeypatch.setattr(command, "live_hold", None)  # all sets are there: no hold is needed
     assert run([*live, "--session", str(session), "--yes"]) == 0
     said = capsys.readouterr()
     new = tomllib.loads((tmp_path / "bench.toml").read_text())
