@@ -164,7 +164,7 @@ def test_nothing_moves_unless_somebody_says_yes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert run(live) == 2
-    assert "say --yes" in capsys.readouterr().err
+    assert "confirm with --yes" in capsys.readouterr().err
     answer(monkeypatch, "n\n")
     assert run(live) == 2
     assert "nothing was moved" in capsys.readouterr().err
