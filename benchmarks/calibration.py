@@ -21,7 +21,7 @@ from membrane_ctrl.metrology.calibrate.diagnose import suspects
 from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, BenchGeometry, bench_at, sigmas
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
 from membrane_ctrl.metrology.calibrate.separable import References
-from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, solve, surface_of
+from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, fit_on, solve
 from membrane_ctrl.metrology.checked import check
 from membrane_ctrl.metrology.frames.frame_stack import FrameStack
 from membrane_ctrl.metrology.optics.geometry import Geometry
@@ -136,7 +136,7 @@ def _errors_um(surface: Surface, film: FilmShape, moved_um: float) -> tuple[floa
 def _measured(solution: Solution, film: FilmShape) -> tuple[float, float]:
     """The middle set as `measure` would with the calibrated geometry."""
     phases = solution.problem.sets[2]
-    surface = surface_of(solution.bench, phases, 500.0, -1e-3 * phases.displacement_um)
+    surface = fit_on(solution.bench, phases, 500.0, -1e-3 * phases.displacement_um).surface
     return _errors_um(surface, film, MOVED_UM[2])
 
 
@@ -149,7 +149,7 @@ def _accuracy() -> list[Figure]:
     for seed in range(SEEDS):
         film, sets = _rendered(seed)
         problem = _problem(sets)
-        stated = surface_of(BenchGeometry(problem.stated), sets[2], 500.0, -1e-3 * sets[2].displacement_um)
+        stated = fit_on(BenchGeometry(problem.stated), sets[2], 500.0, -1e-3 * sets[2].displacement_um).surface
         none.append(_errors_um(stated, film, MOVED_UM[2]))
         plain.append(_measured(solve(_plain(problem)), film))
         full.append(_measured(solve(problem), film))

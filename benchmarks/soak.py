@@ -143,8 +143,8 @@ def _count(tick: VirtualTick, tally: SoakTally) -> None:
         tally.second.restart()
         tally.minute.restart()
     for event in tick.events:
-        tally.events[str(event["kind"])] += 1
-        tally.event_bytes += len(str(event))
+        tally.events[event.kind] += 1
+        tally.event_bytes += len(str(event.to_dict()))
     if not tally.rss_after_hour_mb and row.mono_s > 3600:
         tally.rss_after_hour_mb = rss_mb()
 

@@ -117,7 +117,7 @@ def _identified(case: Case, bench: TwinBench, done: Characterised) -> dict[str, 
         "delay_z": delay_error_s / sigma.delay_s,
         "excursion_um": max(abs(x) for x in bench.true_um),
         "duration_s": bench.plant.time_s,
-        "completed": float(done.finished.completed),
+        "completed": float(done.experiments.finished.completed),
     }
 
 

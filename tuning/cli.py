@@ -144,7 +144,6 @@ def compare(
 
 # Two sessions side by side: each one's gains on each one's plant and weather.
 
-
 _WEATHER_KEYS = ("barometer_gain_um_per_pa", "temperature_gain_um_per_k")
 
 

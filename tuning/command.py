@@ -10,12 +10,11 @@ from pathlib import Path
 
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control.film_health import TOO_TIGHT_UM_PER_S
-from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.control_port.ctl import Where, socket_path
+from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, RejectedError
 from membrane_ctrl.sessions import folder as plain
 from membrane_ctrl.sessions.folder import STEPS, SessionFolder, create_session, newest_session, open_session
-from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, LiveHold, Progress
+from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, Progress, live_hold
 from tuning import gains_file, report, session, twin_hold
 from tuning.identification.characterise import TYPICAL_S
 from tuning.proposal.verify import SETTLE_LEAST_S, STAGES, Stage
@@ -114,7 +113,7 @@ def outer(options: TuneOptions) -> int:
             raise RejectedError(f"shape loop: {error}") from None
         plain.write(folder.file("outer.json"), found)
         progress.say(
-            f"sag seen per um of the laser's {found.scale:.3f}, noise {found.sigma_um:.2f} um a cycle of "
+            f"optical sag per um of the laser {found.scale:.3f}, noise {found.sigma_um:.2f} um per cycle of "
             f"{found.cycle_s:.1f} s, drift {'' if found.drift_seen else 'below '}"
             f"{found.drift_um_per_sqrt_h:.2f} um/sqrt(h): shape.time_constant_s = {found.time_constant_s:.0f}"
         )
@@ -150,7 +149,7 @@ def watch(options: TuneOptions) -> int:
 
 
 def rollback(options: TuneOptions) -> int:
-    """Back to the gains before those that were kept last."""
+    """Back to the gains before those kept last."""
     kept = gains_file.to_roll_back(options.logs)
     progress = Progress()
     with _link(options) as link:
@@ -172,7 +171,7 @@ def _do(step: str, folder: SessionFolder, rig: HoldRig | None, options: TuneOpti
 
     def told(stage: Stage) -> None:
         progress.say(
-            f"  after {stage.time_s:.0f} s: std {stage.std_um:.3f} um, {stage.growth:.2f} of the gains before"
+            f"  after {stage.time_s:.0f} s: std {stage.std_um:.3f} um, {stage.growth:.2f} of the previous gains"
         )
 
     moving: dict[str, Callable[[HoldRig], object]] = {
@@ -216,7 +215,7 @@ def _in_a_line(step: str, folder: SessionFolder) -> str:
             )
         case "observe":
             weather = session.disturbance_of(folder)
-            return f"laser noise {weather.laser_um:.2f} um a reading"
+            return f"laser noise {weather.laser_um:.2f} um per reading"
         case "design":
             gains = gains_file.load_gains(folder.file("gains.toml"))
             return (
@@ -230,7 +229,7 @@ def _in_a_line(step: str, folder: SessionFolder) -> str:
             return f"on the fitted twin {present:.3f} um with the present gains, {proposed:.3f} um with the new ones"
         case "verify":
             done = session.verified_of(folder)
-            return "kept" if done.kept else f"the old gains are back: {done.reason}"
+            return "kept" if done.kept else f"the previous gains are back: {done.reason}"
         case _:
             return "done"
 
@@ -266,32 +265,17 @@ def _go_back(rig: HoldRig, before: LoopConfig, progress: Progress) -> None:
     try:
         rig.go_back(before)
     except HoldError as error:
-        progress.say(f"the last good gains could not be set ({error}); gains on trial go back by themselves")
+        progress.say(f"the last good gains could not be set ({error}); gains on trial revert by themselves")
         return
     progress.say("the mirror is held with the last good gains")
 
 
-@contextlib.contextmanager
-def _link(options: TuneOptions) -> Iterator[HoldLink]:
-    if options.twin:
-        config = open_session(options.session).config if options.session is not None else options.config
-        link: HoldLink = _asked(lambda: twin_hold.TwinHold(config))
-    else:
-        socket = socket_path(options.where)
-        client = PortClient.unix(socket, lambda text: print(f"notice: {text}", file=sys.stderr))
-        run_dir = options.where.run or socket.parent / str(client.greeting["run"])
-        try:
-            link = LiveHold(client, run_dir, options.take_over)
-        except BaseException:
-            client.close()
-            raise
-    with contextlib.closing(link):
-        yield link
-
-
-def _asked(make: Callable[[], HoldLink]) -> HoldLink:
+def _link(options: TuneOptions) -> contextlib.AbstractContextManager[HoldLink]:
+    if not options.twin:
+        return live_hold(options.where, options.take_over)
+    config = open_session(options.session).config if options.session is not None else options.config
     try:
-        return make()
+        return contextlib.closing(twin_hold.TwinHold(config))
     except HoldError as error:
         raise DeviceError(str(error)) from None
 

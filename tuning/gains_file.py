@@ -28,7 +28,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class PlantSection(Section):
-    """The plant the gains were made for (`plant_model.PlantModel`), with standard errors."""
+    """The plant the gains were made for (`loop_model.PlantModel`), with standard errors."""
 
     gain: Positive
     dead_time_s: Annotated[float, Field(ge=0, le=10)]
@@ -84,11 +84,11 @@ def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
     dt_s = 1 / gains.loop.rate_hz
     found = loop_model.margins(loop_model.Gains.of(gains.loop), gains.plant.model, dt_s)
     if not found.stable:
-        raise errors.InputError(f"{where}: loop: unstable on the plant of this very file; was it edited by hand?")
+        raise errors.InputError(f"{where}: loop: unstable on the plant of this file; was it edited by hand?")
     if not found.ms <= MS_MAX or math.isnan(found.ms):
         raise errors.InputError(
-            f"{where}: loop: sensitivity {found.ms:.2f} on the plant of this file, {MS_MAX:g} is the most that is "
-            "applied; was it edited by hand?"
+            f"{where}: loop: sensitivity {found.ms:.2f} on the plant of this file, the limit is "
+            f"{MS_MAX:g}; was it edited by hand?"
         )
     if gains.loop.rate_hz != running.rate_hz:
         raise errors.InputError(
@@ -103,7 +103,6 @@ def for_hold(gains: LoopConfig, running: LoopConfig) -> LoopConfig:
 
 
 # `<logs>/tuning/journal.jsonl`: which gains were kept, taken back or rolled back, when, by whom and why.
-
 
 _FILE = "journal.jsonl"
 What = Literal["kept", "taken_back", "rolled_back"]
@@ -130,12 +129,10 @@ def entry(what: What, session: str, author: str, reason: str, before: LoopConfig
 def note(logs: Path, what: GainsEntry) -> None:
     """Append an entry. Raises InputError where it cannot be written: a link in its place is not followed."""
     path = logs / "tuning" / _FILE
-    try:
+    with errors.writing(path):
         files.make_folder(path.parent)
         files.append_text(path, json.dumps(plain.plain(what), allow_nan=False) + "\n")
         files.sync_data(path)
-    except OSError as error:
-        raise errors.InputError(f"{path}: not noted: {error.strerror}") from None
 
 
 def entries(logs: Path) -> list[GainsEntry]:
@@ -146,7 +143,7 @@ def entries(logs: Path) -> list[GainsEntry]:
     except FileNotFoundError:
         return []
     except OSError as error:
-        raise errors.InputError(f"{path}: {error.strerror}") from None
+        raise errors.InputError(f"{path}: {errors.os_reason(error)}") from None
     found: list[GainsEntry] = []
     for line in text.splitlines():
         try:

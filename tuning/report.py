@@ -7,22 +7,23 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.signal import welch
 
 from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.model.arrays import AnyArray
 from membrane_ctrl.model.files import users, write_text_atomic
 from membrane_ctrl.sessions.folder import STEPS, SessionFolder
-from tuning import gains_file, session, session_recording
+from tuning import gains_file, session
 from tuning.identification import disturbance, identify, loop_model, records
 from tuning.session import Design, Verified
 
-# Pictures of a session: the experiments and their fit, the weather, the candidates, and before against after.
-
-
 _DPI = 100
 _SEGMENT_S = 40.0
+_TIMELINE = "session_time"
 
 
 def draw_experiments(path: Path, record: records.Record, found: identify.Identified | None) -> None:
@@ -34,16 +35,19 @@ def draw_experiments(path: Path, record: records.Record, found: identify.Identif
     upper.set(ylabel="flow (um/s)")
     middle.plot(time_s, record.displacement_um, ".", markersize=1, color="tab:gray", label="reading")
     if found is not None:
-        model = found.model
-        x = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
-        way = model.gain * x - model.leak_um_per_s * time_s
-        off = record.filled_displacement_um() - way
-        middle.plot(time_s, way + off.mean(), linewidth=1, label="the pump's share, by the model")
+        middle.plot(time_s, _pump_share_um(record, found.model), linewidth=1, label="the pump's share, by the model")
         lower.plot(time_s[1:], found.residual_um, linewidth=0.4)
     middle.set(ylabel="centre (um)")
     middle.legend(loc="upper right")
     lower.set(ylabel="prediction error (um)", xlabel="time (s)")
     _save(path, figure)
+
+
+def _pump_share_um(record: records.Record, model: loop_model.PlantModel) -> records.Series:
+    """The centre as pump and leak alone move it, with the readings' mean."""
+    x = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
+    way = model.gain * x - model.leak_um_per_s * np.arange(len(record)) * record.dt_s
+    return way + float(np.mean(record.filled_displacement_um() - way))
 
 
 def draw_weather(
@@ -57,7 +61,7 @@ def draw_weather(
     frequency_hz, power = welch(np.diff(rest), 1 / record.dt_s, nperseg=round(_SEGMENT_S / record.dt_s))
     w: records.Series = 2 * np.pi * frequency_hz[1:]
     back = 1 / np.abs(1 - np.exp(-1j * w * record.dt_s)) ** 2  # from increments to readings
-    axes.loglog(frequency_hz[1:], power[1:] * back, linewidth=0.7, color="tab:gray", label="readings, pump taken out")
+    axes.loglog(frequency_hz[1:], power[1:] * back, linewidth=0.7, color="tab:gray", label="readings less the pump")
     blind = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
     axes.loglog(frequency_hz[1:], 2 * weather.psd(w, model, blind), label="movement, fitted")  # one-sided
     axes.loglog(frequency_hz[1:], 2 * weather.rest.moving_psd(w), label="movement that no weather sensor explains")
@@ -69,10 +73,9 @@ def draw_weather(
 
 def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt_s: float) -> None:
     """All candidates: predicted standard deviation, sensitivity peak, load peak, pump activity, and |S|."""
-    rows = [row for row in design.candidates if row.predicted is not None]
-    names = [row.name for row in rows]
-    stds = [row.predicted.std_um for row in rows if row.predicted is not None]
-    flows = [row.predicted.flow_std_um_per_s for row in rows if row.predicted is not None]
+    sound = [(row, row.predicted) for row in design.candidates if row.predicted is not None]
+    rows, names = [row for row, _ in sound], [row.name for row, _ in sound]
+    stds, flows = ([getattr(p, name) for _, p in sound] for name in ("std_um", "flow_std_um_per_s"))
     figure = Figure(figsize=(12, 8), layout="constrained")
     (a, b, c), (d, e, f) = figure.subplots(2, 3)
     f.remove()
@@ -111,25 +114,14 @@ def draw_verification(
             continue
         readings = record.filled_displacement_um()
         f, power = welch(readings - readings.mean(), 1 / dt_s, nperseg=min(readings.size, round(_SEGMENT_S / dt_s)))
-        ms = float(
-            np.max(
-                np.abs(
-                    1
-                    / (
-                        1
-                        + loop_model.loop_response(
-                            loop_model.Gains.of(loop), model, loop_model.frequencies(dt_s), dt_s
-                        )
-                    )
-                )
-            )
-        )
+        response = loop_model.loop_response(loop_model.Gains.of(loop), model, loop_model.frequencies(dt_s), dt_s)
+        ms = float(np.max(np.abs(1 / (1 + response))))
         left.loglog(f[1:], power[1:], linewidth=0.8, label=f"{name}, Ms {ms:.2f}")
     left.set(xlabel="frequency (Hz)", ylabel="readings (um^2/Hz)")
     left.legend(loc="best")
     times = [stage.time_s for stage in done.stages]
-    right.plot(times, [stage.growth for stage in done.stages], "o-", label="std over that of the gains before")
-    right.plot(times, [stage.growth_max for stage in done.stages], "r--", label="most that passes")
+    right.plot(times, [stage.growth for stage in done.stages], "o-", label="std relative to the previous gains")
+    right.plot(times, [stage.growth_max for stage in done.stages], "r--", label="limit")
     right.set(xlabel="time (s)", title="kept" if done.kept else f"taken back: {done.reason}"[:90])
     right.title.set_fontsize(8)
     right.legend(loc="best")
@@ -163,7 +155,7 @@ def write_report(folder: SessionFolder) -> Path:
     path = folder.file("report.html")
     text = f"<!doctype html><meta charset=utf-8><title>{html.escape(head.name)}</title><style>{_STYLE}</style>"
     write_text_atomic(users(path), text + "\n".join(parts))
-    session_recording.write_recording(folder)
+    write_recording(folder)
     return path
 
 
@@ -215,7 +207,7 @@ def _designed(folder: SessionFolder) -> list[str]:
         return []
     weather = session.disturbance_of(folder)
     parts = [
-        f"<h2>Weather</h2><p>Laser noise {weather.laser_um:.3f} um a reading.</p>",
+        f"<h2>Weather</h2><p>Laser noise {weather.laser_um:.3f} um per reading.</p>",
         _image(folder, "weather.png"),
     ]
     if not folder.done("design"):
@@ -248,20 +240,17 @@ def _verified(folder: SessionFolder) -> list[str]:
         return []
     done = session.verified_of(folder)
     words = "kept" if done.kept else f"taken back: {done.reason}"
+    seen = [f"{s.ms:.2f}" if math.isfinite(s.ms) else "too short to say" for s in done.stages]
     rows = [
-        (f"{s.time_s:.0f} s", f"{s.std_um:.3f}", f"{s.before_um:.3f}", f"{s.growth:.2f}", _seen(s.ms), s.reason)
-        for s in done.stages
+        (f"{s.time_s:.0f} s", f"{s.std_um:.3f}", f"{s.before_um:.3f}", f"{s.growth:.2f}", ms, s.reason)
+        for s, ms in zip(done.stages, seen, strict=True)
     ]
-    heads = ("after", "std um", "gains before um", "ratio", "sensitivity seen", "")
+    heads = ("after", "std um", "previous um", "ratio", "sensitivity seen", "")
     return [
         f"<h2>Verification</h2><p class={'ok' if done.kept else 'refused'}>{html.escape(words)}</p>",
         _table(heads, rows),
         _image(folder, "verify.png"),
     ]
-
-
-def _seen(ms: float) -> str:
-    return f"{ms:.2f}" if math.isfinite(ms) else "too short to say"
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -276,3 +265,82 @@ def _image(folder: SessionFolder, name: str) -> str:
         return ""
     data = base64.b64encode(folder.content(name)).decode()
     return f'<img alt="{path.stem}" src="data:image/png;base64,{data}">'
+
+
+# The recording has a blueprint of its own: experiment and fit, candidates, before and after.
+
+
+def write_recording(folder: SessionFolder) -> None:
+    """Write `session.rrd` of what is done so far."""
+    stream = rr.RecordingStream("membrane_ctrl_tune", recording_id=folder.path.name)
+    path = folder.file("session.rrd")
+    path.unlink(missing_ok=True)
+    stream.save(path, default_blueprint=_blueprint())
+    if folder.done("characterise"):
+        _experiments(stream, folder)
+    if folder.done("observe"):
+        _record(stream, "before", records.load_record(folder.file("quiet.npz")))
+    if folder.done("design"):
+        markdown = folder.candidates()
+        stream.log("candidates/table", rr.TextDocument(markdown, media_type="text/markdown"), static=True)
+        rows = [row for row in session.design_of(folder).candidates if row.predicted is not None]
+        stds = [row.predicted.std_um for row in rows if row.predicted is not None]
+        stream.log("candidates/std_um", rr.BarChart(stds), static=True)
+        stream.log("candidates/ms", rr.BarChart([row.margins.ms for row in rows]), static=True)
+    if folder.file("verify.npz").exists():
+        _record(stream, "after", records.load_record(folder.file("verify.npz")))
+    stream.flush()
+    stream.disconnect()
+
+
+def _experiments(stream: rr.RecordingStream, folder: SessionFolder) -> None:
+    record = session.experiments_of(folder).record
+    _record(stream, "experiment", record)
+    if not folder.done("identify"):
+        return
+    found = session.found_of(folder).identified
+    time_s = np.arange(len(record)) * record.dt_s
+    _series(stream, "fit/pump_share_um", time_s, _pump_share_um(record, found.model))
+    _series(stream, "residual/prediction_error_um", time_s[1:], found.residual_um)
+
+
+def _record(stream: rr.RecordingStream, name: str, record: records.Record) -> None:
+    time_s = np.arange(len(record)) * record.dt_s
+    _series(stream, f"{name}/flow_um_per_s", time_s, record.flow_um_per_s)
+    _series(stream, f"{name}/displacement_um", time_s, record.displacement_um)
+    if record.has_barometer:
+        _series(stream, f"{name}/ambient_pressure_pa", time_s, record.ambient_pressure_pa)
+
+
+def _series(stream: rr.RecordingStream, path: str, time_s: AnyArray, values: AnyArray) -> None:
+    good = np.isfinite(values)
+    index = rr.TimeColumn(_TIMELINE, duration=time_s[good])
+    stream.send_columns(path, indexes=[index], columns=rr.Scalars.columns(scalars=values[good]))
+
+
+def _blueprint() -> rrb.Blueprint:
+    def plot(name: str, *paths: str) -> rrb.TimeSeriesView:
+        return rrb.TimeSeriesView(name=name, origin="/", contents=[f"+ /{path}" for path in paths])
+
+    experiment = rrb.Vertical(
+        plot("Flow, um/s", "experiment/flow_um_per_s"),
+        plot("Centre and the pump's share of it, um", "experiment/displacement_um", "fit/pump_share_um"),
+        plot("Residual, um", "residual/prediction_error_um"),
+        name="Experiment and fit",
+    )
+    candidates = rrb.Vertical(
+        rrb.TextDocumentView(name="Candidates", origin="/candidates/table"),
+        rrb.Horizontal(
+            rrb.BarChartView(name="Predicted std, um", origin="/candidates/std_um"),
+            rrb.BarChartView(name="Ms", origin="/candidates/ms"),
+        ),
+        name="Candidates",
+    )
+    compared = rrb.Vertical(
+        plot("Centre before, um", "before/displacement_um"),
+        plot("Centre after, um", "after/displacement_um"),
+        plot("Flow before and after, um/s", "before/flow_um_per_s", "after/flow_um_per_s"),
+        name="Before and after",
+    )
+    panel = rrb.TimePanel(state="collapsed", timeline=_TIMELINE)
+    return rrb.Blueprint(rrb.Tabs(experiment, candidates, compared), panel, auto_views=False)

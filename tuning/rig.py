@@ -11,8 +11,7 @@ from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control import gas, inner_loop
 from membrane_ctrl.control.experiments import machine, trial
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.model import events, shape_estimate, telemetry
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model import events, shape_estimate, states, telemetry
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink
 from tuning.identification.records import Record, Series
 
@@ -33,7 +32,8 @@ class Rig:
         self._config, self._pump = loop, pump
         self._loop = inner_loop.InnerLoop(loop, pump)
         self.dt_s = 1 / loop.rate_hz
-        self._last = bench.exchange(self._fraction(leak_um_per_s), loop.bleed_fraction)
+        fraction = gas.PumpCurve(pump).command(leak_um_per_s, self.dt_s) if leak_um_per_s > 0 else 0.0
+        self._last = bench.exchange(fraction, loop.bleed_fraction)
         self._loop.start(self._last.displacement_um, leak_um_per_s)
 
     def set_gains(self, loop: LoopConfig) -> None:
@@ -60,9 +60,8 @@ class Rig:
         self, experiment: machine.Experiment, around: machine.Around, centre_um: float
     ) -> tuple[Record, machine.Finished]:
         """The same for an experiment of one's own, inside the guard."""
-        return self._run(
-            machine.ExcursionGuard(experiment, around, centre_um, 1 / self.dt_s), around.holding_flow_um_per_s
-        )
+        guard = machine.ExcursionGuard(experiment, around, centre_um, 1 / self.dt_s)
+        return self._run(guard, around.holding_flow_um_per_s)
 
     def _run(self, guard: machine.Experiment, holding_flow_um_per_s: float) -> tuple[Record, machine.Finished]:
         flows: list[float] = []
@@ -86,9 +85,6 @@ class Rig:
         return inner_loop.LoopInput(
             target_um, 0.0, now.displacement_um, now.ambient_pressure_pa, now.air_temperature_c
         )
-
-    def _fraction(self, flow_um_per_s: float) -> float:
-        return gas.PumpCurve(self._pump).command(flow_um_per_s, self.dt_s) if flow_um_per_s > 0 else 0.0
 
 
 def around_of(held: Record, loop: LoopConfig, pump: PumpConfig, limit_um: float) -> machine.Around:
@@ -118,35 +114,21 @@ def laser_noise_um(record: Record) -> float:
 # Records that follow each other have no gap: each begins with the tick after the last one taken, so that what a
 # session did in between (a fit takes a second) is in the next record and not lost.
 
-
 Progress = Callable[[float], None]  # seconds of the hold that have been recorded since the last call
-_HELD = frozenset({State.HOLD, State.TUNE})
+_HELD = frozenset({states.State.HOLD, states.State.TUNE})
 _ANSWER_TICKS = 500  # until the state changes after a command was obeyed: 10 s at 50 Hz
 
 
 class HoldRig:
-    """Holds, experiments and gains on a hold that somebody else runs.
-
-    Parameters
-    ----------
-    who : str
-        Recorded with every command.
-
-    Attributes
-    ----------
-    loop : LoopConfig
-        Gains as they were last set.
-    shapes : list of ShapeEstimate
-        All that came so far.
-    """
+    """Holds, experiments and gains on a hold that somebody else runs; `who` is recorded with every command."""
 
     def __init__(self, link: HoldLink, who: str, progress: Progress = lambda seconds: None) -> None:
         self._link, self._who, self._progress = link, who, progress
         self._rows: deque[telemetry.TelemetryRow] = deque()
         self._events: deque[events.Event] = deque()
-        self.loop = link.config.loop
+        self.loop = link.config.loop  # with the gains as they were last set
         self.dt_s = 1 / self.loop.rate_hz
-        self.shapes: list[shape_estimate.ShapeEstimate] = []
+        self.shapes: list[shape_estimate.ShapeEstimate] = []  # all so far
 
     def hold(self, duration_s: float) -> Record:
         """The next seconds of hold. Raises HoldError if the mirror is not held throughout."""
@@ -177,11 +159,11 @@ class HoldRig:
         self._link.ask(Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec))
         rows: list[telemetry.TelemetryRow] = []
         begun = False
-        while not begun or rows[-1].state == State.TUNE:
+        while not begun or rows[-1].state == states.State.TUNE:
             rows.append(self._next_held())
-            begun = begun or rows[-1].state == State.TUNE
+            begun = begun or rows[-1].state == states.State.TUNE
             if not begun and len(rows) > _ANSWER_TICKS:
-                raise HoldError("the hold took the experiment and did not begin it")
+                raise HoldError("the hold accepted the experiment but did not begin it")
         told = self._experiment_ended()
         return self.record(rows), machine.Finished(told.completed, told.reason), told
 
@@ -205,7 +187,7 @@ class HoldRig:
     def go_back(self, loop: LoopConfig) -> None:
         """End an experiment that may be running, and set the last good gains."""
         self._take()
-        if self._rows and self._rows[-1].state == State.TUNE:
+        if self._rows and self._rows[-1].state == states.State.TUNE:
             self._link.ask(Command("hold", self._who, "tuning session interrupted"))
         if loop != self.loop:
             self.set_gains(loop, "back to the last good gains")
@@ -228,19 +210,16 @@ class HoldRig:
         return Record.from_samples(self.dt_s, flows, samples)
 
     def _next_held(self) -> telemetry.TelemetryRow:
-        row = self._peek()
+        while not self._rows:
+            self._take()
+        row = self._rows[0]
         if row.state not in _HELD:
             raise HoldError(
-                f"the mirror is not held (state {State(int(row.state)).name.lower()}): {self._why()}; "
+                f"the mirror is not held (state {states.State(int(row.state)).name.lower()}): {self._why()}; "
                 "start or resume the hold, then repeat this step"
             )
         self._progress(self.dt_s)
         return self._rows.popleft()
-
-    def _peek(self) -> telemetry.TelemetryRow:
-        while not self._rows:
-            self._take()
-        return self._rows[0]
 
     def _take(self) -> None:
         news = self._link.news()
@@ -255,8 +234,8 @@ class HoldRig:
             if found:
                 return found[-1]
             self._take()
-        raise HoldError("the hold did not tell of the end of the experiment")
+        raise HoldError("the hold did not report the end of the experiment")
 
     def _why(self) -> str:
         said = [event.why for event in self._events if isinstance(event, events.StateEntered)]
-        return said[-1] if said else "no reason was told"
+        return said[-1] if said else "no reason was given"

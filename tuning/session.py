@@ -1,6 +1,4 @@
-"""The steps of a session, each a function on its folder.
-
-What a step needs is read from the folder, what it has found is left there.
+"""The steps of a session, each a function that reads from and writes to the session's folder.
 
 Steps that move the mirror take a `HoldRig`; the others run anywhere, at any later time.
 """
@@ -11,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from membrane_ctrl.config import schema
 from membrane_ctrl.config import toml_file as config_file
-from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments import machine, pump_map
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.sessions import folder, live_hold
@@ -24,7 +22,7 @@ from tuning.rig import HoldRig
 
 OBSERVE_S = 600.0
 _PREVIEW_SEEDS = 3
-# Time to look at what was applied and to start the verification; then the gains go back by themselves.
+# Time to look at what was applied and to start the verification; then the gains revert by themselves.
 _APPLY_S = 900.0
 _SPARE_S = 120.0
 
@@ -73,8 +71,8 @@ class Verified:
     kept: bool  # the new gains stay
     reason: str
     stages: tuple[verify.Stage, ...]
-    before: LoopConfig
-    after: LoopConfig
+    before: schema.LoopConfig
+    after: schema.LoopConfig
 
 
 def characterise_step(
@@ -94,8 +92,7 @@ def characterise_step(
 
 def experiments_of(session: folder.SessionFolder) -> characterise.Experiments:
     """What the experiments left."""
-    session.require("characterise")
-    head = folder.read(session.file("experiments.json"), ExperimentsHead)
+    head = session.result("characterise", "experiments.json", ExperimentsHead)
     record = records.load_record(session.file("experiments.npz"))
     return characterise.Experiments(head.around, record, head.relays_s, head.pulses_s, head.finished)
 
@@ -115,8 +112,7 @@ def identify_step(session: folder.SessionFolder) -> IdentifiedPlant:
 
 def found_of(session: folder.SessionFolder) -> IdentifiedPlant:
     """What was identified."""
-    session.require("identify")
-    return folder.read(session.file("identified.json"), IdentifiedPlant)
+    return session.result("identify", "identified.json", IdentifiedPlant)
 
 
 def observe_step(session: folder.SessionFolder, rig: HoldRig, duration_s: float = OBSERVE_S) -> DisturbanceModel:
@@ -135,8 +131,7 @@ def observe_step(session: folder.SessionFolder, rig: HoldRig, duration_s: float 
 
 def disturbance_of(session: folder.SessionFolder) -> DisturbanceModel:
     """What was observed."""
-    session.require("observe")
-    return folder.read(session.file("disturbance.json"), DisturbanceModel)
+    return session.result("observe", "disturbance.json", DisturbanceModel)
 
 
 def design_step(session: folder.SessionFolder, reason: str = "tuning session") -> GainsFile:
@@ -161,17 +156,15 @@ def design_step(session: folder.SessionFolder, reason: str = "tuning session") -
         loop=made.loop,
     )
     files.write_text_atomic(files.users(session.file("candidates.md")), design.table(made.candidates) + "\n")
-    folder.write(
-        session.file("proposal.json"), Design(made.candidates, made.least_std_um, made.preview, made.robustness)
-    )
+    kept = Design(made.candidates, made.least_std_um, made.preview, made.robustness)
+    folder.write(session.file("proposal.json"), kept)
     save_gains(session.file("gains.toml"), gains)
     return gains
 
 
 def design_of(session: folder.SessionFolder) -> Design:
     """The candidates."""
-    session.require("design")
-    return folder.read(session.file("proposal.json"), Design)
+    return session.result("design", "proposal.json", Design)
 
 
 def preview_step(session: folder.SessionFolder) -> Previewed:
@@ -192,17 +185,16 @@ def preview_step(session: folder.SessionFolder) -> Previewed:
 
 def preview_of(session: folder.SessionFolder) -> Previewed:
     """What the preview showed."""
-    session.require("preview")
-    return folder.read(session.file("preview.json"), Previewed)
+    return session.result("preview", "preview.json", Previewed)
 
 
-def pump_of(session: folder.SessionFolder) -> PumpConfig:
+def pump_of(session: folder.SessionFolder) -> schema.PumpConfig:
     """The pump as mapped in this session, or as configured."""
     path = session.file("pump.toml")
-    return config_file.load(path, PumpConfig) if path.exists() else session.config.pump
+    return config_file.load(path, schema.PumpConfig) if path.exists() else session.config.pump
 
 
-def checked_gains(session: folder.SessionFolder) -> LoopConfig:
+def checked_gains(session: folder.SessionFolder) -> schema.LoopConfig:
     """The session's gains for its hold. Raises InputError if they must not be applied."""
     session.require("design")
     path = session.file("gains.toml")
@@ -211,8 +203,8 @@ def checked_gains(session: folder.SessionFolder) -> LoopConfig:
     return for_hold(gains.loop, session.head.before)
 
 
-def apply_step(session: folder.SessionFolder, rig: HoldRig) -> LoopConfig:
-    """Set the gains, on trial: without `verify` they go back by themselves."""
+def apply_step(session: folder.SessionFolder, rig: HoldRig) -> schema.LoopConfig:
+    """Set the gains, on trial: without `verify` they revert by themselves."""
     loop = checked_gains(session)
     session.begin("apply")
     rig.set_gains(loop, f"session {session.path.name}", _APPLY_S)
@@ -231,9 +223,8 @@ def verify_step(
     after, before = checked_gains(session), session.head.before
     session.begin("verify")
     trial = verify.VerificationTrial(found_of(session).identified.model, disturbance_of(session), before, after)
-    rig.set_gains(
-        after, f"session {session.path.name}: verification", verify.settle_s(after) + stages[-1][0] + _SPARE_S
-    )
+    trial_s = verify.settle_s(after) + stages[-1][0] + _SPARE_S
+    rig.set_gains(after, f"session {session.path.name}: verification", trial_s)
     looks: list[verify.Stage] = []
     record: records.Record | None = None
     setpoint_um = np.empty(0)
@@ -264,15 +255,11 @@ def verify_step(
 
 def verified_of(session: folder.SessionFolder) -> Verified:
     """How the verification ended."""
-    session.require("verify")
-    return folder.read(session.file("verified.json"), Verified)
+    return session.result("verify", "verified.json", Verified)
 
 
 def map_pump(session: folder.SessionFolder, rig: HoldRig) -> pump_map.PumpMap:
-    """Measure the pump on the mirror; later steps of this session use what was found.
-
-    Raises RejectedError if the map could not be completed, or is none a pump could have.
-    """
+    """Measure the pump for the later steps. Raises RejectedError if the map is incomplete or impossible."""
     around = rig.around(rig.hold(40.0))
     _, finished, event = rig.performed(characterise.spec_of("pump_map", around, 1200.0))
     if not finished.completed:

@@ -1,8 +1,9 @@
-"""The `calibrate-camera` command: the lens, from photographs of a board on the screen; and the board's picture."""
+"""The commands that calibrate the camera by itself: `calibrate-camera` its lens, `calibrate-pose` its pose."""
 
 import json
 import sys
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,18 @@ import cv2
 import numpy as np
 
 from membrane_ctrl.config.schema import CameraConfig, Config
-from membrane_ctrl.geometry.spread_file import write_prior
+from membrane_ctrl.geometry.file import read_geometry
+from membrane_ctrl.geometry.spread_file import read_prior, write_prior
+from membrane_ctrl.measure import capture_set, measurement
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
+from membrane_ctrl.metrology import full, reconstruct
+from membrane_ctrl.metrology.calibrate import artefact, ring_pose
 from membrane_ctrl.metrology.calibrate.lens import Board, BoardView, Lens, calibrate_lens, on_screen
 from membrane_ctrl.metrology.calibrate.parameters import usual_sigma
+from membrane_ctrl.metrology.checked import RejectedSetError, check
+from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
 from membrane_ctrl.model import errors, files
+from membrane_ctrl.model.arrays import FloatArray
 
 _IMAGES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 
@@ -93,9 +101,8 @@ def _view(path: Path, board: Board, camera: CameraConfig) -> BoardView:
     try:
         image = decoded_image(files.read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     except (OSError, ValueError) as error:
-        raise errors.InputError(
-            f"{path}: {(error.strerror if isinstance(error, OSError) else None) or error}"
-        ) from None
+        reason = (error.strerror if isinstance(error, OSError) else None) or error
+        raise errors.InputError(f"{path}: {reason}") from None
     if image.shape != (camera.height_px, camera.width_px):
         raise errors.InputError(
             f"{path}: {image.shape[1]} x {image.shape[0]} pixels, the configuration's optics.camera has "
@@ -136,4 +143,96 @@ def _lines(camera: CameraConfig, lens: Lens, out: Path) -> list[str]:
         lines.append(f"left out, no board or a bad fit: {', '.join(lens.left_out)}")
     if lens.sigmas["focal_relative"] > usual_sigma("focal_relative"):
         lines.append("the focal length is known no better than from its data sheet: tilt the board more, both ways")
+    return [*lines, f"written: {out}; use it with calibrate --prior {out}"]
+
+
+# The camera's pose, from the ring's ellipse in the white frame of a set.
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """What the command was asked for."""
+
+    folder: Path
+    geometry: Path | None
+    priors: Sequence[Path]
+    radius_sigma_mm: float
+    out: Path
+    as_json: bool
+
+
+def calibrate_pose(options: PoseOptions) -> int:
+    """Measure the set, find the rim, fit the pose, write the prior, say what it improved. Raises CommandError."""
+    geometry = None if options.geometry is None else read_geometry(options.geometry)
+    capture = capture_set.read_set(options.folder, geometry)
+    optics = capture.head.optics
+    for path in options.priors:
+        optics = read_prior(path).over(optics)
+    capture = replace(capture, head=replace(capture.head, optics=optics))
+    stated = Geometry.from_config(optics)
+    light, (rim_z, rim_mean_mm) = _light(capture), _rim(capture)
+    radius_mm = optics.mirror.radius_mm
+    outline = find_outline(light, stated, radius_mm, rim_mean_mm)
+    if outline is None:
+        raise errors.RejectedError(f"{options.folder}: the rim is not in the picture")
+    try:
+        pose = ring_pose.ring_pose(light, stated, outline.rim_px, radius_mm, rim_z, options.radius_sigma_mm)
+    except ValueError as error:
+        raise errors.RejectedError(f"{options.folder}: {error}") from None
+    sigmas = dict(zip(ring_pose.POSE_NAMES, pose.sigmas.tolist(), strict=True))
+    tables = {
+        "geometry": artefact.general_form(pose.bench(stated), optics).model_dump(exclude_none=True),
+        "sigmas": sigmas,
+    }
+    write_prior(options.out, tables, "calibrate-pose", [options.folder.name], pose.rms_px)
+    report: dict[str, Any] = {
+        "schema": "membrane-calibrate-pose/1",
+        "out": str(options.out),
+        "rms_px": pose.rms_px,
+        "edges": pose.points,
+        "values": dict(zip(ring_pose.POSE_NAMES, pose.values.tolist(), strict=True)),
+        "sigmas": sigmas,
+    }
+    print(json.dumps(report) if options.as_json else "\n".join(_pose_lines(pose, options.out)))
+    return int(errors.Exit.DONE)
+
+
+def _light(capture: capture_set.CaptureSet) -> FloatArray:
+    """White minus black. Raises InputError for a set without them."""
+    names = [pattern.name for pattern in capture.head.patterns]
+    if "white" not in names:
+        raise errors.InputError(
+            f"{capture.head.folder / 'capture.toml'}: kind: a full set is needed, for its white frame"
+        )
+    for name in ("white", "black"):
+        if (k := names.index(name)) in capture.unusable:
+            raise errors.RejectedError(f"{capture.head.folder}: {capture.head.files[k]}: {capture.unusable[k]}")
+    white, black = (capture.frames[names.index(name)].astype(float) for name in ("white", "black"))
+    return np.asarray(white - black)
+
+
+def _rim(capture: capture_set.CaptureSet) -> tuple[reconstruct.HeightFunction, float]:
+    """Where the film at the rim stands in world, and its mean. Raises RejectedError for a set without a figure."""
+    optics = capture.head.optics
+    try:
+        checked = check(measurement.stack_of(capture), optics)
+    except RejectedSetError as error:
+        raise errors.RejectedError(f"{capture.head.folder}: rejected: {error}") from None
+    surface, vertex_mm = full.bin_figure(optics, checked).fit.surface, checked.tracer.vertex_z_mm
+
+    def height(x: FloatArray, y: FloatArray) -> FloatArray:
+        share = surface.radius_mm / np.maximum(np.hypot(x, y), 1.0)  # terms run away beyond the rim
+        return np.asarray(vertex_mm + surface.height(x * share, y * share))
+
+    return height, vertex_mm + surface.sag_mm
+
+
+def _pose_lines(pose: ring_pose.RingPose, out: Path) -> list[str]:
+    lines = ["what              stated wrong by   +-        known before"]
+    lines += [
+        f"{name:<18}{value:>+13.4f}  {sigma:<9.4f} {usual_sigma(name):.3g}"
+        for name, value, sigma in zip(ring_pose.POSE_NAMES, pose.values, pose.sigmas, strict=True)
+    ]
+    better = max(usual_sigma(name) / sigma for name, sigma in zip(ring_pose.POSE_NAMES, pose.sigmas, strict=True))
+    lines.append(f"edges are left {pose.rms_px:.3f} px RMS, {pose.points} of them; at best {better:.0f} times better")
     return [*lines, f"written: {out}; use it with calibrate --prior {out}"]

@@ -67,8 +67,8 @@ def lines_of(report: dict[str, object]) -> list[str]:
     assert isinstance(error, dict)
     return [
         f"settles in {report['settle_ms']:.0f} ms, gamma {report['gamma']:.2f}",
-        f"its fringes would be off by {error['as_sent']:.1f} um RMS on the screen, "
-        f"corrected by {error['corrected']:.1f} um, which is the rounding of its levels",
+        f"fringe error on the screen: {error['as_sent']:.1f} um RMS as sent, "
+        f"corrected by {error['corrected']:.1f} um, the rounding of its levels",
         "for the configuration (without them both are measured at each start):",
         "[devices.screen]",
         f"settle_ms = {report['settle_ms']:.0f}",

@@ -2,26 +2,26 @@
 
 import contextlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from membrane_ctrl.calibration import plan
 from membrane_ctrl.calibration import session as sessions
-from membrane_ctrl.calibration.plan import HeldMirror, reach_of, setpoints_um
 from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession, adopt, compared
 from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command, freed, stated_sigmas
 from membrane_ctrl.calibration.sweep import CaptureLink, Procedure, Sweep
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
-from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.control_port.ctl import Where, socket_path
+from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.geometry.file import GeometryOrigin, geometry_of_run, origin_of, read_geometry
 from membrane_ctrl.geometry.spread_file import read_prior
 from membrane_ctrl.measure.capture_set import read_head
 from membrane_ctrl.metrology.calibrate import parameters, propagate, verdict
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
-from membrane_ctrl.sessions.live_hold import HoldError, LiveHold, Progress
+from membrane_ctrl.sessions.folder import now_utc
+from membrane_ctrl.sessions.live_hold import HoldError, Progress, live_hold
 
 USUAL_SETS = 5
 _NEARLY_ALL = 0.9  # of the good range: more would hardly be better
@@ -58,7 +58,7 @@ def calibrate_live(options: LiveOptions) -> int:
             raise InputError("--session has its own setpoints: leave out --range-um and --sets")
         session = sessions.resume(options.session)
     if session is None or session.missing:
-        with _link(options) as link:
+        with live_hold(options.where, options.take_over, "calibrate --live") as link:
             session = take_sets(link, session, options)
     return solve_and_adopt(session, options)
 
@@ -73,10 +73,14 @@ def take_sets(link: CaptureLink, session: CalibrationSession | None, options: Li
     try:
         held = sweep.look()
         procedure = Procedure(link, sweep, held, progress)
-        head = session.head if session is not None else _planned(link, held, options)
-        missing = session.missing if session is not None else tuple(range(len(head.setpoints_um)))
         if session is not None:
+            head, missing = session.head, session.missing
             _same_bench(link, session)
+        else:
+            reach, sets = plan.reach_of(held, link.config), options.sets or USUAL_SETS
+            wanted = plan.setpoints_um(held, reach, options.range_um, sets)
+            head = CalibrationHead(sessions.FORMAT, link.name, now_utc(), held.setpoint_um, held.shape_on, wanted)
+            missing = tuple(range(sets))
         procedure.check(head)
         minutes = sum(procedure.times_s(head, missing)) / 60
         progress.say(_plan(head, len(missing), held, minutes))
@@ -121,11 +125,6 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
     return code
 
 
-def _planned(link: CaptureLink, held: HeldMirror, options: LiveOptions) -> CalibrationHead:
-    wanted = setpoints_um(held, reach_of(held, link.config), options.range_um, options.sets or USUAL_SETS)
-    return sessions.head_of(link.name, held.setpoint_um, held.shape_on, wanted)
-
-
 def _same_bench(link: CaptureLink, session: CalibrationSession) -> None:
     """Raises InputError if the hold measures with another geometry than the sets so far were taken with."""
     now = geometry_of_run(link.run_dir, link.config).optics
@@ -143,7 +142,7 @@ def _written_out(optics: OpticsConfig) -> tuple[GeometryConfig, CameraConfig]:
     return optics.geometry.model_copy(update={"reference_displacement_um": None}), camera
 
 
-def _plan(head: CalibrationHead, missing: int, held: HeldMirror, minutes: float) -> str:
+def _plan(head: CalibrationHead, missing: int, held: plan.HeldMirror, minutes: float) -> str:
     low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
     return (
         f"{missing} of {len(head.setpoints_um)} sets from {low_um:g} to {high_um:g} um "
@@ -153,25 +152,25 @@ def _plan(head: CalibrationHead, missing: int, held: HeldMirror, minutes: float)
     )
 
 
-def _worth(link: CaptureLink, head: CalibrationHead, held: HeldMirror, options: LiveOptions) -> str:
+def _worth(link: CaptureLink, head: CalibrationHead, held: plan.HeldMirror, options: LiveOptions) -> str:
     """How well the geometry will be determined, and by how much better if there were more room."""
     here = _foreseen(link, held, head.setpoints_um, options)
-    line = f"such sets leave of a figure: sag +- {here.sag_um:.1f} um, figure +- {here.figure_rms_um:.1f} um RMS"
+    line = f"a figure after such sets: sag +- {here.sag_um:.1f} um, figure +- {here.figure_rms_um:.1f} um RMS"
     low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
     if high_um - low_um >= _NEARLY_ALL * verdict.GOOD_SPREAD_UM:
         return line
     ends = (low_um + high_um - verdict.GOOD_SPREAD_UM) / 2, (low_um + high_um + verdict.GOOD_SPREAD_UM) / 2
     best = _foreseen(link, held, np.linspace(*ends, len(head.setpoints_um)).tolist(), options)
-    reach = reach_of(held, link.config)
+    reach = plan.reach_of(held, link.config)
     return (
-        f"{line}; {verdict.GOOD_SPREAD_UM:.0f} um from first to last would leave {best.sag_um:.1f} and "
-        f"{best.figure_rms_um:.1f} ({reach.low_why} and {reach.high_why} have room for "
+        f"{line}; {verdict.GOOD_SPREAD_UM:.0f} um from first to last would give {best.sag_um:.1f} and "
+        f"{best.figure_rms_um:.1f} ({reach.low_why} and {reach.high_why} allow "
         f"{reach.high_um - reach.low_um:.0f})"
     )
 
 
 def _foreseen(
-    link: CaptureLink, held: HeldMirror, setpoints: Sequence[float], options: LiveOptions
+    link: CaptureLink, held: plan.HeldMirror, setpoints: Sequence[float], options: LiveOptions
 ) -> propagate.Propagated:
     optics = geometry_of_run(link.run_dir, link.config).optics
     if options.geometry is not None:
@@ -195,26 +194,10 @@ def _origin(session: CalibrationSession, place: Path | None) -> GeometryOrigin:
     return origin_of(optics)
 
 
-@contextlib.contextmanager
-def _link(options: LiveOptions) -> Iterator[LiveHold]:
-    socket = socket_path(options.where)
-    client = PortClient.unix(socket, lambda text: _say(f"notice: {text}"))
-    try:
-        if client.greeting["role"] == "read":
-            raise InputError(f"calibrate --live takes the role operate; {client.greeting['you']} has read")
-        run_dir = options.where.run or socket.parent / str(client.greeting["run"])
-        link = LiveHold(client, run_dir, options.take_over)
-    except BaseException:
-        client.close()
-        raise
-    with contextlib.closing(link):
-        yield link
-
-
 def _agree(question: str, yes: bool) -> None:
     """Raises InputError unless somebody says yes."""
     if not yes and not sys.stdin.isatty():
-        raise InputError(f"{question} There is nobody to ask here: say --yes")
+        raise InputError(f"{question} This is no terminal: confirm with --yes")
     if not _asked(question, yes):
         raise InputError("nothing was moved")
 

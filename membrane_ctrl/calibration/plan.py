@@ -85,8 +85,8 @@ def setpoints_um(held: HeldMirror, reach: Reach, range_um: float | None, sets: i
     if wide_um < LEAST_SPREAD_UM:
         what = allowed if range_um is None else f"--range-um {range_um:g}"
         raise InputError(
-            f"{what}: sets closer together than {LEAST_SPREAD_UM:.0f} um say no more than one set; "
-            f"{GOOD_SPREAD_UM:.0f} um are good"
+            f"{what}: sets closer together than {LEAST_SPREAD_UM:.0f} um tell no more than one set; "
+            f"{GOOD_SPREAD_UM:.0f} um is good"
         )
     low_um = min(max(held.setpoint_um - wide_um / 2, reach.low_um), reach.high_um - wide_um)
     ascending = [float(each) for each in np.round(np.linspace(low_um, low_um + wide_um, sets), 1)]

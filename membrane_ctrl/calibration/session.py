@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from membrane_ctrl.config import schema
-from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, read_geometry
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.model import errors, files
-from membrane_ctrl.sessions import folder as plain
-from membrane_ctrl.sessions.folder import fresh_folder
+from membrane_ctrl.sessions.folder import begin_session, read_session
 
 FORMAT = "membrane-live-calibration/1"
 
@@ -59,6 +57,7 @@ class CalibrationSession:
         folder = self.sets[index]
         part = folder.with_name(f".{folder.name}.part")
         try:
+            folder.parent.mkdir(exist_ok=True)
             shutil.rmtree(part, ignore_errors=True)
             shutil.copytree(taken, part)
             part.replace(folder)
@@ -66,41 +65,21 @@ class CalibrationSession:
             raise errors.DeviceError(f"{folder}: the set {taken} cannot be copied there ({error})") from None
 
 
-def head_of(source: str, start_um: float, shape_on: bool, setpoints_um: tuple[float, ...]) -> CalibrationHead:
-    """What a session that begins now is about."""
-    return CalibrationHead(
-        FORMAT, source, datetime.now(UTC).isoformat(timespec="seconds"), start_um, shape_on, setpoints_um
-    )
-
-
 def begin(logs: Path, name: str, head: CalibrationHead, config: schema.Config) -> CalibrationSession:
-    """Make a session's folder. Raises InputError for a bad name, DeviceError if it cannot be written."""
-    path = fresh_folder(logs / "calibration", name, datetime.fromisoformat(head.created_utc))
-    try:
-        files.write_text_atomic(path / "config.toml", config_file.dump(config))
-        (path / "sets").mkdir()
-        plain.write(path / "session.json", head)
-    except OSError as error:
-        raise errors.DeviceError(f"{path}: cannot be written ({(error.strerror or str(error)).lower()})") from None
-    return CalibrationSession(path, head, config)
+    """Begin a session. Raises InputError for a bad name, DeviceError if it cannot be written."""
+    return CalibrationSession(begin_session(logs / "calibration", name, head, config), head, config)
 
 
 def resume(path: Path) -> CalibrationSession:
     """An existing session. Raises InputError if it is none."""
-    head = plain.read(path / "session.json", CalibrationHead)
-    if head.format != FORMAT:
-        raise errors.InputError(f"{path}/session.json: format {head.format!r}, {FORMAT!r} is known")
-    return CalibrationSession(path, head, config_file.load(path / "config.toml", schema.Config))
+    return CalibrationSession(path, *read_session(path, CalibrationHead, FORMAT))
 
 
 # Old geometry against new, and the exchange of the files.
 
 
 def compared(optics: schema.OpticsConfig, origin: GeometryOrigin, new: GeometryFile) -> list[str]:
-    """The geometry in force beside the new one, in the numbers that a person can check with a tape.
-
-    `optics` is the bench in force, as the sets state it; `origin` names it.
-    """
+    """The geometry in force (`optics`, `origin`) beside the new one, in numbers that can be checked with a tape."""
     old = "by hand" if not origin.calibrated_utc else f"calibrated {origin.calibrated_utc}"
     lines = [
         f"in force: {old}, hash {origin.hash}; new: hash {new.origin.hash}",
@@ -128,15 +107,13 @@ def adopt(new: Path, place: Path) -> Path | None:
 
     Raises DeviceError if it cannot be written; then the old one is still there.
     """
-    try:
+    with errors.writing(place, errors.DeviceError):
         place.parent.mkdir(parents=True, exist_ok=True)
         place = files.users(place)
         kept = _kept(place) if place.exists() else None
         if kept is not None:
             files.write_bytes_atomic(kept, files.read_bytes(place, files.SMALL_BYTES, follow=True))
         files.write_text_atomic(place, files.read_text(new))
-    except OSError as error:
-        raise errors.DeviceError(f"{place}: cannot be written ({(error.strerror or str(error)).lower()})") from None
     return kept
 
 

@@ -24,7 +24,7 @@ from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, slope_res
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.phase import mm_per_rad, phase_sigma_rad
-from membrane_ctrl.model.errors import Exit, InputError
+from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.model.files import users, write_text_atomic
 
 # A capture set's bins as screen points with their noise, for the calibration.
@@ -99,13 +99,16 @@ def calibrate_command(options: CalibrateOptions) -> int:
     usable = solution is not None and not any(finding.fatal for finding in findings)
     written = _write(options.out, solution, problem, bundle, findings) if usable and solution is not None else ""
     if solution is not None and options.pictures:
-        _draw(options.out.with_name(f"{options.out.stem}-residuals.png"), solution)
+        path = options.out.with_name(f"{options.out.stem}-residuals.png")
+        with errors.writing(path):  # also of a solution that is refused: there it is wanted most
+            path.parent.mkdir(parents=True, exist_ok=True)
+            draw_residuals(path, solution)
     report = report_of(solution, findings, bundle.optics.mirror.analysis_radius_mm)
     report |= {"out": str(options.out) if usable else None, "hash": written or None, "timing_s": timing}
     print(json.dumps(report) if options.as_json else "\n".join(lines_of(report)))
     if not usable:
         print(f"calibrate: rejected; {options.out} is not written, the old geometry stays in force", file=sys.stderr)
-    return Exit.DONE if usable else Exit.REJECTED
+    return errors.Exit.DONE if usable else errors.Exit.REJECTED
 
 
 def freed(texts: Sequence[str]) -> dict[str, float]:
@@ -114,13 +117,13 @@ def freed(texts: Sequence[str]) -> dict[str, float]:
     for text in texts:
         name, _, amount = text.partition("=")
         if name not in NAMES:
-            raise InputError(f"--free {text}: {name} is not a parameter; known are {', '.join(NAMES)}")
+            raise errors.InputError(f"--free {text}: {name} is not a parameter; known are {', '.join(NAMES)}")
         try:
             out[name] = float(amount) if amount else usual_sigma(name)
         except ValueError:
-            raise InputError(f"--free {text}: {amount} is not a number") from None
+            raise errors.InputError(f"--free {text}: {amount} is not a number") from None
         if not (math.isfinite(out[name]) and out[name] >= 0):
-            raise InputError(f"--free {text}: a sigma is 0 (hold it) or more")
+            raise errors.InputError(f"--free {text}: a sigma is 0 (hold it) or more")
     return out
 
 
@@ -132,21 +135,17 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
     """
     figures = Figures(None if geometry is None else file.read_geometry(geometry))
     if len(set(folders)) < len(folders):
-        raise InputError(f"{next(f for f in folders if list(folders).count(f) > 1)}: given twice")
+        raise errors.InputError(f"{next(f for f in folders if list(folders).count(f) > 1)}: given twice")
     sets: list[residuals.SetPhases] = []
     benches: list[OpticsConfig] = []
     notes: list[str] = []
-    for folder in folders:
+    for folder in terminal.counted(folders, "sets"):
         figure = figures.of(folder)
         benches.append(figure.head.optics)
         _same_rig(folders[0], benches[0], folder, benches[-1])
         sets.append(phases_of(folder.name, figure.checked, figure.head.optics))
         files = figure.head.files
         notes += [f"{folder.name}: {files[flag.frame]} left out: {flag.reason}" for flag in figure.checked.flags]
-        if sys.stderr.isatty():
-            print(f"\r{len(sets)} of {len(folders)} sets read", end="", file=sys.stderr)
-    if sys.stderr.isatty():
-        print(file=sys.stderr)
     reference_um = _reference_um(sets, benches, reference_um)
     if not any(math.isfinite(phases.displacement_um) for phases in sets):
         # no laser: the world's origin is the vertex of the first set
@@ -184,7 +183,7 @@ def _same_rig(first: Path, optics: OpticsConfig, folder: Path, other: OpticsConf
             if field in ("reference_displacement_um", "steps", "noise_adu"):
                 continue
             if getattr(ours, field) != getattr(theirs, field):
-                raise InputError(
+                raise errors.InputError(
                     f"{folder / 'capture.toml'}: {section}.{field}: not that of {first}; "
                     "sets of one calibration are of one rig"
                 )
@@ -202,7 +201,7 @@ def problem_of(bundle: Bundle, free: dict[str, float], laser_sigma_um: float) ->
     try:
         geometry = Geometry.from_config(bundle.optics)
     except ValueError as error:
-        raise InputError(str(error)) from None
+        raise errors.InputError(str(error)) from None
     references = separable.References(bundle.reference_um, laser_sigma_um)
     if sum(math.isfinite(phases.displacement_um) for phases in bundle.sets) < 2:
         own[LASER.name] = 0.0  # a scale of nothing
@@ -214,7 +213,10 @@ def _write(
 ) -> str:
     """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
     slopes = [slope_residual(solution, phases, k) for k, phases in enumerate(problem.sets)]
-    noises = [_noise_urad(solution, phases, k) for k, phases in enumerate(problem.sets)]
+    noises = [
+        drift.noise_urad(solution.bench.geometry, state.surface, float(np.sqrt(np.mean(phases.sigma_mm**2))))
+        for state, phases in zip(solution.states, problem.sets, strict=True)
+    ]
     origin = artefact.Origin(
         date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         sets=tuple(phases.name for phases in problem.sets),
@@ -225,26 +227,10 @@ def _write(
         notes=tuple(finding.says for finding in findings),
     )
     tables = artefact.tables_of(solution, bundle.optics, origin)
-    try:
+    with errors.writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text_atomic(users(path), tomli_w.dumps(tables))  # never half a geometry
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
     return str(tables["calibration"]["hash"])
-
-
-def _noise_urad(solution: Solution, phases: residuals.SetPhases, index: int) -> float:
-    sigma_mm = float(np.sqrt(np.mean(phases.sigma_mm**2)))
-    return drift.noise_urad(solution.bench.geometry, solution.states[index].surface, sigma_mm)
-
-
-def _draw(path: Path, solution: Solution) -> None:
-    """The residuals' maps, also of a solution that is refused: there they are wanted most."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draw_residuals(path, solution)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
 def _progress() -> Any:

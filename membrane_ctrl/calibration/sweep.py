@@ -181,7 +181,7 @@ class Procedure:
         if low_um < reach.low_um or high_um > reach.high_um:
             raise errors.InputError(
                 f"the sets from {low_um:g} to {high_um:g} um are beyond {reach.low_um:.0f} to {reach.high_um:.0f}, "
-                f"which {reach.low_why} and {reach.high_why} leave"
+                f"which {reach.low_why} and {reach.high_why} allow"
             )
         if way_s(held, low_um, high_um, config) + way_s(held, high_um, low_um, config) == float("inf"):
             raise errors.InputError(
@@ -217,7 +217,7 @@ class Procedure:
             yield
         except HoldError:
             off = "; the shape loop is off (ctl shape on)" if session.head.shape_on else ""
-            say(f"the mirror is left to whoever has it{off}; go on with --session {session.path}")
+            say(f"the mirror is left to whoever has the command{off}; go on with --session {session.path}")
             raise
         except BaseException:
             self.progress.interrupted = False

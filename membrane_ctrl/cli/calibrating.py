@@ -60,9 +60,10 @@ def calibrate_pose(
     json: JsonOption = False,
 ) -> int:
     """Determine the pose of the camera from the ring's ellipse in a full set."""
-    from membrane_ctrl.calibration import pose
+    from membrane_ctrl.calibration import camera
 
-    return pose.calibrate_pose(pose.PoseOptions(folder, geometry, tuple(prior or ()), radius_sigma_mm, out, json))
+    options = camera.PoseOptions(folder, geometry, tuple(prior or ()), radius_sigma_mm, out, json)
+    return camera.calibrate_pose(options)
 
 
 def calibrate_display(config: ConfigArgument, json: JsonOption = False) -> int:

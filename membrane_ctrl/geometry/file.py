@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 import tomli_w
 
 from firmware_iface.settings import Section
+from membrane_ctrl.config import toml_file
 from membrane_ctrl.config.schema import CameraConfig, Config, GeometryConfig, OpticsConfig
-from membrane_ctrl.config.toml_file import parse, prune, read_toml, with_height_map
 from membrane_ctrl.model import errors, files, plain_json
 
 Table = TypeVar("Table", bound=Section)
@@ -34,7 +34,7 @@ class LensTable(Section):
             if getattr(self, key) != getattr(camera, key):
                 raise errors.InputError(
                     f"{where}: camera.{key} = {getattr(self, key):g}, the frames' camera has "
-                    f"{getattr(camera, key):g}; a calibrated lens is good for its own camera alone"
+                    f"{getattr(camera, key):g}; a calibrated lens is valid for its own camera only"
                 )
         return camera.model_copy(update=self.model_dump())
 
@@ -88,7 +88,7 @@ class GeometryFile:
         if self.pitch is not None:
             pattern = pattern.model_copy(update=self.pitch.model_dump())
         parts = {"geometry": self.geometry, "camera": camera, "pattern": pattern}
-        return parse({**dict(optics), **parts}, OpticsConfig, str(self.path))
+        return toml_file.parse({**dict(optics), **parts}, OpticsConfig, str(self.path))
 
 
 def read_geometry(path: Path) -> GeometryFile:
@@ -96,15 +96,15 @@ def read_geometry(path: Path) -> GeometryFile:
 
     Raises InputError, also for calibrated numbers that were changed by hand.
     """
-    tables = read_toml(path)
+    tables = toml_file.read_toml(path)
     calibrated = tables.get("schema") == plain_json.SCHEMA
     table = tables.get("geometry", tables)
-    with_height_map(table, path)
+    toml_file.with_height_map(table, path)
     hashed = plain_json.content_hash(tables if "geometry" in tables else {"geometry": tables})
     text = tomli_w.dumps(tables)
     if isinstance(table, dict):
-        prune(table, GeometryConfig)
-    geometry = parse(table, GeometryConfig, str(path))
+        toml_file.prune(table, GeometryConfig)
+    geometry = toml_file.parse(table, GeometryConfig, str(path))
     if not calibrated:
         return GeometryFile(path, geometry, None, None, None, GeometryOrigin(hashed, str(path)), text)
     calibration = _part(tables, "calibration", CalibrationTable, path)
@@ -132,12 +132,11 @@ def origin_of(optics: OpticsConfig) -> GeometryOrigin:
 def _part(tables: dict[str, Any], name: str, model: type[Table], path: Path) -> Table | None:
     table = tables.get(name)
     if isinstance(table, dict):
-        prune(table, model)
-    return None if table is None else parse(table, model, f"{path}: {name}")
+        toml_file.prune(table, model)
+    return None if table is None else toml_file.parse(table, model, f"{path}: {name}")
 
 
 # The geometry that a run measures with: that of `optics.geometry_file`, kept in the run's folder as it was.
-
 
 KEPT = "geometry.toml"  # in the run's folder
 
@@ -156,10 +155,8 @@ class InForce:
         """Leave a copy in the run's folder: whoever measures or looks back takes that. Raises InputError."""
         if not self.text:
             return
-        try:
+        with errors.writing(run_dir / KEPT):
             files.write_text_atomic(run_dir / KEPT, self.text)
-        except OSError as error:
-            raise errors.InputError(f"{run_dir / KEPT}: cannot be written: {error.strerror or error}") from None
 
 
 def geometry_in_force(config: Config) -> InForce:

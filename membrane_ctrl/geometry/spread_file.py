@@ -124,8 +124,6 @@ def write_prior(path: Path, tables: dict[str, Any], made_by: str, made_of: Seque
         "of": list(made_of),
         "rms_px": rms_px,
     }
-    try:
+    with errors.writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         files.write_text_atomic(files.users(path), tomli_w.dumps({"schema": SCHEMA, **tables, "made": made}))
-    except OSError as error:
-        raise errors.InputError(f"{path}: cannot be written: {error.strerror or error}") from None

@@ -18,11 +18,10 @@ from pydantic import Field
 
 from firmware_iface.roles import Pattern
 from firmware_iface.settings import Section
-from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig, PatternConfig
-from membrane_ctrl.config.toml_file import parse, prune, read_toml, with_height_map
+from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, origin_of
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
-from membrane_ctrl.metrology.phase import AXES, GRAY_BITS
+from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
 from membrane_ctrl.model.arrays import FloatArray, Image
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.files import read_bytes
@@ -51,10 +50,10 @@ class CaptureFile(Section):
     schema_: Annotated[Literal["membrane-capture/1"], Field(alias="schema")]
     kind: Literal["full", "fringes"]
     reference: str | None = None
-    pattern: PatternConfig
-    geometry: GeometryConfig
-    camera: CameraConfig
-    mirror: MirrorConfig
+    pattern: schema.PatternConfig
+    geometry: schema.GeometryConfig
+    camera: schema.CameraConfig
+    mirror: schema.MirrorConfig
     frames: tuple[FrameRow, ...]
 
 
@@ -65,7 +64,9 @@ class CaptureHead:
     folder: Path  # of the set
     kind: Literal["full", "fringes"]
     reference: Path | None  # of a fringes set: the full set that anchors it
-    optics: OpticsConfig  # geometry, camera, pattern and mirror; `camera.bits` is to be trusted only if `bits_stated`
+    optics: (
+        schema.OpticsConfig
+    )  # geometry, camera, pattern and mirror; `camera.bits` is to be trusted only if `bits_stated`
     bits_stated: bool  # whether the set says how deep its frames are
     files: tuple[str, ...]  # in the order of the patterns
     patterns: tuple[Pattern, ...]  # x sinusoids, x Gray bits, y sinusoids, y Gray bits, white, black (of a full set)
@@ -105,13 +106,13 @@ def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead
     path = folder / "capture.toml"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such capture set")
-    tables = read_toml(path, follow=False)
-    with_height_map(tables.get("geometry"), path, follow=False)
-    ignored = prune(tables, CaptureFile)
+    tables = toml_file.read_toml(path, follow=False)
+    toml_file.with_height_map(tables.get("geometry"), path, follow=False)
+    ignored = toml_file.prune(tables, CaptureFile)
     if geometry is not None:
         tables["geometry"] = geometry.geometry.model_dump(exclude_none=True)
     bits_stated = isinstance(tables.get("camera"), dict) and "bits" in tables["camera"]
-    content = parse(tables, CaptureFile, str(path))
+    content = toml_file.parse(tables, CaptureFile, str(path))
     rows = _ordered(content, path)
     reference = None
     for row in content.frames:
@@ -122,7 +123,7 @@ def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead
         reference = (folder / content.reference).resolve()
     sections = ("geometry", "camera", "pattern", "mirror")
     blamed = path if geometry is None else geometry.path  # what may not fit together is the screen and the pattern
-    optics = parse({name: getattr(content, name) for name in sections}, OpticsConfig, str(blamed))
+    optics = toml_file.parse({name: getattr(content, name) for name in sections}, schema.OpticsConfig, str(blamed))
     if geometry is not None:
         optics = geometry.over(optics)
     return CaptureHead(
@@ -167,9 +168,8 @@ def assemble(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet:
     size, depth = (camera.height_px, camera.width_px), _most([image.dtype for image in good])
     seen = _most([image.shape for image in good])
     if seen != size:
-        raise InputError(
-            f"{path}: camera.width_px, height_px: {size[1]} x {size[0]}, but the images are {seen[1]} x {seen[0]}"
-        )
+        said = f"{size[1]} x {size[0]}, but the images are {seen[1]} x {seen[0]}"
+        raise InputError(f"{path}: camera.width_px, height_px: {said}")
     frames: Image = np.zeros((len(images), *size), depth)
     unusable: dict[int, str] = {}
     for k, image in enumerate(images):
@@ -204,7 +204,7 @@ def anchored(head: CaptureHead, reference: CaptureHead) -> CaptureHead:
     return replace(head, optics=_with_reference_displacement(ours, theirs.geometry.reference_displacement_um))
 
 
-def _with_reference_displacement(optics: OpticsConfig, displacement_um: float | None) -> OpticsConfig:
+def _with_reference_displacement(optics: schema.OpticsConfig, displacement_um: float | None) -> schema.OpticsConfig:
     """The same with the displacement for which the geometry holds, unless it states one."""
     geometry = optics.geometry
     if geometry.reference_displacement_um is not None or displacement_um is None:
@@ -265,7 +265,7 @@ def _ordered(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]
                 f"{path}: frames: {pattern.name} is there twice ({found[pattern.name][0].file}, {row.file})"
             )
         found[pattern.name] = (row, pattern)
-    names = _sequence_names(content)
+    names = [p.name for p in (full_sequence if content.kind == "full" else fringe_sequence)(content.pattern)]
     if missing := [name for name in names if name not in found]:
         raise InputError(f"{path}: frames: a {content.kind} set of {content.pattern.steps} steps needs {missing[0]}")
     if extra := [name for name in found if name not in names]:
@@ -274,15 +274,6 @@ def _ordered(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]
         if times > 1:
             raise InputError(f"{path}: frames: {name} is given for {times} frames")
     return [found[name] for name in names]
-
-
-def _sequence_names(content: CaptureFile) -> list[str]:
-    names: list[str] = []
-    for axis in AXES:
-        names += [Pattern("sin", axis, k).name for k in range(content.pattern.steps)]
-        if content.kind == "full":
-            names += [Pattern("gray", axis, bit).name for bit in range(1, GRAY_BITS + 1)]
-    return names + (["white", "black"] if content.kind == "full" else [])
 
 
 def _column(values: list[float | None]) -> FloatArray:

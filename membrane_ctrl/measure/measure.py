@@ -13,8 +13,8 @@ from membrane_ctrl.measure.measurement import Measurement, measure_set
 from membrane_ctrl.metrology.frames.series_integrity import SeriesFlag, check_series
 from membrane_ctrl.metrology.optics.geometry import Outline, find_outline
 from membrane_ctrl.metrology.optics.surface import RadialProfile, radial_profile
+from membrane_ctrl.model import errors
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.errors import Exit, InputError
 
 # A good pose leaves 0.4 mm and 0.0007 (simulated, a fifth of the sensor's pixels); a ring is round to 1 mm or so.
 _RIM_OFF_MM, _RIM_SIZE = 3.0, 0.005
@@ -34,7 +34,7 @@ def measure_command(
     profile = _profile(measurement)
     bars = results.error_bars(measurement, geometry)
     begin = time.perf_counter()
-    try:
+    with errors.writing(target):
         results.write_result(target, measurement, results.details_table(measurement, profile, outline, bars), bars)
         drawn: list[Path] = []
         if pictures:
@@ -45,14 +45,12 @@ def measure_command(
             from membrane_ctrl.measure.pictures import log_measurement
 
             log_measurement(target / "measurement.rrd", measurement, drawn)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written: {error.strerror or error}") from None
     print(f"written to {target} in {time.perf_counter() - begin:.1f} s", file=sys.stderr)
     if as_json:
         print(json.dumps(results.result_table(measurement)))
     else:
         print("\n".join(_lines(measurement, profile, outline, bars)))
-    return int(Exit.REJECTED if measurement.verdict == "rejected" else Exit.DONE)
+    return int(errors.Exit.REJECTED if measurement.verdict == "rejected" else errors.Exit.DONE)
 
 
 def _outline(measurement: Measurement) -> tuple[FloatArray, Outline | None]:
@@ -108,7 +106,6 @@ def _lines(
 
 # `measure` of a SOFAST file: are its frames what they should be? Slopes need the poses that its own tool finds.
 
-
 _LEAST_PIXELS = 200  # fewer tell nothing of a frame
 
 
@@ -117,10 +114,10 @@ def facet_command(path: Path, as_json: bool) -> int:
     try:
         measurement = sofast.read_measurement(path)
     except (ValueError, OSError, ImportError) as error:
-        raise InputError(str(error)) from None
+        raise errors.InputError(str(error)) from None
     mask = sofast.lit_pixels(measurement)
     if np.count_nonzero(mask) < _LEAST_PIXELS:
-        raise InputError(f"{path}: only {np.count_nonzero(mask)} pixels see fringes")
+        raise errors.InputError(f"{path}: only {np.count_nonzero(mask)} pixels see fringes")
     found = check_series(sofast.series_of(measurement, mask), measurement.black[mask], measurement.white[mask])
     flagged = [{"file": _name(measurement, flag), "reason": flag.reason} for flag in found.flags]
     table = {
@@ -131,7 +128,7 @@ def facet_command(path: Path, as_json: bool) -> int:
     lines = [f"verdict   {found.verdict}{': ' + found.reason if found.reason else ''}"]
     lines += [f"flagged   {item['file']}: {item['reason']}" for item in flagged]
     print(json.dumps(table) if as_json else "\n".join(lines))
-    return int(Exit.REJECTED if found.verdict == "rejected" else Exit.DONE)
+    return int(errors.Exit.REJECTED if found.verdict == "rejected" else errors.Exit.DONE)
 
 
 def _name(measurement: sofast.SofastMeasurement, flag: SeriesFlag) -> str:

@@ -143,9 +143,6 @@ def noise_seen_adu(measurement: Measurement) -> float:
     return float(np.sqrt(np.median(np.square(measurement.full.rest_adu)) / free)) if free else float("nan")
 
 
-# The figure of one capture set on disk from its bins: what the analyses of many sets call.
-
-
 @dataclass(frozen=True)
 class SetFigure:
     """A set that gave a figure.
@@ -176,12 +173,9 @@ class SetFigure:
 
 
 class Figures:
-    """Figures of sets, one after the other; caches the last reference, which most sets of a run share.
+    """Figures of sets, one after the other, if wanted with another geometry than their own.
 
-    Parameters
-    ----------
-    geometry : GeometryFile, optional
-        Used instead of the sets' own.
+    The last reference, which most sets of a run share, is cached.
     """
 
     def __init__(self, geometry: GeometryFile | None = None) -> None:
@@ -211,9 +205,10 @@ class Figures:
             raise errors.RejectedError(f"{folder}: rejected: {reason}")
         if verdict == "ok":
             verdict, reason = checked.verdict
-        return SetFigure(
-            capture.head, checked, figure, verdict, reason, _middle_s(capture.head), stack.mean_reading_um
-        )
+        head = capture.head
+        sinusoids = [pattern.role == "sin" for pattern in head.patterns]
+        middle_s = float(head.time_s[sinusoids].mean())
+        return SetFigure(head, checked, figure, verdict, reason, middle_s, stack.mean_reading_um)
 
     def _anchored_by(self, reference: Path) -> tuple[CaptureHead, Anchor]:
         if reference != self._reference:
@@ -225,9 +220,3 @@ class Figures:
         if isinstance(self._anchor, errors.CommandError):
             raise self._anchor
         return self._anchor
-
-
-def _middle_s(head: CaptureHead) -> float:
-    """Mean start of exposure of the sinusoids."""
-    times = np.array([t for t, pattern in zip(head.time_s, head.patterns, strict=True) if pattern.role == "sin"])
-    return float(times.mean()) if times.size else math.nan

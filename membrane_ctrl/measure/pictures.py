@@ -29,13 +29,7 @@ def draw_all(
     outline: geometry.Outline | None,
     bars: ErrorBars | None,
 ) -> list[Path]:
-    """Draw everything there is to draw; returns the files.
-
-    Parameters
-    ----------
-    light : (H, W) array
-        The scene, of any size: white, or the mean of the fringes.
-    """
+    """Draw everything; returns the files. `light` (H, W) is the scene of any size: white, or the fringes' mean."""
     files = [write_figure(out / "frames.png", _frames(measurement))]
     full = measurement.full
     if full is None or profile is None:
@@ -58,19 +52,20 @@ def _uncertainty(bars: ErrorBars) -> Figure:
     figure = Figure(figsize=(12, 4.8), layout="constrained")
     of_noise, of_geometry = bars.maps_um()
     left, right = figure.subplots(1, 2)
-    _image(left, "1 sigma of pixel noise (nm)", bars.grid.axis_mm, 1e3 * of_noise, "magma")
+    show_map(left, "1 sigma of pixel noise (nm)", bars.grid.axis_mm, 1e3 * of_noise, "magma")
     if np.isfinite(of_geometry).any():
-        _image(right, "1 sigma of the geometry (um)", bars.grid.axis_mm, of_geometry, "magma")
+        show_map(right, "1 sigma of the geometry (um)", bars.grid.axis_mm, of_geometry, "magma")
     return figure
 
 
 def _map(title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False) -> Figure:
     figure = Figure(figsize=(6.4, 5.4), layout="constrained")
-    _image(figure.subplots(), title, axis, values, colours, even)
+    show_map(figure.subplots(), title, axis, values, colours, even)
     return figure
 
 
-def _image(axes: Any, title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False) -> None:
+def show_map(axes: Any, title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False) -> None:
+    """A map with its colour scale; `even` centres the scale on 0."""
     low, high = np.nanpercentile(values, [0.5, 99.5])
     if even:
         high = max(abs(low), abs(high))
@@ -94,7 +89,7 @@ def _slopes(full: FullResult) -> Figure:
         figure.colorbar(points, ax=place, shrink=0.85)
     for place, slope, name in ((axes[1, 0], grid.slope_x, "dh/dx"), (axes[1, 1], grid.slope_y, "dh/dy")):
         left = np.where(grid.count > 0, 1e6 * slope, np.nan)
-        _image(place, f"{name} less the fit (urad)", grid.axis_mm, left, "RdBu_r", even=True)
+        show_map(place, f"{name} less the fit (urad)", grid.axis_mm, left, "RdBu_r", even=True)
     return figure
 
 
@@ -161,14 +156,11 @@ def _convergence(full: FullResult) -> Figure:
     return figure
 
 
-# A result's own Rerun recording: opened, and closed with a look at whether it reached the disk.
-
-
 @contextmanager
 def result_recording(
     path: Path, application: str, blueprint: rrb.Blueprint | None = None
 ) -> Iterator[rr.RecordingStream]:
-    """A recording in a file `path` (.rrd), overwritten. Raises OSError if it cannot be written."""
+    """A Rerun recording in a file `path` (.rrd), overwritten. Raises OSError if it does not reach the disk."""
     recording = rr.RecordingStream(application)
     with scratch_folder(path.parent, ".recording-") as folder:
         try:
@@ -191,11 +183,8 @@ def log_pictures(recording: rr.RecordingStream, entity: str, pictures: Sequence[
         recording.log(f"{entity}/{picture.stem}", rr.EncodedImage(path=picture), static=True)
 
 
-# A measurement as a Rerun recording: maps, coefficients, verdict, and the pictures.
-
-
 def log_measurement(path: Path, measurement: Measurement, pictures: Sequence[Path]) -> None:
-    """Write a recording `path` (.rrd). Raises OSError if it cannot be written."""
+    """Write maps, coefficients, verdict and pictures as a recording `path` (.rrd). Raises OSError."""
     words = [f"verdict: {measurement.verdict} {measurement.reason}"]
     words += [f"{item['file']}: {item['reason']}" for item in measurement.flagged_files()]
     full = measurement.full

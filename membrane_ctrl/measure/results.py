@@ -25,10 +25,8 @@ if TYPE_CHECKING:  # matplotlib takes a second to load
     from matplotlib.figure import Figure
 
 
-# How well a measured height is known: noise of the pixels, and what is known of the geometry, without any trials.
-#
-# Both are linear (`metrology.uncertainty`): a few dozen solutions of thinned points, 50 ms. The Monte Carlo of the
-# `uncertainty` command agrees within 10 %.
+# How well a measured height is known, without any trials: both shares are linear (`metrology.uncertainty`), a few
+# dozen solutions of thinned points, 50 ms. The Monte Carlo of the `uncertainty` command agrees within 10 %.
 
 
 @dataclass(frozen=True)
@@ -69,27 +67,16 @@ def error_bars(measurement: Measurement, geometry: Path | None) -> ErrorBars | N
     gain = bins.slope_per_screen(checked.tracer.geometry, full.surface.radius_mm, full.surface.sag_mm)
     spread, source = spread_of(optics.geometry, geometry)
     try:
-        of_geometry = monte_carlo.geometry_covariance(
-            monte_carlo.geometry_jacobian(_bench(measurement), spread), spread
+        state = checked.state
+        exact, places_px = np.zeros((2, state.index.size)), checked.places_px(state.index)
+        bench = monte_carlo.TrialBench.of_points(
+            optics, checked.tracer, state.surface, state.points, places_px, exact, monte_carlo.TRIAL_POINTS
         )
+        of_geometry = monte_carlo.geometry_covariance(monte_carlo.geometry_jacobian(bench, spread), spread)
     except ArithmeticError:
         of_geometry, source = np.full((PARAMETERS, PARAMETERS), np.nan), f"{source}: too wide to be a spread"
     grid = monte_carlo.HeightMap.over(optics.mirror.analysis_radius_mm, optics.mirror.radius_mm)
     return ErrorBars(bins.parameter_covariance(full.fit, gain @ sigma_mm**2), of_geometry, source, grid)
-
-
-def _bench(measurement: Measurement) -> monte_carlo.TrialBench:
-    """The bins' points on their surface."""
-    checked = measurement.checked
-    if checked is None:
-        raise ValueError("a set without a figure has no error bars")
-    row, column = np.divmod(checked.state.index, checked.phase_rad.shape[2])
-    side, exact = checked.binned.bin_px, np.zeros((2, row.size))
-    place_px = side * np.stack([column, row]) + (side - 1) / 2
-    surface, points = checked.state.surface, checked.state.points
-    return monte_carlo.TrialBench.of_points(
-        measurement.head.optics, checked.tracer, surface, points, place_px, exact, monte_carlo.TRIAL_POINTS
-    )
 
 
 def result_table(measurement: Measurement) -> dict[str, Any]:

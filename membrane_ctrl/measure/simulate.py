@@ -7,7 +7,7 @@ from pathlib import Path
 
 from membrane_ctrl.config.schema import Config, OpticsConfig
 from membrane_ctrl.geometry.file import read_geometry
-from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model import errors
 from membrane_ctrl.sim.optics import film_shape, shade, simulate, simulation_spec
 
 
@@ -37,17 +37,16 @@ class SimulateOptions:
 def simulate_command(options: SimulateOptions) -> int:
     """Write a set, or a run of sets. Raises InputError."""
     if options.folder.exists() and any(options.folder.iterdir()):
-        raise InputError(f"{options.folder}: is not empty; simulate writes into a new or empty folder")
+        raise errors.InputError(f"{options.folder}: is not empty; simulate writes into a new or empty folder")
     try:
         spec = specification(options)
-        if options.sets == 1:
-            simulate.simulate_set(options.folder, spec)
-        else:
-            simulate.simulate_run(options.folder, spec, options.sets, options.interval_s, _progress(options.sets))
+        with errors.writing(options.folder):
+            if options.sets == 1:
+                simulate.simulate_set(options.folder, spec)
+            else:
+                simulate.simulate_run(options.folder, spec, options.sets, options.interval_s, _progress(options.sets))
     except ValueError as error:
-        raise InputError(f"simulate: {error}") from None
-    except OSError as error:
-        raise InputError(f"{options.folder}: cannot be written: {error.strerror or error}") from None
+        raise errors.InputError(f"simulate: {error}") from None
     print(f"{options.sets} set(s) written to {options.folder}", file=sys.stderr)
     return 0
 

@@ -7,13 +7,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import Progress
-
 from membrane_ctrl.geometry.file import read_geometry
 from membrane_ctrl.measure import capture_set, measurement, results, stability_run
 from membrane_ctrl.metrology.uncertainty.stability import default_points_mm
-from membrane_ctrl.model import errors, files
+from membrane_ctrl.model import errors, files, terminal
 
 
 @dataclass(frozen=True)
@@ -37,7 +34,7 @@ def stability_command(options: StabilityOptions) -> int:
     folders = set_folders(options.folder, out)
     size_px, analysis_radius_mm = common_size(folders)
     points = points_mm(options.points, analysis_radius_mm)
-    try:
+    with errors.writing(out):
         files.make_folder(out)
         with stability_run.StabilityRun(out, points, options.trials, options.seed, options.geometry) as run:
             _analyse(folders, figures, run)
@@ -50,8 +47,6 @@ def stability_command(options: StabilityOptions) -> int:
         pictures = run.draw()
         if options.rerun:
             run.record(pictures)
-    except OSError as error:
-        raise errors.InputError(f"{out}: cannot be written: {error.strerror or error}") from None
     print(f"written to {out}", file=sys.stderr)
     print(json.dumps(table) if options.as_json else "\n".join(run.lines()))
     return 0
@@ -108,21 +103,17 @@ def points_mm(given: tuple[str, ...], analysis_radius_mm: float) -> dict[str, tu
         except ValueError:
             raise errors.InputError(f"--point {text}: give NAME=X,Y in mm, as A=100,-200") from None
         if not name or not math.hypot(x, y) <= analysis_radius_mm:
-            raise errors.InputError(
-                f"--point {text}: needs a name and a place within {analysis_radius_mm:g} mm of the vertex"
-            )
+            within = f"within {analysis_radius_mm:g} mm of the vertex"
+            raise errors.InputError(f"--point {text}: needs a name and a place {within}")
         points[name] = (x, y)
     return points or default_points_mm(analysis_radius_mm)
 
 
 def _analyse(folders: list[Path], figures: measurement.Figures, run: stability_run.StabilityRun) -> None:
     """Every set, one after the other, with a bar on a terminal; a bad one is named and passed over."""
-    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
-        task = progress.add_task("sets", total=len(folders))
-        for number, folder in enumerate(folders):
-            try:
-                run.add(folder.name, number, figures.of(folder))
-            except errors.CommandError as error:
-                run.skip(folder.name, str(error))
-                print(f"passed over {folder.name}: {error}", file=sys.stderr)
-            progress.update(task, advance=1)
+    for number, folder in enumerate(terminal.counted(folders, "sets")):
+        try:
+            run.add(folder.name, number, figures.of(folder))
+        except errors.CommandError as error:
+            run.skip(folder.name, str(error))
+            print(terminal.one_line(f"passed over {folder.name}: {error}"), file=sys.stderr)

@@ -1,57 +1,26 @@
-"""The table of a stability run, one line a set, written as the sets pass by and read back thinned for pictures."""
+"""The table of a stability run, one line a set, read back thinned for pictures; pictures and recording of the run."""
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from matplotlib.figure import Figure
 
-from membrane_ctrl.measure.pictures import log_pictures, result_recording
+from membrane_ctrl.measure.pictures import log_pictures, result_recording, show_map
 from membrane_ctrl.measure.results import write_figure
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.files import fresh_text
 
 _HEAD = ("set", "verdict", "reason")
 _NUMBERS = ("time_s", "displacement_um", "sag_um", "slope_residual_urad", "rmse_mean_um")
 _ZERNIKE = tuple(f"z{j}_um" for j in range(1, 37))
 
 
-class SeriesFile:
-    """Writes `series.csv`; a set that gave no figure has a line without numbers.
-
-    `path` is overwritten; `points` are the names of the points whose height is followed.
-    """
-
-    def __init__(self, path: Path, points: Sequence[str]) -> None:
-        self._file = fresh_text(path)
-        self._writer = csv.writer(self._file, lineterminator="\n")
-        self._writer.writerow((*_HEAD, *_NUMBERS, *(f"{name}_um" for name in points), *_ZERNIKE))
-
-    def __enter__(self) -> "SeriesFile":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
-    ) -> None:
-        self._file.close()
-
-    def add(
-        self,
-        name: str,
-        verdict: str,
-        reason: str,
-        numbers: Sequence[float] = (),
-        points_um: Sequence[float] = (),
-        coeffs_um: Sequence[float] = (),
-    ) -> None:
-        """One line; `numbers` are time_s, displacement_um, sag_um, slope_residual_urad, rmse_mean_um."""
-        cells = [f"{value:.12g}" for value in (*numbers, *points_um, *coeffs_um)]
-        self._writer.writerow((name, verdict, reason, *cells))
+def series_head(points: Iterable[str]) -> tuple[str, ...]:
+    """Columns of `series.csv`, with those of the points whose height is followed; a bad set has the first three."""
+    return (*_HEAD, *_NUMBERS, *(f"{name}_um" for name in points), *_ZERNIKE)
 
 
 def read_series(path: Path, points: int, most: int = 4000) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -71,18 +40,15 @@ def read_series(path: Path, points: int, most: int = 4000) -> tuple[FloatArray, 
     return table[:, 0], table[:, first : first + points], table[:, first + points :]
 
 
-# Pictures of uncertainty and of stability, as PNG files.
-
-
 def draw_uncertainty(path: Path, axis_mm: FloatArray, height_um: FloatArray, rmse_um: FloatArray, pair: bool) -> None:
     """Height, or its change, beside its RMSE; (n, n) maps."""
     figure = Figure(figsize=(11, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     if pair:
-        _image(left, "change of height (um)", axis_mm, height_um, "RdBu_r", even=True)
+        show_map(left, "change of height (um)", axis_mm, height_um, "RdBu_r", even=True)
     else:
-        _image(left, "height (mm)", axis_mm, height_um / 1e3, "viridis")
-    _image(right, f"RMSE (um), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
+        show_map(left, "height (mm)", axis_mm, height_um / 1e3, "viridis")
+    show_map(right, f"RMSE (um), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
     write_figure(path, figure)
 
 
@@ -103,7 +69,7 @@ def draw_stability(
         axes.plot(time_s, change, ".-", markersize=3, linewidth=0.7)
         axes.set(ylabel=f"{name} (um)", xlabel="time (s)" if k == len(points) - 1 else "")
     shown = figure.add_subplot(grid[:, 1])
-    _image(shown, f"SD (um), mean {np.nanmean(sd_um):.3g}", axis_mm, sd_um, "magma")
+    show_map(shown, f"SD (um), mean {np.nanmean(sd_um):.3g}", axis_mm, sd_um, "magma")
     for name, (x, y) in points.items():
         shown.plot(x, y, "o", color="white", markeredgecolor="black")
         frame = {"boxstyle": "round,pad=0.15", "facecolor": "black", "alpha": 0.6}  # readable on any colour
@@ -128,23 +94,9 @@ def draw_pairs(path: Path, axis_mm: FloatArray, maps: Mapping[float, tuple[Float
     figure = Figure(figsize=(11, 4.6 * len(maps)), layout="constrained")
     axes = figure.subplots(len(maps), 2, squeeze=False)
     for row, (lag_s, (change_um, rmse_um)) in zip(axes, maps.items(), strict=True):
-        _image(row[0], f"change over {lag_s / 60:g} min (um)", axis_mm, change_um, "RdBu_r", even=True)
-        _image(row[1], f"RMSE (um), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
+        show_map(row[0], f"change over {lag_s / 60:g} min (um)", axis_mm, change_um, "RdBu_r", even=True)
+        show_map(row[1], f"RMSE (um), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
     write_figure(path, figure)
-
-
-def _image(axes: Any, title: str, axis_mm: FloatArray, values: FloatArray, colours: str, even: bool = False) -> None:
-    low, high = np.nanpercentile(values, [0.5, 99.5])
-    if even:
-        high = max(abs(low), abs(high))
-        low = -high
-    extent = (axis_mm[0], axis_mm[-1], axis_mm[0], axis_mm[-1])
-    shown = axes.imshow(values, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high)
-    axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)")
-    axes.figure.colorbar(shown, ax=axes, shrink=0.85)
-
-
-# A stability run as a Rerun recording: heights and terms in time, the map of standard deviations, the pictures.
 
 
 def log_stability(
@@ -157,24 +109,14 @@ def log_stability(
     lines: Sequence[str],
     pictures: Sequence[Path],
 ) -> None:
-    """Write a recording. Raises OSError if the file cannot be written.
+    """Write a stability run as a recording `path` (.rrd), overwritten. Raises OSError if it cannot be written.
 
     Parameters
     ----------
-    path : Path
-        The `.rrd` file, overwritten.
-    points : names
-        Of the heights that were followed.
-    time_s : (n,) array
-        Of the sets.
-    heights_um : (n, points) array
-        Shown against their means.
-    coeffs_um : (n, 36) array
-        Zernike terms; shown against their means, piston left out.
+    heights_um, coeffs_um : (n, points), (n, 36) arrays
+        Shown against their means, without piston.
     sd_um : (m, m) array
         Map of standard deviations, rows along y, NaN outside.
-    lines, pictures
-        The report, and what was drawn.
     """
     terms = [f"Z{j}" for j in range(2, 37)]
     with result_recording(path, "membrane_ctrl_stability", _blueprint(pictures)) as recording:
@@ -191,9 +133,8 @@ def log_stability(
 
 def _blueprint(pictures: Sequence[Path]) -> rrb.Blueprint:
     """Plots over the whole run: without it they show a minute about the cursor."""
-    axis = rrb.TimeAxis(
-        view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
-    )
+    always = rr.TimeRangeBoundary.infinite()
+    axis = rrb.TimeAxis(view_range=rr.TimeRange(start=always, end=always))
     plots = (
         rrb.TimeSeriesView(origin=f"stability/{name}", name=title, axis_x=axis)
         for name, title in (("points_um", "height at the points (um)"), ("zernike_um", "Zernike terms (um RMS)"))

@@ -1,8 +1,9 @@
 """What a stability analysis accumulates over its sets, and the files it leaves."""
 
+import contextlib
 import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -24,21 +25,8 @@ _PAIR_HEAD = ("lag_s", "earlier", "later", "seconds", "change_rms_um", "rmse_mea
 class StabilityRun:
     """Statistics over the sets of a run.
 
-    Parameters
-    ----------
-    out : Path
-        Existing folder for `series.csv`, `pairs.csv`, the SD map and the pictures.
-    points_mm : mapping of name to (x, y)
-        Where the height is followed.
-    trials, seed : int
-        Of the Monte Carlo, for every set.
-    geometry : Path, optional
-        The file that the sets' geometry is from, with its covariance.
-
-    Attributes
-    ----------
-    degraded : int
-        Sets that gave a figure with a reservation.
+    `out` is an existing folder for `series.csv`, `pairs.csv`, the SD map and the pictures; `points_mm` are the places
+    where the height is followed; `geometry` is the file that the sets' geometry is from, with its covariance.
     """
 
     def __init__(
@@ -52,10 +40,9 @@ class StabilityRun:
         self._out = out
         self._points_mm = dict(points_mm)
         self._trials, self._seed, self._geometry = trials, seed, geometry
-        self._series = stability_results.SeriesFile(out / SERIES, list(points_mm))
-        self._pair_file = files.fresh_text(out / "pairs.csv")
-        self._pair_rows = csv.writer(self._pair_file, lineterminator="\n")
-        self._pair_rows.writerow(_PAIR_HEAD)
+        self._open = contextlib.ExitStack()
+        self._series = self._table(SERIES, stability_results.series_head(points_mm))
+        self._pair_rows = self._table("pairs.csv", _PAIR_HEAD)
         self._grid: monte_carlo.HeightMap | None = None
         self._point_matrix: FloatArray = np.zeros((len(points_mm), PARAMETERS))
         self._spread: geometry_spread.GeometrySpread | None = None
@@ -77,8 +64,12 @@ class StabilityRun:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
     ) -> None:
-        self._series.__exit__(kind, error, at)
-        self._pair_file.close()
+        self._open.close()
+
+    def _table(self, name: str, head: Sequence[str]) -> Any:
+        rows = csv.writer(self._open.enter_context(files.fresh_text(self._out / name)), lineterminator="\n")
+        rows.writerow(head)
+        return rows
 
     @property
     def used(self) -> int:
@@ -95,7 +86,7 @@ class StabilityRun:
         self._bad_count += 1
         if len(self._bad) < _NAMED_BAD:
             self._bad.append({"set": name, "reason": reason})
-        self._series.add(name, "rejected", reason)
+        self._series.writerow((name, "rejected", reason))
 
     def add(self, name: str, number: int, one: measurement.SetFigure) -> None:
         """Count a set; `number` is its place in the run, from which its noise is drawn."""
@@ -117,7 +108,8 @@ class StabilityRun:
         for tally, height in zip(self._heights.values(), heights_um, strict=True):
             tally.add(height)
         numbers = (one.time_s, one.displacement_um, 1e3 * surface.sag_mm, one.figure.quality.residual_urad, rmse_um)
-        self._series.add(name, one.verdict, one.reason, numbers, heights_um, (1e3 * surface.coeffs_mm).tolist())
+        cells = (f"{value:.12g}" for value in (*numbers, *heights_um, *(1e3 * surface.coeffs_mm)))
+        self._series.writerow((name, one.verdict, one.reason, *cells))
         for pair in self._finder.add(stability.Moment(name, one.time_s, parameters, trials)):
             self._add_pair(grid, pair)
 
@@ -184,9 +176,11 @@ class StabilityRun:
         stability_results.draw_zernike(drawn[1], times, coeffs)
         if not self._shown:
             return drawn[:2]
-        stability_results.draw_pairs(
-            drawn[2], axis, {lag: self._pair_maps(grid, pair) for lag, pair in self._shown.items()}
-        )
+        maps = {
+            lag: (grid.picture(1e3 * grid.matrix @ pair.change), grid.picture(1e3 * grid.sigma(pair.covariance)))
+            for lag, pair in self._shown.items()
+        }
+        stability_results.draw_pairs(drawn[2], axis, maps)
         return drawn
 
     def record(self, pictures: list[Path]) -> None:
@@ -240,13 +234,8 @@ class StabilityRun:
         for row, (name, (x, y)) in zip(self._point_matrix, self._points_mm.items(), strict=True):
             tally = self._heights[name]
             sd_um = 1e3 * math.sqrt(row @ self._parameters.covariance @ row)
-            table[name] = {
-                "x_mm": x,
-                "y_mm": y,
-                "mean_um": tally.mean,
-                "sd_um": sd_um,
-                "peak_to_peak_um": tally.high - tally.low,
-            }
+            moved = {"mean_um": tally.mean, "sd_um": sd_um, "peak_to_peak_um": tally.high - tally.low}
+            table[name] = {"x_mm": x, "y_mm": y} | moved
         return table
 
     def _pair_table(self, lag_s: float) -> dict[str, Any]:
@@ -256,15 +245,10 @@ class StabilityRun:
             for name, tally in (("change_rms_um", change), ("rmse_um", rmse))
         }
 
-    def _pair_maps(self, grid: monte_carlo.HeightMap, pair: stability.FigurePair) -> tuple[FloatArray, FloatArray]:
-        return grid.picture(1e3 * grid.matrix @ pair.change), grid.picture(1e3 * grid.sigma(pair.covariance))
-
 
 def _pair_line(pair: dict[str, Any]) -> str:
     lag = f"{pair['lag_s'] / 60:g} min"
     if not pair["count"]:
         return f"{lag:9s} no pairs"
-    change, rmse = pair["change_rms_um"], pair["rmse_um"]
-    return (
-        f"{lag:9s} {pair['count']} pairs: change {change['mean']:.4g} um RMS, RMSE {rmse['mean']:.4g} um on average"
-    )
+    change, rmse = pair["change_rms_um"]["mean"], pair["rmse_um"]["mean"]
+    return f"{lag:9s} {pair['count']} pairs: change {change:.4g} um RMS, RMSE {rmse:.4g} um on average"

@@ -15,15 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
 
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.measure.results import write_arrays, write_json
 from membrane_ctrl.metrology.optics.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
-from membrane_ctrl.model import errors, files
+from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.arrays import FloatArray
 
 # Runs Monte Carlo trials: here, over the cores, or on a Dask cluster; the numbers are the same wherever they run.
@@ -43,19 +41,11 @@ def run_everywhere(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> FloatArray:
-    """Parameters (trials, sets, 36) in mm, with a progress bar on a terminal.
+    """Parameters (trials, sets, 36) in mm as `monte_carlo.run_trials`, with a progress bar on a terminal.
 
-    Raises InputError if Dask is asked for and not installed, or if the spread is too wide for the fit to converge;
-    DeviceError if the scheduler does not answer.
-
-    Parameters
-    ----------
-    benches, spread, seed
-        See `monte_carlo.run_trials`.
-    workers : int, optional
-        Processes; chosen by the amount of work if not given.
-    scheduler : str, optional
-        Address of a Dask scheduler, as tcp://host:8786, to run there instead.
+    `workers` is the number of processes, by default chosen by the amount of work; `scheduler` the address of a Dask
+    scheduler, as tcp://host:8786, to run there instead. Raises InputError if Dask is wanted and not installed, or the
+    spread is too wide for the fit to converge; DeviceError if the scheduler does not answer.
     """
     batches = [range(first, min(first + _BATCH, trials)) for first in range(0, trials, _BATCH)]
     job = partial(monte_carlo.run_trials, benches, spread, seed)
@@ -63,7 +53,7 @@ def run_everywhere(
         workers = (os.cpu_count() or 1) if trials * len(benches) >= _WORTH_PROCESSES else 1
     try:
         with _results(job, batches, min(workers, len(batches)), scheduler) as results:
-            return np.concatenate(list(_shown(results, trials)))
+            return np.concatenate(list(terminal.counted(results, "trials", len(batches))))
     except ArithmeticError as error:
         raise errors.InputError(f"uncertainty: {error}") from None
 
@@ -93,15 +83,6 @@ def _dask_client(address: str) -> Any:
         raise errors.InputError(f"--scheduler {address}: {error}") from None
     except OSError as error:  # a timeout is one
         raise errors.DeviceError(f"--scheduler {address}: does not answer ({error})") from None
-
-
-def _shown(results: Iterator[FloatArray], trials: int) -> Iterator[FloatArray]:
-    """The same, with a bar on stderr if that is a terminal."""
-    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
-        task = progress.add_task("trials", total=trials)
-        for part in results:
-            progress.update(task, advance=len(part))
-            yield part
 
 
 @dataclass(frozen=True)
@@ -148,7 +129,8 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
     grid = monte_carlo.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
     table = _table(options, sets, spread, source, result, grid) | {"timing_s": {"trials": seconds}}
     out = options.out.resolve() if options.out else options.folder / "uncertainty"
-    _write(out, grid, result, _height_um(sets, grid), table)
+    own, *other = (one.figure.fit.surface.parameters for one in sets)
+    _write(out, grid, result, 1e3 * grid.matrix @ (own - other[0] if other else own), table)
     print(json.dumps(table) if options.as_json else "\n".join(_lines(table)))
     return 0
 
@@ -160,13 +142,6 @@ def _spread(
     own = parameters[:, 0] if len(benches) == 1 else parameters[:, 0] - parameters[:, 1]
     noise = np.sum([monte_carlo.noise_covariance(bench) for bench in benches], axis=0)
     return Spread(monte_carlo.trial_covariance(own), monte_carlo.linear_covariance(benches, spread), noise)
-
-
-def _height_um(sets: list[SetFigure], grid: monte_carlo.HeightMap) -> FloatArray:
-    """The height, or its change, at the points of the grid."""
-    own = sets[0].figure.fit.surface.parameters
-    other = sets[1].figure.fit.surface.parameters if len(sets) > 1 else np.zeros_like(own)
-    return np.asarray(1e3 * grid.matrix @ (own - other))
 
 
 def _table(
@@ -203,14 +178,12 @@ def _write(
     from membrane_ctrl.measure.stability_results import draw_uncertainty  # matplotlib takes a second to load
 
     rmse = grid.picture(1e3 * grid.sigma(result.covariance))
-    try:
+    with errors.writing(out):
         files.make_folder(out)
         write_json(out / "uncertainty.json", table)
         write_arrays(out / "rmse.npz", x_mm=grid.axis_mm, y_mm=grid.axis_mm, rmse_um=rmse)
         height = grid.picture(height_um)
         draw_uncertainty(out / "uncertainty.png", grid.axis_mm, height, rmse, table["against"] is not None)
-    except OSError as error:
-        raise errors.InputError(f"{out}: cannot be written: {error.strerror or error}") from None
     print(f"written to {out}", file=sys.stderr)
 
 

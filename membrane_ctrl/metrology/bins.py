@@ -68,7 +68,6 @@ class BinGrid:
 # cov(parameters) = M^-1 (var_x M_x + var_y M_y) M^-1 with M = M_x + M_y = D^T W D. It knows nothing of errors that
 # all pixels share (geometry, gamma of the display, motion of the film): those are the Monte Carlo's.
 
-
 QUANTISATION_VARIANCE_ADU2 = 1 / 12  # of a value rounded to an integer
 
 

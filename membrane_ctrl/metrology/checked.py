@@ -15,9 +15,9 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, motion, reconstruct
 from membrane_ctrl.metrology.frames import evidence, frame_stack, integrity
 from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.orders import Orders, gray_bit, orders
-from membrane_ctrl.metrology.phase import AXES, centre_phase_rad, mm_per_rad
-from membrane_ctrl.model.arrays import BoolArray, FloatArray
+from membrane_ctrl.metrology.orders import gray_bit, orders
+from membrane_ctrl.metrology.phase import AXES, centre_phase_rad, inside_pattern, mm_per_rad
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 from membrane_ctrl.model.shape_estimate import RESIDUAL_REJECTED_URAD, Verdict
 
 _ROUNDS = 8
@@ -57,7 +57,12 @@ class Checked:
         """What the frames alone say: "ok", or "degraded" with what was done about the bad ones."""
         if not self.flags:
             return "ok", ""
-        return "degraded", f"{len(self.flags)} frame(s) flagged; the figure is made without what they spoil"
+        return "degraded", f"{len(self.flags)} frame(s) flagged; the figure leaves out what they spoil"
+
+    def places_px(self, index: IntArray) -> FloatArray:
+        """Column and row (2, n) of bins' centres."""
+        row, column = np.divmod(index, self.phase_rad.shape[2])
+        return self.binned.bin_px * np.stack([column, row]) + (self.binned.bin_px - 1) / 2
 
     def anchor(self) -> Anchor:
         """For the sets that lean on this one."""
@@ -81,14 +86,7 @@ def vertex_z_mm(optics: OpticsConfig, displacement_um: float) -> float:
 def check(stack: frame_stack.FrameStack, optics: OpticsConfig, anchor: Anchor | None = None) -> Checked:
     """Check the frames and fit the bins. Raises RejectedSetError if the frames do not give a figure.
 
-    Parameters
-    ----------
-    stack : FrameStack
-        The frames.
-    optics : OpticsConfig
-        Of the set; `camera.bits` tells saturation.
-    anchor : Anchor, optional
-        For a set without Gray code: where its fringe orders come from.
+    `anchor` gives a set without Gray code its fringe orders; `camera.bits` of the optics tells saturation.
     """
     binned = frame_stack.bin_frames(stack, 2**optics.camera.bits - 1)
     try:
@@ -179,7 +177,8 @@ def _check(
             stack, binned = stack.reordered(order), binned.reordered(order)
             known |= {flag.frame: flag for flag in flags if flag.frame in (pair.frame, pair.swapped_with)}
             continue
-        chosen = {flag.frame: flag for flag in _to_leave_out(stack, fresh)}
+        # the worst sinusoid may be all that is wrong with the others' predictions
+        chosen = {flag.frame: flag for flag in _of_sinusoids(stack, fresh)[:1] or fresh}
         known |= chosen
         excluded |= set(chosen)
     reason = "the frames do not agree, whichever are left out"
@@ -212,18 +211,20 @@ def _attempt(
     candidates = np.flatnonzero(near)
     flat = phase.reshape(2, -1)[:, candidates]
     state = motion.establish(grid, tracer, candidates, flat, optics.pattern, optics.mirror.analysis_radius_mm)
-    return _Attempt(view, phase, tracer, state, _scene(tracer, state, view, optics))
+    predicted = tracer.predict_screen(state.points, state.surface) / mm_per_rad(optics.pattern)
+    light = view.light.reshape(-1)[state.index]
+    at = predicted + centre_phase_rad(optics.pattern)
+    scene = evidence.SampledBins(state.index, light, at, state.sensitivity_rad_per_um)
+    return _Attempt(view, phase, tracer, state, scene)
+
+
+def _of_sinusoids(stack: frame_stack.FrameStack, flags: list[integrity.Flag]) -> list[integrity.Flag]:
+    return [flag for flag in flags if stack.patterns[flag.frame].role == "sin"]
 
 
 def _believable(stack: frame_stack.FrameStack, flags: list[integrity.Flag]) -> list[integrity.Flag]:
     """While sinusoids are wrong so may be the prediction: then only they are named."""
-    return [flag for flag in flags if stack.patterns[flag.frame].role == "sin"] or flags
-
-
-def _to_leave_out(stack: frame_stack.FrameStack, fresh: list[integrity.Flag]) -> list[integrity.Flag]:
-    """The worst sinusoid, which may be all that is wrong with the others' predictions; else all that are flagged."""
-    sinusoids = [flag for flag in fresh if stack.patterns[flag.frame].role == "sin"]
-    return sinusoids[:1] or fresh
+    return _of_sinusoids(stack, flags) or flags
 
 
 def _merged(flags: list[integrity.Flag], known: dict[int, integrity.Flag]) -> tuple[integrity.Flag, ...]:
@@ -242,21 +243,13 @@ def _absolute(
     """Absolute phases of the bins, (2, rows, columns); NaN where not valid."""
     if anchor is not None:
         return _followed(view, anchor)
-    limit = math.pi * optics.pattern.periods
     out = np.empty_like(view.phase_rad)
     for k, axis in enumerate(AXES):
-        found = _axis_orders(stack, binned, view, axis, k)
-        inside = np.abs(found.phase_rad - centre_phase_rad(optics.pattern)) <= limit
-        out[k] = np.where(inside, found.phase_rad, np.nan)
+        # half the light is the fringes' own mean, which no single frame can spoil
+        bits = binned.means[stack.gray(axis)] > view.light
+        phase = orders(view.phase_rad[k], bits, view.mask).phase_rad
+        out[k] = np.where(inside_pattern(phase, optics.pattern), phase, np.nan)
     return out
-
-
-def _axis_orders(
-    stack: frame_stack.FrameStack, binned: frame_stack.Binned, view: evidence.BinView, axis: str, k: int
-) -> Orders:
-    """Gray bits against half the light: the fringes' own mean, which no single frame can spoil."""
-    bits = binned.means[stack.gray(axis)] > view.light
-    return orders(view.phase_rad[k], bits, view.mask)
 
 
 def _followed(view: evidence.BinView, anchor: Anchor) -> FloatArray:
@@ -269,18 +262,6 @@ def _followed(view: evidence.BinView, anchor: Anchor) -> FloatArray:
             f"the phase moved by half a period from the reference at {lost:.0%} of the points"
         )
     return np.where(seen, anchor.phase_rad + change, np.nan)
-
-
-def _scene(
-    tracer: reconstruct.Tracer, state: motion.TrackedPoints, view: evidence.BinView, optics: OpticsConfig
-) -> evidence.SampledBins:
-    phase = tracer.predict_screen(state.points, state.surface) / mm_per_rad(optics.pattern)
-    return evidence.SampledBins(
-        state.index,
-        view.light.reshape(-1)[state.index],
-        phase + centre_phase_rad(optics.pattern),
-        state.sensitivity_rad_per_um,
-    )
 
 
 def _confirm_orders(

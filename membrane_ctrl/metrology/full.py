@@ -1,15 +1,14 @@
 """The full result of a checked set: slopes at every pixel, robust fit, and the zonal map of what the fit leaves."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology import bins, phase, phasor, reconstruct, zonal
+from membrane_ctrl.metrology import bins, motion, phase, phasor, reconstruct, zonal
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.frames.frame_stack import PixelPhases, pixel_phases
-from membrane_ctrl.metrology.motion import combine_steps, sensitivity_mm_per_um, worth_correcting
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
@@ -77,10 +76,10 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     del row, column
     points.t_mm[:] = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / points.rays[2]
     tracer.intersect(points, surface, newton=4)
-    moved = worth_correcting(stack.readings_um, LASER_NOISE_UM)
+    moved = motion.worth_correcting(stack.readings_um, LASER_NOISE_UM)
     sensitivity = np.zeros((2, index.size))
     if moved:
-        sensitivity = sensitivity_mm_per_um(tracer, points, surface) / phase.mm_per_rad(optics.pattern)
+        sensitivity = motion.sensitivity_mm_per_um(tracer, points, surface) / phase.mm_per_rad(optics.pattern)
     axes = [_axis_phases(optics, checked, k, index, in_bin, sensitivity[k] if moved else None) for k in range(2)]
     points.screen_mm[:] = phase.screen_mm(np.stack([a.phase_rad for a in axes]), optics.pattern)
     swing = np.minimum(axes[0].swing_adu, axes[1].swing_adu)
@@ -109,17 +108,13 @@ def _axis_phases(
     sensitivity: FloatArray | None,
 ) -> PixelPhases:
     stack, used = checked.stack, checked.view.used[axis]
-    shifts = stack.shifts_rad(used)
-    motion = None
-    if sensitivity is not None:
-        motion = stack.displacement_um[used] - stack.mean_reading_um
-    combined = combine_steps(phase.step_weights(shifts), shifts, 1, motion)
+    combined = _combination(checked, axis, sensitivity is not None)
     every = stack.sinusoids(phase.AXES[axis])
     # a slice is no copy of the frames; a list is
     frames = stack.frames[every[0] : every[-1] + 1] if used == every else stack.frames[used]
     slope = np.zeros(index.size) if sensitivity is None else sensitivity
     reference = checked.phase_rad[axis].reshape(-1)[in_bin]
-    return pixel_phases(frames, shifts, combined, index, slope, reference, 2**optics.camera.bits - 1)
+    return pixel_phases(frames, stack.shifts_rad(used), combined, index, slope, reference, 2**optics.camera.bits - 1)
 
 
 def reconstruct_full(
@@ -150,12 +145,8 @@ def reconstruct_full(
     field = tracer.slope_field(points, fit.surface)
     seen = np.hypot(field[2] - field[4], field[3] - field[5]) < _NO_SLOPE
     grid = zonal.residual_grid(field, seen.astype(float), optics.mirror.analysis_radius_mm)
-    changes = (*rough.changes_mm, *first.changes_mm, *fit.changes_mm)
-    whole = reconstruct.Fit(
-        fit.surface, fit.normal, changes, fit.converged, fit.residual_x, fit.residual_y, fit.weight_sum
-    )
     return FullResult(
-        fit=whole,
+        fit=replace(fit, changes_mm=(*rough.changes_mm, *first.changes_mm, *fit.changes_mm)),
         index=pixels.index,
         field=field,
         weights=points.weights,
@@ -163,7 +154,7 @@ def reconstruct_full(
         rest_adu=pixels.rest_adu,
         grid=grid,
         residual_mm=zonal.integrate(grid),
-        quality=_quality(optics, checked, pixels, fit),
+        quality=_quality(optics, checked, fit, float(np.median(pixels.swing_adu))),
         moved=pixels.moved,
     )
 
@@ -175,13 +166,13 @@ def tukey(residual: FloatArray) -> FloatArray:
     return np.asarray(np.square(np.maximum(1 - np.square(residual / reach), 0.0)))
 
 
-def _quality(optics: OpticsConfig, checked: Checked, pixels: PixelPoints, fit: reconstruct.Fit) -> Quality:
+def _quality(optics: OpticsConfig, checked: Checked, fit: reconstruct.Fit, swing_adu: float) -> Quality:
     area = math.pi * optics.mirror.analysis_radius_mm**2
     used = [k for axis in checked.view.used for k in axis]
     saturated = checked.binned.saturated[used].any(axis=0) & checked.near
     seen = (checked.view.mask & checked.near) | saturated
     return Quality(
-        modulation_share=float(np.median(pixels.swing_adu)) / (2**optics.camera.bits - 1),
+        modulation_share=swing_adu / (2**optics.camera.bits - 1),
         saturated_fraction=float(np.mean(saturated[seen])) if seen.any() else 0.0,
         valid_fraction=min(1.0, float(np.sum(checked.state.area_mm2)) / area),
         residual_urad=1e6 * math.hypot(fit.residual_x, fit.residual_y) / math.sqrt(2),
@@ -189,9 +180,8 @@ def _quality(optics: OpticsConfig, checked: Checked, pixels: PixelPoints, fit: r
     )
 
 
-# The figure of a checked set from its bins: what every analysis of many sets uses.
-#
-# For 36 terms the bins carry all that the pixels do, at a sixteenth of the cost (decision 41).
+# The figure of a checked set from its bins, for the analysis of many sets: for 36 terms the bins carry all that the
+# pixels do, at a sixteenth of the cost (decision 41).
 
 
 @dataclass(frozen=True)
@@ -209,7 +199,7 @@ class BinFigure:
 def bin_figure(optics: OpticsConfig, checked: Checked) -> BinFigure:
     """Phases of the bins with the film's motion taken out, and the surface fitted to them."""
     stack, state = checked.stack, checked.state
-    moved = worth_correcting(stack.readings_um, LASER_NOISE_UM)
+    moved = motion.worth_correcting(stack.readings_um, LASER_NOISE_UM)
     sums = [checked.binned.means[used].reshape(len(used), -1) for used in checked.view.used]
     steps = [_combination(checked, axis, moved) for axis in range(len(phase.AXES))]
     followed = np.empty_like(state.accepted)
@@ -224,7 +214,7 @@ def bin_figure(optics: OpticsConfig, checked: Checked) -> BinFigure:
     noise = bins.pixel_sigma_adu(optics.camera.noise_adu) / checked.binned.bin_px
     shifts = [stack.shifts_rad(used) for used in checked.view.used]
     sigma = np.stack([phase.phase_sigma_rad(d, noise, 1.0) / b for d, b in zip(shifts, swing, strict=True)])
-    quality = _quality_of_bins(optics, checked, fit, float(np.median(swing.min(axis=0))))
+    quality = _quality(optics, checked, fit, float(np.median(swing.min(axis=0))))
     return BinFigure(fit, points, state.index, scale * sigma, quality, moved)
 
 
@@ -233,18 +223,4 @@ def _combination(checked: Checked, axis: int, moved: bool) -> phasor.StepCombina
     used = checked.view.used[axis]
     shifts = checked.stack.shifts_rad(used)
     motion_um = checked.stack.displacement_um[used] - checked.stack.mean_reading_um if moved else None
-    return combine_steps(phase.step_weights(shifts), shifts, 1, motion_um)
-
-
-def _quality_of_bins(optics: OpticsConfig, checked: Checked, fit: reconstruct.Fit, swing_adu: float) -> Quality:
-    used = [k for axis in checked.view.used for k in axis]
-    saturated = checked.binned.saturated[used].any(axis=0) & checked.near
-    seen = (checked.view.mask & checked.near) | saturated
-    area = math.pi * optics.mirror.analysis_radius_mm**2
-    return Quality(
-        modulation_share=swing_adu / (2**optics.camera.bits - 1),
-        saturated_fraction=float(np.mean(saturated[seen])) if seen.any() else 0.0,
-        valid_fraction=min(1.0, float(np.sum(checked.state.area_mm2)) / area),
-        residual_urad=1e6 * math.hypot(fit.residual_x, fit.residual_y) / math.sqrt(2),
-        converged=fit.converged,
-    )
+    return motion.combine_steps(phase.step_weights(shifts), shifts, 1, motion_um)

@@ -111,7 +111,7 @@ class LiveReconstructor:
         self._binner.add(frames, range(len(frames)), watched=sinusoids)
         optics = self._optics
         images = self._binner.sums.reshape(self._slots.count, -1)[:, self._near] / self._bin_px**2
-        phase_rad = phase.decode_full(images, optics.pattern, self._shifts_rad).phase_rad
+        phase_rad = phase.decode_full(images, optics.pattern, self._shifts_rad)
         phase_rad[:, self._binner.saturated.ravel()[self._near] > 0] = np.nan
         times, readings = times[sinusoids], readings[sinusoids]
         self._tracked = None  # until this cycle is accepted
@@ -187,9 +187,8 @@ class LiveReconstructor:
     ) -> ShapeEstimate:
         """Phases of the points against the last accepted ones, and the figure from them."""
         self._track_phases(state, readings)
-        modulation_adu = float(
-            np.median(state.fresh[:, 4, ::16])
-        )  # every 16th point: the median costs more than the fit
+        # every 16th point: the median costs more than the fit
+        modulation_adu = float(np.median(state.fresh[:, 4, ::16]))
         saturated = self._binner.saturated.ravel()[state.index] > 0
         usable = ~saturated & (state.fresh[:, 4].min(axis=0) > phase.FRINGE_SHARE * modulation_adu)
         if reason := _lost(state.fresh[:, 3], usable):

@@ -73,7 +73,6 @@ def sensitivity_mm_per_um(
 
 # The points that a full cycle hands on to the fringes-only cycles after it, and all that is known of each.
 
-
 _START_SAG_MM = 40.0  # the paper's starting parabola; any other leads to the same end
 _OUTLIER_SIGMAS = 8.0  # of the slopes' robust scatter: dust and glints, never noise
 _MIN_POINTS = 1000  # far more than 36 unknowns, far fewer than any real view of the mirror

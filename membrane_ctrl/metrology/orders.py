@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.metrology.optics.compiled import kernel
-from membrane_ctrl.metrology.phase import absolute_phase
+from membrane_ctrl.metrology.phase import absolute_phase, code_orders
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 # Wrapped phase made continuous over a mask by walking from neighbour to neighbour.
@@ -105,9 +105,7 @@ def orders(wrapped_rad: FloatArray, bits: BoolArray, mask: BoolArray) -> Orders:
     mask : (H, W) bool array
         Pixels that see the pattern.
     """
-    binary = np.bitwise_xor.accumulate(bits.astype(np.int64), axis=0)
-    k1 = 4 * binary[0] + 2 * binary[1] + binary[2]
-    coded = absolute_phase(wrapped_rad, k1, (2 * k1 + binary[3] + 1) // 2)
+    coded = absolute_phase(wrapped_rad, *code_orders(bits))
     smooth, region = unwrap_regions(wrapped_rad, mask)
     if tear_share(smooth) > _TORN_SHARE:
         return Orders(np.where(mask, coded, np.nan), 1.0, torn=True)

@@ -20,19 +20,10 @@ from membrane_ctrl.model.arrays import ArrayLike, BoolArray, ComplexArray, Float
 
 
 def step_weights(shifts_rad: Sequence[float] | FloatArray) -> FloatArray:
-    """Rows that turn the N intensities of a pixel into A, C and S.
+    """Rows (3, N) that turn the N intensities of a pixel into A, C and S: pseudo-inverse of [1, cos d, -sin d].
 
-    Raises ValueError if the steps do not determine a phase (fewer than three different ones on the circle).
-
-    Parameters
-    ----------
-    shifts_rad : (N,) array
-        Phase step of each frame, N >= 3, in any order and spacing.
-
-    Returns
-    -------
-    (3, N) array
-        Pseudo-inverse of the columns [1, cos d, -sin d].
+    The phase steps (N,) may have any order and spacing. Raises ValueError if they do not determine a phase (fewer
+    than three different ones on the circle).
     """
     shifts = np.asarray(shifts_rad, float)
     design = np.stack([np.ones_like(shifts), np.cos(shifts), -np.sin(shifts)], axis=1)
@@ -48,23 +39,13 @@ def equal_shifts(steps: int) -> FloatArray:
 
 
 def phasors(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> ComplexArray:
-    """Phasor C + iS per pixel from a stack of frames (N, ...)."""
+    """Phasor C + iS per pixel from a stack of frames (N, ...): its angle is the phase, its length the amplitude B."""
     stack = np.asarray(frames, float)
     _, cosine, sine = step_weights(shifts_rad)
     out = np.empty(stack.shape[1:], np.complex128)
     out.real = np.einsum("k,k...->...", cosine, stack)
     out.imag = np.einsum("k,k...->...", sine, stack)
     return out
-
-
-def wrapped_phase(phasor: ComplexArray) -> FloatArray:
-    """Phase in (-pi, pi] of C + iS."""
-    return np.angle(phasor)
-
-
-def modulation(phasor: ComplexArray) -> FloatArray:
-    """Fringe amplitude B in the units of the frames."""
-    return np.abs(phasor)
 
 
 def step_residual(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> FloatArray:
@@ -109,11 +90,14 @@ def gray_orders(gray: ArrayLike, white: ArrayLike, black: ArrayLike) -> tuple[In
         floor(s / T) from bits 1-3 and floor((V2 + 1) / 2) from all four, V2 = floor(2 s / T).
     """
     threshold = (np.asarray(white, float) + np.asarray(black, float)) / 2
-    bits = (np.asarray(gray, float) > threshold).astype(np.int64)
-    binary = np.bitwise_xor.accumulate(bits, axis=0)  # Gray to binary: each bit is the xor of all above it
+    return code_orders(np.asarray(gray, float) > threshold)
+
+
+def code_orders(bits: BoolArray) -> tuple[IntArray, IntArray]:
+    """The same from the bits (4, ...)."""
+    binary = np.bitwise_xor.accumulate(bits.astype(np.int64), axis=0)  # each bit is the xor of all above it
     k1 = 4 * binary[0] + 2 * binary[1] + binary[2]
-    v2 = 2 * k1 + binary[3]
-    return k1, (v2 + 1) // 2
+    return k1, (2 * k1 + binary[3] + 1) // 2
 
 
 def absolute_phase(wrapped_rad: FloatArray, k1: IntArray, k2: IntArray) -> FloatArray:
@@ -147,7 +131,6 @@ def inside_pattern(absolute_rad: FloatArray, pattern: PatternConfig) -> BoolArra
 # A full cycle is, for x and then for y, N sinusoids and 4 Gray-code bits, then white and black: 18 images for N = 4.
 # A fringes-only cycle is the 2 N sinusoids, x first.
 
-
 GRAY_BITS = 4  # 16 half periods: enough for the 8 periods a configuration may ask for
 AXES = ("x", "y")
 
@@ -171,9 +154,6 @@ def full_sequence(pattern: PatternConfig) -> tuple[Pattern, ...]:
 def fringe_sequence(pattern: PatternConfig) -> tuple[Pattern, ...]:
     """The images of a fringes-only cycle: 2 N."""
     return tuple(image for axis in AXES for image in sinusoids(axis, pattern.steps))
-
-
-# A full cycle's images to absolute phases: the paper's section 2.2 on any stack, of pixels or of bins.
 
 
 # A pixel sees the screen in the mirror if white differs from black by this share of what the bright pixels show;
@@ -216,24 +196,11 @@ class FullSlots:
         return self.black + 1
 
 
-@dataclass(frozen=True)
-class Decoded:
-    """Absolute phases of a full cycle."""
+def decode_full(images: FloatArray, pattern: PatternConfig, shifts_rad: FloatArray) -> FloatArray:
+    """Absolute phases of x and y (2, ...), counted from the low edge's -pi; NaN where the pattern is not seen.
 
-    phase_rad: FloatArray  # (2, ...): x and y, counted from the low edge's -pi (see `unwrap`); NaN where not valid
-    modulation_adu: FloatArray  # (2, ...): fringe amplitude
-    valid: BoolArray  # (...): pixels that see the pattern in the mirror
-
-
-def decode_full(images: FloatArray, pattern: PatternConfig, shifts_rad: FloatArray) -> Decoded:
-    """Decode the images of a full cycle (2 (N + 4) + 2, ...), in `patterns.full_sequence`'s order.
-
+    `images` (2 (N + 4) + 2, ...) are in the order of `full_sequence`, `shifts_rad` (2, N) the phase steps of x and y.
     Raises ValueError if there are more or fewer images.
-
-    Parameters
-    ----------
-    shifts_rad : (2, N) array
-        Phase steps of x and y.
     """
     slots = FullSlots(pattern.steps)
     if len(images) != slots.count:
@@ -241,15 +208,10 @@ def decode_full(images: FloatArray, pattern: PatternConfig, shifts_rad: FloatArr
     white, black = images[slots.white], images[slots.black]
     contrast = white - black
     valid = contrast > CONTRAST_SHARE * np.percentile(contrast, 95)
-    phases, swings = [], []
+    phases = []
     for sinusoids, gray, shifts in zip(slots.sinusoids, slots.gray, shifts_rad, strict=True):
         z = phasors(images[sinusoids], shifts)
         k1, k2 = gray_orders(images[gray], white, black)
-        phase = absolute_phase(wrapped_phase(z), k1, k2)
-        swing = modulation(z)
-        valid &= (swing > FRINGE_SHARE * contrast) & inside_pattern(phase, pattern)
-        phases.append(phase)
-        swings.append(swing)
-    absolute = np.stack(phases)
-    absolute[:, ~valid] = np.nan
-    return Decoded(absolute, np.stack(swings), valid)
+        phases.append(absolute_phase(np.angle(z), k1, k2))
+        valid &= (np.abs(z) > FRINGE_SHARE * contrast) & inside_pattern(phases[-1], pattern)
+    return np.where(valid, np.stack(phases), np.nan)

@@ -68,10 +68,6 @@ class NormalMatrix:
         """(D^T W D)^-1 times `right`."""
         return np.asarray(self.inverse @ right)
 
-    def condition(self) -> float:
-        """Condition number of D^T W D."""
-        return float(np.linalg.cond(self.x + self.y))
-
 
 def _assemble(products: FloatArray, radius_mm: float) -> tuple[FloatArray, FloatArray]:
     count = kernels.PRODUCT_MONOMIALS

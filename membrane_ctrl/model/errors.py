@@ -1,7 +1,9 @@
 """Errors that end a command with one line and an exit code (INTERFACES section 4)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from enum import IntEnum
+from pathlib import Path
 
 
 class Exit(IntEnum):
@@ -57,3 +59,12 @@ class DeviceError(CommandError):
 def os_reason(error: OSError) -> str:
     """What the operating system says, for use within a sentence."""
     return (error.strerror or str(error)).lower()
+
+
+@contextmanager
+def writing(target: Path, kind: type[CommandError] = InputError, remedy: str = "") -> Iterator[None]:
+    """Turn an OSError of the block, which writes `target`, into a command's error with the reason and a remedy."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{target}: cannot be written ({os_reason(error)}){remedy}") from None

@@ -10,14 +10,15 @@ import contextlib
 import signal
 import sys
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TextIO, cast
+from typing import TYPE_CHECKING, Any, TextIO, TypeVar, cast
 
 if TYPE_CHECKING:  # a command that draws no table need not load it
     from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderableType, RenderResult
 
 
+_T = TypeVar("_T")
 # control, invisible and direction marks, surrogates, and two line ends that terminals do not show
 _REFUSED = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 _KEPT = frozenset("\n\t")
@@ -52,6 +53,17 @@ def table_console(stderr: bool = False, width: int | None = None) -> Console:
     made = Console(stderr=stderr, width=width)
     made.push_render_hook(_Cells())  # type: ignore[arg-type]  # its base class is Rich's, loaded here only
     return made
+
+
+def counted(items: Iterable[_T], what: str, total: int | None = None) -> Iterable[_T]:
+    """The items, with a bar on stderr while they are taken, if that is a terminal."""
+    from rich.progress import track
+
+    rich, on = table_console(stderr=True), sys.stderr.isatty()
+    rich.file = getattr(
+        sys.stderr, "rich_proxied_file", sys.stderr
+    )  # while it draws, Rich stands in front of `_Text`
+    return track(items, what, total, console=rich, transient=True, disable=not on)
 
 
 class Plain:

@@ -83,7 +83,7 @@ def _entry_or_why(folder: Path) -> RunEntry:
     try:
         return entry(folder)
     except OSError as error:
-        began, why = origin_of(folder, ()), f"cannot be read ({(error.strerror or str(error)).lower()})"
+        began, why = origin_of(folder, ()), f"cannot be read ({errors.os_reason(error)})"
         nan = math.nan
         return RunEntry(folder, began, nan, nan, nan, 0, why, nan, nan, "", nan, 0, False)
 
@@ -161,7 +161,7 @@ def prune(runs: Sequence[disk_budget.OldRun]) -> dict[Path, str]:
         try:
             disk_budget.delete_run(run)
         except OSError as error:
-            stay[run.folder] = error.strerror or str(error)
+            stay[run.folder] = errors.os_reason(error)
     return stay
 
 

@@ -74,7 +74,7 @@ def report(
     json: JsonOption = False,
 ) -> int:
     """Write the stability report of a run: one HTML page and its figures as JSON."""
-    from membrane_ctrl.review.report.command import report_command
+    from membrane_ctrl.review.report.html import report_command
 
     return report_command(run, out, compare, start, end, json)
 

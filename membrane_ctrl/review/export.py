@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
-from membrane_ctrl.model.errors import DeviceError, InputError
+from membrane_ctrl.model import errors
 from membrane_ctrl.model.files import make_folder, move, scratch_folder, write_text_atomic
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.run_files.column_file import FOLDER
@@ -26,7 +26,7 @@ def refuse_originals(folder: Path) -> None:
     folder = folder.resolve()
     at = folder.parent if folder.name == FOLDER else folder
     if (at / "config.toml").exists() or any(at.glob("*.rrd")) or any(at.glob(f"{FOLDER}/*.arrows")):
-        raise InputError(f"{folder}: this folder holds the recorder's files; choose another folder")
+        raise errors.InputError(f"{folder}: this folder holds the recorder's files; choose another folder")
 
 
 FORMATS = ("parquet", "csv", "hdf5")
@@ -55,10 +55,10 @@ def export(
         Part of the run.
     """
     if to not in FORMATS:
-        raise InputError(f"--to {to}: known are {', '.join(FORMATS)}")
+        raise errors.InputError(f"--to {to}: known are {', '.join(FORMATS)}")
     fields, extras = _selected(streams)
     refuse_originals(out)
-    try:
+    with errors.writing(out, errors.DeviceError):
         make_folder(out)
         # beside what is there already, so that an export that fails leaves that alone
         with scratch_folder(out, ".export-") as folder:
@@ -66,8 +66,6 @@ def export(
             for path in files:
                 move(path, out / path.name)
             return [out / path.name for path in files]
-    except OSError as error:
-        raise DeviceError(f"{out}: cannot be written ({(error.strerror or str(error)).lower()})") from None
 
 
 def _files(
@@ -99,8 +97,8 @@ def _say_if_missing(run: Run, telemetry: bool) -> None:
         run.notes.append("no telemetry in this part of the run: no ticks are exported")
 
 
-def _nothing(run: Run) -> InputError:
-    return InputError("; ".join((f"{run.folder}: nothing to export of what is wanted", *run.notes)))
+def _nothing(run: Run) -> errors.InputError:
+    return errors.InputError("; ".join((f"{run.folder}: nothing to export of what is wanted", *run.notes)))
 
 
 def shape_table(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> pa.Table:
@@ -129,7 +127,7 @@ def _selected(streams: Sequence[str]) -> tuple[tuple[str, ...], set[str]]:
         elif name in by_path:
             fields += by_path[name]
         else:
-            raise InputError(
+            raise errors.InputError(
                 f"--streams {name}: known are {', '.join([*by_path, SHAPES, EVENTS])} and telemetry fields"
             )
     return (tuple(dict.fromkeys(["mono_s", *fields])) if fields else ()), extras
@@ -157,7 +155,7 @@ def _hdf5(
     try:
         import h5py
     except ImportError:
-        raise InputError(f"--to {to} needs h5py: pip install 'membrane-ctrl[sofast]'") from None
+        raise errors.InputError(f"--to {to} needs h5py: pip install 'membrane-ctrl[sofast]'") from None
     with h5py.File(path, "w") as file:
         file.attrs["run"] = run.name
         file.attrs["started_utc"] = run.origin_utc.isoformat()

@@ -66,7 +66,7 @@ def prune_command(logs: Path, keep_days: float | None, keep_gb: float | None, de
         freed_mb = sum(run.size_bytes for run, _ in gone) / 1e6
         print(f"{len(gone)} runs, {freed_mb:.0f} MB" + ("" if delete or not gone else "; --delete deletes them"))
     for folder, why in stay.items():
-        print(f"{folder}: cannot be deleted ({why.lower()}); check its permissions", file=sys.stderr)
+        print(f"{folder}: cannot be deleted ({why}); check its permissions", file=sys.stderr)
     return errors.Exit.DEVICE_FAILED if stay else 0
 
 

@@ -7,7 +7,7 @@ import types
 from dataclasses import dataclass, fields, is_dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Protocol, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
@@ -134,6 +134,11 @@ class SessionFolder:
             raise errors.InputError(f"{self.file('candidates.md')}: damaged; repeat the step design")
         return text
 
+    def result(self, step: str, name: str, kind: type[T]) -> T:
+        """What a step left in a file. Raises InputError if the step is not done, or the file is damaged."""
+        self.require(step)
+        return read(self.file(name), kind)
+
     def done(self, step: str) -> bool:
         """The step has left its result."""
         return self.file(FILES[step][0]).exists()
@@ -151,11 +156,13 @@ class SessionFolder:
                 try:
                     self.file(name).unlink(missing_ok=True)
                 except OSError as error:  # a folder in its place
-                    raise errors.InputError(f"{self.file(name)}: cannot be removed: {error.strerror}") from None
+                    raise errors.InputError(
+                        f"{self.file(name)}: cannot be removed ({errors.os_reason(error)})"
+                    ) from None
 
 
 def fresh_folder(parent: Path, name: str, now: datetime) -> Path:
-    """Make `<UTC>-<name>` in a folder. Raises InputError for a bad name, DeviceError if it cannot be made."""
+    """Make `<UTC>-<name>` in a folder; errors as `begin_session`."""
     if not _NAME.fullmatch(name):
         raise errors.InputError(
             f"session name {name!r}: use letters, digits, '.', '-' and '_' (at most 64, no '.' in front)"
@@ -173,37 +180,61 @@ def fresh_folder(parent: Path, name: str, now: datetime) -> Path:
     raise errors.DeviceError(f"{parent}: has a thousand sessions {stem} already")
 
 
+class Head(Protocol):
+    """What the `session.json` of every kind of session has."""
+
+    @property
+    def format(self) -> str:
+        """Kind of session, and version."""
+        ...
+
+    @property
+    def created_utc(self) -> str:
+        """ISO 8601."""
+        ...
+
+
+H = TypeVar("H", bound=Head)
+
+
+def begin_session(parent: Path, name: str, head: Head, config: schema.Config) -> Path:
+    """Make the folder of a session. Raises InputError for a bad name, DeviceError if it cannot be written."""
+    path = fresh_folder(parent, name, datetime.fromisoformat(head.created_utc))
+    with errors.writing(path, errors.DeviceError):
+        files.write_text_atomic(path / "config.toml", toml_file.dump(config))
+        write(path / "session.json", head)
+    return path
+
+
+def read_session(path: Path, kind: type[H], known: str) -> tuple[H, schema.Config]:
+    """Head and configuration of a session of the `known` format. Raises InputError if it is none."""
+    head = read(path / "session.json", kind)
+    if head.format != known:
+        raise errors.InputError(f"{path}/session.json: format {head.format!r}, {known!r} is known")
+    return head, toml_file.load(path / "config.toml", schema.Config)
+
+
+def now_utc() -> str:
+    """ISO 8601, to the second."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
 def create_session(
     logs: Path, name: str, author: str, source: str, config: schema.Config, before: schema.LoopConfig
 ) -> SessionFolder:
-    """Make a session's folder. Raises InputError for a bad name, DeviceError if it cannot be written."""
-    now = datetime.now(UTC)
-    path = fresh_folder(logs / "tuning", name, now)
-    head = SessionHead(FORMAT, name, author, source, now.isoformat(timespec="seconds"), before)
-    try:
-        write(path / "session.json", head)
-        files.write_text_atomic(path / "config.toml", toml_file.dump(config))
-    except OSError as error:
-        raise errors.DeviceError(f"{logs}: cannot be written ({errors.os_reason(error)})") from None
-    return SessionFolder(path, head, config)
+    """Begin a tuning session; errors as `begin_session`."""
+    head = SessionHead(FORMAT, name, author, source, now_utc(), before)
+    return SessionFolder(begin_session(logs / "tuning", name, head, config), head, config)
 
 
 def open_session(path: Path) -> SessionFolder:
-    """An existing session. Raises InputError if it is none."""
-    head = read(path / "session.json", SessionHead)
-    if head.format != FORMAT:
-        raise errors.InputError(f"{path}/session.json: format {head.format!r}, {FORMAT!r} is known")
-    return SessionFolder(path, head, toml_file.load(path / "config.toml", schema.Config))
-
-
-def sessions_in(logs: Path) -> list[Path]:
-    """All session folders, oldest first."""
-    return sorted(path.parent for path in (logs / "tuning").glob("*/session.json"))
+    """An existing tuning session. Raises InputError if it is none."""
+    return SessionFolder(path, *read_session(path, SessionHead, FORMAT))
 
 
 def newest_session(logs: Path) -> SessionFolder:
     """The one to go on with. Raises InputError if there is none."""
-    found = sessions_in(logs)
-    if not found:
+    found = max((logs / "tuning").glob("*/session.json"), default=None)
+    if found is None:
         raise errors.InputError(f"{logs / 'tuning'}: no session yet; begin with `membrane-ctrl tune characterise`")
-    return open_session(found[-1])
+    return open_session(found.parent)

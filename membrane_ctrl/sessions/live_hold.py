@@ -14,6 +14,7 @@ from typing import Protocol
 
 from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.control_port.client import PortClient
+from membrane_ctrl.control_port.ctl import Where, socket_path
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model import errors, run_events, shape_estimate, telemetry
 from membrane_ctrl.model.events import Event
@@ -132,6 +133,22 @@ class LiveHold:
         self._client.close()
         for reader in self._readers.values():
             reader.close()
+
+
+@contextlib.contextmanager
+def live_hold(where: Where, take_over: bool, needs_operate: str = "") -> Iterator[LiveHold]:
+    """A link to the hold that is meant; InputError if a command that `needs_operate` may only read."""
+    socket = socket_path(where)
+    client = PortClient.unix(socket, lambda text: print(f"notice: {text}", file=sys.stderr))
+    try:
+        if needs_operate and client.greeting["role"] == "read":
+            raise errors.InputError(f"{needs_operate} takes the role operate; {client.greeting['you']} has read")
+        link = LiveHold(client, where.run or socket.parent / str(client.greeting["run"]), take_over)
+    except BaseException:
+        client.close()
+        raise
+    with contextlib.closing(link):
+        yield link
 
 
 # How far a step is and how long it will take, on stderr: a live line on a terminal, a line a minute elsewhere.

@@ -12,7 +12,6 @@ import pytest
 from live_bench import CAMERA, TRUE, LiveBench, config
 
 from membrane_ctrl.calibration import live as command
-from membrane_ctrl.calibration.live import LiveOptions
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry.file import read_geometry
@@ -34,10 +33,10 @@ def live(bench: LiveBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> l
     """The command line on the bench instead of a running hold."""
 
     @contextmanager
-    def link(_: LiveOptions) -> Iterator[LiveBench]:
+    def link(*_: object) -> Iterator[LiveBench]:
         yield bench
 
-    monkeypatch.setattr(command, "_link", link)
+    monkeypatch.setattr(command, "live_hold", link)
     return [*WORDS, "--logs", str(tmp_path / "logs")]
 
 
@@ -65,8 +64,8 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
     assert run([*live, "--range-um", "4000", "--sets", "3"]) == 130
     said = capsys.readouterr().err
     assert "3 of 3 sets from -2000 to 2000 um" in said
-    assert "such sets leave of a figure: sag +-" in said
-    assert "limits.gauge_pressure_max_pa have room for" in said
+    assert "a figure after such sets: sag +-" in said
+    assert "limits.gauge_pressure_max_pa allow" in said
     session = session_in(tmp_path)
     assert f"go on with --session {session}" in said
     assert [path.name for path in (session / "sets").iterdir()] == ["set-1"]
@@ -91,7 +90,7 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
     assert "not adopted; `membrane-ctrl calibrate --live --session" in said.err
     assert (tmp_path / "bench.toml").read_text() == OLD
 
-    monkeypatch.setattr(command, "_link", None)  # all sets are there: no hold is needed
+    monkeypatch.setattr(command, "live_hold", None)  # all sets are there: no hold is needed
     assert run([*live, "--session", str(session), "--yes"]) == 0
     said = capsys.readouterr()
     new = tomllib.loads((tmp_path / "bench.toml").read_text())
@@ -121,7 +120,7 @@ def test_a_set_that_is_bad_twice_ends_it_and_the_mirror_comes_back(
     assert run([*live, "--range-um", "1000", "--sets", "2", "--yes"]) == 3
     assert "no good set in two attempts: camera: no trigger" in capsys.readouterr().err
     assert abs(bench.hold.rows[-1].displacement_um) < 5.0
-    assert list((session_in(tmp_path) / "sets").iterdir()) == []
+    assert not list((session_in(tmp_path) / "sets").glob("*"))
 
 
 def test_a_fault_on_the_way_is_left_to_the_safety_table(
@@ -131,7 +130,7 @@ def test_a_fault_on_the_way_is_left_to_the_safety_table(
     assert run([*live, "--range-um", "1000", "--sets", "2", "--yes"]) == 4
     said = capsys.readouterr().err
     assert "the mirror is not held but in state fault (" in said
-    assert "the mirror is left to whoever has it; the shape loop is off" in said
+    assert "the mirror is left to whoever has the command; the shape loop is off" in said
     assert bench.asked[-1].value == 500.0  # on its way to the second set; nothing was asked for after the fault
 
 
@@ -165,7 +164,7 @@ def test_nothing_moves_unless_somebody_says_yes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert run(live) == 2
-    assert "say --yes" in capsys.readouterr().err
+    assert "confirm with --yes" in capsys.readouterr().err
     answer(monkeypatch, "n\n")
     assert run(live) == 2
     assert "nothing was moved" in capsys.readouterr().err

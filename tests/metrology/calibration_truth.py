@@ -11,7 +11,7 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, BenchGeometry, bench_at, sigmas
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
 from membrane_ctrl.metrology.calibrate.separable import References
-from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, surface_of
+from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, fit_on
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
@@ -110,10 +110,12 @@ def calibrated_errors_um(solution: Solution, truth: Truth, index: int = 2) -> tu
     """Of a set measured with the calibrated geometry, the vertex where the laser says, as `measure` does."""
     phases = solution.problem.sets[index]
     vertex_z_mm = -1e-3 * (phases.displacement_um - solution.problem.references.reference_um)
-    return errors_um(surface_of(solution.bench, phases, 500.0, vertex_z_mm), truth, index)
+    return errors_um(fit_on(solution.bench, phases, 500.0, vertex_z_mm).surface, truth, index)
 
 
 def stated_errors_um(truth: Truth, index: int = 2) -> tuple[float, float]:
     """Of a set measured with the stated geometry."""
     phases = truth.sets[index]
-    return errors_um(surface_of(BenchGeometry(STATED), phases, 500.0, -1e-3 * phases.displacement_um), truth, index)
+    return errors_um(
+        fit_on(BenchGeometry(STATED), phases, 500.0, -1e-3 * phases.displacement_um).surface, truth, index
+    )

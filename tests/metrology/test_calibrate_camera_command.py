@@ -59,7 +59,7 @@ def test_from_photographs_to_a_prior(bench: Path, tmp_path: Path, capsys: pytest
     assert found.noise_adu == 0.7
     focal_px = found.focal_mm / 20.7e-3
     assert abs(focal_px - TRUE.focal_px) < 5 * focal_px * report["sigmas"]["focal_relative"]
-    with pytest.raises(InputError, match="a calibrated lens is good for its own camera alone"):
+    with pytest.raises(InputError, match="a calibrated lens is valid for its own camera only"):
         prior.over(OpticsConfig())
 
 

@@ -104,13 +104,13 @@ def test_a_bumped_camera_is_named_with_its_turn() -> None:
     (finding,) = judged(yawed(0.02, 3, 4))
     assert finding.fatal
     assert finding.sets == (3, 4)
-    assert finding.says.startswith("the camera stood otherwise from set3 on: yaw +0.0")
+    assert finding.says.startswith("the camera had moved from set3 on: yaw +0.0")
 
 
 def test_a_camera_bumped_and_put_back_is_named() -> None:
     (finding,) = judged(yawed(0.02, 2))
     assert finding.fatal
-    assert finding.says.startswith("the camera stood otherwise in set2")
+    assert finding.says.startswith("the camera had moved in set2")
 
 
 def test_a_camera_that_was_moved_far_is_told_by_the_halves() -> None:
@@ -171,7 +171,7 @@ def test_sets_that_are_close_are_used_with_a_word() -> None:
     near = make(VALUES, 3, points=1500, sags_mm=(36.0, 36.5, 37.0, 37.5, 38.0))
     (finding,) = judged(near)
     assert not finding.fatal
-    assert "8 mm would know the sag better" in finding.says
+    assert "8 mm would determine the sag better" in finding.says
 
 
 def test_the_monitor_waits_for_many_cycles_and_forgives_one() -> None:

@@ -17,19 +17,19 @@ def _frames(shifts: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("steps", [3, 4, 5, 7, 12])
 def test_equal_steps(steps: int) -> None:
     z = phase.phasors(_frames(phase.equal_shifts(steps)), phase.equal_shifts(steps))
-    assert phase.wrapped_phase(z) == pytest.approx(PHASES, abs=1e-12)
-    assert phase.modulation(z) == pytest.approx(70)
+    assert np.angle(z) == pytest.approx(PHASES, abs=1e-12)
+    assert np.abs(z) == pytest.approx(70)
 
 
 def test_four_steps_are_the_papers_equation_1() -> None:
     shifts = phase.equal_shifts(4)
     i1, i2, i3, i4 = frames = _frames(shifts) + np.random.default_rng(1).normal(0, 3, (4, 100))
-    assert phase.wrapped_phase(phase.phasors(frames, shifts)) == pytest.approx(np.arctan2(i4 - i2, i1 - i3))
+    assert np.angle(phase.phasors(frames, shifts)) == pytest.approx(np.arctan2(i4 - i2, i1 - i3))
 
 
 def test_unequal_steps_in_any_order() -> None:
     shifts = np.array([4.1, 0.3, 2.2, 1.0, 5.5])
-    assert phase.wrapped_phase(phase.phasors(_frames(shifts), shifts)) == pytest.approx(PHASES, abs=1e-12)
+    assert np.angle(phase.phasors(_frames(shifts), shifts)) == pytest.approx(PHASES, abs=1e-12)
 
 
 @pytest.mark.parametrize("shifts", [[0.0, 1.0], [0.0, 0.0, np.pi, np.pi], [0.0, 2 * np.pi, 4 * np.pi, 1.0]])
@@ -49,6 +49,6 @@ def test_residual_names_the_disturbed_frame() -> None:
 @pytest.mark.parametrize("shifts", [phase.equal_shifts(4), np.array([0.0, 1.2, 2.9, 4.0])])
 def test_predicted_noise_is_the_scatter_seen(shifts: np.ndarray) -> None:
     noise = np.random.default_rng(2).normal(0, 0.5, (len(shifts), 400, 100))
-    seen = phase.wrapped_phase(phase.phasors(_frames(shifts)[:, None] + noise, shifts)) - PHASES
+    seen = np.angle(phase.phasors(_frames(shifts)[:, None] + noise, shifts)) - PHASES
     scatter = np.sqrt(np.mean(np.angle(np.exp(1j * seen)) ** 2))
     assert phase.phase_sigma_rad(shifts, 0.5, 70) == pytest.approx(scatter, rel=0.02)

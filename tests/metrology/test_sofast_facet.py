@@ -10,7 +10,7 @@ from membrane_ctrl.measure import sofast
 from membrane_ctrl.measure.sofast import SHIFTS_RAD, lit_pixels, series_of
 from membrane_ctrl.metrology.frames.closure import closure, closure_with_level, closure_with_phase
 from membrane_ctrl.metrology.frames.series_integrity import check_series, predicted_phase, unwrap
-from membrane_ctrl.metrology.phase import modulation, phasors
+from membrane_ctrl.metrology.phase import phasors
 from tests.support import sofast_facet
 from tests.support.facet import measure_on, solve_facet
 from tests.support.sofast_facet import decode, sight, wrapped_phases
@@ -145,7 +145,7 @@ def named(frames, periods, index):
     """The suspect of one frequency: by level against the next frequency for the coarsest, else by phase."""
     if index == 0:
         neighbour = frames[1]
-        level = neighbour.mean(axis=0), modulation(phasors(neighbour, SHIFTS_RAD))
+        level = neighbour.mean(axis=0), np.abs(phasors(neighbour, SHIFTS_RAD))
         return closure_with_level(frames[0], SHIFTS_RAD, *level)
     wrapped = np.angle(np.stack([phasors(steps, SHIFTS_RAD) for steps in frames]))
     return closure_with_phase(frames[index], SHIFTS_RAD, predicted_phase(wrapped, periods, index))

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.model.terminal import Plain, one_line, only_text, plain, table_console
+from membrane_ctrl.model.terminal import Plain, counted, one_line, only_text, plain, table_console
 
 # title, bell, carriage return, backspace, C1 of one byte, a line drawn backwards, an invisible tag, half a pair, NUL
 HOSTILE = "a\x1b]0;owned\x07\r\b\x9b2J\u202ebad\u2066\U000e0041\ud800\u2028\x00\x7fz"
@@ -65,6 +65,25 @@ def test_a_table_keeps_its_colours_and_loses_what_its_cells_say(monkeypatch: pyt
     for letter in ("\x1b]", "\x9b", "\x07", "\r", "\b", "\u202e"):
         assert letter not in sent
     assert "\\u001b]0;owned" in sent
+
+
+def test_a_bar_is_drawn_while_items_are_taken_and_lines_beside_it_stay_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with only_text():
+        for number in counted(iter(range(3)), "sets", 3):
+            print(one_line(f"{number}{HOSTILE}"), file=sys.stderr)
+    sent = terminal.getvalue()
+    assert "\x1b[2K" in sent  # the bar moves the cursor
+    assert "\\u001b[2K" not in sent
+    for letter in ("\x1b]", "\x9b", "\x07", "\b", "\u202e"):
+        assert letter not in sent
+
+
+def test_without_a_terminal_there_is_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
+    assert list(counted([1, 2], "sets")) == [1, 2]
+    assert capsys.readouterr() == ("", "")
 
 
 def test_what_a_live_screen_draws_is_looked_through_too() -> None:

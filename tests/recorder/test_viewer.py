@@ -13,7 +13,7 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.telemetry import unpack
 from membrane_ctrl.recorder.rerun_streams import ShapeStreams, TelemetryStreams, send_events
 from membrane_ctrl.recorder.sink import Recording
-from membrane_ctrl.review.viewer.screenshot import screenshot
+from membrane_ctrl.review.viewer.viewer import screenshot
 from tests.support.synthetic_run import rows_of, shape_of
 
 pytestmark = [

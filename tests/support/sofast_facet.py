@@ -18,7 +18,7 @@ from membrane_ctrl.measure.sofast import MM_PER_M, SHIFTS_RAD, SofastMeasurement
 from membrane_ctrl.metrology.frames.series_integrity import Unwrapped, unwrap
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.screen_face import Face
-from membrane_ctrl.metrology.phase import phasors, wrapped_phase
+from membrane_ctrl.metrology.phase import phasors
 from tests.support.facet import Sight
 
 FloatArray = NDArray[np.float64]
@@ -255,7 +255,7 @@ def wrapped_phases(
     def phases(frames: FloatArray) -> FloatArray:
         seen = frames[..., mask]
         shown = seen if response is None else response.shown_levels(seen, black, white)
-        return np.stack([wrapped_phase(phasors(steps, SHIFTS_RAD)) for steps in shown])
+        return np.stack([np.angle(phasors(steps, SHIFTS_RAD)) for steps in shown])
 
     return phases(measurement.frames_x), phases(measurement.frames_y)
 

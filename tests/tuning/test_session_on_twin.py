@@ -118,7 +118,7 @@ def edited(done: SessionFolder, **changed: float) -> None:
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"kp_per_s": 9.0, "ti_s": 0.5}, "unstable on the plant of this very file"),
+        ({"kp_per_s": 9.0, "ti_s": 0.5}, "unstable on the plant of this file"),
         ({"kp_per_s": 3.0, "ti_s": 3.0}, "sensitivity"),
         ({"kp_per_s": 99.0}, "kp_per_s"),
         ({"rate_hz": 100.0}, "rate_hz"),
@@ -141,7 +141,7 @@ def test_gains_that_are_worse_are_taken_back_by_themselves(done: SessionFolder, 
     assert codes == [Exit.DONE, Exit.REJECTED]
     verified = session.verified_of(done)
     assert not verified.kept
-    assert "times that of the gains before" in verified.reason
+    assert "times that of the previous gains" in verified.reason
     (noted,) = journal.entries(tmp_path)
     assert noted.what == "taken_back"
 

@@ -62,7 +62,7 @@ def test_a_look_passes_good_gains_and_names_what_is_wrong_with_bad_ones() -> Non
     record, _ = held(slow)
     stage = look(record, about_um, VerificationTrial(PLANT, WEATHER, LOOP, slow), 1.1)
     assert stage.growth > 1.3
-    assert "times that of the gains before" in stage.reason
+    assert "times that of the previous gains" in stage.reason
 
 
 def test_a_plant_with_less_margin_than_designed_shows_in_the_readings() -> None:

@@ -11,7 +11,6 @@ from tuning.identification.records import Record
 
 # Whether the data carry a proposal; if not, what was wrong with them and which experiment would help.
 
-
 _LOST_MAX = 0.01
 _GAIN_SIGMA_MAX = 0.10  # k beyond +-20 % (2 sigma) moves Ms and the variance by more than designs differ
 _GAIN_SIGMA_GOOD = 0.03
@@ -60,7 +59,7 @@ def judge(record: Record, identified: Identified, validation: Validation | None 
             "the bench changed in between; repeat the relay in steadier weather"
         )
     if validation is not None and validation.independence_p < _P_MIN:
-        degraded.append("the model leaves something of the flow in new data: repeat with the doublets experiment")
+        degraded.append("new residuals still follow the flow: repeat with the doublets experiment")
     verdict: Literal["ok", "degraded", "refused"] = "refused" if refused else "degraded" if degraded else "ok"
     return FitQuality(verdict, (*refused, *degraded))
 
@@ -88,7 +87,7 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
         refused.append(f"the delay is known to {sigma.delay_s:.2f} s only: run the doublets")
     refused.extend(_bent(record, identified))
     if identified.independence_p < _P_MIN:
-        degraded.append("the residuals know the flow (a saturating or sticking pump?): run the pump map")
+        degraded.append("the residuals follow the flow (a saturating or sticking pump?): run the pump map")
     if identified.whiteness_p < _P_MIN:
         degraded.append("the residuals are coloured: something periodic moves the mirror or the reading")
     return refused, degraded
@@ -117,7 +116,7 @@ TYPICAL_S = _SETTLE_S + _QUIET_S + _RELAY_S + _DOUBLETS_S + 2 * _BETWEEN_S
 
 
 class ExperimentRig(Protocol):
-    """What characterising needs: `rig.Rig` on a bench, or `hold_rig.HoldRig` on a running hold."""
+    """What characterising needs: `rig.Rig` on a bench, or `rig.HoldRig` on a running hold."""
 
     def hold(self, duration_s: float) -> Record:
         """Hold for a time."""
@@ -150,21 +149,6 @@ class Characterised:
     experiments: Experiments
     identified: Identified  # fit to all of it
     quality: FitQuality  # verdict; the doublets are predicted with a fit to the relays alone
-
-    @property
-    def around(self) -> machine.Around:
-        """Holding flow, laser noise, limits."""
-        return self.experiments.around
-
-    @property
-    def record(self) -> Record:
-        """All that was recorded."""
-        return self.experiments.record
-
-    @property
-    def finished(self) -> machine.Finished:
-        """How the last relay ended."""
-        return self.experiments.finished
 
 
 class ExperimentError(Exception):

@@ -86,16 +86,8 @@ def fit_noise(series: records.Series, dt_s: float, slow_s: float) -> Noise:
     errors = np.sqrt(np.diag(np.linalg.pinv(shares @ shares.T)) * _HANN_LOSS)
     white, fast, slow = (*intensities, 0.0, 0.0)[:3]
     white_error, fast_error, slow_error = (*errors, 0.0, 0.0)[:3]
-    return Noise(
-        math.sqrt(white),
-        float(fast),
-        float(slow),
-        slow_s,
-        float(white_error),
-        float(fast_error),
-        float(slow_error),
-        dt_s,
-    )
+    sigmas = (float(white_error), float(fast_error), float(slow_error))
+    return Noise(math.sqrt(white), float(fast), float(slow), slow_s, *sigmas, dt_s)
 
 
 def _periodogram(increments: records.Series, dt_s: float) -> tuple[records.Series, records.Series]:
@@ -116,7 +108,6 @@ def _periodogram(increments: records.Series, dt_s: float) -> tuple[records.Serie
 # gain too small (errors in variables): white noise of variance r has the variance 2 r / (1 + beta) after the
 # filter, which is taken off the diagonal of the normal equations.
 # Source: Fuller, Measurement Error Models (1987), section 2.2.
-
 
 _BLOCK_S = 0.5  # below a second a barometer's noise hides its signal; above, its events blur
 
@@ -257,6 +248,5 @@ class DisturbanceModel:
 def observe(record: records.Record, model: loop_model.PlantModel, loop: LoopConfig) -> DisturbanceModel:
     """Weather gains and noise from a quiet hold under any loop. Raises ValueError if it is too short."""
     weather = fit_weather(record, model, loop.gas_follows_air_s)
-    return DisturbanceModel(
-        fit_noise(weather.rest_um, record.dt_s, loop.gas_follows_air_s), weather.barometer, weather.air
-    )
+    rest = fit_noise(weather.rest_um, record.dt_s, loop.gas_follows_air_s)
+    return DisturbanceModel(rest, weather.barometer, weather.air)

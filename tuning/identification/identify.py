@@ -195,7 +195,6 @@ def independence(residual: records.Series, change: records.Series) -> float:
 # with dead time, lag and noise of the fit. What is left of x_above when x and t have taken their share (r) decides:
 # d = r y / r r, with the standard error sigma / |r| (Frisch and Waugh, Econometrica 1 (1933) 387).
 
-
 _SAME = 1e-6  # with two flows in the whole record, x_above is x and t but for rounding
 
 

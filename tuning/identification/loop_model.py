@@ -59,16 +59,8 @@ def driven_um(flow_um_per_s: Series, dead_time_s: float, lag_s: float, dt_s: flo
 
     From T dq/dt = v - q follows the integral of q = integral of v - T q (+ constant). The integral of a held flow is
     a broken line, so interpolating it between samples is exact for any delay. Within a sample the delayed flow
-    changes once, after the share f of the sample: q[i+1] = a q[i] + b1 v[i-m-1] + b2 v[i-m].
-
-    Parameters
-    ----------
-    flow_um_per_s : (n,) array
-        v; its first value is taken to have stood for ever.
-
-    Returns
-    -------
-    (n,) array, 0 at the first reading.
+    changes once, after the share f of the sample: q[i+1] = a q[i] + b1 v[i-m-1] + b2 v[i-m]. The flow's first value
+    is taken to have stood for ever; the way is 0 at the first reading.
     """
     first = flow_um_per_s[0]
     change = flow_um_per_s - first
@@ -102,13 +94,8 @@ class Gains:
 
     def applied_to(self, loop: LoopConfig) -> LoopConfig:
         """The loop with these gains, validated. Raises pydantic.ValidationError outside the permitted range."""
-        changed = {
-            "kp_per_s": self.kp_per_s,
-            "ti_s": self.ti_s,
-            "td_s": self.td_s,
-            "measurement_filter_s": self.filter_s,
-        }
-        return LoopConfig.model_validate(loop.model_dump() | changed)
+        times = {"ti_s": self.ti_s, "td_s": self.td_s, "measurement_filter_s": self.filter_s}
+        return LoopConfig.model_validate(loop.model_dump() | times | {"kp_per_s": self.kp_per_s})
 
 
 def frequencies(dt_s: float, points: int = 400) -> Series:
@@ -135,7 +122,6 @@ def loop_response(gains: Gains, model: PlantModel, w_rad_per_s: Series, dt_s: fl
 
 
 # How far a loop is from instability, on the exact frequency response.
-
 
 _POINTS = 3000  # 0.3 % apart: margins to better than 1 %
 _FINE_DT_S = 1e-3
@@ -165,23 +151,23 @@ def margins(gains: Gains, model: PlantModel, dt_s: float) -> Margins:
     sensitivity = 1 / (1 + response)
     frd = control.FrequencyResponseData(response, w, smooth=True)
     gain_margin, phase_margin_deg, _, _, crossing, _ = control.stability_margins(frd)
-    # from the double pole at the origin 1 + L starts at -180 deg (just above it if stable) and must end at 0
-    turned = float(np.sum(np.angle((1 + response)[1:] / (1 + response)[:-1])))
-    stable = abs(float(np.angle(1 + response[0])) % (-2 * math.pi) + turned) < math.pi / 2
     return Margins(
         ms=float(np.max(np.abs(sensitivity))),
         gain_margin=float(gain_margin),
         phase_margin_deg=float(phase_margin_deg),
         delay_margin_s=math.radians(float(phase_margin_deg)) / float(crossing) if crossing > 0 else math.inf,
         disk_margin=float(1 / np.max(np.abs(sensitivity - 0.5))),
-        stable=stable,
+        stable=_is_stable(response),
     )
+
+
+def _is_stable(response: ComplexArray) -> bool:
+    """From the double pole at the origin 1 + L starts at -180 deg (just above it if stable) and must end at 0."""
+    turned = float(np.sum(np.angle((1 + response)[1:] / (1 + response)[:-1])))
+    return abs(float(np.angle(1 + response[0])) % (-2 * math.pi) + turned) < math.pi / 2
 
 
 def sensitivity_peak(gains: Gains, model: PlantModel, dt_s: float) -> float:
     """Ms on a coarse grid (to 1 %), for searches; infinite for an unstable loop."""
-    w = frequencies(dt_s)
-    response = loop_response(gains, model, w, dt_s)
-    turned = float(np.sum(np.angle((1 + response)[1:] / (1 + response)[:-1])))
-    start = float(np.angle(1 + response[0])) % (-2 * math.pi)
-    return float(np.max(1 / np.abs(1 + response))) if abs(start + turned) < math.pi / 2 else math.inf
+    response = loop_response(gains, model, frequencies(dt_s), dt_s)
+    return float(np.max(1 / np.abs(1 + response))) if _is_stable(response) else math.inf

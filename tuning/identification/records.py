@@ -60,26 +60,14 @@ class Record:
     def part(self, start_s: float, stop_s: float) -> Record:
         """The samples from `start_s` until before `stop_s`."""
         cut = slice(round(start_s / self.dt_s), round(stop_s / self.dt_s))
-        return Record(
-            self.dt_s,
-            self.flow_um_per_s[cut],
-            self.displacement_um[cut],
-            self.ambient_pressure_pa[cut],
-            self.air_temperature_c[cut],
-        )
+        return Record(self.dt_s, *(column[cut] for column in self._columns()))
 
     def followed_by(self, *later: Record) -> Record:
         """This and what came right after it, as one record. Raises ValueError for different sample times."""
-        parts = (self, *later)
         if any(part.dt_s != self.dt_s for part in later):
             raise ValueError("records of different sample times cannot be joined")
-        return Record(
-            self.dt_s,
-            np.concatenate([part.flow_um_per_s for part in parts]),
-            np.concatenate([part.displacement_um for part in parts]),
-            np.concatenate([part.ambient_pressure_pa for part in parts]),
-            np.concatenate([part.air_temperature_c for part in parts]),
-        )
+        columns = zip(*(part._columns() for part in (self, *later)), strict=True)
+        return Record(self.dt_s, *(np.concatenate(parts) for parts in columns))
 
     def filled_displacement_um(self) -> Series:
         """Readings with lost ones interpolated. Raises ValueError if all are lost."""
@@ -91,18 +79,15 @@ class Record:
     def sha256(self) -> str:
         """Hash of the data, to say what gains were made from."""
         digest = hashlib.sha256(np.float64(self.dt_s).tobytes())
-        for column in (
-            self.flow_um_per_s,
-            self.displacement_um,
-            self.ambient_pressure_pa,
-            self.air_temperature_c,
-        ):
+        for column in self._columns():
             digest.update(np.ascontiguousarray(column).tobytes())
         return digest.hexdigest()
 
+    def _columns(self) -> tuple[Series, ...]:
+        return tuple(getattr(self, name) for name in _COLUMNS)
+
 
 # Raw data of a session: one compressed file a record, checked by its hash when it is read back.
-
 
 _BYTES_MAX = 200_000_000  # four columns of a day at 50 Hz are 140 MB
 _COLUMNS = ("flow_um_per_s", "displacement_um", "ambient_pressure_pa", "air_temperature_c")

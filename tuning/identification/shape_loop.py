@@ -26,7 +26,6 @@ from tuning.rig import HoldRig
 # The likelihood of the local level model by its Kalman filter, with the noise's variance concentrated out, over the
 # ratio of walk to noise. Source: Durbin and Koopman, Time Series Analysis by State Space Methods (2012), chapter 2.
 
-
 _RATIOS = np.geomspace(1e-9, 10.0, 61)  # variance of the walk in a cycle over that of the noise
 _DROP = 2.0  # of the log likelihood: 95 % on one side, and some for the grid
 
@@ -115,27 +114,16 @@ def step_experiment(rig: HoldRig, setpoint_um: float, restore: bool) -> list[lis
         if restore:
             rig.shape_loop(True, "shape loop: the step is over")
     if min(len(level) for level in levels) < _LEAST_CYCLES:
-        raise HoldError(
-            f"fewer than {_LEAST_CYCLES} shapes a level: is the shape measured at all, and every few seconds?"
-        )
+        raise HoldError(f"fewer than {_LEAST_CYCLES} shapes a level: is the shape measured every few seconds?")
     return levels
 
 
 def evaluate(
     levels: Sequence[Sequence[ShapeEstimate]], steady: Sequence[ShapeEstimate], assumed: Series
 ) -> ShapeLoopFit:
-    """Sensitivity from the levels, noise and drift from all shapes of a steady hold.
+    """Sensitivity from the levels (low, high, low), noise and drift from these and the shapes of a steady hold.
 
-    Raises ValueError if there are too few shapes to tell noise from drift.
-
-    Parameters
-    ----------
-    levels : three sequences of ShapeEstimate
-        Low, high, low.
-    steady : sequence of ShapeEstimate
-        In a hold; those of the levels count too, for the laser's reading is taken off.
-    assumed : (36,) array
-        Sensitivity the controller works with.
+    `assumed` (36,) is the controller's sensitivity. Raises ValueError if there are too few shapes.
     """
     means = [np.mean([shape.coeffs_um for shape in level], axis=0) for level in levels]
     laser_um = [float(np.mean([shape.displacement_um for shape in level])) for level in levels]
@@ -144,7 +132,8 @@ def evaluate(
     scatter = np.mean([np.var([s.coeffs_um for s in level], axis=0, ddof=1) / len(level) for level in levels], axis=0)
     shapes = sorted((*steady, *(s for level in levels for s in level)), key=lambda shape: shape.time_s)
     reference = shapes[0]
-    gaps_um = np.array([_sag_um(shape, reference, assumed) - shape.displacement_um for shape in shapes])
+    seen = (sag_change(s.coeffs_um, reference.coeffs_um, s.covariance_um2, assumed).change_um for s in shapes)
+    gaps_um = np.array([sag_um - shape.displacement_um for sag_um, shape in zip(seen, shapes, strict=True)])
     cycle_s = float(np.median(np.diff([shape.time_s for shape in shapes])))
     noise = fit_local_level(gaps_um, np.array([shape.time_s for shape in shapes]))
     best_s = noise.white * math.sqrt(cycle_s / noise.walk)
@@ -160,7 +149,3 @@ def evaluate(
         drift_seen=noise.seen,
         time_constant_s=min(max(best_s, _CYCLES_MIN * cycle_s), _TAU_MAX_S),
     )
-
-
-def _sag_um(shape: ShapeEstimate, reference: ShapeEstimate, sensitivity: Series) -> float:
-    return sag_change(shape.coeffs_um, reference.coeffs_um, shape.covariance_um2, sensitivity).change_um

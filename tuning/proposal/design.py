@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -116,7 +116,8 @@ def preview(
 ) -> Preview:
     """Hold on the fitted twin in its weather, and once more without weather for a step of the leak."""
     true_um = _held(loop, pump, model, ModelBench(model, disturbance, pump, seed), duration_s)
-    calm = _without_weather(disturbance)
+    noise = replace(disturbance.rest, white=disturbance.rest.white * 1e-3, fast=0.0, slow=0.0)
+    calm = DisturbanceModel(noise, None, None)
     stepped = ModelBench(model, calm, pump, seed, (_SETTLE_S, load_step_um_per_s))
     answer_um = _held(loop, pump, model, stepped, 120.0)
     away = np.flatnonzero(np.abs(answer_um) > rules.RECOVERED_UM)
@@ -135,12 +136,6 @@ def _held(
     rig = Rig(bench, loop, pump, model.holding_flow_um_per_s)
     rig.hold(_SETTLE_S + duration_s)
     return np.array(bench.true_um)[round(_SETTLE_S * loop.rate_hz) :]
-
-
-def _without_weather(disturbance: DisturbanceModel) -> DisturbanceModel:
-    rest = disturbance.rest
-    still = type(rest)(rest.white * 1e-3, 0.0, 0.0, rest.slow_s, 0.0, 0.0, 0.0, rest.dt_s)
-    return DisturbanceModel(still, None, None)
 
 
 # The hobby tuners' relay on this loop sees a limit cycle at the frequency where the phase is -180 deg, w d = pi / 2:

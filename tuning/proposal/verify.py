@@ -43,7 +43,7 @@ class Stage:
     std_um: float  # of the centre, from the record
     before_um: float  # what the old gains would have given in this weather
     growth: float  # ratio of the two
-    growth_max: float  # the most that passes
+    growth_max: float  # the limit
     ms: float  # sensitivity seen; NaN while the record is too short
     lost_fraction: float  # readings lost
     reason: str  # why it fails; empty if it passes
@@ -74,12 +74,7 @@ class VerificationTrial:
 def centre_std_um(off_um: records.Series, trial: VerificationTrial, weather: disturbance.DisturbanceModel) -> float:
     """Standard deviation of the centre without the laser's noise; 0 where less than nothing is left.
 
-    Parameters
-    ----------
-    off_um : (n,) array
-        Readings less setpoint.
-    weather : DisturbanceModel
-        What the prediction is made with that the readings correct.
+    `off_um` (n,) are readings less setpoint; they correct the prediction for this weather.
     """
     dt_s = weather.rest.dt_s
     off = off_um - off_um.mean()
@@ -128,16 +123,15 @@ def look(record: records.Record, setpoint_um: records.Series, trial: Verificatio
     ms = seen_sensitivity(off_um, trial) if record.duration_s >= _RESONANCE_LEAST_S else math.nan
     reason = ""
     if growth > growth_max:
-        reason = f"the standard deviation is {std_um:.3f} um, {growth:.2f} times that of the gains before"
+        reason = f"the standard deviation is {std_um:.3f} um, {growth:.2f} times that of the previous gains"
     elif ms > MS_MAX:
-        reason = f"the readings show a sensitivity of {ms:.1f} ({MS_MAX:g} is the most): less margin than designed"
+        reason = f"the readings show a sensitivity of {ms:.1f} (limit {MS_MAX:g}): less margin than designed"
     return Stage(record.duration_s, std_um, before_um, growth, growth_max, ms, record.lost_fraction, reason)
 
 
 # Whether a loop has aged, from a hold that nobody disturbs: what the weather's own excitation tells.
 #
 # The gain k from natural excitation is known to 10 or 20 % only; that is enough to see a pump that has lost a third.
-
 
 LEAST_S = 300.0
 # Of what these gains should give: they are 1.05 to 1.4 times the bound by design, with feed-forward 2.
@@ -161,19 +155,7 @@ class Health:
 
 
 def health(record: records.Record, setpoint_um: records.Series, loop: LoopConfig, made: GainsFile) -> Health:
-    """Judge a quiet hold against the gains' own file. Raises ValueError if the record is too short.
-
-    Parameters
-    ----------
-    record : Record
-        At least `LEAST_S` of hold.
-    setpoint_um : (n,) array
-        The loop's setpoint of each sample.
-    loop : LoopConfig
-        As it runs.
-    made : GainsFile
-        Where its gains come from.
-    """
+    """Judge a quiet hold against the file its gains come from. Raises ValueError if it is shorter than `LEAST_S`."""
     if record.duration_s < LEAST_S:
         raise ValueError(f"{record.duration_s:.0f} s of hold are too short to judge a loop: {LEAST_S:.0f} s at least")
     model = made.plant.model
@@ -186,9 +168,8 @@ def health(record: records.Record, setpoint_um: records.Series, loop: LoopConfig
     leak_um_per_s = model.gain * float(record.flow_um_per_s.mean())
     found: list[str] = []
     if std_um / least_um > _RATIO_GROWTH * designed:
-        found.append(
-            f"the centre moves {std_um / (designed * least_um):.1f} times as much as these gains should let it"
-        )
+        ratio = std_um / (designed * least_um)
+        found.append(f"the centre moves {ratio:.1f} times as much as these gains should allow")
     if abs(leak_um_per_s - model.leak_um_per_s) > _LEAK_CHANGE * model.leak_um_per_s:
         found.append(f"the leak is {leak_um_per_s:.2f} um/s, it was {model.leak_um_per_s:.2f} um/s")
     spread = math.hypot(gain_sigma, made.plant.gain_sigma)

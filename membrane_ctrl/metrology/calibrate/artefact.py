@@ -17,6 +17,7 @@ from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, Optics
 from membrane_ctrl.metrology.calibrate import parameters, solve
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.screen_face import BOW_RADIUS_MM
+from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.plain_json import SCHEMA, content_hash
 
@@ -43,7 +44,7 @@ def tables_of(solution: solve.Solution, optics: OpticsConfig, origin: Origin) ->
     tables: dict[str, Any] = {
         "schema": SCHEMA,
         "geometry": geometry_of(solution, optics).model_dump(exclude_none=True),
-        "covariance": {"names": list(general_names()), "matrix": general_covariance(solution).tolist()},
+        "covariance": {"names": list(GENERAL_NAMES), "matrix": general_covariance(solution).tolist()},
         "parameters": {
             "names": [parameters.NAMES[k] for k in free],
             "values": solution.values[free].tolist(),
@@ -98,32 +99,16 @@ def general_form(geometry: Geometry, optics: OpticsConfig) -> GeometryConfig:
     )
 
 
-def general_names() -> tuple[str, ...]:
-    """Shifts and turns of camera and screen in world."""
-    moves = [
-        (thing, move, unit) for thing in ("camera", "screen") for move, unit in (("shift", "mm"), ("turn", "rad"))
-    ]
-    return tuple(f"{thing}_{move}_{axis}_{unit}" for thing, move, unit in moves for axis in "xyz")
-
-
 def general_covariance(solution: solve.Solution) -> FloatArray:
-    """Covariance (12, 12) of `general_names`.
+    """Covariance (12, 12) of `GENERAL_NAMES`.
 
     Rows r of a body turned by a small w become r + w x r, so that C^T dC is minus the cross-product matrix of w.
     """
     geometry = solution.bench.geometry
-    rows = np.stack([geometry.screen_s_x, geometry.screen_s_y, np.cross(geometry.screen_s_x, geometry.screen_s_y)])
-    columns = [
-        np.concatenate(
-            [
-                turn.pinhole_mm,
-                _turn_vector(geometry.rotation.T @ turn.camera),
-                turn.origin_mm,
-                _turn_vector(rows.T @ turn.screen),
-            ]
-        )
-        for turn in parameters.pose_derivatives(solution.problem.stated, solution.values)
-    ]
+    columns = []
+    for turn in parameters.pose_derivatives(solution.problem.stated, solution.values):
+        turns = _turn_vector(geometry.rotation.T @ turn.camera), _turn_vector(geometry.screen_axes.T @ turn.screen)
+        columns.append(np.concatenate([turn.pinhole_mm, turns[0], turn.origin_mm, turns[1]]))
     matrix = np.stack(columns, axis=1)
     covariance = matrix @ solution.covariance[: len(parameters.POSE), : len(parameters.POSE)] @ matrix.T
     return np.asarray((covariance + covariance.T) / 2)

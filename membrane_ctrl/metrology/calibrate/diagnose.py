@@ -81,11 +81,8 @@ class LeftOut:
 def suspects(solution: solve.Solution) -> tuple[Suspect, ...]:
     """Held optical parameters that would take more than noise out of the residuals, the strongest first."""
     sums = np.sum(_reduced(solution), axis=0)
-    response, (heights, plane) = (
-        propagate.surface_response(solution, len(solution.states) // 2)[:, :-1],
-        propagate.disc(1.0),
-    )
-    flat = heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]
+    response = propagate.surface_response(solution, len(solution.states) // 2)[:, :-1]
+    flat = propagate.without_plane(*propagate.disc(1.0))
     out = []
     for name in parameters.NAMES[len(parameters.POSE) : parameters.OPTICAL]:
         if name in solution.free:
@@ -138,10 +135,8 @@ def bumps(solution: solve.Solution) -> tuple[CameraBump, ...]:
         known = _with_bump(solve.prior(sigmas, solution.common), False)
         extra = np.arange(separable.COMMON, separable.COMMON + len(_CAMERA))
         known[extra, extra] += 1 / _CAMERA_SIGMA_DEG**2
-        kept = np.append(
-            np.append(sigmas > 0, np.ones(separable.COMMON - len(parameters.NAMES), bool)),
-            np.ones(len(_CAMERA), bool),
-        )
+        ring = separable.COMMON - len(parameters.NAMES)
+        kept = np.append(sigmas > 0, np.ones(ring + len(_CAMERA), bool))
         delta, squares = _solved(sums + known, np.flatnonzero(kept))
         yaw, pitch, roll = (float(v) for v in delta[-len(_CAMERA) :])
         out.append(CameraBump(group, (yaw, pitch, roll), before - squares))

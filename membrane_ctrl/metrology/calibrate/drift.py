@@ -96,5 +96,5 @@ class RingMonitor:
         elif moved_um > RING_MOVED_UM and not self.says:
             self.says = (
                 f"calibrate again: the ring is seen {moved_um:.1f} um RMS from where it was when the geometry was "
-                "calibrated; camera or screen stand otherwise"
+                "calibrated; camera or screen has moved"
             )

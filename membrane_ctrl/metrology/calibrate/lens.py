@@ -118,7 +118,6 @@ def _matrix(camera: CameraConfig) -> FloatArray:
 
 # A board of known squares, on a screen or on a plate: its picture, and its corners in a photograph.
 
-
 Levels = AnyArray
 
 # A marker of 4 x 4 bits has a border of one: 6 modules; with a margin of one on each side a square has 8, so that
@@ -186,9 +185,8 @@ def on_screen(board: Board, square_px: int, width_px: int, height_px: int) -> Le
     drawn = board.draw(square_px)
     height, width = drawn.shape
     if width > width_px or height > height_px:
-        raise ValueError(
-            f"{board} of {square_px} px has {width} x {height} pixels, the screen {width_px} x {height_px}"
-        )
+        sizes = f"{width} x {height} pixels, the screen {width_px} x {height_px}"
+        raise ValueError(f"{board} of {square_px} px has {sizes}")
     levels = np.full((height_px, width_px), 255, np.uint8)
     top, left = (height_px - height) // 2, (width_px - width) // 2
     levels[top : top + height, left : left + width] = drawn

@@ -132,11 +132,12 @@ def bench_at(stated: Geometry, values: FloatArray) -> BenchGeometry:
 
 def poses_at(stated: Geometry, values: AnyArray) -> Poses:
     """Poses of a parameter vector (real, or complex for `pose_derivatives`); only the first eleven count."""
-    a, b, alpha, x, y, turn_x, turn_y, turn_z, yaw, pitch, roll = _radians(values[: len(POSE)])
+    in_radians = [np.pi / 180 if parameter.unit == "deg" else 1.0 for parameter in POSE]
+    a, b, alpha, x, y, turn_x, turn_y, turn_z, yaw, pitch, roll = values[: len(POSE)] * in_radians
     f0, o0 = stated.pinhole_mm, stated.screen_origin_mm
     hinge = _hinge(f0, o0)
     up, back = _turn(hinge, alpha), _turn(hinge, -alpha)
-    rows = np.stack([stated.screen_s_x, stated.screen_s_y, np.cross(stated.screen_s_x, stated.screen_s_y)])
+    rows = stated.screen_axes
     i, j, k = np.eye(3)
     return Poses(
         pinhole_mm=(1 + a / np.linalg.norm(f0)) * (up @ f0),
@@ -159,12 +160,6 @@ def pose_derivatives(stated: Geometry, values: FloatArray) -> list[Poses]:
         parts = (poses.pinhole_mm, poses.camera, poses.origin_mm, poses.screen)
         out.append(Poses(*(np.asarray(part.imag / _COMPLEX_STEP) for part in parts)))
     return out
-
-
-def _radians(values: AnyArray) -> AnyArray:
-    """Millimetres as they are, degrees as radians."""
-    factors = [np.pi / 180 if parameter.unit == "deg" else 1.0 for parameter in POSE]
-    return np.asarray(values * factors)
 
 
 def _hinge(pinhole_mm: FloatArray, origin_mm: FloatArray) -> FloatArray:

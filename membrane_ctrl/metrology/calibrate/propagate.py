@@ -5,7 +5,7 @@ blocks are at hand. The vertex is put where the laser says, with the laser's own
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,13 +31,8 @@ class Propagated:
 def surface_response(solution: Solution, index: int) -> FloatArray:
     """d surface / d (optical parameters, vertex' height), (36, OPTICAL + 1), of one set."""
     sums = solution.equations[index].sums
-    mixed = np.hstack(
-        [
-            sums[:PARAMETERS, residuals.LOCAL : residuals.LOCAL + parameters.OPTICAL],
-            sums[:PARAMETERS, PARAMETERS : PARAMETERS + 1],
-        ]
-    )
-    return np.asarray(-np.linalg.solve(sums[:PARAMETERS, :PARAMETERS], mixed))
+    order = [*range(residuals.LOCAL, residuals.LOCAL + parameters.OPTICAL), PARAMETERS]
+    return np.asarray(-np.linalg.solve(sums[:PARAMETERS, :PARAMETERS], sums[:PARAMETERS, order]))
 
 
 def surface_covariance(solution: Solution, index: int) -> FloatArray:
@@ -52,7 +47,7 @@ def propagate(solution: Solution, index: int, analysis_radius_mm: float) -> Prop
     """To what a person reads off a figure like that of one set."""
     covariance = surface_covariance(solution, index)
     heights, plane = disc(analysis_radius_mm / solution.problem.radius_mm)
-    flat = heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]
+    flat = without_plane(heights, plane)
     to_coeffs, sag = parameter_to_coeffs(), sag_gradient()
     return Propagated(
         height_rms_um=_rms_um(heights, covariance),
@@ -70,6 +65,11 @@ def disc(radius: float) -> tuple[FloatArray, FloatArray]:
     return np.asarray(residuals.basis(x, y)[0].T), np.stack([np.ones_like(x), x, y], axis=1)
 
 
+def without_plane(heights: FloatArray, plane: FloatArray) -> FloatArray:
+    """Heights (n, ...) less their best plane."""
+    return np.asarray(heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0])
+
+
 def _rms_um(heights: FloatArray, covariance: FloatArray) -> float:
     return 1e3 * float(np.sqrt(np.mean(np.einsum("ij,jk,ik->i", heights, covariance, heights))))
 
@@ -78,7 +78,6 @@ def _rms_um(heights: FloatArray, covariance: FloatArray) -> float:
 #
 # In units of what was known by hand, the covariance has eigenvalues between 0 (the sets know far better) and 1 (they
 # know nothing). A combination near 1 is named by its largest parts and by what one sigma of it does to the surface.
-
 
 WEAK = 0.5  # of the hand's sigma: the sets have not even doubled the knowledge
 _PART = 0.3  # of a unit combination: smaller parts are not named
@@ -137,9 +136,10 @@ def _described(
     change = surface_response(solution, index)[:, free[optical]] @ amounts[optical]
     heights, plane = disc(radius_mm / solution.problem.radius_mm)
     moved_um = 1e3 * heights @ change
-    figure_um = moved_um - plane @ np.linalg.lstsq(plane, moved_um, rcond=None)[0]
+    figure_um = without_plane(moved_um, plane)
     height, figure = (float(np.sqrt(np.mean(part**2))) for part in (moved_um, figure_um))
-    says = "; ".join(f"{amount:+.2g} {_unit(name)}: {_says(name)}" for name, amount in parts)
+    named = [(parameters.ALL[parameters.NAMES.index(name)], amount) for name, amount in parts]
+    says = "; ".join(f"{amount:+.2g} {parameter.unit}: {parameter.says}" for parameter, amount in named)
     effect = _effect(solution, index, moved_um, figure_um, plane)
     return Combination(left, parts, height, figure, f"{effect} ({says})")
 
@@ -151,7 +151,8 @@ def _effect(solution: Solution, index: int, moved_um: FloatArray, figure_um: Flo
         return "nothing that a figure shows"
     kept = f"; {np.sqrt(np.mean(figure_um**2)):.2g} um RMS of figure"
     if 1 - float(np.mean(figure_um**2)) / total > _MOSTLY:
-        return f"a tilt of the surface by {np.hypot(*plane_slope(plane, moved_um)):.2g} um at the rim{kept}"
+        slope = np.linalg.lstsq(plane, moved_um, rcond=None)[0][1:]
+        return f"a tilt of the surface by {np.hypot(*slope):.2g} um at the rim{kept}"
     x, y = plane[:, 1], plane[:, 2]
     surface = solution.states[index].surface.parameters
     height, by_x, by_y = (part.T @ surface for part in residuals.basis(x, y))
@@ -162,58 +163,27 @@ def _effect(solution: Solution, index: int, moved_um: FloatArray, figure_um: Flo
     return f"a change of figure of {np.sqrt(np.mean(figure_um**2)):.2g} um RMS"
 
 
-def plane_slope(plane: FloatArray, heights: FloatArray) -> FloatArray:
-    """x and y slope of the best plane, per radius."""
-    return np.asarray(np.linalg.lstsq(plane, heights, rcond=None)[0][1:])
-
-
-def _unit(name: str) -> str:
-    return parameters.ALL[parameters.NAMES.index(name)].unit
-
-
-def _says(name: str) -> str:
-    return parameters.ALL[parameters.NAMES.index(name)].says
-
-
 # What sets that are still to be taken will determine: the covariance at the stated bench, linear and without noise.
 #
 # A Hencky bowl at each depth is followed to the screen, and the problem is solved from there; its solution is the
 # bowl itself, and its covariance is what sets like these claim: within a tenth of what those of a rippled film do
 # (docs/calibration.md).
 
-
 _ACROSS = 48  # rays along the picture's longer side; twice as many change no claim by a fiftieth
 
 
 def foresee(
-    optics: OpticsConfig,
-    sigmas: FloatArray,
-    sags_mm: Sequence[float],
-    swing_adu: float,
-    laser_sigma_um: float,
+    optics: OpticsConfig, sigmas: FloatArray, sags_mm: Sequence[float], swing_adu: float, laser_sigma_um: float
 ) -> Propagated:
-    """Standard deviations of a figure that is measured with the geometry of such sets.
+    """Standard deviations of a figure that is measured with the geometry of sets at these sags.
 
-    Raises ValueError if no ray of such a set ends on the pattern.
-
-    Parameters
-    ----------
-    optics : OpticsConfig
-        The stated bench.
-    sigmas : (len(NAMES),) array
-        Of the hand's measurements; 0 holds a parameter.
-    sags_mm : sequence of float
-        Of the sets.
-    swing_adu : float
-        Amplitude of the fringes in the picture.
-    laser_sigma_um : float
-        Of a set's mean reading.
+    `sigmas` (len(NAMES),) are those of the hand's measurements, `swing_adu` is the amplitude of the fringes and
+    `laser_sigma_um` that of a set's mean reading. Raises ValueError if no ray of such a set ends on the pattern.
     """
     geometry, middle_mm = Geometry.from_config(optics), sags_mm[len(sags_mm) // 2]
     sets = [_set(geometry, optics, sag_mm, sag_mm - middle_mm, swing_adu) for sag_mm in sags_mm]
-    problem = Problem(
-        geometry, tuple(sets), sigmas, separable.References(0.0, laser_sigma_um), optics.mirror.radius_mm
-    )
+    references = separable.References(0.0, laser_sigma_um)
+    problem = Problem(geometry, tuple(sets), sigmas, references, optics.mirror.radius_mm)
     return propagate(solve(problem), len(sets) // 2, optics.mirror.analysis_radius_mm)
 
 
@@ -242,9 +212,7 @@ def _set(
     seen = inside & (np.abs(screen_mm) < pattern.periods * pattern.period_mm / 2).all(axis=0)
     if np.count_nonzero(seen) < PARAMETERS:
         raise ValueError(blind)
-    return residuals.SetPhases(
-        dark.name, column[seen], row[seen], screen_mm[:, seen], dark.sigma_mm[seen], dark.displacement_um
-    )
+    return replace(dark, screen_mm=screen_mm).subset(seen)
 
 
 def _towards_mirror(

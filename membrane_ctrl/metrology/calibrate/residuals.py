@@ -9,7 +9,7 @@ u = d - 2 (d n) / (n n) n and meets the screen at S = P + k u. For small changes
     ds = T (dP + k du - dO' + X^T dX (S - O')) + (E u) s^2 dc / (N u)
 
 with X the screen's rows, E the first two, N = (third row) - w_x e_x - w_y e_y the normal of a face that stands off by
-w = c s^2 + map (see `metrology.face`) and T = E (1 - u N^T / (N u)), which lets the ray run to the face.
+w = c s^2 + map (see `screen_face`) and T = E (1 - u N^T / (N u)), which lets the ray run to the face.
 """
 
 from collections.abc import Iterator
@@ -24,13 +24,12 @@ from membrane_ctrl.metrology.optics import compiled, hencky, kernels, screen_fac
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 # Small matrix products as plain loops.
 #
 # A linear algebra library keeps its own threads, and on a machine that the control loop shares they wait for each
 # other: products of 40 by 40 then take five times as long as these loops on one core.
-
 
 _BLOCK = 512  # columns that stay in the second-level cache
 
@@ -85,15 +84,12 @@ class SetPhases:
 
     def thinned(self, most: int) -> "SetPhases":
         """Every k-th bin, so that at most `most` are left."""
-        keep = slice(None, None, -(-self.column_px.size // most))
-        return SetPhases(
-            self.name,
-            self.column_px[keep],
-            self.row_px[keep],
-            self.screen_mm[:, keep],
-            self.sigma_mm[keep],
-            self.displacement_um,
-        )
+        return self.subset(slice(None, None, -(-self.column_px.size // most)))
+
+    def subset(self, keep: slice | BoolArray) -> "SetPhases":
+        """Some of the bins."""
+        places = self.column_px[keep], self.row_px[keep]
+        return SetPhases(self.name, *places, self.screen_mm[:, keep], self.sigma_mm[keep], self.displacement_um)
 
 
 @dataclass(frozen=True)
@@ -292,10 +288,8 @@ def curvatures(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> tuple[Fl
     """h_xx, h_xy and h_yy in 1/mm."""
     x, y = x_mm / surface.radius_mm, y_mm / surface.radius_mm
     v = x * x + y * y
-    first, second = (
-        2 * series.polyval(v, series.polyder(surface.excess)),
-        4 * series.polyval(v, series.polyder(surface.excess, 2)),
-    )
+    first = 2 * series.polyval(v, series.polyder(surface.excess))
+    second = 4 * series.polyval(v, series.polyder(surface.excess, 2))
     by_x, by_y = (series.polyder(surface.polynomial, axis=axis) for axis in (0, 1))
     hxx = series.polyval2d(x, y, series.polyder(by_x, axis=0)) + first + second * x * x
     hxy = series.polyval2d(x, y, series.polyder(by_x, axis=1)) + second * x * y

@@ -56,12 +56,8 @@ def ring_pose(
     ----------
     light : (H, W) array
         White minus black.
-    stated : Geometry
-        Where to begin; its lens is taken as it is.
     rough_px : (2, n) array
-        The rim as `outline.find_outline` sees it, to within `_REACH_PX`.
-    radius_mm : float
-        Of the ring.
+        The rim as `geometry.find_outline` sees it, to within `_REACH_PX`.
     rim_z : height function
         Where the rim stands in world; a ring is flat, the rim of a mounted film nearly.
     radius_sigma_mm : float

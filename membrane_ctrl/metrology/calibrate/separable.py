@@ -10,7 +10,7 @@ the rim, z_i e_0 + E q_i, are the same in all sets (a polynomial of degree 7 has
 the laser says: z_i = -(1 + scale) (d_i - reference) / 1000, d_i in um.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -182,6 +182,4 @@ def averaged(
         phases.name, column_px, row_px, np.zeros((2, total.size)), sigma_mm, phases.displacement_um
     )
     model = -residuals.residual_mm(bench, bare, state.surface, state.vertex_z_mm)
-    return residuals.SetPhases(
-        phases.name, column_px, row_px, model + np.stack(rest), sigma_mm, phases.displacement_um
-    )
+    return replace(bare, screen_mm=model + np.stack(rest))

@@ -112,7 +112,9 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
         pairs = zip(problem.sets, start.states, strict=True)
         problem = replace(problem, sets=tuple(separable.averaged(start.bench, *pair, _FEW) for pair in pairs))
     states = start.states if start is not None else first_states(problem)
-    common = start.common if start is not None else _common(states)
+    # the parameters as stated, and the ring as the first surfaces have it
+    ring = np.mean([separable.rim_of(state) for state in states], axis=0)
+    common = start.common if start is not None else np.append(np.zeros(len(parameters.NAMES)), ring)
     trust = tuple(separable.Trust.full(phases) for phases in problem.sets)
     free = problem.sigmas > 0
     changes: list[float] = []
@@ -140,14 +142,7 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
         weighed = changes[-1] < _NEARLY or far > _FURTHEST
         if weighed:
             left = (each.residual_mm for each in linear)
-            trust = tuple(
-                separable.Trust.seen(phases, residual) for phases, residual in zip(problem.sets, left, strict=True)
-            )
-
-
-def _common(states: Sequence[separable.SetState]) -> FloatArray:
-    """Parameters as stated, and the ring as the sets' first surfaces have it."""
-    return np.append(np.zeros(len(parameters.NAMES)), np.mean([separable.rim_of(state) for state in states], axis=0))
+            trust = tuple(separable.Trust.seen(*pair) for pair in zip(problem.sets, left, strict=True))
 
 
 def _linearise(
@@ -175,27 +170,20 @@ def first_states(problem: Problem) -> tuple[separable.SetState, ...]:
 def _first(problem: Problem, phases: residuals.SetPhases) -> separable.SetState:
     moved_um = phases.displacement_um - problem.references.reference_um
     vertex_z_mm = -moved_um * 1e-3 if np.isfinite(moved_um) else 0.0
-    return separable.SetState(
-        surface_of(parameters.BenchGeometry(problem.stated), phases, problem.radius_mm, vertex_z_mm), vertex_z_mm
-    )
-
-
-def surface_of(
-    bench: parameters.BenchGeometry, phases: residuals.SetPhases, radius_mm: float, vertex_z_mm: float
-) -> Surface:
-    """One set's surface on a bench without bow, as `measure` fits it. Raises ValueError if there is none."""
-    return _fit(bench, phases, radius_mm, vertex_z_mm).surface
+    fit = fit_on(parameters.BenchGeometry(problem.stated), phases, problem.radius_mm, vertex_z_mm)
+    return separable.SetState(fit.surface, vertex_z_mm)
 
 
 def slope_residual(solution: Solution, phases: residuals.SetPhases, index: int) -> float:
     """RMS of measured minus fitted slopes of one set's bins on the calibrated bench, as a live cycle states it."""
-    fit = _fit(solution.bench, phases, solution.problem.radius_mm, solution.states[index].vertex_z_mm)
+    fit = fit_on(solution.bench, phases, solution.problem.radius_mm, solution.states[index].vertex_z_mm)
     return float(np.hypot(fit.residual_x, fit.residual_y) / np.sqrt(2))
 
 
-def _fit(
+def fit_on(
     bench: parameters.BenchGeometry, phases: residuals.SetPhases, radius_mm: float, vertex_z_mm: float
 ) -> reconstruct.Fit:
+    """One set's surface on a bench without bow, as `measure` fits it. Raises ValueError if there is none."""
     tracer = reconstruct.Tracer(bench.geometry, radius_mm, vertex_z_mm)
     points = reconstruct.Points.of(residuals.camera_rays(bench.geometry, phases), phases.screen_mm * bench.pitch)
     return reconstruct.solve(tracer, points, reconstruct.parabola(_START_SAG_MM, radius_mm))

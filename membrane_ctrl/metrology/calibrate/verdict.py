@@ -7,7 +7,7 @@ import numpy as np
 from membrane_ctrl.metrology.calibrate import diagnose, parameters, separable
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, solve
 
-# Sets closer together than this say no more than one set: the sag's sigma is then twice that of sets 8 mm apart
+# Sets closer together than this tell no more than one set: the sag's sigma is then twice that of sets 8 mm apart
 LEAST_SPREAD_UM = 1000.0
 GOOD_SPREAD_UM = 8000.0
 # A wrong geometry changes the sag's slope against the laser by some per cent at most; a wrong unit or sign by more
@@ -36,13 +36,11 @@ def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
     spread_um = float(np.ptp(moved[known])) if known.any() else 0.0
     seen_um = float(np.ptp(sag_um))
     if max(spread_um, seen_um) < LEAST_SPREAD_UM:
-        return (
-            CalibrationFinding(
-                True,
-                f"the sets are only {max(spread_um, seen_um):.0f} um apart: they say no more than one of them; "
-                f"at least {LEAST_SPREAD_UM / 1000:.0f} mm are needed, {GOOD_SPREAD_UM / 1000:.0f} mm are good",
-            ),
+        says = (
+            f"the sets are only {max(spread_um, seen_um):.0f} um apart: they tell no more than one of them; "
+            f"at least {LEAST_SPREAD_UM / 1000:.0f} mm are needed, {GOOD_SPREAD_UM / 1000:.0f} mm are good"
         )
+        return (CalibrationFinding(True, says),)
     if np.count_nonzero(known) < 2:
         return ()  # nothing to compare
     slope = float(np.polyfit(moved[known], sag_um[known], 1)[0]) if spread_um > 0 else np.inf
@@ -74,7 +72,7 @@ def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     for bump in diagnose.bumps(solution)[:1]:
         yaw, pitch, roll = bump.turned_deg
         where = f"in {names[bump.sets[0]]}" if len(bump.sets) == 1 else f"from {names[bump.sets[0]]} on"
-        says = f"the camera stood otherwise {where}: yaw {yaw:+.3f}, pitch {pitch:+.3f}, roll {roll:+.3f} degrees"
+        says = f"the camera had moved {where}: yaw {yaw:+.3f}, pitch {pitch:+.3f}, roll {roll:+.3f} degrees"
         out.append((bump.fall - 2 * 3, CalibrationFinding(True, says, bump.sets)))
     worst = max(diagnose.left_out(solution), key=lambda each: each.fall)
     if worst.disagrees:
@@ -95,16 +93,14 @@ def _astray(solution: Solution) -> CalibrationFinding:
     problem, count = solution.problem, len(solution.problem.sets)
     for k in range(count if count > 2 else 0):
         if _agree(replace(problem, sets=problem.sets[:k] + problem.sets[k + 1 :])):
-            return CalibrationFinding(
-                True, f"{problem.sets[k].name} disagrees with all the others: it is of another bench", (k,)
-            )
+            says = f"{problem.sets[k].name} disagrees with all the others: it is of another bench"
+            return CalibrationFinding(True, says, (k,))
     for k in range(2, count - 1):
         if all(_agree(replace(problem, sets=part)) for part in (problem.sets[:k], problem.sets[k:])):
             says = f"the bench was changed between {problem.sets[k - 1].name} and {problem.sets[k].name}"
             return CalibrationFinding(True, says, tuple(range(k, count)))
-    return CalibrationFinding(
-        True, "the sets do not show one bench: they are of different rigs, or several of them are bad"
-    )
+    says = "the sets do not show one bench: they are of different rigs, or several of them are bad"
+    return CalibrationFinding(True, says)
 
 
 def _agree(problem: Problem) -> bool:
@@ -120,9 +116,8 @@ def _agree(problem: Problem) -> bool:
 def _why(solution: Solution, index: int) -> str:
     """Whether it is one set's laser reading that is wrong, or its fringes."""
     rest, phases = diagnose.without(solution, index), solution.problem.sets[index]
-    vertex_um = 1e3 * (
-        rest.common[len(parameters.NAMES)] - separable.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
-    )
+    rim_mm = separable.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
+    vertex_um = 1e3 * (rest.common[len(parameters.NAMES)] - rim_mm)
     moved_um = phases.displacement_um - solution.problem.references.reference_um
     miss_um = moved_um + vertex_um / (1 + rest.values[parameters.NAMES.index(parameters.LASER.name)])
     if abs(miss_um) > _LASER_SIGMAS * solution.problem.references.laser_sigma_um:
@@ -135,12 +130,8 @@ def _scatter(solution: Solution) -> list[CalibrationFinding]:
     ratios = np.sqrt([each.variance for each in solution.equations])
     worse = np.flatnonzero(ratios > _SCATTER * np.median(ratios))
     names = [phases.name for phases in solution.problem.sets]
-    return [
-        CalibrationFinding(
-            False, f"{names[k]} scatters {ratios[k]:.1f} times as much as its camera should", (int(k),)
-        )
-        for k in worse
-    ]
+    says = "{} scatters {:.1f} times as much as its camera should"
+    return [CalibrationFinding(False, says.format(names[k], ratios[k]), (int(k),)) for k in worse]
 
 
 def _laser(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
@@ -170,13 +161,12 @@ def _spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
     """What the sets could have said if they were others."""
     moved = np.array([phases.displacement_um for phases in solution.problem.sets])
     if np.count_nonzero(np.isfinite(moved)) < 2:
-        return (
-            CalibrationFinding(
-                False, "fewer than two sets carry a laser reading: the sag rests on fringes and ring alone"
-            ),
-        )
+        says = "fewer than two sets carry a laser reading: the sag rests on fringes and ring alone"
+        return (CalibrationFinding(False, says),)
     spread_um = float(np.ptp(moved[np.isfinite(moved)]))
     if spread_um >= GOOD_SPREAD_UM / 2:
         return ()
-    says = f"the sets are {spread_um / 1000:.1f} mm apart; {GOOD_SPREAD_UM / 1000:.0f} mm would know the sag better"
+    says = (
+        f"the sets are {spread_um / 1000:.1f} mm apart; {GOOD_SPREAD_UM / 1000:.0f} mm would determine the sag better"
+    )
     return (CalibrationFinding(False, says),)

@@ -38,12 +38,8 @@ class SampledBins:
     def thinned(self) -> "SampledBins":
         """Enough of the bins."""
         every = slice(None, None, max(1, self.index.size // _SAMPLE))
-        return SampledBins(
-            self.index[every],
-            self.light[every],
-            self.phase_rad[:, every],
-            self.sensitivity_rad_per_um[:, every],
-        )
+        of_axes = self.phase_rad[:, every], self.sensitivity_rad_per_um[:, every]
+        return SampledBins(self.index[every], self.light[every], *of_axes)
 
 
 @dataclass(frozen=True)
@@ -151,7 +147,6 @@ def _best(seen: FloatArray, templates: dict[int, _Template], light: FloatArray, 
 # The light of a bin has three estimates, the mean of the x fringes, that of the y fringes, and white minus black; the
 # fringes' swing likewise. The median of three is right when one of them is wrong, so that one bad frame, whichever it
 # is, does not spoil the picture that all frames are compared with.
-
 
 _LEAST_SWING_ADU = 1.0  # less than a rounding step is no fringe
 

@@ -73,9 +73,8 @@ def obvious(stack: FrameStack, binned: Binned) -> list[Flag]:
     flags = []
     for k in frames:
         if light[k] < _DARK * middle:
-            flags.append(
-                Flag(k, f"dark: {light[k] / middle:.2f} of the light of the others", middle / max(light[k], 1e-9))
-            )
+            says = f"dark: {light[k] / middle:.2f} of the light of the others"
+            flags.append(Flag(k, says, middle / max(light[k], 1e-9)))
         elif burnt[k] > usual + 10 * SATURATED_SHARE:
             flags.append(Flag(k, f"saturated: {burnt[k]:.0%} of the bins", burnt[k] / SATURATED_SHARE))
     return flags
@@ -120,7 +119,7 @@ def _judge_sinusoid(
     rest = float(np.median([o.rest for o in same]))
     saturated = float(np.median([o.saturated for o in same]))
     worst = {
-        "step": abs(_wrapped(e.step_rad - step)) / step_limit,
+        "step": abs((e.step_rad - step + np.pi) % (2 * np.pi) - np.pi) / step_limit,
         "light": abs(e.level - level) / max(LEVEL_SHARE * level, level_limit),
         "swing": abs(e.swing - swing) / max(SWING_SHARE * swing, swing_limit),
         "moved": abs(e.moved_um - moved_um) / moved_limit,
@@ -140,7 +139,7 @@ def _sinusoid_reason(kind: str, e: Evidence, level: float, moved_um: float) -> s
     if kind == "light" or abs(light - 1) > _FLICKER:
         return f"flicker: {light:.3f} of the light of the others"
     if kind in ("moved", "rest") and abs(e.moved_um - moved_um) > MOVED_UM:
-        return f"moved: the film stood {e.moved_um - moved_um:+.0f} um from where the others saw it"
+        return f"moved: the film was {e.moved_um - moved_um:+.0f} um from where the others saw it"
     if kind == "step":
         return f"stale or wrong picture: its phase step is {e.step_rad:+.2f} rad off"
     return f"differs from its prediction by {e.rest:.1%} of the light"
@@ -214,7 +213,3 @@ def _limit(values: list[float], floor: float) -> tuple[float, float]:
     middle = float(np.median(values))
     scatter = 1.4826 * float(np.median(np.abs(np.array(values) - middle)))
     return max(floor, _SCATTERS * scatter, 1e-9), middle
-
-
-def _wrapped(angle_rad: float) -> float:
-    return float((angle_rad + np.pi) % (2 * np.pi) - np.pi)

@@ -20,7 +20,7 @@ from itertools import combinations
 import numpy as np
 
 from membrane_ctrl.metrology.frames.closure import Closure, closure, closure_with_level, closure_with_phase
-from membrane_ctrl.metrology.phase import phasors, wrapped_phase
+from membrane_ctrl.metrology.phase import phasors
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.shape_estimate import Verdict
 
@@ -106,7 +106,7 @@ class AxisSeries:
 
     def phases_rad(self) -> FloatArray:
         """Wrapped phases (F, n)."""
-        return np.stack([wrapped_phase(phasors(steps, self.shifts_rad)) for steps in self.frames])
+        return np.stack([np.angle(phasors(steps, self.shifts_rad)) for steps in self.frames])
 
     def inconsistent_share(self) -> float:
         """Share of the pixels whose frequencies disagree."""
@@ -167,7 +167,7 @@ def check_series(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatAr
     if failures:
         return SeriesCheck("rejected", failures[0], tuple(flags), tuple(mended))
     if flags:
-        return SeriesCheck("degraded", f"{len(flags)} frame(s) flagged and done without", tuple(flags), tuple(mended))
+        return SeriesCheck("degraded", f"{len(flags)} frame(s) flagged and left out", tuple(flags), tuple(mended))
     return SeriesCheck("ok", "", (), tuple(mended))
 
 
@@ -274,17 +274,10 @@ def _flat_flags(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatArr
     frames = np.concatenate([axis.frames.reshape(-1, black.size) for axis in axes])
     margin = 0.1 * np.ptp(np.percentile(frames, [5, 95]))
     typical_high, typical_low = np.percentile(frames, [90, 10], axis=0)
-    beyond = {
-        "white": float(np.mean(typical_high > white + margin)),
-        "black": float(np.mean(typical_low < black - margin)),
-    }
+    white_share = float(np.mean(typical_high > white + margin))
+    black_share = float(np.mean(typical_low < black - margin))
     return [
-        SeriesFlag(
-            name,
-            0,
-            0,
-            f"not {'brighter' if name == 'white' else 'darker'} than the fringes at {share:.0%} of the pixels",
-        )
-        for name, share in beyond.items()
+        SeriesFlag(name, 0, 0, f"not {word} than the fringes at {share:.0%} of the pixels")
+        for name, word, share in (("white", "brighter", white_share), ("black", "darker", black_share))
         if share > BEYOND_SHARE
     ]

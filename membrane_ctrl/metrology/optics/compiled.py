@@ -33,7 +33,6 @@ def step(function: Callable[..., Any]) -> Any:
 # loops, keeps idle threads asleep (the control loop shares the machine), has no library that may be entered only
 # once, and adds partial sums in a fixed order, so that results repeat to the last bit.
 
-
 T = TypeVar("T")
 WORKERS = 2
 

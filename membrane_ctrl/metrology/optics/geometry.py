@@ -129,7 +129,6 @@ def distort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> Floa
 # A circle on the mirror is an ellipse in the picture. The rim's points from the pose are drawn, and along the line
 # from the middle through each the light's edge is looked for; the edge is half the light of what is well inside.
 
-
 _POINTS = 180
 _FROM, _TO = 0.85, 1.15  # of the expected radius
 _SAMPLES = 121

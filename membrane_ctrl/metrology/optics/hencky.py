@@ -22,9 +22,8 @@ from membrane_ctrl.model.arrays import FloatArray
 
 POISSON_RATIO = 0.3
 _SERIES_TERMS = 80  # the nearest singularity is beyond v = 2: the last term is below 1e-24
-EXCESS_TERMS = (
-    15  # Legendre degree 14; the coefficients fall sevenfold a degree: what is cut off is below 1e-13 of the sag
-)
+# Legendre degree 14; the coefficients fall sevenfold a degree: what is cut off is below 1e-13 of the sag
+EXCESS_TERMS = 15
 _CARRIED = {0: 1, 1: 4, 2: 11, 3: 22}  # Legendre degree -> Noll index
 
 

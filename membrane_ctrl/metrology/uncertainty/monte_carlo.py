@@ -47,11 +47,9 @@ class TrialBench:
         cls, optics: OpticsConfig, checked: Checked, figure: full.BinFigure, count: int = TRIAL_POINTS
     ) -> "TrialBench":
         """Of a set's figure, its points thinned to about `count`."""
-        row, column = np.divmod(figure.index, checked.phase_rad.shape[2])
-        side = checked.binned.bin_px
-        place_px = side * np.stack([column, row]) + (side - 1) / 2
+        places_px = checked.places_px(figure.index)
         return cls.of_points(
-            optics, checked.tracer, figure.fit.surface, figure.points, place_px, figure.sigma_mm, count
+            optics, checked.tracer, figure.fit.surface, figure.points, places_px, figure.sigma_mm, count
         )
 
     @classmethod
@@ -99,9 +97,8 @@ class TrialBench:
 
     def geometry(self, names: tuple[str, ...], change: FloatArray) -> Geometry:
         """The nominal geometry changed."""
-        return Geometry.from_config(
-            self.optics.model_copy(update={"geometry": changed(self.optics.geometry, names, change)})
-        )
+        moved = {"geometry": changed(self.optics.geometry, names, change)}
+        return Geometry.from_config(self.optics.model_copy(update=moved))
 
     def slope_variance(self) -> FloatArray:
         """(2,) variance of an x and of a y slope from the noise."""
@@ -124,20 +121,10 @@ def run_trials(
     trials: Sequence[int],
     first_set: int = 0,
 ) -> FloatArray:
-    """Parameters (trials, sets, 36) in mm of some trials; all sets share the geometry of a trial.
+    """Parameters (trials, sets, 36) in mm of the trials with these numbers; all sets share the geometry of a trial.
 
-    Parameters
-    ----------
-    benches : sequence of TrialBench
-        One a set; of one bench, that is with the same nominal geometry.
-    spread : GeometrySpread
-        Of the geometry.
-    seed : int
-        Of all that is random.
-    trials : sequence of int
-        Numbers of the trials.
-    first_set : int
-        Number of the first set in its run: noise differs from set to set.
+    The benches, one a set, have the same nominal geometry. `first_set` is the number of the first set in its run:
+    noise differs from set to set.
     """
     out = np.empty((len(trials), len(benches), PARAMETERS))
     for row, trial in enumerate(trials):
@@ -157,7 +144,6 @@ def run_trials(
 # Linear: C = J S J^T + C_noise with S the covariance of the geometry and J the change of the parameters with it, from
 # two solutions a number (some ms each); J hardly changes while the film moves by micrometres, so a live loop works it
 # out once a full cycle.
-
 
 MAP_SIDE = 101  # points across a map: 10 mm a cell, far below what 36 terms can change over
 

@@ -21,13 +21,8 @@ _WATCHED = {"A": (0.45, 90.0), "B": (0.70, 210.0), "C": (0.95, 330.0)}
 
 def default_points_mm(analysis_radius_mm: float) -> dict[str, tuple[float, float]]:
     """A, B and C: name to (x, y) in mm."""
-    return {
-        name: (
-            analysis_radius_mm * share * math.cos(math.radians(azimuth)),
-            analysis_radius_mm * share * math.sin(math.radians(azimuth)),
-        )
-        for name, (share, azimuth) in _WATCHED.items()
-    }
+    turns = {name: (analysis_radius_mm * r, math.radians(azimuth)) for name, (r, azimuth) in _WATCHED.items()}
+    return {name: (r_mm * math.cos(turn), r_mm * math.sin(turn)) for name, (r_mm, turn) in turns.items()}
 
 
 class RunningCovariance:
@@ -79,7 +74,6 @@ class Tally:
 #
 # Both sets of a pair were disturbed with the same geometries (see `monte_carlo`), so that what a wrong geometry does
 # to both alike cancels, trial by trial. Only the sets within the longest lag are kept.
-
 
 LAGS_S = (60.0, 600.0)  # the paper's
 # A set this far from the wanted moment still stands for it: a run with a bad set in it has a neighbour there.

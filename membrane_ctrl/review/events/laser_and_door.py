@@ -180,9 +180,9 @@ def door_steps(mean_pa: Column, reading_pa: Column, least_pa: float, least_sigma
     for place in chosen:
         row, lag = int(found.row[place]), int(found.lag[place])
         size = _whole_size(values, row, lag, float(found.size[place])) if every == 1 else float(found.size[place])
-        result.append(
-            FoundStep(_steepest(mean_pa, row * every, (row + lag) * every), size, float(found.score[place]))
-        )
+        changes = np.abs(np.diff(mean_pa[row * every : (row + lag) * every + 1]))
+        steepest = row * every + 1 + int(np.argmax(np.nan_to_num(changes)))
+        result.append(FoundStep(steepest, size, float(found.score[place])))
     return result
 
 
@@ -240,8 +240,3 @@ def _whole_size(values: Column, row: int, lag: int, size: float) -> float:
     before = sign * values[max(0, row - _BEYOND) : row + 1]
     after = sign * values[row + lag : row + lag + _BEYOND + 1]
     return float(sign * (np.nanmax(after) - np.nanmin(before)))
-
-
-def _steepest(mean_pa: Column, first: int, last: int) -> int:
-    """Row with the greatest change from the one before it, of those behind `first` and up to `last`."""
-    return first + 1 + int(np.argmax(np.nan_to_num(np.abs(np.diff(mean_pa[first : last + 1])))))

@@ -1,16 +1,23 @@
-"""The report for people: one HTML file with everything in it."""
+"""The report for people, one HTML file with everything in it; and the command `report`, which writes it."""
 
 import html
 import shlex
+import sys
+import time
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from membrane_ctrl import __version__
+from membrane_ctrl.model import errors, files, plain_json
+from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.report import figures
-from membrane_ctrl.review.report.json import timeline, verdict
+from membrane_ctrl.review.report.json import report_table, timeline, verdict
 from membrane_ctrl.review.statistics import compare, drift, shape_review, spectra
-from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
-from membrane_ctrl.review.words import number, span
+from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries, analyse
+from membrane_ctrl.review.words import number, part_s, span
+from membrane_ctrl.run_files.run import Run, open_run
 
 STYLE = """
 :root{color-scheme:light}
@@ -84,9 +91,8 @@ def render(analysis: Analysis, other: Analysis | None = None, differences: Seque
 
 
 def _anomalies(analysis: Analysis) -> str:
-    if not analysis.anomalies:
-        return ""
-    return _list(f"<b>{_text(a.name)}</b> {_text(a.seen)}" for a in analysis.anomalies)
+    items = "".join(f"<li><b>{_text(a.name)}</b> {_text(a.seen)}</li>" for a in analysis.anomalies)
+    return f"<ul class='odd'>{items}</ul>" if items else ""
 
 
 def _found(analysis: Analysis) -> str:
@@ -236,10 +242,6 @@ def _facts(facts: Iterable[tuple[str, str]]) -> str:
     return "<dl>" + "".join(f"<dt>{_text(name)}</dt><dd>{said}</dd>" for name, said in facts) + "</dl>"
 
 
-def _list(items: Iterable[str]) -> str:
-    return "<ul class='odd'>" + "".join(f"<li>{item}</li>" for item in items) + "</ul>"
-
-
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     cells = "".join(f"<th>{title}</th>" for title in head)
     body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
@@ -248,3 +250,60 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _text(text: str) -> str:
     return html.escape(text)
+
+
+# `membrane-ctrl report RUN`: the page, the JSON beside it, and the verdict on the terminal.
+
+# A terminal shows no more at once; the page has all of them.
+_SHOWN_MOST = 20
+
+
+def report_command(
+    run: Path, out: Path | None, compare_with: Path | None, start: str | None, end: str | None, json: bool
+) -> int:
+    """Write `report.html` and `report.json`; see `membrane-ctrl report --help`."""
+    began_s = time.monotonic()
+    opened = open_run(catalogue.resolve(run))
+    analysis = analyse(opened, *part_s(opened, start, end))
+    other = None if compare_with is None else _other(open_run(catalogue.resolve(compare_with)), start, end)
+    differences = [] if other is None else compare.compare(analysis, other)
+    table = report_table(analysis)
+    if other is not None:
+        table["compared_with"] = {
+            "run": other.run.name,
+            "whole_run": not other.is_part,
+            "report": report_table(other),
+            "differences": [asdict(difference) | {"said": difference.said} for difference in differences],
+        }
+    folder = out.resolve() if out else opened.folder / "report"  # a link that a person names is meant
+    text = plain_json.dumps(table, indent=1)
+    page = render(analysis, other, differences)
+    with errors.writing(folder, errors.DeviceError, "; choose another folder with --out"):
+        files.make_folder(folder)
+        files.write_text_atomic(folder / "report.json", text + "\n")
+        files.write_text_atomic(folder / "report.html", page)
+    if json:
+        print(text)
+    else:
+        _say(analysis, other, folder, time.monotonic() - began_s)
+    return 0
+
+
+def _other(run: Run, start: str | None, end: str | None) -> Analysis:
+    """The run to compare with: its same part if that counts from the start, else all, for times of day differ."""
+    from_start = all(text is None or text.strip().startswith("+") for text in (start, end))
+    return analyse(run, *part_s(run, start, end)) if from_start else analyse(run)
+
+
+def _say(analysis: Analysis, other: Analysis | None, folder: Path, took_s: float) -> None:
+    for note in analysis.run.notes:
+        print(f"note: {note}", file=sys.stderr)
+    print(verdict(analysis)[1])
+    for event in analysis.found[:_SHOWN_MOST]:
+        print(f"  {analysis.run.utc(event.time_s):%Y-%m-%d %H:%M:%S}  {event.kind}, {event.size:.3g} {event.unit}")
+    if len(analysis.found) > _SHOWN_MOST:
+        print(f"  and {len(analysis.found) - _SHOWN_MOST} more in the report")
+    if other is not None:
+        part = "" if not analysis.is_part else ", same part" if other.is_part else ", all of it"
+        print(f"against {other.run.name}{part}: {verdict(other)[1]}")
+    print(f"{folder / 'report.html'} ({took_s:.1f} s)")

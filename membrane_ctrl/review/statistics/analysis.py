@@ -127,7 +127,7 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
     found, shape = _found_and_shape(run, seconds, start_s, end_s)
     del seconds  # of a month a quarter of a GB, and what comes needs more
     ticks = hold_pass(run, span_s, (start_s, end_s))
-    level_s = _level_for(span_s[1] - span_s[0])
+    level_s = next((w for w in (1.0, 10.0) if (span_s[1] - span_s[0]) / w <= _PICTURE_ROWS), 60.0)
     level = run.level(level_s, start_s, end_s)
     reading = _series(run, ticks, READING)
     true = _series(run, ticks, TRUE)
@@ -233,10 +233,6 @@ def _tracking(level: Block) -> float:
     return float((state == states.ShapeState.TRACKING).mean()) if state.size else math.nan
 
 
-def _level_for(span_s: float) -> float:
-    return next((w for w in (1.0, 10.0) if span_s / w <= _PICTURE_ROWS), 60.0)
-
-
 # What is not as it should be, by name and with the figure that says so.
 
 # 95 % in band is what noise alone leaves of single ticks; of seconds a hold keeps all.
@@ -292,7 +288,7 @@ def _anomalies(
     if ticks.thin_s:
         odd.append(Anomaly("thinned ticks", f"{span(ticks.thin_s)} held {_THIN}"))
     if ticks.uncovered_s:
-        odd.append(Anomaly("thinned ticks", f"{span(ticks.uncovered_s)} held are in no figure: few ticks, no level"))
+        odd.append(Anomaly("thinned ticks", f"{span(ticks.uncovered_s)} held not counted: few ticks, no level"))
     if ticks.lateness_ms.quantile(0.99) > _LATE_P99_MOST_MS:
         odd.append(Anomaly("late ticks", f"p99 is {ticks.lateness_ms.quantile(0.99):.1f} ms"))
     if leak_um_per_s < _LEAK_LEAST_UM_PER_S:
@@ -307,7 +303,7 @@ def _anomalies(
         if shape.rejected > _REJECTED_MOST * shape.cycles:
             odd.append(Anomaly("rejected cycles", f"{shape.rejected} of {shape.cycles}"))
         if shape.disagreement.significant:
-            odd.append(Anomaly("camera and laser part", _of(shape.disagreement, "um/h")))
+            odd.append(Anomaly("camera and laser diverge", _of(shape.disagreement, "um/h")))
     counts = Counter(event.kind for event in found)
     odd += [Anomaly(kind, f"{count} found") for kind, count in counts.most_common()]
     return tuple(odd)

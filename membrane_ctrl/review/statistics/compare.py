@@ -14,7 +14,7 @@ from membrane_ctrl.review.statistics.drift import FittedSlope, mean_p, spread_p,
 
 _SIGNIFICANT = 0.01
 _SHORT = "no test: too short for blocks"
-_STRETCHES = "tests these two stretches of time, not the settings: the weather is another each day"
+_STRETCHES = "tests these two stretches of time, not the settings: the weather differs from day to day"
 
 
 @dataclass(frozen=True, slots=True)

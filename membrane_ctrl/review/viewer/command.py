@@ -11,7 +11,6 @@ from membrane_ctrl.model import errors, states, terminal
 from membrane_ctrl.review import catalogue, words
 from membrane_ctrl.review.viewer import blueprints, viewer
 from membrane_ctrl.review.viewer.layer import Layer
-from membrane_ctrl.review.viewer.screenshot import screenshot_of
 from membrane_ctrl.run_files.run import Run, open_run
 from membrane_ctrl.run_files.run_folder import event_s
 
@@ -62,7 +61,7 @@ def review_command(options: ReviewOptions) -> int:
 def _show(file: Path, options: ReviewOptions, cursor_s: float | None) -> int:
     if options.screenshot is not None:
         try:
-            options.screenshot.write_bytes(screenshot_of([file], cursor_s))
+            options.screenshot.write_bytes(viewer.screenshot_of([file], cursor_s))
         except RuntimeError as error:
             raise errors.DeviceError(f"no picture: {error}") from None
         return 0
@@ -90,23 +89,20 @@ def _require_sense(options: ReviewOptions) -> None:
     if len(options.runs) != 1:
         raise errors.InputError("--live: one run at a time")
     if any(part is not None for part in (*moments, options.save, options.screenshot)):
-        raise errors.InputError("--live follows the run as it goes on: leave --at, --from, --save and the like away")
+        raise errors.InputError("--live follows the run as it goes on: leave out --at, --from, --save and the like")
     if options.bind != _THIS_MACHINE:
-        raise errors.InputError("--live serves this machine only: leave --bind away and use the ssh line it prints")
+        raise errors.InputError("--live serves this machine only: leave out --bind and use the ssh line it prints")
 
 
 def _require_writable(target: Path, runs: Sequence[Run]) -> None:
     """Said before the work, not after it."""
     if any(target.resolve().parent == run.folder.resolve() for run in runs):
         raise errors.InputError(f"{target}: lies among what the recorder wrote; choose another folder")
-    try:
+    with errors.writing(target, errors.DeviceError, "; choose another place"):
         new = not target.exists()
         target.open("ab").close()
         if new:
             target.unlink()
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise errors.DeviceError(f"{target}: cannot be written ({reason}); choose another place") from None
 
 
 def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> float | None:

@@ -1,18 +1,20 @@
 """Starts the viewer on a review: on this screen, for a browser, into a picture, or following a run that goes on."""
 
+import argparse
 import os
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
 import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import ViewerClient
 
-from membrane_ctrl.model.errors import DeviceError
+from membrane_ctrl.model import errors
 from membrane_ctrl.model.files import open_plain
 from membrane_ctrl.run_files.rrd_reader import segments
 from membrane_ctrl.run_files.segments import first_message_after
@@ -88,7 +90,8 @@ def live(folder: Path, web: bool, port: int = 0) -> int:
         _require_screen()
     try:
         with subprocess.Popen(server, stdin=subprocess.PIPE, env=_environment()) as served:
-            watched = served if web else _connected(proxy)
+            viewer = viewer_command("--bind", "127.0.0.1", "--port", str(free_port()), "--connect", proxy)
+            watched = served if web else subprocess.Popen(viewer, env=_environment())
             assert served.stdin is not None
             try:
                 follow(folder, served.stdin, lambda: watched.poll() is None)
@@ -99,18 +102,13 @@ def live(folder: Path, web: bool, port: int = 0) -> int:
                 watched.terminate()
                 served.terminate()
     except OSError as error:
-        raise DeviceError(f"the viewer did not start: {error}") from None
+        raise errors.DeviceError(f"the viewer did not start: {error}") from None
     return 0
-
-
-def _connected(proxy: str) -> subprocess.Popen[bytes]:
-    command = viewer_command("--bind", "127.0.0.1", "--port", str(free_port()), "--connect", proxy)
-    return subprocess.Popen(command, env=_environment())
 
 
 def _require_screen() -> None:
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise DeviceError("no screen here: use --web and open the address in a browser, or --screenshot FILE")
+        raise errors.DeviceError("no screen here: use --web and open the address in a browser, or --screenshot FILE")
 
 
 def _say_where(bind: str, port: int, data_port: int) -> None:
@@ -181,10 +179,8 @@ def _require_listening(bind: str, port: int) -> None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((bind, port))
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise DeviceError(
-            f"cannot listen on {bind}, port {port} ({reason}): choose another --port or --bind"
-        ) from None
+        where = f"{bind}, port {port} ({errors.os_reason(error)})"
+        raise errors.DeviceError(f"cannot listen on {where}: choose another --port or --bind") from None
 
 
 def free_port() -> int:
@@ -204,8 +200,114 @@ def _run(command: list[str], started: Callable[[subprocess.Popen[bytes]], None] 
                 viewer.terminate()
                 return 0
     except OSError as error:
-        raise DeviceError(f"the viewer did not start: {error}") from None
+        raise errors.DeviceError(f"the viewer did not start: {error}") from None
 
 
 def _environment() -> dict[str, str]:
     return {**os.environ, "RUST_LOG": os.environ.get("RUST_LOG", "error")}
+
+
+# A picture of a run as the viewer opens it, without a screen; it needs a Vulkan driver, Mesa's software one will do.
+
+# The viewer is ready when two pictures in a row are the same, which on two cores takes about 7 s for a short run.
+_WAIT_S = 60.0
+_BETWEEN_S = 0.5
+
+
+def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:
+    """PNG of the whole run, at its end.
+
+    Raises FileNotFoundError if there is no recording in the folder; ValueError if the recording has no such tab;
+    RuntimeError if the viewer does not start (no Vulkan driver) or does not come to rest. All segments
+    of the run are opened; `tab` is the name of a tab of the blueprint.
+    """
+    files = [str(path.resolve()) for path in segments(run_dir)]
+    if not files:
+        raise FileNotFoundError(f"{run_dir}: no .rrd file in it")
+    with _headless() as viewer:
+        viewer.open(files)
+        _show_tab(viewer, tab)
+        viewer.set_time("run_time", play_state="following")
+        return _at_rest(viewer)
+
+
+def screenshot_of(files: Sequence[Path], at_s: float | None = None) -> bytes:
+    """PNG of recordings as they open, at a second of `run_time` or their end. Raises RuntimeError as `screenshot`."""
+    with _headless() as viewer:
+        viewer.open([str(path.resolve()) for path in files])
+        if at_s is None:
+            viewer.set_time("run_time", play_state="following")
+        else:
+            viewer.set_time("run_time", duration=at_s, play_state="paused")
+        return _at_rest(viewer)
+
+
+def _show_tab(viewer: ViewerClient, name: str) -> None:
+    blueprint = viewer.get_blueprint().blueprint
+    containers = {
+        path.removeprefix("/"): parts["ContainerBlueprint"]
+        for path, parts in blueprint.items()
+        if "ContainerBlueprint" in parts
+    }
+    wanted = next((path for path, container in containers.items() if container.get("display_name") == name), None)
+    tabs = next((container for container in containers.values() if wanted in container["contents"]), None)
+    if tabs is None:
+        raise ValueError(f"no tab {name!r} in the recording")
+    tabs["active_tab"] = wanted
+    viewer.set_blueprint(blueprint, "recording")
+
+
+def _at_rest(viewer: ViewerClient) -> bytes:
+    until_s = time.monotonic() + _WAIT_S
+    before = b""
+    while time.monotonic() < until_s:
+        picture = viewer.take_screenshot()
+        if picture == before:
+            return picture
+        before = picture
+        time.sleep(_BETWEEN_S)
+    raise RuntimeError(f"the viewer's picture still changed after {_WAIT_S:.0f} s")
+
+
+@contextmanager
+def _headless() -> Iterator[ViewerClient]:
+    """A headless viewer that only this machine can reach; `ViewerClient.spawn` would listen on every interface."""
+    port = free_port()
+    command = viewer_command("--headless", "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen")
+    with subprocess.Popen(command, env=_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+        try:
+            yield _connect(port, process)
+        finally:
+            process.terminate()
+
+
+def _connect(port: int, process: subprocess.Popen[bytes]) -> ViewerClient:
+    until_s = time.monotonic() + _WAIT_S
+    while time.monotonic() < until_s and process.poll() is None:
+        try:
+            viewer = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            viewer.take_screenshot(max_size=16)
+        except (RuntimeError, ConnectionError):
+            time.sleep(_BETWEEN_S)
+        else:
+            return viewer
+    process.terminate()
+    reason = process.stderr.read().decode(errors="replace").strip() if process.stderr else ""
+    raise RuntimeError(f"the headless viewer did not start (Vulkan driver installed?): {reason[-300:]}")
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description="Picture of a recorded run as the viewer opens it.")
+    parser.add_argument("run", type=Path, help="folder of the run")
+    parser.add_argument("out", type=Path, help="PNG file to write")
+    parser.add_argument("--tab", default="Overview", help="name of a tab")
+    arguments = parser.parse_args()
+    try:
+        arguments.out.write_bytes(screenshot(arguments.run, arguments.tab))
+    except (OSError, ValueError, RuntimeError) as error:
+        sys.exit(f"{error}")
+
+
+if __name__ == "__main__":
+    main()
