@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_iface.roles import LinkError
-from membrane_ctrl.acquisition import cycle, optical_bench, process, raw_frames, worker
-from membrane_ctrl.acquisition.exposures import CycleClock
+from membrane_ctrl.acquisition import cycle, exposures, optical_bench, process, raw_frames, worker
 from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.metrology import live, phase
@@ -84,7 +83,7 @@ def warm_up(
     optics: OpticsConfig,
     plan: cycle.CyclePlan,
     position: FilmPosition,
-    clock: CycleClock,
+    clock: exposures.CycleClock,
 ) -> None:
     """A full cycle and two of fringes only, with and without known motion, of a film that stands still.
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from membrane_ctrl.acquisition import exposures, process
-from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed, ShapeCycle
+from membrane_ctrl.acquisition import cycle, exposures, process
 from membrane_ctrl.geometry.file import InForce
 from membrane_ctrl.metrology import bins, phase
 from membrane_ctrl.metrology.calibrate.drift import DriftMonitor, RingMonitor, noise_urad
@@ -17,7 +16,7 @@ from membrane_ctrl.model import events, run_events, shape_estimate
 
 
 def keep_cycling(
-    cycle: ShapeCycle,
+    taking: cycle.ShapeCycle,
     remote: process.Remote,
     publish: Callable[[shape_estimate.ShapeEstimate], None],
     clock: exposures.CycleClock,
@@ -44,8 +43,8 @@ def keep_cycling(
             continue
         captures = remote.take_capture()
         if remote.take_full() or captures:
-            cycle.want_full()
-        result = cycle.take()
+            taking.want_full()
+        result = taking.take()
         _tell(result, remote, publish)
         if captures:
             remote.tell(_captured(result, keep))
@@ -59,13 +58,13 @@ def next_deadline_s(last_s: float, period_s: float, earliest_s: float) -> float:
 
 
 def _captured(
-    result: CycleDone | CycleFailed | None, keep: Callable[[shape_estimate.ShapeEstimate], Path]
+    result: cycle.CycleDone | cycle.CycleFailed | None, keep: Callable[[shape_estimate.ShapeEstimate], Path]
 ) -> run_events.Capture:
     """Result of a requested set; a rejected one is not kept."""
     match result:
         case None:
             return run_events.Capture(failed="the cycle was stopped")
-        case CycleFailed(number, stage, message, _):
+        case cycle.CycleFailed(number, stage, message, _):
             return run_events.Capture(number, failed=f"{stage}: {message}")
     estimate = result.estimate
     if estimate.verdict == "rejected":
@@ -80,17 +79,17 @@ def _captured(
 
 
 def _tell(
-    result: CycleDone | CycleFailed | None,
+    result: cycle.CycleDone | cycle.CycleFailed | None,
     remote: process.Remote,
     publish: Callable[[shape_estimate.ShapeEstimate], None],
 ) -> None:
     match result:
-        case CycleDone(estimate, pause_s):
+        case cycle.CycleDone(estimate, pause_s):
             publish(estimate)
             later = f"; next in {pause_s:g} s" if pause_s else ""
             verdict = f"{estimate.verdict}: {estimate.reason}{later}" if estimate.reason else estimate.verdict
             remote.report("running", verdict, cycle=estimate.cycle)
-        case CycleFailed(number, stage, message, pause_s):
+        case cycle.CycleFailed(number, stage, message, pause_s):
             remote.report("retrying", f"{stage}: {message}; again in {pause_s:g} s", cycle=number)
 
 

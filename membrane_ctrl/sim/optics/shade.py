@@ -88,42 +88,23 @@ def _row_of_nodes(nodes: FloatArray, k: int, node: int, w: FloatArray, line: Flo
 
 @njit(cache=True)
 def shade(
+    # (3, rows, columns): s_x, s_y (from the low edges of the region, mm), squared distance from the vertex (mm^2)
     nodes: FloatArray,
-    weights: FloatArray,
-    axis: int,
-    radius_mm: float,
-    values: FloatArray,
-    cell_mm: float,
-    smooth: bool,
-    side_mm: float,
+    weights: FloatArray,  # (step, 4) of `cubic_weights`
+    axis: int,  # 0: the pattern runs along s_x, 1: along s_y
+    radius_mm: float,  # of the film's rim
+    side_mm: float,  # of the pattern region
+    table: tuple[FloatArray, float, bool],  # the fields of a `LevelTable`
+    # (4,): counts without light, counts of a white screen above that, light outside the region (share), full scale
     scale: FloatArray,
-    loss: tuple[FloatArray, FloatArray],
-    noise: tuple[Singles, float, int],
+    loss: tuple[FloatArray, FloatArray],  # vignetting (W,), (H,): a column's part and a row's
+    noise: tuple[Singles, float, int],  # `normal_quantiles()`, standard deviation in counts, seed of this picture
     out: Pixels,
 ) -> None:
-    """Fill `out` (H, W) with the picture of one pattern.
-
-    Parameters
-    ----------
-    nodes : (3, rows, columns) array
-        s_x, s_y (from the region's low edges, mm) and the distance on the film from the vertex squared (mm^2).
-    weights : (step, 4) array
-        Of `cubic_weights`.
-    axis : int
-        0: the pattern runs along s_x, 1: along s_y.
-    radius_mm, side_mm : float
-        Rim of the film, side of the pattern region.
-    values, cell_mm, smooth
-        The light, a `LevelTable`.
-    scale : (4,) array
-        Counts without light, counts of a white screen above that, darkness outside the region (share), full scale.
-    loss : two arrays, (W,) and (H,)
-        Vignetting as a sum of a part of the column and a part of the row.
-    noise : tuple
-        `normal_quantiles()`, standard deviation in counts, seed of this picture.
-    """
+    """Fill `out` (H, W) with the picture of one pattern."""
     step = weights.shape[0]
     height, width = out.shape
+    values, cell_mm, smooth = table
     dark, white, leak, full = scale
     column_loss, row_loss = loss
     quantiles, sigma, seed = noise
