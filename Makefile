@@ -16,7 +16,9 @@ $(STAMP): pyproject.toml requirements.lock
 hold: $(STAMP)  ## hold the simulated mirror for two minutes, with the console
 	$(BIN)/membrane-ctrl hold --twin --duration 2m --name demo
 
-test: lint types unit  ## everything CI runs
+test: $(STAMP)  ## everything CI runs
+	$(MAKE) --jobs 2 --output-sync lint types
+	$(MAKE) unit
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .
@@ -33,7 +35,7 @@ types: $(STAMP)
 
 unit: $(STAMP)
 	$(BIN)/pytest -m "not campaign and not real_time" -n 2 --dist loadfile
-	$(BIN)/pytest -m "real_time and not campaign"
+	$(BIN)/pytest -m "real_time and not campaign" -n 2 --dist loadfile
 
 shake: $(STAMP)  ## the same tests on a machine that stands still for a second, again and again; SEED=2 for other moments
 	$(BIN)/python tests/shake.py --seed $(or $(SEED),1) $(MAKE) unit
