@@ -193,8 +193,11 @@ def table(path: Path, rng: random.Random) -> None:
 
 
 def toml(path: Path, rng: random.Random) -> None:
-    """A value of a TOML file is another."""
-    value = tomllib.loads(path.read_text())
+    """A value of a TOML file is another; a key of 30 000 parts is left as it is, since tomllib takes 2 GB for it."""
+    before = path.read_text()
+    if ".a" * 30000 in before:
+        return
+    value = tomllib.loads(before)
     _change(value, rng)
     text = tomli_w.dumps(_without_none(value))
     if rng.random() < 0.15:
