@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 _CODES = {
     pa.float64(): "<f8", pa.float32(): "<f4", pa.int64(): "<i8", pa.uint32(): "<u4", pa.uint8(): "|u1",
 }  # fmt: skip
-_KIND = re.compile(rb"(\d{1,4})(<f8|<f4|<i8|<u4|\|u1)")
+_KIND = re.compile(rb"([1-9]\d{0,3})(<f8|<f4|<i8|<u4|\|u1)")
 KIND, SUM = b"kind", b"sum"
 AS_IT_IS, BITS, OF_SUM = b"-", b"b", b"s"  # codes; a digit: the number of decimals
 _DIGITS_MAX = 6
@@ -137,8 +137,8 @@ def decode(batch: pa.RecordBatch, schema: pa.Schema, codes: bytes | None, names:
     """
     if codes is None and not any(kind_of(schema.field(name)) for name in names):
         return batch.select(list(names))
-    if codes is None or len(codes) != len(schema):
-        raise pa.ArrowInvalid("a batch without the codes of its columns")
+    if codes is None or len(codes) != len(schema) or not batch.num_rows:
+        raise pa.ArrowInvalid("a batch without rows, or without the codes of its columns")
     numbers: dict[str, NDArray[Any]] = {}
     arrays: dict[str, pa.Array] = {}
     for name in needed(schema, names):

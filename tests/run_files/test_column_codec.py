@@ -96,3 +96,9 @@ def test_what_no_recorder_writes_is_refused(schema: pa.Schema, codes: bytes | No
     cells = pa.array([bytes(8)] * 5, pa.binary(8))
     with pytest.raises(pa.ArrowInvalid):
         decode(pa.record_batch([cells, cells], schema=schema), schema, codes, ["x", "y"])
+
+
+def test_a_batch_without_rows_is_refused() -> None:
+    schema = about(x=b"")
+    with pytest.raises(pa.ArrowInvalid):
+        decode(pa.RecordBatch.from_pylist([], schema), schema, b"b", ["x"])
