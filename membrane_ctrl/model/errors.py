@@ -58,7 +58,8 @@ class DeviceError(CommandError):
 
 def os_reason(error: OSError) -> str:
     """What the operating system says, for use within a sentence."""
-    return (error.strerror or str(error)).lower()
+    text = error.strerror or str(error)
+    return text[:1].lower() + text[1:]
 
 
 @contextmanager

@@ -87,7 +87,7 @@ def _make_unique(logs_dir: Path, name: str) -> Path:
 
 
 def _unwritable(folder: Path, error: OSError) -> errors.DeviceError:
-    reason = (error.strerror or str(error)).lower()
+    reason = errors.os_reason(error)
     return errors.DeviceError(f"{folder}: cannot be written ({reason}); give a folder you may write with --logs DIR")
 
 
@@ -175,7 +175,7 @@ def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> di
     try:
         files.append_text(folder / ANNOTATIONS_FILE, json.dumps(event, ensure_ascii=False) + "\n")
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
+        reason = errors.os_reason(error)
         raise errors.DeviceError(f"{folder / ANNOTATIONS_FILE}: cannot be written ({reason})") from None
     return event
 

@@ -95,7 +95,7 @@ def test_what_leads_out_of_the_file_or_is_too_large_is_refused(tmp_path):
     path = tmp_path / "e.h5"
     with h5py.File(path, "w") as file:
         file["Camera/intrinsic_mat"] = h5py.ExternalLink(other.name, "Camera/intrinsic_mat")
-    with pytest.raises(ValueError, match="intrinsic_mat is is a link, and links are not followed here"):
+    with pytest.raises(ValueError, match="intrinsic_mat is a link, and links are not followed here"):
         sofast_facet.read_camera(path)
     with h5py.File(path, "w") as file:
         file["Camera"] = h5py.ExternalLink(other.name, "Camera")
@@ -117,5 +117,5 @@ def test_what_leads_out_of_the_file_or_is_too_large_is_refused(tmp_path):
 
 def test_a_pipe_in_place_of_a_file_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "p.h5")
-    with pytest.raises(ValueError, match=r"p\.h5: not an HDF5 file .*no plain file"):
+    with pytest.raises(ValueError, match=r"p\.h5: not an HDF5 file .*not a plain file"):
         sofast.read_measurement(tmp_path / "p.h5")
