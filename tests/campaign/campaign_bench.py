@@ -105,7 +105,7 @@ class Run:
     def recorder(self) -> psutil.Process:
         """The child that has the recording open. Raises LookupError."""
         for child in psutil.Process(self.process.pid).children():
-            if any(str(self.folder) in file.path for file in child.open_files()):
+            if any(str(self.folder / "logs") in file.path for file in child.open_files()):
                 return child
         raise LookupError("no child has the recording open")
 
