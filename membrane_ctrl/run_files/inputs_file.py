@@ -41,7 +41,7 @@ _CODES = {code: code for code in ("<i8", "<f8", "|u1", "<u4")}
 
 @dataclass(frozen=True, slots=True)
 class InputsFrame:
-    """About a second of a run: ticks by number, tails and memories by tick, shape estimates by time."""
+    """A part of a run: ticks by number, tails and memories by tick, shape estimates by time."""
 
     records: Records
     tails: dict[int, bytes]
@@ -138,9 +138,8 @@ class TablesReader(InputsReader):
 
     def _estimates(self) -> Iterator[shape_estimate.ShapeEstimate]:
         for table in self._tables(tables.SHAPES, shapes.ESTIMATE_COLUMNS, _SHAPE_BEFORE_S):
-            late = table.filter(pc.field("time_s") >= self._from_s - _SHAPE_BEFORE_S)
             try:
-                yield from shapes.estimates(late)
+                yield from shapes.estimates(table.filter(pc.field("time_s") >= self._from_s - _SHAPE_BEFORE_S))
             except (ValueError, LookupError) as error:
                 column_reader.add_note(self.damage, f"{tables.SHAPES}: a batch holds no estimates ({error})")
 

@@ -10,6 +10,7 @@ import struct
 from dataclasses import replace
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 
 from benchmarks.recorded_hold import ring_trip
@@ -289,6 +290,16 @@ def test_a_damaged_batch_of_the_tables_is_a_gap(record: Path, monkeypatch: pytes
     gaps = [item for item in recorded_ticks(reader) if isinstance(item, Gap)]
     assert 50 <= sum(gap.ticks for gap in gaps if gap.reason == "not recorded") <= 151
     assert len(reader.damage) == 1
+
+
+def test_shapes_without_their_times_are_damage(record: Path) -> None:
+    (path,) = (record / "columns").glob("shapes*.arrows")
+    path.unlink()
+    with path.open("wb") as file, pa.ipc.new_stream(file, pa.schema([("sag_change_um", pa.float64())])) as stream:
+        stream.write_table(pa.table({"sag_change_um": [1.0]}))
+    reader = open_inputs(record)
+    assert sum(len(frame.estimates) for frame in reader) == 0
+    assert any("shapes" in line and "time_s" in line for line in reader.damage)
 
 
 def test_a_difference_is_shown_with_what_was_recorded(
