@@ -32,7 +32,7 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE.parents[1]), str(HERE)]
 
 MEMORY_BYTES = 700_000_000  # of a case, above what the process has: a command begins with 0.2 GB
-_CASES_A_WORKER = 1000  # each review leaves some threads of Rerun behind, which a command takes with it
+_CASES_A_WORKER = 250  # each review leaves threads of Rerun behind, whose address space counts against the limit
 CASE_S = 120  # on a busy machine; a step of a tuning session takes ten
 _CODES = frozenset({0, 2, 3, 4})
 _REFUSED = {"Cc", "Cf", "Cs", "Zl", "Zp"}

@@ -18,7 +18,7 @@ from tuning import gains_file as journal
 from tuning.gains_file import GainsFile, PlantSection
 from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain
 from tuning.identification.loop_model import PlantModel
-from tuning.identification.records import Record
+from tuning.identification.records import Record, load_record, save_record
 from tuning.identification.shape_loop import STEP_UM, evaluate
 from tuning.proposal.design import ModelBench
 from tuning.proposal.verify import SETTLE_LEAST_S, VerificationTrial, centre_std_um, health, look, settle_s
@@ -182,6 +182,23 @@ def test_results_come_back_from_their_file_as_they_were(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text("{}")
     with pytest.raises(InputError, match="damaged"):
         plain.read(tmp_path / "a.json", Outer)
+
+
+def test_a_record_with_any_wrong_byte_is_one_line(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    path = tmp_path / "experiments.npz"
+    save_record(path, Record(0.02, *(rng.normal(size=60) for _ in range(4))))
+    good = path.read_bytes()
+    refused = 0
+    for place in range(0, len(good), 3):
+        data = bytearray(good)
+        data[place] ^= 0xFF
+        path.write_bytes(data)
+        try:
+            load_record(path)  # a wrong date in the archive changes nothing
+        except InputError:
+            refused += 1
+    assert refused > len(good) / 3 * 0.7
 
 
 def test_the_journal_survives_a_torn_line(tmp_path: Path) -> None:

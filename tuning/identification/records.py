@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -90,6 +91,11 @@ class Record:
 # Raw data of a session: one compressed file a record, checked by its hash when it is read back.
 
 _BYTES_MAX = 200_000_000  # four columns of a day at 50 Hz are 140 MB
+# What NumPy and the archive raise, depending on the byte that is wrong.
+_DAMAGED = (
+    *(OSError, ValueError, TypeError, KeyError, AttributeError, MemoryError, EOFError, NotImplementedError),
+    *(zipfile.BadZipFile, zlib.error),
+)
 _COLUMNS = ("flow_um_per_s", "displacement_um", "ambient_pressure_pa", "air_temperature_c")
 
 
@@ -111,7 +117,7 @@ def load_record(path: Path) -> Record:
             hashed = str(found["sha256"])
     except FileNotFoundError:
         raise errors.InputError(f"{path}: no such file") from None
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, MemoryError, zipfile.BadZipFile) as error:
+    except _DAMAGED as error:
         raise errors.InputError(f"{path}: damaged ({error}); repeat the step that wrote it") from None
     if record.sha256() != hashed:
         raise errors.InputError(f"{path}: the data are not those that were written (hash differs)")
