@@ -1,10 +1,10 @@
-"""Numbers as they are stored: so that zstd makes something of them, and back to the last bit.
+"""Codes columns of numbers so that zstd compresses them well, and decodes them to the last bit.
 
-Each number becomes an integer: of a column of short decimals (a device counts in tenths of a micrometre, and 12.3 is
-the double nearest to 123 / 10) that whole number, of any other its bits. Stored is the difference from the row
-before; of a column that is nearly a sum of others, the exclusive or with that sum's bits. The bytes are sorted by
-their place: the first of all rows, then the second. A column's field says its kind and sum, its batch in `codes` how
-each column is stored.
+Each number becomes an integer. In a column of short decimals (a device counts in tenths of a micrometre, and 12.3 is
+the double nearest to 123 / 10) it is that whole number, in any other column the bits of the float. The codec stores
+the difference from the row before; in a column that nearly equals a sum of others, it stores the exclusive or with
+the bits of that sum. Bytes are sorted by place: the first byte of all rows, then the second. The field's metadata
+gives kind and sum; `codes`, stored with each batch, gives the code of each column.
 """
 
 import re
