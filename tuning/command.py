@@ -11,7 +11,7 @@ from pathlib import Path
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control.film_health import TOO_TIGHT_UM_PER_S
 from membrane_ctrl.control_port.ctl import Where
-from membrane_ctrl.model.errors import DeviceError, Exit, InputError, RejectedError
+from membrane_ctrl.model.errors import DeviceError, Exit, InputError, RejectedError, writing
 from membrane_ctrl.sessions import folder as plain
 from membrane_ctrl.sessions.folder import STEPS, SessionFolder, create_session, newest_session, open_session
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, Progress, live_hold
@@ -73,7 +73,8 @@ def one_step(step: str, options: TuneOptions) -> int:
     """
     if step not in _MOVES:
         folder = _folder(options, None)
-        _do(step, folder, None, options, Progress())
+        with writing(folder.path, DeviceError):
+            _do(step, folder, None, options, Progress())
     else:
         with _session(options, fresh=step == "characterise" and options.session is None) as (folder, rig, progress):
             _begin(progress, options, step, [])
@@ -252,7 +253,8 @@ def _session(options: TuneOptions, fresh: bool = False) -> Iterator[tuple[Sessio
         rig = HoldRig(link, options.author, progress)
         with progress.catching():
             try:
-                yield folder, rig, progress
+                with writing(folder.path, DeviceError):
+                    yield folder, rig, progress
             except BaseException as error:
                 _go_back(rig, folder.head.before, progress)
                 if isinstance(error, HoldError):

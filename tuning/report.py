@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.signal import welch
 
 from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.measure.results import write_figure
 from membrane_ctrl.model.arrays import AnyArray
 from membrane_ctrl.model.files import users, write_text_atomic
 from membrane_ctrl.sessions.folder import STEPS, SessionFolder
@@ -129,7 +129,7 @@ def draw_verification(
 
 
 def _save(path: Path, figure: Figure) -> None:
-    FigureCanvasAgg(figure).print_figure(str(path), dpi=_DPI)
+    write_figure(users(path), figure, _DPI)
 
 
 _STYLE = (

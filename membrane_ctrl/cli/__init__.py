@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 
 from membrane_ctrl import __version__
-from membrane_ctrl.cli import calibrating, holding, optics, records
+from membrane_ctrl.cli import calibrating, holding, optics, records, reviewing
 from membrane_ctrl.model import errors, terminal
-from membrane_ctrl.review.cli import add_commands as add_review_commands
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -27,10 +26,18 @@ def run(arguments: Sequence[str]) -> int:
         except typer.TyperException as error:
             print(f"membrane-ctrl: {terminal.one_line(error.format_message())} (see --help)", file=sys.stderr)
             return errors.Exit.BAD_INPUT
+        except OSError as error:  # of a file that its command did not foresee; better said in its place
+            print(f"membrane-ctrl: {terminal.one_line(_file_trouble(error))}", file=sys.stderr)
+            return errors.Exit.DEVICE_FAILED
         except (KeyboardInterrupt, typer.Abort):
             print("membrane-ctrl: interrupted", file=sys.stderr)
             return errors.Exit.INTERRUPTED
         return int(result or 0)
+
+
+def _file_trouble(error: OSError) -> str:
+    where = error.filename or "a file or connection"
+    return f"{where}: {errors.os_reason(error)}; check that it is there, its permissions and the space on its disk"
 
 
 @app.callback(invoke_without_command=True)
@@ -41,9 +48,8 @@ def top(version: Annotated[bool, typer.Option("--version", help="Print the versi
         raise typer.Exit
 
 
-for _family in (holding, optics, calibrating, records):
+for _family in (holding, optics, calibrating, records, reviewing):
     _family.add_commands(app)
-add_review_commands(app)
 # tuning builds on this package, not the reverse: `tune` comes as an entry point
 for _entry in entry_points(group="membrane_ctrl.subcommands"):
     app.add_typer(_entry.load(), name=_entry.name)

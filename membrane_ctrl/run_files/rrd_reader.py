@@ -5,13 +5,16 @@ Slow against the tables (a chunk an entity a second), but everything is in there
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from rerun.chunk import Chunk
 
 from membrane_ctrl.model.arrays import Column, IntArray
 from membrane_ctrl.run_files import column_reader, streams
 from membrane_ctrl.run_files.segments import FAULTS, read_chunks, salvage
+
+if TYPE_CHECKING:
+    from rerun.chunk import Chunk
 
 REPAIRED = "repaired"  # below the run: what `repair` made of damaged files
 _VALUES = "Scalars:scalars"
@@ -114,7 +117,7 @@ def _chunks(path: Path, entities: set[str], notes: list[str]) -> Iterator[tuple[
         yield chunk.entity_path, batch.column(_TIME).cast("int64").to_numpy(), values
 
 
-def _readable(path: Path, entities: set[str], notes: list[str]) -> list[Chunk]:
+def _readable(path: Path, entities: set[str], notes: list[str]) -> list["Chunk"]:
     try:
         return read_chunks(path, entities)
     except FAULTS as error:

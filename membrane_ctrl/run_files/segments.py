@@ -13,11 +13,12 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
-
-from rerun.chunk import Chunk, RrdReader
+from typing import TYPE_CHECKING, BinaryIO
 
 from membrane_ctrl.model.files import open_plain
+
+if TYPE_CHECKING:  # a list of runs need not load Rerun
+    from rerun.chunk import Chunk
 
 HEAD_BYTES = 12
 MAGIC = b"RRF2"
@@ -198,15 +199,17 @@ FAULTS = (RuntimeError, ValueError, OSError)
 _FAULTS_MAX = 50
 
 
-def read_chunks(path: Path, entities: set[str]) -> list[Chunk]:
+def read_chunks(path: Path, entities: set[str]) -> list["Chunk"]:
     """Chunks of some entities. Raises one of `FAULTS` if Rerun refuses the file."""
+    from rerun.chunk import RrdReader
+
     require_bounded(path)
     with warnings.catch_warnings(), panics_are_faults():
         warnings.simplefilter("ignore")  # the reader's way to say that a file has no footer
         return [chunk for chunk in RrdReader(path).stream() if chunk.entity_path in entities]
 
 
-def salvage(path: Path, entities: set[str]) -> tuple[list[Chunk], int]:
+def salvage(path: Path, entities: set[str]) -> tuple[list["Chunk"], int]:
     """Chunks of some entities in a segment that Rerun refuses, and how many bytes of it are left out.
 
     Raises
@@ -235,7 +238,7 @@ class _Copy:
     lost_bytes: int = 0
     faults: int = 0
 
-    def chunks(self, part: list[SegmentMessage]) -> list[Chunk]:
+    def chunks(self, part: list[SegmentMessage]) -> list["Chunk"]:
         """Chunks of those messages of a part that decode."""
         self.source.seek(0)
         with self.path.open("wb") as file:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from membrane_ctrl.sessions.folder import STEPS, SessionFolder, open_session
 from tuning import command as tune
 from tuning import gains_file as journal
 from tuning import session
-from tuning.cli import compared as compare
+from tuning.comparison import compared as compare
 from tuning.gains_file import load_gains
 from tuning.identification.loop_model import Gains, margins
 from tuning.rig import HoldRig
@@ -238,3 +239,23 @@ def test_a_rig_on_a_hold_records_without_a_gap() -> None:
     together = parts[0].followed_by(parts[1])
     read = [row.displacement_um for row in link.rows[first : first + len(together)]]
     np.testing.assert_array_equal(together.displacement_um, read)
+
+
+@pytest.mark.parametrize("name", ["experiments.png", "session.rrd"])
+def test_what_cannot_be_written_ends_in_one_line(
+    done: SessionFolder, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    path = done.file(name)
+    path.unlink()
+    path.mkdir()
+    assert command_line(["tune", "identify", "--session", str(done.path)]) == Exit.DEVICE_FAILED
+    (said,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("membrane-ctrl: "))
+    assert "cannot be written" in said
+
+
+def test_a_picture_replaces_a_pipe_that_nobody_reads(done: SessionFolder) -> None:
+    path = done.file("experiments.png")
+    path.unlink()
+    os.mkfifo(path)
+    assert command_line(["tune", "identify", "--session", str(done.path)]) == Exit.DONE
+    assert path.read_bytes().startswith(b"\x89PNG")

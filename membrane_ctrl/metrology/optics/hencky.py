@@ -15,7 +15,6 @@ from functools import cache
 
 import numpy as np
 from numpy.polynomial import Chebyshev, Legendre, Polynomial
-from scipy.optimize import brentq
 
 from membrane_ctrl.metrology.optics.zernike import TERMS
 from membrane_ctrl.model.arrays import FloatArray
@@ -42,6 +41,8 @@ def stress_series(centre: float) -> FloatArray:
 @cache
 def stress(poisson_ratio: float = POISSON_RATIO) -> Polynomial:
     """The stress n(v) that fulfils the rim's condition."""
+
+    from scipy.optimize import brentq  # half a second of importing, for one number
 
     def rim(centre: float) -> float:
         b = stress_series(centre)

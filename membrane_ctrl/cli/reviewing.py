@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from membrane_ctrl.cli.options import JsonOption
+
 RunArgument = Annotated[
     Path, typer.Argument(metavar="RUN", help="Folder of the run, its name or a part of it, or `last`.")
 ]
@@ -13,7 +15,6 @@ FromOption = Annotated[
     str | None, typer.Option("--from", help="From this moment: 03:12 (UTC), an ISO time, or +90m from the start.")
 ]
 ToOption = Annotated[str | None, typer.Option("--to", help="Up to this moment.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 runs_app = typer.Typer(invoke_without_command=True, help="List, show and prune runs.")
 
@@ -110,8 +111,7 @@ def list_runs(
     json: JsonOption = False,
 ) -> int:
     """List the runs, oldest first."""
-    from membrane_ctrl.model.clock import parse_duration_s
-    from membrane_ctrl.model.errors import InputError
+    from membrane_ctrl.model import clock, errors
     from membrane_ctrl.review.catalogue import Filter
     from membrane_ctrl.review.runs import list_command
 
@@ -120,9 +120,9 @@ def list_runs(
         given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
         if given:  # `--logs` in front of `prune` would leave it with another folder than was meant
             told = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-            raise InputError(f"{told} in front of `{context.invoked_subcommand}` is for the list: write it behind")
+            raise errors.InputError(f"{told} in front of `{context.invoked_subcommand}` belongs behind it")
         return 0
-    least_s = None if longer is None else parse_duration_s(longer)
+    least_s = None if longer is None else clock.parse_duration_s(longer)
     wanted = Filter(
         least_s=least_s, most_std_um=std_um, with_faults=faults, configuration=configuration, text=name
     )  # fmt: skip
