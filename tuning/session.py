@@ -111,8 +111,13 @@ def identify_step(session: folder.SessionFolder) -> IdentifiedPlant:
 
 
 def found_of(session: folder.SessionFolder) -> IdentifiedPlant:
-    """What was identified."""
-    return session.result("identify", "identified.json", IdentifiedPlant)
+    """What was identified. Raises InputError as well if that was from other data."""
+    found = session.result("identify", "identified.json", IdentifiedPlant)
+    record = experiments_of(session).record
+    steps = len(record) - 1
+    if found.data_sha256 != record.sha256() or found.identified.residual_um.shape != (steps,):
+        raise errors.InputError(f"{session.path}: identified.json is of other experiments; run identify again")
+    return found
 
 
 def observe_step(session: folder.SessionFolder, rig: HoldRig, duration_s: float = OBSERVE_S) -> DisturbanceModel:
@@ -144,6 +149,8 @@ def design_step(session: folder.SessionFolder, reason: str = "tuning session") -
     except design.RefusedError as error:
         raise errors.RejectedError(f"design: {error}") from None
     assert made.chosen.predicted is not None  # a proposal keeps its margins
+    if not math.isfinite(made.chosen.predicted.std_um + made.least_std_um):
+        raise errors.RejectedError("design: no std can be predicted from this noise and weather: observe again")
     gains = GainsFile(
         author=session.head.author,
         date_utc=session.head.created_utc,

@@ -162,14 +162,19 @@ def first_message_after(path: Path, place: int) -> int:
 
 
 def whole_messages(path: Path) -> list[SegmentMessage]:
-    """The messages that a file has in full, up to its end or to where what follows is none. Raises OSError."""
-    size = path.stat().st_size
+    """The messages that a file has in full, up to its end or to where what follows is none. Raises OSError.
+
+    What is larger than a recorder writes is none: a sparse file may claim a terabyte.
+    """
+    size = min(path.stat().st_size, _SEGMENT_BYTES_MAX)
     found: list[SegmentMessage] = []
     with open_plain(path) as file:
         if file.read(len(MAGIC)) != MAGIC:
             return found
         for message in heads(file):
-            if message.kind not in KINDS or message.end > size or len(found) > MESSAGES_MAX:
+            if message.kind not in KINDS or message.end > size or message.size > _MESSAGE_BYTES_MAX:
+                break
+            if len(found) > MESSAGES_MAX:
                 break
             found.append(message)
     return found

@@ -16,6 +16,7 @@ from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.model import errors, files, plain_json
 
 T = TypeVar("T")
+_LARGEST = 1e60  # no quantity is near it; its fourth power is a number still
 _PLAIN_BYTES_MAX = 64_000_000  # candidates with their curves are some megabytes
 
 
@@ -59,7 +60,10 @@ def _built(kind: Any, data: Any) -> Any:
     if is_dataclass(kind):
         hints = get_type_hints(kind)
         return cast(Any, kind)(**{f.name: _built(hints[f.name], data[f.name]) for f in fields(kind)})
-    return kind(data)
+    value = kind(data)
+    if isinstance(value, float) and _LARGEST < abs(value) < math.inf:
+        raise ValueError(f"{value:g} is no quantity")
+    return value
 
 
 def write(path: Path, value: Any) -> None:

@@ -30,7 +30,7 @@ from membrane_ctrl.model.plain_json import dumps_checked
 from membrane_ctrl.run_files import run_folder
 from membrane_ctrl.run_files.inputs_file import decode_columns, open_inputs
 from membrane_ctrl.run_files.sealed_stream import SealedStream, require_bounded, unseal
-from membrane_ctrl.run_files.segments import panics_are_faults
+from membrane_ctrl.run_files.segments import panics_are_faults, whole_messages
 from membrane_ctrl.run_files.tables import tick_schema
 
 HOSTILE = "\x1b]0;owned\x07\x9b2J\r\u202e[/red]"
@@ -315,6 +315,22 @@ def test_a_segment_of_a_terabyte_of_nothing(folder: Path, capsys: Said) -> None:
     assert run(["repair", str(folder), "--json"]) == 0
     (found,) = (row for row in json.loads(capsys.readouterr().out)["files"] if row["file"] == "night-000.rrd")
     assert "MB that are no messages" in found["action"]
+
+
+@pytest.mark.parametrize("kind", [2, 3])
+def test_a_message_that_claims_the_rest_of_a_terabyte(folder: Path, capsys: Said, kind: int) -> None:
+    """It is within its file, which is sparse: what is whole in front of it is read, and no more memory taken."""
+    path = folder / "night-000.rrd"
+    whole = whole_messages(path)
+    with path.open("r+b") as file:
+        file.truncate(whole[-1].start)
+        file.seek(whole[-1].start)
+        file.write(struct.pack("<QQ", kind, 2**39))
+        file.truncate(2**40)
+    shutil.rmtree(folder / "columns")  # the segments are all there is
+    assert whole_messages(path) == whole[:-1]
+    assert run(["runs", "show", str(folder)]) in {0, 3}
+    assert "night-000.rrd" in capsys.readouterr().out
 
 
 def test_where_rerun_gives_up_python_goes_on() -> None:

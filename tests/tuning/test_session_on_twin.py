@@ -12,7 +12,7 @@ import pytest
 
 from membrane_ctrl.cli import run as command_line
 from membrane_ctrl.config.schema import Config, ShapeConfig, TwinConfig
-from membrane_ctrl.model.errors import Exit, InputError
+from membrane_ctrl.model.errors import Exit, InputError, RejectedError
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sessions.folder import STEPS, SessionFolder, open_session
 from tuning import command as tune
@@ -105,6 +105,25 @@ def test_damaged_files_are_named(done: SessionFolder, name: str) -> None:
     step = session.found_of if name == "identified.json" else session.identify_step
     with pytest.raises(InputError, match=f"{name}: damaged"):
         step(done)
+
+
+def test_an_identified_plant_of_other_experiments_is_refused(done: SessionFolder) -> None:
+    path = done.file("identified.json")
+    good = json.loads(path.read_text())
+    shorter = good["identified"] | {"residual_um": good["identified"]["residual_um"][:-1]}
+    for forged in (good | {"data_sha256": "0" * 64}, good | {"identified": shorter}):
+        path.write_text(json.dumps(forged))
+        with pytest.raises(InputError, match=r"identified\.json is of other experiments; run identify again"):
+            session.found_of(done)
+
+
+@pytest.mark.parametrize("white", [1e200, 1e20, -1.0, "nan"])
+def test_noise_that_is_no_number_ends_the_design_in_one_line(done: SessionFolder, white: float | str) -> None:
+    path = done.file("disturbance.json")
+    weather = json.loads(path.read_text())
+    path.write_text(json.dumps(weather | {"rest": weather["rest"] | {"white": white}}))
+    with pytest.raises((RejectedError, InputError), match=r"^(design: |.*disturbance\.json: damaged)"):
+        session.design_step(done)
 
 
 def edited(done: SessionFolder, **changed: float) -> None:

@@ -26,6 +26,7 @@ from tuning.identification import loop_model, records
 # Slower than this the loop does not care, and a random walk is no longer what weather does.
 _SLOWEST_S = 100.0
 _FLOOR = 1e-12  # um^2: an intensity that is not there
+_LARGEST = 1e9  # um^2 a second: the film bursts before
 _HANN_LOSS = 35.0 / 18.0  # neighbouring frequencies of a Hann taper share this much
 
 
@@ -41,6 +42,11 @@ class Noise:
     fast_sigma: float
     slow_sigma: float
     dt_s: float  # sample time that `white` belongs to
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for what no fit finds: a file may say anything."""
+        if not all(0 <= part <= _LARGEST for part in (self.white, self.fast, self.slow, self.slow_s, self.dt_s)):
+            raise ValueError(f"noise of {self.white:g} and walks of {self.fast:g} and {self.slow:g}")
 
     def moving_psd(self, w_rad_per_s: records.Series) -> records.Series:
         """Two-sided spectrum of the true movement, unit^2 s."""
