@@ -84,8 +84,10 @@ class Case:
     command: Command
 
 
-def case(number: int) -> Case:
-    """The command of a case."""
+def case(number: int, only: str | None = None) -> Case:
+    """The command of a case, drawn unless only one is asked for."""
+    if only is not None:
+        return Case(number, next(command for command in COMMANDS if command.name == only))
     shares = [command.share for command in COMMANDS]
     return Case(number, random.Random(f"command {number}").choices(COMMANDS, shares)[0])
 
@@ -219,7 +221,7 @@ def _quiet() -> Iterator[None]:
         yield
 
 
-def work(first: int, last: int, root: Path, good: Path) -> None:
+def work(first: int, last: int, root: Path, good: Path, only: str | None) -> None:
     """Run cases and print a line of JSON for each: what is wrong with it, and how long it took."""
     import functools
     import warnings
@@ -232,16 +234,16 @@ def work(first: int, last: int, root: Path, good: Path) -> None:
     warnings.simplefilter("error")
     warnings.simplefilter("ignore", RuntimeWarning)  # NumPy's, of numbers that are none: a line, and no end
     room = Room(root, good)
-    for kind in {case(number).command.reads for number in range(first, last)}:
+    for kind in {case(number, only).command.reads for number in range(first, last)}:
         room.make(kind)
     signal.signal(signal.SIGALRM, _rang)
     for warm in range(2):  # everything is loaded before the limit is set
         with contextlib.suppress(Exception):
-            room.run(case(warm))
+            room.run(case(warm, only))
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + 3 * MEMORY_BYTES, -1))
     for number in range(first, last):
-        one = case(number)
+        one = case(number, only)
         print(json.dumps({"at": number, "command": one.command.name}), flush=True)
         Path("/proc/self/clear_refs").write_text("5")  # the peak is what it is now
         began_mb = _memory_mb("VmRSS")
@@ -276,15 +278,16 @@ def _memory_mb(what: str) -> float:
     return float(line.split()[1]) / 1e3
 
 
-def campaign(first: int, last: int, say: object = print) -> tuple[Counter[str], list[tuple[int, str, str]], float]:
+Outcome = tuple[Counter[str], list[tuple[int, str, str]], float]
+
+
+def campaign(first: int, last: int, only: str | None = None, say: object = print) -> Outcome:
     """Cases in worker processes; counts by command, what was wrong, and the greatest memory in MB."""
     with tempfile.TemporaryDirectory(prefix="membrane-fuzz-good-") as good:
-        return _campaign(first, last, good, say)
+        return _campaign(first, last, only, good, say)
 
 
-def _campaign(
-    first: int, last: int, good: str, say: object
-) -> tuple[Counter[str], list[tuple[int, str, str]], float]:
+def _campaign(first: int, last: int, only: str | None, good: str, say: object) -> Outcome:
     counts: Counter[str] = Counter()
     found: list[tuple[int, str, str]] = []
     peak_mb = 0.0
@@ -294,7 +297,7 @@ def _campaign(
         with tempfile.TemporaryDirectory(prefix="membrane-fuzz-") as root:
             end = min(last, at + _CASES_A_WORKER)
             words = [sys.executable, str(Path(__file__)), "--worker", root, "--good", good]
-            words += ["--first", str(at), "--last", str(end)]
+            words += ["--first", str(at), "--last", str(end), *(["--command", only] if only else [])]
             with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as worker:
                 assert worker.stdout is not None
                 name = "start"
@@ -332,14 +335,15 @@ def main(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--first", type=int, default=0, help="number of the first case, which is its seed")
     parser.add_argument("--last", type=int, default=20_000, help="and of the one behind the last")
+    parser.add_argument("--command", choices=[command.name for command in COMMANDS], help="cases of this one alone")
     parser.add_argument("--worker", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--good", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.worker is not None:
-        work(options.first, options.last, options.worker, options.good)
+        work(options.first, options.last, options.worker, options.good, options.command)
         return 0
     began_s = time.perf_counter()
-    counts, found, peak_mb = campaign(options.first, options.last)
+    counts, found, peak_mb = campaign(options.first, options.last, options.command)
     took_s = time.perf_counter() - began_s
     print(f"{sum(counts.values())} cases in {took_s:.0f} s, peak {peak_mb:.0f} MB, {len(found)} wrong")
     return int(bool(found))
