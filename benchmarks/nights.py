@@ -276,5 +276,5 @@ def write_run(folder: Path, parts: Iterator[tuple[Rows, list[ShapeEstimate]]]) -
         for e in events
     ]  # fmt: skip
     (folder / "events.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    summary = {"schema": "membrane-summary/1", "exit": "done", "duration_s": end_s}
+    summary = {"schema": "membrane-summary/2", "exit": "done", "duration_s": end_s}
     (folder / "summary.json").write_text(json.dumps(summary) + "\n", encoding="utf-8")

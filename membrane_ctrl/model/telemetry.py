@@ -5,13 +5,13 @@ Codes (state, shape state, fault, rung) are small integers; their names are in `
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from operator import attrgetter
 
 import numpy as np
 
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import Column, FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +82,16 @@ def unpack(messages: Sequence[bytes]) -> Rows:
 def column(rows: Rows, name: str) -> FloatArray:
     """One field of all rows, (n,)."""
     return rows[:, COLUMN[name]]
+
+
+def columns(rows: Rows) -> dict[str, Column]:
+    """All fields of rows by name, (n,) each."""
+    return dict(zip(FIELDS, rows.T, strict=True))
+
+
+def true_error_um(ticks: Mapping[str, Column]) -> Column:
+    """Target minus true centre, with the sign of `error_um` (setpoint minus value); NaN on a real bench."""
+    return ticks["target_um"] - ticks["truth_displacement_um"]
 
 
 def changes(codes: FloatArray, before: float) -> list[tuple[int, int]]:

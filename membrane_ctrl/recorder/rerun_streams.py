@@ -133,7 +133,8 @@ class TelemetryStreams:
     def _send_streams(self, rows: telemetry.Rows) -> None:
         time_s = telemetry.column(rows, "mono_s")
         blocks = [(stream.path, stream.values(rows)) for stream in streams.STREAMS]
-        blocks.append((streams.TRUE_ERROR.path, streams.true_error_um(rows)))
+        true_um = telemetry.true_error_um(telemetry.columns(rows))
+        blocks.append((streams.TRUE_ERROR.path, true_um[:, np.newaxis]))
         for path, values in blocks:
             if np.isfinite(values).any():
                 self._recording.scalars(path, time_s, values)

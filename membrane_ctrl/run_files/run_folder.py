@@ -187,7 +187,8 @@ def _user() -> str:
         return ""
 
 
-_SUMMARY_SCHEMA = "membrane-summary/1"
+_SUMMARY_SCHEMA = "membrane-summary/2"
+_SIGN_TURNED_SCHEMA = "membrane-summary/1"  # true centre minus target, where it now is target minus true centre
 # A fault campaign of months; a line is some 150 bytes.
 EVENTS_BYTES_MAX = 64_000_000
 _RUN_MAX_S = 1e9  # thirty years
@@ -231,7 +232,7 @@ def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
     except (OSError, ValueError) as error:
         notes.append(f"summary.json: cannot be read ({error})")
         return None
-    if not isinstance(summary, dict) or summary.get("schema") != _SUMMARY_SCHEMA:
+    if not isinstance(summary, dict) or summary.get("schema") not in (_SUMMARY_SCHEMA, _SIGN_TURNED_SCHEMA):
         notes.append(f"summary.json: not of schema {_SUMMARY_SCHEMA}; its figures are not used")
         return {} if not isinstance(summary, dict) else summary
     if not take_checksum(summary):
@@ -240,6 +241,16 @@ def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
     if not is_moment(summary.get("duration_s", 0.0) or 0.0):
         notes.append("summary.json: duration_s is no time of a run; it is not used")
         del summary["duration_s"]
+    return _with_present_sign(summary)
+
+
+def _with_present_sign(summary: dict[str, Any]) -> dict[str, Any]:
+    """A summary of an earlier version, its true errors with the sign of `error_um`."""
+    if summary["schema"] == _SIGN_TURNED_SCHEMA:
+        ends = summary.get("sag_error_um")
+        for table, keys in ((summary, ("true_bias_um",)), (ends if isinstance(ends, dict) else {}, ("start", "end"))):
+            table.update({key: -table[key] for key in keys if isinstance(table.get(key), (int, float))})
+        summary["schema"] = _SUMMARY_SCHEMA
     return summary
 
 

@@ -111,7 +111,7 @@ STREAMS: tuple[Stream, ...] = (
 )
 
 # Made here from the rows, so that a plot answers without arithmetic.
-TRUE_ERROR = Stream("/truth/error", (Line("", "true centre minus target um", GREEN, 2.0),))
+TRUE_ERROR = Stream("/truth/error", (Line("", "target minus true centre um", GREEN, 2.0),))
 BAND = Stream("/loop/band", (Line("", "+band um", GREY, 1.0), Line("", "-band um", GREY, 1.0)))
 OVERVIEW = Stream(
     "/overview/error",
@@ -149,11 +149,6 @@ QUALITY = Stream("/shape/quality", (Line("", "valid fraction", GREEN, 2.0), Line
 MODULATION = Stream("/shape/modulation", (Line("", "modulation ADU", BLUE),))
 LATENCY = Stream("/shape/latency", (Line("", "last frame to result ms", BLUE),))
 SHAPE_STREAMS: tuple[Stream, ...] = (ZERNIKE, CHANGE, SAG, RESIDUAL, QUALITY, MODULATION, LATENCY)
-
-
-def true_error_um(rows: Rows) -> FloatArray:
-    """(n, 1) true centre minus target; NaN on a real bench."""
-    return (column(rows, "truth_displacement_um") - column(rows, "target_um"))[:, np.newaxis]
 
 
 def overview_um(rows: Rows) -> FloatArray:

@@ -127,7 +127,7 @@ class SecondMeans:
         self.last = mean
 
 
-SCHEMA = "membrane-summary/1"
+SCHEMA = "membrane-summary/2"
 
 # Rows count as settled this long after hold began and after each setpoint ramp: three closed-loop time constants
 # of 1.45 s (PHYSICS, inner loop) leave 5 % of a step, of which the `settle` state has already taken most.
@@ -141,7 +141,7 @@ _LISTED_MAX = 1000
 class Summary:
     """Takes in everything the recorder sees; `as_dict` is `summary.json` at any moment.
 
-    "True" is what the twin knows of the mirror's centre, minus the target: on a real bench those keys are null.
+    "True" is the target minus what the twin knows of the mirror's centre: on a real bench those keys are null.
     """
 
     def __init__(self, config: Config) -> None:
@@ -156,7 +156,7 @@ class Summary:
         self._rejected = 0
         self._leak_um_per_s = math.nan
         self._state = math.nan
-        self._unsettled_s = math.nan  # last moment that was not settled; NaN: outside hold
+        self._settled = Settled()
         self._time_s = 0.0
         self._states: list[dict[str, Any]] = []
         self._transitions = 0
@@ -174,14 +174,14 @@ class Summary:
             self._transitions += 1
             if len(self._states) < _LISTED_MAX:
                 self._states.append({"state": states.State(code).name.lower(), "mono_s": float(time_s[row])})
-        settled = rows[self._settled(rows)]
+        settled = telemetry.columns(rows[self._settled.mask(telemetry.columns(rows))])
         self._state = float(telemetry.column(rows, "state")[-1])
-        true_um = telemetry.column(settled, "truth_displacement_um") - telemetry.column(settled, "target_um")
+        true_um = telemetry.true_error_um(settled)
         self._true_um.add(true_um)
-        for moment_s, value_um in zip(telemetry.column(settled, "mono_s"), true_um, strict=True):
+        for moment_s, value_um in zip(settled["mono_s"], true_um, strict=True):
             if math.isfinite(value_um):
                 self._true_1s_um.add(float(moment_s), float(value_um))
-        self._reading_um.add(telemetry.column(settled, "displacement_um") - telemetry.column(settled, "setpoint_um"))
+        self._reading_um.add(settled["setpoint_um"] - settled["displacement_um"])
         self._lateness_ms.add(telemetry.column(rows, "lateness_ms"))
         self._rows += len(rows)
         self._missed_ticks = int(telemetry.column(rows, "missed_ticks")[-1])
@@ -189,23 +189,6 @@ class Summary:
         leak = telemetry.column(rows, "leak_um_per_s")
         leak = leak[np.isfinite(leak)]
         self._leak_um_per_s = float(leak[-1]) if leak.size else self._leak_um_per_s
-
-    def _settled(self, rows: telemetry.Rows) -> list[bool]:
-        """Which rows are in hold, with the setpoint ramp at its target, since `SETTLED_AFTER_S`."""
-        ramp_um = (
-            telemetry.column(rows, "setpoint_um")
-            - np.nan_to_num(telemetry.column(rows, "trim_um"))
-            - telemetry.column(rows, "target_um")
-        )
-        hold = telemetry.column(rows, "state") == states.State.HOLD
-        settled = []
-        for moment_s, holding, rest_um in zip(telemetry.column(rows, "mono_s"), hold, ramp_um, strict=True):
-            if not holding:
-                self._unsettled_s = math.nan
-            elif math.isnan(self._unsettled_s) or not abs(rest_um) <= ARRIVED_UM:
-                self._unsettled_s = float(moment_s)
-            settled.append(bool(holding and moment_s - self._unsettled_s >= SETTLED_AFTER_S))
-        return settled
 
     def add_event(self, event: EventLine) -> None:
         """Take in one event; "fault", "geometry" and "end" matter here."""

@@ -66,7 +66,7 @@ def first_level(ticks: Mapping[str, Column]) -> Columns:
     level: Columns = {"time_s": window, "rows": _counts(starts, time_s.size)}
     level |= _codes(ticks, starts)
     for name in SIGNALS:
-        values = true_error_um(ticks) if name == "true_error_um" else ticks[name]
+        values = telemetry.true_error_um(ticks) if name == "true_error_um" else ticks[name]
         level[f"min_{name}"] = np.fmin.reduceat(values, starts)
         level[f"mean_{name}"] = _mean(values, np.ones(values.size), starts)
         level[f"max_{name}"] = np.fmax.reduceat(values, starts)
@@ -89,11 +89,6 @@ def coarser_level(level: Mapping[str, Column], window_s: float) -> Columns:
         elif name.startswith(("min_", "max_")):
             coarse[name] = (np.fmin if name.startswith("min_") else np.fmax).reduceat(values, starts)
     return coarse
-
-
-def true_error_um(ticks: Mapping[str, Column]) -> Column:
-    """Target minus true centre, with the sign of `error_um`; NaN on a real bench."""
-    return ticks["target_um"] - ticks["truth_displacement_um"]
 
 
 def _windows(time_s: Column, window_s: float) -> tuple[NDArray[np.intp], Column]:

@@ -13,18 +13,17 @@ import pytest
 
 from benchmarks.nights import Planted, night, write_run
 from membrane_ctrl.cli import run as command
-from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import plain_json
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.states import ShapeState, State
-from membrane_ctrl.model.telemetry import COLUMN, column
+from membrane_ctrl.model.telemetry import COLUMN, column, columns
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.report.html import render
 from membrane_ctrl.review.report.json import report_table
 from membrane_ctrl.review.statistics.analysis import analyse, fill_short_gaps
 from membrane_ctrl.review.statistics.compare import compare
 from membrane_ctrl.review.statistics.windows import WithoutFeedforward
-from membrane_ctrl.run_files.summary import SETTLED_AFTER_S, Settled, Summary
+from membrane_ctrl.run_files.summary import SETTLED_AFTER_S, Settled
 from tests.support.review_runs import same, set_summary, written
 
 HOURS = 0.5
@@ -51,18 +50,21 @@ def test_windows_are_those_of_the_ticks(quiet_run: Path) -> None:
     assert analysis.ticks.histogram_counts.sum() == reading.size
 
 
-def test_settled_is_the_rule_of_the_summary() -> None:
+def test_settled_is_five_seconds_of_hold_at_the_target() -> None:
     rows, _ = night(1, 0.02, "typical", [])
     rows[100:200, COLUMN["state"]] = State.SETTLE
     rows[400:450, COLUMN["setpoint_um"]] = 3.0  # a ramp
-    summary = Summary(Config())
     settled = Settled()
-    names = ("mono_s", "state", "setpoint_um", "trim_um", "target_um")
-    for first in (0, 150, 151, 430):
-        block = rows[first : {0: 150, 150: 151, 151: 430, 430: len(rows)}[first]]
-        mask = settled.mask({name: column(block, name) for name in names})
-        assert list(mask) == summary._settled(block)
-        summary._state = float(column(block, "state")[-1])
+    parts = np.split(rows, (150, 151, 430))
+    mask = np.concatenate([settled.mask(columns(part)) for part in parts])
+    expected, unsettled_s = [], np.nan
+    for time_s, state, setpoint_um in rows[:, [COLUMN[name] for name in ("mono_s", "state", "setpoint_um")]]:
+        if state != State.HOLD:
+            unsettled_s = np.nan
+        elif np.isnan(unsettled_s) or setpoint_um != 0.0:
+            unsettled_s = time_s
+        expected.append(time_s - unsettled_s >= SETTLED_AFTER_S)
+    assert list(mask) == expected
     assert mask.any()
 
 

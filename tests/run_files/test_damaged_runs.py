@@ -190,7 +190,7 @@ def test_the_last_file_of_a_table_is_missed_and_its_segment_stands_in(tmp_path: 
     assert len(column_files(folder, "ticks")) == 2
     segment(folder, late)
     (folder / "summary.json").write_text(dumps_checked(
-        {"schema": "membrane-summary/1", "duration_s": float(late[-1, 0]), "recorder": {"tables": {"ticks": 2}}}
+        {"schema": "membrane-summary/2", "duration_s": float(late[-1, 0]), "recorder": {"tables": {"ticks": 2}}}
     ))  # fmt: skip
     (folder / "columns" / "ticks-001.arrows").unlink()
     run = open_run(folder)

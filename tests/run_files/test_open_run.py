@@ -123,7 +123,7 @@ def test_a_missing_file_of_any_table_is_named(tmp_path: Path, table: str) -> Non
 def test_a_run_without_tables_is_read_from_rerun(tmp_path: Path) -> None:
     rows, _ = night(4, 0.02, "typical", [])
     segment(tmp_path, rows)
-    (tmp_path / "summary.json").write_text('{"schema": "membrane-summary/1"}')
+    (tmp_path / "summary.json").write_text('{"schema": "membrane-summary/2"}')
     run = open_run(tmp_path)
     assert run.ticks().num_rows == len(rows)
     assert run.level(1.0)["rows"].sum() == len(rows)
@@ -181,7 +181,19 @@ def test_broken_small_files_are_named(tmp_path: Path) -> None:
 def test_another_schema_is_said(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.02)
     set_summary(folder, schema="membrane-summary/0")
-    assert any("membrane-summary/1" in note for note in open_run(folder).notes)
+    assert any("membrane-summary/2" in note for note in open_run(folder).notes)
+
+
+@pytest.mark.parametrize("ends", [{"start": -0.3, "end": None}, None, "?"])
+def test_true_errors_of_an_earlier_summary_get_the_present_sign(tmp_path: Path, ends: object) -> None:
+    folder = written(tmp_path, 0.02)
+    set_summary(folder, schema="membrane-summary/1", true_bias_um=0.168, sag_error_um=ends, true_std_um=0.2)
+    summary = open_run(folder).summary
+    assert summary is not None
+    assert (summary["true_bias_um"], summary["true_std_um"]) == (-0.168, 0.2)
+    assert summary["sag_error_um"] == ({"start": 0.3, "end": None} if isinstance(ends, dict) else ends)
+    set_summary(folder, schema="membrane-summary/1", true_bias_um=None)
+    assert open_run(folder).notes == []
 
 
 @pytest.mark.parametrize("what", ["absent", "empty", "file"])

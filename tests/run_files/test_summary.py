@@ -37,7 +37,7 @@ def test_true_figures_agree_with_numpy(batch: int) -> None:
     values = table(rows)
     found = summary_of(rows, batch)
     settled = values[column(values, "mono_s") >= HOLD_FROM_S + SETTLED_AFTER_S]
-    true_um = column(settled, "truth_displacement_um") - column(settled, "target_um")
+    true_um = column(settled, "target_um") - column(settled, "truth_displacement_um")
     per_second = true_um[: len(true_um) // 50 * 50].reshape(-1, 50).mean(axis=1)
     assert found["true_std_um"] == pytest.approx(true_um.std(), rel=1e-9)
     assert found["true_bias_um"] == pytest.approx(true_um.mean(), rel=1e-6, abs=1e-12)

@@ -99,7 +99,7 @@ class Preview:
     """What the fitted twin did."""
 
     std_um: float  # of the true centre
-    bias_um: float
+    bias_um: float  # target minus true centre
     # After a step of the leak, weather off: furthest excursion, and time until the centre stays within `RECOVERED_UM`
     load_peak_um: float
     recovery_s: float
@@ -123,7 +123,7 @@ def preview(
     away = np.flatnonzero(np.abs(answer_um) > rules.RECOVERED_UM)
     return Preview(
         std_um=float(true_um.std()),
-        bias_um=float(true_um.mean()),
+        bias_um=-float(true_um.mean()),
         load_peak_um=float(np.abs(answer_um).max()),
         recovery_s=float((away[-1] + 1) / loop.rate_hz) if away.size else 0.0,
     )

@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.arrays import BoolArray, Column, IntArray, Singles
 from membrane_ctrl.model.states import State
 from membrane_ctrl.review.statistics import windows
-from membrane_ctrl.run_files import summary, tables
+from membrane_ctrl.run_files import summary
 from membrane_ctrl.run_files.run import Block, Run
 
 # Seconds of which the ticks are not all there (segments while nothing happens): their means are in the 1 s level.
@@ -209,7 +210,7 @@ class _Collector:
         held = {name: np.asarray(block[name][mask], dtype=np.float64) for name in NAMES}
         self._pump.add(held)
         reading = held["setpoint_um"] - held["displacement_um"]
-        true = tables.true_error_um(held)
+        true = telemetry.true_error_um(held)
         place = np.rint((held["mono_s"] - self._grid_s) / self._period_s).astype(np.int64)
         inside = (place >= 0) & (place < self._reading.size)
         self._reading[place[inside]] = reading[inside]

@@ -1,0 +1,51 @@
+"""The error of the true centre has one sign, that of `error_um` (setpoint minus value), wherever it is shown."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.nights import CONFIG, night, write_run
+from membrane_ctrl.hold.start import _headline
+from membrane_ctrl.model.telemetry import COLUMN, Rows, columns, true_error_um
+from membrane_ctrl.review import open_run
+from membrane_ctrl.review.report.json import report_table, verdict
+from membrane_ctrl.review.statistics.analysis import analyse
+from membrane_ctrl.run_files.summary import Summary
+from tests.support.review_runs import segment
+from tests.support.rrd_reading import scalars
+
+SHALLOW_UM = 0.75  # the bowl is so much less deep than it should be
+
+
+@pytest.fixture
+def rows() -> Rows:
+    made, _ = night(1, 0.1, "typical", [])
+    wander_um = made[:, COLUMN["truth_displacement_um"]] - made[:, COLUMN["target_um"]]
+    made[:, COLUMN["truth_displacement_um"]] += -SHALLOW_UM - wander_um.mean()
+    return made
+
+
+def test_every_place_shows_the_same_sign(tmp_path: Path, rows: Rows) -> None:
+    assert true_error_um(columns(rows)).mean() == pytest.approx(SHALLOW_UM)
+    summary = Summary(CONFIG)
+    summary.add_rows(rows)
+    table = summary.as_dict({}, {})
+    folder = tmp_path / "20261121T180000Z-shallow"
+    write_run(folder, iter([(rows, [])]))
+    run = open_run(folder)
+    analysis = analyse(run)
+    report = report_table(analysis)
+    _, recorded = scalars(segment(folder, rows), "/truth/error")
+    shown = {
+        "summary.json": table["true_bias_um"],
+        "summary.json, first second": table["sag_error_um"]["start"],
+        "report.json": report["true"]["windows"][0]["mean_um"],
+        "plots and the viewer": float(np.nanmean(run.level(10.0)["mean_true_error_um"])),
+        "Rerun": float(recorded.mean()),
+    }
+    assert all(value == pytest.approx(SHALLOW_UM, abs=0.2) for value in shown.values()), shown
+    assert f"mean {report['true']['windows'][0]['mean_um']:+.3f} µm" in verdict(analysis)[1]
+    assert any(line.endswith(f"{table['true_bias_um']:+.3f} um") for line in _headline(table))
