@@ -11,7 +11,7 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,21 +48,23 @@ class RecordedRun:
     told_until_s: float  # the event log ends here, if a crash cut it
     config_damage: str = ""  # not the configuration that the run had
 
-    def row_at(self, time_s: float) -> telemetry.TelemetryRow | None:
-        """The row that was recorded then; None if the recording does not have it."""
+    def differences(self, rows: Sequence[telemetry.TelemetryRow]) -> list[dict[str, tuple[float, float]] | None]:
+        """The fields in which each row differs from the one recorded then; None where the recording has none."""
         from membrane_ctrl.replay.repair import read_rows
         from membrane_ctrl.run_files.segments import FAULTS
 
-        for path in sorted(self.folder.glob("*.rrd")):
+        found: list[dict[str, tuple[float, float]] | None] = [None] * len(rows)
+        for path in sorted(self.folder.glob("*.rrd")) if rows else ():
             try:
-                rows = read_rows(path)
+                recorded = read_rows(path)
             except FAULTS:
                 continue
-            near = np.flatnonzero(np.abs(rows[:, 0] - time_s) < _SAME_TIME_S)
-            if near.size:
-                values = rows[near[0]].tolist()
-                return telemetry.TelemetryRow(time_s, *values[1:])
-        return None
+            for n, row in enumerate(rows):
+                near = np.flatnonzero(np.abs(recorded[:, 0] - row.mono_s) < _SAME_TIME_S)
+                if near.size:
+                    then = telemetry.TelemetryRow(row.mono_s, *recorded[near[0]].tolist()[1:])
+                    found[n] = replays.differing_fields(row, then)
+        return found
 
 
 def open_run(folder: Path) -> RecordedRun:
@@ -87,7 +89,7 @@ DECISION_SLACK_S = 0.5
 
 
 def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None, as_json: bool) -> int:
-    """Replay and report; exit 3 if anything is not the same, 0 if all is.
+    """Replay and report; exit 3 if a row or a decision is not the same, 0 if all are.
 
     Raises
     ------
@@ -121,7 +123,7 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
             )
         target = write_incident(run, found, to_test, begin, to_s)
         print(f"written: {target}; say in its incident.toml what happened", file=sys.stderr)
-    return int(Exit.DONE if report["verdict"] == "identical" else Exit.REJECTED)
+    return int(Exit.DONE if report["verdict"] in {"identical", "same rows"} else Exit.REJECTED)
 
 
 def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, replays.Replay]:
@@ -153,12 +155,11 @@ def _report(run: RecordedRun, found: replays.Replay, begin: int, to_s: float) ->
     recorded = [d for d in run.decisions if found.begin_s <= d.time_s <= end_s + DECISION_SLACK_S]
     in_time = sum(decision.time_s <= end_s for decision in recorded)
     decisions = replays.unmatched(recorded[: max(in_time, len(today))], today, DECISION_SLACK_S)
-    first = found.first_different
-    fields: dict[str, tuple[float, float]] | None = None
-    if first is not None and (row := run.row_at(first.mono_s)) is not None:
-        fields = replays.differing_fields(first, row)
+    first = found.different_rows[0] if found.different else None
+    differences = run.differences(found.different_rows)
+    only_words = found.different == differences.count({})
     return {
-        "verdict": _verdict(found, bool(decisions), bool(run.inputs.damage)),
+        "verdict": _verdict(found, only_words, bool(decisions), bool(run.inputs.damage)),
         "recorded_by": run.inputs.program,
         "begin_s": found.begin_s,
         "from_memory": begin > 1,
@@ -166,7 +167,7 @@ def _report(run: RecordedRun, found: replays.Replay, begin: int, to_s: float) ->
         "compared": found.compared,
         "different": found.different,
         "first_different": None if first is None else {"tick": int(first.tick), "time_s": first.mono_s},
-        "fields": fields,
+        "fields": differences[0] if differences else None,
         "decisions": decisions,
         "gaps": [
             {"after_tick": g.after_tick, "time_s": g.time_s, "ticks": g.ticks, "why": g.reason} for g in found.gaps
@@ -175,11 +176,13 @@ def _report(run: RecordedRun, found: replays.Replay, begin: int, to_s: float) ->
     }
 
 
-def _verdict(found: replays.Replay, decisions_differ: bool, damaged: bool) -> str:
+def _verdict(found: replays.Replay, only_words: bool, decisions_differ: bool, damaged: bool) -> str:
     """Identical only if everything was compared; behind a gap another decision says nothing of the code."""
-    if found.different or (decisions_differ and not found.gaps):
+    if (found.different and not only_words) or (decisions_differ and not found.gaps):
         return "different"
-    return "gaps" if found.gaps or damaged or not found.compared else "identical"
+    if found.gaps or damaged or not found.compared:
+        return "gaps"
+    return "same rows" if found.different else "identical"
 
 
 def _lines(report: dict[str, Any]) -> list[str]:
@@ -196,7 +199,8 @@ def _lines(report: dict[str, Any]) -> list[str]:
         if report["fields"] is None:
             lines.append("           what was recorded there is not in the *.rrd files")
         elif not report["fields"]:
-            lines.append("           its row is the same: events or answers to commands differ")
+            rows = "all their rows are" if report["verdict"] == "same rows" else "its row is"
+            lines.append(f"           {rows} the same: events or answers to commands differ")
         for name, (then, now) in (report["fields"] or {}).items():
             lines.append(f"           {name}: recorded {then!r}, today {now!r}")
     lines += [f"decision   {sentence}" for sentence in report["decisions"]]

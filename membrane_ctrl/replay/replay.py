@@ -25,6 +25,8 @@ from membrane_ctrl.run_files.inputs_file import InputsFrame
 
 # A shape is used in the tick it arrives in; more than these need not be remembered.
 _SHAPES_KEPT = 16
+# Events in other words make some ticks an hour different; with more than these the code differs.
+_ROWS_KEPT = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +65,7 @@ class Replay:
     ticks: int = 0  # replayed
     compared: int = 0  # of these, bit by bit
     different: int = 0  # of these
-    first_different: telemetry.TelemetryRow | None = None
+    different_rows: list[telemetry.TelemetryRow] = field(default_factory=list)  # today's, of the first of them
     gaps: list[Gap] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     last_s: float = -math.inf
@@ -130,7 +132,8 @@ def _compare(item: RecordedTick, outputs: TickOutputs, found: Replay) -> None:
     found.compared += 1
     if output_crc(outputs, outputs.row.pack()) != item.output_crc:
         found.different += 1
-        found.first_different = found.first_different or outputs.row
+        if len(found.different_rows) < _ROWS_KEPT:
+            found.different_rows.append(outputs.row)
 
 
 def decisions_of(told: Iterable[tuple[float, Event]]) -> list[Decision]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import tarfile
 from pathlib import Path
@@ -10,18 +11,27 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.cli import run
+from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.run_files.inputs_file import open_inputs
 
-ARCHIVE = Path(__file__).parents[1] / "fixtures" / "runs" / "20261122T043916Z-earlier.tar.xz"
+RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
 TICKS = 702
+
+
+def unpacked(name: str, folder: Path) -> Path:
+    with tarfile.open(RUNS / f"{name}.tar.xz") as archive:
+        archive.extractall(folder, filter="data")
+    return folder / name
 
 
 @pytest.fixture(scope="module")
 def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("runs")
-    with tarfile.open(ARCHIVE) as archive:
-        archive.extractall(folder, filter="data")
-    return folder / ARCHIVE.name.removesuffix(".tar.xz")
+    return unpacked("20261122T043916Z-earlier", tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture
+def before_columns(tmp_path: Path) -> Path:
+    return unpacked("20261122T151047Z-before-columns", tmp_path)
 
 
 def test_every_tick_shape_and_memory_of_it_is_read(earlier: Path) -> None:
@@ -50,3 +60,36 @@ def test_it_is_listed_and_reported(earlier: Path, command: list[str], capsys: py
     where = earlier.parent if command[0] == "runs" else earlier
     assert run([*command, str(where)]) == 0
     assert "earlier" in capsys.readouterr().out
+
+
+def test_events_in_other_words_leave_a_run_the_same_to_the_last_bit(
+    before_columns: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Since then, events have had other fields; every row and decision has stayed."""
+    assert run(["replay", str(before_columns), "--json"]) == Exit.DONE
+    report = json.loads(capsys.readouterr().out)
+    assert (report["verdict"], report["ticks"], report["compared"], report["decisions"]) == (
+        "same rows",
+        1381,
+        1381,
+        [],
+    )
+    assert 0 < report["different"] < 50
+
+
+def test_rows_that_cannot_be_looked_at_are_not_called_the_same(
+    before_columns: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in before_columns.glob("*.rrd"):
+        path.unlink()
+    assert run(["replay", str(before_columns), "--json"]) == Exit.REJECTED
+    report = json.loads(capsys.readouterr().out)
+    assert (report["verdict"], report["decisions"]) == ("different", [])
+
+
+def test_another_pump_command_is_another_row(before_columns: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = before_columns / "config.toml"
+    loop = path.read_text()
+    path.write_text(re.sub(r"(?m)^kp_per_s = .*$", "kp_per_s = 0.21", loop))
+    assert run(["replay", str(before_columns), "--json"]) == Exit.REJECTED
+    assert json.loads(capsys.readouterr().out)["verdict"] == "different"
