@@ -17,7 +17,7 @@ from benchmarks.minimum_variance import WRITE_S, least_std_um
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput, LoopOutput
 from membrane_ctrl.sim.plant import Plant
-from tests.support.bench_events import AmbientChange, Event, LeakChange
+from tests.support.bench_events import AmbientChange, BenchEvent, LeakChange
 
 SETTLED_S = 40.0
 SCENARIOS = ("quiet", "typical", "gusty")
@@ -47,7 +47,7 @@ def hold(
     loop: LoopConfig,
     twin: TwinConfig,
     duration_s: float,
-    events: Sequence[Event] = (),
+    events: Sequence[BenchEvent] = (),
     lost_s: tuple[float, float] = (np.inf, np.inf),
     target_um: Callable[[float], float] = lambda time_s: 0.0,
     true_pump: PumpConfig = PumpConfig(),  # noqa: B008 (frozen)
@@ -102,7 +102,7 @@ def steady(sensors: str, scenario: str, seeds: Sequence[int], duration_s: float,
     }
 
 
-def answer(sensors: str, event: Event, seeds: Sequence[int], near_um: float) -> dict[str, float]:
+def answer(sensors: str, event: BenchEvent, seeds: Sequence[int], near_um: float) -> dict[str, float]:
     """Peak of the true centre after an event at 60 s, and the time until it is near for good."""
     peaks_um, back_s = [], []
     for seed in seeds:

@@ -26,8 +26,7 @@ from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench
-from tests.support.bench_events import DailyTemperature, LaserDropout, PressureWeather
-from tests.support.bench_events import Event as Happening
+from tests.support.bench_events import BenchEvent, DailyTemperature, LaserDropout, PressureWeather
 
 DAY_S = 86_400.0
 RATE_HZ = 10.0
@@ -101,7 +100,7 @@ def soak_config(seed: int) -> Config:
 
 
 def soak(
-    days: float, seed: int, faults: bool = True, events: tuple[Happening, ...] = (), take: Take | None = None
+    days: float, seed: int, faults: bool = True, events: tuple[BenchEvent, ...] = (), take: Take | None = None
 ) -> SoakTally:
     """Hold for `days` or until ctrl-C; with `faults` something goes wrong six times a day. `take` gets every tick."""
     config = soak_config(seed)
@@ -208,7 +207,7 @@ def figures(days: float, seed: int = 1, take: Take | None = None) -> list[Figure
     ]
 
 
-def everything(seed: int) -> tuple[Happening, ...]:
+def everything(seed: int) -> tuple[BenchEvent, ...]:
     """A day's temperature and the pressure of passing weather, on top of the scenario's own."""
     return (DailyTemperature(1.0), PressureWeather(700.0, seed))
 

@@ -18,7 +18,7 @@ from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.control.experiments.machine import BenchSample
 from membrane_ctrl.sim import plant as twin_pump
 from membrane_ctrl.sim.plant import STEP_S, Plant
-from tests.support.bench_events import Event
+from tests.support.bench_events import BenchEvent
 from tuning.identification.characterise import Characterised, characterise
 from tuning.identification.disturbance import observe
 from tuning.proposal.candidates import amigo, simc, ziegler_nichols
@@ -73,7 +73,7 @@ class Case:
 class TwinBench:
     """The twin's plant in ticks; without weather sensors unless the case has them."""
 
-    def __init__(self, case: Case, seed: int, events: Sequence[Event] = ()) -> None:
+    def __init__(self, case: Case, seed: int, events: Sequence[BenchEvent] = ()) -> None:
         delays = {name: getattr(twin_pump, name) * case.delay for name in ("TRANSPORT_S", "LAG_S")}
         with patch.multiple(twin_pump, **delays):
             self.plant = Plant(case.twin(seed), PumpConfig(flow_full_um_per_s=5.3 * case.pump), events)

@@ -105,7 +105,7 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class FaultBit:
     """One bit of `latched_faults`."""
 
     bit: int
@@ -126,7 +126,7 @@ class RegisterMap:
     map_version: int
     device_kind: int
     blocks: tuple[Block, ...]
-    faults: tuple[Fault, ...]
+    faults: tuple[FaultBit, ...]
 
     def __iter__(self) -> Iterator[Register]:
         """All registers by address."""
@@ -194,7 +194,7 @@ def parse(table: Mapping[str, Any]) -> RegisterMap:
     try:
         blocks = tuple(_parse_block(entry) for entry in table["block"])
         faults = tuple(
-            Fault(entry["bit"], entry["name"], entry["meaning"], entry.get("since", 1)) for entry in table["fault"]
+            FaultBit(entry["bit"], entry["name"], entry["meaning"], entry.get("since", 1)) for entry in table["fault"]
         )
         found = RegisterMap(table["map_version"], table["device_kind"], blocks, faults)
     except KeyError as error:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import ast
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
-from benchmarks.house import ROOT, circle_of, floors, imported, module_of, modules, rooms
+from benchmarks.house import ROOT, TOPS, circle_of, floors, imported, module_of, modules, rooms
 
 IO = {
     "asyncio",
@@ -91,6 +92,12 @@ def test_a_circle_is_seen() -> None:
     edges = {"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}
     assert circle_of(edges)["b"] == {"b", "c"}
     assert floors(edges) == {"a": 2, "b": 1, "c": 1, "d": 3}
+
+
+def test_a_class_name_means_one_thing() -> None:
+    trees = (ast.parse(file.read_text(encoding="utf-8")) for file in files_of(*TOPS))
+    names = Counter(node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef))
+    assert [name for name, count in names.items() if count > 1] == []
 
 
 @pytest.mark.parametrize("file", files_of("membrane_ctrl/control"), ids=str)

@@ -19,7 +19,7 @@ _STALE_FRAMES = 2
 _EXPOSURE_MANUAL = 1.0  # V4L2's number; 3 is automatic
 
 
-class Capture(Protocol):
+class VideoCapture(Protocol):
     """The part of cv2.VideoCapture that is used."""
 
     def isOpened(self) -> bool:  # noqa: N802 (OpenCV's name)
@@ -50,10 +50,10 @@ class UvcCamera:
         width_px: int,
         height_px: int,
         now: roles.Clock = time.monotonic,
-        capture: Callable[[int | str], Capture] = cv2.VideoCapture,  # type: ignore[assignment]  # stubs name differently
+        capture: Callable[[int | str], VideoCapture] = cv2.VideoCapture,  # type: ignore[assignment]  # the stubs differ
     ) -> None:
         self._config, self._size, self._now, self._make = config, (width_px, height_px), now, capture
-        self._capture: Capture | None = None
+        self._capture: VideoCapture | None = None
 
     def open(self) -> roles.DeviceIdentity:
         """Connect and set. Raises LinkDownError without a camera, DeviceRefusedError for another size or exposure."""

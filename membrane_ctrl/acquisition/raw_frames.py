@@ -163,7 +163,7 @@ class RawFrames:
         self.left_out += 1
         if why and why != self._told:
             self._told = why
-            self._tell(run_events.RawFrames(self.left_out, f"frames are left out: {why}"))
+            self._tell(run_events.FramesLeftOut(self.left_out, f"frames are left out: {why}"))
 
     def _collect(self) -> None:
         """Collect finished writes; a set that failed is dropped, and nothing may refer to it."""

@@ -212,7 +212,7 @@ class Changes:
         return f"laser {self.laser_um:+.1f} um, camera {self.optics_um:+.1f} um, gauge {self.gauge_um:+.1f} um"
 
 
-class Plausibility:
+class PlausibilityCheck:
     """Judges on every tick; says NOBODY without a camera, for two sensors can only disagree.
 
     Laser and camera may be `limit_um` apart (`shape.disagreement_max_um`). `changes` are NaN until there is a

@@ -92,7 +92,7 @@ class Hour:
 
 
 @dataclass(frozen=True, slots=True)
-class Maintenance:
+class FilmWarning:
     """A maintenance notice; it no longer applies if it is not `bad`."""
 
     name: str
@@ -110,7 +110,7 @@ class FilmHealth:
         self._warned: set[str] = set()
         self._begin_hour()
 
-    def step(self, dt_s: float, leak_um_per_s: float, gauge_pressure_pa: float) -> tuple[Maintenance, ...]:
+    def step(self, dt_s: float, leak_um_per_s: float, gauge_pressure_pa: float) -> tuple[FilmWarning, ...]:
         """One tick of a held mirror; what is newly worth a warning, or no longer, at the end of an hour."""
         if not (math.isfinite(leak_um_per_s) and math.isfinite(gauge_pressure_pa)):
             return ()
@@ -133,7 +133,7 @@ class FilmHealth:
     def _begin_hour(self) -> None:
         self._held_s = self._leak_um = self._pressure_pa_s = 0.0
 
-    def _news(self, hour: Hour, first: Hour) -> list[Maintenance]:
+    def _news(self, hour: Hour, first: Hour) -> list[FilmWarning]:
         leak, most = hour.leak_um_per_s, self._flow_max_um_per_s
         creep = self._creep_per_day()
         found = (
@@ -150,7 +150,7 @@ class FilmHealth:
         changed = bad ^ self._warned
         self._warned = bad
         return [
-            Maintenance(name, says if name in bad else "no longer so", name in bad)
+            FilmWarning(name, says if name in bad else "no longer so", name in bad)
             for name, _, says in found
             if name in changed
         ]

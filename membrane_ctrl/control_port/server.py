@@ -187,7 +187,7 @@ class Port:
         former = self._commander.holder(self._now())
         refusal = self._commander.claim(peer.who, request.take_over, self._now())
         if not refusal and former != peer.who:
-            self._tell(run_events.Commander(peer.who, former or None, request.why))
+            self._tell(run_events.CommanderChanged(peer.who, former or None, request.why))
             for session in self._sessions:
                 if session.peer.who == former:
                     session.notice(
@@ -202,7 +202,7 @@ class Port:
                 session.watch(request.period_s)
             case "release":
                 self._commander.release(who)
-                self._tell(run_events.Commander(None, who, request.why))
+                self._tell(run_events.CommanderChanged(None, who, request.why))
             case "quiet":
                 self._tell(run_events.AlarmsAcknowledged(who, request.why))
         return {"ok": True, "status": self.status(), "loop": self._hooks.loop().model_dump()}

@@ -43,7 +43,7 @@ class SensorConsistency:
     """
 
     def __init__(self, config: Config) -> None:
-        self._plausibility = film.Plausibility(config.shape.disagreement_max_um)
+        self._plausibility = film.PlausibilityCheck(config.shape.disagreement_max_um)
         self._far_um = config.shape.disagreement_max_um
         self._health = film_health.FilmHealth(min(config.loop.flow_max_um_per_s, config.pump.flow_full_um_per_s))
         self._film = film.FilmMonitor(config.limits, config.optics.mirror)

@@ -130,7 +130,7 @@ class Capture(Event, kind="capture"):
     failed: str | None = None
 
 
-class RawFrames(Event, kind="raw_frames"):
+class FramesLeftOut(Event, kind="raw_frames"):
     """Frames around a fault are not kept."""
 
     left_out: int
@@ -209,7 +209,7 @@ class PortOpen(Event, kind="port_open"):
     port: str
 
 
-class Commander(Event, kind="commander"):
+class CommanderChanged(Event, kind="commander"):
     """Who has the command now, and who had it before."""
 
     who: str | None

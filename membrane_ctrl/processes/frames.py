@@ -87,7 +87,7 @@ class FrameWriter:
 
     def __init__(self, address: FrameAddress) -> None:
         self._memory = SharedMemory(address.name)
-        self._slots = _Slots(self._memory, address)
+        self._slots = _FrameSlots(self._memory, address)
         self._next = self._slots.written()
 
     def begin(self) -> FrameSlot:
@@ -112,7 +112,7 @@ class FrameReader:
 
     def __init__(self, address: FrameAddress) -> None:
         self._memory = SharedMemory(address.name)
-        self._slots = _Slots(self._memory, address)
+        self._slots = _FrameSlots(self._memory, address)
         self._count = address.slots
 
     def heads(self) -> list[FrameHead]:
@@ -135,7 +135,7 @@ class FrameReader:
         self._memory.close()
 
 
-class _Slots:
+class _FrameSlots:
     """The layout: write counter; for each slot a head with the sequence number, the pixels, the number again."""
 
     def __init__(self, memory: SharedMemory, address: FrameAddress) -> None:

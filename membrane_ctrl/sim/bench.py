@@ -18,7 +18,7 @@ from membrane_ctrl.model.errors import DeviceError, Exit
 from membrane_ctrl.processes.child import STOP, Child, parent_lives, pipe, raise_priority
 from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
 from membrane_ctrl.sim.lab import Lab
-from membrane_ctrl.sim.plant import STEP_S, Event, Plant
+from membrane_ctrl.sim.plant import STEP_S, BenchEvent, Plant
 from membrane_ctrl.sim.sensors import TRUTH_BYTES, Truth
 
 _PERIOD_S = 0.004  # below the sensors' 5 ms, so that each of their samples is out on time
@@ -38,7 +38,7 @@ class BenchSpec:
     truth: RingAddress | None = None  # where to publish `Truth.pack()` with every sample
     # how long the bench outlives the process that started it, so that the tripped watchdog can be seen
     linger_s: float = 5.0
-    events: tuple[Event, ...] = ()  # what happens when, in plant time (0 at the start)
+    events: tuple[BenchEvent, ...] = ()  # what happens when, in plant time (0 at the start)
     lab: DevicesConfig | None = None  # serve these instruments in place of the pump board
 
 

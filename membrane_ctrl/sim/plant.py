@@ -90,7 +90,7 @@ class Surroundings:
     laser_lost: Series  # 1 where the laser gets no light back, else 0
 
 
-class Event(Protocol):
+class BenchEvent(Protocol):
     """Something that happens to the bench at a time; picklable."""
 
     def apply(self, on: Surroundings) -> None:
@@ -121,7 +121,9 @@ class OrnsteinUhlenbeck:
 class Disturbance:
     """What the surroundings do, in blocks of consecutive steps: scenario, drift of the laser's mount, events."""
 
-    def __init__(self, config: TwinConfig, events: Sequence[Event], step_s: float, rng: np.random.Generator) -> None:
+    def __init__(
+        self, config: TwinConfig, events: Sequence[BenchEvent], step_s: float, rng: np.random.Generator
+    ) -> None:
         pressure, temperature = SCENARIOS[config.scenario]
         pressure_rng, temperature_rng = rng.spawn(2)
         self._pressure = OrnsteinUhlenbeck(*pressure, step_s, pressure_rng)
@@ -180,7 +182,7 @@ class Plant:
     Truth does not depend on how often it is sampled, nor on how time is cut into calls of `advance`.
     """
 
-    def __init__(self, twin: TwinConfig, pump: PumpConfig, events: Sequence[Event] = ()) -> None:
+    def __init__(self, twin: TwinConfig, pump: PumpConfig, events: Sequence[BenchEvent] = ()) -> None:
         chance, noise = np.random.default_rng(twin.seed).spawn(2)
         self._sensors = sensors.Sensors(twin, noise)
         self._disturbance = Disturbance(twin, events, STEP_S, chance)

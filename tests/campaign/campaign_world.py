@@ -10,7 +10,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.sim.plant import STEP_S, Plant
-from tests.support.bench_events import Event
+from tests.support.bench_events import BenchEvent
 
 SCENARIOS = ("calm", "quiet", "typical", "gusty")
 NOMINAL_SEEDS = range(1, 3)  # the twin as it is; all other seeds draw a mirror
@@ -77,7 +77,7 @@ class WatchedPlant(Plant):
         What arrives at the pump's motor and at the valve, whoever sent it.
     """
 
-    def __init__(self, world: World, twin: TwinConfig, pump: PumpConfig, events: Sequence[Event] = ()) -> None:
+    def __init__(self, world: World, twin: TwinConfig, pump: PumpConfig, events: Sequence[BenchEvent] = ()) -> None:
         self._softness = world.softness
         self.pump_given = self.vent_given = 0.0
         real = pump.model_copy(update={"flow_full_um_per_s": world.pump_gain * pump.flow_full_um_per_s})

@@ -28,7 +28,7 @@ from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.sensors import Truth
 from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench
-from tests.support.bench_events import AmbientChange, Event
+from tests.support.bench_events import AmbientChange, BenchEvent
 
 RATE_HZ = 10.0
 REGISTER_MAX = 2e6  # what does not fit a register of the board is sent as none
@@ -116,7 +116,7 @@ class LyingPlant(Plant):
     """
 
     def __init__(
-        self, twin: TwinConfig, pump: PumpConfig, events: Sequence[Event], lying: Lying, linear: float = 0.0
+        self, twin: TwinConfig, pump: PumpConfig, events: Sequence[BenchEvent], lying: Lying, linear: float = 0.0
     ) -> None:
         super().__init__(twin, pump, events)
         self._lying, self._linear = lying, linear

@@ -20,8 +20,8 @@ from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.bench_events import (
     AmbientChange,
+    BenchEvent,
     DailyTemperature,
-    Event,
     LaserDrift,
     LaserDropout,
     LeakChange,
@@ -68,7 +68,7 @@ def _quiet_hours(
     twin = twin.model_copy(update={"scenario": "gusty" if seed % 2 else "typical"})
     camera = seed % 4 < 2
     drift_s = float(chance.uniform(0.2, 0.5)) * end_s
-    events: list[Event] = [
+    events: list[BenchEvent] = [
         DailyTemperature(1.0),
         PressureWeather(700.0, seed),
         LeakChange(float(chance.uniform(0.3, 0.7)) * end_s, 2.0),

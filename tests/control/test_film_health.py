@@ -7,13 +7,13 @@ from collections.abc import Callable
 
 import pytest
 
-from membrane_ctrl.control.film_health import FilmHealth, Maintenance
+from membrane_ctrl.control.film_health import FilmHealth, FilmWarning
 
 STEP_S = 60.0
 HOURS = Callable[[float], float]
 
 
-def days(leak: HOURS, pressure: HOURS, count: float) -> list[tuple[float, Maintenance]]:
+def days(leak: HOURS, pressure: HOURS, count: float) -> list[tuple[float, FilmWarning]]:
     """Warnings with their hour."""
     health = FilmHealth(5.3)
     found = []

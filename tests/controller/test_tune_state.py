@@ -21,8 +21,7 @@ from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
-from tests.support.bench_events import AmbientChange
-from tests.support.bench_events import Event as TwinEvent
+from tests.support.bench_events import AmbientChange, BenchEvent
 
 CONFIG = Config(twin=TwinConfig(scenario="quiet", start_error_um=-5.0), shape=ShapeConfig(enabled=False))
 BEGIN_S = 40.0
@@ -40,7 +39,7 @@ def tune(**changed: Any) -> Command:
 class Held:
     """A twin in hold since a while."""
 
-    def __init__(self, config: Config = CONFIG, twin_events: tuple[TwinEvent, ...] = ()) -> None:
+    def __init__(self, config: Config = CONFIG, twin_events: tuple[BenchEvent, ...] = ()) -> None:
         self.bench = VirtualBench(Plant(config.twin, config.pump, twin_events))
         self._run = VirtualRun(config, self.bench, zernike_projection())
         self.events: list[EventLine] = []

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from membrane_ctrl.model.events import KINDS, CommandTaken, Event, Fault, StateEntered
-from membrane_ctrl.model.run_events import Capture, Commander, Link, UnknownEvent, from_dict
+from membrane_ctrl.model.run_events import Capture, CommanderChanged, Link, UnknownEvent, from_dict
 
 EARLIER = Path(__file__).parents[1] / "fixtures" / "runs" / "20261122T043916Z-earlier.tar.xz"
 TIMES = ("time_utc", "mono_s")
@@ -45,7 +45,12 @@ def test_keys_stay_in_the_order_of_the_format() -> None:
 def test_what_there_is_nothing_to_say_of_is_left_out_but_nobody_is_somebody() -> None:
     assert CommandTaken("ack", "ann", "").to_dict() == {"kind": "command", "command": "ack", "who": "ann", "why": ""}
     assert Capture(3, failed="dark").to_dict() == {"kind": "capture", "cycle": 3, "failed": "dark"}
-    assert Commander(None, "ann", "").to_dict() == {"kind": "commander", "who": None, "former": "ann", "why": ""}
+    assert CommanderChanged(None, "ann", "").to_dict() == {
+        "kind": "commander",
+        "who": None,
+        "former": "ann",
+        "why": "",
+    }
 
 
 @pytest.mark.parametrize("cls", KINDS.values())

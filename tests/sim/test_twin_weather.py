@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.support.bench_events import DailyTemperature, Event, PressureWeather, Surroundings
+from tests.support.bench_events import BenchEvent, DailyTemperature, PressureWeather, Surroundings
 
 DAY_S = 86_400.0
 
 
-def series(event: Event, time_s: np.ndarray) -> Surroundings:
+def series(event: BenchEvent, time_s: np.ndarray) -> Surroundings:
     zero = np.zeros_like(time_s)
     on = Surroundings(time_s, zero.copy(), zero.copy(), np.ones_like(time_s), zero.copy(), zero.copy())
     event.apply(on)
@@ -36,7 +36,7 @@ def test_weather_has_its_size_begins_at_nothing_and_is_slow() -> None:
 
 
 @pytest.mark.parametrize("event", [DailyTemperature(1.0), PressureWeather(500.0, 3)])
-def test_blocks_make_no_difference(event: Event) -> None:
+def test_blocks_make_no_difference(event: BenchEvent) -> None:
     time_s = np.arange(0.0, 4000.0, 1.0)
     whole = series(event, time_s)
     parts = [series(event, part) for part in np.split(time_s, 8)]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.sim.plant import Event as Event
+from membrane_ctrl.sim.plant import BenchEvent as BenchEvent
 from membrane_ctrl.sim.plant import Series
 from membrane_ctrl.sim.plant import Surroundings as Surroundings
 

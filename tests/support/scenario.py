@@ -57,7 +57,7 @@ from tests.support import bench_events as happenings
 _SWITCHES: dict[str, Any] = {field.name: field.default for field in fields(Wrong)}
 _FRACTIONS = ("pump_share", "pump_stuck_fraction", "vent_stuck_fraction")  # beyond them the plant has no answer
 Happening = Literal["ambient", "air_temperature", "leak", "laser_dropout", "laser_drift", "power_cycle"]
-_MAKE: dict[str, Callable[[At], happenings.Event]] = {
+_MAKE: dict[str, Callable[[At], happenings.BenchEvent]] = {
     "ambient": lambda at: happenings.AmbientChange(at.time_s, at.value, at.over_s),
     "air_temperature": lambda at: happenings.AirTemperatureChange(at.time_s, at.value, at.over_s),
     "leak": lambda at: happenings.LeakChange(at.time_s, at.value),

@@ -12,15 +12,14 @@ from membrane_ctrl.model.errors import RejectedError
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_hold import HoldError
-from tests.support.bench_events import AmbientChange
-from tests.support.bench_events import Event as TwinEvent
+from tests.support.bench_events import AmbientChange, BenchEvent
 from tuning import session
 from tuning.identification.characterise import characterise, spec_of
 from tuning.rig import HoldRig
 from tuning.twin_hold import TwinHold
 
 
-def held(events: Sequence[TwinEvent] = (), **twin: object) -> tuple[TwinHold, HoldRig]:
+def held(events: Sequence[BenchEvent] = (), **twin: object) -> tuple[TwinHold, HoldRig]:
     settings = TwinConfig.model_validate({"scenario": "quiet", "start_error_um": -3.0, **twin})
     loop = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
     link = TwinHold(Config(twin=settings, shape=ShapeConfig(enabled=False), loop=loop), events)
