@@ -70,15 +70,12 @@ def _step(name: str) -> None:
         from membrane_ctrl.config.schema import Config
         from membrane_ctrl.config.toml_file import load
         from membrane_ctrl.control_port.ctl import Where
-        from membrane_ctrl.control_port.sockets import SOCKET_NAME
         from tuning import command as tune
 
-        if socket is None and run is None:
-            socket = logs / SOCKET_NAME
         options = tune.TuneOptions(
             config=Config() if config is None else load(config, Config),
             twin=twin,
-            where=Where(socket=socket, run=run),
+            where=Where(socket, run, logs=logs),
             logs=logs,
             session=session,
             name=session_name,

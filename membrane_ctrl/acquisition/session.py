@@ -143,20 +143,15 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
         if spec.truth is None:
             bench = optical_bench.configured_bench(config, clock)
             _warm_up(config, plan, TYPICAL_FILM, clock)
-            signal.signal(child.STOP, lambda number, frame: remote.end())
-            stack.callback(bench.close)
-            _open(bench, config, clock, remote)
         else:
             bench = _twin_bench(spec.truth, config, plan, clock, remote, stack)
-            signal.signal(child.STOP, lambda number, frame: remote.end())
-            stack.callback(bench.close)
+        signal.signal(child.STOP, lambda number, frame: remote.end())
+        stack.callback(bench.close)
+        if spec.truth is None:
+            _open(bench, config, clock, remote)
         if remote.stop:
             return
-        kept = None if spec.run_dir is None else spec.run_dir / file.KEPT
-        stated = geometry.optics.geometry
-        spread, _ = spread_file.spread_of(stated, kept if kept is not None and kept.exists() else None)
-        known = spread if spread.names else None
-        reconstructor = live.LiveReconstructor(geometry.optics, config.shape.bin_px, spread=known)
+        reconstructor = _reconstructor(spec, geometry.optics)
         drift = worker.LiveDrift(geometry, config.shape.bin_px)
         shapes = stack.enter_context(closing(ring.RingWriter(spec.shapes)))
         slots = stack.enter_context(closing(frames.FrameWriter(spec.frames)))
@@ -182,6 +177,13 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
         remote.prepared()
         remote.report("running", "first cycle")
         worker.keep_cycling(taking, remote, publish, clock, config.shape.period_s, keep)
+
+
+def _reconstructor(spec: process.AcquisitionSpec, optics: OpticsConfig) -> live.LiveReconstructor:
+    """What makes figures of the frames, with their covariance if the uncertainty of the geometry is stated."""
+    kept = None if spec.run_dir is None else spec.run_dir / file.KEPT
+    spread, _ = spread_file.spread_of(optics.geometry, kept if kept is not None and kept.exists() else None)
+    return live.LiveReconstructor(optics, spec.config.shape.bin_px, spread=spread if spread.names else None)
 
 
 def _twin_bench(

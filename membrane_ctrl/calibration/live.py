@@ -3,7 +3,7 @@
 import contextlib
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,28 +29,22 @@ _NEARLY_ALL = 0.9  # of the good range: more would hardly be better
 
 @dataclass(frozen=True, slots=True)
 class LiveOptions:
-    """What the command line asked for; from `geometry` on as for `calibrate`."""
+    """What the command line asked for; sets and output of `solving` are the session's."""
 
     where: Where
-    logs: Path
     session: Path | None
     name: str
     range_um: float | None
     sets: int | None
     yes: bool
     take_over: bool
-    geometry: Path | None
-    free: tuple[str, ...]
-    laser_sigma_um: float
-    json: bool
-    pictures: bool = True
-    priors: tuple[Path, ...] = ()
+    solving: CalibrateOptions
 
 
 def calibrate_live(options: LiveOptions) -> int:
     """Take what is missing of a session's sets, solve, and adopt if a person agrees. Returns the exit code."""
-    freed(options.free)  # what is wrong with these is better known before the mirror moves
-    for path in options.priors:
+    freed(options.solving.free)  # what is wrong with these is better known before the mirror moves
+    for path in options.solving.priors:
         read_prior(path)
     session = None
     if options.session is not None:
@@ -87,7 +81,7 @@ def take_sets(link: CaptureLink, session: CalibrationSession | None, options: Li
         progress.say(_worth(link, head, held, options))
         _agree(f"move the mirror through {len(missing)} setpoints?", options.yes)
         sweep.claim(held.setpoint_um)
-        session = session or sessions.begin(options.logs, options.name, head, link.config)
+        session = session or sessions.begin(options.where.logs, options.name, head, link.config)
         progress.say(f"session: {session.path}")
         procedure.take(session)
     except HoldError as error:
@@ -97,18 +91,10 @@ def take_sets(link: CaptureLink, session: CalibrationSession | None, options: Li
 
 def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
     """Solve a session's sets, show old and new, put the new geometry in place if that is agreed."""
-    solving = CalibrateOptions(
-        session.sets,
-        options.geometry,
-        session.geometry,
-        options.free,
-        options.laser_sigma_um,
-        options.json,
-        options.pictures,
-        session.head.start_um,
-        priors=options.priors,
+    start_um = session.head.start_um
+    code = calibrate_command(
+        replace(options.solving, folders=session.sets, out=session.geometry, reference_um=start_um)
     )
-    code = calibrate_command(solving)
     if code != Exit.DONE:
         return code
     optics, place = read_head(session.sets[0]).optics, session.config.optics.geometry_file
@@ -173,12 +159,13 @@ def _foreseen(
     link: CaptureLink, held: plan.HeldMirror, setpoints: Sequence[float], options: LiveOptions
 ) -> propagate.Propagated:
     optics = geometry_of_run(link.run_dir, link.config).optics
-    if options.geometry is not None:
-        optics = read_geometry(options.geometry).over(optics)
-    known = parameters.sigmas({**stated_sigmas(optics.geometry), **freed(options.free)})
+    solving = options.solving
+    if solving.geometry is not None:
+        optics = read_geometry(solving.geometry).over(optics)
+    known = parameters.sigmas({**stated_sigmas(optics.geometry), **freed(solving.free)})
     sags_mm = [held.sag_at_mm(each) for each in sorted(setpoints)]
     try:
-        return propagate.foresee(optics, known, sags_mm, held.swing_adu, options.laser_sigma_um)
+        return propagate.foresee(optics, known, sags_mm, held.swing_adu, solving.laser_sigma_um)
     except ValueError as error:
         raise InputError(f"{link.name}: {error}; does [optics] state this bench?") from None
 

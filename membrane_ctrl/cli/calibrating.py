@@ -98,46 +98,36 @@ def calibrate(
     ] = 1.0,
     pictures: Annotated[bool, typer.Option(help="Draw the residuals next to the geometry file.")] = True,
     json: JsonOption = False,
-    live: Annotated[
-        bool, typer.Option("--live", help="Take the sets from a running hold; ask before the mirror moves.")
-    ] = False,
+    live: Annotated[bool, typer.Option("--live", help="Take the sets from a hold; ask before it moves.")] = False,
     range_um: Annotated[
         float | None, typer.Option(help="--live: range of setpoints, um; 8000 by default, or what the limits allow.")
     ] = None,
     sets: Annotated[int | None, typer.Option(min=2, max=20, help="--live: number of sets; 5 by default.")] = None,
-    yes: Annotated[
-        bool, typer.Option("--yes", help="--live: move the mirror and adopt the result without asking.")
-    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="--live: move the mirror and adopt without asking.")] = False,
     session: Annotated[Path | None, typer.Option(help="--live: continue this session.")] = None,
     session_name: Annotated[str, typer.Option("--name", help="--live: name of a new session.")] = "live",
     logs: Annotated[Path, typer.Option(help="--live: put sessions in LOGS/calibration.")] = Path("logs"),
     run: Annotated[Path | None, typer.Option(help="--live: run folder of the hold.")] = None,
     socket: Annotated[Path | None, typer.Option(help="--live: control port of the hold.")] = None,
-    take_over: Annotated[
-        bool, typer.Option("--take-over", help="--live: take the command from whoever has it.")
-    ] = False,
+    take_over: Annotated[bool, typer.Option("--take-over", help="--live: take over the command.")] = False,
 ) -> int:
     """Calibrate the optics: one geometry with its covariance, from sets at several pressures."""
     from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command
 
-    names, priors = tuple(free or ()), tuple(prior or ())
+    solving = CalibrateOptions(
+        folders or (), geometry, out or Path("geometry.toml"), free or (), laser_sigma_um, json, pictures,
+        priors=prior or (),
+    )  # fmt: skip
     if not live:
         if not folders:
             raise InputError("calibrate: name the capture sets, or take them from a running hold with --live")
         if any((range_um, sets, yes, session, run, socket, take_over)):
             raise InputError("calibrate SET...: --range-um, --sets, --yes, --session and the hold are for --live")
-        geometry_out = out or Path("geometry.toml")
-        return calibrate_command(
-            CalibrateOptions(folders, geometry, geometry_out, names, laser_sigma_um, json, pictures, priors=priors)
-        )
+        return calibrate_command(solving)
     from membrane_ctrl.calibration.live import LiveOptions, calibrate_live
-    from membrane_ctrl.control_port import ctl, sockets
+    from membrane_ctrl.control_port.ctl import Where
 
     if folders or out:
         raise InputError("calibrate --live takes its sets into its session's folder: leave out SET... and --out")
-    where = ctl.Where(socket=logs / sockets.SOCKET_NAME if socket is None and run is None else socket, run=run)
-    options = LiveOptions(
-        where, logs, session, session_name, range_um, sets, yes, take_over,
-        geometry, names, laser_sigma_um, json, pictures, priors,
-    )  # fmt: skip
-    return calibrate_live(options)
+    where = Where(socket, run, logs=logs)
+    return calibrate_live(LiveOptions(where, session, session_name, range_um, sets, yes, take_over, solving))

@@ -23,6 +23,7 @@ class Where:
     certificate: Path | None = None
     key: Path | None = None
     authority: Path | None = None
+    logs: Path = Path("logs")
 
 
 def ctl(request: dict[str, Any], where: Where, as_json: bool) -> int:
@@ -152,10 +153,10 @@ def _connect_tls(where: Where, notice: Any) -> PortClient:
 
 
 def socket_path(where: Where) -> Path:
-    """The socket file: as told, of the run's own configuration, beside the run's folder, or in `logs`."""
+    """The socket file: as told, of the run's own configuration, beside the run's folder, or among the runs."""
     if where.socket is not None:
         return where.socket
     if where.run is None:
-        return Path("logs") / sockets.SOCKET_NAME
+        return where.logs / sockets.SOCKET_NAME
     configured = read_toml(where.run / "config.toml").get("port", {}).get("socket")
     return Path(configured) if configured else where.run.resolve().parent / sockets.SOCKET_NAME

@@ -221,7 +221,7 @@ HANDLERS: dict[State, Callable[[Scene], State]] = {
 def run_state(state: State, scene: Scene) -> State:
     """Run the state's handler and return the next state; a request for another state comes first."""
     if scene.way_down is not None and state not in (State.LOWER, State.FAULT):
-        scene.why = f"{_way(scene)}"
+        scene.why = _way(scene)
         return State.LOWER
     if state in (State.INFLATE, State.SETTLE, State.HOLD) and (elsewhere := _asked_elsewhere(scene)) is not None:
         return elsewhere
@@ -308,10 +308,8 @@ def _begin(scene: Scene, leak_um_per_s: float) -> State:
 
 def _drive(scene: Scene, target_um: float) -> inner_loop.LoopOutput:
     """Let the loop drive the pump: automatic with a reading to trust, the held mean flow without one."""
-    if math.isfinite(scene.observer.displacement_um) and scene.levels.rung == Rung.NONE:
-        output = scene.loop.step(_given(scene, target_um), scene.dt_s)
-    else:
-        output = scene.loop.stale(scene.dt_s)
+    trusted = math.isfinite(scene.observer.displacement_um) and scene.levels.rung == Rung.NONE
+    output = scene.loop.step(_given(scene, target_um), scene.dt_s) if trusted else scene.loop.stale(scene.dt_s)
     scene.give(output)
     return output
 

@@ -184,17 +184,7 @@ async def _run(
 
     assert config.devices is not None
     with contextlib.ExitStack() as stack:
-        telemetry, events, inputs = (
-            stack.enter_context(contextlib.closing(ring.RingWriter(address)))
-            for address in (rings.telemetry, rings.events, rings.inputs)
-        )
-        shapes = (
-            newest_of(stack.enter_context(contextlib.closing(ring.RingReader(rings.shapes))))
-            if rings.shapes
-            else None
-        )
-        truth = twin.truth_reader() if twin else None
-        wiring = Wiring(bench, telemetry, events, inputs, shapes, truth, children.reports)
+        wiring = _wiring(bench, rings, children, twin, stack)
         controller = Controller(config, zernike_projection())
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         port = port_for(server.RunHooks(supervisor.ask, supervisor.tell, clock.now, lambda: controller.loop_config))
@@ -226,6 +216,23 @@ async def _run(
             ticks, missed_ticks = supervisor.ticks, supervisor.missed_ticks
             supervisor.tell(run_events.Ended(exit_code.name.lower(), int(exit_code), ticks, missed_ticks))
     return exit_code
+
+
+def _wiring(
+    bench: Bench,
+    rings: child_processes.Rings,
+    children: child_processes.ChildProcesses,
+    twin: TwinProcess | None,
+    stack: contextlib.ExitStack,
+) -> Wiring:
+    """What the tick reads and writes, without listeners; the rings are closed with the stack."""
+    telemetry, events, inputs = (
+        stack.enter_context(contextlib.closing(ring.RingWriter(address)))
+        for address in (rings.telemetry, rings.events, rings.inputs)
+    )
+    shapes = stack.enter_context(contextlib.closing(ring.RingReader(rings.shapes))) if rings.shapes else None
+    truth = twin.truth_reader() if twin else None
+    return Wiring(bench, telemetry, events, inputs, newest_of(shapes) if shapes else None, truth, children.reports)
 
 
 def _ask_first(supervisor: Supervisor, standby: bool, latch: FaultLatch, board: BoardAtStart) -> None:
