@@ -124,7 +124,7 @@ def ask_tests(tree: Path, first: Sequence[str]) -> str:
     """The first fast test that fails; empty if all pass."""
     rest = [str(p.relative_to(tree)) for pattern in ALL_FAST for p in sorted(tree.glob(pattern))]
     left = [path for path in rest if path not in first and Path(path).name not in (*COMPARISONS, *_OF_TIME)]
-    for files in (first, left):
+    for files in filter(None, (first, left)):  # pytest without a file would run every test there is
         if found := _failed_test(_run(tree, "-m", "pytest", *_PYTEST, *files)):
             return found
     return ""
