@@ -15,4 +15,4 @@ _.power_cycle, _.intrude, _.set_double  # faults that scenarios and tests bring 
 _.__signature__  # Typer reads a command's options from it
 _.failing  # state of an outbox, which tests look at
 _.__init_subclass__  # Python calls it
-_.priority, _.overdue_s, _.restarts, _.column_rows_lost, _.and_unrecorded  # fields of events, written as a whole
+_.priority, _.overdue_s, _.restarts, _.column_rows_lost, _.and_unrecorded, made_utc  # of events, written as a whole

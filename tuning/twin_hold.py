@@ -10,7 +10,6 @@ from membrane_ctrl.model import shape_estimate, states, telemetry
 from membrane_ctrl.model.events import CommandTaken, Event
 from membrane_ctrl.sessions.live_hold import HoldError, News
 from membrane_ctrl.sim import plant, truth_shape, virtual_bench
-from membrane_ctrl.sim.plant import BenchEvent
 
 _NEWS_S = 0.5
 _HELD_WITHIN_S = 120.0
@@ -36,7 +35,7 @@ class TwinHold:
 
     name = "twin"
 
-    def __init__(self, config: Config, events: Sequence[BenchEvent] = ()) -> None:
+    def __init__(self, config: Config, events: Sequence[plant.BenchEvent] = ()) -> None:
         self.config = config
         self.bench = virtual_bench.VirtualBench(plant.Plant(config.twin, config.pump, events))
         source = truth_shape.TruthShape(self.bench, config, config.twin.seed) if config.shape.enabled else None

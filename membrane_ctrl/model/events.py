@@ -18,10 +18,12 @@ class Event:
     """The base of all kinds; a class derived from it is a frozen dataclass."""
 
     _kind: ClassVar[str]
+    keys: ClassVar[tuple[tuple[Field[Any], str], ...]]  # the fields, each with its key in the line
 
     def __init_subclass__(cls, kind: str = "") -> None:
         dataclass(frozen=True)(cls)
         cls._kind = kind
+        cls.keys = tuple((field, field.name.rstrip("_")) for field in fields(cls))
         if kind:
             KINDS[kind] = cls
 
@@ -32,13 +34,8 @@ class Event:
 
     def to_dict(self) -> EventLine:
         """The line, without its times."""
-        told = ((key, getattr(self, field.name), field.default is MISSING) for field, key in keys(type(self)))
+        told = ((key, getattr(self, field.name), field.default is MISSING) for field, key in self.keys)
         return {"kind": self.kind} | {key: value for key, value, always in told if always or value is not None}
-
-
-def keys(cls: type[Event]) -> tuple[tuple[Field[Any], str], ...]:
-    """The fields of a kind, and their keys in the line."""
-    return tuple((field, field.name.rstrip("_")) for field in fields(cls))
 
 
 class StateEntered(Event, kind="state"):

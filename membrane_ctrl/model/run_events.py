@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from membrane_ctrl.model.events import KINDS, Event, EventLine, keys
+from membrane_ctrl.model.events import KINDS, Event, EventLine
 
 # The control process.
 
@@ -246,6 +246,17 @@ class AlarmTold(Event, kind="alarm"):
     escalated: bool
 
 
+# People, during the run or after it.
+
+
+class Mark(Event, kind="mark"):
+    """A remark on a moment of the run."""
+
+    text: str
+    who: str
+    made_utc: str | None = None  # after the run
+
+
 CONNECTED_AGAIN = "connected again"
 _EMPTY: dict[object, object] = {str: "", int: 0, float: math.nan, bool: False}
 
@@ -274,7 +285,7 @@ def from_dict(line: EventLine) -> Event:
     if cls is None:
         return UnknownEvent(line)
     values = {}
-    for field, key in keys(cls):
+    for field, key in cls.keys:
         value = values[field.name] = line[key] if key in line else _EMPTY.get(field.type)
         if not _fits(value, field.type):
             return UnknownEvent(line)

@@ -15,7 +15,6 @@ from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.processes.ring import RingReader
 from membrane_ctrl.recorder import housekeeping, rerun_output, sink
 from membrane_ctrl.run_files import events, tables
-from membrane_ctrl.run_files.events import EventsFile
 from membrane_ctrl.run_files.summary import Summary
 
 # A ring as the recorder reads it: each message once, also when another recorder goes on where one was killed.
@@ -103,10 +102,6 @@ def remove_state(run_dir: Path) -> None:
         (run_dir / _NAME).unlink(missing_ok=True)
 
 
-# After these the disk is waited for at once: a power cut may follow.
-_URGENT = frozenset({"fault", "end"})
-
-
 class Recorder:
     """Everything of a run that goes to the disk.
 
@@ -155,7 +150,7 @@ class Recorder:
         self._housekeeping = housekeeping.Housekeeping(run_dir, clock, config.recording, self._errors)
         self._rerun = rerun_output.RerunOutput(recording, config, thumbnails, self._errors)
         self._rerun.shapes.reference, self._rerun.state = before.reference, before.state
-        self._events_file = EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
+        self._events_file = events.EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
         self._events_lost = before.events_lost
         self._summary = before.summary
         self._columns = tables.ColumnTables(run_dir, before.windows if resumes else None)
@@ -181,7 +176,7 @@ class Recorder:
         """Take in events; an "end" among them ends the run."""
         for event in new:
             self._summary.add_event(event)
-            self.urgent |= event.get("kind") in _URGENT
+            self.urgent |= event.get("kind") in events.URGENT
             self.ended |= event.get("kind") == "end"
         self._events += new
         self._errors.guarded("events.jsonl", lambda: self._events_file.append(new))

@@ -18,14 +18,7 @@ from membrane_ctrl.run_files import shapes, streams
 
 EVENTS_PATH = "/events"
 
-_LEVELS = {
-    "fault": "ERROR",
-    "tick_error": "ERROR",
-    "recorder_error": "ERROR",
-    "unreadable_event": "ERROR",
-    "warning": "WARN",
-    "disk_low": "WARN",
-}
+_LEVELS = {"fault": "ERROR", "recorder_error": "ERROR", "unreadable_event": "ERROR", "disk_low": "WARN"}
 _TIMES = frozenset({"time_utc", "mono_s", "kind"})
 
 
@@ -33,16 +26,10 @@ def send_events(recording: sink.Recording, events: Sequence[EventLine]) -> None:
     """Send events in their order."""
     if not events:
         return
-    time_s = np.array([event_time_s(event) for event in events])
+    time_s = np.array([float(event.get("mono_s") or 0.0) for event in events])
     texts = [event_text(event) for event in events]
     levels = [_LEVELS.get(str(event.get("kind")), "INFO") for event in events]
     recording.columns(EVENTS_PATH, time_s, rr.TextLog.columns(text=texts, level=levels))
-
-
-def event_time_s(event: EventLine) -> float:
-    """When it happened on the run's axis; 0 for an event that does not say."""
-    mono_s = event.get("mono_s")
-    return float(mono_s) if isinstance(mono_s, (int, float)) else 0.0
 
 
 def event_text(event: EventLine) -> str:

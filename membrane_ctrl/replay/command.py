@@ -24,9 +24,8 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.memory import UnknownMemoryError
 from membrane_ctrl.controller.tick import Records, TickBatch
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
-from membrane_ctrl.model import files, plain_json, shape_estimate, telemetry
+from membrane_ctrl.model import files, plain_json, run_events, shape_estimate, telemetry
 from membrane_ctrl.model.errors import Exit, InputError
-from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.replay import replay as replays
 from membrane_ctrl.run_files import inputs_file, run_folder, tables
 
@@ -74,10 +73,10 @@ def open_run(folder: Path) -> RecordedRun:
     inputs = inputs_file.open_inputs(folder)
     if not inputs.paths:
         raise InputError(f"{folder}: no inputs: there is no table of ticks in columns/")
-    events = run_folder.read_events(folder, [])
-    cut = not any(event.get("kind") == "end" for event in events)
-    decisions = replays.decisions_of((run_folder.event_s(line), from_dict(line)) for line in events)
-    told_until_s = max((run_folder.event_s(event) for event in events), default=0.0) if cut else math.inf
+    log = run_folder.read_events(folder, [])
+    cut = not any(isinstance(each.event, run_events.Ended) for each in log)
+    decisions = replays.decisions_of((each.mono_s, each.event) for each in log)
+    told_until_s = max((each.mono_s for each in log), default=0.0) if cut else math.inf
     config = toml_file.load(folder / "config.toml", Config, follow=False)
     right = plain_json.comment_is_right(files.read_text(folder / "config.toml"))
     damage = "" if right else "config.toml: does not fit its checksum (damaged or edited)"

@@ -15,7 +15,6 @@ from rerun.chunk import RrdReader
 
 from membrane_ctrl.model import errors, files, plain_json, telemetry
 from membrane_ctrl.model.arrays import IntArray
-from membrane_ctrl.model.plain_json import take_checksum
 from membrane_ctrl.recorder import housekeeping, sink
 from membrane_ctrl.run_files import column_reader, inputs_file, run, run_folder, streams, tables
 from membrane_ctrl.run_files.rrd_reader import REPAIRED
@@ -195,7 +194,7 @@ def _is_whole_object(data: bytes) -> bool:
         table = plain_json.loads(data.decode())
     except ValueError:
         return False
-    return isinstance(table, dict) and take_checksum(table)
+    return isinstance(table, dict) and plain_json.take_checksum(table)
 
 
 def _look_at_inputs(run_dir: Path) -> list[FileFinding]:

@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from membrane_ctrl.model import errors, files
+from membrane_ctrl.model import errors, events, files, run_events
 from membrane_ctrl.run_files import column_reader, disk_budget, run_folder, tables
 from membrane_ctrl.run_files.run import origin_of
 
@@ -91,23 +91,23 @@ def _entry_or_why(folder: Path) -> RunEntry:
 def entry(folder: Path) -> RunEntry:
     """One run's line, from its small files only, and of one without a summary from the end of its seconds."""
     notes: list[str] = []
-    events = run_folder.read_events(folder, notes)
+    log = run_folder.read_events(folder, notes)
     summary: dict[str, Any] = run_folder.read_summary(folder, notes) or {}
     loop = run_folder.read_config(folder, notes).loop
     std, duration_s = _number(summary.get("true_std_um")), _number(summary.get("duration_s"))
     return RunEntry(
         folder=folder,
-        started_utc=origin_of(folder, events),
+        started_utc=origin_of(folder, log),
         duration_s=duration_s if math.isfinite(duration_s) else _recorded_s(folder),
         std_um=std if math.isfinite(std) else _number(summary.get("reading_std_um")),
         in_band=_number(summary.get("in_band_1s_fraction")),
-        faults=sum(event.get("kind") == "fault" for event in events),
+        faults=sum(isinstance(each.event, events.Fault) for each in log),
         exit=str(summary.get("exit", "open")),
         kp_per_s=loop.kp_per_s,
         ti_s=loop.ti_s,
         configuration=_hash(folder / "config.toml"),
         size_mb=disk_budget.size_bytes(folder) / 1e6,
-        marks=sum(event.get("kind") == "mark" for event in events),
+        marks=sum(isinstance(each.event, run_events.Mark) for each in log),
         kept=(folder / KEPT_FILE).exists(),
     )
 

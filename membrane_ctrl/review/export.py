@@ -88,8 +88,7 @@ def _files(
 
 
 def _event_lines(run: Run, start_s: float, end_s: float) -> list[str]:
-    part = (event for event in run.events if start_s <= float(event.get("mono_s") or 0.0) < end_s)
-    return [json.dumps(event, ensure_ascii=False) for event in part]
+    return [json.dumps(each.line, ensure_ascii=False) for each in run.log_between(start_s, end_s)]
 
 
 def _say_if_missing(run: Run, telemetry: bool) -> None:

@@ -11,19 +11,19 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from membrane_ctrl.model import errors, plain_json, terminal
+from membrane_ctrl.model import errors, events, plain_json, terminal
+from membrane_ctrl.model.run_events import Ended, Mark
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.catalogue import Filter, RunEntry, entries, resolve
 from membrane_ctrl.review.export import export
 from membrane_ctrl.review.words import end_s, moment_s, not_in, number, one_line, part_s, span
 from membrane_ctrl.run_files.run import open_run
-from membrane_ctrl.run_files.run_folder import add_mark, event_s
+from membrane_ctrl.run_files.run_folder import add_mark
 
 
-def list_command(logs: Path, wanted: Filter, since: str | None, until: str | None, json: bool) -> int:
+def list_command(logs: Path, wanted: catalogue.Filter, since: str | None, until: str | None, json: bool) -> int:
     """The table of runs that pass a filter."""
     wanted = replace(wanted, since_utc=_day(since), until_utc=_day(until))
-    found = entries(logs, wanted)
+    found = catalogue.entries(logs, wanted)
     if json:
         print(plain_json.dumps([catalogue.as_dict(entry) for entry in found], indent=1))
     else:
@@ -33,7 +33,7 @@ def list_command(logs: Path, wanted: Filter, since: str | None, until: str | Non
 
 def show_command(run: Path, json: bool) -> int:
     """One run: its line of the catalogue, its states and faults, what is missing of it."""
-    opened = open_run(resolve(run))
+    opened = open_run(catalogue.resolve(run))
     opened.look_through()
     entry = catalogue.entry(opened.folder)
     if json:
@@ -41,10 +41,10 @@ def show_command(run: Path, json: bool) -> int:
         print(plain_json.dumps(table, indent=1))
         return 0
     _console().print(_table([entry]))
-    for event in opened.events:
-        if event.get("kind") in {"state", "fault", "mark", "end"}:
-            said = str(event.get("state") or event.get("name") or event.get("text") or event.get("exit") or "")
-            print(f"  {opened.utc(event_s(event)):%H:%M:%S}  {event['kind']:6} {one_line(said)}")
+    for each in opened.log:
+        match each.event:
+            case events.StateEntered(state=said) | events.Fault(name=said) | Mark(text=said) | Ended(exit=said):
+                print(f"  {opened.utc(each.mono_s):%H:%M:%S}  {each.event.kind:6} {one_line(said)}")
     for note in opened.notes:
         print(f"  note: {note}")
     return 0
@@ -76,7 +76,7 @@ def mark_command(words: Sequence[str], at: str | None) -> int:
         raise errors.InputError("review mark: write `review mark RUN TEXT --at 03:12` (TEXT in quotes)")
     if not words[1].strip():
         raise errors.InputError("review mark: TEXT is empty: write `review mark RUN TEXT --at 03:12`")
-    opened = open_run(resolve(Path(words[0])))
+    opened = open_run(catalogue.resolve(Path(words[0])))
     at_s = moment_s(at, opened.origin_utc)
     if not 0 <= at_s <= end_s(opened):
         raise not_in(opened, f"--at {at}")
@@ -89,7 +89,7 @@ def export_command(
     run: Path, to: str, out: Path | None, streams: list[str], start: str | None, end: str | None
 ) -> int:
     """Write a run for other programs and say where."""
-    opened = open_run(resolve(run))
+    opened = open_run(catalogue.resolve(run))
     folder = out.resolve() if out else opened.folder / "export"
     files = export(opened, to, folder, streams, *part_s(opened, start, end))
     for note in opened.notes:
@@ -115,7 +115,7 @@ def _console() -> Console:
     return terminal.table_console(width=None if sys.stdout.isatty() else 170)
 
 
-def _table(found: list[RunEntry]) -> Table:
+def _table(found: list[catalogue.RunEntry]) -> Table:
     table = Table(box=None, header_style="bold", pad_edge=False)
     words = {"run", "started, UTC", "configuration", "end"}
     numbers = ("length", "std µm", "in band", "faults", "Kp", "Ti")

@@ -9,8 +9,8 @@ from pathlib import Path
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.plain_json import dumps_checked
 
-# Synced at once: what must survive the power cut that may follow.
-_SYNCED = frozenset({"fault", "end"})
+# What is on the disk at once: a power cut may follow.
+URGENT = frozenset({"fault", "end"})
 # While the disk is full events wait here; a fault campaign makes some hundred.
 _WAITING_MAX = 10_000
 
@@ -54,7 +54,7 @@ class EventsFile:
             if line in self._written:
                 continue
             self._waiting.append(line)
-            self._sync |= event.get("kind") in _SYNCED
+            self._sync |= event.get("kind") in URGENT
         while len(self._waiting) > _WAITING_MAX:
             # the front line may be half on the disk already: it stays, the one behind it goes
             del self._waiting[1]

@@ -12,11 +12,11 @@ import numpy as np
 import pyarrow as pa
 
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.run_files import column_reader, rrd_reader, run_folder, shapes, tables
 from membrane_ctrl.run_files.column_file import SUFFIX
-from membrane_ctrl.run_files.rrd_reader import cut, segment_blocks
 from membrane_ctrl.run_files.segments import is_closed
 from membrane_ctrl.run_files.shapes import Shapes
 
@@ -54,7 +54,7 @@ class Run:
     folder : Path
     config : Config
         As run; of another version, the keys that can be read, the rest at their defaults.
-    events : tuple of dict
+    log : tuple of LoggedEvent
         `events.jsonl` and the annotations made later, in the order of time.
     summary : dict or None
         `summary.json`; None while the run goes on, or if its recorder was killed.
@@ -66,7 +66,7 @@ class Run:
 
     folder: Path
     config: Config
-    events: tuple[dict[str, Any], ...]
+    log: tuple[run_folder.LoggedEvent, ...]
     summary: dict[str, Any] | None
     origin_utc: datetime
     notes: list[str] = field(default_factory=list)
@@ -76,13 +76,18 @@ class Run:
         """The folder's name."""
         return self.folder.name
 
+    @property
+    def events(self) -> tuple[events.EventLine, ...]:
+        """The lines of the log, as in their files."""
+        return tuple(each.line for each in self.log)
+
     def utc(self, mono_s: float) -> datetime:
         """UTC of a second of the run; for an impossible one, as in damaged tables, of its start."""
         return self.origin_utc + timedelta(seconds=mono_s if abs(mono_s) < _RUN_MAX_S else 0.0)
 
-    def events_between(self, start_s: float, end_s: float) -> tuple[dict[str, Any], ...]:
-        """Events of a part of the run."""
-        return tuple(event for event in self.events if start_s <= run_folder.event_s(event) < end_s)
+    def log_between(self, start_s: float, end_s: float) -> tuple[run_folder.LoggedEvent, ...]:
+        """The log of a part of the run."""
+        return tuple(each for each in self.log if start_s <= each.mono_s < end_s)
 
     def ticks(self, names: Sequence[str] | None = None, start_s: float = -np.inf, end_s: float = np.inf) -> pa.Table:
         """Telemetry as an Arrow table (`.to_pandas()` where pandas is installed).
@@ -108,7 +113,8 @@ class Run:
         if not hole and (table.known_s >= end_s or self._reaches_end(table.known_s)):
             return
         last_s = -np.inf if hole else table.known_s
-        for block in segment_blocks(self.folder, wanted, max(start_s, last_s + _SAME_TICK_S), end_s, self.notes):
+        begin_s = max(start_s, last_s + _SAME_TICK_S)
+        for block in rrd_reader.segment_blocks(self.folder, wanted, begin_s, end_s, self.notes):
             if block["mono_s"][-1] - last_s > _WAY_DOWN_S:
                 column_reader.add_note(self.notes, _STAND_IN)
             yield block
@@ -204,7 +210,7 @@ class Run:
                 block = {name: _array(read, name) for name in names}
                 known_s = max(known_s, block[time_name][-1] if block[time_name].size else -np.inf)
                 # a journal may repeat what the recorder had just written when it was killed
-                block = cut(block, time_name, max(start_s, np.nextafter(last_s, np.inf)), end_s)
+                block = rrd_reader.cut(block, time_name, max(start_s, np.nextafter(last_s, np.inf)), end_s)
                 if block[time_name].size:
                     last_s = float(block[time_name][-1])
                     yield block
@@ -236,13 +242,13 @@ def open_run(path: Path | str) -> Run:
     """
     folder = run_folder.find_folder(Path(path))
     notes: list[str] = []
-    events = run_folder.read_events(folder, notes)
+    log = run_folder.read_events(folder, notes)
     summary = run_folder.read_summary(folder, notes)
-    if summary and summary.get("exit") and not any(event.get("kind") == "end" for event in events):
+    if summary and summary.get("exit") and not any(isinstance(each.event, run_events.Ended) for each in log):
         notes.append("events.jsonl: lines are missing, the last one at least: the run has ended, and no line says so")
     notes += _missing(folder, summary)
     config = column_reader.at_recorded_rate(run_folder.read_config(folder, notes), folder, notes)
-    return Run(folder, config, events, summary, origin_of(folder, events), notes)
+    return Run(folder, config, log, summary, origin_of(folder, log), notes)
 
 
 def _is_closed(path: Path) -> bool:
@@ -279,12 +285,12 @@ def _count(value: object) -> int:
     return value if isinstance(value, int) and value <= _FILES_MAX else 0
 
 
-def origin_of(folder: Path, events: Sequence[dict[str, Any]]) -> datetime:
+def origin_of(folder: Path, log: Sequence[run_folder.LoggedEvent]) -> datetime:
     """UTC at 0 s of a run: from its first event that says both, else from the folder's name or age."""
-    for event in events:
+    for each in log:
         try:
-            moment = datetime.fromisoformat(event["time_utc"])
-            began = moment.astimezone(UTC) - timedelta(seconds=float(event["mono_s"]))
+            moment = datetime.fromisoformat(each.line["time_utc"])
+            began = moment.astimezone(UTC) - timedelta(seconds=float(each.line["mono_s"]))
         except (KeyError, TypeError, ValueError, OverflowError):
             continue
         if began.year in _YEARS:

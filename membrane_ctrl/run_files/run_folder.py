@@ -6,17 +6,16 @@ import json
 import re
 import shutil
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from membrane_ctrl.config import toml_file as config_file
+from membrane_ctrl.config import toml_file
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import parse, read_toml
-from membrane_ctrl.model import errors, files, plain_json
-from membrane_ctrl.model.plain_json import comment_is_right, take_checksum, with_comment
+from membrane_ctrl.model import errors, events, files, plain_json, run_events
 from membrane_ctrl.run_files.column_file import FOLDER
 
 # The folder of a run: `logs/<UTC time>-<name>/` with the configuration as it ran (INTERFACES section 6).
@@ -58,7 +57,7 @@ def create_run_folder(logs_dir: Path, name: str, started_utc: datetime, config: 
 
 def write_config(run_dir: Path, config: Config) -> None:
     """Write `config.toml`, every default written out. Raises OSError."""
-    files.write_text_atomic(run_dir / CONFIG, with_comment(config_file.dump(config)))
+    files.write_text_atomic(run_dir / CONFIG, plain_json.with_comment(toml_file.dump(config)))
 
 
 def free_mb(folder: Path) -> float:
@@ -141,10 +140,9 @@ def _copied(value: Any) -> Any:
 
 
 ANNOTATIONS_FILE = "annotations.jsonl"
-MARK = "mark"
 
 
-def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> dict[str, Any]:
+def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> events.EventLine:
     """Append a mark at a second of the run; it stands among the run's events from then on.
 
     Parameters
@@ -164,20 +162,14 @@ def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> di
         If the folder cannot be written.
     """
     moment = datetime.fromtimestamp(origin_utc.timestamp() + mono_s, UTC)
-    event = {
-        "time_utc": moment.isoformat(),
-        "mono_s": mono_s,
-        "kind": MARK,
-        "text": text,
-        "who": _user(),
-        "made_utc": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
+    mark = run_events.Mark(text, _user(), made_utc=datetime.now(UTC).isoformat(timespec="seconds"))
+    line = {"time_utc": moment.isoformat(), "mono_s": mono_s} | mark.to_dict()
     try:
-        files.append_text(folder / ANNOTATIONS_FILE, json.dumps(event, ensure_ascii=False) + "\n")
+        files.append_text(folder / ANNOTATIONS_FILE, json.dumps(line, ensure_ascii=False) + "\n")
     except OSError as error:
         reason = errors.os_reason(error)
         raise errors.DeviceError(f"{folder / ANNOTATIONS_FILE}: cannot be written ({reason})") from None
-    return event
+    return line
 
 
 def _user() -> str:
@@ -212,13 +204,31 @@ def is_run(folder: Path) -> bool:
     )
 
 
-def read_events(folder: Path, notes: list[str]) -> tuple[dict[str, Any], ...]:
+@dataclass(frozen=True, slots=True)
+class LoggedEvent:
+    """A line of a run's events, and what it means."""
+
+    mono_s: float  # second of the run; 0 if the line does not say
+    event: events.Event
+    line: events.EventLine
+
+
+def logged(line: events.EventLine) -> LoggedEvent:
+    """What a line means; a mark made while the run went on (`ctl mark`) is recorded as a command."""
+    event = run_events.from_dict(line)
+    if isinstance(event, events.CommandTaken) and event.command == "mark":
+        line = line | {"kind": "mark", "text": event.text or event.why}
+        event = run_events.from_dict(line)
+    return LoggedEvent(float(line.get("mono_s") or 0.0), event, line)
+
+
+def read_events(folder: Path, notes: list[str]) -> tuple[LoggedEvent, ...]:
     """Events and annotations in the order of time; lines that are no JSON object are counted in `notes`."""
-    events = _json_lines(folder / "events.jsonl", notes)
+    told = _json_lines(folder / "events.jsonl", notes)
     if not (folder / "events.jsonl").exists():
         notes.append("events.jsonl: missing; states are taken from the telemetry")
     later = _json_lines(folder / ANNOTATIONS_FILE, notes)
-    return tuple(sorted(events + later, key=event_s))
+    return tuple(sorted(map(logged, told + later), key=lambda each: each.mono_s))
 
 
 def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
@@ -235,7 +245,7 @@ def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
     if not isinstance(summary, dict) or summary.get("schema") not in (_SUMMARY_SCHEMA, _SIGN_TURNED_SCHEMA):
         notes.append(f"summary.json: not of schema {_SUMMARY_SCHEMA}; its figures are not used")
         return {} if not isinstance(summary, dict) else summary
-    if not take_checksum(summary):
+    if not plain_json.take_checksum(summary):
         notes.append("summary.json: does not fit its checksum (damaged or edited); it is not used")
         return None
     if not is_moment(summary.get("duration_s", 0.0) or 0.0):
@@ -259,12 +269,12 @@ def read_config(folder: Path, notes: list[str]) -> Config:
     path = folder / "config.toml"
     notes += _config_damage(path)
     try:
-        tables = read_toml(path, follow=False)
+        tables = toml_file.read_toml(path, follow=False)
     except errors.InputError as error:
         notes.append(f"{error}; everything is taken at its default")
         return Config()
     try:
-        return parse(tables, Config, "config.toml")
+        return toml_file.parse(tables, Config, "config.toml")
     except errors.InputError as error:
         config, left_out = understood(tables)
         named = ", ".join(left_out[:_NAMED_MAX]) + (
@@ -281,11 +291,11 @@ def _config_damage(path: Path) -> list[str]:
         return []
     if not text:
         return ["config.toml: empty; everything is taken at its default"]
-    right = comment_is_right(text)
+    right = plain_json.comment_is_right(text)
     return [] if right else ["config.toml: does not fit its checksum (damaged or edited); its values are doubtful"]
 
 
-def _json_lines(path: Path, notes: list[str]) -> list[dict[str, Any]]:
+def _json_lines(path: Path, notes: list[str]) -> list[events.EventLine]:
     try:
         text = files.read_text(path, EVENTS_BYTES_MAX, errors="replace")
         if plain_json.elements(text) > plain_json.ELEMENTS_MAX:
@@ -295,42 +305,25 @@ def _json_lines(path: Path, notes: list[str]) -> list[dict[str, Any]]:
     except OSError as error:
         notes.append(f"{path.name}: cannot be read ({error.strerror})")
         return []
-    found, broken = [], 0
-    for line in text.splitlines():
-        event = event_of(line)
-        if event is not None:
-            found.append(_mark(event))
-        else:
-            broken += 1
-    if broken:
+    lines = [event_of(line) for line in text.splitlines()]
+    if broken := lines.count(None):
         notes.append(f"{path.name}: {broken} line{'s' * (broken > 1)} cannot be read, or not trusted: left out")
-    return found
+    return [line for line in lines if line is not None]
 
 
-def event_of(line: str) -> dict[str, Any] | None:
+def event_of(line: str) -> events.EventLine | None:
     """The event in a line, if it is one: an object that fits its checksum, of a known form and a time that can be."""
     try:
         event = plain_json.loads(line)
     except ValueError:
         return None
-    if not isinstance(event, dict) or not take_checksum(event) or not isinstance(event.get("kind", ""), str):
+    if not isinstance(event, dict) or not plain_json.take_checksum(event):
         return None
     moment_s = event.get("mono_s")
-    return event if moment_s is None or is_moment(moment_s) else None
+    right = isinstance(event.get("kind", ""), str) and (moment_s is None or is_moment(moment_s))
+    return event if right else None
 
 
 def is_moment(value: object) -> bool:
     """Whether a value is a second that a run can have; what a damaged or forged file says need not be."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < _RUN_MAX_S
-
-
-def _mark(event: dict[str, Any]) -> dict[str, Any]:
-    """A mark made while the run went on (`ctl mark`) is recorded as a command; here it is what it means."""
-    if event.get("kind") == "command" and event.get("command") == MARK:
-        return event | {"kind": MARK, "text": event.get("text") or event.get("why") or ""}
-    return event
-
-
-def event_s(event: dict[str, Any]) -> float:
-    """Second of the run of an event; 0 of one that does not say."""
-    return float(event.get("mono_s") or 0.0)

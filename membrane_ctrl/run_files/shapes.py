@@ -14,7 +14,6 @@ from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.arrays import Column
-from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +113,7 @@ ESTIMATE_COLUMNS = (
 )
 
 
-def estimates(table: pa.Table) -> Iterator[ShapeEstimate]:
+def estimates(table: pa.Table) -> Iterator[shape_estimate.ShapeEstimate]:
     """The estimates of the recorder's table, as the controller got them. Raises ValueError if they are none."""
     names = ESTIMATE_COLUMNS[:-2]
     heads = zip(*(table.column(name).to_pylist() for name in names), strict=True)
@@ -179,7 +178,7 @@ Map = NDArray[np.float32]
 MAP_PX = 128
 
 
-def height_map_mm(estimate: ShapeEstimate) -> Map:
+def height_map_mm(estimate: shape_estimate.ShapeEstimate) -> Map:
     """Height over the mirror's disc, from the vertex.
 
     Returns
@@ -190,7 +189,7 @@ def height_map_mm(estimate: ShapeEstimate) -> Map:
     return _spread(_surface(estimate).height(*_points()))
 
 
-def difference_map_um(estimate: ShapeEstimate, reference: ShapeEstimate) -> Map:
+def difference_map_um(estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate) -> Map:
     """Height now minus height of the reference, each from its own vertex; um, as `height_map_mm`."""
     now, before = _surface(estimate), _surface(reference)
     change = Surface(now.coeffs_mm - before.coeffs_mm, now.hencky_mm - before.hencky_mm, 1.0)
@@ -209,7 +208,7 @@ def outside_disc() -> NDArray[np.uint8]:
     return (~_inside()).astype(np.uint8)
 
 
-def _surface(estimate: ShapeEstimate) -> Surface:
+def _surface(estimate: shape_estimate.ShapeEstimate) -> Surface:
     """Over the unit disc: a map does not ask how large the mirror is."""
     return Surface(estimate.coeffs_um * 1e-3, estimate.hencky_um * 1e-3, 1.0)
 

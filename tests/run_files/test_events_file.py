@@ -9,8 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.run_events import Mark, UnknownEvent
 from membrane_ctrl.run_files import events
 from membrane_ctrl.run_files.events import EventsFile, parse
+from membrane_ctrl.run_files.run_folder import logged
 
 
 def lines(path: Path) -> list[dict[str, object]]:
@@ -76,3 +79,22 @@ def test_too_many_waiting_events_are_counted_as_lost(tmp_path: Path, monkeypatch
 @pytest.mark.parametrize("message", [b"{half", b"\xff\xfe", b"[1, 2]", b""])
 def test_a_message_that_is_no_event_becomes_one_that_says_so(message: bytes) -> None:
     assert parse(message)["kind"] == "unreadable_event"
+
+
+@pytest.mark.parametrize(
+    ("line", "event"),
+    [
+        ({"kind": "mark", "text": "door", "who": "ann", "made_utc": "now"}, Mark("door", "ann", "now")),
+        ({"kind": "command", "command": "mark", "text": "door", "who": "ann", "why": ""}, Mark("door", "ann")),
+        ({"kind": "command", "command": "mark", "who": "ann", "why": "a door"}, Mark("a door", "ann")),
+        ({"kind": "fault", "name": 3}, UnknownEvent({"mono_s": 2, "kind": "fault", "name": 3})),
+    ],
+)
+def test_a_line_of_a_run_as_what_it_means(line: dict[str, object], event: Event) -> None:
+    each = logged({"mono_s": 2, **line})
+    assert (each.mono_s, each.event) == (2.0, event)
+    assert each.line["kind"] == event.kind
+
+
+def test_a_line_that_says_no_time_stands_at_the_start() -> None:
+    assert logged({"kind": "of tomorrow", "mono_s": None}).mono_s == 0.0

@@ -11,6 +11,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.states import State
 from membrane_ctrl.review.report.json import timeline
@@ -129,17 +130,17 @@ def overview(analysis: Analysis) -> str:
 
 def _found(plot: Any, analysis: Analysis, span_s: float) -> None:
     top = plot.get_ylim()[1]
-    for event in analysis.found:
-        at, _ = hours_or_less(event.time_s, span_s)
-        colour = _FOUND_COLOURS.get(event.kind, RED)
+    for found in analysis.found:
+        at, _ = hours_or_less(found.time_s, span_s)
+        colour = _FOUND_COLOURS.get(found.kind, RED)
         plot.axvline(at, color=colour, lw=0.8, ls=":")
         plot.plot([at], [0.96 * top], marker="v", ms=5, color=colour, clip_on=False)
     for noted in timeline(analysis):
-        if noted.get("kind") in {"mark", "fault"}:
-            at, _ = hours_or_less(float(noted.get("mono_s") or 0.0), span_s)
-            colour = RED if noted["kind"] == "fault" else "black"
+        if isinstance(event := noted.event, (events.Fault, run_events.Mark)):
+            at, _ = hours_or_less(noted.mono_s, span_s)
+            colour, text = (RED, event.name) if isinstance(event, events.Fault) else ("black", event.text)
             plot.axvline(at, color=colour, lw=1)
-            text = one_line(str(noted.get("text") or noted.get("name") or "fault"))
+            text = one_line(text)
             if len(text) > _LETTERS_MOST:
                 text = f"{text[: _LETTERS_MOST - 1]}…"
             plot.annotate(
@@ -149,12 +150,12 @@ def _found(plot: Any, analysis: Analysis, span_s: float) -> None:
 
 def _lane(lane: Any, analysis: Analysis, span_s: float) -> None:
     """States as coloured stretches, named where there is room."""
-    states = [event for event in timeline(analysis) if event.get("kind") == "state"]
-    edges_s = [float(event.get("mono_s") or 0.0) for event in states]
+    states = [(at.mono_s, at.event.state) for at in timeline(analysis) if isinstance(at.event, events.StateEntered)]
+    edges_s = [start_s for start_s, _ in states]
     edges_s.append(max(analysis.ticks.end_s, *edges_s, 0.0))
-    for event, start_s, end_s in zip(states, edges_s, edges_s[1:], strict=False):
+    for (start_s, name), end_s in zip(states, edges_s[1:], strict=True):
         try:
-            state = State[str(event.get("state", "")).upper()]
+            state = State[name.upper()]
         except KeyError:
             continue
         (start, end), _ = hours_or_less(np.array([start_s, end_s]), span_s)

@@ -205,16 +205,12 @@ def _compared(analysis: Analysis, other: Analysis, differences: Sequence[compare
 
 
 def _timeline(analysis: Analysis) -> str:
-    events = timeline(analysis)
+    told = timeline(analysis)
     rows = [
-        [
-            f"{analysis.run.utc(float(event.get('mono_s') or 0)):%Y-%m-%d %H:%M:%S}",
-            _text(str(event.get("kind"))),
-            _text(_said(event)),
-        ]
-        for event in events[:_LINES_MOST]
+        [f"{analysis.run.utc(each.mono_s):%Y-%m-%d %H:%M:%S}", _text(each.event.kind), _text(_said(each.line))]
+        for each in told[:_LINES_MOST]
     ]
-    return _table(["UTC", "what", ""], rows) + _more(len(events))
+    return _table(["UTC", "what", ""], rows) + _more(len(told))
 
 
 def _said(event: dict[str, Any]) -> str:

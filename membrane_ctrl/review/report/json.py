@@ -4,10 +4,12 @@ import math
 from dataclasses import asdict
 from typing import Any, Literal
 
+from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.states import State
 from membrane_ctrl.review.statistics import drift, shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
 from membrane_ctrl.review.words import span
+from membrane_ctrl.run_files.run_folder import LoggedEvent, logged
 
 Word = Literal["good", "look", "bad"]
 
@@ -51,9 +53,10 @@ def _what(names: list[str]) -> str:
 
 SCHEMA = "membrane-report/1"
 
-_TOLD = frozenset(
-    ["start", "geometry", "state", "fault", "cleared", "maintenance", "maintenance_over", "command", "mark", "end"]
-)
+_TOLD = (
+    run_events.Started, run_events.GeometryInForce, events.StateEntered, events.Fault, events.Cleared,
+    events.Maintenance, events.MaintenanceOver, events.CommandTaken, run_events.Mark, run_events.Ended,
+)  # fmt: skip
 
 
 def report_table(analysis: Analysis) -> dict[str, Any]:
@@ -88,7 +91,7 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
         if analysis.benefit is None
         else {"std_1s_with_um": analysis.benefit.with_um, "std_1s_without_um": analysis.benefit.without_um},
         "lateness_ms": {"p50": late.quantile(0.5), "p99": late.quantile(0.99), "max": late.largest},
-        "timeline": timeline(analysis),
+        "timeline": [each.line for each in timeline(analysis)],
         "found": [asdict(event) for event in analysis.found],
         "shape": None if analysis.shape is None else _shape(analysis.shape),
         "anomalies": [asdict(anomaly) for anomaly in analysis.anomalies],
@@ -97,25 +100,18 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
     }
 
 
-def timeline(analysis: Analysis) -> list[dict[str, Any]]:
+def timeline(analysis: Analysis) -> list[LoggedEvent]:
     """State changes, faults, commands and marks in their order; without events, states from the telemetry."""
-    start_s, end_s = analysis.part_s
-    events = [event for event in analysis.run.events if event.get("kind") in _TOLD]
-    if not any(event.get("kind") == "state" for event in events):
-        level = analysis.level
-        codes = level["state"]
-        events += [
-            {"mono_s": float(level["time_s"][row]), "kind": "state", "state": State(int(codes[row])).name.lower()}
+    told = [each for each in analysis.run.log if isinstance(each.event, _TOLD)]
+    if not any(isinstance(each.event, events.StateEntered) for each in told):
+        time_s, codes = analysis.level["time_s"], analysis.level["state"]
+        lines = (
+            {"mono_s": float(time_s[row]), "kind": "state", "state": State(int(codes[row])).name.lower()}
             for row in range(codes.size)
             if math.isfinite(codes[row]) and (row == 0 or codes[row] != codes[row - 1])
-        ]
-    inside = [event for event in events if start_s <= _moment_s(event) < end_s]
-    return sorted(inside, key=_moment_s)
-
-
-def _moment_s(event: dict[str, Any]) -> float:
-    moment = event.get("mono_s")
-    return float(moment) if isinstance(moment, (int, float)) else 0.0
+        )
+        told = sorted([*told, *map(logged, lines)], key=lambda each: each.mono_s)
+    return [each for each in told if analysis.part_s[0] <= each.mono_s < analysis.part_s[1]]
 
 
 def _series(series: ErrorSeries | None) -> dict[str, Any] | None:

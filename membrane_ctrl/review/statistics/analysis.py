@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
-from membrane_ctrl.model import errors, states
+from membrane_ctrl.model import errors, events, run_events, states
 from membrane_ctrl.model.arrays import Column, Singles
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.steps import FoundEvent
@@ -17,7 +17,7 @@ from membrane_ctrl.review.statistics.drift import FittedSlope, slope
 from membrane_ctrl.review.statistics.hold_pass import ERROR, KEPT_AWAY, READING, TRUE, HoldPass, hold_pass
 from membrane_ctrl.review.statistics.windows import WindowStatistics, describe, window_means
 from membrane_ctrl.review.words import span
-from membrane_ctrl.run_files import run_folder, summary
+from membrane_ctrl.run_files import summary
 from membrane_ctrl.run_files.run import Block, Run
 
 WINDOWS_S = (1, 4, 60)
@@ -266,8 +266,7 @@ def _anomalies(
 ) -> tuple[Anomaly, ...]:
     """All of a part of a run, the gravest first."""
     odd = [Anomaly("incomplete recording", note) for note in run.notes]
-    faults = [event for event in run.events_between(*part_s) if event.get("kind") == "fault"]
-    names = Counter(str(event.get("name", "?")) for event in faults)
+    names = Counter(each.event.name for each in run.log_between(*part_s) if isinstance(each.event, events.Fault))
     odd += [Anomaly("fault", f"{name}, {count} time{'s' * (count > 1)}") for name, count in names.most_common()]
     if reading is None:
         odd.append(Anomaly("never settled", "no tick counts as held: there are no hold statistics"))
@@ -313,15 +312,15 @@ def _pauses_s(run: Run, part_s: tuple[float, float], end_s: float) -> list[float
     """Lengths of the pauses asked for within a part: to `resume`, another state, the longest allowed, or the end."""
     lengths_s: list[float] = []
     since_s = math.nan
-    for event in (*run.events, {"kind": "end", "mono_s": end_s}):
-        command = event.get("command") if not event.get("refused") else None
-        if command == "pause" and math.isnan(since_s):
-            since_s = run_folder.event_s(event)
-        elif not math.isnan(since_s) and (command == "resume" or event.get("kind") in {"state", "end"}):
-            over_s = min(run_folder.event_s(event), since_s + run.config.states.pause_max_s, part_s[1])
-            lengths_s.append(over_s - max(since_s, part_s[0]))
-            since_s = math.nan
-    return [length_s for length_s in lengths_s if length_s > 0]
+    for moment_s, event in (*((each.mono_s, each.event) for each in run.log), (end_s, run_events.Ended(""))):
+        match event:
+            case events.CommandTaken(command="pause", refused=None) if math.isnan(since_s):
+                since_s = moment_s
+            case events.CommandTaken(command="resume", refused=None) | events.StateEntered() | run_events.Ended():
+                over_s = min(moment_s, since_s + run.config.states.pause_max_s, part_s[1])
+                lengths_s.append(over_s - max(since_s, part_s[0]))
+                since_s = math.nan
+    return [length_s for length_s in lengths_s if length_s > 0]  # NaN: nothing was paused
 
 
 def _of(drift: FittedSlope, unit: str) -> str:

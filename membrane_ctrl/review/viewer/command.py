@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from membrane_ctrl.model import errors, states, terminal
+from membrane_ctrl.model import errors, events, states, terminal
 from membrane_ctrl.review import catalogue, words
 from membrane_ctrl.review.viewer import blueprints, viewer
 from membrane_ctrl.review.viewer.layer import Layer
 from membrane_ctrl.run_files.run import Run, open_run
-from membrane_ctrl.run_files.run_folder import event_s
 
 _THIS_MACHINE = "127.0.0.1"
 # Seen about a moment asked for with --at or --around.
@@ -178,9 +177,9 @@ def _around(run: Run, what: str) -> float:
     wanted = what.lower()
     # `hold` is the state, not the command that led to it
     for keys in (("kind", "name", "state", "text"), ("command",)):
-        for event in run.events:
-            if any(wanted in str(event.get(key, "")).lower() for key in keys):
-                return event_s(event)
+        for each in run.log:
+            if any(wanted in str(each.line.get(key, "")).lower() for key in keys):
+                return each.mono_s
     from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 
     found = find_events(run.level(1.0, names=LEVEL_COLUMNS), run.shapes(), run.config.limits.band_um)
@@ -203,8 +202,8 @@ def _zeros(runs: Sequence[Run], align: str) -> list[float]:
 
 def _hold_s(run: Run) -> float:
     level = run.level(60.0, names=("state",))
-    entered = [e for e in run.events if e.get("kind") == "state" and e.get("state") == "hold"]
-    if entered:
-        return float(entered[0].get("mono_s") or 0.0)
+    for each in run.log:
+        if isinstance(each.event, events.StateEntered) and each.event.state == "hold":
+            return each.mono_s
     held_s = level["time_s"][level["state"] == states.State.HOLD]
     return float(held_s[0]) if held_s.size else 0.0

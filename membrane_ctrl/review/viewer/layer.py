@@ -11,14 +11,16 @@ import numpy as np
 import rerun as rr
 
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
+from membrane_ctrl.model.events import Fault, Why
+from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.model.telemetry import FIELDS, changes
 from membrane_ctrl.recorder.blueprint import TELEMETRY_LANES
-from membrane_ctrl.recorder.rerun_streams import event_text, event_time_s
+from membrane_ctrl.recorder.rerun_streams import event_text
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.review.report.figures import broken_at_gaps
 from membrane_ctrl.review.words import end_s
-from membrane_ctrl.run_files import run_folder, streams, summary
+from membrane_ctrl.run_files import streams, summary
 from membrane_ctrl.run_files.run import Block, Run
 from membrane_ctrl.run_files.shapes import Shapes, height_basis
 
@@ -141,11 +143,11 @@ class Layer:
                 self._columns(lane.path, times, rr.StateChange.columns(state=states))
 
     def _events(self, run: Run, found: Sequence[FoundEvent], part_s: tuple[float, float]) -> None:
-        told = [e for e in run.events if e.get("kind") != "why" and part_s[0] <= event_time_s(e) <= part_s[1]]
+        told = [e for e in run.log if not isinstance(e.event, Why) and part_s[0] <= e.mono_s <= part_s[1]]
         if told:
-            levels = ["ERROR" if event.get("kind") == "fault" else "INFO" for event in told]
-            texts = [f"mark: {e.get('text')}" if e.get("kind") == run_folder.MARK else event_text(e) for e in told]
-            times = np.array([event_time_s(event) for event in told])
+            levels = ["ERROR" if isinstance(each.event, Fault) else "INFO" for each in told]
+            texts = [f"mark: {e.event.text}" if isinstance(e.event, Mark) else event_text(e.line) for e in told]
+            times = np.array([each.mono_s for each in told])
             self._log(run, "/events", times, texts, levels)
         seen = [f for f in found if part_s[0] <= f.time_s <= part_s[1]]
         if seen:
