@@ -32,6 +32,8 @@ def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
         return told or _STATES[state]
     if not (math.isfinite(row.displacement_um) and math.isfinite(row.filtered_um)):
         return f"{_RUNGS[Rung.HOLD_FLOW]}: {told or fault or 'no valid laser reading'}"
+    if told.startswith("paused"):
+        return told
     if state == State.INFLATE:
         to_go_um = row.target_um - row.filtered_um
         return f"{_flow(row)}: {'filling' if to_go_um > 0 else 'waiting for the leak'}, {abs(to_go_um):.1f} um to go"

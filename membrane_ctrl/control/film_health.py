@@ -47,8 +47,8 @@ class LeakEstimate:
 
     @property
     def leak_um_per_s(self) -> float:
-        """Estimate; NaN until there is one."""
-        return self._mean_um_per_s if self._elapsed_s >= FIRST_S else math.nan
+        """Estimate; NaN until there is one, and while nothing is seen."""
+        return self._mean_um_per_s if self._elapsed_s >= FIRST_S and math.isfinite(self._last_um) else math.nan
 
     @property
     def too_tight(self) -> bool:

@@ -5,7 +5,7 @@ Order of a tick: setpoint ramp and trim -> measurement filter -> P, I, D -> feed
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,8 +30,8 @@ class LoopOutput:
     """What one tick decided, and from what."""
 
     setpoint_um: float  # ramp and trim
-    filtered_um: float
-    error_um: float  # setpoint minus filtered reading
+    filtered_um: float  # NaN in a tick without a reading
+    error_um: float  # setpoint minus filtered reading; NaN without one, and while the setpoint follows the mirror
     p_um_per_s: float
     i_um_per_s: float
     d_um_per_s: float
@@ -40,7 +40,7 @@ class LoopOutput:
     flow_um_per_s: float
     pump_fraction: float  # command, 0..1
     saturated: bool  # more was wanted than the pump has, or less than nothing
-    leak_um_per_s: float  # estimated loss of gas, NaN until there is an estimate
+    leak_um_per_s: float  # estimated loss of gas, NaN in a tick without an estimate
     too_tight: bool  # the mirror loses too little gas to be held within the band
 
 
@@ -105,7 +105,7 @@ class InnerLoop:
     def step(self, given: LoopInput, dt_s: float) -> LoopOutput:
         """One automatic tick; a reading that is not finite is missing (`stale`). The caller keeps `dt_s` above 0."""
         if not math.isfinite(given.displacement_um):
-            return self.stale(dt_s)
+            return self.stale(given, dt_s)
         before_um = self._measured.value
         filtered_um = self._measured.update(given.displacement_um, dt_s)
         error_um, ramp_um_per_s = self._follow_setpoint(given, filtered_um, dt_s)
@@ -117,19 +117,24 @@ class InnerLoop:
         self._pid.integrate(dt_s)
         fraction = self._curve.command(limited_um_per_s, dt_s)
         self._leak.update(self._curve.flow(fraction), weather_um_per_s, filtered_um, dt_s)
-        return self._output(terms, weather_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction)
+        return self._output(terms, weather_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction, filtered_um)
 
-    def stale(self, dt_s: float) -> LoopOutput:
-        """One tick without a fresh reading: the integrator is frozen and put out, for it is the mean flow.
+    def stale(self, given: LoopInput, dt_s: float) -> LoopOutput:
+        """One tick without control: the integrator is frozen and put out, for it is the mean flow.
 
-        Repeating the last reading instead would integrate its error: 5 times the excursion (PHYSICS, inner loop).
+        Repeating the last reading instead would integrate its error: 5 times the excursion (PHYSICS, inner loop). A
+        reading that is there (a pause) is filtered all the same, so that the error is the present one.
         """
+        seen = math.isfinite(given.displacement_um)
+        filtered_um = self._measured.update(given.displacement_um, dt_s) if seen else math.nan
+        if not math.isnan(self._ramp.value_um):
+            self._setpoint_um = self._ramp.value_um + given.trim_um
         self._feedforward.update(math.nan, math.nan, dt_s)
         self._leak.pause()
         mean_um_per_s = self._pid.integral_um_per_s
         self._limiter.limit(mean_um_per_s, dt_s)
         fraction = self._curve.command(self._limiter.flow_um_per_s, dt_s)
-        return self._output(pid.PidTerms(0.0, mean_um_per_s, 0.0), 0.0, mean_um_per_s, fraction)
+        return self._output(pid.PidTerms(0.0, mean_um_per_s, 0.0), 0.0, mean_um_per_s, fraction, filtered_um)
 
     def follow(self, given: LoopInput, flow_um_per_s: float, dt_s: float) -> LoopOutput:
         """One tick in which somebody else gives the flow (manual, tuning, ramp-down), within the pump's range.
@@ -137,7 +142,8 @@ class InnerLoop:
         The setpoint stands at the reading (the last one that was finite) and the integrator at the flow, so that
         `step` goes on from there; the target is not used.
         """
-        if math.isfinite(given.displacement_um):
+        seen = math.isfinite(given.displacement_um)
+        if seen:
             self._measured.update(given.displacement_um, dt_s)
         if not math.isnan(self._measured.value):
             self._stand_at(self._measured.value)
@@ -146,20 +152,27 @@ class InnerLoop:
         placed_um_per_s = self._limiter.place(flow_um_per_s)
         self._pid.place(placed_um_per_s - weather_um_per_s)
         fraction = self._curve.command(placed_um_per_s, dt_s)
-        if math.isfinite(given.displacement_um):
+        if seen:
             self._leak.update(self._curve.flow(fraction), weather_um_per_s, self._measured.value, dt_s)
         else:
             self._leak.pause()
         terms = pid.PidTerms(0.0, self._pid.integral_um_per_s, 0.0)
-        return self._output(terms, weather_um_per_s, flow_um_per_s, fraction)
+        filtered_um = self._measured.value if seen else math.nan
+        return replace(self._output(terms, weather_um_per_s, flow_um_per_s, fraction, filtered_um), error_um=math.nan)
 
     def follow_raw(self, given: LoopInput, fraction: float, dt_s: float) -> LoopOutput:
         """`follow` with the pump's command itself, put out as it is; whether the pump runs is not known."""
         flow_um_per_s = self._curve.flow(fraction)
-        self.follow(given, flow_um_per_s, dt_s)
+        output = self.follow(given, flow_um_per_s, dt_s)
         self._curve.stopped()
         self._leak.pause()
-        return self._output(pid.PidTerms(0.0, self._pid.integral_um_per_s, 0.0), 0.0, flow_um_per_s, fraction)
+        return replace(
+            output,
+            feedforward_um_per_s=0.0,
+            flow_um_per_s=self._curve.flow(fraction),
+            pump_fraction=fraction,
+            leak_um_per_s=math.nan,
+        )
 
     def set_gains(self, loop: LoopConfig) -> None:
         """Take new settings without a bump in the flow."""
@@ -196,12 +209,14 @@ class InnerLoop:
         self._shaped_um = shaped_um
         return self._matched.update(shaped_um, dt_s) - filtered_um, speed_um_per_s
 
-    def _output(self, terms: pid.PidTerms, feedforward: float, wanted: float, fraction: float) -> LoopOutput:
+    def _output(
+        self, terms: pid.PidTerms, feedforward: float, wanted: float, fraction: float, filtered_um: float
+    ) -> LoopOutput:
         """The tick as it is told; flows in um/s."""
         return LoopOutput(
             setpoint_um=self._setpoint_um,
-            filtered_um=self._measured.value,
-            error_um=self._setpoint_um - self._measured.value,
+            filtered_um=filtered_um,
+            error_um=self._setpoint_um - filtered_um,
             p_um_per_s=terms.p_um_per_s,
             i_um_per_s=terms.i_um_per_s,
             d_um_per_s=terms.d_um_per_s,

@@ -75,7 +75,8 @@ class Controller:
         events: list[told.Event] = []
         self._begin(inputs, events)
         last = scene.output or inner_loop.NO_OUTPUT
-        error_um = last.error_um if self.state in safety_rules.MOVING else math.nan
+        judged = self.state in safety_rules.MOVING and not scene.paused  # nothing follows a setpoint in a pause
+        error_um = last.error_um if judged else math.nan
         left_um = scene.setpoint_um + scene.trim_um - last.setpoint_um
         scene.observer.look(inputs)
         held = sensor_consistency.HoldStatus(

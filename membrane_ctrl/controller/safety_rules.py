@@ -26,7 +26,7 @@ class Observation:
     displacement_um: float  # the laser's reading as it came, NaN if it was bad or absent
     displacement_valid: bool  # it is finite, new, of good quality, and no jump
     jumps: int  # readings in a row refused for a jump
-    error_um: float  # setpoint minus reading; NaN outside the loop
+    error_um: float  # setpoint minus reading; NaN outside the loop, and in a pause
     gauge_pressure_pa: float
     pump_mismatch: float  # largest of |command - read-back| that both of the last two commands agree on
     watchdog_tripped: bool

@@ -61,9 +61,10 @@ def inflate(scene: Scene) -> State:
     target_um = scene.output.setpoint_um - scene.trim_um if scene.output is not None and lags else scene.setpoint_um
     output = _drive(scene, target_um)
     to_go_um = scene.setpoint_um - output.filtered_um
-    scene.why = f"inflating: {to_go_um:.1f} um to go" + (", the ramp waits for the mirror" if lags else "")
+    to_go = f"{to_go_um:.1f} um to go" if math.isfinite(to_go_um) else "no laser reading"
+    scene.why = f"inflating: {to_go}" + (", the ramp waits for the mirror" if lags else "")
     ramp_left_um = scene.setpoint_um + scene.trim_um - output.setpoint_um
-    if max(abs(ramp_left_um), abs(to_go_um)) < scene.config.limits.band_um:
+    if abs(ramp_left_um) < scene.config.limits.band_um and abs(to_go_um) < scene.config.limits.band_um:
         return State.SETTLE
     if scene.state_age_s > scene.config.states.inflate_timeout_s:
         scene.overdue = f"still {to_go_um:.0f} um from the setpoint"
@@ -74,7 +75,7 @@ def settle(scene: Scene) -> State:
     """Stay inside the band for a while before the state is called hold."""
     output = _drive(scene, scene.setpoint_um)
     band_um = scene.config.limits.band_um
-    settled_s = scene.stay_good(abs(output.error_um) < band_um)
+    settled_s = scene.stay_good(not abs(output.error_um) >= band_um)  # a lost reading is no error
     scene.why = f"settling: inside the band for {settled_s:.0f} s"
     if settled_s >= scene.config.states.settle_s:
         scene.why = f"inside +-{band_um:g} um for {settled_s:.1f} s"
@@ -87,7 +88,7 @@ def settle(scene: Scene) -> State:
 def hold(scene: Scene) -> State:
     """The main job."""
     if scene.paused:
-        scene.give(scene.loop.stale(scene.dt_s))
+        scene.give(scene.loop.stale(_given(scene, scene.setpoint_um), scene.dt_s))
         scene.why = f"paused by {scene.asked_by}: the pump keeps its mean flow"
         if scene.stay_good(True) > scene.config.states.pause_max_s or _strayed(scene):
             scene.paused = False
@@ -308,8 +309,8 @@ def _begin(scene: Scene, leak_um_per_s: float) -> State:
 
 def _drive(scene: Scene, target_um: float) -> inner_loop.LoopOutput:
     """Let the loop drive the pump: automatic with a reading to trust, the held mean flow without one."""
-    trusted = math.isfinite(scene.observer.displacement_um) and scene.levels.rung == Rung.NONE
-    output = scene.loop.step(_given(scene, target_um), scene.dt_s) if trusted else scene.loop.stale(scene.dt_s)
+    drive = scene.loop.step if scene.levels.rung == Rung.NONE else scene.loop.stale
+    output = drive(_given(scene, target_um), scene.dt_s)
     scene.give(output)
     return output
 

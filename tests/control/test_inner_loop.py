@@ -83,7 +83,7 @@ def test_missing_reading_puts_out_the_mean_flow(missing: float) -> None:
 def test_reading_that_comes_back_goes_on_from_the_mean_flow() -> None:
     inner, _ = settled()
     for _ in range(500):
-        inner.stale(DT_S)
+        inner.stale(given_at(math.nan), DT_S)
     out = inner.step(given_at(0.0), DT_S)
     assert out.flow_wanted_um_per_s == pytest.approx(1.24)
 
@@ -162,7 +162,7 @@ def test_whatever_comes_the_command_is_sane(run: list[tuple[str, LoopInput, floa
         if call == "step":
             out = inner.step(reading, dt_s)
         elif call == "stale":
-            out = inner.stale(dt_s)
+            out = inner.stale(reading, dt_s)
         else:
             out = inner.follow(reading, reading.trim_um, dt_s)
         assert out.pump_fraction == 0.0 or PUMP.stall_fraction < out.pump_fraction <= 1.0
