@@ -24,8 +24,8 @@ class RunEntry:
     folder: Path
     started_utc: datetime
     duration_s: float  # of a run that goes on, or whose recorder was killed, as far as its tables go; NaN without any
-    std_um: float  # of the true centre on the twin, else of the reading
-    in_band: float  # share of 1 s means within the band
+    std_um: float  # of 1 s means of what was meant to be held: of the true centre on the twin, else of the reading
+    in_band: float  # share of these within the band
     faults: int
     exit: str  # "done", "trip", ...; "open" without a summary
     kp_per_s: float
@@ -34,6 +34,10 @@ class RunEntry:
     size_mb: float
     marks: int  # annotations
     kept: bool  # the folder has a file `.keep`: it is never pruned
+    held_s: float = math.nan  # these are the parts of a run as `summary.HoldParts` tells them
+    faults_s: float = math.nan
+    paused_s: float = math.nan
+    moving_s: float = math.nan
 
     @property
     def name(self) -> str:
@@ -94,13 +98,14 @@ def entry(folder: Path) -> RunEntry:
     log = run_folder.read_events(folder, notes)
     summary: dict[str, Any] = run_folder.read_summary(folder, notes) or {}
     loop = run_folder.read_config(folder, notes).loop
-    std, duration_s = _number(summary.get("true_std_um")), _number(summary.get("duration_s"))
+    told, duration_s = summary.get("held"), _number(summary.get("duration_s"))
+    held = told if isinstance(told, dict) else {}
     return RunEntry(
         folder=folder,
         started_utc=origin_of(folder, log),
         duration_s=duration_s if math.isfinite(duration_s) else _recorded_s(folder),
-        std_um=std if math.isfinite(std) else _number(summary.get("reading_std_um")),
-        in_band=_number(summary.get("in_band_1s_fraction")),
+        std_um=_number(held.get("std_um")),
+        in_band=_number(held.get("in_band")),
         faults=sum(isinstance(each.event, events.Fault) for each in log),
         exit=str(summary.get("exit", "open")),
         kp_per_s=loop.kp_per_s,
@@ -109,6 +114,7 @@ def entry(folder: Path) -> RunEntry:
         size_mb=disk_budget.size_bytes(folder) / 1e6,
         marks=sum(isinstance(each.event, run_events.Mark) for each in log),
         kept=(folder / KEPT_FILE).exists(),
+        **{name: _number(held.get(name)) for name in ("held_s", "faults_s", "paused_s", "moving_s")},
     )
 
 

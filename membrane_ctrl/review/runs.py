@@ -15,6 +15,7 @@ from membrane_ctrl.model import errors, events, plain_json, terminal
 from membrane_ctrl.model.run_events import Ended, Mark
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.export import export
+from membrane_ctrl.review.report.json import beside
 from membrane_ctrl.review.words import end_s, moment_s, not_in, number, one_line, part_s, span
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_folder import add_mark
@@ -41,6 +42,8 @@ def show_command(run: Path, json: bool) -> int:
         print(plain_json.dumps(table, indent=1))
         return 0
     _console().print(_table([entry]))
+    if besides := beside(entry.faults_s, entry.paused_s, entry.moving_s, entry.duration_s):
+        print(f"  beside what was held: {', '.join(besides)}")
     for each in opened.log:
         match each.event:
             case events.StateEntered(state=said) | events.Fault(name=said) | Mark(text=said) | Ended(exit=said):
@@ -118,7 +121,7 @@ def _console() -> Console:
 def _table(found: list[catalogue.RunEntry]) -> Table:
     table = Table(box=None, header_style="bold", pad_edge=False)
     words = {"run", "started, UTC", "configuration", "end"}
-    numbers = ("length", "std µm", "in band", "faults", "Kp", "Ti")
+    numbers = ("length", "held", "std µm", "in band", "faults", "Kp", "Ti")
     for title in ("run", "started, UTC", *numbers, "configuration", "MB", "end"):
         table.add_column(title, justify="left" if title in words else "right")
     for entry in found:
@@ -126,6 +129,7 @@ def _table(found: list[catalogue.RunEntry]) -> Table:
             escape(one_line(entry.name)),
             f"{entry.started_utc:%Y-%m-%d %H:%M}",
             span(entry.duration_s),
+            span(entry.held_s),
             number(entry.std_um),
             "–" if math.isnan(entry.in_band) else f"{100 * entry.in_band:.4g} %",
             str(entry.faults),

@@ -1,5 +1,6 @@
 """`summary.json`: the figures of a run, computed as the rows come, in memory that does not grow with the run."""
 
+import copy
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -84,47 +85,58 @@ class LogHistogram:
         return self._low * math.exp((place + 0.5) * self._log_ratio)
 
 
+# A window with fewer of its ticks than this says nothing of its length.
+_LEAST_SHARE = 0.9
+
+
+def least_ticks(window_s: float, rate_hz: float) -> float:
+    """Ticks that a window must have: nine tenths, or all but one, which may have come just behind its end."""
+    ticks = window_s * rate_hz
+    return min(_LEAST_SHARE * ticks, ticks - 1)
+
+
 class SecondMeans:
-    """Means over consecutive windows of one second; a window with a gap in it gives none.
+    """Means of the seconds of the run that have at least `least` values; `result` is that of all until now."""
 
-    `count` windows so far, `inside` of them with a mean within `band`; means of the `first` and the `last`, or NaN.
-    """
-
-    def __init__(self, band: float, window_s: float = 1.0, gap_s: float = 0.5) -> None:
+    def __init__(self, band: float, least: float) -> None:
         self._band = band
-        self._window_s = window_s
-        self._gap_s = gap_s
-        self._start_s = math.nan
-        self._latest_s = math.nan
-        self._sum = 0.0
-        self._rows = 0
-        self.count = 0
-        self.inside = 0
-        self.first = math.nan
-        self.last = math.nan
+        self._least = least
+        self._second = self._count = self._sum = 0.0  # of the last second, which may go on
+        self._means = Moments()
+        self._inside = 0
+        self._first = self._last = math.nan
 
-    def add(self, time_s: float, value: float) -> None:
-        """Take in one value; times rise."""
-        if not time_s - self._latest_s <= self._gap_s:
-            self._begin(time_s)
-        elif time_s - self._start_s >= self._window_s:
-            self._close()
-            self._begin(time_s)
-        self._latest_s = time_s
-        self._sum += value
-        self._rows += 1
+    def add(self, time_s: Column, values: Column) -> None:
+        """Take in (n,) values at their times, which rise; those that are not finite are left out."""
+        there = np.isfinite(values)
+        second = np.append(self._second, np.floor(time_s[there] + 1e-9))
+        starts = np.flatnonzero(np.diff(second, prepend=np.nan))
+        counts = np.add.reduceat(np.append(self._count, np.ones(second.size - 1)), starts)
+        sums = np.add.reduceat(np.append(self._sum, values[there]), starts)
+        self._second, self._count, self._sum = float(second[-1]), float(counts[-1]), float(sums[-1])
+        self._take(counts[:-1], sums[:-1])
 
-    def _begin(self, time_s: float) -> None:
-        self._start_s = time_s
-        self._sum = 0.0
-        self._rows = 0
+    def _take(self, counts: Column, sums: Column) -> None:
+        whole = counts >= self._least
+        means = sums[whole] / counts[whole]
+        self._means.add(means)
+        self._inside += int((np.abs(means) <= self._band).sum())
+        if means.size:
+            self._first, self._last = float(means[0]) if math.isnan(self._first) else self._first, float(means[-1])
 
-    def _close(self) -> None:
-        mean = self._sum / self._rows
-        self.count += 1
-        self.inside += abs(mean) <= self._band
-        self.first = mean if self.count == 1 else self.first
-        self.last = mean
+    def result(self) -> dict[str, float]:
+        """Number of seconds; mean, standard deviation, first and last of their means; share within the band."""
+        all_of = copy.deepcopy(self)
+        all_of._take(np.array([self._count]), np.array([self._sum]))
+        count = all_of._means.count
+        return {
+            "seconds": count,
+            "mean_um": all_of._means.mean if count else math.nan,
+            "std_um": all_of._means.std if count > 1 else math.nan,
+            "in_band": all_of._inside / count if count else math.nan,
+            "first_um": all_of._first,
+            "last_um": all_of._last,
+        }
 
 
 SCHEMA = "membrane-summary/2"
@@ -146,7 +158,8 @@ class Summary:
 
     def __init__(self, config: Config) -> None:
         self._true_um = Moments()
-        self._true_1s_um = SecondMeans(config.limits.band_um)
+        least = least_ticks(1.0, config.loop.rate_hz)
+        self._true_1s_um, self._reading_1s_um = (SecondMeans(config.limits.band_um, least) for _ in range(2))
         self._reading_um = Moments()
         self._lateness_ms = LogHistogram()
         self._latency_ms = LogHistogram()
@@ -156,7 +169,8 @@ class Summary:
         self._rejected = 0
         self._leak_um_per_s = math.nan
         self._state = math.nan
-        self._settled = Settled()
+        self._parts = HoldParts(config.limits.band_um)
+        self._parts_s = dict.fromkeys(PARTS, 0.0)
         self._time_s = 0.0
         self._states: list[dict[str, Any]] = []
         self._transitions = 0
@@ -174,14 +188,17 @@ class Summary:
             self._transitions += 1
             if len(self._states) < _LISTED_MAX:
                 self._states.append({"state": states.State(code).name.lower(), "mono_s": float(time_s[row])})
-        settled = telemetry.columns(rows[self._settled.mask(telemetry.columns(rows))])
+        parts = self._parts.of(telemetry.columns(rows))
+        for name, part in parts.items():
+            self._parts_s[name] += float(telemetry.column(rows, "dt_s")[part].sum())
+        settled = telemetry.columns(rows[parts["held"]])
         self._state = float(telemetry.column(rows, "state")[-1])
         true_um = telemetry.true_error_um(settled)
         self._true_um.add(true_um)
-        for moment_s, value_um in zip(settled["mono_s"], true_um, strict=True):
-            if math.isfinite(value_um):
-                self._true_1s_um.add(float(moment_s), float(value_um))
-        self._reading_um.add(settled["setpoint_um"] - settled["displacement_um"])
+        self._true_1s_um.add(settled["mono_s"], true_um)
+        reading_um = settled["setpoint_um"] - settled["displacement_um"]
+        self._reading_um.add(reading_um)
+        self._reading_1s_um.add(settled["mono_s"], reading_um)
         self._lateness_ms.add(telemetry.column(rows, "lateness_ms"))
         self._rows += len(rows)
         self._missed_ticks = int(telemetry.column(rows, "missed_ticks")[-1])
@@ -217,17 +234,21 @@ class Summary:
         recorder : dict
             The recorder's own account: files, errors.
         """
-        true, means = self._true_um, self._true_1s_um
+        true, means = self._true_um, self._true_1s_um.result()
+        held = means if means["seconds"] else self._reading_1s_um.result()
         return {
             "schema": SCHEMA,
             "exit": self._end.get("exit"),
             "duration_s": max(self._time_s, float(self._end.get("mono_s") or 0.0)),
             "true_std_um": true.std,
             "true_bias_um": true.mean if true.count else math.nan,
-            "in_band_1s_fraction": means.inside / means.count if means.count else math.nan,
-            "band_1s_windows": means.count,
+            "in_band_1s_fraction": means["in_band"],
+            "band_1s_windows": means["seconds"],
             "settled_after_s": SETTLED_AFTER_S,
-            "sag_error_um": {"start": means.first, "end": means.last},
+            "sag_error_um": {"start": means["first_um"], "end": means["last_um"]},
+            "held": {"of": "true" if means["seconds"] else "reading"}
+            | held
+            | {f"{name}_s": time_s for name, time_s in self._parts_s.items()},
             "reading_std_um": self._reading_um.std,
             "leak_um_per_s": self._leak_um_per_s,
             "lateness_ms": _quantiles(self._lateness_ms) | {"max": self._lateness_ms.largest},
@@ -251,32 +272,65 @@ def _quantiles(histogram: LogHistogram) -> dict[str, float]:
     return {"p50": histogram.quantile(0.50), "p99": histogram.quantile(0.99)}
 
 
-# Which ticks count as held: in `hold`, the setpoint ramp at its target, and that for some seconds.
+# What counts as held: in `hold`, the setpoint ramp at its target, no pause, no fault, and that for some seconds.
 
-FIELDS = ("mono_s", "state", "setpoint_um", "trim_um", "target_um")
+FIELDS = (
+    "mono_s", "state", "rung", "setpoint_um", "trim_um", "target_um", "displacement_um", "error_um", "p_um_per_s",
+)  # fmt: skip
+PARTS = ("held", "faults", "paused", "moving")
+# A mirror that was let go (a pause, a fault's mean flow) may have strayed: it counts again once it has stayed
+# in the band, and after this time in any case.
+_BACK_WITHIN_S = 60.0
 
 
-class Settled:
-    """The rule of `summary.json`, over blocks that come in their order."""
+class HoldParts:
+    """Parts of a run's ticks, over blocks that come in their order.
 
-    def __init__(self) -> None:
+    `held` is what was meant to be held and is settled; `faults`: a safe level is in force; `paused`; `moving`: in
+    `hold`, the setpoint on its way, or not yet settled after that or after what let the mirror go.
+    """
+
+    def __init__(self, band_um: float) -> None:
+        self._band_um = band_um
         self._since_s = math.nan  # last moment that was not settled; NaN: not in hold
+        self._let_go_s = math.nan  # last moment that nothing held it; NaN: it has been back since
+        self._away_s = math.nan  # last moment that it was outside the band since
 
-    def mask(self, block: Mapping[str, Column]) -> BoolArray:
-        """(n,) true where the ticks of the next block are settled."""
-        time_s = block["mono_s"]
-        hold = block["state"] == states.State.HOLD
+    def of(self, block: Mapping[str, Column]) -> dict[str, BoolArray]:
+        """(n,) masks of the next block by the names of `PARTS`; no tick is in two."""
+        time_s, hold = block["mono_s"], block["state"] == states.State.HOLD
+        faults = block["rung"] > 0
+        # a loop that follows its error has a proportional part; a lost reading alone is no pause
+        open_loop = (block["p_um_per_s"] == 0) & (block["error_um"] != 0) & np.isfinite(block["displacement_um"])
+        paused = hold & ~faults & open_loop
         ramp_um = block["setpoint_um"] - np.nan_to_num(block["trim_um"]) - block["target_um"]
         began = hold & ~np.concatenate(([not math.isnan(self._since_s)], hold[:-1]))
-        moving = began | ~(np.abs(ramp_um) <= ARRIVED_UM)
-        marks = np.where(hold & moving, time_s, -np.inf)
+        away = paused | faults | self._straying(block, paused | (faults & hold))
+        marks = np.where(hold & (began | away | ~(np.abs(ramp_um) <= ARRIVED_UM)), time_s, -np.inf)
         if not math.isnan(self._since_s) and time_s.size and hold[0]:
             marks[0] = max(marks[0], self._since_s)
         since_s = np.maximum.accumulate(marks)
-        settled = hold & (time_s - since_s >= SETTLED_AFTER_S)
+        held = hold & (time_s - since_s >= SETTLED_AFTER_S)
         if time_s.size:
             self._since_s = float(since_s[-1]) if hold[-1] else math.nan
-        return np.asarray(settled)
+        return {"held": held, "faults": faults, "paused": paused, "moving": hold & ~(held | paused | faults)}
+
+    def _straying(self, block: Mapping[str, Column], let_go: BoolArray) -> BoolArray:
+        """(n,) the ticks outside the band from the moment that it is held again until it has stayed inside."""
+        time_s, outside = block["mono_s"], ~(np.abs(block["error_um"]) <= self._band_um)
+        straying = np.zeros(time_s.size, dtype=bool)
+        for first in np.flatnonzero(~let_go & np.concatenate(([not math.isnan(self._let_go_s)], let_go[:-1]))):
+            gone_s, away_s = (time_s[first - 1], time_s[first - 1]) if first else (self._let_go_s, self._away_s)
+            rows = first + np.flatnonzero((outside & (time_s <= gone_s + _BACK_WITHIN_S))[first:])
+            away = np.append(away_s, time_s[rows])
+            stayed = np.flatnonzero(np.diff(away, append=time_s[-1]) >= SETTLED_AFTER_S)
+            count = int(stayed[0]) if stayed.size else rows.size
+            straying[rows[:count]] = True
+            over = stayed.size or time_s[-1] > gone_s + _BACK_WITHIN_S
+            self._let_go_s, self._away_s = (math.nan, math.nan) if over else (float(gone_s), float(away[count]))
+        if let_go.size and let_go[-1]:
+            self._let_go_s = self._away_s = float(time_s[-1])
+        return straying
 
 
 def held_at(level: Mapping[str, Column], time_s: Column) -> BoolArray:

@@ -23,7 +23,7 @@ from membrane_ctrl.review.report.json import report_table
 from membrane_ctrl.review.statistics.analysis import analyse, fill_short_gaps
 from membrane_ctrl.review.statistics.compare import compare
 from membrane_ctrl.review.statistics.windows import WithoutFeedforward
-from membrane_ctrl.run_files.summary import SETTLED_AFTER_S, Settled
+from membrane_ctrl.run_files.summary import SETTLED_AFTER_S, HoldParts
 from tests.support.review_runs import same, set_summary, written
 
 HOURS = 0.5
@@ -54,9 +54,8 @@ def test_settled_is_five_seconds_of_hold_at_the_target() -> None:
     rows, _ = night(1, 0.02, "typical", [])
     rows[100:200, COLUMN["state"]] = State.SETTLE
     rows[400:450, COLUMN["setpoint_um"]] = 3.0  # a ramp
-    settled = Settled()
-    parts = np.split(rows, (150, 151, 430))
-    mask = np.concatenate([settled.mask(columns(part)) for part in parts])
+    hold_parts = HoldParts(2.0)
+    mask = np.concatenate([hold_parts.of(columns(part))["held"] for part in np.split(rows, (150, 151, 430))])
     expected, unsettled_s = [], np.nan
     for time_s, state, setpoint_um in rows[:, [COLUMN[name] for name in ("mono_s", "state", "setpoint_um")]]:
         if state != State.HOLD:
@@ -193,22 +192,6 @@ def test_a_mark_may_say_anything(quiet_run: Path, tmp_path: Path, text: str) -> 
     page = render(analyse(open_run(folder)))
     assert html.escape(text) in page
     assert "<b>" not in page.split("<svg")[1]
-
-
-def test_pauses_are_named(quiet_run: Path, tmp_path: Path) -> None:
-    folder = tmp_path / quiet_run.name
-    shutil.copytree(quiet_run, folder)
-    asked = [(100.0, "pause", None), (160.0, "resume", None), (200.0, "pause", "no"), (1000.0, "pause", None)]
-    lines = [{"kind": "command", "mono_s": at_s, "command": what, "refused": why} for at_s, what, why in asked]
-    with (folder / "events.jsonl").open("a") as file:
-        file.write("".join(json.dumps(line) + "\n" for line in lines))
-
-    def paused(start_s: float) -> list[str]:
-        return [odd.seen for odd in analyse(open_run(folder), start_s).anomalies if odd.name == "paused"]
-
-    # a pause that nobody ended was over after `states.pause_max_s`
-    assert paused(-np.inf)[0].startswith("2 times, 11 min in all")
-    assert paused(1300.0)[0].startswith("1 time, 5 min in all")
 
 
 @pytest.mark.parametrize(("state", "share"), [(ShapeState.WAITING, "0 %"), (ShapeState.TRACKING, None)])

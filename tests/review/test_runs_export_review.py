@@ -44,7 +44,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("logs")
     for day, std in ((21, 0.1), (22, 0.3), (23, 0.2)):
         run = written(folder, 0.02, seed=day, name=f"202611{day}T180000Z-night")
-        set_summary(run, true_std_um=std, in_band_1s_fraction=1.0)
+        set_summary(run, held={"std_um": std, "in_band": 1.0})
     (folder / "notes").mkdir()
     return folder
 

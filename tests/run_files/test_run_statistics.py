@@ -57,20 +57,25 @@ def test_quantile_of_nothing_is_nan() -> None:
     assert math.isnan(LogHistogram().quantile(0.5))
 
 
-def test_second_means_agree_with_numpy() -> None:
+@pytest.mark.parametrize("batch", [1, 7, 50, 1000])
+def test_second_means_agree_with_numpy(batch: int) -> None:
     values = np.random.default_rng(3).normal(size=(20, 50))
-    means = SecondMeans(band=0.1)
-    for k, value in enumerate(values.ravel()):
-        means.add(k * 0.02, float(value))
-    expected = values.mean(axis=1)[:-1]  # the last second is not over yet
-    assert means.count == 19
-    assert means.inside == int((np.abs(expected) <= 0.1).sum())
-    assert (means.first, means.last) == pytest.approx((expected[0], expected[-1]))
+    time_s = np.arange(1000) * 0.02
+    means = SecondMeans(band=0.1, least=45.0)
+    for start in range(0, 1000, batch):
+        means.add(time_s[start : start + batch], values.ravel()[start : start + batch])
+    found, expected = means.result(), values.mean(axis=1)
+    assert found["seconds"] == 20
+    assert found["in_band"] == pytest.approx(np.mean(np.abs(expected) <= 0.1))
+    assert (found["first_um"], found["last_um"]) == pytest.approx((expected[0], expected[-1]))
+    assert (found["mean_um"], found["std_um"]) == pytest.approx((expected.mean(), expected.std()))
+    assert means.result() == found
 
 
 def test_a_second_with_a_gap_gives_no_mean() -> None:
-    means = SecondMeans(band=1.0)
-    times_s = [*np.arange(0, 0.8, 0.1), *np.arange(2.0, 3.35, 0.1)]
-    for time_s in times_s:
-        means.add(float(time_s), 1.0 if time_s >= 2 else 100.0)
-    assert (means.count, means.first, means.last) == (1, 1.0, 1.0)
+    means = SecondMeans(band=1.0, least=9.0)
+    time_s = np.array([*np.arange(0, 0.75, 0.1), *np.arange(2.0, 3.35, 0.1)])
+    means.add(time_s, np.where(time_s >= 2, 1.0, 100.0))
+    found = means.result()
+    assert (found["seconds"], found["first_um"], found["last_um"]) == (1, 1.0, 1.0)
+    assert np.isnan(SecondMeans(band=1.0, least=9.0).result()["in_band"])

@@ -15,7 +15,7 @@ from membrane_ctrl.run_files.shapes import Shapes
 LEVEL_COLUMNS = (
     "state", "fault", "min_ambient_pressure_pa", "mean_ambient_pressure_pa", "mean_flow_um_per_s",
     "mean_feedforward_um_per_s", "min_displacement_um", "mean_displacement_um", "max_displacement_um",
-    "max_displacement_quality", "max_lateness_ms", "mean_error_um", "mean_air_temperature_c",
+    "max_displacement_quality", "max_lateness_ms", "mean_error_um", "mean_air_temperature_c", "mean_leak_um_per_s",
 )  # fmt: skip
 _WEATHER = {"mean_ambient_pressure_pa": "barometer lost", "mean_air_temperature_c": "thermometer lost"}
 # A door is 20 Pa, weather within two seconds a few Pa (gusty: 1.8 Pa, 1 sigma).

@@ -13,7 +13,7 @@ from membrane_ctrl import __version__
 from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.report import figures
-from membrane_ctrl.review.report.json import report_table, timeline, verdict
+from membrane_ctrl.review.report.json import beside, report_table, timeline, verdict
 from membrane_ctrl.review.statistics import compare, drift, shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries, analyse
 from membrane_ctrl.review.words import number, part_s, span
@@ -138,6 +138,8 @@ def _details(analysis: Analysis) -> str:
     single = f"std {number(ticks.raw_reading.std)} µm, {100 * ticks.raw_in_band:.2f} % within the band"
     return _facts([
         (f"drift, {name}", _slope(series.drift, "µm/h")),
+        ("beside what was held", ", ".join(beside(ticks.faults_s, ticks.paused_s, ticks.moving_s,
+                                                  ticks.end_s - ticks.start_s)) or "nothing"),
         ("single laser readings", f"{single}; {number(ticks.unread_s)} s held without readings"),
         (f"RMS by frequency, {name}", _bands(series)),
     ])  # fmt: skip

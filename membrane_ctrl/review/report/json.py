@@ -37,14 +37,21 @@ def verdict(analysis: Analysis) -> tuple[Word, str]:
     parts = []
     if ticks.unread_s >= _UNREAD_LEAST_S:
         parts.append(f"{span(ticks.unread_s)} of it without a reading")
-    if ticks.hold_s - ticks.settled_s >= _MOVING_LEAST_S:
-        parts.append(f"{span(ticks.hold_s - ticks.settled_s)} of it not yet settled")
+    parts += beside(ticks.faults_s, ticks.paused_s, ticks.moving_s, ticks.end_s - ticks.start_s)
     but = f" ({', '.join(parts)})" if parts else ""
     return word, (
-        f"Held for {span(ticks.hold_s)} of {whole}{but}; {share:.6g} % of its seconds within "
+        f"Held for {span(ticks.settled_s)} of {whole}{but}; {share:.6g} % of its seconds within "
         f"±{run.config.limits.band_um:g} µm ({who}: {std}mean {seconds.mean_um:+.3f} µm)"
         f"{_what(names)}."
     )
+
+
+def beside(faults_s: float, paused_s: float, moving_s: float, whole_s: float) -> list[str]:
+    """What there was beside the hold, with its share of the whole time; NaN where that is not known."""
+    parts = (("faults", faults_s, 0.0), ("paused", paused_s, 0.0), ("moving or settling", moving_s, _MOVING_LEAST_S))
+    return [
+        f"{name} {span(time_s)} ({100 * time_s / whole_s:.2g} %)" for name, time_s, least in parts if time_s > least
+    ]
 
 
 def _what(names: list[str]) -> str:
@@ -74,6 +81,9 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
         "duration_s": ticks.end_s - ticks.start_s,
         "hold_s": ticks.hold_s,
         "settled_s": ticks.settled_s,
+        "faults_s": ticks.faults_s,
+        "paused_s": ticks.paused_s,
+        "moving_s": ticks.moving_s,
         "held_without_every_tick_s": ticks.thin_s,
         "held_without_reading_s": ticks.unread_s,
         "ticks": ticks.ticks,

@@ -279,9 +279,8 @@ def _anomalies(
             odd.append(Anomaly("bias", f"{seconds.mean_um:+.3f} um on average"))
         if series.drift.significant:
             odd.append(Anomaly("drift", _of(series.drift, "um/h")))
-    if pauses := _pauses_s(run, part_s, ticks.end_s):
-        asked = f"{len(pauses)} time{'s' * (len(pauses) > 1)}, {span(sum(pauses))} in all"
-        odd.append(Anomaly("paused", f"{asked}: the pump gave its mean flow, and nothing held the mirror"))
+    if ticks.paused_s:
+        odd.append(Anomaly("paused", f"{span(ticks.paused_s)}: the pump gave its mean flow, nothing held the mirror"))
     if ticks.missed_ticks:
         odd.append(Anomaly("missed ticks", f"{ticks.missed_ticks} of {ticks.ticks + ticks.missed_ticks}"))
     if ticks.thin_s:
@@ -306,21 +305,6 @@ def _anomalies(
     counts = Counter(event.kind for event in found)
     odd += [Anomaly(kind, f"{count} found") for kind, count in counts.most_common()]
     return tuple(odd)
-
-
-def _pauses_s(run: Run, part_s: tuple[float, float], end_s: float) -> list[float]:
-    """Lengths of the pauses asked for within a part: to `resume`, another state, the longest allowed, or the end."""
-    lengths_s: list[float] = []
-    since_s = math.nan
-    for moment_s, event in (*((each.mono_s, each.event) for each in run.log), (end_s, run_events.Ended(""))):
-        match event:
-            case events.CommandTaken(command="pause", refused=None) if math.isnan(since_s):
-                since_s = moment_s
-            case events.CommandTaken(command="resume", refused=None) | events.StateEntered() | run_events.Ended():
-                over_s = min(moment_s, since_s + run.config.states.pause_max_s, part_s[1])
-                lengths_s.append(over_s - max(since_s, part_s[0]))
-                since_s = math.nan
-    return [length_s for length_s in lengths_s if length_s > 0]  # NaN: nothing was paused
 
 
 def _of(drift: FittedSlope, unit: str) -> str:

@@ -22,7 +22,7 @@ class ThinSeconds:
     """Finds them, over blocks in order of time."""
 
     def __init__(self, rate_hz: float) -> None:
-        self._least = windows.least_ticks(1.0, rate_hz)
+        self._least = summary.least_ticks(1.0, rate_hz)
         self._parts: list[tuple[windows.Seconds, Column]] = []
 
     def add(self, time_s: Column, setpoint_um: Column, settled: BoolArray) -> None:
@@ -64,7 +64,7 @@ def level_means(run: Run, second: windows.Seconds, setpoint_um: Column) -> Level
     """What the 1 s level knows of thin seconds, as far as its own are whole."""
     level: Block = run.level(1.0, float(second[0]), float(second[-1]) + 1.0, LEVEL_COLUMNS)
     _, place, row = np.intersect1d(second, np.rint(level["time_s"]).astype(np.int32), return_indices=True)
-    whole = (level["rows"][row] >= windows.least_ticks(1.0, run.config.loop.rate_hz)) & (
+    whole = (level["rows"][row] >= summary.least_ticks(1.0, run.config.loop.rate_hz)) & (
         level["state"][row] == State.HOLD
     )
     place, row = place[whole], row[whole]
@@ -88,7 +88,7 @@ def filled(seconds: windows.SecondsOf, means: LevelMeans, error_um: Column) -> w
 
 
 NAMES = (
-    *summary.FIELDS, "displacement_um", "truth_displacement_um", "feedforward_um_per_s", "flow_wanted_um_per_s",
+    *summary.FIELDS, "truth_displacement_um", "feedforward_um_per_s", "flow_wanted_um_per_s",
     "pump_fraction", "lateness_ms", "missed_ticks",
 )  # fmt: skip
 # Which error: a tick without a reading has a true centre all the same, so each has sums of its own,
@@ -127,7 +127,10 @@ class HoldPass:
     start_s: float
     end_s: float
     hold_s: float  # time in `hold`
-    settled_s: float
+    settled_s: float  # that of `summary.HoldParts`: what was meant to be held
+    faults_s: float
+    paused_s: float
+    moving_s: float  # the setpoint on its way, or not yet settled
     thin_s: float  # settled seconds whose ticks are not all there: their means are those of the level
     uncovered_s: float  # those whose means the level has not either: no statistics cover them
     # (n,) each: setpoint minus laser reading, target minus true centre; on a grid of ticks, NaN where not settled
@@ -172,7 +175,7 @@ class _Collector:
     def __init__(self, run: Run, span_s: tuple[float, float], from_within: bool) -> None:
         loop, self._band_um = run.config.loop, run.config.limits.band_um
         self._period_s = 1 / loop.rate_hz
-        self._settled = summary.Settled()
+        self._parts = summary.HoldParts(self._band_um)
         self._without = windows.WithoutFeedforward(loop.kp_per_s, loop.ti_s, self._period_s)
         self._grid_s = span_s[0]
         size = max(0, math.ceil((span_s[1] - span_s[0]) / self._period_s) + 2)
@@ -186,7 +189,7 @@ class _Collector:
         self._lateness = summary.LogHistogram()
         self._pump = _PumpSums(loop.flow_max_um_per_s)
         self._ticks = self._counted = self._unread = self._inside = 0
-        self._hold, self._calm = (windows.HeldTime(run.config.recording.quiet_hz) for _ in range(2))
+        self._times = {name: windows.HeldTime(run.config.recording.quiet_hz) for name in ("hold", *summary.PARTS)}
         self.thin = ThinSeconds(loop.rate_hz)
         # the running count at the beginning: of a part its first tick's, which says what was before
         self._missed_before = math.nan if from_within else 0.0
@@ -195,12 +198,13 @@ class _Collector:
 
     def add(self, block: Mapping[str, Column]) -> None:
         time_s = block["mono_s"]
-        mask = self._settled.mask(block)
+        parts = self._parts.of(block)
+        mask = parts["held"]
         kept_away = self._without.kept_away_um(block["feedforward_um_per_s"])[mask]
         self._ticks += time_s.size
         self._span = (self._span[0] if self._ticks > time_s.size else float(time_s[0]), float(time_s[-1]))
-        self._hold.add(time_s, block["state"] == State.HOLD)
-        self._calm.add(time_s, mask)
+        for name, part in {"hold": block["state"] == State.HOLD, **parts}.items():
+            self._times[name].add(time_s, part)
         self.thin.add(time_s, block["setpoint_um"], mask)
         missed = block["missed_ticks"][np.isfinite(block["missed_ticks"])]
         if missed.size:
@@ -230,6 +234,7 @@ class _Collector:
 
     def result(self) -> HoldPass:
         reading, true = (sums.result() for sums in self._seconds)
+        times_s = {name: time.result_s(self._period_s) for name, time in self._times.items()}
         if true[0].size:  # what was kept away is asked of one of the two only: of a month 20 MB
             reading = reading[0], reading[1], reading[2][:KEPT_AWAY].copy()
         return HoldPass(
@@ -239,8 +244,11 @@ class _Collector:
             missed_ticks=int(self._missed),
             start_s=self._span[0],
             end_s=self._span[1],
-            hold_s=self._hold.result_s(self._period_s),
-            settled_s=self._calm.result_s(self._period_s),
+            hold_s=times_s["hold"],
+            settled_s=times_s["held"],
+            faults_s=times_s["faults"],
+            paused_s=times_s["paused"],
+            moving_s=times_s["moving"],
             thin_s=0.0,
             uncovered_s=0.0,
             reading_um=self._reading,

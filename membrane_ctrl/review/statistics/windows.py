@@ -7,14 +7,12 @@ import numpy as np
 from scipy import signal
 
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column, IntArray, Singles
+from membrane_ctrl.run_files.summary import least_ticks
 
 # Of a month there are millions: single precision, which counts ticks exactly.
 Seconds = AnyArray
 Counts = Singles
 SecondsOf = tuple[Seconds, Counts, Column]
-
-# A window with fewer of its ticks than this says nothing of its length.
-_LEAST_SHARE = 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,12 +56,6 @@ class SecondSums:
         second, counts, sums = (np.concatenate(parts, axis=-1) for parts in zip(*self._parts, strict=True))
         starts = group_starts(second)  # two blocks may share a second
         return second[starts], np.add.reduceat(counts, starts), np.add.reduceat(sums, starts, axis=1)
-
-
-def least_ticks(window_s: float, rate_hz: float) -> float:
-    """Ticks that a window must have: nine tenths, or all but one, which may have come just behind its end."""
-    ticks = window_s * rate_hz
-    return min(_LEAST_SHARE * ticks, ticks - 1)
 
 
 def window_means(
