@@ -53,7 +53,9 @@ class ShapeView:
     state: states.ShapeState
     estimate: shape_estimate.ShapeEstimate | None
     age_s: float
-    sag_change_um: float  # since the first usable estimate of the hold
+    sag_change_um: float  # since the reference: the first usable estimate of a settled hold
+    change_sigma_um: float  # of that change, noise only
+    reference_s: float  # when the reference was taken
     trim_um: float
     cycles: int
     rejected: int
@@ -96,7 +98,7 @@ class ConsoleModel:
         self._error = Trend()
         self._lateness = Trend()
         self._estimate: shape_estimate.ShapeEstimate | None = None
-        self._first_sag_um = math.nan
+        self._reference: shape_estimate.ShapeEstimate | None = None
         self._cycles = 0
         self._rejected = 0
 
@@ -123,8 +125,10 @@ class ConsoleModel:
         self._cycles += 1
         if estimate.verdict == "rejected":
             self._rejected += 1
-        elif math.isnan(self._first_sag_um) and row is not None and row.state == states.State.HOLD:
-            self._first_sag_um = estimate.sag_um
+        elif row is not None and row.state == states.State.HOLD:
+            settled_s = self._status.since_s + telemetry.SETTLED_AFTER_S
+            if estimate.time_s >= settled_s and (self._reference is None or self._reference.time_s < settled_s):
+                self._reference = estimate
 
     def view(self, now_s: float) -> ConsoleView:
         """What to show at a moment of the run's clock."""
@@ -166,7 +170,7 @@ class ConsoleModel:
         return why(status.row, status.why, _fault_words(status.fault), self._config)
 
     def _shape(self, now_s: float) -> ShapeView:
-        estimate, row, status = self._estimate, self._status.row, self._status
+        estimate, since, row, status = self._estimate, self._reference, self._status.row, self._status
         state = states.ShapeState(int(row.shape_state)) if row else states.ShapeState.OFF
         reason = estimate.reason if estimate and estimate.verdict != "ok" else ""
         loop = status.shape_reason if state in (states.ShapeState.WAITING, states.ShapeState.SUSPENDED) else ""
@@ -174,7 +178,9 @@ class ConsoleModel:
             state=state,
             estimate=estimate,
             age_s=now_s - estimate.time_s if estimate else math.nan,
-            sag_change_um=estimate.sag_um - self._first_sag_um if estimate else math.nan,
+            sag_change_um=estimate.sag_um - since.sag_um if estimate and since else math.nan,
+            change_sigma_um=math.hypot(estimate.sag_sigma_um, since.sag_sigma_um) if estimate and since else math.nan,
+            reference_s=since.time_s if since else math.nan,
             trim_um=row.trim_um if row else math.nan,
             cycles=self._cycles,
             rejected=self._rejected,

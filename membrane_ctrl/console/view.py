@@ -175,8 +175,9 @@ def _shape(shape: ShapeView) -> list[tuple[str, RenderableType]]:
     state.append(f"  trim {number(shape.trim_um, 2, 'um', sign=True)}", style="default")
     estimate = shape.estimate
     change = number(shape.sag_change_um, 3, sign=True)
-    if estimate is not None and change != NONE:
-        state.append(f"  sag change {change} ± {number(estimate.sag_sigma_um, 3)} um", style="default")
+    if change != NONE:
+        sigma = number(shape.change_sigma_um, 3)
+        state.append(f"  sag {change} ± {sigma} um since {duration(shape.reference_s)}", style="default")
     if shape.note:
         state.append(f"  {shape.note}", style="yellow")
     if estimate is None:

@@ -126,12 +126,13 @@ class RerunOutput:
         self._recording.lay_out_again()
 
     def _watch_hold(self, rows: telemetry.Rows) -> None:
-        """Changes of the figure are against the first of the hold: before it they only show the way there."""
+        """Changes of the figure are against the first of the settled hold: before it they only show the way there."""
         if not len(rows):
             return
         state = telemetry.column(rows, "state")
-        if any(code == states.State.HOLD for _, code in telemetry.changes(state, self.state)):
-            self.shapes.rebase()
+        for row, code in telemetry.changes(state, self.state):
+            if code == states.State.HOLD:
+                self.shapes.rebase(float(telemetry.column(rows, "mono_s")[row]) + telemetry.SETTLED_AFTER_S)
         self.state = float(state[-1])
 
     def close(self) -> None:

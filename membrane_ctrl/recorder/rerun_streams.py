@@ -152,12 +152,13 @@ _DIFFERENCE_LEAST_UM = 0.5
 
 
 class ShapeStreams:
-    """Sends estimates to a recording. Changes are against the first estimate since `rebase` that was not rejected."""
+    """Sends estimates to a recording. Changes are against the first good one that `rebase` lets be."""
 
     def __init__(self, recording: sink.Recording) -> None:
         self._recording = recording
         self.reference: shape_estimate.ShapeEstimate | None = None
         self.pictures = True
+        self._reference_from_s = -math.inf
         self._next_map_s = -math.inf
         self._next_difference_s = -math.inf
         self._colours: dict[str, tuple[float, float]] = {}
@@ -169,10 +170,9 @@ class ShapeStreams:
         self._next_difference_s = -math.inf
         self._verdict = ""
 
-    def rebase(self) -> None:
-        """Take the next estimate as the reference, and show the maps against it at once."""
-        self.reference = None
-        self._next_difference_s = -math.inf
+    def rebase(self, from_s: float) -> None:
+        """Take the first estimate from a moment on as the reference, and show the maps against it at once."""
+        self._reference_from_s = from_s
 
     def send(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Send one estimate at the middle of its exposures; of a rejected one only quality and verdict."""
@@ -184,7 +184,8 @@ class ShapeStreams:
             self._recording.columns(blueprint.VERDICT.path, time_s, rr.StateChange.columns(state=[estimate.verdict]))
         if estimate.verdict == "rejected":
             return
-        self.reference = self.reference or estimate
+        if self.reference is None or self.reference.time_s < self._reference_from_s <= estimate.time_s:
+            self.reference, self._next_difference_s = estimate, -math.inf
         for stream, values in _figure(estimate, self.reference).items():
             self._recording.scalars(stream.path, time_s, np.array([values]))
         change_um = (estimate.coeffs_um - self.reference.coeffs_um)[1:]
@@ -207,7 +208,7 @@ class ShapeStreams:
             difference_um = shapes.difference_map_um(estimate, reference)
             most_um = max(_DIFFERENCE_LEAST_UM, *(abs(end) for end in _span(difference_um)))
             self._send_map("difference", time_s, difference_um, "um", (-most_um, most_um))
-            legend = _legend(estimate, self._colours)
+            legend = _legend(estimate, reference, self._colours)
             self._recording.log("/shape/legend", time_s, rr.TextDocument(legend, media_type="text/markdown"))
 
     def _send_map(
@@ -223,7 +224,11 @@ def _span(values: NDArray[np.float32]) -> tuple[float, float]:
     return float(np.nanmin(values)), float(np.nanmax(values))
 
 
-def _legend(estimate: shape_estimate.ShapeEstimate, colours: dict[str, tuple[float, float]]) -> str:
+def _legend(
+    estimate: shape_estimate.ShapeEstimate,
+    reference: shape_estimate.ShapeEstimate,
+    colours: dict[str, tuple[float, float]],
+) -> str:
     """Markdown: what the maps' colours mean, and the cycle in one line each."""
     rows = "\n".join(f"| {name} | {low:.4g} | {high:.4g} |" for name, (low, high) in colours.items())
     reason = f" ({estimate.reason})" if estimate.reason else ""
@@ -232,6 +237,7 @@ def _legend(estimate: shape_estimate.ShapeEstimate, colours: dict[str, tuple[flo
     return (
         f"| map | blue | red |\n|---|---|---|\n{rows}\n\n"
         f"- cycle {estimate.cycle}, {estimate.kind}: {estimate.verdict}{reason}\n"
+        f"- changes are against cycle {reference.cycle}, at {reference.time_s:.0f} s\n"
         f"- sag {estimate.sag_um / 1e3:.4f} mm ± {estimate.sag_sigma_um:.3f} um of noise{geometry}\n"
         f"- slope residual {estimate.slope_residual_urad:.2f} urad, {100 * estimate.valid_fraction:.1f} % valid\n"
     )

@@ -141,9 +141,6 @@ class SecondMeans:
 
 SCHEMA = "membrane-summary/2"
 
-# Rows count as settled this long after hold began and after each setpoint ramp: three closed-loop time constants
-# of 1.45 s (PHYSICS, inner loop) leave 5 % of a step, of which the `settle` state has already taken most.
-SETTLED_AFTER_S = 5.0
 # The ramp has arrived when setpoint minus trim is this near to the target; far below the laser's 0.1 um steps.
 ARRIVED_UM = 0.01
 # Transitions and faults listed; the counters beside the lists go on (a device that flickers for a week).
@@ -244,7 +241,7 @@ class Summary:
             "true_bias_um": true.mean if true.count else math.nan,
             "in_band_1s_fraction": means["in_band"],
             "band_1s_windows": means["seconds"],
-            "settled_after_s": SETTLED_AFTER_S,
+            "settled_after_s": telemetry.SETTLED_AFTER_S,
             "sag_error_um": {"start": means["first_um"], "end": means["last_um"]},
             "held": {"of": "true" if means["seconds"] else "reading"}
             | held
@@ -310,7 +307,7 @@ class HoldParts:
         if not math.isnan(self._since_s) and time_s.size and hold[0]:
             marks[0] = max(marks[0], self._since_s)
         since_s = np.maximum.accumulate(marks)
-        held = hold & (time_s - since_s >= SETTLED_AFTER_S)
+        held = hold & (time_s - since_s >= telemetry.SETTLED_AFTER_S)
         if time_s.size:
             self._since_s = float(since_s[-1]) if hold[-1] else math.nan
         return {"held": held, "faults": faults, "paused": paused, "moving": hold & ~(held | paused | faults)}
@@ -323,7 +320,7 @@ class HoldParts:
             gone_s, away_s = (time_s[first - 1], time_s[first - 1]) if first else (self._let_go_s, self._away_s)
             rows = first + np.flatnonzero((outside & (time_s <= gone_s + _BACK_WITHIN_S))[first:])
             away = np.append(away_s, time_s[rows])
-            stayed = np.flatnonzero(np.diff(away, append=time_s[-1]) >= SETTLED_AFTER_S)
+            stayed = np.flatnonzero(np.diff(away, append=time_s[-1]) >= telemetry.SETTLED_AFTER_S)
             count = int(stayed[0]) if stayed.size else rows.size
             straying[rows[:count]] = True
             over = stayed.size or time_s[-1] > gone_s + _BACK_WITHIN_S
@@ -334,9 +331,10 @@ class HoldParts:
 
 
 def held_at(level: Mapping[str, Column], time_s: Column) -> BoolArray:
-    """(n,) whether the window of a level that holds each time, and the one before, were in `hold`."""
+    """(n,) whether the mirror was settled in `hold` at each time, as far as the windows of a level tell."""
     if not level["time_s"].size:
         return np.zeros(time_s.size, dtype=bool)
     place = np.clip(np.searchsorted(level["time_s"], time_s, side="right") - 1, 0, None)
     hold = level["state"] == states.State.HOLD
-    return np.asarray(hold[place] & hold[np.maximum(place - 1, 0)])
+    since_s = np.maximum.accumulate(np.where(hold, -np.inf, np.append(level["time_s"][1:], np.inf)))
+    return np.asarray(hold[place] & (time_s - since_s[place] >= telemetry.SETTLED_AFTER_S))

@@ -11,6 +11,7 @@ from console_feed import FAULT, HOLDING, event, rows, shape
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.model import ConsoleModel, Trend, text
 from membrane_ctrl.model.states import Rung, ShapeState, State
+from membrane_ctrl.model.telemetry import SETTLED_AFTER_S
 
 
 def model(duration_s: float | None = None) -> ConsoleModel:
@@ -111,18 +112,21 @@ def test_too_tight_is_judged_after_half_a_minute_of_hold() -> None:
     assert not given.view(31.0).too_tight
 
 
-def test_sag_change_is_against_the_first_usable_shape_of_the_hold() -> None:
+def test_sag_change_is_against_the_first_usable_shape_of_a_settled_hold() -> None:
     given = model()
     given.take_row(replace(HOLDING, state=State.SETTLE))
     given.take_shape(shape(sag_um=37000.0))
     assert math.isnan(given.view(0.0).shape.sag_change_um)
     given.take_row(HOLDING)
-    given.take_shape(shape(sag_um=30000.0, verdict="rejected", reason="tracking lost"))
-    given.take_shape(shape(sag_um=37100.0))
-    given.take_shape(shape(time_s=4.0, sag_um=37100.5))
-    seen = given.view(6.0).shape
-    assert seen.sag_change_um == pytest.approx(0.5)
-    assert (seen.cycles, seen.rejected, seen.age_s) == (4, 1, 2.0)
+    settled_s = HOLDING.mono_s + SETTLED_AFTER_S
+    given.take_shape(shape(time_s=settled_s + 0.5, sag_um=30000.0, verdict="rejected", reason="tracking lost"))
+    given.take_shape(shape(time_s=settled_s - 0.5, sag_um=37098.9))  # the mirror still moved
+    given.take_shape(shape(time_s=settled_s + 1.0, sag_um=37100.0))
+    given.take_shape(shape(time_s=settled_s + 4.0, sag_um=37100.5))
+    seen = given.view(settled_s + 6.0).shape
+    assert (seen.sag_change_um, seen.reference_s) == (pytest.approx(0.5), settled_s + 1.0)
+    assert seen.change_sigma_um == pytest.approx(math.sqrt(2) * shape().sag_sigma_um)
+    assert (seen.cycles, seen.rejected, seen.age_s) == (5, 1, 2.0)
 
 
 def test_note_says_what_is_wrong_with_the_shape() -> None:

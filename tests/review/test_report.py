@@ -16,14 +16,14 @@ from membrane_ctrl.cli import run as command
 from membrane_ctrl.model import plain_json
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.states import ShapeState, State
-from membrane_ctrl.model.telemetry import COLUMN, column, columns
+from membrane_ctrl.model.telemetry import COLUMN, SETTLED_AFTER_S, column, columns
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.report.html import render
 from membrane_ctrl.review.report.json import report_table
 from membrane_ctrl.review.statistics.analysis import analyse, fill_short_gaps
 from membrane_ctrl.review.statistics.compare import compare
 from membrane_ctrl.review.statistics.windows import WithoutFeedforward
-from membrane_ctrl.run_files.summary import SETTLED_AFTER_S, HoldParts
+from membrane_ctrl.run_files.summary import HoldParts
 from tests.support.review_runs import same, set_summary, written
 
 HOURS = 0.5

@@ -65,8 +65,8 @@ def test_changes_of_the_figure_are_against_the_first_since_rebase(tmp_path: Path
     recording.next_segment()
     shapes = ShapeStreams(recording)
     for cycle in range(4):
-        if cycle == 2:
-            shapes.rebase()
+        if cycle == 1:
+            shapes.rebase(1.5)
         shapes.send(replace(shape_of(float(cycle), cycle), sag_um=100.0 * cycle))
     recording.close()
     _, values = scalars(tmp_path / "test-000.rrd", "/shape/sag_change")

@@ -12,8 +12,8 @@ import pytest
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import plain_json
 from membrane_ctrl.model.states import State
-from membrane_ctrl.model.telemetry import Rows, TelemetryRow, column, unpack
-from membrane_ctrl.run_files.summary import SCHEMA, SETTLED_AFTER_S, Summary
+from membrane_ctrl.model.telemetry import SETTLED_AFTER_S, Rows, TelemetryRow, column, unpack
+from membrane_ctrl.run_files.summary import SCHEMA, Summary, held_at
 from tests.support.synthetic_run import RATE_HZ, rows_of, shape_of
 
 HOLD_FROM_S = 6.0
@@ -166,3 +166,12 @@ def test_the_geometry_that_was_measured_with_is_named() -> None:
     origin = {"hash": "12ab", "file": "g.toml", "calibrated_utc": "2026-01-02"}
     summary.add_event({"kind": "geometry", **origin, "message": "", "mono_s": 3.0})
     assert summary.as_dict({}, {})["geometry"] == origin
+
+
+@pytest.mark.parametrize("window_s", [1.0, 10.0])
+def test_a_cycle_counts_once_the_hold_has_settled(window_s: float) -> None:
+    starts_s = np.arange(0.0, 60.0, window_s)
+    state = np.where(starts_s >= 20.0, State.HOLD, State.SETTLE)
+    seen = held_at({"time_s": starts_s, "state": state}, np.array([3.0, 20.5, 24.9, 25.1, 59.0]))
+    assert list(seen) == [False, False, False, True, True]
+    assert list(held_at({"time_s": starts_s, "state": state * 0 + State.HOLD}, np.array([3.0]))) == [True]

@@ -17,7 +17,7 @@ from membrane_ctrl.model.states import State
 from membrane_ctrl.review.report.json import timeline
 from membrane_ctrl.review.statistics import shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis
-from membrane_ctrl.review.words import one_line
+from membrane_ctrl.review.words import one_line, span
 
 BLUE, ORANGE, GREEN, RED, VIOLET, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#8a8f98"
 WIDTH_IN = 10.5
@@ -240,7 +240,7 @@ def stability(shape: shape_review.ShapeReview) -> str:
         points, sd, loops, drift = plots.ravel()
         for name in shape.points_um:
             points.plot(time, lines[name], color=_POINT_COLOURS[name], lw=0.9, label=name)
-        points.set(title="Height at A, B and C since the first cycle, µm", xlabel=unit)
+        points.set(title=f"Height at A, B and C since the settled cycle at {span(shape.time_s[0])}, µm", xlabel=unit)
         points.legend(loc="upper right", ncols=3)
         _map(figure, sd, shape.sd_um, "Standard deviation of the height, µm", "viridis", (0, None))
         for name, (x, y) in shape_review.POINTS.items():

@@ -178,6 +178,7 @@ def _shape(shape: shape_review.ShapeReview) -> str:
     ]
     facts = [
         ("cycles", f"{shape.time_s.size} used of {shape.cycles}, {shape.rejected} rejected"),
+        ("changes are since", f"the first settled one, at {span(float(shape.time_s[0]))} of the run"),
         ("standard deviation", f"{number(shape.mean_sd_um)} µm, mean over the area"),
         ("A, B, C", ", ".join(f"{name} {number(float(v.std()))} µm" for name, v in shape.points_um.items())),
         ("drifting terms", ", ".join(drifting) or "none"),

@@ -150,6 +150,7 @@ def _shape(shape: shape_review.ShapeReview) -> dict[str, Any]:
         "cycles": shape.cycles,
         "rejected": shape.rejected,
         "used": int(shape.time_s.size),
+        "reference_s": float(shape.time_s[0]),
         "mean_sd_um": shape.mean_sd_um,
         "points_sd_um": {name: float(values.std()) for name, values in shape.points_um.items()},
         "drift_um_per_hour": {f"Z{j}": _slope(term) for j, term in enumerate(shape.drift_um_per_hour, 2)},

@@ -35,7 +35,7 @@ class CyclePair:
 class ShapeReview:
     """Figure of a held mirror over the run."""
 
-    time_s: Column  # (n,): of the cycles used: held and not rejected
+    time_s: Column  # (n,): of the cycles used: settled and not rejected; the first is what changes refer to
     cycles: int  # of the run
     rejected: int
     points_um: dict[str, Column]  # (n,) change of height at `POINTS` against the first cycle
