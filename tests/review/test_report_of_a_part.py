@@ -49,9 +49,9 @@ def test_faults_and_missed_ticks_of_a_part_are_its_own(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("part", "whole", "said"),
     [
-        (["--from", "+100s", "--to", "+180s"], False, ", same part: Held for 1 min 20 s"),
-        (["--from", "18:02", "--to", "18:04"], True, ", all of it: Held for 6 min"),
-        ([], True, "-other: Held for 6 min"),
+        (["--from", "+100s", "--to", "+180s"], False, ", same part: Held for 1 min 15 s"),
+        (["--from", "18:02", "--to", "18:04"], True, ", all of it: Held for 5 min 55 s"),
+        ([], True, "-other: Held for 5 min 55 s"),
     ],
 )
 def test_a_part_is_set_against_the_same_part_or_says_that_it_is_not(

@@ -13,7 +13,7 @@ from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
 from membrane_ctrl.review.statistics.drift import FittedSlope, mean_p, spread_p, windowed
 
 _SIGNIFICANT = 0.01
-_SHORT = "no test: too short for blocks"
+_SHORT = "no test: too short"
 _STRETCHES = "tests these two stretches of time, not the settings: the weather differs from day to day"
 
 
@@ -42,8 +42,8 @@ class Difference:
 def compare(ours: Analysis, theirs: Analysis) -> list[Difference]:
     """Differences of two analyses.
 
-    Means and spreads are tested between blocks: each run gives a mean and a log variance every five minutes, and
-    Welch's t test asks whether the two sets differ. Slopes are tested by their own standard errors.
+    Means are tested between blocks: each run gives one every five minutes, and Welch's t test asks whether the two
+    sets differ. Spreads are tested so, too, and as a whole (`spread_p`); slopes by their own standard errors.
     """
     found: list[Difference] = []
     for name, a, b in (("reading", ours.reading, theirs.reading), ("true centre", ours.true, theirs.true)):
@@ -91,13 +91,13 @@ def _loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
     window_s = max(ours.level_s, theirs.level_s)
     late = [np.stack((part[0], np.log(np.maximum(part[1], 1e-6)))) for part in late]
     same = ours.level_s == theirs.level_s
-    late_p = mean_p(late[0], late[1], window_s, correlated=True) if same else math.nan
+    late_p = mean_p(late[0], late[1], window_s) if same else math.nan
     late_note = f"tested by the greatest of each {window_s:g} s" if same else "no test: levels of different length"
     return [
         _tested("leak", "µm/s", ours.leak_um_per_s[0], theirs.leak_um_per_s[0],
-                mean_p(leak[0], leak[1], window_s, correlated=True), _STRETCHES),
+                mean_p(leak[0], leak[1], window_s), _STRETCHES),
         _tested("pump, mean", "of full", mine.pump.mean_fraction, other.pump.mean_fraction,
-                mean_p(pump[0], pump[1], window_s, correlated=True), _STRETCHES),
+                mean_p(pump[0], pump[1], window_s), _STRETCHES),
         _tested("pump strokes", "1/h", mine.pump.travel_per_hour, other.pump.travel_per_hour, math.nan,
                 "no test: one sum over the run"),
         _tested("lateness p99", "ms", mine.lateness_ms.quantile(0.99), other.lateness_ms.quantile(0.99),
@@ -119,7 +119,7 @@ def _figure(ours: Analysis, theirs: Analysis) -> list[Difference]:
     parting = ours.shape.disagreement, theirs.shape.disagreement
     return [
         _tested("figure, mean SD", "µm", ours.shape.mean_sd_um, theirs.shape.mean_sd_um, least,
-                "tested at A, B and C, within blocks"),
+                "tested at A, B and C"),
         _tested("sag − laser", "µm/h", parting[0].per_hour, parting[1].per_hour, _slope_p(*parting)),
     ]  # fmt: skip
 
@@ -157,6 +157,8 @@ def _reference_um(analysis: Analysis) -> float:
 
 def _slope_p(a: FittedSlope, b: FittedSlope) -> float:
     sigmas = [(slope.high - slope.low) / 2 / 1.96 for slope in (a, b)]
-    if not all(math.isfinite(sigma) and sigma > 0 for sigma in sigmas):
+    if not all(map(math.isfinite, sigmas)):
         return math.nan
+    if not any(sigmas):
+        return float(a.per_hour == b.per_hour)
     return float(2 * stats.norm.sf(abs(a.per_hour - b.per_hour) / math.hypot(*sigmas)))

@@ -64,24 +64,26 @@ def slope(time_s: Column, values: Column) -> FittedSlope:
 
 def correlation_time(residual: Column) -> float:
     """1 + 2 sum of the autocorrelation, in samples; at least 1."""
+    return _times(residual)[0]
+
+
+def _times(residual: Column) -> tuple[float, float]:
+    """1 + 2 sum of the autocorrelation, and of its square, which tells of a variance; in samples, at least 1."""
     size = residual.size
     power = np.abs(np.fft.rfft(residual, 2 * size)) ** 2
     covariance = np.fft.irfft(power)[:size]
     if covariance[0] <= 0:
-        return 1.0
-    seen, factor = covariance / covariance[0], 1.0
+        return 1.0, 1.0
+    seen, factor, of_square = covariance / covariance[0], 1.0, 1.0
     for _ in range(_BIAS_ROUNDS):
         taken = min(2 * factor / size, _TAKEN_MOST)
-        factor = _positive_sum(seen * (1 - taken) + taken)
-    return factor
-
-
-def _positive_sum(correlation: Column) -> float:
-    size = correlation.size
-    pairs = correlation[: size // 2 * 2].reshape(-1, 2).sum(axis=1)
-    ends = np.flatnonzero(pairs <= 0)
-    pairs = np.minimum.accumulate(pairs[: ends[0]] if ends.size else pairs)
-    return float(np.clip(2 * pairs.sum() - 1, 1.0, size / 3))
+        correlation = seen * (1 - taken) + taken
+        pairs = correlation[: size // 2 * 2].reshape(-1, 2).sum(axis=1)
+        ends = np.flatnonzero(pairs <= 0)
+        count = int(ends[0]) if ends.size else pairs.size
+        sums = np.minimum.accumulate(pairs[:count]).sum(), (correlation[: 2 * count] ** 2).sum()
+        factor, of_square = (float(np.clip(2 * total - 1, 1.0, size / 3)) for total in sums)
+    return factor, of_square
 
 
 # Whether two series differ, asked of blocks of time that count as independent.
@@ -113,9 +115,10 @@ def blocks(time_s: Column, values: Column, length_s: float) -> tuple[Column, Col
     mean = np.bincount(number, values) / np.maximum(count, 1)
     freedom = np.maximum(count - 1, 1)
     variance = np.bincount(number, (values - mean[number]) ** 2) / freedom
-    kept = (count >= 0.5 * np.median(count[count > 0])) & (variance > 0)
+    kept = count >= 0.5 * np.median(count[count > 0])
+    varies = kept & (variance > 0)
     bias = special.digamma(freedom / 2) - np.log(freedom / 2)
-    return np.asarray(mean[kept], dtype=np.float64), np.log(variance[kept]) - bias[kept]
+    return np.asarray(mean[kept], dtype=np.float64), np.log(variance[varies]) - bias[varies]
 
 
 def windowed(time_s: Column, values: Column, window_s: float) -> tuple[Column, Column]:
@@ -131,12 +134,39 @@ def windowed(time_s: Column, values: Column, window_s: float) -> tuple[Column, C
 
 
 def spread_p(a: Column, b: Column, window_s: float = 1.0) -> float:
-    """Chance of log variances as different between alike series (2, n) of times and values; NaN: too short."""
+    """Chance of spreads as different between alike series (2, n) of times and values; NaN: too short.
+
+    Two tests, each of half the level. Within blocks: Welch's of log variances, which sees any difference of the usual
+    motion. Of the whole: the ratio of the variances against F with their effective degrees of freedom, the fewer of
+    n / (1 + 2 sum r_k^2) and what the scatter of the squares says; it sees what is slower or rarer than a block.
+    """
     length_s = block_s(a[0], b[0], window_s)
-    return welch_p(blocks(a[0], a[1], length_s)[1], blocks(b[0], b[1], length_s)[1])
+    within = welch_p(blocks(a[0], a[1], length_s)[1], blocks(b[0], b[1], length_s)[1])
+    both = [p for p in (within, _variances_p(a[1], b[1])) if math.isfinite(p)]
+    return min(1.0, len(both) * min(both)) if both else math.nan
 
 
-def mean_p(a: Column, b: Column, window_s: float = 1.0, offset: float = 0.0, correlated: bool = False) -> float:
+def _variances_p(a: Column, b: Column) -> float:
+    """The test of the whole of `spread_p`."""
+    variances, freedoms = [], []
+    for values in (a[np.isfinite(a)], b[np.isfinite(b)]):
+        if values.size < _LEAST_BLOCKS:
+            return math.nan
+        residual = values - values.mean()
+        square = float((residual**2).mean())
+        if square <= 0:
+            return math.nan
+        excess = residual**2 - square
+        # of a Gaussian series (Bartlett 1946), and of its squares as they are: rare excursions make them few
+        gaussian = 1 / _times(residual)[1]
+        seen = 2 * square**2 / (max(float(excess.var()), 1e-300) * correlation_time(excess))
+        freedoms.append(max(values.size * min(gaussian, seen) - 1, 1.0))
+        variances.append(square)
+    ratio = variances[0] / variances[1]
+    return 2 * float(min(stats.f.cdf(ratio, *freedoms), stats.f.sf(ratio, *freedoms)))
+
+
+def mean_p(a: Column, b: Column, window_s: float = 1.0, offset: float = 0.0) -> float:
     """Chance of means as different between series (times and values) that are alike; NaN: too short.
 
     Parameters
@@ -145,25 +175,22 @@ def mean_p(a: Column, b: Column, window_s: float = 1.0, offset: float = 0.0, cor
         Of a value.
     offset : float
         Standard deviation that the difference has beside that between blocks: what all blocks of a run share.
-    correlated : bool
-        Whether blocks may remember each other: they count for fewer, then.
     """
     length_s = block_s(a[0], b[0], window_s)
-    return welch_p(blocks(a[0], a[1], length_s)[0], blocks(b[0], b[1], length_s)[0], offset, correlated)
+    return welch_p(blocks(a[0], a[1], length_s)[0], blocks(b[0], b[1], length_s)[0], offset)
 
 
-def welch_p(a: Column, b: Column, offset: float = 0.0, correlated: bool = False) -> float:
-    """Welch's t test of two sets of blocks; with an offset or correlation see `mean_p`."""
+def welch_p(a: Column, b: Column, offset: float = 0.0) -> float:
+    """Welch's t test of two sets of blocks; those that remember each other count for fewer. `offset` as in `mean_p`."""
     if min(a.size, b.size) < _LEAST_TESTED:
         return math.nan
     variance, weights = offset**2, 0.0
     for part in (a, b):
-        factor = correlation_time(part - part.mean()) if correlated else 1.0
-        size = part.size / factor
+        size = part.size / correlation_time(part - part.mean())
         own = float(part.var(ddof=1)) / size
         variance += own
         weights += own**2 / max(size - 1, 1.0)
-    if variance <= 0:
-        return math.nan
+    if variance <= 0:  # what never varies differs, or does not
+        return float(a.mean() == b.mean())
     freedom = variance**2 / weights if weights > 0 else math.inf
     return float(2 * stats.t.sf(abs(a.mean() - b.mean()) / math.sqrt(variance), freedom))
