@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
-from membrane_ctrl.model import errors, events, run_events, states
+from membrane_ctrl.model import errors, events, states
 from membrane_ctrl.model.arrays import Column, Singles
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.steps import FoundEvent

@@ -177,16 +177,16 @@ def mean_p(a: Column, b: Column, window_s: float = 1.0, offset: float = 0.0) -> 
         Standard deviation that the difference has beside that between blocks: what all blocks of a run share.
     """
     length_s = block_s(a[0], b[0], window_s)
-    return welch_p(blocks(a[0], a[1], length_s)[0], blocks(b[0], b[1], length_s)[0], offset)
+    return welch_p(blocks(a[0], a[1], length_s)[0], blocks(b[0], b[1], length_s)[0], offset, correlated=True)
 
 
-def welch_p(a: Column, b: Column, offset: float = 0.0) -> float:
-    """Welch's t test of two sets of blocks; those that remember each other count for fewer. `offset` as in `mean_p`."""
+def welch_p(a: Column, b: Column, offset: float = 0.0, correlated: bool = False) -> float:
+    """Welch's t test of two sets of blocks; correlated ones count for fewer. `offset` as in `mean_p`."""
     if min(a.size, b.size) < _LEAST_TESTED:
         return math.nan
     variance, weights = offset**2, 0.0
     for part in (a, b):
-        size = part.size / correlation_time(part - part.mean())
+        size = part.size / (correlation_time(part - part.mean()) if correlated else 1.0)
         own = float(part.var(ddof=1)) / size
         variance += own
         weights += own**2 / max(size - 1, 1.0)
