@@ -83,6 +83,7 @@ class ConsoleView:
     faults: int  # faults so far in the run
     last_fault: str  # the newest of them, with its time
     too_tight: bool  # the leak is too small for the band
+    gains: str  # in force, with the countdown of a trial
     recording: str  # what keeps the run from being recorded; empty if nothing does
     shape: ShapeView
 
@@ -154,6 +155,7 @@ class ConsoleModel:
             faults=status.faults,
             last_fault=f"{_fault_words(status.last_fault)} at {duration(status.last_fault_s)}" * bool(status.faults),
             too_tight=self._too_tight(now_s),
+            gains=run_status.gains_words(status.loop or self._config.loop.model_dump(), status.trial_left_s),
             recording=status.recording_words,
             shape=self._shape(now_s),
         )

@@ -103,7 +103,7 @@ def _figures(view: ConsoleView, config: Config) -> Table:
     for label, bars in _trend(view, config):
         table.add_row(label, bars)
     table.add_row("mirror", _mirror(row))
-    table.add_row("", "")
+    table.add_row("gains", Text(view.gains))
     table.add_row("pump", _pump(row, config))
     table.add_row("flow", _flow(row))
     table.add_row("gas", _gas(view, row))

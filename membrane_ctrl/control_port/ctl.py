@@ -10,7 +10,7 @@ from typing import Any
 from membrane_ctrl.config.toml_file import read_toml
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.model import errors, files, plain_json
+from membrane_ctrl.model import errors, files, plain_json, run_status
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +65,8 @@ def status_lines(status: dict[str, Any]) -> list[str]:
             "late": ("lateness_ms", "ms"),
         }
         lines += [f"  {name:15}{_shown(row.get(field))} {unit}" for name, (field, unit) in shown.items()]
+        if gains := status.get("gains"):
+            lines.append(f"  {'gains':15}{run_status.gains_words(gains, status.get('trial_left_s'))}")
         lines.append(f"  {'shape loop':15}{status['shape']} {status['shape_reason']}".rstrip())
         lines.append(f"  {'geometry':15}{_geometry(status.get('geometry'))}")
     lines += [f"  {'maintenance':15}{message}" for message in status.get("maintenance", {}).values()]

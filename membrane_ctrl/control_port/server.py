@@ -18,7 +18,7 @@ from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control_port import protocol, sockets
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
 from membrane_ctrl.control_port.session import FREE, Commander, Peer, PortSession, may_not
-from membrane_ctrl.controller import commands, tick
+from membrane_ctrl.controller import commands, cross_check_plant, tick
 from membrane_ctrl.model import errors, events, run_events, run_status, states
 
 # Beyond these the longest silent connection is dropped: one person's terminals cannot lock out another's stop
@@ -56,7 +56,7 @@ class Port:
         """Note what a tick decided, and answer those who asked."""
         self._status = self._status.after_row(outputs.row)
         for event in outputs.events:
-            self._status = self._status.after_event(event)
+            self._status = self._status.after_event(event, outputs.row.mono_s)
             for session in self._sessions:
                 session.event(event)
         for number, refusal in outputs.answers:
@@ -103,6 +103,7 @@ class Port:
         return {
             "run": self._run,
             **status_table(self._status),
+            "gains": self._hooks.loop().model_dump(include={"kp_per_s", "ti_s", "td_s"}),
             "commander": self._commander.holder(self._now()) or None,
             "clients": len(self._sessions),
         }
@@ -222,7 +223,11 @@ class Port:
     def _new_loop(self, changes: dict[str, bool | float]) -> schema.LoopConfig:
         if "setpoint_um" in changes:
             raise errors.InputError("gains: setpoint_um: use the command setpoint")
-        return toml_file.parse({**self._hooks.loop().model_dump(), **changes}, schema.LoopConfig, "gains")
+        loop = toml_file.parse({**self._hooks.loop().model_dump(), **changes}, schema.LoopConfig, "gains")
+        weak = cross_check_plant.weak_gains(loop)
+        if weak is not None and weak[0] == "error":
+            raise errors.InputError(f"gains: kp_per_s = {loop.kp_per_s:g}: {weak[1]}")
+        return loop
 
     async def _obeyed(self, command: commands.Command) -> str:
         """Why the tick that took the command up refused it; empty if it obeyed."""
@@ -304,6 +309,7 @@ def status_table(status: run_status.RunStatus) -> dict[str, Any]:
         "rung": states.Rung(int(row.rung)).name.lower(),
         "shape": states.ShapeState(int(row.shape_state)).name.lower(),
         "shape_reason": status.shape_reason,
+        "trial_left_s": round(status.trial_left_s, 1) if math.isfinite(status.trial_left_s) else None,
         "geometry": asdict(geometry) if geometry else None,
         "maintenance": dict(status.maintenance),
         "recording": dict(status.recording),

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from firmware_iface.roles import BenchIdentity
 from firmware_iface.settings import ModbusMapConfig, Optoncdt1420Config
-from membrane_ctrl.config.schema import Config, GeometryConfig
+from membrane_ctrl.config.schema import Config, GeometryConfig, LoopConfig
 from membrane_ctrl.control import film, gas, inner_loop
 from membrane_ctrl.controller import pump_obeys, safety
 
@@ -98,16 +98,24 @@ def judge_pump(config: Config, say: ConfigFindings) -> None:
             say.error(high < 1.0, f"devices.{role}.{name}", "a command of 1 would be refused", "end at 1")
 
 
-def judge_loop(config: Config, say: ConfigFindings) -> None:
-    loop, full_um_per_s = config.loop, flow_um_per_s(config)
+def weak_gains(loop: LoopConfig) -> tuple[Severity, str] | None:
+    """What is wrong with the gains of a loop on the nominal pump, if anything."""
     sensitivity = inner_loop.peak_sensitivity(loop)
     gains = f"with Ti {loop.ti_s:g} s, Td {loop.td_s:g} s, a filter of {loop.measurement_filter_s:g} s"
-    measure = "run `tune`, or use the default gains"
-    say.error(loop.kp_per_s == 0.0, "loop.kp_per_s", "nothing would hold the mirror", measure)
-    say.error(math.isinf(sensitivity), "loop.kp_per_s", f"{gains} the loop is unstable on the nominal pump", measure)
+    if loop.kp_per_s == 0.0:
+        return "error", "nothing would hold the mirror"
+    if math.isinf(sensitivity):
+        return "error", f"{gains} the loop is unstable on the nominal pump"
     close = f"{gains} the loop is close to unstable (peak sensitivity {sensitivity:.1f}, the defaults have 1.3)"
-    say.error(_MS_MOST < sensitivity < math.inf, "loop.kp_per_s", close, measure)
-    say.warn(_MS_WARN < sensitivity <= _MS_MOST, "loop.kp_per_s", close, measure)
+    return ("error" if sensitivity > _MS_MOST else "warning", close) if sensitivity > _MS_WARN else None
+
+
+def judge_loop(config: Config, say: ConfigFindings) -> None:
+    loop, full_um_per_s = config.loop, flow_um_per_s(config)
+    severity, why = weak_gains(loop) or ("", "")
+    measure = "run `tune`, or use the default gains"
+    say.error(severity == "error", "loop.kp_per_s", why, measure)
+    say.warn(severity == "warning", "loop.kp_per_s", why, measure)
     for on, name, nominal in (
         (loop.feedforward_barometer, "barometer_gain_um_per_pa", _BAROMETER_UM_PER_PA),
         (loop.feedforward_temperature, "temperature_gain_um_per_k", _TEMPERATURE_UM_PER_K),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from membrane_ctrl.model import events, run_events, telemetry
 
@@ -29,7 +30,15 @@ class RunStatus:
     maintenance: Mapping[str, str] = field(default_factory=dict)  # what a person should look at, by name
     # trouble of the recording, by what is affected. A full disk may keep `events.jsonl` from reporting itself
     recording: Mapping[str, str] = field(default_factory=dict)
+    loop: Mapping[str, Any] | None = None  # gains set during the run; None: those of the configuration
+    kept_loop: Mapping[str, Any] | None = None  # what a trial goes back to
+    trial_ends_s: float = math.nan  # when gains on trial are reverted; NaN: none are
     ended: bool = False
+
+    @property
+    def trial_left_s(self) -> float:
+        """How long gains on trial may still be kept; NaN if none are."""
+        return self.trial_ends_s - self.row.mono_s if self.row else math.nan
 
     @property
     def recording_words(self) -> str:
@@ -54,6 +63,14 @@ class RunStatus:
                 return replace(self, fault=None)
             case events.ShapeLoopState():
                 return replace(self, shape_reason=event.reason)
+            case events.CommandTaken(command="gains", refused=None, loop=loop, value=trial_s):
+                kept = self.kept_loop if trial_s is not None else loop
+                ends_s = math.nan if trial_s is None else mono_s + trial_s
+                return replace(self, loop=loop, kept_loop=kept, trial_ends_s=ends_s)
+            case events.CommandTaken(command="keep", refused=None):
+                return replace(self, kept_loop=self.loop, trial_ends_s=math.nan)
+            case events.GainsReverted():
+                return replace(self, loop=self.kept_loop, trial_ends_s=math.nan)
             case events.Maintenance():
                 return replace(self, maintenance={**self.maintenance, event.name: event.message})
             case events.MaintenanceOver():
@@ -65,6 +82,13 @@ class RunStatus:
             case run_events.Ended():
                 return replace(self, ended=True)
         return replace(self, recording=_recording(self.recording, event))
+
+
+def gains_words(loop: Mapping[str, Any], trial_left_s: float | None) -> str:
+    """Gains for a person, with the countdown of a trial."""
+    on_trial = trial_left_s is not None and math.isfinite(trial_left_s)
+    trial = f"; on trial, reverted in {max(trial_left_s or 0.0, 0.0):.0f} s unless kept" if on_trial else ""
+    return f"Kp {loop['kp_per_s']:g} 1/s, Ti {loop['ti_s']:g} s, Td {loop['td_s']:g} s{trial}"
 
 
 def _recording(standing: Mapping[str, str], event: events.Event) -> Mapping[str, str]:

@@ -162,3 +162,18 @@ def test_end_event_ends() -> None:
 )
 def test_words_of_an_event(given: dict[str, object], words: str) -> None:
     assert text(given) == words
+
+
+def test_gains_in_force_and_the_countdown_of_a_trial_are_shown() -> None:
+    given = model()
+    given.take_row(replace(HOLDING, mono_s=20.0))
+    assert given.view(20.0).gains == "Kp 0.61 1/s, Ti 6.5 s, Td 0 s"
+    asked = {"kind": "command", "command": "gains", "who": "tom", "why": "", "mono_s": 10.0}
+    gains = Config().loop.model_dump()
+    given.take_event(asked | {"loop": gains | {"kp_per_s": 9.0}, "refused": "no"})
+    given.take_event(asked | {"loop": gains | {"kp_per_s": 0.5}, "value": 60.0})
+    assert given.view(20.0).gains == "Kp 0.5 1/s, Ti 6.5 s, Td 0 s; on trial, reverted in 50 s unless kept"
+    given.take_event({"kind": "command", "command": "keep", "who": "tom", "why": "", "mono_s": 30.0})
+    given.take_event(asked | {"loop": gains | {"kp_per_s": 0.7}, "value": 60.0})
+    given.take_event({"kind": "gains_reverted", "why": "nobody kept them", "mono_s": 70.0})
+    assert given.view(70.0).gains == "Kp 0.5 1/s, Ti 6.5 s, Td 0 s"

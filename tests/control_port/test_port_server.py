@@ -126,6 +126,8 @@ async def test_gains_change_what_they_name(tmp_path: Path) -> None:
         ({"kp_per_s": -1.0}, "kp_per_s: input should be greater"),
         ({"setpoint_um": 3.0}, "use the command setpoint"),
         ({"rate_hz": 100.0}, "tick rate cannot be changed"),
+        ({"kp_per_s": 15.0}, "kp_per_s = 15: with Ti 6.5 s, Td 0 s, a filter of 0.2 s the loop is unstable"),
+        ({"kp_per_s": 0.0}, "nothing would hold the mirror"),
         ({}, "takes"),
     ],
 )
