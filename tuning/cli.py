@@ -19,10 +19,10 @@ TwinOption = Annotated[bool, typer.Option("--twin", help="Work on the twin, in v
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="With --twin: its configuration.")]
 RunOption = Annotated[Path | None, typer.Option("--run", help="Run folder of the hold.")]
 SocketOption = Annotated[Path | None, typer.Option("--socket", help="Control port of the hold.")]
-LogsOption = Annotated[Path, typer.Option("--logs", help="Sessions are in LOGS/tuning.")]
+LogsOption = Annotated[Path, typer.Option("--logs", help="Keep sessions in LOGS/tuning.")]
 SessionOption = Annotated[Path | None, typer.Option("--session", help="Continue this session.")]
 NameOption = Annotated[str, typer.Option("--name", help="Name of a new session.")]
-AuthorOption = Annotated[str | None, typer.Option("--author", help="Name of who tunes; your login by default.")]
+AuthorOption = Annotated[str | None, typer.Option("--author", help="Who is tuning; your login by default.")]
 ReasonOption = Annotated[str, typer.Option("--reason", help="Reason, for the gains file and the journal.")]
 LimitOption = Annotated[
     float, typer.Option(min=3, max=30, help="Largest excursion of the centre in an experiment, um.")
@@ -33,23 +33,23 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JS
 TakeOverOption = Annotated[bool, typer.Option("--take-over", help="Take the command from whoever has it.")]
 
 _STEPS = {
-    "characterise": "Excite the loop with relay and doublets about the mean flow; begins a session.",
-    "identify": "Identify gain, dead time and lag with their errors; judge whether the data carry a proposal.",
+    "characterise": "Excite the loop with a relay and doublets about the mean flow; starts a session.",
+    "identify": "Identify gain, dead time and lag with their errors; judge whether the data support a proposal.",
     "observe": "Observe a quiet hold: laser noise and weather.",
     "design": "Compare candidates side by side and propose gains.",
-    "preview": "Preview present and proposed gains on the fitted twin.",
-    "apply": "Apply the proposed gains on trial: without `verify` they revert.",
-    "verify": "Verify the new gains in ten minutes of hold: keep them, or revert (exit 3).",
+    "preview": "Simulate present and proposed gains on the fitted twin.",
+    "apply": "Apply the proposed gains on trial; they revert unless `verify` keeps them.",
+    "verify": "Verify the new gains over ten minutes of hold; keep them, or revert (exit 3).",
     "run": "Run all steps that are not done yet.",
     "pump": "Map the pump (start, stall, gain, leak); later steps of the session use it.",
     "outer": "Measure sag sensitivity, noise and drift of the figure; propose the shape loop's time constant.",
-    "watch": "Watch a hold without touching it; say whether a session is due (exit 3).",
-    "rollback": "Roll back to the gains before the last ones kept.",
+    "watch": "Watch a hold without touching it; report whether a session is due (exit 3).",
+    "rollback": "Restore the gains from before the last kept session.",
 }
 
 
 def _step(name: str) -> None:
-    """Make the command of a step: all take the same options."""
+    """Make the command for a step; all steps take the same options."""
 
     def command(
         twin: TwinOption = False,
@@ -127,7 +127,7 @@ def compare(
     a: Annotated[Path, typer.Argument(metavar="A", help="Session folder.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="Session folder.")],
 ) -> int:
-    """Compare two sessions: each one's gains on each one's plant and weather."""
+    """Compare two sessions: the gains of each on the plant and weather of each."""
     from membrane_ctrl.sessions.folder import open_session
     from tuning.comparison import compared
 

@@ -44,20 +44,20 @@ class TuneOptions:
 
     @property
     def stages(self) -> tuple[tuple[float, float], ...]:
-        """Of the verification, in the time there is for it."""
+        """Stages of the verification that fit in the time available."""
         share = self.verify_s / STAGES[-1][0]
         return tuple((share * until_s, growth) for until_s, growth in STAGES)
 
 
 def author_name() -> str:
-    """Who is logged in."""
+    """Login name."""
     with contextlib.suppress(OSError, KeyError):
         return getpass.getuser()
     return "unknown"
 
 
 def run_session(options: TuneOptions) -> int:
-    """All steps that are not done yet. Returns the exit code; see `one_step` for what is raised."""
+    """Run all steps that are not done yet and return the exit code; raises like `one_step`."""
     with _session(options) as (folder, rig, progress):
         todo = [step for step in STEPS if not folder.done(step)]
         for number, step in enumerate(todo):
@@ -67,9 +67,9 @@ def run_session(options: TuneOptions) -> int:
 
 
 def one_step(step: str, options: TuneOptions) -> int:
-    """One step of the newest session, or of the one named; `characterise` begins one.
+    """Run one step of the named or newest session; `characterise` starts a new one.
 
-    Raises InputError, DeviceError or RejectedError; the mirror is then held with the last good gains.
+    Raises InputError, DeviceError or RejectedError, and then holds the mirror with the last good gains.
     """
     if step not in _MOVES:
         folder = _folder(options, None)
@@ -83,7 +83,7 @@ def one_step(step: str, options: TuneOptions) -> int:
 
 
 def map_pump(options: TuneOptions) -> int:
-    """Measure the pump; the later steps of the session use it."""
+    """Measure the pump for the later steps of the session."""
     with _session(options) as (folder, rig, progress):
         progress.begin("pump map", 700.0, 0.0)
         found = session.map_pump(folder, rig)
@@ -98,7 +98,7 @@ def map_pump(options: TuneOptions) -> int:
 
 
 def outer(options: TuneOptions) -> int:
-    """Sag sensitivity, noise and drift of the figure; the shape loop's time constant."""
+    """Measure sag sensitivity, noise and drift of the figure; propose the shape loop's time constant."""
     from membrane_ctrl.metrology.optics.hencky import zernike_projection
     from tuning.identification.shape_loop import TYPICAL_S as OUTER_S
     from tuning.identification.shape_loop import evaluate, step_experiment
@@ -122,7 +122,7 @@ def outer(options: TuneOptions) -> int:
 
 
 def watch(options: TuneOptions) -> int:
-    """Look at a hold for the observation time and say whether a session is due (exit 3)."""
+    """Observe a hold and report whether a session is due (exit 3)."""
     from tuning.proposal.verify import health
 
     folder = _folder(options, None)
@@ -141,7 +141,7 @@ def watch(options: TuneOptions) -> int:
     if options.json:
         print(json.dumps(plain.plain(found)))
     progress.say(
-        f"std {found.std_um:.3f} um, {found.ratio:.2f} of the least possible ({found.ratio_designed:.2f} expected); "
+        f"std {found.std_um:.3f} um, {found.ratio:.2f} of the lower bound ({found.ratio_designed:.2f} expected); "
         f"k {found.gain:.2f} +- {found.gain_sigma:.2f}; leak {found.leak_um_per_s:.2f} um/s"
     )
     for suggestion in found.suggestions:
@@ -150,7 +150,7 @@ def watch(options: TuneOptions) -> int:
 
 
 def rollback(options: TuneOptions) -> int:
-    """Back to the gains before those kept last."""
+    """Restore the gains from before the last kept session."""
     kept = gains_file.to_roll_back(options.logs)
     progress = Progress()
     with _link(options) as link:
@@ -168,7 +168,7 @@ def rollback(options: TuneOptions) -> int:
 
 
 def _do(step: str, folder: SessionFolder, rig: HoldRig | None, options: TuneOptions, progress: Progress) -> None:
-    """One step; what it found is said in a line."""
+    """Run one step and report its result in one line."""
 
     def told(stage: Stage) -> None:
         progress.say(
@@ -222,7 +222,7 @@ def _in_a_line(step: str, folder: SessionFolder) -> str:
             return (
                 f"K {gains.loop.kp_per_s:.3f} 1/s, Ti {gains.loop.ti_s:.2f} s, filter "
                 f"{gains.loop.measurement_filter_s:.2f} s: {gains.predicted_std_um:.3f} um predicted, "
-                f"{gains.predicted_std_um / gains.least_std_um:.2f} of the least possible"
+                f"{gains.predicted_std_um / gains.least_std_um:.2f} of the lower bound"
             )
         case "preview":
             shown = session.preview_of(folder)
@@ -246,7 +246,7 @@ def _begin(progress: Progress, options: TuneOptions, step: str, after: list[str]
 
 @contextlib.contextmanager
 def _session(options: TuneOptions, fresh: bool = False) -> Iterator[tuple[SessionFolder, HoldRig, Progress]]:
-    """Folder and hold of a session; whatever ends it early, the mirror gets the last good gains back."""
+    """Yield a session's folder and hold; restore the last good gains if it ends early."""
     progress = Progress()
     with _link(options) as link:
         folder = _folder(options, link, fresh)
@@ -267,9 +267,9 @@ def _go_back(rig: HoldRig, before: LoopConfig, progress: Progress) -> None:
     try:
         rig.go_back(before)
     except HoldError as error:
-        progress.say(f"the last good gains could not be set ({error}); gains on trial revert by themselves")
+        progress.say(f"could not restore the last good gains ({error}); gains on trial revert automatically")
         return
-    progress.say("the mirror is held with the last good gains")
+    progress.say("holding the mirror with the last good gains")
 
 
 def _link(options: TuneOptions) -> contextlib.AbstractContextManager[HoldLink]:
@@ -283,7 +283,7 @@ def _link(options: TuneOptions) -> contextlib.AbstractContextManager[HoldLink]:
 
 
 def _folder(options: TuneOptions, link: HoldLink | None, fresh: bool = False) -> SessionFolder:
-    """The session that was named; without a name the newest, or a new one where there is a hold to begin it on."""
+    """Return the named session, else the newest, or a new one if there is a hold to start it on."""
     if options.session is not None:
         return open_session(options.session)
     if link is None:

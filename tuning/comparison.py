@@ -1,4 +1,4 @@
-"""Two tuning sessions side by side: each one's gains on each one's plant and weather."""
+"""Two tuning sessions side by side: the gains of each on the plant and weather of each."""
 
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.sessions.folder import SessionFolder
@@ -11,7 +11,7 @@ _WEATHER_KEYS = ("barometer_gain_um_per_pa", "temperature_gain_um_per_k")
 
 
 def compared(a: SessionFolder, b: SessionFolder) -> str:
-    """Markdown: the plants, the gains, and what each gains would do on each plant.
+    """Return Markdown: the plants, the gains, and the prediction for each set of gains on each plant.
 
     Raises InputError if one of the sessions has no design yet.
     """
@@ -35,7 +35,7 @@ def _plants(a: SessionFolder, b: SessionFolder, files: list[GainsFile]) -> list[
 
 
 def _gains(files: list[GainsFile]) -> list[str]:
-    """The loop settings that differ."""
+    """Table of the loop settings that differ."""
     left, right = (gains.loop.model_dump() for gains in files)
     lines = ["| setting | A | B |", "|---|---:|---:|"]
     lines += [f"| {name} | {left[name]} | {right[name]} |" for name in left if left[name] != right[name]]
@@ -49,7 +49,7 @@ def _crossed(a: SessionFolder, b: SessionFolder, files: list[GainsFile]) -> list
         found, weather = found_of(session), disturbance_of(session)
         own = files[0 if place == "A" else 1].loop
         for name, gains in zip("AB", files, strict=True):
-            # the weather's gains belong to the bench, not to the design
+            # the weather gains belong to the bench, not to the design
             loop = LoopConfig.model_validate(
                 gains.loop.model_dump() | {key: getattr(own, key) for key in _WEATHER_KEYS}
             )

@@ -1,7 +1,7 @@
-"""Gains with where they come from: the loop's settings, the plant they are for, data, author, date, reason.
+"""Gains and their origin: the loop's settings, the plant they are for, data, author, date, reason.
 
-A file that was edited by hand is read like any other: its gains are checked on its plant, and what would be unstable
-or has too little margin is refused by name.
+A hand-edited file is read like any other: its gains are checked on its plant, and gains that are unstable
+or have too little margin are refused by name.
 """
 
 import json
@@ -21,14 +21,14 @@ from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.sessions import folder as plain
 from tuning.identification import identify, loop_model
 
-# A little above what the design demands (1.4): the grid of the search, and a plant that was identified again.
+# A little above the design's limit (1.4), to allow for the search grid and a re-identified plant.
 MS_MAX = 1.6
 
 Positive = Annotated[float, Field(gt=0)]
 
 
 class PlantSection(Section):
-    """The plant the gains were made for (`loop_model.PlantModel`), with standard errors."""
+    """The plant the gains were designed for (`loop_model.PlantModel`), with standard errors."""
 
     gain: Positive
     dead_time_s: Annotated[float, Field(ge=0, le=10)]
@@ -65,7 +65,7 @@ class GainsFile(Section):
 
 
 def save_gains(path: Path, gains: GainsFile) -> None:
-    """Write a gains file in one step; without the setpoint, which is the hold's own."""
+    """Write a gains file atomically, without the setpoint, which belongs to the hold."""
     text = tomli_w.dumps(gains.model_dump(mode="json", exclude={"loop": {"setpoint_um"}}))
     files.write_text_atomic(files.users(path), text)
 
@@ -78,16 +78,16 @@ def load_gains(path: Path) -> GainsFile:
 def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
     """Refuse gains that must not be applied.
 
-    Raises InputError if the loop would be unstable on the file's own plant or has too little margin, or ticks
-    differently from the hold (`running`); `where` names the file.
+    Raises InputError if the loop is unstable or has too little margin on the file's own plant, or its tick rate
+    differs from that of the hold (`running`); `where` names the file.
     """
     dt_s = 1 / gains.loop.rate_hz
     found = loop_model.margins(loop_model.Gains.of(gains.loop), gains.plant.model, dt_s)
     if not found.stable:
-        raise errors.InputError(f"{where}: loop: unstable on the plant of this file; was it edited by hand?")
+        raise errors.InputError(f"{where}: loop: unstable on this file's plant; was the file edited by hand?")
     if not found.ms <= MS_MAX or math.isnan(found.ms):
         raise errors.InputError(
-            f"{where}: loop: sensitivity {found.ms:.2f} on the plant of this file, the limit is "
+            f"{where}: loop: sensitivity {found.ms:.2f} on this file's plant, the limit is "
             f"{MS_MAX:g}; was it edited by hand?"
         )
     if gains.loop.rate_hz != running.rate_hz:
@@ -97,7 +97,7 @@ def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
 
 
 def for_hold(gains: LoopConfig, running: LoopConfig) -> LoopConfig:
-    """The gains for a hold whose setpoint and bleed are its own: those are no gains."""
+    """The gains for a hold, which keeps its own setpoint and bleed: those are not gains."""
     kept = {"setpoint_um": running.setpoint_um, "bleed_fraction": running.bleed_fraction}
     return LoopConfig.model_validate(gains.model_dump() | kept)
 
@@ -110,24 +110,24 @@ What = Literal["kept", "taken_back", "rolled_back"]
 
 @dataclass(frozen=True, slots=True)
 class GainsEntry:
-    """One line."""
+    """One line of the journal."""
 
     time_utc: str
     what: What  # "kept": verified; "taken_back": the verification failed; "rolled_back": by a person
     session: str
     author: str
     reason: str
-    before: LoopConfig  # gains before and with it; after "taken_back" those before run again
+    before: LoopConfig  # gains before and with it; after "taken_back" the former are in force again
     after: LoopConfig
 
 
 def entry(what: What, session: str, author: str, reason: str, before: LoopConfig, after: LoopConfig) -> GainsEntry:
-    """An entry of now."""
+    """Return an entry stamped with the present time."""
     return GainsEntry(datetime.now(UTC).isoformat(timespec="seconds"), what, session, author, reason, before, after)
 
 
 def note(logs: Path, what: GainsEntry) -> None:
-    """Append an entry. Raises InputError where it cannot be written: a link in its place is not followed."""
+    """Append an entry. Raises InputError if it cannot be written; symbolic links are not followed."""
     path = logs / "tuning" / _FILE
     with errors.writing(path):
         files.make_folder(path.parent)
@@ -136,7 +136,7 @@ def note(logs: Path, what: GainsEntry) -> None:
 
 
 def entries(logs: Path) -> list[GainsEntry]:
-    """All entries, oldest first; a line that was cut off is left out. Raises InputError for no plain file."""
+    """All entries, oldest first, without truncated lines. Raises InputError if it is not a regular file."""
     path = logs / "tuning" / _FILE
     try:
         text = files.read_text(path, errors="replace")
@@ -154,7 +154,7 @@ def entries(logs: Path) -> list[GainsEntry]:
 
 
 def to_roll_back(logs: Path) -> GainsEntry:
-    """The newest gains that were kept and not rolled back since. Raises InputError if there are none."""
+    """The newest gains kept and not rolled back since. Raises InputError if there are none."""
     undone: set[str] = set()
     for found in reversed(entries(logs)):
         if found.what == "rolled_back":

@@ -1,4 +1,4 @@
-"""The report of a session: one HTML file with everything in it, and a Rerun recording; renewed after each step."""
+"""The report of a session: one self-contained HTML file and a Rerun recording, updated after each step."""
 
 import base64
 import html
@@ -27,7 +27,7 @@ _TIMELINE = "session_time"
 
 
 def draw_experiments(path: Path, record: records.Record, found: identify.Identified | None) -> None:
-    """Flow, reading, and (once fitted) what the model makes of the flow, with the residuals."""
+    """Draw flow and readings and, once fitted, the model's response to the flow with the residuals."""
     figure = Figure(figsize=(11, 7), layout="constrained")
     upper, middle, lower = figure.subplots(3, 1, sharex=True)
     time_s = np.arange(len(record)) * record.dt_s
@@ -35,7 +35,7 @@ def draw_experiments(path: Path, record: records.Record, found: identify.Identif
     upper.set(ylabel="flow (um/s)")
     middle.plot(time_s, record.displacement_um, ".", markersize=1, color="tab:gray", label="reading")
     if found is not None:
-        middle.plot(time_s, _pump_share_um(record, found.model), linewidth=1, label="the pump's share, by the model")
+        middle.plot(time_s, _pump_share_um(record, found.model), linewidth=1, label="response to the pump (model)")
         lower.plot(time_s[1:], found.residual_um, linewidth=0.4)
     middle.set(ylabel="centre (um)")
     middle.legend(loc="upper right")
@@ -44,7 +44,7 @@ def draw_experiments(path: Path, record: records.Record, found: identify.Identif
 
 
 def _pump_share_um(record: records.Record, model: loop_model.PlantModel) -> records.Series:
-    """The centre as pump and leak alone move it, with the readings' mean."""
+    """Motion of the centre due to pump and leak alone, with the readings' mean."""
     x = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
     way = model.gain * x - model.leak_um_per_s * np.arange(len(record)) * record.dt_s
     return way + float(np.mean(record.filled_displacement_um() - way))
@@ -53,7 +53,7 @@ def _pump_share_um(record: records.Record, model: loop_model.PlantModel) -> reco
 def draw_weather(
     path: Path, record: records.Record, model: loop_model.PlantModel, weather: disturbance.DisturbanceModel
 ) -> None:
-    """Spectrum of a quiet hold's readings without the pump's share, and the fitted parts."""
+    """Draw the spectrum of a quiet hold's readings less the pump's response, and the fitted parts."""
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.subplots()
     x = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
@@ -61,10 +61,10 @@ def draw_weather(
     frequency_hz, power = welch(np.diff(rest), 1 / record.dt_s, nperseg=round(_SEGMENT_S / record.dt_s))
     w: records.Series = 2 * np.pi * frequency_hz[1:]
     back = 1 / np.abs(1 - np.exp(-1j * w * record.dt_s)) ** 2  # from increments to readings
-    axes.loglog(frequency_hz[1:], power[1:] * back, linewidth=0.7, color="tab:gray", label="readings less the pump")
+    axes.loglog(frequency_hz[1:], power[1:] * back, linewidth=0.7, color="tab:gray", label="readings less pump")
     blind = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
-    axes.loglog(frequency_hz[1:], 2 * weather.psd(w, model, blind), label="movement, fitted")  # one-sided
-    axes.loglog(frequency_hz[1:], 2 * weather.rest.moving_psd(w), label="movement that no weather sensor explains")
+    axes.loglog(frequency_hz[1:], 2 * weather.psd(w, model, blind), label="fitted motion")  # one-sided
+    axes.loglog(frequency_hz[1:], 2 * weather.rest.moving_psd(w), label="motion not explained by weather sensors")
     axes.axhline(2 * weather.rest.white_psd, color="tab:red", linestyle="--", label="laser noise")
     axes.set(xlabel="frequency (Hz)", ylabel="um^2/Hz", ylim=(1e-4 * weather.rest.white_psd, None))
     axes.legend(loc="best")
@@ -72,7 +72,7 @@ def draw_weather(
 
 
 def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt_s: float) -> None:
-    """All candidates: predicted standard deviation, sensitivity peak, load peak, pump activity, and |S|."""
+    """Draw all candidates: predicted standard deviation, sensitivity peak, load peak, pump activity, |S|."""
     sound = [(row, row.predicted) for row in design.candidates if row.predicted is not None]
     rows, names = [row for row, _ in sound], [row.name for row, _ in sound]
     stds, flows = ([getattr(p, name) for _, p in sound] for name in ("std_um", "flow_std_um_per_s"))
@@ -105,7 +105,7 @@ def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt
 def draw_verification(
     path: Path, before: records.Record, after: records.Record | None, model: loop_model.PlantModel, done: Verified
 ) -> None:
-    """Spectra of the readings before and after, and how the trial grew or shrank stage by stage."""
+    """Draw the readings' spectra before and after, and the ratio of standard deviations per stage."""
     figure = Figure(figsize=(11, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2)
     dt_s = before.dt_s
@@ -122,7 +122,7 @@ def draw_verification(
     times = [stage.time_s for stage in done.stages]
     right.plot(times, [stage.growth for stage in done.stages], "o-", label="std relative to the previous gains")
     right.plot(times, [stage.growth_max for stage in done.stages], "r--", label="limit")
-    right.set(xlabel="time (s)", title="kept" if done.kept else f"taken back: {done.reason}"[:90])
+    right.set(xlabel="time (s)", title="kept" if done.kept else f"reverted: {done.reason}"[:90])
     right.title.set_fontsize(8)
     right.legend(loc="best")
     _save(path, figure)
@@ -140,7 +140,7 @@ _STYLE = (
 
 
 def write_report(folder: SessionFolder) -> Path:
-    """Draw what there is and put it together; returns `report.html`."""
+    """Draw the finished steps, write `report.html` and return its path."""
     draw(folder)
     head = folder.head
     done = [step for step in STEPS if folder.done(step)]
@@ -160,7 +160,7 @@ def write_report(folder: SessionFolder) -> Path:
 
 
 def draw(folder: SessionFolder) -> None:
-    """Renew the pictures of all steps that are done."""
+    """Redraw the pictures of all finished steps."""
     if folder.done("characterise"):
         found = session.found_of(folder).identified if folder.done("identify") else None
         draw_experiments(folder.file("experiments.png"), session.experiments_of(folder).record, found)
@@ -220,7 +220,7 @@ def _designed(folder: SessionFolder) -> list[str]:
         _table(cells[0], cells[2:]),
         _image(folder, "candidates.png"),
         f"<p>Proposed: K {gains.loop.kp_per_s:.3f} 1/s, Ti {gains.loop.ti_s:.2f} s, filter "
-        f"{gains.loop.measurement_filter_s:.2f} s; {gains.predicted_std_um:.3f} um predicted, the least possible is "
+        f"{gains.loop.measurement_filter_s:.2f} s; {gains.predicted_std_um:.3f} um predicted, lower bound "
         f"{gains.least_std_um:.3f} um. Over plants drawn from the fit: Ms {design.robustness.ms_p95:.2f}, std "
         f"{design.robustness.std_p95_um:.3f} um at 95 %, {design.robustness.stable_fraction:.0%} stable.</p>",
     ]
@@ -239,13 +239,13 @@ def _verified(folder: SessionFolder) -> list[str]:
     if not folder.done("verify"):
         return []
     done = session.verified_of(folder)
-    words = "kept" if done.kept else f"taken back: {done.reason}"
-    seen = [f"{s.ms:.2f}" if math.isfinite(s.ms) else "too short to say" for s in done.stages]
+    words = "kept" if done.kept else f"reverted: {done.reason}"
+    seen = [f"{s.ms:.2f}" if math.isfinite(s.ms) else "record too short" for s in done.stages]
     rows = [
         (f"{s.time_s:.0f} s", f"{s.std_um:.3f}", f"{s.before_um:.3f}", f"{s.growth:.2f}", ms, s.reason)
         for s, ms in zip(done.stages, seen, strict=True)
     ]
-    heads = ("after", "std um", "previous um", "ratio", "sensitivity seen", "")
+    heads = ("after", "std um", "previous um", "ratio", "observed sensitivity", "")
     return [
         f"<h2>Verification</h2><p class={'ok' if done.kept else 'refused'}>{html.escape(words)}</p>",
         _table(heads, rows),
@@ -267,11 +267,11 @@ def _image(folder: SessionFolder, name: str) -> str:
     return f'<img alt="{path.stem}" src="data:image/png;base64,{data}">'
 
 
-# The recording has a blueprint of its own: experiment and fit, candidates, before and after.
+# The recording's blueprint: experiment and fit, candidates, before and after.
 
 
 def write_recording(folder: SessionFolder) -> None:
-    """Write `session.rrd` of what is done so far."""
+    """Write `session.rrd` with the steps done so far."""
     stream = rr.RecordingStream("membrane_ctrl_tune", recording_id=folder.path.name)
     path = folder.file("session.rrd")
     path.unlink(missing_ok=True)
@@ -324,7 +324,7 @@ def _blueprint() -> rrb.Blueprint:
 
     experiment = rrb.Vertical(
         plot("Flow, um/s", "experiment/flow_um_per_s"),
-        plot("Centre and the pump's share of it, um", "experiment/displacement_um", "fit/pump_share_um"),
+        plot("Centre and its response to the pump, um", "experiment/displacement_um", "fit/pump_share_um"),
         plot("Residual, um", "residual/prediction_error_um"),
         name="Experiment and fit",
     )

@@ -1,4 +1,4 @@
-"""A bench under the tuner's hand: holds and experiments on one loop, without a bump between them, each a record."""
+"""A bench under the tuner's control: bumpless holds and experiments on one loop, each of which gives a record."""
 
 import math
 from collections import deque
@@ -17,15 +17,15 @@ from tuning.identification.records import Record, Series
 
 
 class DrivenBench(Protocol):
-    """What a rig drives: the twin, a fitted model, or a live hold in its `tune` state."""
+    """The bench a rig drives: the twin, a fitted model, or a live hold in its `tune` state."""
 
     def exchange(self, pump_fraction: float, vent_fraction: float) -> machine.BenchSample:
-        """Put out the commands, wait for the next tick, and return its reading."""
+        """Write the commands, wait for the next tick and return its reading."""
         ...
 
 
 class Rig:
-    """One loop on one bench, in ticks; it begins with the flow `leak_um_per_s`."""
+    """One loop on one bench, tick by tick; it starts with the flow `leak_um_per_s`."""
 
     def __init__(self, bench: DrivenBench, loop: LoopConfig, pump: PumpConfig, leak_um_per_s: float) -> None:
         self._bench = bench
@@ -37,7 +37,7 @@ class Rig:
         self._loop.start(self._last.displacement_um, leak_um_per_s)
 
     def set_gains(self, loop: LoopConfig) -> None:
-        """Bumpless."""
+        """Change the gains without a bump."""
         self._config = loop
         self._loop.set_gains(loop)
 
@@ -53,13 +53,13 @@ class Rig:
         return Record.from_samples(self.dt_s, flows, samples)
 
     def perform(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished]:
-        """Run an experiment about 0 until it says that it is finished; the loop may hold from there on."""
+        """Run an experiment about 0 until it finishes; the loop can hold afterwards."""
         return self._run(trial.Trial(spec, self._config, self._pump, 0.0), spec.holding_flow_um_per_s)
 
     def run(
         self, experiment: machine.Experiment, around: machine.Around, centre_um: float
     ) -> tuple[Record, machine.Finished]:
-        """The same for an experiment of one's own, inside the guard."""
+        """Run a custom experiment inside the guard."""
         guard = machine.ExcursionGuard(experiment, around, centre_um, 1 / self.dt_s)
         return self._run(guard, around.holding_flow_um_per_s)
 
@@ -77,7 +77,7 @@ class Rig:
             self._last = self._bench.exchange(out.pump_fraction, self._config.bleed_fraction)
 
     def around(self, held: Record, limit_um: float = 10.0) -> machine.Around:
-        """The frame of an experiment, from a hold before it."""
+        """Operating point of an experiment, from the hold before it."""
         return around_of(held, self._config, self._pump, limit_um)
 
     def _given(self, target_um: float) -> inner_loop.LoopInput:
@@ -88,7 +88,7 @@ class Rig:
 
 
 def around_of(held: Record, loop: LoopConfig, pump: PumpConfig, limit_um: float) -> machine.Around:
-    """The frame of an experiment: what a hold before it shows, and the pump's range."""
+    """Operating point of an experiment, from the hold before it and the pump's range."""
     return machine.Around(
         holding_flow_um_per_s=float(held.flow_um_per_s.mean()),
         least_flow_um_per_s=gas.PumpCurve(pump).least_flow_um_per_s,
@@ -99,9 +99,9 @@ def around_of(held: Record, loop: LoopConfig, pump: PumpConfig, limit_um: float)
 
 
 def laser_noise_um(record: Record) -> float:
-    """Standard deviation of a reading: of two in a row, over sqrt(2), for the mirror hardly moves in a tick.
+    """Standard deviation of a reading, from differences of successive readings: the mirror hardly moves in a tick.
 
-    A median, so that a jump does not count. Raises ValueError without two readings.
+    Uses the median, so that jumps do not count. Raises ValueError for fewer than two readings.
     """
     steps_um = np.diff(record.displacement_um[np.isfinite(record.displacement_um)])
     if steps_um.size == 0:
@@ -109,33 +109,33 @@ def laser_noise_um(record: Record) -> float:
     return float(np.median(np.abs(steps_um)) / 0.6745 / math.sqrt(2))
 
 
-# A running hold under the tuner's hand: the supervisor stays in charge, its ticks are the record.
+# A running hold under the tuner's control: the supervisor stays in charge; its ticks are the record.
 #
-# Records that follow each other have no gap: each begins with the tick after the last one taken, so that what a
-# session did in between (a fit takes a second) is in the next record and not lost.
+# Successive records have no gap: each starts with the tick after the last one taken, so that what happens
+# in between (a fit takes a second) is in the next record and not lost.
 
-Progress = Callable[[float], None]  # seconds of the hold that have been recorded since the last call
+Progress = Callable[[float], None]  # seconds of hold recorded since the last call
 _HELD = frozenset({states.State.HOLD, states.State.TUNE})
-_ANSWER_TICKS = 500  # until the state changes after a command was obeyed: 10 s at 50 Hz
+_ANSWER_TICKS = 500  # for the state to change after a command: 10 s at 50 Hz
 
 
 class HoldRig:
-    """Holds, experiments and gains on a hold that somebody else runs; `who` is recorded with every command."""
+    """Runs holds and experiments and sets gains on a running hold; every command is recorded with `who`."""
 
     def __init__(self, link: HoldLink, who: str, progress: Progress = lambda seconds: None) -> None:
         self._link, self._who, self._progress = link, who, progress
         self._rows: deque[telemetry.TelemetryRow] = deque()
         self._events: deque[events.Event] = deque()
-        self.loop = link.config.loop  # with the gains as they were last set
+        self.loop = link.config.loop  # with the gains last set
         self.dt_s = 1 / self.loop.rate_hz
         self.shapes: list[shape_estimate.ShapeEstimate] = []  # all so far
 
     def hold(self, duration_s: float) -> Record:
-        """The next seconds of hold. Raises HoldError if the mirror is not held throughout."""
+        """Record the next seconds of hold. Raises HoldError if the mirror is not held throughout."""
         return self.record([self._next_held() for _ in range(round(duration_s / self.dt_s))])
 
     def hold_about(self, duration_s: float) -> tuple[Record, Series]:
-        """As `hold`, with the setpoint of each sample in um: the shape loop moves it, and the mirror with it."""
+        """As `hold`, with each sample's setpoint in um, because the shape loop moves setpoint and mirror."""
         rows = [self._next_held() for _ in range(round(duration_s / self.dt_s))]
         record = self.record(rows)
         ticks = np.array([row.tick + row.missed_ticks for row in rows])
@@ -143,18 +143,18 @@ class HoldRig:
         return record, setpoints
 
     def around(self, held: Record, limit_um: float = 10.0) -> machine.Around:
-        """The frame of an experiment, from a hold before it."""
+        """Operating point of an experiment, from the hold before it."""
         return around_of(held, self.loop, self._link.config.pump, limit_um)
 
     def perform(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished]:
-        """Let the controller run an experiment; the record ends with the tick that gave the mirror back.
+        """Let the controller run an experiment; the record ends with the tick that returns to hold.
 
-        Raises HoldError if it is refused, or ends in another state than hold.
+        Raises HoldError if the experiment is refused or ends in a state other than hold.
         """
         return self.performed(spec)[:2]
 
     def performed(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished, events.ExperimentEnded]:
-        """As `perform`, with the event that tells its end (and the pump map's figures)."""
+        """As `perform`, also returning the event at its end (with the pump map's figures)."""
         self._events.clear()
         self._link.ask(Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec))
         rows: list[telemetry.TelemetryRow] = []
@@ -168,12 +168,12 @@ class HoldRig:
         return self.record(rows), machine.Finished(told.completed, told.reason), told
 
     def set_gains(self, loop: LoopConfig, why: str = "tuning session", trial_s: float = math.nan) -> None:
-        """Bumpless. On trial for a time, the hold goes back by itself without `keep`."""
+        """Set gains without a bump; on trial, the hold restores the old ones unless `keep` follows."""
         self._link.ask(Command("gains", self._who, why, value=trial_s, loop=loop))
         self.loop = loop
 
     def keep(self) -> None:
-        """The gains on trial are good."""
+        """Keep the gains that are on trial."""
         self._link.ask(Command("keep", self._who, "verified"))
 
     def setpoint(self, setpoint_um: float, why: str) -> None:
@@ -185,7 +185,7 @@ class HoldRig:
         self._link.ask(Command("shape_on" if on else "shape_off", self._who, why))
 
     def go_back(self, loop: LoopConfig) -> None:
-        """End an experiment that may be running, and set the last good gains."""
+        """End any running experiment and set the last good gains."""
         self._take()
         if self._rows and self._rows[-1].state == states.State.TUNE:
             self._link.ask(Command("hold", self._who, "tuning session interrupted"))
@@ -193,7 +193,7 @@ class HoldRig:
             self.set_gains(loop, "back to the last good gains")
 
     def record(self, rows: Sequence[telemetry.TelemetryRow]) -> Record:
-        """Ticks as an even record; one that was skipped has no reading and the flow before it."""
+        """Return ticks as an evenly sampled record; a skipped tick has no reading and keeps the flow."""
         flows: list[float] = []
         samples: list[machine.BenchSample] = []
         flow = next((row.flow_um_per_s for row in rows if math.isfinite(row.flow_um_per_s)), 0.0)
@@ -228,7 +228,7 @@ class HoldRig:
         self.shapes += news.shapes
 
     def _experiment_ended(self) -> events.ExperimentEnded:
-        """The newest of its kind; it may come a moment after its tick."""
+        """Return the newest end event, which may come a moment after its tick."""
         for _ in range(20):
             found = [event for event in self._events if isinstance(event, events.ExperimentEnded)]
             if found:

@@ -1,4 +1,4 @@
-"""The steps of a session, each a function that reads from and writes to the session's folder.
+"""The steps of a session. Each is a function that reads and writes the session's folder.
 
 Steps that move the mirror take a `HoldRig`; the others run anywhere, at any later time.
 """
@@ -22,14 +22,14 @@ from tuning.rig import HoldRig
 
 OBSERVE_S = 600.0
 _PREVIEW_SEEDS = 3
-# Time to look at what was applied and to start the verification; then the gains revert by themselves.
+# Time to check the applied gains and start the verification; then they revert automatically.
 _APPLY_S = 900.0
 _SPARE_S = 120.0
 
 
 @dataclass(frozen=True, slots=True)
 class ExperimentsHead:
-    """`experiments.json`: what `characterise.Experiments` holds beside its record."""
+    """`experiments.json`: the contents of `characterise.Experiments` except its record."""
 
     around: machine.Around
     relays_s: float
@@ -58,7 +58,7 @@ class Design:
 
 @dataclass(frozen=True, slots=True)
 class Previewed:
-    """`preview.json`: the present gains and the proposed ones on the fitted twin, a seed a row."""
+    """`preview.json`: present and proposed gains on the fitted twin, one row per seed."""
 
     present: tuple[design.Preview, ...]
     proposed: tuple[design.Preview, ...]
@@ -78,7 +78,7 @@ class Verified:
 def characterise_step(
     session: folder.SessionFolder, rig: HoldRig, limit_um: float = 10.0
 ) -> characterise.Experiments:
-    """Experiments on the mirror. Raises RejectedError naming what would help if none could be completed."""
+    """Run the experiments on the mirror. Raises RejectedError with a remedy if none completes."""
     session.begin("characterise")
     try:
         done = characterise.experiment(rig, limit_um)
@@ -91,14 +91,14 @@ def characterise_step(
 
 
 def experiments_of(session: folder.SessionFolder) -> characterise.Experiments:
-    """What the experiments left."""
+    """Results of the experiments."""
     head = session.result("characterise", "experiments.json", ExperimentsHead)
     record = records.load_record(session.file("experiments.npz"))
     return characterise.Experiments(head.around, record, head.relays_s, head.pulses_s, head.finished)
 
 
 def identify_step(session: folder.SessionFolder) -> IdentifiedPlant:
-    """Fit and verdict; a refused one is kept too, for the report."""
+    """Fit the model and judge it; a refused fit is kept too, for the report."""
     done = experiments_of(session)
     session.begin("identify")
     try:
@@ -111,17 +111,17 @@ def identify_step(session: folder.SessionFolder) -> IdentifiedPlant:
 
 
 def found_of(session: folder.SessionFolder) -> IdentifiedPlant:
-    """What was identified. Raises InputError as well if that was from other data."""
+    """The identified plant. Raises InputError also if it comes from other data."""
     found = session.result("identify", "identified.json", IdentifiedPlant)
     record = experiments_of(session).record
     steps = len(record) - 1
     if found.data_sha256 != record.sha256() or found.identified.residual_um.shape != (steps,):
-        raise errors.InputError(f"{session.path}: identified.json is of other experiments; run identify again")
+        raise errors.InputError(f"{session.path}: identified.json comes from other experiments; run identify again")
     return found
 
 
 def observe_step(session: folder.SessionFolder, rig: HoldRig, duration_s: float = OBSERVE_S) -> DisturbanceModel:
-    """A quiet hold: the laser's noise and the weather."""
+    """Observe a quiet hold: laser noise and weather."""
     model = found_of(session).identified.model
     session.begin("observe")
     record = rig.hold(duration_s)
@@ -135,12 +135,12 @@ def observe_step(session: folder.SessionFolder, rig: HoldRig, duration_s: float 
 
 
 def disturbance_of(session: folder.SessionFolder) -> DisturbanceModel:
-    """What was observed."""
+    """The observed disturbance."""
     return session.result("observe", "disturbance.json", DisturbanceModel)
 
 
 def design_step(session: folder.SessionFolder, reason: str = "tuning session") -> GainsFile:
-    """Candidates and the proposed gains. Raises RejectedError if the data do not carry a proposal."""
+    """Compute the candidates and propose gains. Raises RejectedError if the data do not support a proposal."""
     found, disturbance = found_of(session), disturbance_of(session)
     session.begin("design")
     before = session.head.before
@@ -150,7 +150,7 @@ def design_step(session: folder.SessionFolder, reason: str = "tuning session") -
         raise errors.RejectedError(f"design: {error}") from None
     assert made.chosen.predicted is not None  # a proposal keeps its margins
     if not math.isfinite(made.chosen.predicted.std_um + made.least_std_um):
-        raise errors.RejectedError("design: no std can be predicted from this noise and weather: observe again")
+        raise errors.RejectedError("design: cannot predict a std from this noise and weather: observe again")
     gains = GainsFile(
         author=session.head.author,
         date_utc=session.head.created_utc,
@@ -175,7 +175,7 @@ def design_of(session: folder.SessionFolder) -> Design:
 
 
 def preview_step(session: folder.SessionFolder) -> Previewed:
-    """Present and proposed gains on the fitted twin with its one-sided pump, over some seeds of weather."""
+    """Simulate present and proposed gains on the fitted twin with its one-sided pump, for several weather seeds."""
     session.require("design")
     found, disturbance = found_of(session), disturbance_of(session)
     gains = load_gains(session.file("gains.toml"))
@@ -191,12 +191,12 @@ def preview_step(session: folder.SessionFolder) -> Previewed:
 
 
 def preview_of(session: folder.SessionFolder) -> Previewed:
-    """What the preview showed."""
+    """Result of the preview."""
     return session.result("preview", "preview.json", Previewed)
 
 
 def pump_of(session: folder.SessionFolder) -> schema.PumpConfig:
-    """The pump as mapped in this session, or as configured."""
+    """The pump as mapped in this session, else as configured."""
     path = session.file("pump.toml")
     return config_file.load(path, schema.PumpConfig) if path.exists() else session.config.pump
 
@@ -211,7 +211,7 @@ def checked_gains(session: folder.SessionFolder) -> schema.LoopConfig:
 
 
 def apply_step(session: folder.SessionFolder, rig: HoldRig) -> schema.LoopConfig:
-    """Set the gains, on trial: without `verify` they revert by themselves."""
+    """Set the gains on trial; without `verify` they revert automatically."""
     loop = checked_gains(session)
     session.begin("apply")
     rig.set_gains(loop, f"session {session.path.name}", _APPLY_S)
@@ -225,7 +225,7 @@ def verify_step(
     told: Callable[[verify.Stage], None] = lambda stage: None,
     stages: tuple[tuple[float, float], ...] = verify.STAGES,
 ) -> Verified:
-    """Hold with the new gains and judge in stages; they are kept, or the old ones are set again at once."""
+    """Hold with the new gains and judge them in stages; keep them, or restore the old ones at once."""
     session.require("apply")
     after, before = checked_gains(session), session.head.before
     session.begin("verify")
@@ -261,7 +261,7 @@ def verify_step(
 
 
 def verified_of(session: folder.SessionFolder) -> Verified:
-    """How the verification ended."""
+    """Result of the verification."""
     return session.result("verify", "verified.json", Verified)
 
 

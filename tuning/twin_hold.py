@@ -1,4 +1,4 @@
-"""A hold of the twin in virtual time, for a session: the same controller, its safety table and its states."""
+"""A hold of the twin in virtual time for a session, with the same controller, safety table and states."""
 
 from collections.abc import Sequence
 
@@ -16,21 +16,21 @@ _HELD_WITHIN_S = 120.0
 
 
 class TwinHold:
-    """A `HoldLink`; time passes only while news is waited for.
+    """A `HoldLink`; time passes only while the caller waits for news.
 
     Parameters
     ----------
     config : Config
         As for a run.
     events : sequence of twin events
-        What happens to the bench.
+        Events applied to the bench.
 
     Attributes
     ----------
     bench : VirtualBench
-        For a test to turn its switches.
+        The bench, for tests to change.
     rows : list of TelemetryRow
-        Everything so far, with the truth in it.
+        All rows so far, including the truth.
     """
 
     name = "twin"
@@ -57,7 +57,7 @@ class TwinHold:
                 raise HoldError(f"the twin is not held within {_HELD_WITHIN_S:g} s; is its configuration sound?")
 
     def ask(self, command: Command) -> None:
-        """Run the tick that obeys it, or raises HoldError with the refusal."""
+        """Run the tick that executes the command. Raises HoldError if it is refused."""
         self._pending = (command,)
         answer = self._advance(1)
         self._early = _joined(self._early, answer)
@@ -66,7 +66,7 @@ class TwinHold:
                 raise HoldError(f"refused: {event.refused}")
 
     def news(self) -> News:
-        """Half a second of the twin's time."""
+        """Return half a second of twin time."""
         early, self._early = self._early, News((), (), ())
         return _joined(early, self._advance(round(_NEWS_S * self.config.loop.rate_hz)))
 

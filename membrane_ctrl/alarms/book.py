@@ -1,9 +1,9 @@
-"""The alarms that stand, and their notices. Time is passed in: no clock, no I/O.
+"""The standing alarms and their notices. Time is an argument: no clock, no I/O.
 
-An alarm is raised when its condition has stood for its time, escalated to more people when nobody acknowledges it,
-repeated as a reminder, and cleared when the condition has stayed away. A condition that returns within that time is
-the same alarm; a latched fault is always a new one. Several conditions under one name are one alarm: a full disk
-affects all files.
+An alarm is raised when its condition has persisted, escalated to more people if nobody acknowledges it, repeated as
+a reminder, and cleared when the condition has stayed away. A condition that returns sooner is the same alarm; a
+latched fault is always a new one. Several conditions under one name are one alarm: a full disk affects
+all files.
 """
 
 import math
@@ -15,26 +15,26 @@ from membrane_ctrl.model import events, run_events
 
 Severity = Literal["warning", "critical"]
 
-_GLITCH_S = 5.0  # a fault that only holds the flow for a few samples wakes nobody
+_GLITCH_S = 5.0  # a fault that only holds the flow for a few samples must not wake anyone
 _LIARS = {"laser": "the laser", "optics": "the camera"}
 
 
 @dataclass(frozen=True, slots=True)
 class Sign:
-    """One alarm's condition has come or gone."""
+    """The condition of an alarm has appeared or cleared."""
 
     name: str  # of the alarm
-    bad: bool  # True: the condition has come; False: it has gone
+    bad: bool  # True: the condition has appeared; False: it has cleared
     severity: Severity = "warning"
     text: str = ""
-    for_s: float = 0.0  # how long the condition must stand before anyone is told
-    # which of several conditions under one name; the alarm stands until all have gone. With `bad` False, "" means all
+    for_s: float = 0.0  # how long the condition must persist before a notice
+    # which of several conditions under one name; the alarm stands until all clear. With `bad` False, "" means all
     about: str = ""
-    anew: bool = False  # once all conditions have gone, the next one is a new alarm, however soon
+    anew: bool = False  # once all conditions have cleared, the next one is a new alarm, however soon
 
 
 def signs_of(event: events.Event) -> list[Sign]:
-    """The signs of an event; most have none."""
+    """Signs in an event; most have none."""
     match event:
         case events.Fault():
             text = f"{event.name}: {event.cause} ({event.seen}; {event.limit}); {event.remedy}"
@@ -61,17 +61,17 @@ def _signs_of_process(event: events.Event) -> list[Sign]:
         case run_events.Link():
             return [Sign("link", not event.up, "warning", event.message, _GLITCH_S)]
         case run_events.ChildEnded():
-            text = f"the {event.child} process ended with {event.exit_code}; the hold goes on"
+            text = f"the {event.child} process ended with {event.exit_code}; the hold continues"
             return [Sign(f"{event.child}_ended", True, "warning", text, _GLITCH_S)]
         case run_events.ChildSilent():
-            text = f"the {event.child} process does not answer; the hold goes on"
+            text = f"the {event.child} process does not answer; the hold continues"
             return [Sign(f"{event.child}_ended", True, "warning", text, _GLITCH_S)]
         case run_events.ChildGivenUp():
             text = f"the {event.child} process has ended too often and is not restarted for an hour; check the run"
             return [Sign(f"{event.child}_ended", True, "warning", text)]
         case run_events.ChildRestarted():
             ended = Sign(f"{event.child}_ended", False)
-            # another recorder knows nothing of the former's trouble, and says anew what still stands
+            # a new recorder knows nothing about its predecessor's problems and reports again those that remain
             return [ended, Sign("recorder", False)] if event.child == "recorder" else [ended]
         case run_events.RecorderError() | run_events.DiskLow():
             return [Sign("recorder", True, "warning", event.message, about=event.what)]
@@ -92,7 +92,7 @@ def _signs_of_process(event: events.Event) -> list[Sign]:
 
 
 def sign_of_value(rule: AlarmRule, value: float, standing: bool) -> Sign | None:
-    """The sign of a telemetry value for a rule whose condition was `standing`; None if nothing changes.
+    """Sign of a telemetry value for a rule whose condition was `standing`; None if nothing changes.
 
     NaN changes nothing: missing values are the safety table's task.
     """
@@ -116,21 +116,21 @@ NoticeKind = Literal["raised", "escalated", "reminder", "cleared"]
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """Something to tell people."""
+    """A notice to send."""
 
-    kind: NoticeKind  # what has happened to the alarm
+    kind: NoticeKind  # change of the alarm
     name: str  # of the alarm, as the next two
     severity: Severity
     text: str
-    escalated: bool = False  # also for those behind `escalation_urls_file`
+    escalated: bool = False  # also to the `escalation_urls_file`
 
 
 @dataclass(slots=True)
 class _Alarm:
-    sign: Sign  # what people are told
+    sign: Sign  # content of the notices
     since_s: float  # of the condition
-    standing: dict[str, Sign] = field(default_factory=dict)  # by what it is about, the oldest first
-    gone_s: float = math.inf  # since when it has stayed away
+    standing: dict[str, Sign] = field(default_factory=dict)  # by subject, oldest first
+    gone_s: float = math.inf  # when the last condition cleared
     told_s: float = math.inf
     reminded_s: float = math.inf
     escalated: bool = False
@@ -141,7 +141,7 @@ class _Alarm:
         return math.isfinite(self.told_s)
 
     def end(self, about: str) -> None:
-        """End one of its conditions, or all with ""; a reminder names one that still stands."""
+        """End one of its conditions, or all with ""; reminders name one that still stands."""
         if about:
             self.standing.pop(about, None)
         else:
@@ -175,7 +175,7 @@ class AlarmBook:
                 return
             if alarm.told:
                 alarm.gone_s = min(alarm.gone_s, now_s)
-            else:  # gone before anyone was told
+            else:  # cleared before any notice
                 del self._alarms[sign.name]
             return
         alarm.gone_s = math.inf
@@ -189,7 +189,7 @@ class AlarmBook:
             alarm.acknowledged |= alarm.told
 
     def step(self, now_s: float) -> list[Notice]:
-        """The notices that are due."""
+        """Return the due notices."""
         notices: list[Notice] = []
         for name, alarm in list(self._alarms.items()):
             kind = self._due(alarm, now_s)

@@ -1,4 +1,4 @@
-"""The process that tells people: mail servers may take a minute, and nothing of the run waits for them."""
+"""The process that sends alarms: mail servers may take a minute, and the run does not wait for them."""
 
 import json
 import time
@@ -16,12 +16,12 @@ from membrane_ctrl.model.events import CommandTaken, Event, EventLine, StateEnte
 from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.processes import child, ring
 
-# before its first tick a run connects its devices, with patience of its own
+# before its first tick a run connects its devices, with time-outs of its own
 _STARTS_S = 30.0
 
 
 class Watcher:
-    """Turns what the rings hold into notices; of the outboxes the first gets all, the second the escalated ones."""
+    """Turns ring messages into notices; the first outbox gets all of them, the second only the escalated ones."""
 
     def __init__(self, config: AlarmsConfig, outboxes: Sequence[Outbox], now_s: float) -> None:
         self._config = config
@@ -32,11 +32,11 @@ class Watcher:
 
     @property
     def ended(self) -> bool:
-        """The event that ends a run has come."""
+        """The "end" event has arrived."""
         return self._status.ended
 
     def look(self, rows: Sequence[bytes], events: Sequence[bytes], now_s: float) -> None:
-        """Take rows and events, and send what is due."""
+        """Take rows and events, and send due notices."""
         for message in events:
             self._take_event(json.loads(message), now_s)
         for row in rows:
@@ -45,7 +45,7 @@ class Watcher:
         self._send(now_s)
 
     def orphaned(self, now_s: float) -> None:
-        """The control process is gone without an "end" event."""
+        """Report that the control process ended without an "end" event."""
         text = "the control process ended without a report; the board's watchdog has stopped the pump"
         self._book.take(Sign("control_gone", True, "critical", text), now_s)
         self._send(now_s)
@@ -56,9 +56,9 @@ class Watcher:
         fault = self._status.fault
         match event:
             case StateEntered(state="fault") if fault is not None and not fault.latching:
-                event = replace(fault, latching=True)  # held on the mean flow for too long, it has latched
+                event = replace(fault, latching=True)  # latched after too long on the mean flow
             case run_events.AlarmsAcknowledged() | CommandTaken(command="ack"):
-                self._book.acknowledge()  # whoever asks for `ack` has seen it, whether it is obeyed or not
+                self._book.acknowledge()  # whoever sends `ack` has seen the alarms, even if the hold refuses it
         for sign in signs_of(event):
             self._book.take(sign, now_s)
 
@@ -86,16 +86,16 @@ class Watcher:
 
 
 _LOOK_S = 0.5
-# After the run's end, for the last notices; a longer one would keep a service manager from restarting
+# After the run's end, for the last notices; longer would delay a service manager's restart
 _LAST_S = 8.0
 _SENDING_S = 300.0  # a list of mail servers, each with a minute of time-out
 _TO = ("urls_file", "escalation_urls_file")  # of the configuration, in the order of the senders
-_IDLE_S = 15.0  # with nothing to send; who hangs then would not tell anybody anything
+_IDLE_S = 15.0  # with nothing to send; a process that hangs then could not send an alarm
 
 
 @dataclass(frozen=True, slots=True)
 class AlarmsSpec:
-    """What the process needs to know of the run."""
+    """What the process needs to know about the run."""
 
     clock: RunClock
     telemetry: ring.RingAddress
@@ -105,9 +105,9 @@ class AlarmsSpec:
 
 
 def alarms_main(spec: AlarmsSpec, status: Any) -> None:
-    """Watch until the run ends, or the control process is gone.
+    """Watch until the run ends or the control process has gone.
 
-    Target of a `spawn`ed process; `status` is its end of a pipe, for events about what it has sent.
+    Target of a `spawn`ed process; `status` is its end of a pipe, for events about sent notices.
     """
     child.leave_at_stop()
     watch(spec, apprise_senders(spec.config, spec.run), child.reporter(status), child.parent_lives)
@@ -116,13 +116,13 @@ def alarms_main(spec: AlarmsSpec, status: Any) -> None:
 def watch(
     spec: AlarmsSpec, senders: Sequence[Send], report: Callable[[Event], None], parent_lives: Callable[[], bool]
 ) -> None:
-    """The process's loop; `senders` are those of all notices, and of the escalated ones."""
+    """Run the process's loop; `senders` are the one for all notices and the one for escalated ones."""
     clock = spec.clock
     outboxes = [Outbox(_reporting(send, to, report)) for send, to in zip(senders, _TO, strict=False)]
     watcher = Watcher(spec.config, outboxes, clock.now())
     with closing(ring.RingReader(spec.telemetry)) as telemetry, closing(ring.RingReader(spec.events)) as events:
         while True:
-            lives = parent_lives()  # before the rings: who ends puts the last word in first
+            lives = parent_lives()  # before the rings: a dying parent has written its last message first
             report(run_events.Alive(_SENDING_S))
             watcher.look(telemetry.drain(), events.drain(), clock.now())
             if watcher.ended or not lives:

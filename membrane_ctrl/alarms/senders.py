@@ -1,4 +1,4 @@
-"""Notices by Apprise: mail, chat, web hook and a hundred more, each an URL (https://appriseit.com)."""
+"""Notices through Apprise: mail, chat, web hook and many more, each a URL (https://appriseit.com)."""
 
 import importlib
 import importlib.util
@@ -17,14 +17,14 @@ from membrane_ctrl.model import clock, errors, files
 Send = Callable[[Notice], bool]
 
 _AGAIN_S, _AGAIN_MOST_S = 10.0, 300.0
-# a day without network must not end in a thousand mails
+# a day without a network must not end in a thousand mails
 _KEPT = 50
 
 
 class Outbox:
     """A queue of notices, each tried until it is sent; a full box drops the oldest, which `dropped` counts.
 
-    `send` returns whether the notice was sent; it may take its time and must not raise.
+    `send` returns whether the notice was sent; it may be slow but must not raise.
     """
 
     def __init__(self, send: Send) -> None:
@@ -40,7 +40,7 @@ class Outbox:
         return self._failures > 0
 
     def post(self, notice: Notice) -> None:
-        """Add a notice."""
+        """Queue a notice."""
         self._waiting.append(notice)
         if len(self._waiting) > _KEPT:
             self._waiting.popleft()
@@ -52,7 +52,7 @@ class Outbox:
         return not self._waiting
 
     def step(self, now_s: float) -> None:
-        """Send what waits, oldest first, unless the last failure is too recent."""
+        """Send queued notices, oldest first, unless the last failure is too recent."""
         if now_s < self._due_s:
             return
         while self._waiting:
@@ -69,7 +69,7 @@ _TYPES = {"raised": "", "escalated": "failure", "reminder": "", "cleared": "succ
 
 
 def read_urls(path: Path) -> list[str]:
-    """The URLs of a file, one a line; empty lines and comments (`#`) are ignored. Raises InputError."""
+    """Read the URLs of a file, one per line, ignoring empty lines and comments (`#`). Raises InputError."""
     try:
         lines = files.read_text(path, follow=True).splitlines()
     except OSError as error:
@@ -78,7 +78,7 @@ def read_urls(path: Path) -> list[str]:
         raise errors.InputError(f"alarms: {path}: {error}") from None
     urls = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not urls:
-        raise errors.InputError(f"{path}: no URL in it; one a line, e.g. mailto://user:password@example.org")
+        raise errors.InputError(f"{path}: no URL found; write one per line, e.g. mailto://user:password@example.org")
     return urls
 
 
@@ -94,8 +94,8 @@ def require_sendable(config: port.AlarmsConfig) -> None:
 def apprise_senders(config: port.AlarmsConfig, run: str) -> list[Send]:
     """One sender for `urls_file`, one for `escalation_urls_file` if it is set; every notice names the run.
 
-    Raises DeviceError without Apprise, InputError for a bad file or URL, which is named by its line, as it may hold a
-    password.
+    Raises DeviceError without Apprise, InputError for a bad file or URL. The error gives only the URL's line: it may
+    hold a password.
     """
     apprise = _apprise()
     assert config.urls_file is not None
@@ -110,12 +110,12 @@ def _send(targets: Sequence[Any], run: str, notice: Notice) -> bool:
 
 
 def _notify(targets: Sequence[Any], title: str, body: str, kind: str) -> bool:
-    """Notify every target; one success is enough: a dead chat server must not repeat the mail for ever."""
+    """Notify every target; one success suffices: a dead chat server must not repeat the mail forever."""
     sent = []
     for target in targets:
         try:
             sent.append(bool(target.notify(title=title, body=body, notify_type=kind)))
-        except Exception as error:  # a plug-in's own trouble
+        except Exception as error:  # plug-ins raise anything
             logging.getLogger(__name__).warning("%s: %s", type(target).__name__, type(error).__name__)
             sent.append(False)
     return any(sent)
@@ -126,7 +126,7 @@ def _plugins(apprise: Any, path: Path) -> list[Any]:
     for number, url in enumerate(read_urls(path), start=1):
         plugin = apprise.Apprise.instantiate(url)
         if plugin is None:
-            raise errors.InputError(f"{path}: URL {number} is not known to Apprise")
+            raise errors.InputError(f"{path}: URL {number}: Apprise does not support it")
         plugins.append(plugin)
     return plugins
 
@@ -139,16 +139,16 @@ def _apprise() -> Any:
 
 
 def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json: bool) -> int:
-    """`alarm test`: send one notice to the addresses of the alarms, with `escalated` also to those of the escalation.
+    """`alarm test`: send one notice to the alarm addresses, and with `escalated` to the escalation addresses.
 
     Raises InputError without addresses, DeviceError if no service accepts it.
     """
     alarms = config.alarms
     if alarms.urls_file is None:
-        raise errors.InputError(f"{source}: alarms.urls_file: missing; name a file with one Apprise URL a line")
+        raise errors.InputError(f"{source}: alarms.urls_file: missing; name a file with one Apprise URL per line")
     if escalated and alarms.escalation_urls_file is None:
-        raise errors.InputError(f"{source}: alarms.escalation_urls_file: missing; there is nobody to escalate to")
-    notice = Notice("raised", "test", "warning", "this is a test; nothing is wrong", escalated)
+        raise errors.InputError(f"{source}: alarms.escalation_urls_file: missing; no escalation addresses")
+    notice = Notice("raised", "test", "warning", "this is only a test", escalated)
     senders = apprise_senders(alarms, "none, a test")
     lists = [alarms.urls_file, alarms.escalation_urls_file][: 2 if escalated else 1]
     deaf = [file for file, send in zip(lists, senders, strict=False) if not send(notice)]

@@ -1,4 +1,4 @@
-"""The command line: one thin function a command; errors end in one line and an exit code (INTERFACES section 4)."""
+"""The command line: one thin function per command; errors end in one line and an exit code (docs/interfaces.md)."""
 
 import sys
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run one command and return its exit code; an expected failure is a line on stderr, a finding each its own."""
+    """Run one command and return its exit code; print an expected failure on stderr, one line per finding."""
     with terminal.only_text():
         try:
             result = app(list(arguments), prog_name="membrane-ctrl", standalone_mode=False)
@@ -26,7 +26,7 @@ def run(arguments: Sequence[str]) -> int:
         except typer.TyperException as error:
             print(f"membrane-ctrl: {terminal.one_line(error.format_message())} (see --help)", file=sys.stderr)
             return errors.Exit.BAD_INPUT
-        except OSError as error:  # of a file that its command did not foresee; better said in its place
+        except OSError as error:  # a file error that the command itself should have caught
             print(f"membrane-ctrl: {terminal.one_line(_file_trouble(error))}", file=sys.stderr)
             return errors.Exit.DEVICE_FAILED
         except (KeyboardInterrupt, typer.Abort):
@@ -37,7 +37,7 @@ def run(arguments: Sequence[str]) -> int:
 
 def _file_trouble(error: OSError) -> str:
     where = error.filename or "a file or connection"
-    return f"{where}: {errors.os_reason(error)}; check that it is there, its permissions and the space on its disk"
+    return f"{where}: {errors.os_reason(error)}; check that it exists, its permissions and the free disk space"
 
 
 @app.callback(invoke_without_command=True)
@@ -50,6 +50,6 @@ def top(version: Annotated[bool, typer.Option("--version", help="Print the versi
 
 for _family in (holding, optics, calibrating, records, reviewing):
     _family.add_commands(app)
-# tuning builds on this package, not the reverse: `tune` comes as an entry point
+# tuning imports this package, not the reverse: `tune` is an entry point
 for _entry in entry_points(group="membrane_ctrl.subcommands"):
     app.add_typer(_entry.load(), name=_entry.name)

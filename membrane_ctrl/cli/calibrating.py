@@ -9,7 +9,7 @@ from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, 
 from membrane_ctrl.model.errors import InputError
 
 BoardOption = Annotated[
-    str, typer.Option(help="Board as KIND:COLUMNSxROWS of squares; KIND is charuco or chessboard.")
+    str, typer.Option(help="Board, as KIND:COLUMNSxROWS in squares; KIND is charuco or chessboard.")
 ]
 
 
@@ -22,10 +22,10 @@ def add_auxiliary_commands(app: typer.Typer) -> None:
 
 
 def calibrate_board(
-    out: Annotated[Path, typer.Argument(metavar="PICTURE", help="PNG file, to be shown pixel for pixel.")],
+    out: Annotated[Path, typer.Argument(metavar="PICTURE", help="PNG file to write; display it pixel for pixel.")],
     width_px: Annotated[int, typer.Option(min=64, help="Width of the screen, px.")],
     height_px: Annotated[int, typer.Option(min=64, help="Height of the screen, px.")],
-    square_px: Annotated[int, typer.Option(min=8, help="Side of a square, px; a multiple of 8.")],
+    square_px: Annotated[int, typer.Option(min=8, help="Side of a square, px; must be a multiple of 8.")],
     board: BoardOption = "charuco:15x9",
 ) -> int:
     """Draw the board that `calibrate-camera` looks for."""
@@ -40,7 +40,7 @@ def calibrate_camera(
     ],
     config: ConfigOption = None,
     board: BoardOption = "charuco:15x9",
-    out: Annotated[Path, typer.Option(help="File of the lens, for `calibrate --prior`.")] = Path("camera.toml"),
+    out: Annotated[Path, typer.Option(help="Lens file to write, for `calibrate --prior`.")] = Path("camera.toml"),
     json: JsonOption = False,
 ) -> int:
     """Determine focal length, principal point and distortion from photographs of a board."""
@@ -51,12 +51,12 @@ def calibrate_camera(
 
 def calibrate_pose(
     folder: SetArgument,
-    geometry: Annotated[Path | None, typer.Option(help="Geometry measured by hand, instead of the set's.")] = None,
+    geometry: Annotated[Path | None, typer.Option(help="Geometry measured by hand, replacing the set's.")] = None,
     prior: PriorOption = None,
     radius_sigma_mm: Annotated[
         float, typer.Option(min=0.001, help="Standard uncertainty of the ring's radius, mm.")
     ] = 0.2,
-    out: Annotated[Path, typer.Option(help="File of the pose, for `calibrate --prior`.")] = Path("pose.toml"),
+    out: Annotated[Path, typer.Option(help="Pose file to write, for `calibrate --prior`.")] = Path("pose.toml"),
     json: JsonOption = False,
 ) -> int:
     """Determine the pose of the camera from the ring's ellipse in a full set."""
@@ -83,8 +83,8 @@ def calibrate(
     folders: Annotated[
         list[Path] | None, typer.Argument(metavar="SET...", help="Capture sets at different pressures.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="File of the new geometry; geometry.toml by default.")] = None,
-    geometry: Annotated[Path | None, typer.Option(help="Geometry measured by hand, instead of the sets'.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Geometry file to write; geometry.toml by default.")] = None,
+    geometry: Annotated[Path | None, typer.Option(help="Geometry measured by hand, replacing the sets'.")] = None,
     free: Annotated[
         list[str] | None,
         typer.Option(
@@ -100,7 +100,7 @@ def calibrate(
     json: JsonOption = False,
     live: Annotated[bool, typer.Option("--live", help="Take the sets from a hold; ask before it moves.")] = False,
     range_um: Annotated[
-        float | None, typer.Option(help="--live: range of setpoints, um; 8000 by default, or what the limits allow.")
+        float | None, typer.Option(help="--live: range of setpoints, um; by default 8000, or less if limited.")
     ] = None,
     sets: Annotated[int | None, typer.Option(min=2, max=20, help="--live: number of sets; 5 by default.")] = None,
     yes: Annotated[bool, typer.Option("--yes", help="--live: move the mirror and adopt without asking.")] = False,
@@ -120,7 +120,7 @@ def calibrate(
     )  # fmt: skip
     if not live:
         if not folders:
-            raise InputError("calibrate: name the capture sets, or take them from a running hold with --live")
+            raise InputError("calibrate: name the capture sets, or use --live to take them from a running hold")
         if any((range_um, sets, yes, session, run, socket, take_over)):
             raise InputError("calibrate SET...: --range-um, --sets, --yes, --session and the hold are for --live")
         return calibrate_command(solving)

@@ -1,4 +1,4 @@
-"""The commands of `ctl`: one for each that a running hold takes, with its own value and the common options."""
+"""The commands of `ctl`: one for each command of a running hold, with its own arguments and the common options."""
 
 import inspect
 import math
@@ -14,13 +14,13 @@ from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.model import clock
 
 WhyOption = Annotated[str, typer.Option(help="Reason, recorded with the command.")]
-TakeOverOption = Annotated[bool, typer.Option("--take-over", help="Take the command from whoever has it.")]
+TakeOverOption = Annotated[bool, typer.Option("--take-over", help="Take command from whoever has it.")]
 RunOption = Annotated[Path | None, typer.Option(help="The run's folder.")]
 SocketOption = Annotated[Path | None, typer.Option(help="The hold's socket; logs/control.sock by default.")]
-TlsOption = Annotated[str, typer.Option(metavar="HOST:PORT", help="Connect by TCP, with the certificate below.")]
+TlsOption = Annotated[str, typer.Option(metavar="HOST:PORT", help="Connect over TLS, with the certificate below.")]
 CertificateOption = Annotated[Path | None, typer.Option(help="With --tls: your certificate.")]
 KeyOption = Annotated[Path | None, typer.Option(help="With --tls: its key.")]
-AuthorityOption = Annotated[Path | None, typer.Option(help="With --tls: the authority of the hold's certificate.")]
+AuthorityOption = Annotated[Path | None, typer.Option(help="With --tls: the CA of the hold's certificate.")]
 
 
 def _finite(value: float) -> float:
@@ -35,12 +35,12 @@ OnArgument = Annotated[bool, typer.Argument(metavar="on|off")]
 TextArgument = Annotated[str, typer.Argument(metavar="TEXT", help="The remark.")]
 ReasonArgument = Annotated[str, typer.Argument(metavar="TEXT", help="Why the mirror is locked.")]
 GainsArgument = Annotated[
-    str, typer.Argument(metavar="FILE", help="TOML or JSON file with loop keys, or the keys: 'kp_per_s = 0.5'.")
+    str, typer.Argument(metavar="FILE", help="TOML or JSON file with loop keys, or just the keys: 'kp_per_s = 0.5'.")
 ]
 TrialOption = Annotated[
-    str, typer.Option(help="Trial time, e.g. 2m; the old gains return unless `ctl keep` comes first.")
+    str, typer.Option(help="Trial time, e.g. 2m; the old gains return afterwards unless kept by `ctl keep`.")
 ]
-EveryOption = Annotated[str, typer.Option(help="Time between two lines, e.g. 0.5s.")]
+EveryOption = Annotated[str, typer.Option(help="Interval between lines, e.g. 0.5s.")]
 
 
 def _has_value_next(word: str) -> bool:
@@ -48,10 +48,10 @@ def _has_value_next(word: str) -> bool:
 
 
 class ActionFirst(TyperGroup):
-    """Options may stand before the action, too."""
+    """Accept options before the action, too."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the first word that is an action, and no option's value, in front."""
+        """Move the action to the front; an option's value does not count as one."""
         words = zip(["", *args], args, strict=False)
         at = next(
             (n for n, (last, word) in enumerate(words) if word in self.commands and not _has_value_next(last)), 0
@@ -75,14 +75,14 @@ def _common(
     authority: AuthorityOption = None,
     json: JsonOption = False,
 ) -> tuple[dict[str, Any], Any, bool]:
-    """Fields of every request, which hold is meant, and whether the answer is printed as JSON."""
+    """Return the common request fields, the target hold, and whether to print the answer as JSON."""
     from membrane_ctrl.control_port.ctl import Where
 
     return {"why": why, "take_over": take_over}, Where(socket, run, tls, certificate, key, authority), json
 
 
 def _add(action: str, does: str, own: Callable[..., dict[str, Any]]) -> None:
-    """Add a command with the parameters of `own`, which makes its part of the request, and the common options."""
+    """Add a command with the common options and the parameters of `own`, which makes its part of the request."""
     parameters = inspect.signature(own).parameters
 
     def command(**given: Any) -> int:
@@ -98,7 +98,7 @@ def _add(action: str, does: str, own: Callable[..., dict[str, Any]]) -> None:
             for parameter in (*parameters.values(), *inspect.signature(_common).parameters.values())
         ]
     )
-    # a negative setpoint, and a text that begins with a dash, are no options
+    # a negative setpoint or a text that begins with a dash is not an option
     settings = {"ignore_unknown_options": bool(parameters)}
     ctl_app.command(action, help=does, context_settings=settings)(command)
 
@@ -146,10 +146,10 @@ _OWN: dict[str, Callable[..., dict[str, Any]]] = {
 }
 
 _add("status", "Show the status once.", _plain)
-_add("watch", "Print the status line by line until the run ends.", _watch)
+_add("watch", "Print a status line repeatedly until the run ends.", _watch)
 for _kind, _rule in TABLE.items():
-    if _kind in _OWN or not (_rule.needs or _kind.startswith("shape_")):  # `tune` has a command of its own
+    if _kind in _OWN or not (_rule.needs or _kind.startswith("shape_")):  # `tune` is a separate command
         _add(_kind, _rule.does, _OWN.get(_kind, _plain))
 _add("shape", "Switch the shape loop on or off.", _shape)
 _add("quiet", "Acknowledge the alarms: no reminders, no escalation.", _plain)
-_add("release", "Release the command, so that another may take it.", _plain)
+_add("release", "Release command, so that someone else may take it.", _plain)

@@ -30,7 +30,7 @@ def hold(
     twin: Annotated[bool, typer.Option("--twin", help="Hold the simulated bench instead of devices.")] = False,
     devices: Annotated[
         Path | None,
-        typer.Option(help="With --twin: emulate the instruments of this configuration on their own protocols."),
+        typer.Option(help="With --twin: emulate this configuration's instruments, each with its own protocol."),
     ] = None,
     duration: Annotated[str | None, typer.Option(help="Stop after this long, e.g. 90s, 3m, 2h30m.")] = None,
     name: Annotated[str, typer.Option(help="Name of the run folder.")] = "hold",
@@ -38,7 +38,7 @@ def hold(
     clear_faults: Annotated[
         bool,
         typer.Option(
-            "--clear-faults", help="Clear faults latched by the board or an earlier run; find their cause first."
+            "--clear-faults", help="Clear faults latched by the board or an earlier run. Find their cause first."
         ),
     ] = False,
     standby: Annotated[bool, typer.Option("--standby", help="Start in standby and wait for `ctl hold`.")] = False,
@@ -79,19 +79,17 @@ def safe(
     logs: Annotated[Path | None, typer.Option(help="Folder of the runs; recording.logs_dir by default.")] = None,
     latch: Annotated[
         bool,
-        typer.Option(
-            help="Lock the pump until a person clears the latch; --no-latch leaves a running program alone."
-        ),
+        typer.Option(help="Lock the pump until a person clears the latch; --no-latch spares a running program."),
     ] = True,
 ) -> int:
-    """Stop the pump of a configuration, whatever program controls it; leave the vent as it is."""
+    """Stop a configuration's pump, whichever program controls it; leave the vent as it is."""
     from membrane_ctrl.commissioning.safe import make_safe
 
     return make_safe(configured(config), str(config), logs, latch)
 
 
 def check(config: ConfigArgument, json: JsonOption = False) -> int:
-    """Validate a configuration, probe its devices, and say what a hold would do."""
+    """Validate a configuration, probe its devices, and show what a hold would do."""
     from membrane_ctrl.commissioning.check import check_config
 
     return check_config(configured(config), str(config), json)
@@ -135,14 +133,14 @@ def alarm_test(
 
 
 def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> Config:
-    """The configuration, its [devices] from the file of `--devices`; that file alone is a configuration, too."""
+    """Return the configuration with the [devices] of the `--devices` file, which can also be used alone."""
     if devices is None:
         return configured(config)
     lab = configured(devices)
     if not twin:
-        raise errors.InputError("--devices: only with --twin; without it --config names the devices")
+        raise errors.InputError("--devices needs --twin; otherwise --config names the devices")
     if lab.devices is None:
-        raise errors.InputError(f"{devices}: devices: missing; there is nothing to emulate")
+        raise errors.InputError(f"{devices}: devices: missing; nothing to emulate")
     return lab if config is None else configured(config).model_copy(update={"devices": lab.devices})
 
 

@@ -1,4 +1,4 @@
-"""The commands over capture sets."""
+"""The commands that work on capture sets."""
 
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +19,7 @@ def add_commands(app: typer.Typer) -> None:
 def measure(
     capture_set: SetArgument,
     geometry: Annotated[Path | None, typer.Option(help="Geometry to use instead of the set's own.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder of the result; SET/result by default.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder; SET/result by default.")] = None,
     pictures: Annotated[bool, typer.Option(help="Draw pictures next to the result.")] = True,
     rerun: Annotated[bool, typer.Option("--rerun", help="Write measurement.rrd next to the result.")] = False,
     json: JsonOption = False,
@@ -41,15 +41,15 @@ def uncertainty(
         Path | None, typer.Option(help="Geometry to use instead of the set's own, with its covariance.")
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Worker processes; chosen by the number of trials by default.")
+        int | None, typer.Option(min=1, help="Worker processes; by default according to the number of trials.")
     ] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Run on this Dask scheduler, e.g. tcp://host:8786.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder of the result; SET/uncertainty by default.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder; SET/uncertainty by default.")] = None,
     json: JsonOption = False,
 ) -> int:
-    """Estimate by Monte Carlo the RMSE of the height, or of the change between two sets."""
+    """Estimate the RMSE of the height, or of the change between two sets, by Monte Carlo."""
     from membrane_ctrl.measure.uncertainty import UncertaintyOptions, uncertainty_command
 
     options = UncertaintyOptions(
@@ -68,9 +68,9 @@ def uncertainty(
 
 def stability(
     run_of_sets: Annotated[Path, typer.Argument(metavar="RUN_OF_SETS", help="Folder of capture sets.")],
-    out: Annotated[Path | None, typer.Option(help="Folder of the result; RUN_OF_SETS/stability by default.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder; RUN_OF_SETS/stability by default.")] = None,
     point: Annotated[
-        list[str] | None, typer.Option(help="NAME=X,Y in mm: a point to follow, instead of A, B and C; repeatable.")
+        list[str] | None, typer.Option(help="Point to follow instead of A, B and C, as NAME=X,Y in mm; repeatable.")
     ] = None,
     geometry: Annotated[
         Path | None, typer.Option(help="Geometry to use instead of the sets' own, with its covariance.")
@@ -80,7 +80,7 @@ def stability(
     rerun: Annotated[bool, typer.Option("--rerun", help="Write stability.rrd next to the result.")] = False,
     json: JsonOption = False,
 ) -> int:
-    """Evaluate the stability of a run of sets: standard deviation, points over time, pairs with uncertainty."""
+    """Evaluate the stability of a run of sets: standard deviation, points over time, pairs and their uncertainty."""
     from membrane_ctrl.measure.stability import StabilityOptions, stability_command
 
     options = StabilityOptions(run_of_sets, out, tuple(point or ()), geometry, trials, seed, json, rerun)
@@ -91,32 +91,32 @@ def simulate(
     set_dir: Annotated[Path, typer.Argument(metavar="SET_DIR", help="New folder for the set, or for the run.")],
     config: ConfigOption = None,
     sag_mm: Annotated[float, typer.Option(help="Depth of the bowl, mm.")] = 37.1,
-    figure: Annotated[bool, typer.Option(help="Add the astigmatism, coma and so on of a mounted film.")] = True,
+    figure: Annotated[bool, typer.Option(help="Add the aberrations of a mounted film, e.g. astigmatism.")] = True,
     steps: Annotated[int | None, typer.Option(min=3, max=64, help="Phase steps.")] = None,
     bits: Annotated[int | None, typer.Option(min=8, max=16, help="Bits per pixel.")] = None,
-    noise_adu: Annotated[float | None, typer.Option(min=0.0, help="Noise of a pixel, counts.")] = None,
-    shrink: Annotated[int, typer.Option(min=1, max=16, help="Make the pixels larger and fewer by this factor.")] = 1,
+    noise_adu: Annotated[float | None, typer.Option(min=0.0, help="Noise of each pixel, counts.")] = None,
+    shrink: Annotated[int, typer.Option(min=1, max=16, help="Use larger and fewer pixels, by this factor.")] = 1,
     gamma: Annotated[float, typer.Option(help="Gamma of the display.")] = 1.0,
     motion_um: Annotated[float, typer.Option(help="Amplitude of the film's motion, um.")] = 0.0,
     motion_hz: Annotated[float, typer.Option(help="Frequency of the motion, Hz.")] = 0.3,
     drift_um_per_s: Annotated[float, typer.Option(help="Drift of the film, um/s.")] = 0.0,
-    displacement_um: Annotated[float, typer.Option(help="Displacement from that depth at the start, um.")] = 0.0,
+    displacement_um: Annotated[float, typer.Option(help="Initial displacement from that depth, um.")] = 0.0,
     laser_noise_um: Annotated[float, typer.Option(min=0.0, help="Noise of the laser readings, um.")] = 0.0,
     stated: Annotated[
-        Path | None, typer.Option(help="Geometry stated in the set; the true one is the configuration's.")
+        Path | None, typer.Option(help="Geometry to state in the set; the true one is the configuration's.")
     ] = None,
-    exact: Annotated[bool, typer.Option("--exact", help="Trace every pixel exactly: slow.")] = False,
+    exact: Annotated[bool, typer.Option("--exact", help="Trace every pixel exactly (slow).")] = False,
     seed: SeedOption = 1,
     fault: Annotated[
         list[str] | None,
         typer.Option(help="Fault to add, kind:frame or kind:frame:amount, e.g. stale:x_sin_2; repeatable."),
     ] = None,
     sets: Annotated[
-        int, typer.Option(min=1, help="Number of sets; more than one make a run: 0000 full, the others fringes.")
+        int, typer.Option(min=1, help="Number of sets; several make a run: 0000 full, the others fringes.")
     ] = 1,
-    interval_s: Annotated[float, typer.Option(min=0.0, help="Time from set to set of a run, s.")] = 4.0,
+    interval_s: Annotated[float, typer.Option(min=0.0, help="Interval between the sets of a run, s.")] = 4.0,
 ) -> int:
-    """Simulate a capture set, or a run of sets, with its truth."""
+    """Simulate a capture set, or a run of sets, with known truth."""
     from membrane_ctrl.measure.simulate import SimulateOptions, simulate_command
     from membrane_ctrl.sim.optics.simulation_spec import Motion
 

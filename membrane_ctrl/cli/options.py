@@ -1,4 +1,4 @@
-"""What several commands share: options, and the configuration that they name."""
+"""Options that several commands share, and reading the configuration they name."""
 
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -12,14 +12,12 @@ S = TypeVar("S", bound=Section)
 
 ConfigArgument = Annotated[Path, typer.Argument(help="Configuration, one TOML file.", metavar="CONFIG")]
 ConfigOption = Annotated[
-    Path | None, typer.Option("--config", help="Configuration, one TOML file; the defaults without it.")
+    Path | None, typer.Option("--config", help="Configuration, one TOML file; defaults apply without it.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 PriorOption = Annotated[
     list[Path] | None,
-    typer.Option(
-        metavar="FILE", help="Result of calibrate-camera or calibrate-pose; repeatable, the last one counts."
-    ),
+    typer.Option(metavar="FILE", help="Result of calibrate-camera or calibrate-pose; repeatable, the last one wins."),
 ]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")]
 SetArgument = Annotated[Path, typer.Argument(metavar="SET", help="Folder with capture.toml and its images.")]
@@ -30,7 +28,7 @@ TrialsOption = Annotated[int, typer.Option(min=2, help="Monte Carlo trials.")]
 def configured(path: Path | None) -> schema.Config:
     """Return the configuration of a file, or the defaults without one; raises `InputError`.
 
-    The files that it names are looked for beside it, wherever the command is called.
+    The file names in it are relative to its own folder, not to the current one.
     """
     if path is None:
         return schema.Config()
@@ -47,7 +45,7 @@ def configured(path: Path | None) -> schema.Config:
 
 
 def _beside(section: S, folder: Path, *names: str) -> S:
-    """The section with its file names as paths from a folder; what is not set stays so."""
+    """Return the section with its file names relative to a folder; unset ones stay unset."""
     given = {name: getattr(section, name) for name in names}
     made = {name: type(file)(folder / Path(file).expanduser()) for name, file in given.items() if file is not None}
     return section.model_copy(update=made)

@@ -1,4 +1,4 @@
-"""The commands over recorded inputs: run them again, mend them."""
+"""The commands that work on recorded inputs: replay and repair."""
 
 import contextlib
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ def add_commands(app: typer.Typer) -> None:
 def replay(
     run_dir: RunArgument,
     start: Annotated[str | None, typer.Option("--from", help="Compare from this time of the run, e.g. 3m.")] = None,
-    end: Annotated[str | None, typer.Option("--to", help="End at this time of the run.")] = None,
+    end: Annotated[str | None, typer.Option("--to", help="Compare up to this time of the run.")] = None,
     to_test: Annotated[str | None, typer.Option(help="Write a regression test to tests/incidents/NAME.")] = None,
     json: JsonOption = False,
 ) -> int:
@@ -50,7 +50,7 @@ def repair(
 
 @contextlib.contextmanager
 def _files_of_the_run() -> Iterator[None]:
-    """A file that cannot be read or written is named in one line."""
+    """Name a file that cannot be read or written, in one line."""
     try:
         yield
     except OSError as error:

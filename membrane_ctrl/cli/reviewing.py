@@ -1,4 +1,4 @@
-"""The commands over finished runs, added to the command line by `add_commands`."""
+"""The commands that work on finished runs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,13 +8,13 @@ import typer
 from membrane_ctrl.cli.options import JsonOption
 
 RunArgument = Annotated[
-    Path, typer.Argument(metavar="RUN", help="Folder of the run, its name or a part of it, or `last`.")
+    Path, typer.Argument(metavar="RUN", help="Run folder, its name or part of the name, or `last`.")
 ]
 LogsOption = Annotated[Path, typer.Option("--logs", help="Folder of the runs.")]
 FromOption = Annotated[
-    str | None, typer.Option("--from", help="From this moment: 03:12 (UTC), an ISO time, or +90m from the start.")
+    str | None, typer.Option("--from", help="Start of the part: 03:12 (UTC), an ISO time, or +90m from the start.")
 ]
-ToOption = Annotated[str | None, typer.Option("--to", help="Up to this moment.")]
+ToOption = Annotated[str | None, typer.Option("--to", help="End of the part.")]
 
 runs_app = typer.Typer(invoke_without_command=True, help="List, show and prune runs.")
 
@@ -28,23 +28,25 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def review(
-    runs: Annotated[list[str], typer.Argument(metavar="RUN...", help="One run, or several laid over each other.")],
-    at: Annotated[str | None, typer.Option(help="Open on this moment: 03:12 (UTC) or +90m from the start.")] = None,
-    around: Annotated[str | None, typer.Option(help="Open on the first event of this name, e.g. a fault.")] = None,
+    runs: Annotated[list[str], typer.Argument(metavar="RUN...", help="One run, or several to overlay.")],
+    at: Annotated[str | None, typer.Option(help="Open at this time: 03:12 (UTC) or +90m from the start.")] = None,
+    around: Annotated[str | None, typer.Option(help="Open at the first event of this name, e.g. a fault.")] = None,
     start: FromOption = None,
     end: ToOption = None,
     tab: Annotated[str, typer.Option(help="Tab to open: overview, loop, shape, faults or tuning.")] = "overview",
-    align: Annotated[str, typer.Option(help="Several runs: align them at hold, start or by utc.")] = "hold",
-    live: Annotated[bool, typer.Option("--live", help="Follow a run that is still going.")] = False,
+    align: Annotated[str, typer.Option(help="Several runs: align them by hold, start or utc.")] = "hold",
+    live: Annotated[bool, typer.Option("--live", help="Follow a run in progress.")] = False,
     web: Annotated[bool, typer.Option("--web", help="Serve it to a browser.")] = False,
     bind: Annotated[str, typer.Option(help="With --web: address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="With --web: port of the page; 0: any free one.")] = 0,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="With --web: port of the page; 0 for any free one.")
+    ] = 0,
     save: Annotated[Path | None, typer.Option(help="Write the review's recording instead of showing it.")] = None,
     screenshot: Annotated[Path | None, typer.Option(help="Write a picture instead of showing it.")] = None,
 ) -> int:
-    """Open the timeline of one run, or of several laid over each other, in the Rerun viewer.
+    """Open the timeline of one run, or of several overlaid, in the Rerun viewer.
 
-    `review mark RUN TEXT --at 03:12` marks a moment, on the timeline and in the report.
+    `review mark RUN TEXT --at 03:12` adds a mark to the timeline and the report.
     """
     if runs[0] == "mark":  # what follows is text, too, and a path would lose its double slashes
         from membrane_ctrl.review.runs import mark_command
@@ -62,12 +64,12 @@ def review(
 def report(
     run: RunArgument,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for report.html and report.json; RUN/report by default.")
+        Path | None, typer.Option(help="Output folder for report.html and report.json; RUN/report by default.")
     ] = None,
     compare: Annotated[
         Path | None,
         typer.Option(
-            "--compare", help="Another run to compare with: the same part of it if --from is +.., else all of it."
+            "--compare", help="Another run to compare with: the same part if --from is +.., else all of it."
         ),
     ] = None,
     start: FromOption = None,
@@ -83,13 +85,13 @@ def report(
 def export_run(
     run: RunArgument,
     to: Annotated[str, typer.Option("--to", help="Format: parquet, csv or hdf5.")] = "parquet",
-    out: Annotated[Path | None, typer.Option(help="Folder for the files; RUN/export by default.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder; RUN/export by default.")] = None,
     streams: Annotated[
         list[str] | None,
-        typer.Option("--streams", help="What to write: a path, a field, shapes or events; repeatable."),
+        typer.Option("--streams", help="Stream to write: a path, a field, shapes or events; repeatable."),
     ] = None,
     start: FromOption = None,
-    end: Annotated[str | None, typer.Option("--until", help="Up to this moment.")] = None,
+    end: Annotated[str | None, typer.Option("--until", help="End of the part.")] = None,
 ) -> int:
     """Export a run's columns for other programs."""
     from membrane_ctrl.review.runs import export_command
@@ -101,13 +103,15 @@ def export_run(
 def list_runs(
     context: typer.Context,
     logs: LogsOption = Path("logs"),
-    since: Annotated[str | None, typer.Option(help="Started on this day (UTC) or later.")] = None,
-    until: Annotated[str | None, typer.Option(help="Started before this day.")] = None,
-    longer: Annotated[str | None, typer.Option(help="At least this long, e.g. 2h.")] = None,
-    std_um: Annotated[float | None, typer.Option(min=0, help="Standard deviation at most this, um.")] = None,
-    faults: Annotated[bool | None, typer.Option("--faults/--no-faults", help="With faults, or without.")] = None,
-    configuration: Annotated[str | None, typer.Option(help="Beginning of the configuration's hash.")] = None,
-    name: Annotated[str | None, typer.Option(help="Part of the name.")] = None,
+    since: Annotated[str | None, typer.Option(help="Only runs started on this day (UTC) or later.")] = None,
+    until: Annotated[str | None, typer.Option(help="Only runs started before this day (UTC).")] = None,
+    longer: Annotated[str | None, typer.Option(help="Only runs at least this long, e.g. 2h.")] = None,
+    std_um: Annotated[float | None, typer.Option(min=0, help="Largest standard deviation, um.")] = None,
+    faults: Annotated[
+        bool | None, typer.Option("--faults/--no-faults", help="Only runs with or without faults.")
+    ] = None,
+    configuration: Annotated[str | None, typer.Option(help="First characters of the configuration's hash.")] = None,
+    name: Annotated[str | None, typer.Option(help="Part of the run's name.")] = None,
     json: JsonOption = False,
 ) -> int:
     """List the runs, oldest first."""
@@ -120,7 +124,7 @@ def list_runs(
         given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
         if given:  # `--logs` in front of `prune` would leave it with another folder than was meant
             told = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-            raise errors.InputError(f"{told} in front of `{context.invoked_subcommand}` belongs behind it")
+            raise errors.InputError(f"{told} in front of `{context.invoked_subcommand}` belongs after it")
         return 0
     least_s = None if longer is None else clock.parse_duration_s(longer)
     wanted = Filter(
@@ -145,12 +149,12 @@ def prune_runs(
     ] = None,
     keep_gb: Annotated[
         float | None,
-        typer.Option(min=0, max=1e6, help="Then delete the oldest until the others take at most this, GB."),
+        typer.Option(min=0, max=1e6, help="Then delete the oldest until the rest take at most this, GB."),
     ] = None,
     delete: Annotated[bool, typer.Option("--delete", help="Actually delete; the default is a dry run.")] = False,
     json: JsonOption = False,
 ) -> int:
-    """Delete old runs; the newest three are never too old, and a run with a file `.keep` stays."""
+    """Delete old runs; --keep-days spares the newest three, and a run with a file `.keep` always stays."""
     from membrane_ctrl.review.runs import prune_command
 
     return prune_command(logs, keep_days, keep_gb, delete, json)

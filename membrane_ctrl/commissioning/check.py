@@ -1,4 +1,4 @@
-"""`check`: is the configuration right, do its devices answer, and what would `hold` do with them?"""
+"""`check`: is the configuration valid, do its devices answer, and what would `hold` do with them?"""
 
 import asyncio
 import contextlib
@@ -27,31 +27,31 @@ from membrane_ctrl.model import errors, plain_json, run_status, terminal
 from membrane_ctrl.model.clock import RunClock
 
 _READS = 100
-_LONGEST_S = 2.0  # a slow device gets fewer reads
-_BACK_OFF_S = 0.2  # rest for a bus after a device that could not be opened
+_LONGEST_S = 2.0  # slow devices get fewer reads
+_BACK_OFF_S = 0.2  # pause on a bus after a device that could not be opened
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceProbe:
-    """What one device said."""
+    """Result of probing one device."""
 
-    role: str  # what it fills; "board" for all of them
+    role: str  # role it fills; "board" for all roles
     device: str  # port and settings
-    identity: str = ""  # who answered
+    identity: str = ""  # identity of the device that answered
     reading: str = ""  # one value, with its unit
     latency_p50_ms: float = math.nan  # of a read; NaN without one
     latency_p99_ms: float = math.nan
-    problem: str = ""  # what is wrong and what to do; empty when nothing is
+    problem: str = ""  # what is wrong and what to do; empty if nothing
     notes: str = ""  # information that is not a problem
-    facts: roles.BenchIdentity | None = None  # the limits of what answered
+    facts: roles.BenchIdentity | None = None  # limits of the device that answered
 
 
 def check_config(config: Config, source: str, as_json: bool) -> int:
-    """Judge the configuration, probe the devices, and report.
+    """Check the configuration, probe the devices and report.
 
-    Raises InputError with a line for each bad setting; after the report, DeviceError for a device in trouble.
+    Raises InputError with one line per bad setting; after the report, DeviceError if a device cannot be used.
     """
-    findings = dict.fromkeys(require_sound(config, source))  # before a device is touched
+    findings = dict.fromkeys(require_sound(config, source))  # before touching any device
     probes = _probed(config)
     for probe in probes:
         findings |= dict.fromkeys(cross_check(config, probe.facts))
@@ -81,7 +81,7 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
 
 
 def _probed(config: Config) -> list[DeviceProbe]:
-    """Probe the devices, except those (and the screen) that another program uses."""
+    """Probe the devices, except those (including the screen) that another program uses."""
     devices = config.devices
     if devices is None:
         return probe_optics(config)
@@ -128,7 +128,7 @@ def _what_would_happen(config: Config) -> dict[str, str]:
         if on
     ]
     return {
-        "devices": config.devices.name if config.devices else "none: only `hold --twin` would run",
+        "devices": config.devices.name if config.devices else "none: only `hold --twin` can run",
         "hold": f"{loop.setpoint_um:g} um at {loop.rate_hz:g} Hz, limits {limits.displacement_min_um:g} .. "
         f"{limits.displacement_max_um:g} um and {limits.gauge_pressure_max_pa:g} Pa",
         "gains": run_status.gains_words(loop.model_dump(), None),
@@ -141,7 +141,7 @@ def _what_would_happen(config: Config) -> dict[str, str]:
 
 
 def _port(port: PortConfig) -> str:
-    """Where the control port would listen. Raises InputError for certificates that cannot be used."""
+    """Where the control port would listen. Raises InputError for unusable certificates."""
     if not port.enabled:
         return "off"
     ways = [port.socket or f"{sockets.SOCKET_NAME} beside the run folders"]
@@ -154,25 +154,25 @@ def _port(port: PortConfig) -> str:
 
 
 def _alarms(alarms: AlarmsConfig) -> str:
-    """Who would get alarms. Raises InputError or DeviceError if they could not be sent."""
+    """Who would get alarms. Raises InputError or DeviceError if they cannot be sent."""
     require_sendable(alarms)
     if alarms.urls_file is None:
-        return "nobody is told: no alarms.urls_file"
+        return "not sent: no alarms.urls_file"
     return f"{len(alarms.rules)} rules besides faults, to those in {alarms.urls_file}"
 
 
 def _geometry(config: Config) -> str:
-    """The geometry of the cycles. Raises InputError for a file that cannot be used."""
+    """The geometry that cycles would use. Raises InputError for an unusable file."""
     there = geometry_in_force(config)
     origin = there.origin
     if there.note or not origin.file:
-        return there.note or "as [optics.geometry] states it"
+        return there.note or "as stated in [optics.geometry]"
     made = f", calibrated {origin.calibrated_utc}" if origin.calibrated_utc else ""
     return f"{origin.file} (hash {origin.hash}{made})"
 
 
 async def probe_board(board: PumpBoard, name: str) -> DeviceProbe:
-    """Probe the board, whoever controls it: nothing is written, claim and watchdog stay as they are."""
+    """Probe the board, whoever controls it, without writing: claim and watchdog are unaffected."""
     try:
         identity = await board.identify()
         reading, p50_ms, p99_ms = await _timed(board.read)
@@ -195,14 +195,14 @@ def _board_reading(reading: roles.BenchReading) -> str:
 
 def _board_problem(reading: roles.BenchReading) -> str:
     if reading.latched_faults:
-        return f"faults {reading.latched_faults:#x} are latched (docs/registers.md); find out why"
+        return f"faults {reading.latched_faults:#x} are latched (docs/registers.md); find the cause"
     if not math.isfinite(reading.displacement_um):
-        return f"the laser has no value (code {reading.displacement_quality}); check its aim"
-    return "" if math.isfinite(reading.gauge_pressure_pa) else "no gauge pressure; check the sensor"
+        return f"no laser reading (code {reading.displacement_quality}); check its aim"
+    return "" if math.isfinite(reading.gauge_pressure_pa) else "no gauge pressure reading; check the sensor"
 
 
 async def probe_roles(devices: role_bench.RoleDevices) -> list[DeviceProbe]:
-    """Open, read and close each device in turn; a failed one does not hide the next."""
+    """Open, read and close each device in turn; a failure does not stop the others."""
     reads: dict[str, tuple[Callable[[Any], Callable[[], Awaitable[Any]]], str]] = {
         "displacement": (lambda device: device.displacement, "um"),
         "gauge_pressure": (lambda device: device.gauge_pressure_pa, "Pa"),
@@ -233,10 +233,10 @@ async def _probe(role: str, device: roles.Device, read: Callable[[], Awaitable[A
     identity = " ".join(part for part in (found.kind, found.serial, found.firmware, found.detail) if part)
     problem = ""
     if isinstance(value, roles.DisplacementSample):
-        problem = "" if value.quality == 0 else f"no value, error code {value.quality}; check its aim and its manual"
+        problem = "" if value.quality == 0 else f"no reading, error code {value.quality}; check aim and manual"
         value = value.displacement_um
     if not problem and not math.isfinite(value):
-        problem = "it answers, but has no value"
+        problem = "answers without a reading"
     facts = roles.BenchIdentity(found.kind, 0, found.firmware, math.nan)
     if role == "displacement":
         facts = replace(facts, displacement_range_um=found.shows)
@@ -246,7 +246,7 @@ async def _probe(role: str, device: roles.Device, read: Callable[[], Awaitable[A
 
 
 async def _timed(read: Callable[[], Awaitable[Any]]) -> tuple[Any, float, float]:
-    """The last value of many reads, and how long they took (p50, p99) in ms."""
+    """Last value of many reads, and their duration (p50, p99) in ms."""
     took_ms: list[float] = []
     give_up_s = time.monotonic() + _LONGEST_S
     while len(took_ms) < _READS and time.monotonic() < give_up_s:
@@ -261,7 +261,7 @@ _GRABS = 10
 
 
 def probe_optics(config: Config) -> list[DeviceProbe]:
-    """One probe for camera and screen, which are tested together; none without a camera. For the main thread only."""
+    """Probe camera and screen together; no probe without a camera. Call from the main thread only."""
     if config.devices is None or config.devices.camera is None:
         return []
     clock = session.WaitingClock(RunClock.start())
@@ -288,7 +288,7 @@ def _where(optics: optical_bench.OpticalBench) -> str:
 
 
 def _grab(optics: optical_bench.OpticalBench) -> tuple[float, float, float]:
-    """Times of some exposures (p50, p99) in ms, and the median count of the last."""
+    """Duration of some exposures (p50, p99) in ms, and median count of the last."""
     took_ms, median_adu = [], math.nan
     for _ in range(_GRABS):
         begin_s = time.monotonic()

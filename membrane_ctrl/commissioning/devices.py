@@ -1,4 +1,4 @@
-"""`devices`: what is plugged into this machine, with the text to paste into a configuration."""
+"""`devices`: the hardware on this machine, with the text to paste into a configuration."""
 
 import asyncio
 import json
@@ -19,15 +19,15 @@ _DRM = Path("/sys/class/drm")
 
 @dataclass(frozen=True, slots=True)
 class FoundDevice:
-    """A port, camera or display that was found."""
+    """A port, camera or display."""
 
     kind: str  # "port", "camera" or "display"
-    name: str  # what it says it is
-    paste: str = ""  # the configuration line that names it; empty if there is none
+    name: str  # its own description
+    paste: str = ""  # configuration line that names it; may be empty
 
 
 def list_devices(as_json: bool) -> int:
-    """Print all that was found, and what could not be searched."""
+    """Print every device found, and the searches that failed."""
     cameras, missing = find_cameras()
     found = [*find_ports(), *cameras, *find_displays()]
     if as_json:
@@ -45,7 +45,7 @@ def list_devices(as_json: bool) -> int:
 
 
 def find_ports() -> list[FoundDevice]:
-    """Serial ports, by their USB identity if they have one: it survives a replug."""
+    """Serial ports, by USB identity if they have one: it survives replugging."""
     return [
         FoundDevice("port", f"{port.path}: {port.description}", f'port = "{port.usb_name or port.path}"')
         for port in serial_ports()
@@ -53,7 +53,7 @@ def find_ports() -> list[FoundDevice]:
 
 
 def find_cameras() -> tuple[list[FoundDevice], list[str]]:
-    """GenICam cameras, and a note if they cannot be searched."""
+    """GenICam cameras, and a note if the search is impossible."""
     try:
         cameras = list(aravis.find_cameras())
     except roles.LinkError as error:
@@ -65,7 +65,7 @@ def find_cameras() -> tuple[list[FoundDevice], list[str]]:
 
 
 def find_displays(root: Path = _DRM) -> list[FoundDevice]:
-    """Connected displays, from the kernel: no desktop need run."""
+    """Connected displays, as listed by the kernel; needs no desktop."""
     found = []
     for status in sorted(root.glob("card*-*/status")):
         if status.read_text(encoding="ascii").strip() != "connected":
@@ -100,5 +100,5 @@ def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
         for finding in findings:
             table.add_row(finding.check, escape(finding.problem) or "passed", finding.section)
         terminal.table_console().print(table)
-        terminal.table_console().print("conforms" if passed else "does not conform: do not let it run a pump")
+        terminal.table_console().print("conforms" if passed else "does not conform: do not use it to run a pump")
     return errors.Exit.DONE if passed else errors.Exit.REJECTED

@@ -1,7 +1,7 @@
-"""`safe`: stops the pump, whatever program runs it, and keeps it stopped until a person clears the latch.
+"""`safe`: stops the pump, whichever program runs it, and keeps it stopped until a person clears the latch.
 
-For a person in doubt, and for `ExecStopPost`. It works when the control process is dead or hangs. It neither claims
-the devices, nor arms a watchdog, nor opens a sensor.
+For operators in doubt, and for `ExecStopPost`. It works even if the control process is dead or hangs. It claims no
+device, arms no watchdog and opens no sensor.
 """
 
 import asyncio
@@ -24,19 +24,19 @@ from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile
 _CAUSE = "made safe by hand"
 _REMEDY = "ask the person who made it safe whether the mirror may move"
 _LOOK_S = 0.1
-_LAPSE_S = 1.0  # after a watchdog period: then the board is not going to stop the pump
+_LAPSE_S = 1.0  # beyond a watchdog period the board will not stop the pump any more
 
 
 def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: bool = True) -> int:
-    """Stop the pump of a configuration that came from `source`; the vent stays as it is.
+    """Stop the pump of a configuration from `source`; leave the vent as it is.
 
-    With `latch` nobody can run the pump again until a person clears it: at the board, in a running hold and in the
-    next one. Without, a program that has the devices is left alone.
+    With `latch`, nothing runs the pump until a person clears the latch: at the board, in a running hold and in the
+    next one. Without it, a program that has the devices keeps running.
 
     Raises InputError without devices, DeviceError if the pump could not be stopped or latched.
     """
     if config.devices is None:
-        raise InputError(f"{source}: devices: missing; there is nothing to make safe")
+        raise InputError(f"{source}: devices: missing; nothing to make safe")
     if not latch:
         with bench.locked(bench.device_names(config.devices)):
             print(asyncio.run(_after_a_run(config.devices)), file=sys.stderr)
@@ -44,7 +44,7 @@ def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: 
     folder = logs_dir or Path(config.recording.logs_dir)
     stopped = _tried(config.devices)
     told = _hold_told(config, folder)
-    if not stopped.lasts:  # the hold may have commanded it again before it was told
+    if not stopped.lasts:  # the hold may have commanded the pump again before it was latched
         stopped = _tried(config.devices)
     if stopped.problem and not told:
         raise DeviceError(f"{stopped.problem}; cut the pump's power if it runs")
@@ -57,7 +57,7 @@ def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: 
 
 @dataclass(frozen=True, slots=True)
 class _Stopped:
-    """The result; `lasts` if the board itself keeps the pump stopped."""
+    """The result; `lasts` means that the board itself keeps the pump stopped."""
 
     words: str = ""
     problem: str = ""
@@ -88,7 +88,7 @@ async def _stop(devices: DevicesConfig) -> _Stopped:
 
 
 async def _stop_instrument(devices: DevicesConfig) -> _Stopped:
-    """The pump alone: a laser that is unplugged must not keep it running."""
+    """Stop the pump alone: an unplugged laser must not keep it running."""
     pump = bench.role_devices(devices).pump
     try:
         await bench.patiently(pump.open, "pump")
@@ -127,7 +127,7 @@ async def _after_a_run(devices: DevicesConfig) -> str:
 
 
 async def _standing(board: PumpBoard, watchdog_s: float) -> BenchReading:
-    """The reading of a stopped pump; one that runs on beyond the watchdog is stopped, which latches."""
+    """Reading of a stopped pump; a pump still running after the watchdog period is stopped, which latches."""
     for _ in range(math.ceil((watchdog_s + _LAPSE_S) / _LOOK_S)):
         if (reading := await board.read()).pump_fraction == 0.0:
             return reading
@@ -137,7 +137,7 @@ async def _standing(board: PumpBoard, watchdog_s: float) -> BenchReading:
 
 
 def _hold_told(config: Config, folder: Path) -> str:
-    """Make a running hold latch; returns the result, empty if none answers."""
+    """Latch a running hold; returns the result, empty if none answers."""
     path = Path(config.port.socket) if config.port.socket else folder / sockets.SOCKET_NAME
     if not config.port.enabled or not path.exists():
         return ""
@@ -155,7 +155,7 @@ def _hold_told(config: Config, folder: Path) -> str:
 
 
 def _keep(file: LatchedFile) -> None:
-    """Write the latch: no hold before a person clears it. Raises DeviceError."""
+    """Write the latch, which blocks holds until a person clears it. Raises DeviceError."""
     now = datetime.now(UTC).isoformat(timespec="seconds")
     try:
         file.path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The `[devices]` part of the configuration: the pump board, or one table a role and the `driver` that fills it."""
+"""The `[devices]` part of the configuration: the pump board, or one table per role with its `driver`."""
 
 import math
 from typing import Annotated
@@ -8,12 +8,12 @@ from pydantic import Field, model_validator
 from firmware_iface import settings
 
 ROLES = ("displacement", "pump", "gauge_pressure", "vent", "barometer", "thermometer")
-# without these nothing may move gas: the loop's two ends, and the limit that keeps the film whole
+# required before any gas moves: the loop's two ends, and the limit that protects the film
 NEEDED = ("displacement", "pump", "gauge_pressure")
 
 
 class DevicesConfig(settings.Section):
-    """Which device fills which role: a board fills all, or one table a role."""
+    """Which device fills which role: a board fills all, or one table per role."""
 
     board: str | None = None  # the pump board: tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200
     unit_id: settings.UnitId = 1
@@ -32,12 +32,12 @@ class DevicesConfig(settings.Section):
     def _board_or_roles(self) -> "DevicesConfig":
         filled = [role for role in ROLES if getattr(self, role) is not None]
         if self.board is not None and filled:
-            raise ValueError(f"give either board, or a table for each role; not board and {filled[0]}")
+            raise ValueError(f"give either board or one table per role, not board and {filled[0]}")
         if self.board is None and not filled:
-            raise ValueError('name the pump board (board = "tcp://HOST:PORT"), or give a table for each role')
+            raise ValueError('name the pump board (board = "tcp://HOST:PORT"), or give one table per role')
         missing = [role for role in NEEDED if role not in filled]
         if self.board is None and missing:
-            raise ValueError(f"no device for {missing[0]}; required are {', '.join(NEEDED)}")
+            raise ValueError(f"no device for {missing[0]}; required: {', '.join(NEEDED)}")
         for role in ("pump", "vent"):
             section = getattr(self, role)
             if isinstance(section, settings.ModbusMapConfig) and not _is_fraction(section.limits or section.value):
@@ -63,9 +63,9 @@ class DevicesConfig(settings.Section):
     @model_validator(mode="after")
     def _camera_sees_a_screen(self) -> "DevicesConfig":
         if self.camera is None and self.screen is not None:
-            raise ValueError("[devices.screen] needs a [devices.camera] that looks at it")
+            raise ValueError("[devices.screen] needs a [devices.camera]")
         if self.camera is not None and (self.screen is None) != isinstance(self.camera, settings.FolderCameraConfig):
-            raise ValueError("a camera needs a [devices.screen]; a folder of frames needs none")
+            raise ValueError("a camera needs a [devices.screen]; a folder of frames must not have one")
         return self
 
     def roles(self) -> dict[str, settings.AnyDriver]:
@@ -74,12 +74,12 @@ class DevicesConfig(settings.Section):
 
     @property
     def name(self) -> str:
-        """For messages: the board's address, or where the roles' devices are."""
+        """For messages: the board's address, or each role's address."""
         return self.board or ", ".join(f"{role} on {address_of(section)}" for role, section in self.roles().items())
 
 
 def address_of(section: settings.AnyDriver) -> str:
-    """Where the device is: its port or its Modbus address."""
+    """Address of the device: its port or its Modbus address."""
     if isinstance(section, settings.ON_MODBUS):
         return f"{section.link} unit {section.unit_id}"
     return section.port

@@ -1,4 +1,4 @@
-"""The screen in the configuration: its pose, and how its face stands off a plane."""
+"""The screen in the configuration: its pose, and its face's departure from a plane."""
 
 from typing import Annotated
 
@@ -10,15 +10,15 @@ from firmware_iface.settings import Section
 Vector3 = tuple[float, float, float]
 Axis = Annotated[tuple[float, ...], Field(min_length=2, max_length=500)]
 
-_EVEN = 1e-6  # of the distance of two nodes: rounding of written decimals
-_SQUARE = 1e-6  # of two unit vectors: what rounding to seven digits leaves
+_EVEN = 1e-6  # of the node spacing: rounding of written decimals
+_SQUARE = 1e-6  # of two unit vectors: rounding to seven digits
 
 
 class HeightMapConfig(Section):
-    """Heights of the face at the nodes of an even grid, towards the mirror; between them a bicubic spline.
+    """Heights of the face towards the mirror at the nodes of an even grid, interpolated by a bicubic spline.
 
     `heights_mm[r][c]` belongs to `s_y_mm[r]` and `s_x_mm[c]`. With three nodes along an axis the spline is quadratic
-    there, with two linear. In a file, `file` may stand for `heights_mm`: a text of numbers, a row a line.
+    there, with two linear. In TOML, `file` may replace `heights_mm`: a text file of numbers, one row per line.
     """
 
     s_x_mm: Axis
@@ -34,17 +34,17 @@ class HeightMapConfig(Section):
         rows, columns = len(self.s_y_mm), len(self.s_x_mm)
         if len(self.heights_mm) != rows or any(len(row) != columns for row in self.heights_mm):
             shape = f"{len(self.heights_mm)} rows of {', '.join(sorted({str(len(row)) for row in self.heights_mm}))}"
-            raise ValueError(f"heights_mm has {shape} numbers, s_y_mm and s_x_mm ask for {rows} rows of {columns}")
-        if np.abs(self.heights_mm).max() > 100:  # a screen is not that crooked: micrometres taken for millimetres?
+            raise ValueError(f"heights_mm has {shape} numbers; s_y_mm and s_x_mm require {rows} rows of {columns}")
+        if np.abs(self.heights_mm).max() > 100:  # no screen is that crooked: micrometres taken for millimetres?
             raise ValueError("heights_mm has a height beyond 100 mm")
         return self
 
 
 class ScreenPoseConfig(Section):
-    """Any screen pose, O' in world and the unit vectors of `s_x` and `s_y`, and its face; both may be left out.
+    """Any screen pose (O' in world, unit vectors `s_x` and `s_y`) and its face; both may be omitted.
 
-    The face stands off the plane, along s_x x s_y, which points at the mirror, by the bow, a paraboloid given by its
-    height 200 mm from O', plus the height map.
+    The face departs from the plane along s_x x s_y, towards the mirror, by the bow (a paraboloid, given by its
+    height 200 mm from O') plus the height map.
     """
 
     origin_mm: Vector3 | None = None
@@ -55,7 +55,7 @@ class ScreenPoseConfig(Section):
 
     @property
     def pose(self) -> tuple[Vector3, Vector3, Vector3] | None:
-        """Origin, s_x and s_y; None if the short form gives them."""
+        """Origin, s_x and s_y; None if the short form is used."""
         if self.origin_mm is None or self.s_x is None or self.s_y is None:
             return None
         return self.origin_mm, self.s_x, self.s_y
@@ -72,7 +72,7 @@ class ScreenPoseConfig(Section):
         return self
 
     def covers(self, half_side_mm: float) -> bool:
-        """Whether the height map, if there is one, reaches over the pattern."""
+        """Whether the height map, if any, covers the pattern."""
         if self.height_map is None:
             return True
         axes = (self.height_map.s_x_mm, self.height_map.s_y_mm)

@@ -1,7 +1,7 @@
 """The whole configuration: frozen, validated, unit-suffixed, one TOML file.
 
-Every field that holds a quantity ends in its unit. Values outside the range a real bench could have are
-refused, so that a wrong unit (metres for millimetres) is seen when the file is read and not at the mirror.
+Every field that holds a quantity ends in its unit. Values that no real bench could have are refused,
+so that a wrong unit (metres for millimetres) shows when the file is read and not at the mirror.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class LoopConfig(Section):
 
     rate_hz: Annotated[float, Field(ge=1, le=200)] = 50.0
     setpoint_um: float = 0.0
-    # SIMC PI with the closed-loop time constant chosen for least predicted variance (PHYSICS, inner loop)
+    # SIMC PI with the closed-loop time constant chosen for least predicted variance (docs/physics.md, inner loop)
     kp_per_s: Annotated[float, Field(ge=0, le=20)] = 0.61
     ti_s: Annotated[float, Field(gt=0.05, le=3600)] = 6.5
     td_s: Annotated[float, Field(ge=0, le=10)] = 0.0
@@ -52,7 +52,7 @@ class LoopConfig(Section):
 
 
 class PumpConfig(Section):
-    """Flow of the pump against its command (PHYSICS: film and gas)."""
+    """Flow of the pump against its command (docs/physics.md, film and gas)."""
 
     flow_full_um_per_s: Annotated[float, Field(gt=0, le=100)] = 5.3
     dead_fraction: Fraction = 0.10
@@ -61,22 +61,22 @@ class PumpConfig(Section):
 
 
 class LimitsConfig(Section):
-    """What the mirror must never leave."""
+    """Limits the mirror must never exceed."""
 
     displacement_min_um: float = -2000.0
     displacement_max_um: float = 500.0
     gauge_pressure_max_pa: Annotated[float, Field(gt=0, le=5000)] = 750.0
     stale_s: Annotated[float, Field(gt=0, le=10)] = 0.3
-    # a film is never still: a reading equal to the last bit for so long comes from a sensor that has stopped
+    # a film is never still: a reading identical for this long means that the sensor has stopped
     stuck_s: Annotated[float, Field(gt=0, le=600)] = 5.0
     lateness_max_ms: Annotated[float, Field(gt=0, le=10000)] = 100.0
-    step_max_um: Annotated[float, Field(gt=0, le=10000)] = 50.0  # a jump between two ticks that no film makes
-    # noise of 0.5 Pa on steps of 0.001 Pa never repeats so long, nor does a slow gauge that answers once a second; a
+    step_max_um: Annotated[float, Field(gt=0, le=10000)] = 50.0  # per tick; no film jumps this far
+    # noise of 0.5 Pa in steps of 0.001 Pa never repeats this long, nor does a slow gauge that updates every second; a
     # gauge that filters its noise below its own resolution repeats itself on a held mirror, and needs more
     gauge_stuck_s: Annotated[float, Field(gt=0, le=1e5)] = 20.0
     # a slammed door (100 Pa) moves the film by 36 um, 2 Pa; a storm of 250 Pa by 5 Pa
     gauge_step_max_pa: Annotated[float, Field(gt=0, le=5000)] = 30.0
-    # 20 um are 1 Pa: 30 sigma of a gauge's ten-second mean, 5 times what a mount at 2 um/min has in two minutes
+    # 20 um are 1 Pa: 30 sigma of a gauge's ten-second mean, 5 times the drift in two minutes of a mount at 2 um/min
     laser_gauge_apart_max_um: Annotated[float, Field(gt=0, le=10000)] = 20.0
     # over hours: a gauge's zero drifts by 1 Pa/K (20 um/K), a fresh film's creep is 31 um (control/film.py)
     laser_gauge_drift_max_um: Annotated[float, Field(gt=0, le=10000)] = 100.0
@@ -87,30 +87,30 @@ class LimitsConfig(Section):
 
 
 class StatesConfig(Section):
-    """How long states and rungs may last."""
+    """How long states and safe levels may last."""
 
-    check_s: Annotated[float, Field(ge=0.1, le=600)] = 2.0  # of good readings before the pump may run
+    check_s: Annotated[float, Field(ge=0.1, le=600)] = 2.0  # good readings required before the pump may run
     check_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
     actuator_test: bool = True  # pump up, pump off, vent, before a hold: does the film answer?
     inflate_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 14_400.0  # a fill from flat takes two hours
-    inflate_pause_um: Annotated[float, Field(gt=0, le=1e4)] = 10.0  # behind the ramp by this much: the ramp waits
-    settle_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.5  # inside the band before the state is `hold`
+    inflate_pause_um: Annotated[float, Field(gt=0, le=1e4)] = 10.0  # the ramp waits if the centre lags further
+    settle_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.5  # within the band before `hold` begins
     settle_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 600.0
-    # 10 s of laser loss cost 1.6 um on average (PHYSICS, inner loop); longer is no glitch
+    # 10 s of laser loss cost 1.6 um on average (docs/physics.md); longer is not a glitch
     hold_flow_max_s: Annotated[float, Field(gt=0, le=600)] = 12.0
     ramp_down_s: Annotated[float, Field(gt=0, le=600)] = 10.0
     pump_off_max_s: Annotated[float, Field(gt=0, le=1e6)] = 3600.0
-    lower_timeout_s: Annotated[float, Field(gt=0, le=600)] = 3.0  # a pump commanded off is seen to stand by then
+    lower_timeout_s: Annotated[float, Field(gt=0, le=600)] = 3.0  # by then a pump commanded off must have stopped
     pause_max_s: Annotated[float, Field(gt=0, le=1e5)] = 600.0
-    manual_max_s: Annotated[float, Field(gt=0, le=1e5)] = 600.0  # since the last `manual`; then it is held again
-    manual_range_um: Annotated[float, Field(gt=0, le=1e4)] = 50.0  # and so it is further from the setpoint
+    manual_max_s: Annotated[float, Field(gt=0, le=1e5)] = 600.0  # after the last `manual` the loop holds again
+    manual_range_um: Annotated[float, Field(gt=0, le=1e4)] = 50.0  # likewise beyond this distance from the setpoint
     vented_pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 100.0  # `vent` is done below this
-    latch_twin_faults: bool = False  # a trip of the simulated mirror keeps the next run down, as a real one does
+    latch_twin_faults: bool = False  # let a trip of the twin block the next run, as a real one does
     stay_after_trip: bool = False  # wait in `fault` for `ctl ack` instead of ending the run
 
 
 class ResumeConfig(Section):
-    """Which latched faults may clear by themselves once their cause has gone."""
+    """Which latched faults may clear automatically once their cause has gone."""
 
     faults: tuple[str, ...] = ()
     wait_s: Annotated[float, Field(ge=1, le=1e5)] = 30.0
@@ -124,7 +124,7 @@ class ShapeConfig(Section):
     period_s: Annotated[float, Field(ge=0.2, le=3600)] = 2.0
     frame_interval_s: Annotated[float, Field(ge=0.0, le=10)] = 0.1
     bin_px: Annotated[int, Field(ge=1, le=16)] = 4
-    # a laser mount that sets off at 2 um/min is then followed within 0.5 um (control/filters.py)
+    # then a laser mount that starts to drift at 2 um/min is followed within 0.5 um (control/filters.py)
     time_constant_s: Annotated[float, Field(ge=1, le=1e5)] = 40.0
     trim_rate_max_um_per_s: Annotated[float, Field(gt=0, le=10)] = 0.1
     trim_max_um: Annotated[float, Field(gt=0, le=1000)] = 100.0
@@ -133,7 +133,7 @@ class ShapeConfig(Section):
 
 
 class PatternConfig(Section):
-    """Fringes on the screen (INTERFACES section 2)."""
+    """Fringes on the screen (docs/interfaces.md)."""
 
     steps: Annotated[int, Field(ge=3, le=64)] = 4
     periods: Annotated[int, Field(ge=1, le=8)] = 8
@@ -149,16 +149,16 @@ class CameraPoseConfig(Section):
     @model_validator(mode="after")
     def _is_rotation(self) -> CameraPoseConfig:
         rows = np.array(self.rotation)
-        # 1e-6: what rounding to seven digits leaves
+        # 1e-6: rounding to seven digits
         if not np.allclose(rows @ rows.T, np.eye(3), atol=1e-6) or np.linalg.det(rows) < 0:
             raise ValueError("rotation is not a rotation matrix (rows: right, down, forward in world)")
         return self
 
 
 class GeometryConfig(Section):
-    """Camera and screen: the paper's a, b, alpha, or two general poses (INTERFACES section 1).
+    """Camera and screen: the paper's a, b, alpha, or two general poses (docs/interfaces.md).
 
-    Either form may say in `screen` how the screen's face stands off its plane.
+    In either form, `screen` may give the departure of the screen's face from its plane.
     """
 
     a_mm: Annotated[float, Field(ge=100, le=100_000)] | None = None
@@ -201,12 +201,12 @@ class CameraConfig(Section):
 
 
 class MirrorConfig(Section):
-    """The film's rim and the part of it that is measured."""
+    """The film's rim and its measured part."""
 
     radius_mm: Annotated[float, Field(ge=10, le=50_000)] = 500.0
     analysis_radius_mm: Annotated[float, Field(ge=10, le=50_000)] = 475.0
     sag_mm: Annotated[float, Field(ge=0.1, le=10_000)] = 37.1  # depth of the bowl at displacement 0
-    pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 600.0  # and the gauge's reading there; 0: not known
+    pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 600.0  # gauge reading at displacement 0; 0: unknown
 
     @model_validator(mode="after")
     def _inside(self) -> MirrorConfig:
@@ -216,13 +216,13 @@ class MirrorConfig(Section):
 
 
 class OpticsConfig(Section):
-    """Everything the deflectometry must know of the bench."""
+    """What deflectometry must know about the bench."""
 
     geometry: GeometryConfig = GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9)
     camera: CameraConfig = CameraConfig()
     pattern: PatternConfig = PatternConfig()
     mirror: MirrorConfig = MirrorConfig()
-    geometry_file: Path | None = None  # of `calibrate`: used instead of `geometry` (a path from the file's folder)
+    geometry_file: Path | None = None  # written by `calibrate`; replaces `geometry` (relative path)
 
     @model_validator(mode="after")
     def _map_covers_pattern(self) -> OpticsConfig:
@@ -235,7 +235,7 @@ class OpticsConfig(Section):
 
 
 class TwinConfig(Section):
-    """The simulated bench. Numbers are PHYSICS' (assumed) ones unless the file says otherwise."""
+    """The simulated bench. The defaults are assumptions, explained in docs/physics.md."""
 
     port: Annotated[int, Field(ge=0, le=65535)] = 5020  # 0: any free one
     scenario: Literal["calm", "quiet", "typical", "gusty"] = "typical"
@@ -248,20 +248,20 @@ class TwinConfig(Section):
     leak_time_constant_s: Annotated[float, Field(ge=10, le=1e8)] = 1.0e4
     barometer_noise_pa: Annotated[float, Field(ge=0, le=100)] = 0.05
     thermometer_noise_k: Annotated[float, Field(ge=0, le=10)] = 0.002
-    geometry: GeometryConfig | None = None  # where camera and screen really stand; none: as [optics.geometry] states
+    geometry: GeometryConfig | None = None  # true camera and screen poses; none: those of [optics.geometry]
 
 
 class RecordingConfig(Section):
-    """Where runs go and what they hold."""
+    """Where runs are stored and what they contain."""
 
     logs_dir: str = "logs"
     min_free_mb: Annotated[float, Field(ge=1)] = 500.0
     thumbnails: bool = True
-    raw_every_cycles: Annotated[int, Field(ge=0, le=1_000_000)] = 0  # keep the frames of every n-th cycle; 0: of none
+    raw_every_cycles: Annotated[int, Field(ge=0, le=1_000_000)] = 0  # keep the frames of every n-th cycle; 0: none
     raw_before_fault_cycles: Annotated[int, Field(ge=0, le=20)] = 2  # and always of the last before a fault
     segment_s: Annotated[float, Field(ge=10, le=86_400)] = 3600.0  # a crash leaves at most this much unoptimised
-    quiet_hz: Annotated[float, Field(ge=0.1, le=200)] = 1.0  # rows for the viewer while nothing happens
-    keep_gb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None  # old runs beyond this are deleted; none: never
+    quiet_hz: Annotated[float, Field(ge=0.1, le=200)] = 1.0  # viewer rows per second while nothing happens
+    keep_gb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None  # delete old runs beyond this; none: never
     keep_days: Annotated[float, Field(ge=0.1, le=1e5)] | None = None
 
 

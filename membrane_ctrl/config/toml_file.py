@@ -1,4 +1,4 @@
-"""The configuration's TOML file: read with errors a person can act on, written with every default spelled out."""
+"""The configuration's TOML file: read with actionable errors, written with every default spelled out."""
 
 import difflib
 import re
@@ -16,7 +16,7 @@ from membrane_ctrl.model.files import read_text
 Model = TypeVar("Model", bound=BaseModel)
 # A configuration with every default is 10 kB, a height map of 100 x 100 nodes 80 kB.
 _BYTES_MAX = 1_000_000
-# The parser takes time and memory by the square of the parts of a dotted key. No key of ours has more than four.
+# The parser's time and memory grow with the square of a dotted key's parts. Our keys have at most four.
 _PARTS_MAX = 50
 _QUOTED_PART = re.compile(r"""["']\s*\.""")
 
@@ -24,7 +24,7 @@ _QUOTED_PART = re.compile(r"""["']\s*\.""")
 def load(path: Path, model: type[Model], follow: bool = True) -> Model:
     """Read a TOML file as `model`; `follow` is False in a folder from an untrusted source (`model.files`).
 
-    Raises InputError with one line that names the file, the field and what would be right.
+    Raises InputError with one line that names the file, the field and a valid value.
     """
     tables = read_toml(path, follow)
     optics = tables.get("optics")
@@ -43,7 +43,7 @@ def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except IsADirectoryError:
-        raise InputError(f"{path}: is a folder, a TOML file is needed") from None
+        raise InputError(f"{path}: is a folder, not a TOML file") from None
     except PermissionError:
         raise InputError(f"{path}: no permission to read it") from None
     except OSError as error:
@@ -55,7 +55,7 @@ def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
 
 
 def _too_many_parts(line: str) -> bool:
-    """Whether a line may hold such a key: too many dots between commas (a key has commas only in quotes)."""
+    """Whether a line may hold such a key, i.e. too many dots between commas (only quoted keys contain commas)."""
     if line.count(".") <= _PARTS_MAX or line.lstrip().startswith("#"):
         return False
     dots = max(piece.count(".") for piece in line.split(","))
@@ -63,7 +63,7 @@ def _too_many_parts(line: str) -> bool:
 
 
 def with_height_map(geometry: Any, where: Path, follow: bool = True) -> None:
-    """Replace `screen.height_map.file` by its numbers, in the tables of a geometry that came from `where`.
+    """Replace `screen.height_map.file` by its numbers in the tables of a geometry from `where`.
 
     Raises InputError if the file is missing or holds anything but rows of numbers.
     """
@@ -87,7 +87,7 @@ def with_height_map(geometry: Any, where: Path, follow: bool = True) -> None:
 
 
 def parse(tables: dict[str, Any], model: type[Model], where: str) -> Model:
-    """Validate tables that came from `where`. Raises InputError like `load`."""
+    """Validate tables from `where`. Raises InputError like `load`."""
     try:
         return model.model_validate(tables)
     except ValidationError as error:
@@ -95,7 +95,7 @@ def parse(tables: dict[str, Any], model: type[Model], where: str) -> Model:
 
 
 def prune(table: dict[str, Any], model: type[BaseModel], prefix: str = "") -> tuple[str, ...]:
-    """Remove unknown keys, so that sets of newer versions can be read; returns their names."""
+    """Remove unknown keys, so that sets from newer versions can be read; returns their names."""
     ignored: list[str] = []
     known = {(field.alias or name): field.annotation for name, field in model.model_fields.items()}
     for key in list(table):
@@ -112,12 +112,12 @@ def prune(table: dict[str, Any], model: type[BaseModel], prefix: str = "") -> tu
 
 
 def dump(config: BaseModel) -> str:
-    """TOML text of a configuration, every default written out; fields that are None are left out."""
+    """TOML text of a configuration with every default; omits fields that are None."""
     return tomli_w.dumps(config.model_dump(mode="json", exclude_none=True))
 
 
 def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
-    """One line for a validation error: the field, what is wrong with it, and what would be right."""
+    """One line for a validation error: the field, the problem and the remedy."""
     path, parent = _walk(model, error["loc"])
     field = ".".join(str(part) for part in path)
     if error["type"] == "extra_forbidden":
@@ -137,17 +137,17 @@ def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
 
 def _hint(word: str, known: list[str]) -> str:
     near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    return f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}" if known else "remove it"
+    return f"did you mean {near[0]}?" if near else f"known: {', '.join(known)}" if known else "remove it"
 
 
 def _telling(errors: list[ErrorDetails]) -> ErrorDetails:
-    """The most helpful error: an unknown key is often the misspelt one that another error misses."""
+    """The most helpful error: an unknown key is often a misspelling of one reported missing."""
     misspelt = [error for error in errors if error["type"] == "extra_forbidden"]
     return misspelt[0] if misspelt and errors[0]["type"] == "missing" else errors[0]
 
 
 def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[int | str], type[BaseModel] | None]:
-    """The path of a key as in the file, and its section (None if unknown).
+    """Return the path of a key as in the file, and its section (None if unknown).
 
     In `location`, the tag of a union's member (`driver = "ventus"`) stands between the table and its key.
     """
@@ -169,13 +169,13 @@ def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list
 
 
 def _sections(annotation: Any) -> list[type[BaseModel]]:
-    """All sections that a field may hold."""
+    """Return all sections that a field may hold."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [section for inner in get_args(annotation) for section in _sections(inner)]
 
 
 def _tags(section: type[BaseModel]) -> tuple[Any, ...]:
-    """Values of `driver` that mean this section."""
+    """Return the values of `driver` that select this section."""
     driver = section.model_fields.get("driver")
     return () if driver is None else get_args(driver.annotation)

@@ -1,4 +1,4 @@
-"""From telemetry rows, events and shapes to what the console shows. No I/O, no terminal, no clock."""
+"""Turns telemetry rows, events and shapes into the console's content. No I/O, no terminal, no clock."""
 
 import math
 from collections import deque
@@ -43,12 +43,12 @@ class Trend:
         return [value for second, values in self._seconds if second >= oldest for value in values]
 
 
-SILENT_S = 1.0  # without a row for so long the control process hangs
+SILENT_S = 1.0  # the control process hangs if no row comes for this long
 
 
 @dataclass(frozen=True, slots=True)
 class ShapeView:
-    """The last measurement cycle and the shape loop; `note` says what is wrong."""
+    """The last measurement cycle and the shape loop; `note` names any problem."""
 
     state: states.ShapeState
     estimate: shape_estimate.ShapeEstimate | None
@@ -64,21 +64,21 @@ class ShapeView:
 
 @dataclass(frozen=True, slots=True)
 class ConsoleView:
-    """Everything on the console, still as numbers."""
+    """Content of the console, still as numbers."""
 
     row: telemetry.TelemetryRow | None  # the newest tick; None before the first
-    why: str  # the one line
-    silent_s: float  # age of the row if that is worth a warning, else 0
+    why: str  # the answer in one line
+    silent_s: float  # age of the row if it deserves a warning, else 0
     state: states.State
     state_age_s: float
     elapsed_s: float
     left_s: float  # from the first tick; infinite for a run without an end
     trend_um: tuple[float, ...]  # mean error of each of the last 60 s
-    error_mean_um: float  # of the error's samples in the last minute, as the next two
+    error_mean_um: float  # of the last minute's error samples, as the next two
     error_std_um: float
     in_band_fraction: float
     lateness_max_ms: float  # the worst of the last minute
-    fault: str  # that stands
+    fault: str  # the standing fault
     remedy: str  # for it
     faults: int  # faults so far in the run
     last_fault: str  # the newest of them, with its time
@@ -89,7 +89,7 @@ class ConsoleView:
 
 
 class ConsoleModel:
-    """Remembers what the console shows of rows, events and shapes."""
+    """Remembers the rows, events and shapes that the console shows."""
 
     def __init__(self, config: Config, duration_s: float | None = None) -> None:
         self._config = config
@@ -105,11 +105,11 @@ class ConsoleModel:
 
     @property
     def ended(self) -> bool:
-        """The event that ends a run has come."""
+        """The "end" event has arrived."""
         return self._status.ended
 
     def take_row(self, row: telemetry.TelemetryRow) -> None:
-        """One tick."""
+        """Take one tick."""
         if self._status.row is None:
             self._started_s = row.mono_s
         self._status = self._status.after_row(row)
@@ -117,11 +117,11 @@ class ConsoleModel:
         self._lateness.add(row.mono_s, row.lateness_ms)
 
     def take_event(self, line: events.EventLine) -> None:
-        """One event, a line of `events.jsonl`."""
+        """Take one event, a line of `events.jsonl`."""
         self._status = self._status.after_event(run_events.from_dict(line), line.get("mono_s", math.nan))
 
     def take_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
-        """One measurement cycle."""
+        """Take one measurement cycle."""
         self._estimate, row = estimate, self._status.row
         self._cycles += 1
         if estimate.verdict == "rejected":
@@ -132,7 +132,7 @@ class ConsoleModel:
                 self._reference = estimate
 
     def view(self, now_s: float) -> ConsoleView:
-        """What to show at a moment of the run's clock."""
+        """The content at a time of the run's clock."""
         status, row = self._status, self._status.row
         errors = self._error.values()
         band_um = self._config.limits.band_um
@@ -199,7 +199,7 @@ def _acquisition_words(said: run_events.AcquisitionState | None) -> str:
 
 
 def text(line: events.EventLine) -> str:
-    """An event's name, reason and observed value, as far as it has them."""
+    """An event's name, reason and observed value, where present."""
     name = str(line.get("name", "")).replace("_", " ")
     reason = next((str(line[key]) for key in ("why", "reason", "cause", "message") if line.get(key)), "")
     seen = f" ({line['seen']})" if line.get("seen") else ""

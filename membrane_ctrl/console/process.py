@@ -1,4 +1,4 @@
-"""The process that draws, so that the tick never waits for a terminal."""
+"""The process that draws the console, so that no tick waits for a terminal."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.model.terminal import Plain
 from membrane_ctrl.processes import child, ring
 
-# For a log file: a line a second, and these at once
+# For a log file: one line per second, and these at once
 _AT_ONCE = (
     events.Fault | events.Cleared | events.StateEntered | run_events.Link | run_events.Ended
     | run_events.ChildEnded | run_events.ChildSilent | run_events.ChildRestarted | run_events.ChildGivenUp
-    # a disk that takes nothing does not take the event either
+    # a full disk cannot store the event either
     | run_events.RecorderError | run_events.DiskLow | run_events.RecorderRecovered
 )  # fmt: skip
 
 
 def line(view: model.ConsoleView) -> str:
-    """The view in one line."""
+    """Format the view as one line."""
     row = view.row
     if view.silent_s or row is None:
         silent = f"no tick for {view.silent_s:.1f} s" if row else view.why
@@ -57,7 +57,7 @@ def line(view: model.ConsoleView) -> str:
 
 
 def at_once(line: events.EventLine) -> bool:
-    """Whether the event is shown at once."""
+    """Whether to show the event at once."""
     event = run_events.from_dict(line)
     if isinstance(event, run_events.AcquisitionState):
         return event.state != "running"
@@ -65,10 +65,10 @@ def at_once(line: events.EventLine) -> bool:
 
 
 def event_line(event: events.EventLine) -> str:
-    """An event in one line."""
+    """Format an event as one line."""
     mono_s = event.get("mono_s", math.nan)
     what = " ".join(str(event[key]) for key in ("state", "child", "exit") if key in event)
-    words = " ".join(f"{what} {model.text(event)}".split())  # one line, whatever an error said
+    words = " ".join(f"{what} {model.text(event)}".split())  # one line, even for multi-line errors
     remedy = f"; {event['remedy']}" if event.get("remedy") else ""
     return f"{why.number(mono_s, 1):>9} s  {str(event.get('kind', '?')).upper()} {words}{remedy}".rstrip()
 
@@ -80,30 +80,30 @@ def _shape_words(view: model.ConsoleView) -> str:
     return f"{shape.state.name.lower()} {shape.estimate.verdict} {why.duration(shape.age_s)}"
 
 
-_LOOK_S = 0.2  # as fast as a person reads changing figures
+_LOOK_S = 0.2  # as fast as people read changing figures
 _PLAIN_S = 1.0
-# A round takes some ms; a terminal that is stopped (Ctrl-S, a dead ssh) takes what is written to it for a while
+# A round takes some ms; a stopped terminal (Ctrl-S, a dead ssh) buffers writes for a while
 _HANGS_S = 15.0
 
 
 @dataclass(frozen=True, slots=True)
 class ConsoleSpec:
-    """What the console needs to know of the run."""
+    """What the console needs to know about the run."""
 
     clock: RunClock
     telemetry: ring.RingAddress
     events: ring.RingAddress
     shapes: ring.RingAddress | None  # None for a run without a camera
-    run_dir: Path  # where the recording goes, for the person to find
+    run_dir: Path  # run folder, shown to the operator
     config: Config
     duration_s: float | None = None
-    since_s: float = -math.inf  # earlier events are not shown again: another console showed them
+    since_s: float = -math.inf  # an earlier console has shown the events before
 
 
 def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
     """Show the run on stderr until its "end" event, `processes.STOP`, or the death of the parent.
 
-    Target of a `spawn`ed process; over `status` it says that it is alive. The terminal is given back in any case.
+    Target of a `spawn`ed process; reports over `status` that it is alive. Always restores the terminal.
     """
     child.leave_at_stop()
     report = child.reporter(status)
@@ -117,7 +117,7 @@ def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
 
         try:
             _draw(spec, feed, rounds)
-        except OSError:  # nobody reads any more: `2>&1 | head`, a terminal that was closed; another would see no more
+        except OSError:  # no reader: `2>&1 | head`, a closed terminal; another console would not help
             rounds(feed.update)
 
 
@@ -130,16 +130,16 @@ def _draw(spec: ConsoleSpec, feed: _Feed, rounds: Callable[[Callable[[], object]
 
 
 def give_back_terminal() -> None:
-    """After a console that was killed: the terminal's first page and its cursor."""
+    """Restore the terminal's main page and cursor after a killed console."""
     with suppress(OSError):
-        terminal = getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # this once, control bytes are ours
+        terminal = getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # these control bytes are intended
         if terminal.isatty():
             terminal.write("\x1b[?1049l\x1b[?25h")
             terminal.flush()
 
 
 class _Feed:
-    """The rings, poured into the model."""
+    """Feeds the rings into the model."""
 
     def __init__(self, spec: ConsoleSpec) -> None:
         self.model = model.ConsoleModel(spec.config, spec.duration_s)
@@ -148,7 +148,7 @@ class _Feed:
         self._shapes = ring.RingReader(spec.shapes) if spec.shapes else None
 
     def update(self) -> list[events.EventLine]:
-        """Take what has come; returns the events."""
+        """Take all new messages; returns the events."""
         for message in self._telemetry.drain():
             self.model.take_row(TelemetryRow.unpack(message))
         for message in self._shapes.drain() if self._shapes else ():
@@ -166,7 +166,7 @@ class _Feed:
 
 @contextmanager
 def _live(console: Console, spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
-    """The console on a terminal's second page; the first one is back afterwards."""
+    """Show the console on the terminal's alternate page; restore the main page afterwards."""
     run = str(spec.run_dir)
 
     def show() -> None:
@@ -175,12 +175,12 @@ def _live(console: Console, spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable
 
     with Live(console=console, screen=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False) as live:
         yield show
-    print(line(feed.model.view(spec.clock.now())), file=sys.stderr)  # a last line that stays
+    print(line(feed.model.view(spec.clock.now())), file=sys.stderr)  # a last line that remains
 
 
 @contextmanager
 def _plain(spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
-    """A line a second; important events at once."""
+    """Print a line per second, and important events at once."""
     due_s = spec.clock.now()
 
     def show() -> None:

@@ -1,4 +1,4 @@
-"""The console on a terminal. 80 x 24 holds all of it; a wider one gets longer lines, not more things to look at."""
+"""The console on a terminal. It fits 80 x 24; a wider terminal gets longer lines, not more items."""
 
 import math
 from collections.abc import Sequence
@@ -24,10 +24,10 @@ def level_bar(fraction: float, width: int, style: str = "cyan") -> Text:
 
 
 def signed_bars(values: Sequence[float], full: float, band: float) -> tuple[Text, Text]:
-    """A history as bars that stand on (upper line) and hang from (lower line) a common zero.
+    """Draw a history as bars above (upper line) and below (lower line) a common zero.
 
-    `full` is the value of a bar of full height; bars beyond `band` are red, the others green. NaN is a gap, zero the
-    thinnest bar upward.
+    `full` is the value of a full-height bar; bars beyond `band` are red, the others green. NaN is a gap, zero the
+    thinnest upward bar.
     """
     upper, lower = Text(), Text()
     for value in values:
@@ -42,13 +42,13 @@ def signed_bars(values: Sequence[float], full: float, band: float) -> tuple[Text
             lower.append(" ")
         else:
             upper.append(" ")
-            # no characters hang: the rest of the cell is drawn in the background's colour
+            # there are no hanging block characters: draw the rest of the cell in the background colour
             lower.append(_EIGHTHS[8 - eighths], Style(color=colour, reverse=True))
     return upper, lower
 
 
 def full_scale(values: Sequence[float], least: float) -> float:
-    """The smallest of 1, 2, 5 x 10^n that holds all values, and at least `least`."""
+    """The smallest of 1, 2, 5 x 10^n that covers all values, and is at least `least`."""
     largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
     if largest <= least:
         return least
@@ -64,11 +64,11 @@ _STATE_STYLES = {
 _SHAPE_STYLES = {states.ShapeState.TRACKING: "green", states.ShapeState.SUSPENDED: "yellow"}
 _VERDICT_STYLES = {"ok": "green", "degraded": "yellow", "rejected": "red"}
 _BAR_WIDTH = 10
-_CALM = 0.25  # of the band: a finer scale than this would make noise look like trouble
+_CALM = 0.25  # of the band: on a finer scale noise would look like trouble
 
 
 def console_panel(view: ConsoleView, config: Config, run: str) -> Panel:
-    """The whole console; `run` is where the recording goes."""
+    """The whole console; `run` is the run folder."""
     time_left = f"{duration(view.left_s)} left" if math.isfinite(view.left_s) else "until stopped"
     title = Text.assemble(" ", (view.state.name.lower(), _STATE_STYLES.get(view.state, "bold")))
     title.append(f" for {duration(view.state_age_s)} ")
@@ -83,7 +83,7 @@ def console_panel(view: ConsoleView, config: Config, run: str) -> Panel:
 
 
 def _headline(view: ConsoleView, config: Config) -> Text:
-    """Faults first, else why the pump is where it is."""
+    """The standing fault, else why the pump is where it is."""
     if view.silent_s:
         return Text(f"no tick for {view.silent_s:.1f} s", style="bold red")
     outside = view.row is not None and abs(view.row.error_um) > config.limits.band_um
@@ -113,7 +113,7 @@ def _figures(view: ConsoleView, config: Config) -> Table:
     table.add_row("", "")
     table.add_row("lateness", _lateness(view, row))
     table.add_row("faults", _faults(view))
-    if view.recording:  # one line: with a full disk every file complains
+    if view.recording:  # one line only: with a full disk every file reports an error
         table.add_row("recorder", Text(view.recording, style="bold yellow", no_wrap=True, overflow="ellipsis"))
     return table
 
@@ -163,7 +163,7 @@ def _flow(row: telemetry.TelemetryRow) -> Text:
 def _gas(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
     text = Text(f"leak {number(row.leak_um_per_s, 2, 'um/s')}")
     if view.too_tight:
-        text.append(" too tight: open a bleed", style="bold yellow")
+        text.append(" too tight: open the bleed", style="bold yellow")
     ambient_hpa = row.ambient_pressure_pa / 100.0
     text.append(f"  gauge {number(row.gauge_pressure_pa, 1, 'Pa')}  air {number(ambient_hpa, 2, 'hPa')}")
     text.append(f" {number(row.air_temperature_c, 2, '°C')}")

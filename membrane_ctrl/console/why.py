@@ -24,7 +24,7 @@ _WORTH_NAMING = 0.03  # of the flow: smaller contributions are not named
 
 
 def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
-    """The line; `told` is the controller's own last reason, `fault` the fault that stands in words, or empty."""
+    """The line; `told` is the controller's last reason, `fault` describes the standing fault or is empty."""
     state, rung = State(int(row.state)), Rung(int(row.rung))
     if rung != Rung.NONE:
         return f"{_RUNGS[rung]}: {fault or told or 'unknown fault'}"
@@ -43,18 +43,18 @@ def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
 
 
 def _outside(row: TelemetryRow) -> str:
-    """Which way the mirror is off and what the pump does about it (error = setpoint - reading)."""
+    """Direction of the deviation, and the pump's response to it (error = setpoint - reading)."""
     if row.error_um > 0:
         at_limit = row.flow_wanted_um_per_s > row.flow_um_per_s + 1e-6
-        return f"bowl {row.error_um:.1f} um too shallow, {_flow(row)}{', all it may give' if at_limit else ''}"
+        return f"bowl {row.error_um:.1f} um too shallow, {_flow(row)}{', its limit' if at_limit else ''}"
     waits = row.flow_um_per_s <= 0
-    return f"bowl {-row.error_um:.1f} um too deep, {_flow(row)}{', only the leak lets it down' if waits else ''}"
+    return f"bowl {-row.error_um:.1f} um too deep, {_flow(row)}{', only the leak can lower it' if waits else ''}"
 
 
 def _balance(row: TelemetryRow) -> str:
-    """The contributions to the flow, the largest first."""
+    """Contributions to the flow, largest first."""
     parts = {
-        "leak": row.i_um_per_s,  # in the mean the integrator's part is what leaks
+        "leak": row.i_um_per_s,  # on average the integrator supplies the leak
         "error": row.p_um_per_s,
         "its speed": row.d_um_per_s,
         "feed-forward": row.feedforward_um_per_s,
@@ -70,11 +70,11 @@ def _flow(row: TelemetryRow) -> str:
     return f"pump gives {row.flow_um_per_s:.2f} um/s"
 
 
-NONE = "–"  # where there is no number
+NONE = "–"  # for a missing number
 
 
 def number(value: float, digits: int, unit: str = "", sign: bool = False) -> str:
-    """`value` with its unit."""
+    """Format `value` with its unit."""
     if not math.isfinite(value):
         return NONE
     figure = f"{value:{'+' if sign else ''}.{digits}f}"
@@ -82,12 +82,12 @@ def number(value: float, digits: int, unit: str = "", sign: bool = False) -> str
 
 
 def percent(fraction: float, digits: int = 0) -> str:
-    """A fraction as a percentage."""
+    """Format a fraction as a percentage."""
     return number(100.0 * fraction, digits, "%")
 
 
 def duration(seconds_s: float) -> str:
-    """A time span: 7 s, 2:05, 3:02:05, 4 d 03:02:05."""
+    """Format a time span: 7 s, 2:05, 3:02:05, 4 d 03:02:05."""
     if not math.isfinite(seconds_s):
         return NONE
     minutes, seconds = divmod(int(seconds_s), 60)

@@ -1,6 +1,6 @@
 """The diaphragm pump: command for a flow, and the flow a command gives.
 
-    q = q_full (d - dead) / (1 - dead)   while it runs; starts at `start`, stalls below `stall`   (PHYSICS, pump)
+    q = q_full (d - dead) / (1 - dead)   while it runs; starts at `start`, stalls below `stall`   (docs/physics.md)
 
 Between rest and the least running flow there is nothing: a wanted flow in that gap goes to the nearer end, so that
 the error of the gap has no sign of its own. (Always running on would add gas that nothing takes away, always stopping

@@ -1,4 +1,4 @@
-"""What may be asked of a running hold, by whom and in which states: one table for all who need it."""
+"""The commands of a running hold, who may send them and in which states: one table for every user."""
 
 import math
 from collections.abc import Collection, Iterable
@@ -16,13 +16,13 @@ Kind = Literal[
 ]  # fmt: skip
 Role = Literal["read", "operate", "tune"]
 
-AT_START = "command line"  # who asks for what `hold` begins with
-AT_END = "duration"  # and for its `stop`
+AT_START = "command line"  # sender of the first commands
+AT_END = "duration"  # sender of the last `stop`
 TRIAL_MAX_S = 7200.0  # nobody watches a trial for longer
 
-# Of the commands of one tick these come first, in this order: the safest wins
+# Within one tick these come first, in this order: the safest wins
 DOWN: tuple[Kind, ...] = ("latch", "vent", "stop", "lower")
-# and none of these, which lift the mirror or allow it, is obeyed in the same tick
+# these can lift the mirror and are not obeyed in the same tick
 _OVERRULED: frozenset[str] = frozenset({"hold", "manual", "tune", "resume", "ack"})
 
 ANY = frozenset(State)
@@ -31,30 +31,30 @@ RUNNING = MOVING | {State.STANDBY, State.CHECK}
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What a person or program asks for."""
+    """A request of a person or program."""
 
-    # of `TABLE`, or "resumed": an earlier run resumed within the last day; only the start of a run may say so
+    # of `TABLE`, or "resumed": an earlier run resumed within the last day; only the start of a run may send it
     kind: Kind | Literal["resumed"]
     who: str  # recorded, as is `why`
     why: str = ""
-    # `setpoint`: um. `manual`: flow, um/s of the centre. `gains`: s on trial, until they are kept or revert; NaN: for
-    # good. `resumed`: s ago
+    # `setpoint`: um. `manual`: flow, um/s of the centre. `gains`: trial time, s; NaN: no trial. `resumed`: age of the
+    # resume, s
     value: float = math.nan
-    text: str = ""  # `mark`: what to write on the timeline. `latch`: the fault
-    loop: LoopConfig | None = None  # `gains`: the loop's new settings, whole
-    experiment: ExperimentSpec | None = None  # `tune`: what to do
-    number: int = 0  # given by the asker, returned with the answer
+    text: str = ""  # `mark`: text for the timeline. `latch`: the fault
+    loop: LoopConfig | None = None  # `gains`: all new loop settings
+    experiment: ExperimentSpec | None = None  # `tune`: the experiment
+    number: int = 0  # chosen by the client, returned with the answer
 
 
 @dataclass(frozen=True, slots=True)
 class CommandRule:
-    """One row."""
+    """One row of the table."""
 
-    role: Role  # who may ask for it
+    role: Role  # required role
     states: Collection[State]  # where it is allowed
-    does: str  # for the help
-    needs: tuple[str, ...] = ()  # fields that a request must have
-    takes: tuple[str, ...] = ()  # and those it may have
+    does: str  # help text
+    needs: tuple[str, ...] = ()  # required fields of the request
+    takes: tuple[str, ...] = ()  # optional fields
 
 
 _HOLD, _PARKED, _FLOW = (
@@ -64,42 +64,42 @@ _HOLD, _PARKED, _FLOW = (
 )
 
 TABLE: dict[Kind, CommandRule] = {
-    "setpoint": CommandRule("operate", RUNNING, "Ramp to a setpoint of the laser, in um.", needs=("value",)),
-    "hold": CommandRule("operate", _PARKED, "Hold the mirror, or go back to holding it."),
-    "pause": CommandRule("operate", _HOLD, "Pause the loop: the pump keeps its mean flow."),
+    "setpoint": CommandRule("operate", RUNNING, "Ramp to a laser setpoint, in um.", needs=("value",)),
+    "hold": CommandRule("operate", _PARKED, "Hold the mirror, or return to holding it."),
+    "pause": CommandRule("operate", _HOLD, "Pause the loop; the pump keeps its mean flow."),
     "resume": CommandRule("operate", _HOLD, "Resume the loop after a pause."),
     "manual": CommandRule("operate", _FLOW, "Set the pump's flow by hand, in um/s of the centre.", needs=("value",)),
-    "gains": CommandRule("tune", RUNNING, "Set loop gains, on trial or for good.", needs=("loop",), takes=("value",)),
-    "keep": CommandRule("tune", RUNNING, "Keep the gains that are on trial."),
+    "gains": CommandRule("tune", RUNNING, "Set loop gains, on trial or to stay.", needs=("loop",), takes=("value",)),
+    "keep": CommandRule("tune", RUNNING, "Keep the gains on trial."),
     "tune": CommandRule("tune", _HOLD, "Run a tuning experiment.", needs=("experiment",)),
     "shape_on": CommandRule("operate", ANY, "Switch the shape loop on."),
     "shape_off": CommandRule("operate", ANY, "Switch the shape loop off."),
     "mark": CommandRule("operate", ANY, "Add a remark to the timeline.", needs=("text",)),
-    "capture": CommandRule("operate", _HOLD, "Save a full capture set in the run's raw/ folder."),
+    "capture": CommandRule("operate", _HOLD, "Save a full capture set to the run's raw/ folder."),
     "ack": CommandRule("operate", {State.STANDBY, State.FAULT}, "Clear a latched fault and acknowledge the alarms."),
     "lower": CommandRule("operate", RUNNING, "Stop the pump; the leak lowers the mirror."),
     "vent": CommandRule("operate", ANY, "Open the vent."),
     "stop": CommandRule("operate", ANY, "End the run safely; never refused."),
     # a fault of an earlier run, or a person's lock
-    "latch": CommandRule("operate", ANY, "Lock the mirror: pump off, no hold before `ack`.", takes=("text",)),
+    "latch": CommandRule("operate", ANY, "Lock the mirror: pump off, no hold until `ack`.", takes=("text",)),
 }
 
 
 def in_order(commands: Iterable[Command]) -> list[Command]:
-    """The commands of a tick, the safest first; the others as they came."""
+    """Commands of a tick, safest first, the others in order of arrival."""
     return sorted(commands, key=lambda command: DOWN.index(command.kind) if command.kind in DOWN else len(DOWN))
 
 
 def overruled(command: Command, obeyed: Collection[str]) -> str:
-    """What of this tick's obeyed commands keeps this one from being obeyed, as a refusal; empty if nothing does."""
+    """Refusal naming the command of the same tick that overrules this one; empty if none does."""
     winner = next((kind for kind in DOWN if kind in obeyed), "")
     if command.kind not in _OVERRULED or not winner:
         return ""
-    return f"{winner} came at the same time and wins; ask again"
+    return f"{winner} came at the same time and takes precedence; send again"
 
 
 def refusal(command: Command, state: State, config: Config) -> str:
-    """Why a command cannot be obeyed now; empty if it can."""
+    """Why a command cannot be executed now; empty if it can."""
     if command.kind == "resumed":
         return "" if command.who == AT_START else "only the start of a run may report earlier resumes"
     rule = TABLE[command.kind]
@@ -115,9 +115,9 @@ def refusal(command: Command, state: State, config: Config) -> str:
     if command.kind == "tune" and command.experiment is None:
         return "tune: experiment missing"
     if command.kind == "gains" and command.loop is None:
-        return "gains: no gains given"
+        return "gains: missing"
     if command.kind == "gains" and not (math.isnan(command.value) or 1.0 <= command.value <= TRIAL_MAX_S):
-        return f"gains on trial for {command.value:g} s: a trial lasts 1 .. {TRIAL_MAX_S:g} s"
+        return f"gains on trial for {command.value:g} s: a trial takes 1 .. {TRIAL_MAX_S:g} s"
     if command.kind == "gains" and command.loop is not None and command.loop.rate_hz != config.loop.rate_hz:
         return "the tick rate cannot be changed during a run"
     if command.kind == "capture" and not config.shape.enabled:
@@ -126,9 +126,9 @@ def refusal(command: Command, state: State, config: Config) -> str:
 
 
 class GainsTrial:
-    """Gains on trial revert to the last good ones unless they are kept in time; the first gains of a run are good.
+    """Gains on trial revert to the last good ones unless kept in time; a run's first gains count as good.
 
-    Whoever tries them may lose its connection or be killed: the loop must not keep gains that nobody has verified
+    The client that tries them may lose its connection or be killed: the loop must not keep unverified gains
     (docs/decisions/78-gains-on-trial.md).
     """
 
@@ -138,25 +138,25 @@ class GainsTrial:
 
     @property
     def on_trial(self) -> bool:
-        """The present gains have not been kept yet."""
+        """The present gains are not kept yet."""
         return math.isfinite(self._until_s)
 
     def begin(self, loop: LoopConfig, now_s: float, trial_s: float) -> None:
-        """Set new gains for `trial_s` seconds, or for good if that is NaN."""
+        """Set new gains for `trial_s` seconds, or permanently if that is NaN."""
         self._tried = loop
         self._until_s = now_s + trial_s
         if not self.on_trial:
             self._good = loop
 
     def keep(self) -> None:
-        """The present gains are good."""
+        """Keep the present gains."""
         self._good, self._until_s = self._tried, math.nan
 
     def overdue(self, now_s: float) -> bool:
-        """The trial is over, and nobody has kept the gains."""
+        """The trial has ended without `keep`."""
         return now_s >= self._until_s
 
     def revert(self) -> LoopConfig:
-        """Go back to the last good gains, and return them."""
+        """Restore and return the last good gains."""
         self._tried, self._until_s = self._good, math.nan
         return self._good

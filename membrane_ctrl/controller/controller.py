@@ -1,7 +1,7 @@
-"""One tick of control: observe, judge, act. Pure of I/O and clock, so that a run, a replay and a test are the same.
+"""One tick of control: observe, judge, act. Without I/O and clock, so that a run, a replay and a test are alike.
 
-The order is fixed: what the bench shows becomes an observation; the safety table judges it; only then the state's
-handler runs, and what it wants is overruled wherever a safe level is in force. Every path through a tick ends here.
+The order is fixed: the inputs become an observation; the safety table judges it; only then the state's handler runs,
+and a safe level in force overrules its output. Every path through a tick ends here.
 """
 
 import math
@@ -28,10 +28,10 @@ from membrane_ctrl.model import arrays, errors
 from membrane_ctrl.model import events as told
 from membrane_ctrl.model.states import Rung, State
 
-# the loop's time step is clamped to this range of the nominal one; beyond it is a missed tick, which safety sees
+# range of the loop's time step relative to the nominal one; beyond it a tick is missed, which the safety table sees
 _DT_RANGE = (0.2, 5.0)
-_WHY_STANDS_S = 1.0  # a reason that comes and goes faster (a pump that touches its limit) is not reported
-# the operator's line names who asked for one of these
+_WHY_STANDS_S = 1.0  # shorter-lived reasons (a pump that touches its limit) are not reported
+# the operator's line names the sender of these commands
 _MOVES = frozenset({"hold", "stop", "pause", "manual", "tune", "ack", "lower", "vent"})
 _NO_DIGITS = str.maketrans("", "", "0123456789")
 
@@ -146,7 +146,7 @@ class Controller:
             self._revert_gains("nobody kept them in time", events)
 
     def _obey(self, command: commands.Command, obeyed: Collection[str], events: list[told.Event]) -> bool:
-        """Do what a command asks, or refuse it; either is recorded with who asked and why."""
+        """Execute or refuse a command; either way, record its sender and reason."""
         refused = (
             commands.refusal(command, self.state, self._config)
             or commands.overruled(command, obeyed)
@@ -181,7 +181,7 @@ class Controller:
             case "setpoint":
                 scene.setpoint_um = command.value
             case "gains":
-                assert command.loop is not None  # `refusal` has looked
+                assert command.loop is not None  # checked by `refusal`
                 self._gains.begin(command.loop, scene.now_s, command.value)
                 self._set_gains(command.loop)
             case "keep":
@@ -209,7 +209,7 @@ class Controller:
             scene.asked_by = command.who
 
     def _prepare(self, command: commands.Command) -> str:
-        """Make the experiment of a `tune`; returns why the command is refused, or an empty text."""
+        """Prepare the experiment of a `tune`; returns why the command is refused, or an empty text."""
         scene, spec = self._scene, command.experiment
         if command.kind == "hold" and scene.latched:
             return f"a fault is latched: {scene.latched}; acknowledge it first"
@@ -234,7 +234,7 @@ class Controller:
         events.append(told.GainsReverted(why))
 
     def _consider_resuming(self, observation: safety_rules.Observation) -> None:
-        """Decide whether a latched fault may clear by itself (`resume`)."""
+        """Decide whether a latched fault may clear automatically (`resume`)."""
         scene, resume = self._scene, self._resume
         if self.state != State.FAULT or self.fault is None:
             resume.forget()
@@ -273,21 +273,21 @@ class Controller:
             self._consistency.camera_lies,
         )
         scene.trim_um = shape.trim_um if self.state in safety_rules.MOVING else 0.0
-        words = shape.reason.translate(_NO_DIGITS)  # numbers that change are no news
+        words = shape.reason.translate(_NO_DIGITS)  # changed numbers are not news
         if (shape.state, words) != self._shape_was:
             self._shape_was = (shape.state, words)
             events.append(told.ShapeLoopState(shape.state.name.lower(), shape.reason))
         return shape
 
     def _act(self, events: list[told.Event]) -> None:
-        """Run the state's handler with everything off unless it says otherwise."""
+        """Run the state's handler; everything is off unless it sets it."""
         scene = self._scene
         scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, 0.0
         try:
             wanted = states.run_state(self.state, scene)
         except Exception as error:
             self._tick_error = f"{type(error).__name__}: {error}"
-            # an error must not close the vent of a mirror that is being vented
+            # an error must not close an open vent
             vents = scene.venting or scene.levels.rung == Rung.VENT
             scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, float(vents)
             if self.state == State.FAULT:  # no safer state is left
@@ -309,7 +309,7 @@ class Controller:
             scene.trial = scene.trial_ended = None
         if state == State.FAULT and self._gains.on_trial:
             self._revert_gains("a fault occurred during the trial", events)
-        if self.state == State.FAULT:  # it was acknowledged, or may resume
+        if self.state == State.FAULT:  # acknowledged, or may resume
             if not scene.acknowledged and self.fault is not None:
                 self._resume.resumed(scene.now_s)
                 events.append(told.Resumed(self.fault.name))
@@ -318,7 +318,7 @@ class Controller:
             scene.acknowledged = False
         if state == State.STANDBY:
             scene.venting = False
-        scene.manual_wanted = scene.paused = False  # they end with the hold they belong to
+        scene.manual_wanted = scene.paused = False  # they end with their hold
         self.state = state
         self._state_since_s = math.nan
         scene.good_since_s = scene.last_good_s = math.nan
@@ -326,7 +326,7 @@ class Controller:
         scene.test = None
 
     def _tell_trial(self, why: str, events: list[told.Event]) -> None:
-        """How the experiment ended: by itself, or because the state was left."""
+        """Report how the experiment ended: by itself, or because the state changed."""
         experiment = self._scene.trial
         assert experiment is not None
         ended = self._scene.trial_ended or machine.Finished(False, why)
@@ -335,7 +335,7 @@ class Controller:
         )
 
     def _tell_why(self, events: list[told.Event]) -> None:
-        """Report the operator's line when its words (not its numbers) have changed for good."""
+        """Report the operator's line once its words (not its numbers) have changed durably."""
         scene = self._scene
         words = scene.why.translate(_NO_DIGITS)
         if words != self._why_words:

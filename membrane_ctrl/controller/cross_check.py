@@ -1,7 +1,7 @@
-"""The configuration against itself and against what the board says. Pure; `check` and `hold` refuse by it.
+"""Checks the configuration against itself and against the board's limits, for `check` and `hold`. Pure.
 
-The range of a field (`config`) catches a wrong unit. The combinations are judged here: settings that let the pump run
-when it must not, guards that can never trip or always do, and numbers that contradict each other.
+The range of a field (`config`) catches a wrong unit. This module judges combinations: settings that let the pump run
+when it must not, guards that never or always trip, and contradictory numbers.
 """
 
 import difflib
@@ -19,22 +19,22 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller import cross_check_plant, pump_obeys, safety
 from membrane_ctrl.model.errors import FindingsError
 
-_RESUMES_MOST = 24  # a day: what comes back more often than once an hour has a cause that is not passing
-# How long the pump may run with nobody in control, and give a flow that nobody corrects. At 5 um/s and at the
-# 1.2 um/s of a doubled leak that is 10 um and 70 um, well inside what the default limits leave.
+_RESUMES_MOST = 24  # a day: the cause of a fault that recurs more than once an hour is not temporary
+# How long the pump may run without control, and how long at an uncorrected flow. At 5 um/s and at the 1.2 um/s of a
+# doubled leak that is 10 um and 70 um, well within the default limits.
 _UNATTENDED_S, _BLIND_S = 2.0, 60.0
-_PAUSE_S = 3600.0  # the laser still guards the limits, but nobody holds the mirror
+_PAUSE_S = 3600.0  # the laser still guards the limits, but no loop holds the mirror
 _PUMP_STANDS_S = 0.5  # lag and transport
 _GAUGE_NOISE_PA = 1.0
 _UNKNOWN = BenchIdentity("", 0, "", math.nan)
-_TWIN_BOARD = DevicesConfig(board="tcp://twin")  # what `--twin` makes when no devices are named
+_TWIN_BOARD = DevicesConfig(board="tcp://twin")  # the device of `--twin` if none are named
 
 
 def cross_check(config: Config, board: BenchIdentity | None = None) -> tuple[cross_check_plant.ConfigFinding, ...]:
-    """Findings on a configuration and, if given, on the limits that its board keeps; errors first."""
+    """Findings on a configuration and, if given, on its board's limits; errors first."""
     say = cross_check_plant.ConfigFindings(config)
     _finite(config, say)
-    if not say.found:  # the others compute
+    if not say.found:  # the others compute with the values
         for judge in _RULES:
             judge(config, say)
         for judge_board in (cross_check_plant.judge_ranges, _board):
@@ -45,7 +45,7 @@ def cross_check(config: Config, board: BenchIdentity | None = None) -> tuple[cro
 def require_sound(
     config: Config, source: str, board: BenchIdentity | None = None
 ) -> tuple[cross_check_plant.ConfigFinding, ...]:
-    """Refuse a configuration with errors (FindingsError, a line each); return the warnings of one without."""
+    """Return the warnings; raise FindingsError for a configuration with errors, one line each."""
     findings = cross_check(config, board)
     if any(finding.severity == "error" for finding in findings):
         raise FindingsError([finding.line(source) for finding in findings])
@@ -53,9 +53,9 @@ def require_sound(
 
 
 def _finite(config: Config, say: cross_check_plant.ConfigFindings) -> None:
-    """Not a number is refused where a file is read; a program may have put one in since."""
+    """Refuse NaN, which the file's reader refuses too, but which a program may have set."""
     for field, value in _numbers(config, ""):
-        say.error(not math.isfinite(value), field, "is not a number", "set a finite one")
+        say.error(not math.isfinite(value), field, "is not a number", "set a finite value")
 
 
 def _numbers(value: Any, field: str) -> Iterator[tuple[str, float]]:
@@ -82,14 +82,14 @@ def _resume(config: Config, say: cross_check_plant.ConfigFindings) -> None:
         say.error(name not in known, field, "no fault has this name", hint)
         why, remedy = "only a person may clear this fault", f"remove it; may resume: {', '.join(may)}"
         say.error(name in known and name not in may, field, why, remedy)
-    why = "a fault that comes back so often has a lasting cause"
+    why = "a fault that recurs this often has a lasting cause"
     say.error(resume.most_per_day > _RESUMES_MOST, "resume.most_per_day", why, f"set at most {_RESUMES_MOST}")
     if resume.faults:
         never, remedy = "nothing would ever resume", "set at least 1, or empty resume.faults"
         say.warn(resume.most_per_day == 0, "resume.most_per_day", never, remedy)
         waits = resume.wait_s >= config.states.pump_off_max_s
         say.warn(
-            waits, "resume.wait_s", f"the mirror is vented before: {never}", "keep it below states.pump_off_max_s"
+            waits, "resume.wait_s", f"the mirror is vented earlier: {never}", "keep it below states.pump_off_max_s"
         )
 
 
@@ -97,7 +97,7 @@ def _watchdog(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     devices, limits = config.devices or _TWIN_BOARD, config.limits
     tick_s, watchdog_s = 1.0 / config.loop.rate_hz, devices.watchdog_s
     if config.devices is not None:
-        why, most = "the pump runs on for so long without a control process", f"set at most {_UNATTENDED_S:g} s"
+        why, most = "the pump would run this long without a control process", f"set at most {_UNATTENDED_S:g} s"
         say.error(watchdog_s > _UNATTENDED_S, "devices.watchdog_s", why, most)
         for field, timeout_s in _slowest_answers(devices):
             lost_s = timeout_s + tick_s
@@ -111,26 +111,26 @@ def _watchdog(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     say.error(2.0 * tick_s > watchdog_s, "loop.rate_hz", why, remedy)
     late, why = "limits.lateness_max_ms", f"can never trip: the watchdog ({watchdog_s:g} s) trips first"
     say.error(1e-3 * limits.lateness_max_ms >= watchdog_s, late, why, "keep it below devices.watchdog_s")
-    say.warn(limits.lateness_max_ms < 5.0, late, "a healthy machine is that late", "set 100 ms")
+    say.warn(limits.lateness_max_ms < 5.0, late, "a healthy machine can be that late", "set 100 ms")
 
 
 def _stale(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     limits, tick_s = config.limits, 1.0 / config.loop.rate_hz
     why, least = (
-        f"shorter than 1.5 ticks of {tick_s:g} s: every late tick is a fault",
+        f"shorter than 1.5 ticks of {tick_s:g} s: every late tick would be a fault",
         f"set at least {1.5 * tick_s:g} s",
     )
     say.error(limits.stale_s * config.loop.rate_hz < 1.5 - 1e-9, "limits.stale_s", why, least)
-    why, most = "the pump runs on without a reading for so long", f"set at most {_UNATTENDED_S:g} s"
+    why, most = "the pump would run this long without a reading", f"set at most {_UNATTENDED_S:g} s"
     say.error(limits.stale_s > _UNATTENDED_S, "limits.stale_s", why, most)
-    why, least = "two equal readings by chance are a fault", f"set at least {3.0 * tick_s:g} s"
+    why, least = "two readings equal by chance would be a fault", f"set at least {3.0 * tick_s:g} s"
     say.error(limits.stuck_s < 3.0 * tick_s, "limits.stuck_s", why, least)
-    why, most = "the loop follows a stopped laser for so long", f"set at most {_BLIND_S:g} s"
+    why, most = "the loop would follow a stopped laser this long", f"set at most {_BLIND_S:g} s"
     say.error(limits.stuck_s > _BLIND_S, "limits.stuck_s", why, most)
 
 
 def _slowest_answers(devices: DevicesConfig) -> Iterator[tuple[str, float]]:
-    """The longest time that a tick waits for answers: those on one line wait for each other, the lines do not."""
+    """Longest wait of a tick for answers: devices on one line take turns, lines work in parallel."""
     if devices.board is not None:
         yield "devices.timeout_s", devices.timeout_s
         return
@@ -147,7 +147,7 @@ def _states(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     states, limits = config.states, config.limits
     for name, most_s in (("hold_flow_max_s", _BLIND_S), ("ramp_down_s", _BLIND_S), ("pause_max_s", _PAUSE_S)):
         too_long = getattr(states, name) > most_s
-        say.error(too_long, f"states.{name}", "the flow is not controlled for so long", f"set at most {most_s:g} s")
+        say.error(too_long, f"states.{name}", "the flow would be uncontrolled this long", f"set at most {most_s:g} s")
     needed_s = states.check_s
     if states.actuator_test:
         needed_s = pump_obeys.ActuatorTest(config.pump, True, config.loop.rate_hz).duration_s
@@ -156,11 +156,11 @@ def _states(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     why = f"too short: states.settle_s is {states.settle_s:g} s"
     say.error(states.settle_timeout_s <= states.settle_s, "states.settle_timeout_s", why, "set some minutes")
     seen_s = _PUMP_STANDS_S + 2.0 / config.loop.rate_hz
-    why = f"too short: a pump stands {_PUMP_STANDS_S:g} s after its command, and is seen to a tick later"
+    why = f"too short: a pump stops {_PUMP_STANDS_S:g} s after its command, and its read-back shows it a tick later"
     say.error(states.lower_timeout_s < seen_s, "states.lower_timeout_s", why, "set 3 s")
     speed_um_per_s = min(config.loop.setpoint_ramp_um_per_s, cross_check_plant.flow_um_per_s(config))
     way_s = (config.loop.setpoint_um - limits.displacement_min_um) / speed_um_per_s
-    why = f"too short: the way up from limits.displacement_min_um takes at least {way_s:.0f} s"
+    why = f"too short: inflating from limits.displacement_min_um takes at least {way_s:.0f} s"
     say.warn(states.inflate_timeout_s < way_s, "states.inflate_timeout_s", why, "lengthen it")
     vented, pressure_pa = "states.vented_pressure_pa", states.vented_pressure_pa
     less = "set less than half of limits.gauge_pressure_max_pa"
@@ -192,12 +192,10 @@ def _limits(config: Config, say: cross_check_plant.ConfigFindings) -> None:
 
 
 def _board(config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFindings) -> None:
-    """The limits that the board keeps by itself."""
+    """Check the limits that the board enforces itself."""
     own_pa = board.gauge_pressure_limit_pa
     above = config.limits.gauge_pressure_max_pa > own_pa
-    say.error(
-        above, "limits.gauge_pressure_max_pa", f"the board vents at {own_pa:g} Pa by itself", "lower it to that"
-    )
+    say.error(above, "limits.gauge_pressure_max_pa", f"the board itself vents at {own_pa:g} Pa", "lower it to that")
     pump, limit = config.pump, board.pump_limit_fraction
     share = cross_check_plant.flow_um_per_s(config) / pump.flow_full_um_per_s
     needed = pump.dead_fraction + (1.0 - pump.dead_fraction) * share

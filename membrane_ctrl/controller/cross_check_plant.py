@@ -1,4 +1,4 @@
-"""Findings, and those about pump, sensors, loops, optics and alarms. Guards and limits are in `cross_check`."""
+"""Findings on pump, sensors, loops, optics and alarms. `cross_check` has those on guards and limits."""
 
 import math
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ Severity = Literal["error", "warning"]
 
 _MS_MOST, _MS_WARN = 3.0, 1.8  # peak sensitivity: 3 leaves a phase margin of 19 deg
 _BAROMETER_UM_PER_PA, _TEMPERATURE_UM_PER_K = -0.358, 123.0  # docs/physics.md
-_FEEDFORWARD_MOST = 2.0  # times the physical gain: from there on it does more harm than none
+_FEEDFORWARD_MOST = 2.0  # times the physical gain: beyond, feed-forward is worse than none
 _VENT_FULL_UM_PER_S = 100.0  # of an open vent at the nominal pressure
 _GRAZING_DEG = 10.0
-_GAUGE_BLIND_S = 600.0  # a slow, filtered gauge of a calm mirror repeats itself for minutes
-_STORM_PA = 5.0  # what 250 Pa of weather at once move the gauge by
-# What parts laser and gauge although none of them lies: the gauge's noise at 1 Hz and a mount that warms up; a fresh
-# film's creep (control/film.py)
+_GAUGE_BLIND_S = 600.0  # a slow, filtered gauge on a calm mirror repeats itself for minutes
+_STORM_PA = 5.0  # effect on the gauge of 250 Pa of weather at once
+# Differences between an honest laser and gauge: the gauge's noise at 1 Hz and a mount that warms up; the creep of a
+# fresh film (control/film.py)
 _APART_UM, _CREEP_UM = 7.0, 31.0
 
 
 @dataclass(frozen=True, slots=True)
 class ConfigFinding:
-    """One setting that is wrong: `error` refuses, `warning` only says."""
+    """One wrong setting: an `error` refuses it, a `warning` only reports it."""
 
     severity: Severity
     field: str
@@ -35,25 +35,25 @@ class ConfigFinding:
     remedy: str
 
     def line(self, source: str) -> str:
-        """For people, with the file's name."""
+        """Format the finding for people, with the file's name."""
         mark = "warning: " if self.severity == "warning" else ""
         return f"{source}: {mark}{self.field} = {self.value}: {self.why}; {self.remedy}"
 
 
 class ConfigFindings:
-    """Collects findings; the value is looked up by the field's name, so that a name cannot be wrong."""
+    """Collects findings; looks up values by field name, so that no name can be wrong."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
         self.found: list[ConfigFinding] = []
 
     def error(self, wrong: bool, field: str, why: str, remedy: str) -> None:
-        """Note that the field must not be so, if it is wrong."""
+        """Add an error on the field if `wrong`."""
         if wrong:
             self.found.append(ConfigFinding("error", field, self._value(field), why, remedy))
 
     def warn(self, wrong: bool, field: str, why: str, remedy: str) -> None:
-        """Note that the field should not be so."""
+        """Add a warning on the field if `wrong`."""
         if wrong:
             self.found.append(ConfigFinding("warning", field, self._value(field), why, remedy))
 
@@ -76,11 +76,11 @@ def judge_pump(config: Config, say: ConfigFindings) -> None:
     test_fraction = max(part.pump_fraction for part in pump_obeys.PARTS)
     if pump.start_fraction >= test_fraction:
         why = f"the actuator test commands {test_fraction:g}, which would not start the pump"
-        say.error(config.states.actuator_test, "pump.start_fraction", why, "measure it; no pump starts so late")
-        say.warn(not config.states.actuator_test, "pump.start_fraction", "no pump starts so late", "measure it")
+        say.error(config.states.actuator_test, "pump.start_fraction", why, "measure it; no pump starts that late")
+        say.warn(not config.states.actuator_test, "pump.start_fraction", "no pump starts that late", "measure it")
     else:
         least_um_per_s = gas.PumpCurve(pump).least_flow_um_per_s
-        why = f"a running pump gives at least {least_um_per_s:.2f} um/s: it would only start and stop"
+        why = f"a running pump gives at least {least_um_per_s:.2f} um/s: it would only switch on and off"
         remedy = "set several times as much, or measure pump.stall_fraction"
         say.error(loop.flow_max_um_per_s <= 2.0 * least_um_per_s, "loop.flow_max_um_per_s", why, remedy)
     more = loop.flow_max_um_per_s > pump.flow_full_um_per_s + 1e-9
@@ -150,7 +150,7 @@ def judge_shape(config: Config, say: ConfigFindings) -> None:
     never = shape.disagreement_max_um >= config.limits.displacement_max_um - config.loop.setpoint_um
     why = "can never trip: limits.displacement_max_um trips first"
     say.error(never, "shape.disagreement_max_um", why, "set 10 um")
-    why = f"a cycle of 8 frames does not fit shape.period_s ({shape.period_s:g} s)"
+    why = f"a cycle of 8 frames does not fit into shape.period_s ({shape.period_s:g} s)"
     say.warn(8.0 * shape.frame_interval_s > shape.period_s, "shape.frame_interval_s", why, "shorten it")
 
 
@@ -179,7 +179,7 @@ def _geometry(field: str, geometry: GeometryConfig, radius_mm: float, say: Confi
 
 def judge_alarms(config: Config, say: ConfigFindings) -> None:
     alarms, tick_s = config.alarms, 1.0 / config.loop.rate_hz
-    say.error(alarms.silent_s < 2.0 * tick_s, "alarms.silent_s", "a tick takes as long", f"set {4.0 * tick_s:g} s")
+    say.error(alarms.silent_s < 2.0 * tick_s, "alarms.silent_s", "a tick takes that long", f"set {4.0 * tick_s:g} s")
     most = {
         "fault": max(rule.code for rule in safety.TABLE),
         "pump_fraction": 1.0,
@@ -199,7 +199,7 @@ def judge_alarms(config: Config, say: ConfigFindings) -> None:
 
 
 def judge_gauge(config: Config, say: ConfigFindings) -> None:
-    """The gauge as a guard, and as a check of the laser."""
+    """Judge the gauge as a guard and as a check of the laser."""
     limits, pressure_pa, tick_s = config.limits, config.optics.mirror.pressure_pa, 1.0 / config.loop.rate_hz
     above_um = limits.displacement_max_um - config.loop.setpoint_um
     room_pa = limits.gauge_pressure_max_pa - pressure_pa
@@ -208,11 +208,11 @@ def judge_gauge(config: Config, say: ConfigFindings) -> None:
     step, why = "limits.gauge_step_max_pa", "can never trip: the pressure limit trips first"
     say.error(0.0 < room_pa <= limits.gauge_step_max_pa, step, why, f"set less than {room_pa:g} Pa")
     least = f"set at least {_STORM_PA:g} Pa"
-    say.error(limits.gauge_step_max_pa < _STORM_PA, step, "a storm alone moves the gauge so far", least)
+    say.error(limits.gauge_step_max_pa < _STORM_PA, step, "a storm alone moves the gauge this far", least)
     stuck, most = "limits.gauge_stuck_s", f"set at most {_GAUGE_BLIND_S:g} s"
-    say.error(limits.gauge_stuck_s > _GAUGE_BLIND_S, stuck, "a stopped gauge guards nothing for so long", most)
+    say.error(limits.gauge_stuck_s > _GAUGE_BLIND_S, stuck, "a stopped gauge would guard nothing this long", most)
     least = f"set at least {3.0 * tick_s:g} s"
-    say.error(limits.gauge_stuck_s < 3.0 * tick_s, stuck, "two equal readings by chance are a fault", least)
+    say.error(limits.gauge_stuck_s < 3.0 * tick_s, stuck, "two readings equal by chance would be a fault", least)
     for name, least_um, by in (
         ("laser_gauge_apart_max_um", _APART_UM, "the gauge's noise and a mount that warms up"),
         ("laser_gauge_drift_max_um", _CREEP_UM, "the creep of a fresh film"),
@@ -224,7 +224,7 @@ def judge_gauge(config: Config, say: ConfigFindings) -> None:
 
 
 def judge_film(config: Config, say: ConfigFindings) -> None:
-    """What is said of the film, which gas, laser and gauge are judged by."""
+    """Judge the film's data, which serve to judge gas, laser and gauge."""
     limits, mirror = config.limits, config.optics.mirror
     most = 1.0 + flow_um_per_s(config) / film.LEAK_LEAST_UM_PER_S
     growth, why = "limits.leak_growth_max", f"can never trip: the pump gives {flow_um_per_s(config):g} um/s"
@@ -233,18 +233,18 @@ def judge_film(config: Config, say: ConfigFindings) -> None:
     say.error(
         limits.leak_growth_max < film.CONTRADICTED_MOST, growth, "the weather's effect on a leak trips it", least
     )
-    why = f"no film of {mirror.radius_mm:g} mm radius is so deep"
+    why = f"no film of {mirror.radius_mm:g} mm radius is this deep"
     say.error(mirror.sag_mm >= 0.5 * mirror.radius_mm, "optics.mirror.sag_mm", why, "set the bowl's depth in mm")
     why = f"can never trip: the bowl is only {mirror.sag_mm:g} mm deep (optics.mirror.sag_mm)"
     say.error(limits.displacement_min_um <= -1e3 * mirror.sag_mm, "limits.displacement_min_um", why, "raise it")
     pressure, why = "optics.mirror.pressure_pa", f"laser and gauge are not compared below {film.TAUT_PA:g} Pa"
     say.warn(0.0 < mirror.pressure_pa <= film.TAUT_PA, pressure, why, "measure it with the film taut")
-    why = "not known: a gauge in a wrong unit is not noticed"
+    why = "unknown: a gauge in the wrong unit would go unnoticed"
     say.warn(mirror.pressure_pa == 0.0, pressure, why, "set the gauge's reading at displacement 0")
 
 
 def judge_ranges(config: Config, board: BenchIdentity, say: ConfigFindings) -> None:
-    """A limit that its sensor cannot show never trips."""
+    """Judge limits against sensor ranges: a limit outside its sensor's range never trips."""
     limits, devices = config.limits, config.devices
     laser = devices.displacement if devices is not None else None
     gauge = devices.gauge_pressure if devices is not None else None

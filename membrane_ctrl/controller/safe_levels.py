@@ -1,8 +1,8 @@
 """The safe levels: hold the last mean flow -> ramp down -> pump off -> vent.
 
-A fault chooses the rung to enter at; each rung times out into the next; only a clear observation on the first rung
-leads back up. The first rung's time recovers only as fast as it is used: a cause that is there more than half of the
-time times out like one that stays.
+A fault chooses the rung to enter; each rung times out into the next; only a clear observation on the first rung
+leads back up. The first rung's time recovers only as fast as it is used, so a cause present more than half of the
+time also times out.
 """
 
 import math
@@ -15,7 +15,7 @@ from membrane_ctrl.model.states import Rung
 
 
 class SafeLevels:
-    """Which safe action is in force, and since when."""
+    """The safe action in force, and since when."""
 
     def __init__(self, config: StatesConfig) -> None:
         self._limit_s = {
@@ -25,31 +25,31 @@ class SafeLevels:
         }
         self.rung = Rung.NONE
         self._since_s = 0.0
-        self._used_s = self._cleared_s = 0.0  # of HOLD_FLOW's time, when it was last left, and when that was
+        self._used_s = self._cleared_s = 0.0  # HOLD_FLOW's used time when last left, and the moment of leaving
 
     def enter(self, rung: Rung, now_s: float) -> None:
-        """Go to a rung, if it is further down than the present one."""
+        """Enter a rung if it is deeper than the present one."""
         if rung > self.rung:
             used_s = max(0.0, self._used_s - (now_s - self._cleared_s)) if rung == Rung.HOLD_FLOW else 0.0
             self.rung = rung
             self._since_s = now_s - used_s
 
     def clear(self, now_s: float) -> None:
-        """Leave the safe levels; only from HOLD_FLOW, as everything below is latched."""
+        """Leave the safe levels, but only from HOLD_FLOW: all deeper ones are latched."""
         assert self.rung == Rung.HOLD_FLOW, self.rung
         self._used_s, self._cleared_s = self.age_s(now_s), now_s
         self.rung = Rung.NONE
 
     def leave(self) -> None:
-        """Leave the safe levels from any rung: after an acknowledgement, or by the resume rule."""
+        """Leave the safe levels from any rung, after an acknowledgement or by the resume rule."""
         self.rung, self._used_s = Rung.NONE, 0.0
 
     def age_s(self, now_s: float) -> float:
-        """Time on the present rung; on HOLD_FLOW including what has not recovered of earlier times."""
+        """Time on the present rung; on HOLD_FLOW including earlier time not yet recovered."""
         return now_s - self._since_s
 
     def step(self, now_s: float) -> Rung:
-        """The present rung, after a time-out the next one."""
+        """Return the present rung, or the next one after a time-out."""
         limit_s = self._limit_s.get(self.rung)
         if limit_s is not None and self.age_s(now_s) > limit_s:
             self.enter(Rung(self.rung + 1), now_s)
@@ -58,16 +58,15 @@ class SafeLevels:
 
 DAY_S = 86_400.0
 WATCHDOG_MASK = default_map().fault_mask("watchdog")
-# A bleed, the actuator test and a controller's way down leave the vent at most this far open; a board that vents by
-# itself opens it fully
+# A bleed, the actuator test and `lower` open the vent at most this far; a board that vents by itself opens it fully
 VENTED_FRACTION = 0.5
 
 
 class ResumeRule:
-    """May a latched fault clear by itself? Only a listed one, after its cause has stayed away, so often a day.
+    """Whether a latched fault may clear automatically: only a listed one, its cause absent, a limited number a day.
 
-    Never after a vent, a board latch other than the watchdog's trip, a board taken by another program, or a person's
-    lock: one of these at any moment of the fault decides, whatever its first cause was.
+    Never after a vent, a board latch other than the watchdog's, a board taken by another program, or a person's lock:
+    any of these during the fault decides, whatever the first cause.
     """
 
     def __init__(self, config: ResumeConfig, limits: LimitsConfig) -> None:
@@ -79,18 +78,18 @@ class ResumeRule:
         self.clear_mask = 0
 
     def resumed(self, at_s: float) -> None:
-        """Count a resume; one before this run has a negative time."""
+        """Count a resume; those before this run have negative times."""
         self._resumed_s.append(at_s)
 
     def forget(self) -> None:
-        """The fault is over: what was seen in it does not count in the next."""
+        """Forget the observations of a fault that is over."""
         self._clear_since_s, self._never, self.possible, self.clear_mask = math.nan, False, False, 0
 
     def due(self, fault: Rule, levels: SafeLevels, observation: Observation, now_s: float) -> bool:
-        """Look at a tick of a fault; True once its cause has been absent for long enough.
+        """Observe a tick of a fault; True once its cause has been absent for long enough.
 
-        Sets `possible`, whether the fault may still clear by itself, and `clear_mask`, the board's latches to clear
-        for that: the watchdog's, or none.
+        Sets `possible` (the fault may still clear automatically) and `clear_mask` (the board's latches to clear for
+        that: the watchdog's, or none).
         """
         self._never |= _decides(levels, observation)
         listed = fault.may_resume and fault.name in self._config.faults
@@ -102,11 +101,11 @@ class ResumeRule:
         silent = not observation.link_up or observation.reading_age_s > self._limits.stale_s
         gone = not (silent or self.clear_mask or fault.broken(observation, self._limits))
         if gone and observation.reading_age_s > 0.0:
-            return False  # a single lost answer says nothing
+            return False  # a single lost answer proves nothing
         return self._waited(gone, now_s)
 
     def _left(self, now_s: float) -> bool:
-        """The day's resumes are not used up."""
+        """Whether the day's resumes are not used up."""
         while self._resumed_s and now_s - self._resumed_s[0] > DAY_S:
             self._resumed_s.popleft()
         return len(self._resumed_s) < self._config.most_per_day
@@ -121,7 +120,7 @@ class ResumeRule:
 
 
 def _decides(levels: SafeLevels, observation: Observation) -> bool:
-    """Whether only a person may clear it."""
+    """Whether only a person may clear the fault."""
     return (
         levels.rung == Rung.VENT
         or bool(observation.board_faults & ~WATCHDOG_MASK)

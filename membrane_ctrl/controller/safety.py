@@ -1,8 +1,8 @@
-"""The safety table: a tick's observation in, a verdict out. No I/O, no clock.
+"""The safety table: turns a tick's observation into a verdict. No I/O, no clock.
 
-Each rule names a cause, how many of the last ticks must show it (N of M), its limit, and the safe level that it
-enters. It is judged on every tick in the states where it applies. Of rules that trip together the one that enters
-deepest wins; the operator is told the first cause of a fault. `docs/faults.md` is made from this table.
+Each rule names a cause, how many of the last ticks must show it (N of M), its limit and the safe level it enters. It
+is judged on every tick in the states where it applies. Of several tripped rules the deepest level wins; the operator
+sees the first cause of a fault. `docs/faults.md` is generated from this table.
 """
 
 import math
@@ -18,7 +18,7 @@ _FOREIGN = {FOREIGN_CLAIM: "another claim is in force", FOREIGN_PERIOD: "another
 _TWICE = (2, 3)
 # The pump follows with its lag (0.15 s) and a tick or two; the loop's noise hides a constant difference in some ticks
 _FOLLOWED = (40, 50)
-_A_FEW = (3, 3)  # one repeated sample of a busy device is no fault
+_A_FEW = (3, 3)  # one repeated sample of a busy device is not a fault
 
 # fmt: off
 TABLE: tuple[Rule, ...] = (
@@ -216,7 +216,7 @@ class Verdict:
 
 
 class SafetyTable:
-    """Judges observations by the table; remembers only the last M ticks that showed something of each rule."""
+    """Judges observations by the table; remembers only the last M relevant ticks of each rule."""
 
     def __init__(self, limits: LimitsConfig, table: tuple[Rule, ...] = TABLE) -> None:
         self._limits = limits
@@ -224,9 +224,9 @@ class SafetyTable:
         self._history = [0] * len(table)
 
     def judge(self, state: State, observation: Observation) -> Verdict:
-        """The tripped rule that enters deepest, of equal ones the first; all are judged: no history has a hole.
+        """Return the tripped rule with the deepest level, the first of equals. Judges all: every history is complete.
 
-        Not simply the first: a lost laser, which only holds the flow, must not hide a lost pressure sensor.
+        Returning simply the first would let a lost laser, which only holds the flow, hide a lost pressure sensor.
         """
         tripped: Rule | None = None
         for index, rule in enumerate(self._table):

@@ -1,4 +1,4 @@
-"""What a tick shows, and what a rule of the safety table is. No I/O, no clock."""
+"""What the safety table sees in a tick, and what a rule is. No I/O, no clock."""
 
 import math
 from collections.abc import Callable, Collection
@@ -17,7 +17,7 @@ NOT_YET_FAULT = ALWAYS - {State.FAULT}
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What one tick shows of the bench and of ourselves; NaN and None mean "not seen", never "fine"."""
+    """What one tick shows of the bench and of the program; NaN and None mean "not seen", never "fine"."""
 
     link_up: bool  # the device link is connected
     reading_age_s: float  # since the last answer of the device
@@ -28,33 +28,33 @@ class Observation:
     jumps: int  # readings in a row refused for a jump
     error_um: float  # setpoint minus reading; NaN outside the loop, and in a pause
     gauge_pressure_pa: float
-    pump_mismatch: float  # largest of |command - read-back| that both of the last two commands agree on
+    pump_mismatch: float  # |command - read-back|, the smaller of the last two commands'
     watchdog_tripped: bool
     board_faults: int
     lateness_ms: float
     dead_tasks: tuple[str, ...] = ()  # supervised tasks of the control process that ended
-    tick_error: str = ""  # what a handler raised, if it did
-    overdue: str = ""  # what the present state has waited for too long, if it has
+    tick_error: str = ""  # exception of a handler, if any
+    overdue: str = ""  # what the present state has waited for too long, if anything
     unfit: str = ""  # what the actuator test found, if anything
-    same_s: float = 0.0  # since the valid readings have been equal to the last bit
-    laser_lies: str = ""  # what laser, gauge and camera show, if the laser is wrong
+    same_s: float = 0.0  # how long the valid readings have been bit-identical
+    laser_lies: str = ""  # readings of laser, gauge and camera, if the laser is wrong
     runs_on: str = ""  # the read-back of a pump that should have stopped
     inflow: str = ""  # how the mirror rises although the pump is commanded off
     locked: str = ""  # why a person has locked the mirror
     vent_fraction: float = math.nan  # the vent's read-back; NaN without one
-    foreign: int = 0  # what another program changed: claim, watchdog (`roles.FOREIGN_...`)
-    gauge_same_s: float = 0.0  # since the readings of a taut film's gauge have been equal to the last bit
-    gauge_jumps: int = 0  # readings in a row that no film makes
-    laser_gauge_apart: str = ""  # what laser and gauge show, if they contradict each other
-    gas_excess: str = ""  # how much more gas the film takes than before, if no camera sees it stand still
+    foreign: int = 0  # changes by another program: claim, watchdog (`roles.FOREIGN_...`)
+    gauge_same_s: float = 0.0  # how long a taut film's gauge readings have been bit-identical
+    gauge_jumps: int = 0  # consecutive readings that no film can cause
+    laser_gauge_apart: str = ""  # readings of laser and gauge, if they contradict each other
+    gas_excess: str = ""  # excess gas the film takes, unless a camera sees it stand still
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
     """One row of the table. `limit` and `remedy` are for people; `broken` decides.
 
-    A tick in which `unseen` is true is left out of the window: a sensor that answers now and then, each time over its
-    limit, must not be excused by the ticks between.
+    The window skips ticks in which `unseen` is true: ticks without an answer must not excuse a sensor that exceeds
+    its limit whenever it answers.
     """
 
     code: int
@@ -65,9 +65,9 @@ class Rule:
     remedy: str
     broken: Callable[[Observation, LimitsConfig], bool]
     seen: Callable[[Observation], str] = lambda o: ""  # the observed value, for the operator
-    seen_in: tuple[int, int] = (1, 1)  # ticks that must show the cause, of so many
+    seen_in: tuple[int, int] = (1, 1)  # (m, n): m of n ticks must show the cause
     states: Collection[State] = MOVING
-    # `resume.faults` may name it: a lost message or sensor, whose return is seen. All others need a person.
+    # `resume.faults` may name it: a lost message or sensor whose return is visible. All others need a person.
     may_resume: bool = False
     unseen: Callable[[Observation], bool] = lambda o: False
 
@@ -78,16 +78,16 @@ class Rule:
 
     @property
     def window(self) -> int:
-        """Ticks that are looked back at."""
+        """Length of the window in ticks."""
         return self.seen_in[1]
 
     @property
     def latching(self) -> bool:
-        """Whether the fault stays until somebody acknowledges it."""
+        """Whether the fault stays until acknowledged."""
         return self.rung > Rung.HOLD_FLOW
 
     def fault(self, seen: str) -> Fault:
-        """The event of a rule that has tripped, with the observed value in words."""
+        """The event of a tripped rule, with the observed value in words."""
         return Fault(
             code=self.code,
             name=self.name,

@@ -1,4 +1,4 @@
-"""What the states' handlers share, and the telemetry row that a tick leaves of it."""
+"""Data that the states' handlers share, and the telemetry row of a tick."""
 
 import math
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from membrane_ctrl.controller import pump_obeys, safe_levels, safety_rules, tick
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.model import errors, states, telemetry
 
-# for the record of a tick without an answer; its whole numbers, which have no NaN, are not used
+# for the record of a tick without an answer; its integers, which have no NaN, are unused
 _NO_READING = BenchReading(
     displacement_um=math.nan,
     displacement_quality=0,
@@ -32,10 +32,10 @@ _NO_READING = BenchReading(
 
 @dataclass(slots=True)
 class Scene:
-    """What the handlers share: the loop, this tick's facts, and what they decide."""
+    """Data that the handlers share: the loop, the facts of this tick, and the decisions."""
 
     config: Config
-    loop_config: LoopConfig  # as it is now, after `gains`
+    loop_config: LoopConfig  # present settings, after `gains`
     loop: inner_loop.InnerLoop
     observer: Observer
     levels: safe_levels.SafeLevels
@@ -46,26 +46,26 @@ class Scene:
     dt_s: float = 0.02
     state_age_s: float = 0.0  # 0 exactly in the first tick of a state
     trim_um: float = 0.0
-    # what was asked for
+    # requests
     hold_wanted: bool = False
     manual_wanted: bool = False
     manual_um_per_s: float = 0.0
     manual_since_s: float = math.nan  # the last `manual` command
-    mean_flow_um_per_s: float = 0.0  # the pump's when a person took it
+    mean_flow_um_per_s: float = 0.0  # the pump's mean flow when a person took over
     paused: bool = False
-    trial: Trial | None = None  # an experiment, until its end has been told
+    trial: Trial | None = None  # an experiment, until its end is reported
     way_down: Literal["stop", "lower"] | None = None
-    venting: bool = False  # on the way down, and after a `stop` as well
+    venting: bool = False  # while lowering, also after a `stop`
     asked_by: str = ""
     stop_exit: errors.Exit = errors.Exit.DONE
     acknowledged: bool = False
-    latched: str = ""  # a fault of an earlier run: no hold before a person has acknowledged it
-    may_resume: bool = False  # the resume rule lets a latched fault go
-    resume_possible: bool = False  # it may yet
+    latched: str = ""  # a fault of an earlier run: no hold until a person acknowledges it
+    may_resume: bool = False  # the resume rule clears a latched fault now
+    resume_possible: bool = False  # the rule may clear it later
     # memory of the states
     good_since_s: float = math.nan
     last_good_s: float = math.nan  # in `check`
-    sinking: filters.Slope = field(default_factory=filters.Slope)  # of the mirror with the pump off, seen in `check`
+    sinking: filters.Slope = field(default_factory=filters.Slope)  # of the mirror with the pump off, in `check`
     test: pump_obeys.ActuatorTest | None = None
     ramp_from_fraction: float = 0.0
     last_pump_fraction: float = 0.0
@@ -103,7 +103,7 @@ def telemetry_row(
     observation: safety_rules.Observation,
     shape: shape_loop.ShapeOutput,
 ) -> telemetry.TelemetryRow:
-    """The row of tick `number`; `fault` is the code of the fault that stands, 0 for none."""
+    """The row of tick `number`; `fault` is the standing fault's code, 0 for none."""
     reading = inputs.reading or _NO_READING
     out = scene.output or inner_loop.NO_OUTPUT
     return telemetry.TelemetryRow(

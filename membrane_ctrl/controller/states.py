@@ -1,7 +1,7 @@
-"""States as small functions: each looks at the tick, sets what the pump shall do, and returns the next state.
+"""States as small functions: each reads the tick, sets the pump and returns the next state.
 
-They decide only what is wanted when all is well. Safety is judged around them on every tick
-(`controller.Controller.tick`): no handler can go past it.
+They decide only what to do when all is well. Safety is judged around them on every tick
+(`controller.Controller.tick`), and no handler can bypass it.
 """
 
 import math
@@ -14,16 +14,16 @@ from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.states import Rung, State
 
-# a pump that someone left running has run down by then: lag 0.15 s, transport 0.1 s (docs/physics.md, inner loop)
+# by then a pump that was left running has stopped: lag 0.15 s, transport 0.1 s (docs/physics.md)
 _PUMP_STANDS_S = 0.5
-_VENTED_S = 900.0  # twice what the twin's valve takes from 600 Pa; longer means a shut vent or a wrong gauge
-# A `stop` of a pump that does not obey: the vent has been open and the pump commanded off for so long, and whoever
-# waits is told that it runs on. Shorter than the 30 s that the service manager gives a stop.
+_VENTED_S = 900.0  # twice the twin's time from 600 Pa; longer means a shut vent or a wrong gauge
+# A `stop` with a pump that does not obey: after this long with the vent open and the pump commanded off, report that
+# the pump still runs. Shorter than the 30 s that the service manager allows.
 _STOP_GIVES_UP_S = 10.0
 
 
 def standby(scene: Scene) -> State:
-    """Pump off until someone wants the mirror held."""
+    """Keep the pump off until someone requests a hold."""
     if scene.hold_wanted:
         scene.why = "a hold was requested"
         return State.CHECK
@@ -32,17 +32,17 @@ def standby(scene: Scene) -> State:
 
 
 def check(scene: Scene) -> State:
-    """Every sensor must have been good for a while, and the film must answer, before the pump may run for good."""
+    """Require good sensors for a while and a film that responds before the pump may run."""
     missing = _missing(scene)
     if not missing:
         scene.last_good_s = scene.now_s
-    # an answer that is lost now and then is no sensor that is bad
+    # occasional lost answers do not make a bad sensor
     gone = not scene.now_s - scene.last_good_s <= scene.config.limits.stale_s
     good_s = scene.stay_good(not gone)
     if scene.state_age_s > scene.config.states.check_timeout_s:
         scene.overdue = f"sensors still not good after {scene.config.states.check_timeout_s:g} s: {missing}"
     if gone:
-        scene.test = None  # what was measured with a hole in it is measured again
+        scene.test = None  # repeat a measurement with a gap
         scene.why = f"checking the sensors: {missing}"
         return State.CHECK
     if scene.config.states.actuator_test:
@@ -72,7 +72,7 @@ def inflate(scene: Scene) -> State:
 
 
 def settle(scene: Scene) -> State:
-    """Stay inside the band for a while before the state is called hold."""
+    """Stay within the band for a while before `hold` begins."""
     output = _drive(scene, scene.setpoint_um)
     band_um = scene.config.limits.band_um
     settled_s = scene.stay_good(not abs(output.error_um) >= band_um)  # a lost reading is no error
@@ -86,7 +86,7 @@ def settle(scene: Scene) -> State:
 
 
 def hold(scene: Scene) -> State:
-    """The main job."""
+    """Hold the mirror at its setpoint."""
     if scene.paused:
         scene.give(scene.loop.stale(_given(scene, scene.setpoint_um), scene.dt_s))
         scene.why = f"paused by {scene.asked_by}: the pump keeps its mean flow"
@@ -99,7 +99,7 @@ def hold(scene: Scene) -> State:
 
 
 def manual(scene: Scene) -> State:
-    """The flow that a person has asked for; the loop follows, so that `hold` takes over without a bump."""
+    """Give the flow a person has requested; the loop tracks it, so that `hold` takes over without a bump."""
     if scene.hold_wanted:
         scene.why = f"{scene.asked_by} requested a hold again"
         _keep_flowing(scene)
@@ -115,9 +115,9 @@ def manual(scene: Scene) -> State:
 
 
 def tune(scene: Scene) -> State:
-    """An experiment, inside its guard; whatever ends it, the loop takes the mirror back at the holding flow."""
+    """Run an experiment inside its guard; however it ends, the loop resumes at the holding flow."""
     trial = scene.trial
-    assert trial is not None  # the command that leads here has made it
+    assert trial is not None  # made by the command that leads here
     given = _given(scene, scene.setpoint_um)
     measurement = BenchSample(given.displacement_um, given.ambient_pressure_pa, given.air_temperature_c)
     wanted: float | Finished
@@ -138,9 +138,9 @@ def tune(scene: Scene) -> State:
 
 
 def lower(scene: Scene) -> State:
-    """The way down: pump off, and seen to be off; the leak lets the mirror down by itself, or the vent does.
+    """Lower the mirror: pump off, confirmed by its read-back; the leak or the vent lowers the film.
 
-    What ends it is read-back and pressure, never a time-out: a pump that runs on is a fault (`pump_runs_on`).
+    Read-back and pressure end it, never a time-out: a pump that still runs is a fault (`pump_runs_on`).
     """
     scene.hold_wanted = False
     scene.vent_fraction = float(scene.venting)
@@ -148,7 +148,7 @@ def lower(scene: Scene) -> State:
     scene.why = f"{_way(scene)}: pump off"
     if scene.way_down == "stop":
         if stand.silent_s > scene.config.states.lower_timeout_s:
-            scene.finished = Exit.DEVICE_FAILED  # nobody can see whether the pump stands
+            scene.finished = Exit.DEVICE_FAILED  # the pump's state is unknown
         elif stand.at_rest:
             scene.finished = scene.stop_exit
         return State.LOWER
@@ -167,7 +167,7 @@ def lower(scene: Scene) -> State:
 
 
 def fault(scene: Scene) -> State:
-    """Down the safe levels, latched; a person clears it, or the resume rule does for a cause that has gone."""
+    """Descend the safe levels, latched; a person clears the fault, or the resume rule once its cause has gone."""
     rung = scene.levels.step(scene.now_s)
     scene.why = f"fault: {rung.name.lower().replace('_', ' ')}"
     scene.hold_wanted = False
@@ -195,9 +195,9 @@ def fault(scene: Scene) -> State:
 
 
 def _nothing_left_to_do(scene: Scene, rung: Rung) -> bool:
-    """A pump that does not obey: the vent is open, and the mirror is empty or has been given the time to get so.
+    """Whether, with a pump that does not obey, the vent is open and the mirror empty or given time to empty.
 
-    Until then the run goes on, for its last command is then not the only one that tells the pump to stop.
+    Until then the run continues, so that it keeps commanding the pump to stop.
     """
     if rung != Rung.VENT:
         return False
@@ -220,7 +220,7 @@ HANDLERS: dict[State, Callable[[Scene], State]] = {
 
 
 def run_state(state: State, scene: Scene) -> State:
-    """Run the state's handler and return the next state; a request for another state comes first."""
+    """Run the state's handler and return the next state; a request for another state takes precedence."""
     if scene.way_down is not None and state not in (State.LOWER, State.FAULT):
         scene.why = _way(scene)
         return State.LOWER
@@ -237,13 +237,13 @@ def _way(scene: Scene) -> str:
 
 
 def _strayed(scene: Scene) -> bool:
-    """The mirror is further from its setpoint than it may get while no loop holds it."""
+    """Whether the mirror has moved too far from its setpoint while no loop holds it."""
     away_um = abs(scene.observer.displacement_um - scene.setpoint_um - scene.trim_um)
     return away_um > scene.config.states.manual_range_um
 
 
 def _manual_over(scene: Scene) -> str:
-    """Why the loop takes the mirror back from whoever set the flow; empty if it does not."""
+    """Why the loop takes over from manual flow; empty if it does not."""
     states = scene.config.states
     if scene.levels.rung != Rung.NONE:
         return "the safety table holds the mean flow"
@@ -255,15 +255,15 @@ def _manual_over(scene: Scene) -> str:
 
 
 def _keep_flowing(scene: Scene) -> None:
-    """Go on as in the last tick: the state that was just chosen takes over in the next one."""
+    """Continue as in the last tick: the new state takes over in the next one."""
     scene.pump_fraction = scene.last_pump_fraction
     scene.vent_fraction = scene.loop_config.bleed_fraction
 
 
 def _asked_elsewhere(scene: Scene) -> State | None:
-    """The state that somebody has asked for, if it is not a hold."""
+    """The requested state, if it is not a hold."""
     if scene.trial is not None:
-        _drive(scene, scene.setpoint_um)  # the loop has this tick: without it the pump would be off for 20 ms
+        _drive(scene, scene.setpoint_um)  # the loop runs this tick: otherwise the pump would be off for 20 ms
         scene.why = f"{scene.asked_by} requested the experiment {scene.trial.spec.kind}"
         return State.TUNE
     if scene.manual_wanted:
@@ -288,7 +288,7 @@ def _test_actuators(scene: Scene) -> State:
         scene.why = f"testing the actuators: {part.name}"
         return State.CHECK
     if _missing(scene):
-        return State.CHECK  # the loop begins at a reading
+        return State.CHECK  # the loop starts from a reading
     failure = scene.test.failure()
     if failure:
         if scene.test.is_second:
@@ -300,7 +300,7 @@ def _test_actuators(scene: Scene) -> State:
 
 
 def _begin(scene: Scene, leak_um_per_s: float) -> State:
-    """Hand over to the loop, with the flow that balances the leak: the integrator need not find it first."""
+    """Hand over to the loop at the flow that balances the leak, so that the integrator need not find it."""
     scene.loop.start(scene.observer.displacement_um, leak_um_per_s)
     scene.why = f"all sensors good, the film responds and sinks by {leak_um_per_s:.2f} um/s"
     scene.pump_fraction = scene.last_pump_fraction

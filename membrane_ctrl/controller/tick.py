@@ -1,4 +1,4 @@
-"""What goes into a tick and what comes out: the whole interface between the control code and the world.
+"""Inputs and outputs of a tick: the whole interface between the control code and the world.
 
 A tick is a plain function of these, with no I/O and no clock: the asyncio supervisor, the virtual-time runs and
 a replay call the same code.
@@ -25,15 +25,15 @@ from membrane_ctrl.model.events import Event
 
 @dataclass(frozen=True, slots=True)
 class TickInputs:
-    """Everything a tick may know."""
+    """All inputs of a tick."""
 
     now_s: float  # start of the tick on the run's clock
     dt_s: float  # true time since the last tick, clamped
     reading: BenchReading | None  # None without a valid answer in this tick
-    lateness_ms: float = 0.0  # start against the deadline
+    lateness_ms: float = 0.0  # start after the deadline
     missed_ticks: int = 0  # running count of skipped deadlines
     link_up: bool = True  # the device link is connected
-    estimate: shape_estimate.ShapeEstimate | None = None  # the newest shape, in the tick in which it arrives
+    estimate: shape_estimate.ShapeEstimate | None = None  # the newest shape, only in the tick in which it arrives
     commands: tuple[Command, ...] = ()  # since the last tick
     dead_tasks: tuple[str, ...] = ()  # supervised tasks that ended
     # the twin's truth, for the record only; NaN on a real bench
@@ -43,25 +43,25 @@ class TickInputs:
 
 @dataclass(frozen=True, slots=True)
 class TickOutputs:
-    """What a tick decided."""
+    """All outputs of a tick."""
 
     command: BenchCommand  # the write that ends the tick
     row: telemetry.TelemetryRow
     events: tuple[Event, ...]
-    finished: errors.Exit | None  # the run is over, with this exit code
-    answers: tuple[tuple[int, str], ...] = ()  # number of each command, and why it was refused (empty: obeyed)
+    finished: errors.Exit | None  # exit code if the run is over
+    answers: tuple[tuple[int, str], ...] = ()  # number of each command, and why it was refused (empty: executed)
     clear_mask: int = 0  # the board's latches to clear: all after `ack`, the watchdog's by the resume rule
 
 
-# The inputs of a tick as bytes, exactly, so that a replay gives the same tick (docs/replay.md).
+# The exact inputs of a tick as bytes, so that a replay gives the same tick (docs/replay.md).
 #
-# A tick is one fixed record and its telemetry row; what is rare (commands, ended tasks) precedes it as JSON, in
-# pieces. A shape estimate is named by its time only: the recorder has it from its own ring. A checksum of all outputs
-# tells whether a replay is the same.
+# A tick is one fixed record and its telemetry row; rare data (commands, ended tasks) precede it as JSON, in pieces. A
+# shape estimate is referred to by its time: the recorder has it from its own ring. A checksum of all outputs tells
+# whether a replay is identical.
 
-# First bytes of the messages of the inputs ring.
+# First bytes of the inputs ring's messages.
 TICK, PIECE, MEMORY = b"T", b"P", b"M"
-MESSAGE_BYTES = 512  # a slot of the ring: a tick takes 444, a longer command comes in pieces
+MESSAGE_BYTES = 512  # a slot of the ring: a tick takes 444; longer commands come in pieces
 
 _FORMATS = {
     "displacement_quality": "i8", "sample_counter": "i8", "latched_faults": "i8", "watchdog_tripped": "u1",
@@ -94,7 +94,7 @@ _LETTERS = {"<i8": "q", "<f8": "d", "|u1": "B", "<u4": "I"}
 _STRUCT = struct.Struct("<" + "".join(_LETTERS[RECORD[name].str] for name in RECORD.names or ()))
 assert _STRUCT.size == RECORD.itemsize
 _ROW_PLACE = len(TICK) + RECORD.itemsize
-# Tables in, tables out, whatever a command comes to carry; a float keeps its last bit on the way.
+# Plain tables in, plain tables out, whatever a command carries; floats survive bit by bit.
 _COMMANDS = TypeAdapter(tuple[Command, ...])
 _reading_values = attrgetter(*_READING)  # ten times as fast as `astuple`
 _NO_READING = tuple(0 if name in _FORMATS else math.nan for name in _READING)
@@ -104,7 +104,7 @@ def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes, m
     """Messages for the inputs ring, in order; the last one is the tick.
 
     `tick` counts from 1, `row` is the packed telemetry row of the outputs, and `memory` the controller's memory
-    before this tick, if a replay shall be able to begin here.
+    before this tick, if replays are to start here.
     """
     tail = _tail(inputs)
     reading, estimate = inputs.reading, inputs.estimate
@@ -126,7 +126,7 @@ def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes, m
 
 
 def pack_row(tick: int, row: telemetry.TelemetryRow) -> bytes:
-    """The message of a tick whose inputs cannot be packed: its row, and for a replay a gap."""
+    """The message of a tick whose inputs cannot be packed: its row alone, a gap for a replay."""
     record = np.zeros(1, dtype=RECORD)
     for name, field in SAME.items():
         record[name] = getattr(row, field)
@@ -140,10 +140,10 @@ def _pieces(kind: bytes, data: bytes) -> list[bytes]:
 
 
 def output_crc(outputs: TickOutputs, row: bytes) -> int:
-    """Checksum of everything a tick decided: command and row, events, end."""
+    """Checksum of all outputs of a tick: command and row, events, end."""
     crc = zlib.crc32(row)
     if outputs.events or outputs.finished is not None or outputs.answers or outputs.clear_mask:
-        # a truth value, as in runs recorded before the mask: their replay still gives the same checksum
+        # a truth value, as before the mask existed: replays of older runs still give the same checksum
         rest = [outputs.events, outputs.finished, outputs.answers, outputs.clear_mask != 0]
         crc = zlib.crc32(json.dumps(rest, default=str).encode(), crc)
     return crc
@@ -157,9 +157,9 @@ def _tail(inputs: TickInputs) -> bytes:
 
 
 def unpack_tick(record: np.void, tail: bytes, estimates: Mapping[float, shape_estimate.ShapeEstimate]) -> TickInputs:
-    """The inputs of a tick, exact to the last bit; `tail` are its commands and ended tasks as JSON.
+    """Return the bit-exact inputs of a tick; `tail` are its commands and ended tasks as JSON.
 
-    `estimates` are the run's shape estimates by their time. Raises LookupError for an estimate or a tail that is
+    `estimates` are the run's shape estimates by time. Raises LookupError if an estimate or a tail is
     missing.
     """
     values: dict[str, Any] = dict(zip(RECORD.names or (), record.item(), strict=True))
@@ -187,7 +187,7 @@ def unpack_tick(record: np.void, tail: bytes, estimates: Mapping[float, shape_es
 
 @dataclass(frozen=True, slots=True)
 class TickBatch:
-    """Ticks taken from the ring: inputs, telemetry rows, and by tick the tails and memories there are."""
+    """Ticks taken from the ring: inputs, telemetry rows, and any tails and memories by tick."""
 
     records: Records
     rows: telemetry.Rows
@@ -196,14 +196,14 @@ class TickBatch:
 
 
 class TickAssembler:
-    """Puts the pieces of the inputs ring together; a tick whose pieces were overwritten keeps an empty tail."""
+    """Assembles the pieces in the inputs ring; a tick whose pieces were overwritten gets an empty tail."""
 
     def __init__(self) -> None:
         self._pieces: list[bytes] = []
         self._memory: list[bytes] = []
 
     def take(self, messages: list[bytes]) -> TickBatch:
-        """Take in messages in their order; a tick may end in a later call than its pieces begin."""
+        """Take messages in order; a tick may end in a later call than its first piece."""
         records: list[bytes] = []
         rows: list[bytes] = []
         tails: dict[int, bytes] = {}

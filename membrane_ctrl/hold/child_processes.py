@@ -17,10 +17,10 @@ from membrane_ctrl.model.telemetry import ROW_BYTES
 from membrane_ctrl.processes.child import Child, pipe
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, ring
 
-# A child that ends more often will not be mended by starting it again
+# Restarting does not help a child that ends more often
 _MOST_PER_HOUR = 10
 _HOUR_S = 3600.0
-# Until its first report: an interpreter that starts on a busy machine
+# Until the first report: the interpreter may start on a busy machine
 _STARTS_S = 60.0
 
 Make = Callable[[int], tuple[Child, Connection]]
@@ -29,9 +29,9 @@ Make = Callable[[int], tuple[Child, Connection]]
 class ManagedChild:
     """A child process that is replaced when it ends or falls silent; `child` is the current one.
 
-    A child reports each second or so that it is alive, and how long it may now be silent (`run_events.Alive`). One
-    that was stopped, or that hangs, breaks that promise and is killed. `make` gets the number of children before, and
-    returns the next one, not yet started, with our end of its pipe.
+    A child reports about once a second that it is alive, and how long it may now be silent (`run_events.Alive`). A
+    stopped or hung child breaks that promise and is killed. `make` gets the number of earlier children and returns
+    the next one, not yet started, with our end of its pipe.
     """
 
     def __init__(self, make: Make) -> None:
@@ -40,7 +40,7 @@ class ManagedChild:
         self._count = 0
         self._ended_s: float | None = None
         self._given_up = False
-        self._expected_s = math.inf  # the child's next word
+        self._expected_s = math.inf  # when the next report is due
         self._silent = False
         self.child, self._line = make(0)
 
@@ -50,7 +50,7 @@ class ManagedChild:
         self.child.start()
 
     def send(self, word: str) -> bool:
-        """Send a word to the child without waiting; False if it cannot be taken now."""
+        """Send the child a message without waiting; False if the pipe is full."""
         try:
             if not (self.child.alive and select.select([], [self._line.fileno()], [], 0)[1]):
                 return False
@@ -60,7 +60,7 @@ class ManagedChild:
         return True
 
     def look(self, now_s: float) -> list[events.Event]:
-        """What it reported since the last call, and what became of it; starts the next one when due (some ms)."""
+        """Return reports and fate of the child since the last call; start the next one when due (some ms)."""
         said = self._said(now_s)
         if self.child.alive:
             if now_s > self._expected_s and not self._silent:
@@ -75,7 +75,7 @@ class ManagedChild:
                 self._given_up = True
                 said.append(run_events.ChildGivenUp(name, len(self._replaced_s)))
             return said
-        # at once, then later and later: what dies at its start must not keep the machine busy with starting it
+        # at once, then at growing intervals: a child that dies at its start must not keep the machine busy
         if now_s - self._ended_s >= pause_s(len(self._replaced_s)):
             self.replace(now_s)
             said.append(run_events.ChildRestarted(name, self._count))
@@ -92,7 +92,7 @@ class ManagedChild:
         self.child.start()
 
     def _fell_silent(self, now_s: float) -> events.Event:
-        """Kill a silent child, unless it may not be replaced: half a recorder is better than none."""
+        """Kill a silent child, unless it may not be replaced: a slow recorder is better than none."""
         self._silent = True
         late_s = round(now_s - self._expected_s, 1)
         killed = not self._used_up(now_s)
@@ -120,12 +120,12 @@ class ManagedChild:
         return said
 
 
-_TELEMETRY_KEPT_S = 60.0  # a recorder that is busy so long (a slow disk) loses nothing
+_TELEMETRY_KEPT_S = 60.0  # a recorder busy for this long (a slow disk) loses nothing
 _EVENTS_KEPT, _EVENT_BYTES = 1024, 4096
 _SHAPES_KEPT, _SHAPE_BYTES = 64, 1 << 16  # a 36 x 36 covariance is 10 kB
 _RECORDER_CLOSES_S = 30.0
 _CHILD_STOPS_S = 3.0
-_ALARMS_LEAVE_S = 10.0  # it gives itself 8 s for the last notices
+_ALARMS_LEAVE_S = 10.0  # the process allows itself 8 s for the last notices
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ def _frames(config: Config, stack: ExitStack) -> FrameAddress:
 
 
 class ChildProcesses:
-    """Recorder, console, acquisition and alarms of one run. The hold goes on without any of them, and reports it."""
+    """Recorder, console, acquisition and alarms of one run. The hold continues without them and reports it."""
 
     def __init__(
         self, config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str, duration_s: float | None
@@ -195,7 +195,7 @@ class ChildProcesses:
         return [each for each in (self._recorder, self._acquisition, self._alarms, self._console) if each is not None]
 
     def start(self, stack: ExitStack) -> None:
-        """Start all; the stack stops what `take_down` has not."""
+        """Start all children; the stack stops those that `take_down` has not."""
         stack.callback(self._stop)
         for managed in self._managed:
             managed.start(self._clock.now())
@@ -205,11 +205,11 @@ class ChildProcesses:
             managed.child.stop(_CHILD_STOPS_S)
 
     def reports(self) -> list[events.Event]:
-        """The children's reports since the last call, and who was replaced; never waits."""
+        """The children's reports and replacements since the last call; never waits."""
         return [event for managed in self._managed for event in managed.look(self._clock.now())]
 
     def capture(self) -> events.Event | None:
-        """Have the acquisition save a full set, and report it; returns an event if that is impossible."""
+        """Ask the acquisition to save and report a full set; returns an event if that is impossible."""
         if self._acquisition is None:
             return run_events.Capture(failed="no shape measurement in this run")
         if not self._acquisition.send("capture"):
@@ -222,8 +222,8 @@ class ChildProcesses:
             self._acquisition.child.stop(_CHILD_STOPS_S)
         recorder = self._recorder.child
         if not recorder.join(_RECORDER_CLOSES_S):
-            recorder.stop(0.0)  # it hangs, or its disk does
-        if recorder.exit_code != 0 and not self._summary.exists():  # another one records the end
+            recorder.stop(0.0)  # recorder or disk hangs
+        if recorder.exit_code != 0 and not self._summary.exists():  # a new one records the end
             self._recorder.replace(self._clock.now())
             self._recorder.child.join(_RECORDER_CLOSES_S)
         self._end_console()
@@ -242,7 +242,7 @@ class ChildProcesses:
 
 
 def _makes(name: str, room: str, nice: int, spec: Callable[[int], object]) -> Make:
-    """Makes the children of a room; `spec` gives the argument of the one that comes after so many others."""
+    """Return a maker of a room's children; `spec` maps the number of earlier children to the next one's argument."""
 
     def make(count: int) -> tuple[Child, Connection]:
         ours, theirs = pipe()

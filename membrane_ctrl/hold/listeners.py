@@ -1,4 +1,4 @@
-"""Listeners to the ticks of a hold: the latched-fault file, and systemd. No tick waits for either."""
+"""Listeners to the ticks of a hold: the latched-fault file and systemd. No tick waits for either."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile, Res
 
 
 class FaultLatch:
-    """Keeps the latched-fault file in step with the controller; on exit it waits for the disk, when the pump is off.
+    """Keeps the latched-fault file in step with the controller; waits for the disk only on exit, with the pump off.
 
     Parameters
     ----------
     file : LatchedFile or None
-        None: nothing is latched beyond the run (the twin's default).
+        None: no latch outlives the run (the twin's default).
     resumes : ResumeLog or None
-        Counts resumes beyond the run.
+        Counts resumes across runs.
     run : str
         Name of the run folder.
     utc : callable
-        UTC of a moment on the run's clock.
+        Converts the run's clock to UTC.
     tell : callable
-        Records that the file could not be written, or can again.
+        Records that writing the file failed, or works again.
     """
 
     def __init__(
@@ -44,9 +44,9 @@ class FaultLatch:
         tell: Callable[[events.Event], None],
     ) -> None:
         self._file, self._resumes, self._run, self._utc, self._tell = file, resumes, run, utc, tell
-        # one thread, so that a fault and its acknowledgement stay in order; it exists only once there is a fault
+        # one thread, so that a fault and its acknowledgement stay in order; started by the first fault
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="latched-fault")
-        self._news: deque[events.Event] = deque()  # from the disk's thread
+        self._news: deque[events.Event] = deque()  # from the disk thread
         self._failing = False
         self._last: Callable[[], None] = lambda: None
         self._fault: events.Fault | None = None
@@ -59,7 +59,7 @@ class FaultLatch:
 
     @property
     def resumes_s(self) -> tuple[float, ...]:
-        """How long ago the resumes of the last day were, oldest first."""
+        """Ages of the last day's resumes, oldest first."""
         return () if self._resumes is None else self._resumes.ages_s(datetime.now(UTC))
 
     def __enter__(self) -> FaultLatch:
@@ -77,7 +77,7 @@ class FaultLatch:
         self._report()
 
     def heard(self, outputs: tick.TickOutputs) -> None:
-        """After a tick: latch a fault or a person's lock, clear what was left or acknowledged."""
+        """After a tick: latch a fault or a person's lock; clear an acknowledged one."""
         self._report()
         for event in outputs.events:
             match event:
@@ -86,7 +86,7 @@ class FaultLatch:
                 case events.StateEntered(state="fault"):
                     self._latch(outputs.row.mono_s)
                 case events.CommandTaken(command="latch", who=who, refused=None) if who != commands.AT_START:
-                    # what is latched at the start is in the file already
+                    # a latch from the start is already in the file
                     self._lock(who, event.text or "", outputs.row.mono_s)
                 case events.Resumed() if self._resumes is not None:
                     self._disk.submit(self._try, partial(self._resumes.add, self._utc(outputs.row.mono_s)))
@@ -114,7 +114,7 @@ class FaultLatch:
         self._disk.submit(self._try, act)
 
     def _settle(self, file: LatchedFile) -> None:
-        """At the end of the run: try once more what the disk did not take, and wait for the disk."""
+        """At the end of the run: retry a failed write once, and wait for the disk."""
         if self._failing:
             self._try(self._last)
         if not self._failing:
@@ -124,7 +124,7 @@ class FaultLatch:
     def _try(self, act: Callable[[], None]) -> None:
         try:
             act()
-        except Exception as error:  # nobody looks at what a thread raises
+        except Exception as error:  # nothing else would see an exception of this thread
             if not self._failing:
                 self._news.append(run_events.LatchFailed(str(error)))
             self._failing = True
@@ -138,14 +138,14 @@ class FaultLatch:
             self._tell(self._news.popleft())
 
 
-_NOTIFY_S = 0.5  # far below any sensible WatchdogSec=, and nothing to a tick
+_NOTIFY_S = 0.5  # far below any sensible WatchdogSec=, and cheap
 
 
 class SystemdNotify:
-    """Tells systemd that ticks go on (`Type=notify`, `WatchdogSec=`), with a status line, and that they end.
+    """Tells systemd that ticks continue (`Type=notify`, `WatchdogSec=`), with a status line, and when they end.
 
-    The protocol is a datagram of KEY=VALUE lines to the socket in NOTIFY_SOCKET (sd_notify(3)); "@name" is an
-    abstract one, and without a socket nothing is sent. A loop that hangs sends nothing, and systemd restarts it.
+    The protocol is a datagram of KEY=VALUE lines to the socket in NOTIFY_SOCKET (sd_notify(3)); "@name" means an
+    abstract one. Without a socket nothing is sent. systemd restarts a loop that hangs and so sends nothing.
     """
 
     def __init__(self, address: str | None = None) -> None:
@@ -183,4 +183,4 @@ class SystemdNotify:
     def _send(self, message: str) -> None:
         if self._address:
             with contextlib.suppress(OSError):
-                self._socket.sendto(message.encode(errors="replace"), self._address)  # a path may be no text
+                self._socket.sendto(message.encode(errors="replace"), self._address)  # a path need not be valid text

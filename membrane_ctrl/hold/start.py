@@ -1,7 +1,7 @@
-"""`hold`: everything around the ticks. Starts the processes, wires them, and takes them down in the right order.
+"""`hold`: everything around the ticks. Starts the processes, wires them, and stops them in the right order.
 
-On the way in, what can be refused is refused before anything exists: configuration, port, devices, folder. On the
-way out: the safe state first, then the recording, then the rest.
+At the start, configuration, port, devices and folder are checked before anything is created. At the end, the safe
+state comes first, then the recording, then the rest.
 """
 
 import asyncio
@@ -42,7 +42,7 @@ class HoldOptions:
     """What the command line asked for."""
 
     config: Config
-    source: str  # where the configuration came from, for messages
+    source: str  # origin of the configuration, for messages
     twin: bool
     duration_s: float | None
     name: str
@@ -54,9 +54,9 @@ class HoldOptions:
 
 
 def hold_mirror(options: HoldOptions) -> int:
-    """Hold the mirror until the duration is over, a signal comes, or a safety trip ends it.
+    """Hold the mirror until the duration is over, a signal arrives, or a safety trip ends the run.
 
-    Returns the exit code. Raises InputError or DeviceError (one line) for what fails before the first tick.
+    Returns the exit code. Raises InputError or DeviceError (one line) for failures before the first tick.
     """
     if options.config.devices is None and not options.twin:
         raise errors.InputError(
@@ -73,8 +73,8 @@ def hold_mirror(options: HoldOptions) -> int:
         config = twin.config if twin else options.config
         assert config.devices is not None
         logs_dir = options.logs_dir or Path(config.recording.logs_dir)
-        listeners = sockets.listeners_for(config.port, logs_dir, stack)  # a second hold ends here, no device touched
-        stack.enter_context(locked(device_names(config.devices)))  # and here one with other folders
+        listeners = sockets.listeners_for(config.port, logs_dir, stack)  # a second hold ends here, devices untouched
+        stack.enter_context(locked(device_names(config.devices)))  # one with other folders ends here
         latched = _latched(config, logs_dir, options)
         resumes = None if latched is None else latched_fault.ResumeLog(logs_dir)
         board = asyncio.run(_identify(open_bench(config.devices), config, options, resumes))
@@ -89,15 +89,15 @@ def hold_mirror(options: HoldOptions) -> int:
         latch = partial(FaultLatch, latched, resumes, run_dir.name, clock.utc)
         exit_code = asyncio.run(_run(bench, config, options, clock, rings, children, twin, port, latch, board))
         children.take_down()
-    with contextlib.suppress(OSError):  # the terminal was closed, or nobody reads any more
+    with contextlib.suppress(OSError):  # the terminal was closed, or the pipe's reader has gone
         _report(run_dir, options.json)
     return exit_code
 
 
 def _latched(config: Config, logs_dir: Path, options: HoldOptions) -> latched_fault.LatchedFile | None:
-    """The file of the fault that outlives a run; the twin has one only if its configuration says so.
+    """The file of a latched fault, which outlives a run; the twin has one only if configured.
 
-    Raises DeviceError if a fault is latched, unless it is to be cleared, or nobody asks to hold the mirror yet.
+    Raises DeviceError if a fault is latched, unless it is to be cleared or the run starts in standby.
     """
     if options.twin and not config.states.latch_twin_faults:
         return None
@@ -116,16 +116,16 @@ def _latched(config: Config, logs_dir: Path, options: HoldOptions) -> latched_fa
 
 @dataclass(frozen=True, slots=True)
 class BoardAtStart:
-    """What the board itself had latched before this run."""
+    """Faults that the board itself had latched before this run."""
 
-    latched: str = ""  # and has still: nobody asks to hold the mirror yet
-    cleared: str = ""  # as the resume rule allows
+    latched: str = ""  # still latched, as the run starts in standby
+    cleared: str = ""  # cleared under the resume rule
 
 
 async def _identify(
     bench: Bench, config: Config, options: HoldOptions, resumes: latched_fault.ResumeLog | None = None
 ) -> BoardAtStart:
-    """Who is there, and is it fit to run, before a run folder exists. Raises DeviceError or InputError."""
+    """Identify the devices and check their fitness before making a run folder. Raises DeviceError or InputError."""
     devices = config.devices
     assert devices is not None
     try:
@@ -138,26 +138,26 @@ async def _identify(
         if not faults:
             return BoardAtStart()
         what = f"{devices.name}: the board has latched faults {faults:#x} (docs/registers.md)"
-        # the controller before this one was killed: no more than that, if nothing else is latched and none vented
+        # the last controller was killed, and nothing else happened if no other fault is latched and nobody vented
         vented = reading.vent_fraction > safe_levels.VENTED_FRACTION
         if faults == safe_levels.WATCHDOG_MASK and not vented and _may_resume("watchdog_tripped", config, resumes):
             await bench.clear_faults(safe_levels.WATCHDOG_MASK)
-            return BoardAtStart(cleared="its watchdog had stopped the pump; cleared, as resume.faults allows")
+            return BoardAtStart(cleared="its watchdog had stopped the pump; cleared under resume.faults")
     except LinkError as error:
         raise errors.DeviceError(f"{devices.name}: {error}") from None
     finally:
         await bench.close()
     if not options.standby:
-        raise errors.DeviceError(f"{what}; find out why, then start with --clear-faults")
+        raise errors.DeviceError(f"{what}; find the cause, then start with --clear-faults")
     return BoardAtStart(latched=what)
 
 
 def _may_resume(name: str, config: Config, resumes: latched_fault.ResumeLog | None) -> bool:
-    """The resume rule at a start; what it allows is counted, or it is not allowed."""
+    """Apply the resume rule at a start; a resume that cannot be counted is not allowed."""
     if name not in config.resume.faults:
         return False
     if resumes is None:
-        return True  # the twin, of which nothing is kept
+        return True  # the twin, which keeps no latch
     now = datetime.now(UTC)
     if len(resumes.ages_s(now)) >= config.resume.most_per_day:
         return False
@@ -201,7 +201,7 @@ async def _run(
         try:
             _ask_first(supervisor, options.standby, latch, board)
             gc.collect()
-            gc.freeze()  # what lives for the whole run need not be looked at again between two ticks
+            gc.freeze()  # the collector need not visit objects that live for the whole run
             async with port.open():
                 with _signals(supervisor), latch, systemd:
                     # last: the board's watchdog runs from here on
@@ -236,7 +236,7 @@ def _wiring(
 
 
 def _ask_first(supervisor: Supervisor, standby: bool, latch: FaultLatch, board: BoardAtStart) -> None:
-    """What the first tick is asked: to hold, unless the run begins in standby; and what earlier runs left."""
+    """The first tick's commands: hold, unless the run starts in standby, and the resumes of earlier runs."""
     if not standby:
         supervisor.ask(commands.Command("hold", commands.AT_START))
     elif latched := "; ".join(part for part in (latch.latched, board.latched) if part):
@@ -248,7 +248,7 @@ def _ask_first(supervisor: Supervisor, standby: bool, latch: FaultLatch, board: 
 def _capture(
     children: child_processes.ChildProcesses, tell: Callable[[Event], None], outputs: tick.TickOutputs
 ) -> None:
-    """A set that was asked for, and not refused, is the acquisition's to take."""
+    """Pass accepted requests for a capture set to the acquisition."""
     for event in outputs.events:
         match event:
             case CommandTaken(command="capture", refused=None) if (failed := children.capture()) is not None:
@@ -257,10 +257,10 @@ def _capture(
 
 @contextlib.contextmanager
 def _signals(supervisor: Supervisor) -> Iterator[None]:
-    """SIGINT, SIGTERM and a closed terminal ask for a clean stop; the safe state comes before anything else."""
+    """Turn SIGINT, SIGTERM and a closed terminal into a clean stop, which begins with the safe state."""
     loop = asyncio.get_running_loop()
     numbers = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # `nohup` asks to go on without the terminal
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # `nohup`: continue without the terminal
         numbers.append(signal.SIGHUP)
     before = {number: signal.getsignal(number) for number in numbers}
     for number in numbers:
@@ -274,13 +274,13 @@ def _signals(supervisor: Supervisor) -> Iterator[None]:
 
 
 def _report(run_dir: Path, as_json: bool) -> None:
-    """What the run was, and where it is."""
+    """Print the run's result and folder."""
     summary_path = run_dir / "summary.json"
     if as_json:
         print(summary_path.read_text(encoding="utf-8") if summary_path.exists() else "{}")
         return
     if not run_dir.exists():
-        print(f"{run_dir}: removed or moved during the run; nothing is left", file=sys.stderr)
+        print(f"{run_dir}: removed or moved during the run; no data left", file=sys.stderr)
         return
     if summary_path.exists():
         summary = json.loads(summary_path.read_text(encoding="utf-8"))
@@ -288,7 +288,7 @@ def _report(run_dir: Path, as_json: bool) -> None:
             print(line, file=sys.stderr)
         anew_s = summary["recorder"].get("folder_anew_s")
         if anew_s is not None:
-            print(f"the run folder was removed or moved; the new one begins at {anew_s:.1f} s", file=sys.stderr)
+            print(f"the run folder was removed or moved; the new one starts at {anew_s:.1f} s", file=sys.stderr)
     else:
         print("summary.json is missing; the recorded data are readable", file=sys.stderr)
     print(f"run folder: {run_dir}", file=sys.stderr)

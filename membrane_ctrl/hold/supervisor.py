@@ -1,7 +1,7 @@
 """The tick: asyncio, absolute deadlines, one device exchange, one pure function, one write.
 
-Nothing here may take longer than a tick: no image, no Rerun, no file; the record goes into shared-memory rings, which
-never wait. A missed deadline is skipped and counted, never made up in a burst.
+Nothing here may take longer than a tick: no image, no Rerun, no file; records go into shared-memory rings, which
+never block. A missed deadline is skipped and counted, never made up in a burst.
 """
 
 import asyncio
@@ -22,10 +22,10 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.processes.ring import RingReader, RingWriter
 
-_CHILD_WATCH_S = 0.5  # looking after a child costs a system call
-# A replay runs through half of this on the way to its part, in some seconds; a memory takes 0.6 ms of a tick and 7 kB
+_CHILD_WATCH_S = 0.5  # checking on a child costs a system call
+# On average a replay runs through half of this to reach its part, in seconds; a memory costs 0.6 ms and 7 kB
 MEMORY_EVERY_S = 600.0
-_TEXT_CUTS = (200, 20)  # letters of a text, if the event is longer than a slot; one takes up to 12 bytes in JSON
+_TEXT_CUTS = (200, 20)  # characters to keep if the event exceeds its slot; each takes up to 12 bytes in JSON
 
 
 @dataclass(slots=True)
@@ -35,11 +35,11 @@ class Wiring:
     bench: Bench
     telemetry: RingWriter | None = None
     events: RingWriter | None = None
-    inputs: RingWriter | None = None  # of the ticks, for a replay
+    inputs: RingWriter | None = None  # inputs of the ticks, for a replay
     shapes: Callable[[], shape_estimate.ShapeEstimate | None] | None = None  # the newest since the last call
     truth: Callable[[], tuple[float, float]] | None = None  # (displacement_um, laser_bias_um) of the twin
     reports: Callable[[], list[Event]] = list  # of the children since the last call
-    # listeners to each tick's outputs, and to the children's reports; one that raises is a fault
+    # listeners to each tick's outputs and the children's reports; an exception in one is a fault
     heard: Mapping[str, Callable[[TickOutputs], None]] = field(default_factory=dict)
     told: Mapping[str, Callable[[Event], None]] = field(default_factory=dict)
 
@@ -76,14 +76,14 @@ class Supervisor:
         self._wiring.events.put(_line(stamped | event.to_dict(), self._wiring.events.slot_bytes))
 
     async def run(self, duration_s: float | None) -> errors.Exit:
-        """Tick until a tick says that the run is over; the pump is off by then, or cannot be reached."""
+        """Tick until the run is over; the pump is then off, or unreachable."""
         deadline_s = last_s = self._clock.now()
         ends_s = math.inf if duration_s is None else deadline_s + duration_s
         try:
             while True:
                 deadline_s += self._period_s
                 await asyncio.sleep(max(0.0, deadline_s - self._clock.now()))
-                now_s = round(self._clock.now(), 6)  # microseconds are recorded in half the bytes
+                now_s = round(self._clock.now(), 6)  # whole microseconds take half the bytes
                 late_s = now_s - deadline_s
                 skipped = max(0, int(late_s / self._period_s))
                 self.missed_ticks += skipped
@@ -99,7 +99,7 @@ class Supervisor:
             await self.leave()
 
     async def leave(self) -> None:
-        """Write the pump off; a mirror that is being vented must not be shut by the end of the program."""
+        """Write the pump off; leave an open vent open."""
         await self._write(BenchCommand(0.0, self._vent_fraction))
 
     async def tick(self, now_s: float, dt_s: float, late_s: float) -> tuple[TickInputs, TickOutputs]:
@@ -141,14 +141,14 @@ class Supervisor:
         return inputs, outputs
 
     def _remember(self, now_s: float) -> bytes:
-        """Now and then the controller's memory, so that a replay can begin there."""
+        """Record the controller's memory now and then, so that a replay can start there."""
         if self._wiring.inputs is None or now_s < self._next_memory_s:
             return b""
         self._next_memory_s = now_s + MEMORY_EVERY_S
         return remember(self._controller)
 
     def _record(self, inputs: TickInputs, outputs: TickOutputs, memory: bytes) -> None:
-        """Record the row, and the inputs for a replay; a value of a wrong type costs the replay, not the row."""
+        """Record the row, and the inputs for a replay; a value of the wrong type loses the inputs, not the row."""
         if self._wiring.telemetry is None:
             return
         row = outputs.row.pack()
@@ -179,7 +179,7 @@ class Supervisor:
             await self._wiring.bench.open()
         except LinkWaitsError:
             return
-        except LinkError as error:  # e.g. it answers, but another program holds it
+        except LinkError as error:  # e.g. the device answers, but another program holds it
             self._link_failed(error)
             return
         self._link_up, self._link_error = True, ""
@@ -192,7 +192,7 @@ class Supervisor:
             self._link_failed(error)
 
     async def _write(self, command: BenchCommand) -> None:
-        """The write that ends a tick and feeds the board's watchdog."""
+        """Make the write that ends a tick and feeds the board's watchdog."""
         if not self._link_up:
             return
         try:
@@ -212,14 +212,14 @@ class Supervisor:
             return None
         try:
             return self._wiring.shapes()
-        except ValueError as error:  # the shape loop goes on without it
+        except ValueError as error:  # the shape loop continues without it
             if str(error) != self._shape_error:
                 self._shape_error = str(error)
                 self.tell(run_events.ShapeUnreadable(str(error)))
             return None
 
     def _watch(self) -> None:
-        """The hold goes on without its children, and says so."""
+        """Report what happened to the children; the hold continues without them."""
         for report in self._wiring.reports():
             self.tell(report)
             for name, told in self._wiring.told.items():
@@ -234,7 +234,7 @@ class Supervisor:
 
 
 def newest_of(reader: RingReader) -> Callable[[], shape_estimate.ShapeEstimate | None]:
-    """A function that takes the newest estimate out of the shapes' ring; it raises ValueError for a bad one."""
+    """Return a function that takes the newest estimate from the shape ring; it raises ValueError for a bad one."""
 
     def newest() -> shape_estimate.ShapeEstimate | None:
         messages = reader.drain()
@@ -244,7 +244,7 @@ def newest_of(reader: RingReader) -> Callable[[], shape_estimate.ShapeEstimate |
 
 
 def _line(event: EventLine, most_bytes: int) -> bytes:
-    """An event for the ring; its texts are cut if it is too long."""
+    """Encode an event for the ring; truncate its texts if it is too long."""
     line = json.dumps(event, allow_nan=False, default=str).encode()
     for most in _TEXT_CUTS:
         if len(line) <= most_bytes:

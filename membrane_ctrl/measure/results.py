@@ -1,4 +1,4 @@
-"""What `measure` leaves in a folder: `result.json` and `height.npz` (INTERFACES section 5), and `details.json`."""
+"""What `measure` leaves in a folder: `result.json` and `height.npz` (docs/interfaces.md), and `details.json`."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Recorded inputs run again, and runs repaired."""
+"""Replay of recorded inputs, and repair of runs."""

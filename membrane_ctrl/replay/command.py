@@ -1,8 +1,8 @@
-"""`replay RUN`: the run's recorded inputs through today's control code, and what is not the same.
+"""`replay RUN`: runs the recorded inputs through today's control code and reports the differences.
 
-With `--to-test` a stretch of it becomes an incident: `tests/incidents/<name>/` holds the run's configuration and
-inputs, and `incident.toml` with the decisions expected. Where the incident shows that the controller decided wrongly,
-a person writes there what it should have decided: the test then fails until it does.
+`--to-test` turns a part of the run into an incident: `tests/incidents/<name>/` holds the run's configuration and
+inputs, and `incident.toml` the expected decisions. If the controller decided wrongly, edit those to the decisions it
+should have made: the test then fails until it makes them.
 """
 
 import json
@@ -29,10 +29,10 @@ from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.replay import replay as replays
 from membrane_ctrl.run_files import inputs_file, run_folder, tables
 
-# What a replay needs of a run folder: configuration, inputs, recorded decisions, recorded rows.
+# The parts of a run folder that a replay needs: configuration, inputs, recorded decisions, recorded rows.
 
 
-# A row is found in the recording by its time, which Rerun keeps in whole nanoseconds.
+# A row is found in the recording by its time, which Rerun stores in whole nanoseconds.
 _SAME_TIME_S = 2e-9
 
 
@@ -44,8 +44,8 @@ class RecordedRun:
     config: Config
     inputs: inputs_file.InputsReader
     decisions: list[replays.Decision]
-    told_until_s: float  # the event log ends here, if a crash cut it
-    config_damage: str = ""  # not the configuration that the run had
+    told_until_s: float  # end of the event log, if a crash truncated it
+    config_damage: str = ""  # why this is not the run's configuration
 
     def differences(self, rows: Sequence[telemetry.TelemetryRow]) -> list[dict[str, tuple[float, float]] | None]:
         """The fields in which each row differs from the one recorded then; None where the recording has none."""
@@ -67,9 +67,9 @@ class RecordedRun:
 
 
 def open_run(folder: Path) -> RecordedRun:
-    """Open a run. Raises InputError in one line that names the folder and what is missing."""
+    """Open a run. Raises InputError, naming the folder and what is missing."""
     if not (folder / "config.toml").is_file():
-        raise InputError(f"{folder}: not a run folder: there is no config.toml in it")
+        raise InputError(f"{folder}: not a run folder (no config.toml)")
     inputs = inputs_file.open_inputs(folder)
     if not inputs.paths:
         raise InputError(f"{folder}: no inputs: there is no table of ticks in columns/")
@@ -79,11 +79,11 @@ def open_run(folder: Path) -> RecordedRun:
     told_until_s = max((each.mono_s for each in log), default=0.0) if cut else math.inf
     config = toml_file.load(folder / "config.toml", Config, follow=False)
     right = plain_json.comment_is_right(files.read_text(folder / "config.toml"))
-    damage = "" if right else "config.toml: does not fit its checksum (damaged or edited)"
+    damage = "" if right else "config.toml: checksum mismatch (damaged or edited)"
     return RecordedRun(folder, config, inputs, decisions, told_until_s, damage)
 
 
-# An event is stamped when it is told, at the end of its tick.
+# An event is stamped when it is reported, at the end of its tick.
 DECISION_SLACK_S = 0.5
 
 
@@ -93,7 +93,7 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
     Raises
     ------
     InputError
-        Not a run that can be replayed, a part that it does not have, or (with `to_test`) a name that is taken.
+        If the run cannot be replayed, has no such part, or (with `to_test`) the name is taken.
     """
     if from_s >= to_s:
         raise InputError(f"--from {from_s:g}s is not before --to {to_s:g}s")
@@ -117,8 +117,8 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
     if to_test is not None:
         if found.gaps:
             raise InputError(
-                f"--to-test: ticks are missing at {found.gaps[0].time_s:.1f} s, so that what the controller should "
-                "have decided is not known; choose a part without a gap with --from and --to"
+                f"--to-test: ticks are missing at {found.gaps[0].time_s:.1f} s, so the right decisions are "
+                "unknown; choose a part without a gap with --from and --to"
             )
         target = write_incident(run, found, to_test, begin, to_s)
         print(f"written: {target}; say in its incident.toml what happened", file=sys.stderr)
@@ -126,7 +126,7 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
 
 
 def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, replays.Replay]:
-    """Begin at the last memory before `from_s`; with the run, if there is none or it is not of today's layout."""
+    """Start at the last memory before `from_s`, or at the run's start without a memory of today's layout."""
     inputs = run.inputs.since(from_s)
     begin = replays.tick_to_begin_with(inputs, from_s)
     if begin > 1:
@@ -140,15 +140,15 @@ def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, replay
             run.inputs.program = inputs.program
     try:
         return 1, replays.replay(run.config, replays.recorded_ticks(run.inputs), zernike_projection(), from_s, to_s)
-    except UnknownMemoryError as error:  # one behind a gap
+    except UnknownMemoryError as error:  # a memory after a gap
         print(f"without recorded memories: {error}", file=sys.stderr)
-        run.inputs.damage.clear()  # it is told again
+        run.inputs.damage.clear()  # the second pass reports it again
         ticks = replays.recorded_ticks(run.inputs, memories=False)
         return 1, replays.replay(run.config, ticks, zernike_projection(), from_s, to_s)
 
 
 def _report(run: RecordedRun, found: replays.Replay, begin: int, to_s: float) -> dict[str, Any]:
-    # where the log or the inputs end early, nothing is said of what came then
+    # make no claim about the time after the log or the inputs end
     end_s = min(to_s, run.told_until_s, found.last_s)
     today = [decision for decision in found.decisions if decision.time_s <= end_s]
     recorded = [d for d in run.decisions if found.begin_s <= d.time_s <= end_s + DECISION_SLACK_S]
@@ -185,7 +185,7 @@ def _verdict(found: replays.Replay, only_words: bool, decisions_differ: bool, da
 
 
 def _lines(report: dict[str, Any]) -> list[str]:
-    """What a person wants to read."""
+    """The report as lines of text."""
     lines = [f"verdict    {report['verdict']}: {report['compared']} of {report['ticks']} ticks compared bit by bit"]
     lines.append(f"recorded   by {report['recorded_by'] or 'an unknown program'}")
     if report["from_memory"]:
@@ -196,7 +196,7 @@ def _lines(report: dict[str, Any]) -> list[str]:
             f"different  {report['different']} ticks, the first is tick {first['tick']} at {first['time_s']:.3f} s"
         )
         if report["fields"] is None:
-            lines.append("           what was recorded there is not in the *.rrd files")
+            lines.append("           the recorded values there are not in the *.rrd files")
         elif not report["fields"]:
             rows = "all their rows are" if report["verdict"] == "same rows" else "its row is"
             lines.append(f"           {rows} the same: events or answers to commands differ")
@@ -215,29 +215,29 @@ def _lines(report: dict[str, Any]) -> list[str]:
 SCHEMA = "membrane-incident/1"
 INCIDENTS = Path("tests/incidents")
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
-# An incident lives in the repository: what is larger than this is a recording.
+# An incident is kept in the repository, which must not hold more than this.
 _BYTES_MAX = 4_000_000
 
 
 def write_incident(
     run: RecordedRun, found: replays.Replay, name: str, begin: int, to_s: float, incidents: Path = INCIDENTS
 ) -> Path:
-    """Make a test of a replay: the run's inputs up to `to_s`, and the decisions found, which it expects.
+    """Make a test from a replay: the run's inputs up to `to_s`, and the decisions found as expectations.
 
-    It begins with the tick `begin`: the run's first, or one that has the controller's memory with it.
+    It starts at the tick `begin`: the run's first, or one with a recorded controller memory.
 
     Raises
     ------
     InputError
-        A name that is none or taken, no such folder, or more than a repository should hold.
+        If the name is invalid or taken, the folder is missing, or the test is too large for a repository.
     """
     if not _NAME.fullmatch(name):
         raise InputError(f"--to-test {name!r}: use small letters, digits, '-' and '_'")
     if not incidents.is_dir():
-        raise InputError(f"{incidents}: no such folder; run this in the project's own folder")
+        raise InputError(f"{incidents}: no such folder; run this in the project folder")
     folder = incidents / name
     if folder.exists():
-        raise InputError(f"{folder}: is there already; choose another name")
+        raise InputError(f"{folder}: already exists; choose another name")
     folder.mkdir()
     kept = tables.ColumnTables(folder)
     for frame in _between(run.inputs.since(found.begin_s), begin, to_s):
@@ -258,12 +258,12 @@ def write_incident(
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     if size > _BYTES_MAX:
         shutil.rmtree(folder)
-        raise InputError(f"--to-test: {size / 1e6:.0f} MB is too much for a test; narrow it with --from and --to")
+        raise InputError(f"--to-test: {size / 1e6:.0f} MB is too large for a test; narrow it with --from and --to")
     return folder
 
 
 def _rows(records: Records) -> telemetry.Rows:
-    """Telemetry rows as far as they repeat what the ticks were given, NaN otherwise."""
+    """Telemetry rows holding only the fields that repeat the ticks' inputs, NaN elsewhere."""
     rows = np.full((len(records), len(telemetry.FIELDS)), np.nan)
     for name, column in tables.GIVEN.items():
         if (field := column.removeprefix("given_")) in telemetry.COLUMN:
@@ -272,9 +272,7 @@ def _rows(records: Records) -> telemetry.Rows:
 
 
 def _between(frames: inputs_file.InputsReader, begin: int, to_s: float) -> Iterator[inputs_file.InputsFrame]:
-    before: dict[
-        float, shape_estimate.ShapeEstimate
-    ] = {}  # a shape may have come a frame ahead of the tick that used it
+    before: dict[float, shape_estimate.ShapeEstimate] = {}  # a shape may arrive a frame before the tick that used it
     for frame in frames:
         if len(frame.records) and frame.records["now_s"][0] > to_s:
             return

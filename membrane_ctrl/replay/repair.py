@@ -1,4 +1,4 @@
-"""`repair RUN`: what a crash left of a run, made whole again. Originals stay as they are unless a person says so."""
+"""`repair RUN`: repairs a run after a crash. Originals stay untouched unless a person asks otherwise."""
 
 import json
 import os
@@ -21,17 +21,17 @@ from membrane_ctrl.run_files.rrd_reader import REPAIRED
 from membrane_ctrl.run_files.segments import panics_are_faults, require_bounded
 from membrane_ctrl.run_files.summary import Summary
 
-# Rerun segments back to telemetry rows, for a repair and for a replay that differs.
+# Rerun segments back to telemetry rows, for repairs and for replays that differ.
 
 
 _SCALARS = "Scalars:scalars"
 
 
 def read_rows(path: Path) -> telemetry.Rows:
-    """(n, len(FIELDS)) telemetry rows of a segment, by time in whole nanoseconds; fields that were left out are NaN.
+    """(n, len(FIELDS)) telemetry rows of a segment, by time in whole nanoseconds; fields not recorded are NaN.
 
-    What lies behind damage is not read. Raises RuntimeError, ValueError, OSError: Rerun's ways to say that nothing
-    can be read.
+    Stops at damage. Raises RuntimeError, ValueError or OSError (Rerun uses all three) if nothing can be
+    read.
     """
     where = {stream.path: [telemetry.COLUMN[line.field] for line in stream.lines] for stream in streams.STREAMS}
     found: dict[str, tuple[list[IntArray], list[telemetry.Rows]]] = {path: ([], []) for path in where}
@@ -60,14 +60,14 @@ def read_rows(path: Path) -> telemetry.Rows:
     return rows
 
 
-# A recorder writes each second: what has changed since is a run that is still going on.
+# A recorder writes every second: a run changed more recently is still in progress.
 _STILL_RUNNING_S = 5.0
 _SEGMENT_TIMEOUT_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
 class FileFinding:
-    """One file of the run: what was wrong with it, and what was done."""
+    """One file of the run: its state, and the repair made."""
 
     file: str
     state: str
@@ -75,12 +75,12 @@ class FileFinding:
 
 
 def repair_command(run_dir: Path, in_place: bool, as_json: bool) -> int:
-    """Repair and report; exit 0 also when nothing was wrong.
+    """Repair and report; exit 0 also if nothing was wrong.
 
     Raises
     ------
     InputError
-        Not a run folder, or a run that is still going on.
+        If it is not a run folder, or the run is still in progress.
     """
     findings = repair(run_dir, in_place)
     if as_json:
@@ -90,18 +90,18 @@ def repair_command(run_dir: Path, in_place: bool, as_json: bool) -> int:
         for finding in findings:
             print(f"{finding.file:28} {finding.state}{': ' if finding.action else ''}{finding.action}")
     if not in_place and (run_dir / REPAIRED).exists():
-        print(f"repaired files: {run_dir / REPAIRED}; --in-place puts them in the originals' place", file=sys.stderr)
+        print(f"repaired files: {run_dir / REPAIRED}; --in-place replaces the originals", file=sys.stderr)
     return int(errors.Exit.DONE)
 
 
 def repair(run_dir: Path, in_place: bool = False) -> list[FileFinding]:
-    """Mend every file of a run that a crash can have torn.
+    """Repair every file of a run that a crash may have torn.
 
-    Repaired files go to `repaired/`, or replace the originals; what was cut off the event log stays beside it as
-    `.torn`. A summary that is missing is written to its place in either case.
+    Repaired files go to `repaired/` or replace the originals; the part cut off the event log stays beside it as
+    `.torn`. A missing summary is always written in place.
     """
     if not (run_dir / "config.toml").is_file():
-        raise errors.InputError(f"{run_dir}: not a run folder: there is no config.toml in it")
+        raise errors.InputError(f"{run_dir}: not a run folder (no config.toml)")
     _refuse_running(run_dir)
     segments = sorted(run_dir.glob("*.rrd"))
     findings = [_repair_segment(path, in_place) for path in segments]
@@ -120,7 +120,7 @@ def _refuse_running(run_dir: Path) -> None:
 
 
 def _now_s(folder: Path) -> float:
-    """The file system's own time: that of another machine's disk need not be ours."""
+    """The file system's own time, which may differ from ours on a network disk."""
     probe = folder / ".probe"
     try:
         with files.fresh_file(probe) as file:
@@ -167,7 +167,7 @@ def _repair_segment(path: Path, in_place: bool) -> FileFinding:
 def _repair_events(run_dir: Path, in_place: bool) -> list[FileFinding]:
     path = run_dir / "events.jsonl"
     if not path.exists():
-        return [FileFinding(path.name, "missing", "the run had no event, or it was lost")]
+        return [FileFinding(path.name, "missing", "the run had no events, or the log was lost")]
     data = files.read_bytes(path, run_folder.EVENTS_BYTES_MAX)
     good, torn = _split_events(data)
     if not torn:
@@ -180,7 +180,7 @@ def _repair_events(run_dir: Path, in_place: bool) -> list[FileFinding]:
 
 
 def _split_events(data: bytes) -> tuple[bytes, bytes]:
-    """Whole lines, and what is none: a torn tail, a block of zeros that a power cut left."""
+    """Split into whole lines and the rest: a torn tail, or a block of zeros left by a power cut."""
     good: list[bytes] = []
     torn: list[bytes] = []
     for line in data.splitlines(keepends=True):
@@ -198,7 +198,7 @@ def _is_whole_object(data: bytes) -> bool:
 
 
 def _look_at_inputs(run_dir: Path) -> list[FileFinding]:
-    """Nothing to mend: a replay reads all that is whole."""
+    """Report only: a replay reads whatever is intact."""
     reader = inputs_file.open_inputs(run_dir)
     ticks = sum(len(frame.records) for frame in reader)
     name = f"inputs ({len(reader.paths)} files)"
@@ -208,7 +208,7 @@ def _look_at_inputs(run_dir: Path) -> list[FileFinding]:
 
 
 def _look_at_config(run_dir: Path) -> list[FileFinding]:
-    """Nothing to mend: a summary that is rebuilt takes what cannot be read of it at its default."""
+    """Report only: a rebuilt summary uses defaults for settings that cannot be read."""
     notes: list[str] = []
     run_folder.read_config(run_dir, notes)
     return [FileFinding("config.toml", "damaged", "; ".join(notes))] if notes else []
@@ -227,9 +227,9 @@ def _repair_summary(run_dir: Path, in_place: bool) -> FileFinding:
 
 
 def rebuild_summary(run_dir: Path) -> dict[str, Any]:
-    """`summary.json` from what is on the disk; `"rebuilt": true` says so.
+    """Rebuild `summary.json` from the files on disk, marked `"rebuilt": true`.
 
-    Of a run without tables the ticks that Rerun does not have (in quiet times) are not in the statistics.
+    Without tables, the statistics lack the ticks that Rerun does not record (in quiet times).
     """
     summary = Summary(run_folder.read_config(run_dir, []))
     path = run_dir / "events.jsonl"
@@ -253,14 +253,14 @@ def rebuild_summary(run_dir: Path) -> dict[str, Any]:
 
 
 def _segments(run_dir: Path) -> Sequence[Path]:
-    """Each segment once: the repaired one where there is one."""
+    """Each segment once, in its repaired form if there is one."""
     repaired = run_dir / REPAIRED
     paths = sorted(run_dir.glob("*.rrd"))
     return [repaired / path.name if (repaired / path.name).exists() else path for path in paths]
 
 
 def _all_rows(run_dir: Path) -> Iterator[telemetry.Rows]:
-    """Every tick of the tables; without them the rows of all segments that can be read."""
+    """Every tick of the tables; without tables, the rows of all readable segments."""
     if column_reader.column_files(run_dir, tables.TICKS):
         for block in run.open_run(run_dir).tick_blocks(telemetry.FIELDS):
             yield np.column_stack([block[name] for name in telemetry.FIELDS])
@@ -268,5 +268,5 @@ def _all_rows(run_dir: Path) -> Iterator[telemetry.Rows]:
     for path in _segments(run_dir):
         try:
             yield read_rows(path)
-        except (RuntimeError, ValueError, OSError):  # Rerun's own ways to say that nothing can be read
+        except (RuntimeError, ValueError, OSError):  # Rerun raises any of these for an unreadable file
             continue

@@ -1,10 +1,10 @@
-"""Replay: the recorded inputs of a run through today's control code, on the run's own clock.
+"""Replay: runs the recorded inputs of a run through today's control code, on the run's own clock.
 
-A tick is a pure function of its inputs and of the ticks before it, so the same code gives the same outputs to the
-last bit; what differs is a change of the code. A replay begins with the run, or in the middle of it with a recorded
-memory of the controller (`controller_memory`). Each tick's outputs are compared by their checksum. Where ticks are
-missing in the record, what follows starts from a controller that missed them, too: up to the next recorded memory
-only decisions (states, faults) are compared.
+A tick is a pure function of its inputs and of the ticks before it, so the same code gives identical outputs, and any
+difference is a change of the code. A replay starts with the run, or in the middle of it from a recorded memory of
+the controller (`controller_memory`). Each tick's outputs are compared by checksum. Where the record lacks ticks, the
+replayed controller misses them too: until the next recorded memory, only decisions (states, faults) are
+compared.
 """
 
 import math
@@ -23,7 +23,7 @@ from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.events import Cleared, Event, Fault, ShapeLoopState, StateEntered
 from membrane_ctrl.run_files.inputs_file import InputsFrame
 
-# A shape is used in the tick it arrives in; more than these need not be remembered.
+# A shape is used in the tick it arrives in; no more than these need be kept.
 _SHAPES_KEPT = 16
 # Events in other words make some ticks an hour different; with more than these the code differs.
 _ROWS_KEPT = 1000
@@ -31,7 +31,7 @@ _ROWS_KEPT = 1000
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What the controller decided, and when: a state, a fault, the shape loop's state."""
+    """A decision of the controller and its time: a state, a fault, or the shape loop's state."""
 
     time_s: float
     what: str
@@ -39,7 +39,7 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class RecordedTick:
-    """One tick of the record: its inputs, the checksum of what came out of it, what was remembered before it."""
+    """One recorded tick: its inputs, the checksum of its outputs, and the memory before it."""
 
     tick: int
     inputs: TickInputs
@@ -49,7 +49,7 @@ class RecordedTick:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Ticks that are not in the record, or not whole."""
+    """Ticks that are missing or incomplete in the record."""
 
     after_tick: int
     time_s: float
@@ -59,7 +59,7 @@ class Gap:
 
 @dataclass(slots=True)
 class Replay:
-    """What a replay found; rows, decisions and end are those of today's code."""
+    """Result of a replay; rows, decisions and end are those of today's code."""
 
     begin_s: float = math.nan
     ticks: int = 0  # replayed
@@ -79,14 +79,14 @@ def replay(
     from_s: float = 0.0,
     to_s: float = math.inf,
 ) -> Replay:
-    """Run recorded ticks, from the run's first on or from one that has its memory with it, through a new controller.
+    """Run recorded ticks through a new controller, from the run's first or from one with a recorded memory.
 
-    Compared bit by bit is what lies between `from_s` and `to_s`; ticks before it run all the same.
+    The part between `from_s` and `to_s` is compared bit by bit; earlier ticks run, but are not compared.
 
     Raises
     ------
     UnknownMemoryError
-        The record begins with a memory that today's code cannot take up, or a tick raises after one was taken up.
+        If today's code cannot load the record's first memory, or a tick raises after loading one.
     """
     controller = Controller(config, sag_sensitivity)
     found = Replay()
@@ -118,7 +118,7 @@ def replay(
 
 
 def _ticked(controller: Controller, item: RecordedTick, remembered: bool) -> TickOutputs:
-    """A tick, which never raises by itself: if it does after a memory was taken up, the memory was forged."""
+    """Run a tick. Ticks never raise by themselves: one that does after loading a memory proves the memory forged."""
     try:
         return controller.tick(item.inputs)
     except Exception as error:
@@ -147,7 +147,7 @@ def decisions_of(told: Iterable[tuple[float, Event]]) -> list[Decision]:
 
 
 def tick_to_begin_with(frames: Iterable[InputsFrame], from_s: float) -> int:
-    """The last tick before a time of the run that has its memory with it; 1 if there is none."""
+    """The last tick before a time of the run that has a recorded memory; 1 if there is none."""
     begin = 1
     for frame in frames:
         for record in frame.records[np.isin(frame.records["tick"], list(frame.memories))]:
@@ -161,7 +161,7 @@ def tick_to_begin_with(frames: Iterable[InputsFrame], from_s: float) -> int:
 def recorded_ticks(
     frames: Iterable[InputsFrame], begin: int = 1, memories: bool = True
 ) -> Iterator[RecordedTick | Gap]:
-    """The ticks of a record in order from the tick `begin` on, and a `Gap` wherever some are missing."""
+    """Yield the ticks of a record in order from `begin` on, with a `Gap` wherever some are missing."""
     estimates: dict[float, shape_estimate.ShapeEstimate] = {}
     last, last_s = begin - 1, 0.0
     for frame in frames:
@@ -185,7 +185,7 @@ def recorded_ticks(
 def differing_fields(
     today: telemetry.TelemetryRow, recorded: telemetry.TelemetryRow
 ) -> dict[str, tuple[float, float]]:
-    """Fields that are not the same to the last bit: recorded and today's value."""
+    """Fields that are not bit-identical: recorded and today's value."""
     fields: dict[str, tuple[float, float]] = {}
     for name in telemetry.TelemetryRow.__slots__:
         then, now = getattr(recorded, name), getattr(today, name)
@@ -195,7 +195,7 @@ def differing_fields(
 
 
 def without_repeats(decisions: list[Decision]) -> list[Decision]:
-    """Without those of the shape loop that only give another reason for the state it is in."""
+    """Drop shape-loop decisions that only give another reason for the same state."""
     kept: list[Decision] = []
     shape = ""
     for decision in decisions:
@@ -206,7 +206,7 @@ def without_repeats(decisions: list[Decision]) -> list[Decision]:
 
 
 def unmatched(recorded: list[Decision], today: list[Decision], slack_s: float) -> list[str]:
-    """Where two lists of decisions differ, as sentences; times may differ by `slack_s`."""
+    """Differences between two lists of decisions, as sentences; times may differ by `slack_s`."""
     said: list[str] = []
     recorded, today = without_repeats(recorded), without_repeats(today)
     for place in range(max(len(recorded), len(today))):
@@ -215,7 +215,7 @@ def unmatched(recorded: list[Decision], today: list[Decision], slack_s: float) -
         if then is None or now is None or then.what != now.what or abs(then.time_s - now.time_s) > slack_s:
             said.append(f"recorded: {_told(then)}; today: {_told(now)}")
             if then is None or now is None or then.what != now.what:
-                break  # all that follow are shifted against each other
+                break  # all later ones are shifted against each other
     return said
 
 

@@ -18,7 +18,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import errors, events, files, plain_json, run_events
 from membrane_ctrl.run_files.column_file import FOLDER
 
-# The folder of a run: `logs/<UTC time>-<name>/` with the configuration as it ran (INTERFACES section 6).
+# The folder of a run: `logs/<UTC time>-<name>/` with the configuration as it ran (docs/interfaces.md).
 
 
 CONFIG = "config.toml"

@@ -189,7 +189,10 @@ def test_check_names_what_is_wrong_with_the_screen(
     [
         (SCREEN_TABLE, "needs a [devices.camera]"),
         ('[devices.camera]\ndriver = "aravis"\n', "a camera needs a [devices.screen]"),
-        ('[devices.camera]\ndriver = "folder"\nfolder = "f"\n' + SCREEN_TABLE, "a folder of frames needs none"),
+        (
+            '[devices.camera]\ndriver = "folder"\nfolder = "f"\n' + SCREEN_TABLE,
+            "a folder of frames must not have one",
+        ),
         (
             '[devices.camera]\ndriver = "aravis"\npixel_format = "Mono12"\n' + SCREEN_TABLE,
             "optics.camera.bits = 8, but devices.camera gives 12",

@@ -233,7 +233,7 @@ def test_who_is_told(tmp_path: Path, apprise: list[tuple[str, str, str, str]]) -
 def test_files_of_urls_that_are_none(tmp_path: Path, apprise: list[tuple[str, str, str, str]]) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_urls(tmp_path / "none")
-    with pytest.raises(InputError, match="no URL in it"):
+    with pytest.raises(InputError, match="no URL found"):
         read_urls(Path(urls(tmp_path, "# nothing")))
     secret = urls(tmp_path, "mail://ok", "password-and-no-scheme")
     with pytest.raises(InputError, match="URL 2 is not known") as refused:
@@ -255,7 +255,7 @@ def test_alarm_test(
     config.write_text(f'[alarms]\nurls_file = "{urls(tmp_path, "mail://ann")}"\n')
     assert run(["alarm", "test", "--config", str(config), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"sent": True}
-    assert "this is a test" in apprise[0][2]
+    assert "this is only a test" in apprise[0][2]
     assert run(["alarm", "test", "--config", str(config), "--escalated"]) == 2
     assert "escalation_urls_file: missing" in capsys.readouterr().err
     config.write_text(

@@ -192,9 +192,9 @@ def test_somebody_elses_setpoint_ends_it(
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ([], "name the capture sets, or take them from a running hold"),
-        (["--live", "set"], "leave out SET... and --out"),
-        (["set", "--yes"], "are for --live"),
+        ([], "or use --live to take them from a running hold"),
+        (["--live", "set"], "omit SET... and --out"),
+        (["set", "--yes"], "need --live"),
         (["--live", "--free", "nonsense"], "nonsense is not a parameter"),
         (["--live", "--session", "nowhere"], "nowhere/session.json"),
         (["--live", "--session", "nowhere", "--sets", "3"], "leave out --range-um and --sets"),

@@ -42,5 +42,5 @@ def test_a_file_error_that_no_command_foresaw_is_one_line(
     assert cli.run(["devices"]) == Exit.DEVICE_FAILED
     assert capsys.readouterr().err == (
         "membrane-ctrl: some/file: no space left on device; "
-        "check that it is there, its permissions and the space on its disk\n"
+        "check that it exists, its permissions and the free disk space\n"
     )

@@ -22,7 +22,7 @@ def would(config: Config, capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
 def test_the_defaults(capsys: pytest.CaptureFixture[str]) -> None:
     said = would(Config(), capsys)
     assert said["control port"] == "control.sock beside the run folders"
-    assert said["alarms"] == "nobody is told: no alarms.urls_file"
+    assert said["alarms"] == "not sent: no alarms.urls_file"
 
 
 def test_what_is_configured(

@@ -42,10 +42,10 @@ def test_inflate_says_how_far(target_um: float, flow_um_per_s: float, said: str)
 
 def test_outside_the_band_says_which_way_and_what_is_done() -> None:
     assert line(error_um=-6.9, flow_um_per_s=0.0) == (
-        "outside the band: bowl 6.9 um too deep, pump is at 0, only the leak lets it down"
+        "outside the band: bowl 6.9 um too deep, pump is at 0, only the leak can lower it"
     )
     assert line(error_um=6.9, flow_um_per_s=5.3, flow_wanted_um_per_s=9.0) == (
-        "outside the band: bowl 6.9 um too shallow, pump gives 5.30 um/s, all it may give"
+        "outside the band: bowl 6.9 um too shallow, pump gives 5.30 um/s, its limit"
     )
     assert line(error_um=2.0) == line(error_um=0.0)  # on the edge is inside
 

@@ -342,6 +342,6 @@ async def test_a_limit_beyond_the_boards_own_is_refused_by_whoever_asks_it(
         await board.stop()
     assert process.returncode == 2
     (line,) = said.decode().splitlines()
-    assert "limits.gauge_pressure_max_pa = 801: the board vents at 800 Pa by itself" in line
+    assert "limits.gauge_pressure_max_pa = 801: the board itself vents at 800 Pa" in line
     assert os.listdir(tmp_path) == ["lab.toml"]  # noqa: PTH208
     assert max(plant.outputs) == 0.0

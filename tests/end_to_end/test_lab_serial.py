@@ -47,5 +47,5 @@ def test_devices_without_twin_is_a_usage_error(tmp_path: Path) -> None:
         [*HOLD, "--logs", str(tmp_path / "logs")], capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode == 2
-    assert "only with --twin" in done.stderr
+    assert "--devices needs --twin" in done.stderr
     assert not (tmp_path / "logs").exists()

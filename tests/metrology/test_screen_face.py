@@ -159,7 +159,7 @@ def test_both_forms_of_the_geometry_carry_the_face() -> None:
     [
         ({"s_x_mm": (-250.0, 0.0, 249.0, 300.0, 400.0, 500.0)}, "s_x_mm must rise in even steps"),
         ({"s_y_mm": tuple(NODES_Y[::-1])}, "s_y_mm must rise"),
-        ({"heights_mm": ((0.0,) * 6,) * 4}, "4 rows of 6 numbers, s_y_mm and s_x_mm ask for 5 rows of 6"),
+        ({"heights_mm": ((0.0,) * 6,) * 4}, "4 rows of 6 numbers; s_y_mm and s_x_mm require 5 rows of 6"),
         ({"heights_mm": ((800.0,) * 6,) * 5}, "beyond 100 mm"),
     ],
 )

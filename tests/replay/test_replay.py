@@ -137,7 +137,7 @@ def test_another_configuration_than_the_run_had_is_named(record: Path, capsys: p
     text = with_comment(config_file.dump(CONFIG)).replace("kp_per_s = 0.61", "kp_per_s = 0.5")
     (record / "config.toml").write_text(text)
     assert run(["replay", str(record)]) == Exit.REJECTED
-    assert "config.toml: does not fit its checksum" in capsys.readouterr().out
+    assert "config.toml: checksum mismatch" in capsys.readouterr().out
 
 
 def test_only_what_is_asked_for_is_compared(

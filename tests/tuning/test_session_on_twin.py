@@ -113,7 +113,7 @@ def test_an_identified_plant_of_other_experiments_is_refused(done: SessionFolder
     shorter = good["identified"] | {"residual_um": good["identified"]["residual_um"][:-1]}
     for forged in (good | {"data_sha256": "0" * 64}, good | {"identified": shorter}):
         path.write_text(json.dumps(forged))
-        with pytest.raises(InputError, match=r"identified\.json is of other experiments; run identify again"):
+        with pytest.raises(InputError, match=r"identified\.json comes from other experiments; run identify again"):
             session.found_of(done)
 
 
@@ -138,7 +138,7 @@ def edited(done: SessionFolder, **changed: float) -> None:
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"kp_per_s": 9.0, "ti_s": 0.5}, "unstable on the plant of this file"),
+        ({"kp_per_s": 9.0, "ti_s": 0.5}, "unstable on this file's plant"),
         ({"kp_per_s": 3.0, "ti_s": 3.0}, "sensitivity"),
         ({"kp_per_s": 99.0}, "kp_per_s"),
         ({"rate_hz": 100.0}, "rate_hz"),

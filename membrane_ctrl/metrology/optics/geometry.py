@@ -1,4 +1,4 @@
-"""Camera and screen in world coordinates: the one form the code behind knows (INTERFACES section 1).
+"""Camera and screen in world coordinates: the one form the code behind knows (docs/interfaces.md).
 
 The short form is turned into it on loading. With the camera at F = a (cos alpha, 0, sin alpha) looking at O
 without roll, image down is world -y, forward is -F / a, and image right is the unit vector normal to both that points
