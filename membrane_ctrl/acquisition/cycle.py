@@ -1,7 +1,7 @@
-"""One measurement cycle after the other: show, expose, reconstruct; and what to do when that fails.
+"""Measurement cycles, one after the other: show, expose, reconstruct, and recover from failures.
 
-Synchronous and free of any real clock or device: everything it needs is passed in, so the same code runs over
-a camera, over the twin's renderer and over a fake in a test.
+Synchronous and free of real clocks and devices: everything is an argument, so the same code runs with a camera, with
+the twin's renderer and with a fake in a test.
 """
 
 import math
@@ -21,13 +21,13 @@ from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.processes.frames import FrameWriter
 from membrane_ctrl.processes.ring import RingAddress, RingReader
 
-# A full cycle may be spoilt by a door or by the mirror still moving: take two more at once. Three in a row mean
-# that there is no mirror to be seen (flat, dark, covered), which a pause does not worsen.
+# A door or a moving mirror may spoil a full cycle: take two more at once. Three failures in a row mean that no mirror
+# is visible (flat, dark, covered), which a pause does not worsen.
 REJECTED_IN_A_ROW = 3
 
 
 class Reconstructor(Protocol):
-    """From frames to the figure; keeps the last absolute phase between calls."""
+    """Turns frames into the figure; keeps the last absolute phase between calls."""
 
     def full(self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray) -> ShapeEstimate:
         """Figure from sinusoids, Gray codes, white and black, in the order of the full sequence."""
@@ -38,7 +38,7 @@ class Reconstructor(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class CyclePlan:
-    """The patterns of both kinds of cycle in their order, and the least time between two exposures."""
+    """The patterns of both kinds of cycle, in order, and the least time between exposures."""
 
     full: Sequence[Pattern]
     fringes: Sequence[Pattern]
@@ -47,7 +47,7 @@ class CyclePlan:
 
 @dataclass(frozen=True, slots=True)
 class CycleDone:
-    """A cycle that gave an estimate (whatever its verdict); wait `pause_s` before the next."""
+    """A cycle with an estimate, whatever its verdict; wait `pause_s` before the next."""
 
     estimate: ShapeEstimate
     pause_s: float
@@ -55,7 +55,7 @@ class CycleDone:
 
 @dataclass(frozen=True, slots=True)
 class CycleFailed:
-    """A cycle that gave none, where and why; wait `pause_s` before the next."""
+    """A cycle without an estimate, where it failed and why; wait `pause_s` before the next."""
 
     cycle: int
     stage: exposures.Stage
@@ -64,9 +64,9 @@ class CycleFailed:
 
 
 class ShapeCycle:
-    """Takes cycles: a full one first and whenever the fringe orders are lost, else fringes only.
+    """Takes cycles: a full one first and after losing the fringe orders, else fringes only.
 
-    `frames` must hold a full cycle. `stopping` is asked before every exposure: True ends the cycle without a result.
+    `frames` must hold a full cycle. `stopping` is checked before each exposure: True ends the cycle without a result.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class ShapeCycle:
         self._full_next = True
 
     def take(self) -> CycleDone | CycleFailed | None:
-        """One cycle; None if it was stopped on the way. Raises nothing a device or the numerics may raise."""
+        """Take one cycle; None if it was stopped. Catches whatever devices and numerics raise."""
         self._cycle += 1
         try:
             estimate = self._measure("full" if self._full_next else "fringes")
@@ -110,7 +110,7 @@ class ShapeCycle:
         return CycleDone(estimate, pause_s(self._full_rejected_in_a_row - REJECTED_IN_A_ROW + 1))
 
     def _judge(self, estimate: ShapeEstimate) -> None:
-        """Decide of which kind the next cycle is."""
+        """Decide the kind of the next cycle."""
         rejected = estimate.verdict == "rejected"
         if estimate.kind == "full":
             self._full_next = rejected
@@ -124,7 +124,7 @@ class ShapeCycle:
         if frames is None:
             return None
         arrived_s = self._clock.now()
-        # asked again for all: when a frame arrives, the second half of the readings around it is still to come
+        # asked again for all frames: when a frame arrives, half of the readings around it are still to come
         displacement_um = np.array([self._laser.at(frame.time_s) for frame in frames])
         time_s = np.array([frame.time_s for frame in frames])
         with exposures.during("reconstruction"):
@@ -133,22 +133,22 @@ class ShapeCycle:
         return replace(estimate, latency_s=self._clock.now() - arrived_s, cycle=self._cycle)
 
 
-# Which displacement the laser saw while a frame was exposed, from the telemetry of the control process.
+# The laser's displacement during a frame's exposure, from the control process's telemetry.
 
 
-# One reading has 1 um of noise, which is ten times what the held centre moves between two frames: a frame gets
-# the mean of the readings around it. 0.2 s to each side is 20 readings at 50 Hz (0.22 um), symmetric in time so
-# that a steady motion cancels; in its 0.4 s the held centre moves less than the noise that is left.
+# One reading has 1 um of noise, ten times the held centre's motion between frames: a frame gets the mean of the
+# readings around it. 0.2 s to each side are 20 readings at 50 Hz (0.22 um), symmetric in time so that a steady motion
+# cancels; in these 0.4 s the held centre moves less than the remaining noise.
 HALF_WINDOW_S = 0.2
-HALF_WINDOW_TICKS = 2.0  # below 10 Hz that would be fewer readings than make a mean
+HALF_WINDOW_TICKS = 2.0  # below 10 Hz there would be too few readings for a mean
 LEAST_READINGS = 3
 _KEPT_S = 60.0  # longer than any full cycle takes
 
 
 class LaserHistory:
-    """The last minute of laser readings, from rows of `TelemetryRow` that come `rate_hz` times a second.
+    """The last minute of laser readings, from `TelemetryRow` rows at `rate_hz`.
 
-    A frame gets the readings from `half_window_s` before it to as long after.
+    A frame gets the readings within `half_window_s` before and after it.
     """
 
     def __init__(self, telemetry: RingAddress, rate_hz: float) -> None:
@@ -158,9 +158,9 @@ class LaserHistory:
         self._counter = math.nan
 
     def at(self, time_s: float) -> float:
-        """Mean reading (um) within `half_window_s` of a moment on the run's clock.
+        """Mean reading (um) within `half_window_s` of a time on the run's clock.
 
-        NaN if there are fewer than `LEAST_READINGS` good ones: missing, flagged and repeated samples are none.
+        NaN with fewer than `LEAST_READINGS` good ones; missing, flagged and repeated samples do not count.
         """
         self._update()
         near = [reading for mono_s, reading in self._readings if abs(mono_s - time_s) <= self.half_window_s]

@@ -1,8 +1,8 @@
-"""The frames of a cycle, with everything overlapping that may.
+"""Takes the frames of a cycle with the greatest possible overlap.
 
-While a pattern settles on the screen, the frame of the one before is transferred and stored; while the first pattern
-of the next cycle settles, this one is reconstructed. The producer is the camera's own thread (aravis fills buffers
-outside of Python), the consumer is the cycle.
+While a pattern settles on the screen, the previous frame is transferred and stored; while the first pattern of the
+next cycle settles, this cycle is reconstructed. The producer is the camera's own thread (aravis fills buffers outside
+Python), the consumer is the cycle.
 
     screen   | settle 1     | expose 1 | settle 2             | expose 2 | settle 1 (ahead)
     camera   |              |          | transfer 1 | store 1 |          | transfer 2 | store 2
@@ -16,14 +16,14 @@ from typing import Literal, Protocol, runtime_checkable
 from firmware_iface.roles import TRIES, Camera, ExposingCamera, Frame, FrameLostError, Pattern, Pixels, Screen
 from membrane_ctrl.processes.frames import FrameSlot, FrameWriter
 
-# Where a cycle failed: whatever a device or the numerics raise becomes one kind of error that names the stage.
+# Where a cycle failed: every exception of a device or the numerics becomes one error that names the stage.
 
 
 Stage = Literal["screen", "camera", "reconstruction"]
 
 
 class StageError(Exception):
-    """What was raised, and in which stage."""
+    """A failure and its stage."""
 
     def __init__(self, stage: Stage, message: str) -> None:
         super().__init__(message)
@@ -32,7 +32,7 @@ class StageError(Exception):
 
 @contextmanager
 def during(stage: Stage) -> Iterator[None]:
-    """Raise whatever the block raises as a StageError."""
+    """Turn any exception of the block into a StageError."""
     try:
         yield
     except Exception as error:
@@ -57,11 +57,11 @@ class SettlingScreen(Protocol):
         """Send the pattern to the display. Raises LinkError."""
 
     def wait(self) -> None:
-        """Return when what was begun is lit and settled."""
+        """Return when the pattern is displayed and settled."""
 
 
 class Laser(Protocol):
-    """Gives the displacement at a recent moment."""
+    """Gives the displacement at a recent time."""
 
     def at(self, time_s: float) -> float:
         """Displacement in um, NaN if unknown."""
@@ -70,7 +70,7 @@ class Laser(Protocol):
 class Exposures:
     """Takes the frames of a cycle into the ring of frames, their starts at least `interval_s` apart.
 
-    A camera or screen that has only its plain role is used step by step.
+    A camera or screen with only the plain role is used step by step.
     """
 
     def __init__(
@@ -89,14 +89,14 @@ class Exposures:
         self._interval_s = interval_s
 
     def take(self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]) -> list[Frame] | None:
-        """Frames of these patterns, in their order; None if `stopping` said so before an exposure.
+        """Take frames of these patterns, in order; None if `stopping` before an exposure.
 
-        Raises StageError ("screen" or "camera", and what went wrong there).
+        Raises StageError ("screen" or "camera", and the failure).
         """
         try:
             return self._take(patterns, cycle, stopping)
         finally:
-            if isinstance(self._camera, _Grabbing):  # what a cycle that ended early did not fetch
+            if isinstance(self._camera, _Grabbing):  # frames left by a cycle that ended early
                 self._camera.forget()
 
     def _take(self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]) -> list[Frame] | None:
@@ -119,7 +119,7 @@ class Exposures:
                 self._camera.expose(slot.pixels)
             pending = pattern, slot
         if pending is not None:
-            ahead = patterns[0] if self._looks_ahead else None  # both kinds of cycle begin with the same pattern
+            ahead = patterns[0] if self._looks_ahead else None  # both kinds of cycle start with the same pattern
             if ahead is not None:
                 with during("screen"):
                     self._screen.begin(ahead)
@@ -127,7 +127,7 @@ class Exposures:
         return taken
 
     def _store(self, pattern: Pattern, slot: FrameSlot, cycle: int, then: Pattern | None) -> Frame:
-        """Fetch what was exposed with `pattern` into its slot; `then` is on the screen already, and afterwards."""
+        """Fetch the exposure of `pattern` into its slot; the screen shows `then` before and after."""
         frame = self._fetch(pattern, slot, then)
         if frame.pixels is not slot.pixels:
             with during("camera"):
@@ -138,7 +138,7 @@ class Exposures:
         return Frame(slot.pixels, frame.time_s)
 
     def _fetch(self, pattern: Pattern, slot: FrameSlot, then: Pattern | None) -> Frame:
-        """The frame; one that was lost is taken again, with its own pattern on the screen."""
+        """Fetch the frame; retake a lost one with its own pattern on the screen."""
         for tried in range(1, TRIES + 1):
             with during("camera"):
                 try:
@@ -159,7 +159,7 @@ class Exposures:
 
 
 class _Grabbing:
-    """A camera that is triggered and read in one."""
+    """A camera that triggers and reads in one call."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
@@ -178,7 +178,7 @@ class _Grabbing:
 
 
 class _Showing:
-    """A screen that returns when the pattern is settled."""
+    """A screen that returns once the pattern has settled."""
 
     def __init__(self, screen: Screen) -> None:
         self._screen = screen
@@ -193,5 +193,5 @@ class _Showing:
 def _mismatch(got: Pixels, wanted: Pixels) -> str:
     return (
         f"camera gave {got.shape[1]} x {got.shape[0]} {got.dtype}, "
-        f"the configuration says {wanted.shape[1]} x {wanted.shape[0]} {wanted.dtype}"
+        f"the configuration states {wanted.shape[1]} x {wanted.shape[0]} {wanted.dtype}"
     )

@@ -1,4 +1,4 @@
-"""Camera and screen of a run: the twin's, or those of the configuration."""
+"""Camera and screen of a run: the twin's, or the configured ones."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,20 +13,20 @@ from membrane_ctrl.acquisition.exposures import CycleClock
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.metrology.phase import full_sequence
 
-# Before the first cycle: exposure, checkerboard, settle time and response of the display, seen by the camera.
+# Before the first cycle, the camera measures exposure, checkerboard, settle time and response of the display.
 
 
-# Longer than any display takes that is fit for this
+# Longer than any suitable display takes
 LONG_S = 0.5
-# One frame after the other for this long, three times for each direction: refresh and exposure are not in step
+# Frame after frame for this long, three times per direction, as refresh and exposure are not synchronised
 _FOLLOWED_S = 0.35
 _TIMES = 3
 
 
 class DisplayTest:
-    """Measures a display through the camera that looks at it, both open.
+    """Measures a display with the camera that sees it, both open.
 
-    Before a still picture it waits `settle_s`, which `settling` lowers.
+    It waits `settle_s` before a still picture; `settling` shortens that.
     """
 
     def __init__(
@@ -42,12 +42,12 @@ class DisplayTest:
         self.settle_s = LONG_S
 
     def exposure(self, full_scale_adu: int, exposure_ms: float) -> str:
-        """What is wrong with the camera's exposure; empty when nothing is."""
+        """Any problem with the camera's exposure, else empty."""
         white, black = self._still(self._grey(255)), self._still(self._grey(0))
         return display.exposure_problem(white, black, full_scale_adu, exposure_ms)
 
     def checkerboard(self) -> str:
-        """Whether the screen shows pixel for pixel; empty when it does."""
+        """Any problem with pixel-for-pixel display, else empty."""
         white, black = self._still(self._grey(255)), self._still(self._grey(0))
         return display.checkerboard_problem(
             self._still(display.checkerboard(self._size[1], self._size[0])), white, black
@@ -56,7 +56,7 @@ class DisplayTest:
     def settling(self) -> display.Settling:
         """Time from a command to the light, over steps both ways between black, white and two greys.
 
-        The greys are there because panels are slowest between them. Raises ValueError if the display never settles.
+        Includes greys because panels are slowest between them. Raises ValueError if the display never settles.
         """
         delays_s: list[float] = []
         left: list[float] = []
@@ -67,7 +67,7 @@ class DisplayTest:
             noise = max(noise, display.share_left(again, pictures[other], pictures[one]))
             for before, after in ((one, other), (other, one)) * _TIMES:
                 self._still(self._grey(before))
-                for delay_s, pixels in list(self._follow(self._grey(after))):  # looked at afterwards
+                for delay_s, pixels in list(self._follow(self._grey(after))):  # evaluated afterwards
                     delays_s.append(delay_s)
                     left.append(display.share_left(pixels, pictures[before], pictures[after]))
         found = display.settling(delays_s, left, noise)
@@ -87,7 +87,7 @@ class DisplayTest:
         return self._camera.grab().pixels
 
     def _follow(self, levels: roles.Levels) -> Iterator[tuple[float, roles.Pixels]]:
-        """roles.Pixels one after the other, each with the time from the command to the start of its exposure."""
+        """Frames one after the other, each with the time from the command to the start of its exposure."""
         self._screen.show_levels(levels)
         begun_s = self._clock.now()
         while self._clock.now() - begun_s < _FOLLOWED_S:
@@ -99,12 +99,12 @@ class DisplayTest:
 
 
 def _thin(pixels: roles.Pixels) -> roles.Pixels:
-    """Every fourth pixel both ways (of a Bayer sensor always the same colour): enough for means over blocks."""
+    """Every fourth pixel both ways (the same colour on a Bayer sensor), enough for block means."""
     return pixels[::4, ::4].copy()
 
 
 def told(name: str, measure: Callable[[], str]) -> str:
-    """A finding with its subject; empty for none. A failed measurement is a finding."""
+    """A finding with its subject, or an empty text. A failed measurement is a finding."""
     try:
         problem = measure()
     except ValueError as error:
@@ -114,7 +114,7 @@ def told(name: str, measure: Callable[[], str]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class OpticalBench:
-    """A camera and what it looks at."""
+    """A camera and its target."""
 
     camera: Any
     screen: Any
@@ -126,9 +126,9 @@ class OpticalBench:
 
 
 def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
-    """The drivers that `[devices.camera]` and `[devices.screen]` name, not yet open.
+    """The drivers named in `[devices.camera]` and `[devices.screen]`, not yet open.
 
-    Raises LinkError if the configuration names none, or patterns that do not fit on the screen.
+    Raises LinkError if the configuration names none, or the patterns do not fit on the screen.
     """
     devices = config.devices
     if devices is None or devices.camera is None:
@@ -160,7 +160,7 @@ def _camera(config: Config, section: settings.CameraConfig, clock: CycleClock) -
 
 @dataclass(frozen=True, slots=True)
 class BenchFindings:
-    """What opening the bench has shown: who the camera is, what was measured, and what is wrong with which remedy."""
+    """Findings from opening the bench: the camera's identity, the measurements, and the problems with remedies."""
 
     camera: str
     measured: tuple[str, ...] = ()
@@ -168,10 +168,10 @@ class BenchFindings:
 
 
 def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchFindings:
-    """Connect camera and screen (of `configured_bench`), and let the camera measure the screen.
+    """Connect the camera and screen of `configured_bench`, and measure the screen with the camera.
 
-    What is found wrong does not keep a run from trying: its cycles are judged one by one. Raises LinkError if one of
-    them is not there or not usable.
+    Problems found do not stop a run, as each cycle is judged. Raises LinkError if camera or screen is missing or
+    unusable.
     """
     identity = bench.camera.open()
     who = " ".join(part for part in (identity.kind, identity.serial, identity.detail) if part)
@@ -196,7 +196,7 @@ def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchF
 
 def _exposure(config: Config, test: DisplayTest) -> str:
     camera = config.devices.camera if config.devices is not None else None
-    if not isinstance(camera, settings.AravisCameraConfig):  # another's exposure has no unit
+    if not isinstance(camera, settings.AravisCameraConfig):  # other cameras' exposure has no unit
         return ""
     return told("camera", lambda: test.exposure((1 << config.optics.camera.bits) - 1, camera.exposure_ms))
 

@@ -19,11 +19,11 @@ from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.processes import child, ring
 
-# Limits on the threads of this process's numerics: the tick of the control process needs a core.
+# Limits this process's numerical threads: the control process's tick needs a core.
 
 
-# The kernels split their work over two threads by themselves (metrology.threads). Linear algebra is 36 x 36 here:
-# more than one thread would only spin.
+# The kernels use two threads of their own (metrology.threads). Linear algebra is 36 x 36 here: more than one thread
+# would only spin.
 _LIMITS = {
     "NUMBA_NUM_THREADS": "2",
     "OMP_NUM_THREADS": "1",
@@ -34,7 +34,7 @@ _LIMITS = {
 
 
 def limit_threads() -> None:
-    """Set the limits. Must come before NumPy, OpenCV and numba are imported: they look once, when they are loaded."""
+    """Set the limits. Call before importing NumPy, OpenCV and numba, which read them only at import."""
     os.environ.update(_LIMITS)
 
 
@@ -42,18 +42,18 @@ def limit_threads() -> None:
 
 AcquisitionState = Literal["preparing", "running", "paused", "retrying", "failed", "stopped"]
 
-_PARENT_CHECK_S = 0.2  # how soon a dead parent is noticed
+_PARENT_CHECK_S = 0.2  # interval of checking for a dead parent
 _ALIVE_EVERY_S = 1.0
-# Between two looks at the line: one exposure (up to 10 s), one reconstruction, a camera that is opened again
+# Between two checks of the line: one exposure (up to 10 s), one reconstruction, reopening a camera
 _STEP_S = 60.0
-# Compiling kernels on a slow machine, and the self-test of a real screen and camera, do not look at it at all
+# Compiling kernels on a slow machine and the self-test of a real screen and camera do not check it at all
 _PREPARING_S = 900.0
 
 
 class Remote:
     """Commands "pause", "resume", "full", "capture" and "stop" over a Connection; reports as dicts.
 
-    `stop` and `paused` are what was last asked for; `stop` is also set when the parent has died.
+    `stop` and `paused` reflect the last commands; the parent's death also sets `stop`.
     """
 
     def __init__(self, control: Connection) -> None:
@@ -66,7 +66,7 @@ class Remote:
         self.paused = False
 
     def listen(self, timeout_s: float = 0.0) -> None:
-        """Take what has been sent; without anything to take, wait for it up to `timeout_s` (at most 0.2 s)."""
+        """Take pending commands; if there are none, wait up to `timeout_s` (at most 0.2 s)."""
         if not child.parent_lives():
             self.stop = True
             return
@@ -84,25 +84,25 @@ class Remote:
         return self.stop or self.paused
 
     def end(self) -> None:
-        """Stop, as if told to."""
+        """Stop, as if commanded."""
         self.stop = True
 
     def take_full(self) -> bool:
-        """Whether a full cycle was asked for since the last call."""
+        """Whether a full cycle was requested since the last call."""
         wanted, self._full = self._full, False
         return wanted
 
     def take_capture(self) -> bool:
-        """Whether a full cycle to be kept on disk was asked for since the last call."""
+        """Whether a full cycle to keep on disk was requested since the last call."""
         wanted, self._capture = self._capture, False
         return wanted
 
     def report(
         self, state: AcquisitionState, message: str = "", cycle: int | None = None, traceback: str | None = None
     ) -> None:
-        """Send a report that differs from the last one: a record of weeks needs no report of each good cycle.
+        """Send a report that differs from the last one: in weeks of recording, good cycles need no reports.
 
-        It is dropped when the other end does not read, as the cycle must never wait for it.
+        It is dropped if the other end does not read: the cycle must never wait.
         """
         if (state, message) == self._said:
             return
@@ -110,11 +110,11 @@ class Remote:
         self._send(run_events.AcquisitionState(state, message, cycle, traceback))
 
     def tell(self, event: events.Event) -> None:
-        """Put an event on record; it is dropped like a report."""
+        """Record an event; it may be dropped like a report."""
         self._send(event)
 
     def prepared(self) -> None:
-        """From now on the line is looked at between any two exposures."""
+        """From now on, the line is checked between any two exposures."""
         self._step_s = _STEP_S
         self._alive_due_s = 0.0
         self._say_alive()
@@ -152,19 +152,19 @@ _NICENESS = 10  # behind the tick, the recorder and the screen
 
 @dataclass(frozen=True, slots=True)
 class AcquisitionSpec:
-    """What the acquisition needs to know of the run."""
+    """What the acquisition needs to know about the run."""
 
     config: Config
     clock: RunClock
-    telemetry: ring.RingAddress  # where the laser readings are
-    shapes: ring.RingAddress  # where the estimates go (`estimate.pack_estimate`)
+    telemetry: ring.RingAddress  # source of the laser readings
+    shapes: ring.RingAddress  # destination of the estimates (`estimate.pack_estimate`)
     truth: ring.RingAddress | None  # the twin's truth, which its camera renders; None on a real bench
     frames: ring.FrameAddress
-    run_dir: Path | None = None  # folder of the run, for the frames that are kept
+    run_dir: Path | None = None  # folder of the run, for kept frames
 
 
 def acquisition_main(spec: AcquisitionSpec, control: Connection) -> None:
-    """Measure the shape until told to stop: target of a `spawn`ed process.
+    """Measure the shape until stopped: target of a `spawn`ed process.
 
     Ends on "stop" over `control`, on `processes.STOP`, and when the parent has died. Reports go back over `control`
     as lines of events (`run_events.AcquisitionState`). Raises SystemExit with 1 if it cannot work at all (after a

@@ -1,8 +1,8 @@
-"""Whole frames on disk: of every n-th cycle, and of the last cycles before a fault, as capture sets to measure again.
+"""Keeps raw frames of every n-th cycle, and of the last cycles before a fault, as capture sets to remeasure.
 
 `raw/cycle-000017/` in the run's folder is a set like any other (docs/interfaces.md section 3). A set of fringes only
-refers to the full cycle that anchors it, so that the newest accepted full cycle is kept too, until the next one
-replaces it or something refers to it.
+refers to the full cycle that anchors it, so the newest accepted full cycle is kept too, until the next one replaces
+it or a set refers to it.
 """
 
 import shutil
@@ -24,9 +24,9 @@ from membrane_ctrl.processes.frames import FrameHead, FrameReader
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
 from membrane_ctrl.run_files.disk_budget import PICTURES_FROM
 
-# A disk that is slower than the cycles: what would wait longer than for these sets is left out
+# If the disk is slower than the cycles, sets beyond this queue are omitted
 _WAITING_SETS = 3
-_FASTEST = [cv2.IMWRITE_PNG_COMPRESSION, 1]  # a noisy frame hardly shrinks any further
+_FASTEST = [cv2.IMWRITE_PNG_COMPRESSION, 1]  # stronger compression hardly shrinks a noisy frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,13 +37,13 @@ class _Set:
 
     @property
     def size_bytes(self) -> int:
-        """What it takes on disk at most: noise does not shrink."""
+        """Largest size on disk: noise does not compress."""
         return sum(pixels.nbytes for pixels in self.pixels)
 
 
 @dataclass(frozen=True, slots=True)
 class _Write:
-    """A set on its way to the disk."""
+    """A set being written."""
 
     cycle: int
     folder: Path
@@ -52,10 +52,10 @@ class _Write:
 
 
 class RawFrames:
-    """Keeps frames in `raw` of the run's folder, made when the first set is kept; a fault is seen in the telemetry.
+    """Keeps frames in the run's folder `raw`, made for the first set; sees faults in the telemetry.
 
-    `tell` gets an event of kind "raw_frames" when sets begin to be left out for want of disk: once for each reason,
-    until one is kept again. `left_out` counts the sets that were not kept for want of time or disk.
+    `tell` gets an event of kind "raw_frames" when the disk forces sets to be omitted: once per reason, until one is
+    kept again. `left_out` counts the sets omitted for lack of time or disk.
     """
 
     def __init__(
@@ -99,18 +99,18 @@ class RawFrames:
             self._reference, self._reference_needed = kept, bool(due)
 
     def capture(self, estimate: ShapeEstimate) -> Path:
-        """Have a cycle's frames written and wait for it; returns the set's folder. Raises OSError."""
+        """Write a cycle's frames and wait; returns the set's folder. Raises OSError."""
         kept = self._keep(estimate.cycle)
         wait(write.done for write in self._writing)
         self._collect()
         if kept is None or not (kept / "capture.toml").exists():
-            raise OSError("the set could not be written whole: is the disk full, or slower than the cycles?")
+            raise OSError("the set could not be written completely: is the disk full, or slower than the cycles?")
         if kept == self._reference:
-            self._reference_needed = True  # it is somebody's now
+            self._reference_needed = True  # the set now belongs to the user
         return kept
 
     def look_for_fault(self) -> None:
-        """Keep the last cycles if a fault has come up since the last call."""
+        """Keep the last cycles if a fault has occurred since the last call."""
         message = self._telemetry.latest()
         fault = message is not None and telemetry.TelemetryRow.unpack(message).fault > 0
         if fault and not self._in_fault and self._recording.raw_before_fault_cycles:
@@ -120,7 +120,7 @@ class RawFrames:
         self._in_fault = fault
 
     def close(self) -> None:
-        """Check for a fault once more, write what is pending, detach."""
+        """Check for a fault once more, write pending sets, detach."""
         self.look_for_fault()
         self._writer.shutdown()
         self._collect()
@@ -128,7 +128,7 @@ class RawFrames:
         self._telemetry.close()
 
     def _keep(self, cycle: int) -> Path | None:
-        """Copy a cycle's frames and have them written; None if that cannot be."""
+        """Copy a cycle's frames and queue them for writing; None if impossible."""
         if cycle in self._kept:
             return self._kept[cycle]
         self._collect()
@@ -154,10 +154,10 @@ class RawFrames:
             free_bytes = shutil.disk_usage(self._folder.parent).free
         except OSError as error:
             return str(error)
-        # what is on its way may not be there yet: after all of it the disk has to be left as for thumbnails
+        # count queued sets too: after writing them, the disk must still have room as for thumbnails
         left_mb = (free_bytes - found.size_bytes - sum(write.size_bytes for write in self._writing)) / 1e6
         least_mb = PICTURES_FROM * self._recording.min_free_mb
-        return "" if left_mb > least_mb else f"they would leave less than {least_mb:g} MB free"
+        return "" if left_mb > least_mb else f"less than {least_mb:g} MB would stay free"
 
     def _leave_out(self, why: str) -> None:
         self.left_out += 1
@@ -166,7 +166,7 @@ class RawFrames:
             self._tell(run_events.FramesLeftOut(self.left_out, f"frames are left out: {why}"))
 
     def _collect(self) -> None:
-        """Collect finished writes; a set that failed is dropped, and nothing may refer to it."""
+        """Collect finished writes; drop a failed set, to which no other may refer."""
         done = [write for write in self._writing if write.done.done()]
         self._writing = [write for write in self._writing if write not in done]
         for write in done:
@@ -180,7 +180,7 @@ class RawFrames:
             self._leave_out(str(error))
 
     def _unused(self, cycle: int) -> Path:
-        """A name for the set; an acquisition that was replaced counts its cycles from 1 again."""
+        """A free name for the set; a replacement acquisition counts its cycles from 1 again."""
         path, again = self._folder / f"cycle-{cycle:06d}", 1
         while path.exists():
             again += 1
@@ -194,21 +194,19 @@ class RawFrames:
         for kind, wanted in (("full", self._plan.full), ("fringes", self._plan.fringes)):
             if names == {pattern.name for pattern in wanted} and len(heads) == len(wanted):
                 return _Set(kind, tuple(heads), tuple(pixels for pixels in copies if pixels is not None))
-        return None  # a cycle that was stopped, or is partly written over
+        return None  # a stopped or partly overwritten cycle
 
 
 def _write(folder: Path, table: dict[str, Any], content: _Set) -> None:
-    """Write a set, or leave nothing of it. Raises OSError, cv2.error."""
+    """Write a set completely or not at all. Raises OSError, cv2.error."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if "reference" in table and not (folder / table["reference"] / "capture.toml").exists():
-            raise OSError(f"{folder.name}: the full cycle that it refers to is not there")
+            raise OSError(f"{folder.name}: the full cycle it refers to is missing")
         for head, pixels in zip(content.heads, content.pixels, strict=True):
             _, png = cv2.imencode(".png", pixels, _FASTEST)
-            (folder / f"{head.pattern}.png").write_bytes(
-                png.tobytes()
-            )  # unlike OpenCV it says why a full disk refuses
-        # last: a set is whole when it is there
+            (folder / f"{head.pattern}.png").write_bytes(png.tobytes())  # unlike OpenCV, this reports a full disk
+        # last, as it marks a complete set
         (folder / "capture.toml").write_text(tomli_w.dumps(table), encoding="utf-8")
     except Exception:
         shutil.rmtree(folder, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""Everything the acquisition holds, opened and closed around its loop."""
+"""The acquisition's resources, opened and closed around its loop."""
 
 import signal
 import time
@@ -19,17 +19,17 @@ from membrane_ctrl.processes import child, frames, ring
 from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics
 from membrane_ctrl.sim.sensors import Truth
 
-# The twin's film, screen and camera, as the acquisition finds them.
+# The twin's film, screen and camera, as the acquisition sees them.
 
 
 class TwinTruth:
-    """Where the simulated film is now, from the ring in which the bench publishes the truth; call it."""
+    """The simulated film's present position, from the truth ring of the bench; callable."""
 
     def __init__(self, address: ring.RingAddress) -> None:
         self._reader = ring.RingReader(address)
 
     def __call__(self) -> Truth:
-        """The newest truth. Raises LinkError before the first."""
+        """Return the newest truth. Raises LinkError before the first."""
         message = self._reader.latest()
         if message is None:
             raise LinkError("twin camera: the simulated bench has not started")
@@ -37,7 +37,7 @@ class TwinTruth:
 
     @property
     def known(self) -> bool:
-        """There is one."""
+        """Whether there is any truth yet."""
         return self._reader.latest() is not None
 
     def close(self) -> None:
@@ -45,7 +45,7 @@ class TwinTruth:
         self._reader.close()
 
 
-# Every kernel of the cycle once, on a small sensor: on a fresh machine they are compiled here, for many seconds.
+# Runs every kernel of the cycle once, on a small sensor: a fresh machine compiles them here, for many seconds.
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +56,10 @@ class _StandingFilm:
     sag_mm: float
 
 
-# A real film's sag is not known before it was measured; a meter of film at the usual pressure has this one
+# A real film's sag is unknown before the measurement; a metre of film at the usual pressure has this one
 TYPICAL_FILM: FilmPosition = _StandingFilm(0.0, 37.1)
 
-_SMALL_PX = 300  # this side still gives 36 terms enough points, in a hundredth of the work
+_SMALL_PX = 300  # still enough points for 36 terms, at a hundredth of the work
 
 
 def small(optics: OpticsConfig) -> OpticsConfig:
@@ -85,12 +85,12 @@ def warm_up(
     position: FilmPosition,
     clock: exposures.CycleClock,
 ) -> None:
-    """A full cycle and two of fringes only, with and without known motion, of a film that stands still.
+    """Run a full cycle and two fringes-only cycles, with and without known motion, of a film at rest.
 
-    `reconstructor` is for `small(optics)`, as `optics` are, and to be thrown away.
+    `reconstructor` is a disposable one for `small(optics)`, and `optics` are those small ones.
     """
     bench = TwinOptics(optics, TwinConfig(), lambda: position, clock)
-    # displacements that differ by more than noise let the kernels run that take the film's motion out
+    # displacements that differ by more than noise trigger the kernels that correct the film's motion
     still, moving = np.zeros(1), np.array([-10.0, 10.0])
     for patterns, reconstruct, motion_um in (
         (plan.full, reconstructor.full, moving),
@@ -124,13 +124,13 @@ class WaitingClock:
 
 
 def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
-    """Prepare, then measure until told to stop.
+    """Prepare, then measure until stopped.
 
-    Until the first cycle `processes.STOP` simply ends the process, as nothing is held that would need care and a
-    kernel that is being compiled cannot be asked; from then on it ends the cycle at its next exposure. Raises
-    LinkError if no camera is configured, or its patterns do not fit on the screen.
+    Before the first cycle `processes.STOP` simply ends the process, as no resource needs care and a compiling kernel
+    cannot check for it; afterwards it ends the cycle at its next exposure. Raises LinkError if no camera is
+    configured, or its patterns do not fit on the screen.
     """
-    remote.listen()  # the first word, which promises the next one for when all this is over
+    remote.listen()  # the first report, which allows silence until all this is done
     remote.report("preparing", "rendering the first picture, compiling")
     config, clock = spec.config, WaitingClock(spec.clock)
     geometry = file.geometry_of_run(spec.run_dir, config)
@@ -155,7 +155,7 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
         drift = worker.LiveDrift(geometry, config.shape.bin_px)
         shapes = stack.enter_context(closing(ring.RingWriter(spec.shapes)))
         slots = stack.enter_context(closing(frames.FrameWriter(spec.frames)))
-        stack.callback(bench.close)  # before the ring of frames: an exposure under way holds the pixels of a slot
+        stack.callback(bench.close)  # before the frame ring: a running exposure holds the pixels of a slot
         laser = stack.enter_context(closing(cycle.LaserHistory(spec.telemetry, config.loop.rate_hz)))
         raw = _raw_frames(spec, geometry.optics, plan, stack, remote)
         taking = cycle.ShapeCycle(
@@ -194,7 +194,7 @@ def _twin_bench(
     remote: process.Remote,
     stack: ExitStack,
 ) -> optical_bench.OpticalBench:
-    """The twin's camera and screen, once its bench has said where the film is."""
+    """The twin's camera and screen, once its bench has published the film's position."""
     truth = stack.enter_context(closing(TwinTruth(address)))
     while not truth.known and not remote.stop:
         remote.listen(_TRUTH_LOOK_S)
@@ -211,7 +211,7 @@ def _warm_up(config: Config, plan: cycle.CyclePlan, position: FilmPosition, cloc
 
 
 def _open(bench: optical_bench.OpticalBench, config: Config, clock: WaitingClock, remote: process.Remote) -> None:
-    """Open camera and screen; what is not there is tried again until told to stop: the hold goes on meanwhile."""
+    """Open camera and screen; retry until stopped if they are missing, while the hold continues."""
     failures = 0
     while not remote.stop:
         try:
@@ -234,7 +234,7 @@ def _raw_frames(
     stack: ExitStack,
     remote: process.Remote,
 ) -> raw_frames.RawFrames | None:
-    """What keeps frames, if there is a place for them."""
+    """The keeper of raw frames, if the run has a folder."""
     if spec.run_dir is None:
         return None
     folder, recording = spec.run_dir / "raw", spec.config.recording

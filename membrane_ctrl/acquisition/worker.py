@@ -1,4 +1,4 @@
-"""The loop of the acquisition process: a cycle at each deadline, its estimate to the ring, its troubles reported."""
+"""The loop of the acquisition process: takes a cycle at each deadline, publishes estimates, reports failures."""
 
 import math
 from collections.abc import Callable
@@ -23,11 +23,11 @@ def keep_cycling(
     period_s: float,
     keep: Callable[[shape_estimate.ShapeEstimate], Path],
 ) -> None:
-    """Take cycles until told to stop.
+    """Take cycles until stopped.
 
-    A cycle must end early when `remote.interrupts()`; one that takes longer than `period_s` costs the deadlines it
-    covers, which are not made up. `publish` gets every estimate, whatever its verdict. `keep` writes the frames of a
-    cycle and returns the set's folder; OSError says why not.
+    A cycle must end early when `remote.interrupts()`; one longer than `period_s` skips the deadlines it covers.
+    `publish` gets every estimate, whatever its verdict. `keep` writes the frames of a cycle and returns the set's
+    folder, or raises OSError with the reason.
     """
     due_s = clock.now()
     while not remote.stop:
@@ -53,7 +53,7 @@ def keep_cycling(
 
 
 def next_deadline_s(last_s: float, period_s: float, earliest_s: float) -> float:
-    """The first moment of `last_s + k period_s`, k >= 1, that is not before `earliest_s`."""
+    """The first of `last_s + k period_s`, k >= 1, that is not before `earliest_s`."""
     return last_s + max(1, math.ceil((earliest_s - last_s) / period_s)) * period_s
 
 
@@ -93,17 +93,17 @@ def _tell(
             remote.report("retrying", f"{stage}: {message}; again in {pause_s:g} s", cycle=number)
 
 
-# The geometry of a live cycle: which one it is, and whether it still fits what the cycles see.
+# The geometry of live cycles: its origin, and whether it still fits the cycles.
 
 
 def geometry_event(geometry: InForce) -> run_events.GeometryInForce:
-    """For the record of the run."""
+    """The event that records the geometry."""
     origin = geometry.origin
     return run_events.GeometryInForce(origin.hash, origin.file or None, origin.calibrated_utc or None, geometry.note)
 
 
 class LiveDrift:
-    """Compares residual and ring of each cycle with the calibrated ones; without a calibration it says nothing."""
+    """Compares residual and ring of each cycle with the calibrated ones; silent without a calibration."""
 
     def __init__(self, geometry: InForce, bin_px: int) -> None:
         optics = geometry.optics
@@ -119,13 +119,13 @@ class LiveDrift:
         self._said = False
 
     def noise_urad(self, estimate: shape_estimate.ShapeEstimate) -> float:
-        """What the camera's noise is in a cycle's residual."""
+        """The camera noise's share of a cycle's residual."""
         return noise_urad(
             self._geometry, self._surface(estimate), self._sigma_mm_adu / estimate.modulation_median_adu
         )
 
     def after(self, estimate: shape_estimate.ShapeEstimate) -> events.Event | None:
-        """A notice when it is time to calibrate again, and when it no longer is."""
+        """Returns a notice when a new calibration becomes due, and when no longer."""
         if self._monitors is None or estimate.verdict == "rejected":
             return None
         residual, ring = self._monitors

@@ -1,4 +1,4 @@
-"""The commands that calibrate the camera by itself: `calibrate-camera` its lens, `calibrate-pose` its pose."""
+"""The commands that calibrate the camera alone: `calibrate-camera` its lens, `calibrate-pose` its pose."""
 
 import json
 import sys
@@ -29,7 +29,7 @@ _IMAGES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """What the command was asked for: a folder of photographs, the board in them, the camera as it is known."""
+    """Options of the command: a folder of photographs, the board in them, the camera as configured."""
 
     folder: Path
     board: str
@@ -39,7 +39,7 @@ class CameraOptions:
 
 
 def calibrate_camera(options: CameraOptions) -> int:
-    """Find the corners, fit the lens, write the prior, say what it improved. Raises CommandError."""
+    """Find the corners, fit the lens, write the prior and report the improvement. Raises CommandError."""
     board, camera = _board(options.board), options.config.optics.camera
     views = [_view(path, board, camera) for path in _images(options.folder)]
     try:
@@ -63,7 +63,7 @@ def calibrate_camera(options: CameraOptions) -> int:
 
 
 def draw_board(out: Path, board_text: str, square_px: int, width_px: int, height_px: int) -> int:
-    """Write the board as a picture for a screen of so many pixels. Raises InputError."""
+    """Write the board as a picture for a screen of the given size in pixels. Raises InputError."""
     try:
         levels = on_screen(_board(board_text), square_px, width_px, height_px)
     except ValueError as error:
@@ -76,8 +76,8 @@ def draw_board(out: Path, board_text: str, square_px: int, width_px: int, height
     except (OSError, cv2.error):
         written = False
     if not written:
-        raise errors.InputError(f"{out}: cannot be written: a .png in a folder you may write to is needed")
-    print(f"{board_text} of {square_px} px squares written to {out}; show it pixel for pixel", file=sys.stderr)
+        raise errors.InputError(f"{out}: cannot be written; give a .png in a writable folder")
+    print(f"{board_text} of {square_px} px squares written to {out}; display it pixel for pixel", file=sys.stderr)
     return int(errors.Exit.DONE)
 
 
@@ -105,10 +105,10 @@ def _view(path: Path, board: Board, camera: CameraConfig) -> BoardView:
         raise errors.InputError(f"{path}: {reason}") from None
     if image.shape != (camera.height_px, camera.width_px):
         raise errors.InputError(
-            f"{path}: {image.shape[1]} x {image.shape[0]} pixels, the configuration's optics.camera has "
+            f"{path}: {image.shape[1]} x {image.shape[0]} pixels, but the configuration's optics.camera has "
             f"{camera.width_px} x {camera.height_px}"
         )
-    if image.dtype != np.uint8:  # the detectors know 8 bits only; a corner needs no more
+    if image.dtype != np.uint8:  # the detectors take 8 bits only, which suffice for corners
         image = (np.asarray(image, float) * (255.0 / max(1, int(image.max())))).astype(np.uint8)
     place, seen_px = board.corners(np.asarray(image, np.uint8))
     return BoardView(path.name, place, seen_px)
@@ -136,13 +136,13 @@ def _lines(camera: CameraConfig, lens: Lens, out: Path) -> list[str]:
         sigma, usual = lens.sigmas[name] * scale, usual_sigma(name) * scale
         lines.append(f"{label:<16}{before:>10.5g}{value:>13.6g}  {sigma:<11.2g}  {usual:.2g}")
     lines.append(
-        f"corners are left {lens.rms_px:.3f} px RMS in {len(lens.used)} photographs; "
+        f"corner residuals {lens.rms_px:.3f} px RMS in {len(lens.used)} photographs; "
         f"with the stated lens {lens.stated_rms_px:.3f} px"
     )
     if lens.left_out:
-        lines.append(f"left out, no board or a bad fit: {', '.join(lens.left_out)}")
+        lines.append(f"omitted, without a board or with a bad fit: {', '.join(lens.left_out)}")
     if lens.sigmas["focal_relative"] > usual_sigma("focal_relative"):
-        lines.append("the focal length is known no better than from its data sheet: tilt the board more, both ways")
+        lines.append("the focal length is no better known than from its data sheet: tilt the board more, both ways")
     return [*lines, f"written: {out}; use it with calibrate --prior {out}"]
 
 
@@ -151,7 +151,7 @@ def _lines(camera: CameraConfig, lens: Lens, out: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class PoseOptions:
-    """What the command was asked for."""
+    """Options of the command."""
 
     folder: Path
     geometry: Path | None
@@ -162,7 +162,7 @@ class PoseOptions:
 
 
 def calibrate_pose(options: PoseOptions) -> int:
-    """Measure the set, find the rim, fit the pose, write the prior, say what it improved. Raises CommandError."""
+    """Measure the set, find the rim, fit the pose, write the prior and report. Raises CommandError."""
     geometry = None if options.geometry is None else read_geometry(options.geometry)
     capture = capture_set.read_set(options.folder, geometry)
     optics = capture.head.optics
@@ -212,7 +212,7 @@ def _light(capture: capture_set.CaptureSet) -> FloatArray:
 
 
 def _rim(capture: capture_set.CaptureSet) -> tuple[reconstruct.HeightFunction, float]:
-    """Where the film at the rim stands in world, and its mean. Raises RejectedError for a set without a figure."""
+    """Height of the film at the rim in world, and its mean. Raises RejectedError for a set without a figure."""
     optics = capture.head.optics
     try:
         checked = check(measurement.stack_of(capture), optics)
@@ -221,7 +221,7 @@ def _rim(capture: capture_set.CaptureSet) -> tuple[reconstruct.HeightFunction, f
     surface, vertex_mm = full.bin_figure(optics, checked).fit.surface, checked.tracer.vertex_z_mm
 
     def height(x: FloatArray, y: FloatArray) -> FloatArray:
-        share = surface.radius_mm / np.maximum(np.hypot(x, y), 1.0)  # terms run away beyond the rim
+        share = surface.radius_mm / np.maximum(np.hypot(x, y), 1.0)  # the terms diverge beyond the rim
         return np.asarray(vertex_mm + surface.height(x * share, y * share))
 
     return height, vertex_mm + surface.sag_mm
@@ -234,5 +234,5 @@ def _pose_lines(pose: ring_pose.RingPose, out: Path) -> list[str]:
         for name, value, sigma in zip(ring_pose.POSE_NAMES, pose.values, pose.sigmas, strict=True)
     ]
     better = max(usual_sigma(name) / sigma for name, sigma in zip(ring_pose.POSE_NAMES, pose.sigmas, strict=True))
-    lines.append(f"edges are left {pose.rms_px:.3f} px RMS, {pose.points} of them; at best {better:.0f} times better")
+    lines.append(f"edges left {pose.rms_px:.3f} px RMS at {pose.points} points, at best {better:.0f} times better")
     return [*lines, f"written: {out}; use it with calibrate --prior {out}"]

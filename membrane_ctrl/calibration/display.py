@@ -1,4 +1,4 @@
-"""The `calibrate-display` command: how fast the screen settles and how its light goes with the level."""
+"""The `calibrate-display` command: the screen's settle time, and its light against level."""
 
 import json
 
@@ -12,16 +12,16 @@ from membrane_ctrl.metrology.phase import mm_per_rad
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
 
-_PHASES = 720  # of a period, for the worst of it to be met
+_PHASES = 720  # per period, to include the worst one
 
 
 def calibrate_display(config: Config, source: str, as_json: bool) -> int:
-    """Open camera and screen, measure, say what it is worth. Raises CommandError.
+    """Open camera and screen, measure, and report the resulting error. Raises CommandError.
 
-    For the main thread only (the screen).
+    Call from the main thread only (because of the screen).
     """
     if config.devices is None or config.devices.camera is None or config.devices.screen is None:
-        raise InputError(f"{source}: devices.camera, devices.screen: both are needed to measure the screen")
+        raise InputError(f"{source}: devices.camera and devices.screen are both needed to measure the screen")
     section, clock = config.devices.screen, session.WaitingClock(RunClock.start())
     try:
         bench = optical_bench.configured_bench(config, clock)
@@ -41,7 +41,7 @@ def calibrate_display(config: Config, source: str, as_json: bool) -> int:
 def measured(
     bench: optical_bench.OpticalBench, clock: exposures.CycleClock, width_px: int, height_px: int
 ) -> tuple[Settling, DisplayResponse]:
-    """Open the bench and look at its screen. Raises LinkError, or ValueError if nothing of the screen is seen."""
+    """Open the bench and measure its screen. Raises LinkError, or ValueError if the camera cannot see the screen."""
     bench.camera.open()
     bench.screen.open()
     test = optical_bench.DisplayTest(bench.screen, bench.camera, clock, width_px, height_px)
@@ -62,14 +62,14 @@ def report_of(settling: Settling, response: DisplayResponse, pattern: PatternCon
 
 
 def lines_of(report: dict[str, object]) -> list[str]:
-    """For a person, with the lines for the configuration."""
+    """Format the report for people, with the lines for the configuration."""
     error = report["fringe_error_um"]
     assert isinstance(error, dict)
     return [
         f"settles in {report['settle_ms']:.0f} ms, gamma {report['gamma']:.2f}",
         f"fringe error on the screen: {error['as_sent']:.1f} um RMS as sent, "
-        f"corrected by {error['corrected']:.1f} um, the rounding of its levels",
-        "for the configuration (without them both are measured at each start):",
+        f"{error['corrected']:.1f} um corrected, from the rounding of its levels",
+        "for the configuration (otherwise every start measures both):",
         "[devices.screen]",
         f"settle_ms = {report['settle_ms']:.0f}",
         "linearise = true",
@@ -77,7 +77,7 @@ def lines_of(report: dict[str, object]) -> list[str]:
 
 
 def fringe_error_mm(response: DisplayResponse, pattern: PatternConfig, corrected: bool) -> float:
-    """RMS error of a screen coordinate that this display makes in sinusoids: harmonics taken for phase."""
+    """RMS error of a screen coordinate from this display's sinusoids, whose harmonics appear as phase."""
     phase = 2 * np.pi * np.arange(_PHASES) / _PHASES
     shifts = 2 * np.pi * np.arange(pattern.steps) / pattern.steps
     wanted = (1 + np.cos(phase + shifts[:, None])) / 2

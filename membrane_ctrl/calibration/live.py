@@ -1,4 +1,4 @@
-"""`calibrate --live`: plan, ask, take the sets, come back, solve, show, ask, adopt."""
+"""`calibrate --live`: plan, ask, take the sets, return, solve, show, ask, adopt."""
 
 import contextlib
 import sys
@@ -24,7 +24,7 @@ from membrane_ctrl.sessions.folder import now_utc
 from membrane_ctrl.sessions.live_hold import HoldError, Progress, live_hold
 
 USUAL_SETS = 5
-_NEARLY_ALL = 0.9  # of the good range: more would hardly be better
+_NEARLY_ALL = 0.9  # of the good range: more would hardly help
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ def calibrate_live(options: LiveOptions) -> int:
     session = None
     if options.session is not None:
         if options.range_um is not None or options.sets is not None:
-            raise InputError("--session has its own setpoints: leave out --range-um and --sets")
+            raise InputError("--session has its own setpoints: omit --range-um and --sets")
         session = sessions.resume(options.session)
     if session is None or session.missing:
         with live_hold(options.where, options.take_over, "calibrate --live") as link:
@@ -58,7 +58,7 @@ def calibrate_live(options: LiveOptions) -> int:
 
 
 def take_sets(link: CaptureLink, session: CalibrationSession | None, options: LiveOptions) -> CalibrationSession:
-    """Take the missing sets, if a person agrees, and move the mirror back to where it was.
+    """Take the missing sets, if a person agrees, and move the mirror back.
 
     Raises InputError, DeviceError, RejectedError or KeyboardInterrupt; the session's folder keeps the sets so far.
     """
@@ -103,27 +103,27 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
     if place is None:
         _say(f"not adopted: the configuration names no optics.geometry_file; the geometry is {session.geometry}")
     elif not _asked(f"adopt it as {place}?", options.yes):
-        _say(f"not adopted; `membrane-ctrl calibrate --live --session {session.path} --yes` does it")
+        _say(f"not adopted; `membrane-ctrl calibrate --live --session {session.path} --yes` adopts it")
     else:
         kept = adopt(session.geometry, place)
-        before = f"; the one before it is {kept}" if kept else ""
-        _say(f"adopted: {place}{before}; the next hold measures with it")
+        before = f"; the previous one is {kept}" if kept else ""
+        _say(f"adopted: {place}{before}; the next hold uses it")
     return code
 
 
 def _same_bench(link: CaptureLink, session: CalibrationSession) -> None:
-    """Raises InputError if the hold measures with another geometry than the sets so far were taken with."""
+    """Raises InputError if the hold's geometry differs from that of the sets so far."""
     now = geometry_of_run(link.run_dir, link.config).optics
     for folder in session.sets:
         if not folder.exists():
             continue
         then = read_head(folder).optics
         if _written_out(then) != _written_out(now):
-            raise InputError(f"{folder}: of another camera or geometry than {link.name} has; begin a new session")
+            raise InputError(f"{folder}: camera or geometry differs from that of {link.name}; start a new session")
 
 
 def _written_out(optics: OpticsConfig) -> tuple[GeometryConfig, CameraConfig]:
-    """What may be left out in one place and stand in another: the reference is not compared, the pixel's place is."""
+    """Spell out defaults that one file may omit; the reference is not compared, the principal point is."""
     camera = optics.camera.model_copy(update={"principal_px": optics.camera.principal})
     return optics.geometry.model_copy(update={"reference_displacement_um": None}), camera
 
@@ -139,9 +139,9 @@ def _plan(head: CalibrationHead, missing: int, held: plan.HeldMirror, minutes: f
 
 
 def _worth(link: CaptureLink, head: CalibrationHead, held: plan.HeldMirror, options: LiveOptions) -> str:
-    """How well the geometry will be determined, and by how much better if there were more room."""
+    """How well the sets will determine the geometry, and how much better a wider range would."""
     here = _foreseen(link, held, head.setpoints_um, options)
-    line = f"a figure after such sets: sag +- {here.sag_um:.1f} um, figure +- {here.figure_rms_um:.1f} um RMS"
+    line = f"a figure after these sets: sag +- {here.sag_um:.1f} um, figure +- {here.figure_rms_um:.1f} um RMS"
     low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
     if high_um - low_um >= _NEARLY_ALL * verdict.GOOD_SPREAD_UM:
         return line
@@ -149,7 +149,7 @@ def _worth(link: CaptureLink, head: CalibrationHead, held: plan.HeldMirror, opti
     best = _foreseen(link, held, np.linspace(*ends, len(head.setpoints_um)).tolist(), options)
     reach = plan.reach_of(held, link.config)
     return (
-        f"{line}; {verdict.GOOD_SPREAD_UM:.0f} um from first to last would give {best.sag_um:.1f} and "
+        f"{line}; {verdict.GOOD_SPREAD_UM:.0f} um of range would give {best.sag_um:.1f} and "
         f"{best.figure_rms_um:.1f} ({reach.low_why} and {reach.high_why} allow "
         f"{reach.high_um - reach.low_um:.0f})"
     )
@@ -167,14 +167,14 @@ def _foreseen(
     try:
         return propagate.foresee(optics, known, sags_mm, held.swing_adu, solving.laser_sigma_um)
     except ValueError as error:
-        raise InputError(f"{link.name}: {error}; does [optics] state this bench?") from None
+        raise InputError(f"{link.name}: {error}; does [optics] describe this bench?") from None
 
 
 def _origin(session: CalibrationSession, place: Path | None) -> GeometryOrigin:
-    """Of the geometry that the sets were taken with: the file's if it is still the same, else by its numbers."""
+    """Origin of the sets' geometry: the file if it is unchanged, else the numbers' hash."""
     optics = read_head(session.sets[0]).optics
     if place is not None and place.exists():
-        with contextlib.suppress(InputError):  # a file that is spoilt is in nobody's way
+        with contextlib.suppress(InputError):  # a damaged file does no harm here
             file = read_geometry(place)
             if file.geometry == optics.geometry:
                 return file.origin
@@ -182,9 +182,9 @@ def _origin(session: CalibrationSession, place: Path | None) -> GeometryOrigin:
 
 
 def _agree(question: str, yes: bool) -> None:
-    """Raises InputError unless somebody says yes."""
+    """Raises InputError unless a person agrees."""
     if not yes and not sys.stdin.isatty():
-        raise InputError(f"{question} This is no terminal: confirm with --yes")
+        raise InputError(f"{question} Not a terminal: confirm with --yes")
     if not _asked(question, yes):
         raise InputError("nothing was moved")
 

@@ -1,4 +1,4 @@
-"""Where the mirror goes for a calibration, whether it may, and how long that takes. Pure."""
+"""Setpoints of a calibration: where the mirror goes, whether it may, and how long it takes. Pure."""
 
 import math
 from dataclasses import dataclass
@@ -11,38 +11,38 @@ from membrane_ctrl.control.pid import RAMP_SHARE
 from membrane_ctrl.metrology.calibrate.verdict import GOOD_SPREAD_UM, LEAST_SPREAD_UM
 from membrane_ctrl.model.errors import InputError
 
-# Of the limit's pressure: the sag of a Hencky bowl is known from it to a per cent, the pressure of a sag to three;
-# a film with tension of its own needs less pressure for more depth than said here
+# Of the limiting pressure: it gives the sag of a Hencky bowl to a per cent, and a sag gives the pressure to three;
+# a pretensioned film needs less extra pressure than this for more depth
 _PRESSURE_SHARE = 0.95
-SETTLE_S = 15.0  # at a setpoint: the gas has found the air's temperature again (12 s), the ramp's end is forgotten
-# A cycle under way ends first, then 18 frames, their reconstruction and the disk
+SETTLE_S = 15.0  # at a setpoint: the gas is back at the air's temperature (12 s), and the ramp has no more effect
+# The current cycle ends first, then 18 frames, their reconstruction and writing
 _SET_S = 15.0
-_PIECES = 8  # of a way, for its time: the leak grows with the cube of the depth
+_PIECES = 8  # to integrate a move's duration: the leak grows with the cube of the depth
 
 
 @dataclass(frozen=True, slots=True)
 class HeldMirror:
-    """The mirror as it is held before anything moves."""
+    """The held mirror before any move."""
 
     setpoint_um: float  # without the trim
-    sag_mm: float  # as the camera sees it with the geometry in force
-    pressure_pa: float  # of the gauge
+    sag_mm: float  # seen by the camera with the geometry in force
+    pressure_pa: float  # gauge reading
     leak_um_per_s: float  # speed at which the centre sinks without the pump
     swing_adu: float  # amplitude of the fringes
     shape_on: bool  # whether the shape loop is on
 
     def sag_at_mm(self, setpoint_um: float) -> float:
-        """Sag at another setpoint: the ring stays where it is."""
+        """Sag at another setpoint; the ring does not move."""
         return self.sag_mm + 1e-3 * (setpoint_um - self.setpoint_um)
 
     def leak_at_um_per_s(self, setpoint_um: float) -> float:
-        """Leak there: as the pressure, it goes with the cube of the sag (Hencky)."""
+        """Leak at another setpoint: like the pressure, it grows with the cube of the sag (Hencky)."""
         return self.leak_um_per_s * float(self.sag_at_mm(setpoint_um) / self.sag_mm) ** 3
 
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """How far the setpoint may go, and what keeps it from going further."""
+    """Range of the setpoint, and what limits it."""
 
     low_um: float
     high_um: float
@@ -51,7 +51,7 @@ class Reach:
 
 
 def reach_of(held: HeldMirror, config: Config) -> Reach:
-    """The safety table's limits, less what it forgives: a mirror that lags must not trip them on its way."""
+    """The safety table's limits less a margin: a lagging mirror must not trip them during a move."""
     limits, margin_um = config.limits, config.limits.following_error_max_um
     high_um, why = limits.displacement_max_um - margin_um, "limits.displacement_max_um"
     if held.pressure_pa > 0:
@@ -71,21 +71,21 @@ def setpoints_um(held: HeldMirror, reach: Reach, range_um: float | None, sets: i
     Parameters
     ----------
     reach : Reach
-        The range is moved to fit into it.
+        The range is shifted to fit into it.
     range_um : float or None
-        From the first to the last; None: 8 mm, or what there is.
+        From the first to the last; None: 8 mm, or less if limited.
     sets : int
-        How many.
+        Number of sets.
     """
     room_um = reach.high_um - reach.low_um
     allowed = f"{reach.low_why} and {reach.high_why} leave {max(room_um, 0.0):.0f} um"
     if range_um is not None and range_um > room_um:
-        raise InputError(f"--range-um {range_um:g}: {allowed}; ask for less, or widen them if the films allow it")
+        raise InputError(f"--range-um {range_um:g}: {allowed}; reduce it, or widen the limits if the film allows")
     wide_um = min(GOOD_SPREAD_UM, room_um) if range_um is None else range_um
     if wide_um < LEAST_SPREAD_UM:
         what = allowed if range_um is None else f"--range-um {range_um:g}"
         raise InputError(
-            f"{what}: sets closer together than {LEAST_SPREAD_UM:.0f} um tell no more than one set; "
+            f"{what}: sets closer together than {LEAST_SPREAD_UM:.0f} um add nothing to one set; "
             f"{GOOD_SPREAD_UM:.0f} um is good"
         )
     low_um = min(max(held.setpoint_um - wide_um / 2, reach.low_um), reach.high_um - wide_um)
@@ -94,7 +94,7 @@ def setpoints_um(held: HeldMirror, reach: Reach, range_um: float | None, sets: i
 
 
 def way_s(held: HeldMirror, from_um: float, to_um: float, config: Config) -> float:
-    """How long the setpoint's ramp takes; inf if the mirror does not sink by itself, or the pump has no reserve."""
+    """Duration of the setpoint's ramp; inf if the mirror does not sink, or the pump has no reserve."""
     loop, most_um_per_s = config.loop, min(config.loop.flow_max_um_per_s, config.pump.flow_full_um_per_s)
     total_s = 0.0
     for a_um, b_um in pairwise(np.linspace(from_um, to_um, _PIECES + 1).tolist()):
@@ -106,5 +106,5 @@ def way_s(held: HeldMirror, from_um: float, to_um: float, config: Config) -> flo
 
 
 def step_s(held: HeldMirror, from_um: float, to_um: float, config: Config) -> float:
-    """The way, settling, and the set."""
+    """Duration of the move, of settling and of the set."""
     return way_s(held, from_um, to_um, config) + SETTLE_S + _SET_S

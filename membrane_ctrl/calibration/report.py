@@ -1,4 +1,4 @@
-"""What a calibration found, as a table for JSON and as lines for a person."""
+"""Results of a calibration, as a table for JSON and as lines for people."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ _SOME_LASER = 0.5  # sigma of the laser's scale without any reading: 1
 def report_of(
     solution: solve.Solution | None, findings: Sequence[verdict.CalibrationFinding], analysis_radius_mm: float
 ) -> dict[str, Any]:
-    """The report, schema membrane-calibration/1; without a solution only what was found."""
+    """The report, schema membrane-calibration/1; without a solution only the findings."""
     table: dict[str, Any] = {
         "schema": "membrane-calibration/1",
         "verdict": "rejected" if any(finding.fatal for finding in findings) else "ok",
@@ -61,7 +61,7 @@ def _parameter(solution: solve.Solution, name: str) -> dict[str, Any]:
 
 
 def _sets(solution: solve.Solution) -> list[dict[str, Any]]:
-    """Each set: its noise against the camera's, what the model leaves, and the set against the others."""
+    """Per set: its noise relative to the camera's, its residuals, and the test against the other sets."""
     return [
         {
             "name": phases.name,
@@ -79,7 +79,7 @@ def _sets(solution: solve.Solution) -> list[dict[str, Any]]:
 
 
 def lines_of(report: dict[str, Any]) -> list[str]:
-    """For a terminal."""
+    """Format the report for a terminal."""
     lines = [f"verdict: {report['verdict']}"]
     lines += [("  ! " if finding["fatal"] else "  note: ") + finding["says"] for finding in report["findings"]]
     if "parameters" not in report:
@@ -99,7 +99,7 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         )
     claim = report["uncertainty"]
     lines.append(
-        f"a figure made with it: sag +- {claim['sag_um']:.2f} um, figure +- {claim['figure_rms_um']:.2f} um RMS, "
+        f"figure with this geometry: sag +- {claim['sag_um']:.2f} um, figure +- {claim['figure_rms_um']:.2f} um RMS, "
         f"with its tilt +- {claim['height_rms_um']:.1f} um RMS"
     )
     if report["laser"]["sigma"] < _SOME_LASER:
@@ -113,15 +113,15 @@ def lines_of(report: dict[str, Any]) -> list[str]:
     return lines
 
 
-# What a calibration leaves of the seen screen points, set by set: noise if the model is right, a pattern if not.
+# Residuals of the seen screen points, set by set: noise if the model is right, a pattern if not.
 
 _INCHES = 2.6  # a panel
 _DPI = 110
-_CELLS = 24  # across the picture: enough points in each for a pattern below the noise to be seen
+_CELLS = 24  # across the picture: each averages enough points to show a pattern below the noise
 
 
 def draw_residuals(path: Path, solution: solve.Solution) -> None:
-    """Draw means of the s_x and s_y residuals of all sets over the camera's picture, one scale for all.
+    """Draw the mean s_x and s_y residuals of all sets over the camera's picture, on a common scale.
 
     Raises OSError if the file cannot be written.
     """
@@ -145,7 +145,7 @@ def draw_residuals(path: Path, solution: solve.Solution) -> None:
 
 
 def _edges(solution: solve.Solution) -> tuple[FloatArray, FloatArray]:
-    """Columns and rows at which square cells begin and end."""
+    """Columns and rows of the boundaries of square cells."""
     column = np.concatenate([phases.column_px for phases in solution.problem.sets])
     row = np.concatenate([phases.row_px for phases in solution.problem.sets])
     side = max(float(np.ptp(column)), float(np.ptp(row)), 1.0) / _CELLS
@@ -154,7 +154,7 @@ def _edges(solution: solve.Solution) -> tuple[FloatArray, FloatArray]:
 
 
 def _means(solution: solve.Solution, index: int, axis: int, edges: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """Weighted means over cells, (rows, columns); NaN where a set has no point."""
+    """Weighted means over cells, (rows, columns); NaN in cells without points."""
     phases, linear = solution.problem.sets[index], solution.equations[index]
     weights = linear.trust.weights / phases.sigma_mm**2
     bins = (edges[1], edges[0])

@@ -21,9 +21,9 @@ class CalibrationHead:
     """`session.json`."""
 
     format: str
-    source: str  # the run it began on
+    source: str  # the run it started on
     created_utc: str
-    # Setpoint to return to; the measurements by hand are taken to hold there
+    # Setpoint to return to; the measurements by hand are assumed valid there
     start_um: float
     shape_on: bool  # whether the shape loop was on
     setpoints_um: tuple[float, ...]  # of the sets, in their order
@@ -31,7 +31,7 @@ class CalibrationHead:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSession:
-    """A live calibration on disk; it goes on with the sets that are not there yet."""
+    """A live calibration on disk; it continues with the missing sets."""
 
     path: Path
     head: CalibrationHead
@@ -39,21 +39,21 @@ class CalibrationSession:
 
     @property
     def sets(self) -> tuple[Path, ...]:
-        """Folders of all sets, there or not."""
+        """Folders of all sets, existing or not."""
         return tuple(self.path / "sets" / f"set-{k + 1}" for k in range(len(self.head.setpoints_um)))
 
     @property
     def missing(self) -> tuple[int, ...]:
-        """Which are not there yet."""
+        """Indices of the missing sets."""
         return tuple(k for k, folder in enumerate(self.sets) if not folder.exists())
 
     @property
     def geometry(self) -> Path:
-        """Where the result is."""
+        """Path of the result."""
         return self.path / "geometry.toml"
 
     def keep(self, index: int, taken: Path) -> None:
-        """Copy a set out of the run's folder, whole or not at all. Raises DeviceError."""
+        """Copy a set from the run's folder, atomically. Raises DeviceError."""
         folder = self.sets[index]
         part = folder.with_name(f".{folder.name}.part")
         try:
@@ -62,7 +62,7 @@ class CalibrationSession:
             shutil.copytree(taken, part)
             part.replace(folder)
         except (OSError, shutil.Error) as error:
-            raise errors.DeviceError(f"{folder}: the set {taken} cannot be copied there ({error})") from None
+            raise errors.DeviceError(f"{folder}: cannot copy the set {taken} here ({error})") from None
 
 
 def begin(logs: Path, name: str, head: CalibrationHead, config: schema.Config) -> CalibrationSession:
@@ -71,15 +71,15 @@ def begin(logs: Path, name: str, head: CalibrationHead, config: schema.Config) -
 
 
 def resume(path: Path) -> CalibrationSession:
-    """An existing session. Raises InputError if it is none."""
+    """Open an existing session. Raises InputError if it is not one."""
     return CalibrationSession(path, *read_session(path, CalibrationHead, FORMAT))
 
 
-# Old geometry against new, and the exchange of the files.
+# Comparison of old and new geometry, and the exchange of the files.
 
 
 def compared(optics: schema.OpticsConfig, origin: GeometryOrigin, new: GeometryFile) -> list[str]:
-    """The geometry in force (`optics`, `origin`) beside the new one, in numbers that can be checked with a tape."""
+    """The geometry in force (`optics`, `origin`) beside the new one, in numbers that a tape measure can check."""
     old = "by hand" if not origin.calibrated_utc else f"calibrated {origin.calibrated_utc}"
     lines = [
         f"in force: {old}, hash {origin.hash}; new: hash {new.origin.hash}",
@@ -103,9 +103,9 @@ def _by_tape(geometry: Geometry) -> list[tuple[str, float]]:
 
 
 def adopt(new: Path, place: Path) -> Path | None:
-    """Put a geometry where the configuration looks for it; returns where the one before it is kept now.
+    """Put a geometry where the configuration looks for it; returns where the previous one is kept.
 
-    Raises DeviceError if it cannot be written; then the old one is still there.
+    Raises DeviceError if it cannot be written; the old one then stays in place.
     """
     with errors.writing(place, errors.DeviceError):
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -118,7 +118,7 @@ def adopt(new: Path, place: Path) -> Path | None:
 
 
 def _kept(place: Path) -> Path:
-    """A name with the date of the calibration, or of the file if a person wrote it; never one that is taken."""
+    """A free name with the date of the calibration, or of the file if a person wrote it."""
     try:
         written = datetime.fromisoformat(read_geometry(place).origin.calibrated_utc)
     except (errors.InputError, ValueError):
@@ -128,4 +128,4 @@ def _kept(place: Path) -> Path:
         kept = place.with_name(f"{stem}{'' if number == 1 else f'-{number}'}{place.suffix}")
         if not kept.exists():
             return kept
-    raise OSError(f"{stem} is there a thousand times")
+    raise OSError(f"a thousand files {stem} exist")

@@ -31,7 +31,7 @@ from membrane_ctrl.model.files import users, write_text_atomic
 
 
 def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.SetPhases:
-    """The bins inside the analysis radius that the set's own fit kept.
+    """The bins within the analysis radius that the set's own fit kept.
 
     The stated geometry only chooses the bins and corrects the averaging of a curved phase over a bin (some 1e-3 mm,
     which no calibration changes).
@@ -59,20 +59,20 @@ class CalibrateOptions:
     """What the command was asked for."""
 
     folders: Sequence[Path]  # capture sets
-    geometry: Path | None  # what was measured by hand, instead of what the sets say
+    geometry: Path | None  # geometry measured by hand, replacing the sets'
     out: Path  # the new `geometry.toml`
     free: Sequence[str]  # NAME or NAME=SIGMA; a sigma of 0 holds a parameter
-    laser_sigma_um: float  # of a set's mean reading
+    laser_sigma_um: float  # sigma of a set's mean reading
     as_json: bool
-    pictures: bool = True  # draw what is left of the screen points, beside the geometry
-    # Laser reading for which the hand's measurements hold, if the sets do not say; None: the first set's
+    pictures: bool = True  # draw the residuals of the screen points next to the geometry
+    # Laser reading at which the manual measurements hold, if the sets do not state it; None: the first set's
     reference_um: float | None = None
-    priors: Sequence[Path] = ()  # what auxiliary calibrations have found; the last one counts
+    priors: Sequence[Path] = ()  # results of auxiliary calibrations; the last one wins
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """Sets that were read: their phases, the bench that all of them state, and what is wrong with single frames."""
+    """The sets read: their phases, the bench that all of them state, and defects of single frames."""
 
     sets: tuple[residuals.SetPhases, ...]
     optics: OpticsConfig
@@ -81,7 +81,7 @@ class Bundle:
 
 
 def calibrate_command(options: CalibrateOptions) -> int:
-    """Read, solve, judge, write. Returns the exit code; raises CommandError for sets that are none."""
+    """Read, solve, judge, write. Returns the exit code; raises CommandError for invalid sets."""
     priors = [spread_file.read_prior(path) for path in options.priors]
     free = {name: sigma for prior in priors for name, sigma in prior.content.sigmas.items()} | freed(options.free)
     begin = time.perf_counter()
@@ -100,7 +100,7 @@ def calibrate_command(options: CalibrateOptions) -> int:
     written = _write(options.out, solution, problem, bundle, findings) if usable and solution is not None else ""
     if solution is not None and options.pictures:
         path = options.out.with_name(f"{options.out.stem}-residuals.png")
-        with errors.writing(path):  # also of a solution that is refused: there it is wanted most
+        with errors.writing(path):  # also for a refused solution, where it helps most
             path.parent.mkdir(parents=True, exist_ok=True)
             draw_residuals(path, solution)
     report = report_of(solution, findings, bundle.optics.mirror.analysis_radius_mm)
@@ -117,7 +117,7 @@ def freed(texts: Sequence[str]) -> dict[str, float]:
     for text in texts:
         name, _, amount = text.partition("=")
         if name not in NAMES:
-            raise errors.InputError(f"--free {text}: {name} is not a parameter; known are {', '.join(NAMES)}")
+            raise errors.InputError(f"--free {text}: {name} is not a parameter; known: {', '.join(NAMES)}")
         try:
             out[name] = float(amount) if amount else usual_sigma(name)
         except ValueError:
@@ -130,8 +130,8 @@ def freed(texts: Sequence[str]) -> dict[str, float]:
 def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: float | None = None) -> Bundle:
     """Read capture sets and their phases.
 
-    Raises InputError for a set that is none, or that says it is of another rig than the first; RejectedError for a
-    set that gives no figure.
+    Raises InputError for an invalid set or one whose rig differs from that of the first; RejectedError for a
+    set without a figure.
     """
     figures = Figures(None if geometry is None else file.read_geometry(geometry))
     if len(set(folders)) < len(folders):
@@ -145,7 +145,7 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
         _same_rig(folders[0], benches[0], folder, benches[-1])
         sets.append(phases_of(folder.name, figure.checked, figure.head.optics))
         files = figure.head.files
-        notes += [f"{folder.name}: {files[flag.frame]} left out: {flag.reason}" for flag in figure.checked.flags]
+        notes += [f"{folder.name}: {files[flag.frame]} omitted: {flag.reason}" for flag in figure.checked.flags]
     reference_um = _reference_um(sets, benches, reference_um)
     if not any(math.isfinite(phases.displacement_um) for phases in sets):
         # no laser: the world's origin is the vertex of the first set
@@ -154,7 +154,7 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
 
 
 def with_priors(bundle: Bundle, priors: Sequence[spread_file.Prior]) -> Bundle:
-    """The sets with the bench as auxiliary calibrations have it. Raises InputError for another camera's."""
+    """The sets with the bench as found by auxiliary calibrations. Raises InputError for a different camera."""
     optics = bundle.optics
     for prior in priors:
         optics = prior.over(optics)
@@ -164,9 +164,9 @@ def with_priors(bundle: Bundle, priors: Sequence[spread_file.Prior]) -> Bundle:
 def _reference_um(
     sets: Sequence[residuals.SetPhases], benches: Sequence[OpticsConfig], known_um: float | None
 ) -> float:
-    """Reading at which the vertex is the world's origin: what all sets state, else as known, else the first there is.
+    """Reading at which the vertex is the world's origin: as all sets state, else as given, else the first one.
 
-    A set that states none has its own first reading there: then the sets differ.
+    A set that states none uses its own first reading: then the sets differ.
     """
     stated = {bench.geometry.reference_displacement_um for bench in benches}
     if len(stated) == 1 and (reference_um := stated.pop()) is not None:
@@ -184,19 +184,19 @@ def _same_rig(first: Path, optics: OpticsConfig, folder: Path, other: OpticsConf
                 continue
             if getattr(ours, field) != getattr(theirs, field):
                 raise errors.InputError(
-                    f"{folder / 'capture.toml'}: {section}.{field}: not that of {first}; "
-                    "sets of one calibration are of one rig"
+                    f"{folder / 'capture.toml'}: {section}.{field}: differs from {first}; "
+                    "a calibration needs sets of one rig"
                 )
 
 
 def stated_sigmas(stated: GeometryConfig) -> dict[str, float]:
-    """Those of the hand's measurements that are stated."""
+    """The stated sigmas of the manual measurements."""
     given = {"a_mm": stated.a_sigma_mm, "b_mm": stated.b_sigma_mm, "alpha_deg": stated.alpha_sigma_deg}
     return {name: sigma for name, sigma in given.items() if sigma is not None}
 
 
 def problem_of(bundle: Bundle, free: dict[str, float], laser_sigma_um: float) -> Problem:
-    """The stated bench with its sigmas. Raises InputError for a geometry that cannot be calibrated."""
+    """The stated bench with its sigmas. Raises InputError if the geometry cannot be calibrated."""
     own = stated_sigmas(bundle.optics.geometry)
     try:
         geometry = Geometry.from_config(bundle.optics)
@@ -204,7 +204,7 @@ def problem_of(bundle: Bundle, free: dict[str, float], laser_sigma_um: float) ->
         raise errors.InputError(str(error)) from None
     references = separable.References(bundle.reference_um, laser_sigma_um)
     if sum(math.isfinite(phases.displacement_um) for phases in bundle.sets) < 2:
-        own[LASER.name] = 0.0  # a scale of nothing
+        own[LASER.name] = 0.0  # no readings to scale
     return Problem(geometry, bundle.sets, sigmas({**own, **free}), references, bundle.optics.mirror.radius_mm)
 
 

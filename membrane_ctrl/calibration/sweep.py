@@ -1,4 +1,4 @@
-"""A running hold under the hand of a calibration: look, go, settle, take a set. The supervisor stays in charge."""
+"""A running hold controlled by a calibration: observe, move, settle, take a set. The supervisor stays in charge."""
 
 import contextlib
 import math
@@ -17,16 +17,16 @@ from membrane_ctrl.model import errors, events, run_events, states, telemetry
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News, Progress
 
 WHY = "calibration of the optics"
-_LOOK_S = 10.0  # at the pressure and the leak, which are noisy
-_SHAPE_WITHIN_S = 90.0  # a camera that was rejected waits up to a minute
+_LOOK_S = 10.0  # averaging time for pressure and leak, which are noisy
+_SHAPE_WITHIN_S = 90.0  # a rejected cycle pauses up to a minute
 _SET_WITHIN_S = 180.0  # likewise, and a slow machine reconstructs for seconds
 _ARRIVED_UM = 0.5  # the ramp's end is exponential
-_MEAN_S = 5.0  # over which the mirror must be inside the band
-_LATE = 2.0, 300.0  # times what was foreseen, and seconds more: then something else is wrong
+_MEAN_S = 5.0  # the mirror must be inside the band for this long
+_LATE = 2.0, 300.0  # factor on the planned time, and seconds more: then something else is wrong
 
 
 class CaptureLink(HoldLink, Protocol):
-    """A hold whose run folder can be read, for its sets are there."""
+    """A hold with a readable run folder, where its sets are."""
 
     @property
     def run_dir(self) -> Path:
@@ -35,9 +35,9 @@ class CaptureLink(HoldLink, Protocol):
 
 
 class Sweep:
-    """Moves and looks; every wait ends by itself.
+    """Moves and observes; every wait has a time-out.
 
-    `progress` is told the seconds of the hold that have passed, and may raise KeyboardInterrupt.
+    `progress` gets the elapsed seconds of the hold, and may raise KeyboardInterrupt.
     """
 
     def __init__(self, link: CaptureLink, limits: LimitsConfig, progress: Callable[[float], None]) -> None:
@@ -46,7 +46,7 @@ class Sweep:
         self._why = ""
 
     def look(self) -> HeldMirror:
-        """The mirror as held, from some seconds and a shape. Raises HoldError, or DeviceError without a camera."""
+        """Observe the held mirror for some seconds and a shape. Raises HoldError, or DeviceError without a camera."""
         rows: deque[telemetry.TelemetryRow] = deque()
         shape = None
         while shape is None or rows[-1].mono_s - rows[0].mono_s < _LOOK_S:
@@ -56,7 +56,7 @@ class Sweep:
             if shape is None and rows and rows[-1].mono_s - rows[0].mono_s > _SHAPE_WITHIN_S:
                 raise errors.DeviceError(
                     f"{self._link.name}: no shape within {_SHAPE_WITHIN_S:.0f} s; "
-                    "has this run a camera that sees the mirror? (ctl status)"
+                    "does this run have a camera that sees the mirror? (ctl status)"
                 )
         newest = rows[-1]
         leaks = [row.leak_um_per_s for row in rows if math.isfinite(row.leak_um_per_s)]
@@ -64,20 +64,20 @@ class Sweep:
             setpoint_um=newest.target_um,
             sag_mm=1e-3 * shape.sag_um,
             pressure_pa=_mean([row.gauge_pressure_pa for row in rows]),
-            # the mean flow makes up for the leak, which is estimated only after a while of hold
+            # the mean flow replaces the leak, whose own estimate needs a while of hold
             leak_um_per_s=_mean(leaks or [row.i_um_per_s for row in rows]),
             swing_adu=shape.modulation_median_adu,
             shape_on=newest.shape_state != states.ShapeState.OFF,
         )
 
     def claim(self, setpoint_um: float) -> None:
-        """Take the command without a motion: its own setpoint again. Raises HoldError if it is refused."""
+        """Take command without a motion, by repeating the setpoint. Raises HoldError if refused."""
         self._ask("setpoint", setpoint_um)
 
     def go(self, setpoint_um: float, expected_s: float) -> None:
-        """Ramp there and settle.
+        """Ramp to a setpoint and settle.
 
-        Raises HoldError if the mirror is no longer held or somebody else moves it; DeviceError if it does not arrive.
+        Raises HoldError if the mirror is no longer held or someone else moves it; DeviceError if it does not arrive.
         """
         self._ask("setpoint", setpoint_um)
         patience_s = _LATE[0] * expected_s + _LATE[1]
@@ -87,7 +87,7 @@ class Sweep:
             for row in self._news().rows:
                 obeyed = obeyed or row.target_um == setpoint_um
                 if obeyed and row.target_um != setpoint_um:
-                    raise HoldError(f"somebody else has moved the setpoint to {row.target_um:g} um")
+                    raise HoldError(f"someone else moved the setpoint to {row.target_um:g} um")
                 begin_s = row.mono_s if math.isnan(begin_s) else begin_s
                 ramping = abs(row.setpoint_um - row.trim_um - setpoint_um) > _ARRIVED_UM
                 if not obeyed or ramping:
@@ -102,7 +102,7 @@ class Sweep:
                 )
 
     def take(self) -> run_events.Capture:
-        """Have a set taken; repeat a bad one once.
+        """Request a set; repeat a bad one once.
 
         Raises HoldError if the hold refuses or the mirror is no longer held; RejectedError if both are bad.
         """
@@ -133,7 +133,7 @@ class Sweep:
         self._link.ask(Command(kind, "calibration", WHY, value=value))
 
     def _news(self) -> News:
-        """What has come; raises HoldError if the mirror is not held any more."""
+        """New ticks, events and shapes. Raises HoldError if the mirror is no longer held."""
         news = self._link.news()
         for event in news.events:
             if isinstance(event, events.StateEntered):
@@ -142,7 +142,7 @@ class Sweep:
             if row.state != states.State.HOLD:
                 name = states.State(int(row.state)).name.lower()
                 raise HoldError(
-                    f"the mirror is not held but in state {name}{self._why}; start or resume the hold first"
+                    f"the mirror is not held, but in state {name}{self._why}; start or resume the hold first"
                 )
         if news.rows:
             passed_s = news.rows[-1].mono_s - self._last_s
@@ -156,20 +156,20 @@ def _mean(values: list[float]) -> float:
     return sum(finite) / len(finite) if finite else math.nan
 
 
-# The sets of a session, one after the other, on a running hold; and the way back, whatever happens.
+# The sets of a session, one after the other, on a running hold, and the return, whatever happens.
 
 
 @dataclass(frozen=True, slots=True)
 class Procedure:
-    """What moves the mirror for a calibration."""
+    """Moves the mirror for a calibration."""
 
     link: CaptureLink
-    sweep: Sweep  # the hand on it
-    held: HeldMirror  # the mirror as it was found
+    sweep: Sweep  # the hold under control
+    held: HeldMirror  # the mirror before the first move
     progress: Progress
 
     def times_s(self, head: CalibrationHead, missing: tuple[int, ...]) -> list[float]:
-        """How long each step takes: the sets that are missing, and the way back."""
+        """Duration of each step: the missing sets, and the return."""
         stops = [self.held.setpoint_um, *(head.setpoints_um[k] for k in missing), head.start_um]
         return [step_s(self.held, a, b, self.link.config) for a, b in pairwise(stops)]
 
@@ -192,7 +192,7 @@ class Procedure:
     def take(self, session: CalibrationSession) -> None:
         """Take the missing sets and move the mirror back.
 
-        Raises HoldError if the mirror is no longer held or somebody else moves it (it is then left alone);
+        Raises HoldError if the mirror is no longer held or someone else moves it (it is then left alone);
         DeviceError, RejectedError or KeyboardInterrupt after the mirror has moved back.
         """
         with self.progress.catching(), self._coming_back(session):
@@ -217,11 +217,11 @@ class Procedure:
             yield
         except HoldError:
             off = "; the shape loop is off (ctl shape on)" if session.head.shape_on else ""
-            say(f"the mirror is left to whoever has the command{off}; go on with --session {session.path}")
+            say(f"the mirror is left to whoever has command{off}; continue with --session {session.path}")
             raise
         except BaseException:
             self.progress.interrupted = False
-            say(f"stopped with {len(session.missing)} sets missing; go on with --session {session.path}")
+            say(f"stopped with {len(session.missing)} sets missing; continue with --session {session.path}")
             with contextlib.suppress(HoldError, errors.DeviceError):
                 self._come_back(session)
             raise
@@ -231,12 +231,12 @@ class Procedure:
         head = session.head
         far_um = max(head.setpoints_um, key=lambda each: abs(each - head.start_um))
         back_s = step_s(self.held, far_um, head.start_um, self.link.config)
-        self.progress.begin(f"back to {head.start_um:g} um (Ctrl-C leaves it on its way)", back_s, 0.0)
+        self.progress.begin(f"back to {head.start_um:g} um (Ctrl-C stops waiting)", back_s, 0.0)
         try:
             self.sweep.go(head.start_um, back_s)
         except KeyboardInterrupt:
             off = "; then switch the shape loop on (ctl shape on)" if head.shape_on else ""
-            self.progress.say(f"left: the hold ramps on to {head.start_um:g} um by itself{off}")
+            self.progress.say(f"left: the hold continues its ramp to {head.start_um:g} um{off}")
             raise
         if head.shape_on:
             self.sweep.shape_loop(True)

@@ -1,4 +1,4 @@
-"""The other end of the port: plain blocking sockets, for the command line and for programs."""
+"""The client of the port: plain blocking sockets, for the command line and for programs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from membrane_ctrl.model.errors import DeviceError, os_reason
 
 Message = dict[str, Any]
 _ANSWER_S = 10.0
-_TURN = struct.pack("ll", 10, 0)  # to wait for one's turn: s and us, as the kernel takes a time-out
+_TURN = struct.pack("ll", 10, 0)  # time-out while queueing to connect: s and us, as the kernel takes it
 
 
 class PortClient:
@@ -27,7 +27,7 @@ class PortClient:
         self._lines = connection.makefile("rb")
         self._number = 0
         greeting = self._next()
-        if greeting is None:  # the hold says why in its record; a refused certificate is the usual reason by TLS
+        if greeting is None:  # the hold records the reason; with TLS it is usually a refused certificate
             self.close()
             raise DeviceError(f"{where}: no greeting; with TLS, check the certificate")
         if "membrane_ctrl" not in greeting:
@@ -39,17 +39,17 @@ class PortClient:
     def unix(cls, path: Path, notice: Callable[[str], None]) -> PortClient:
         """Connect to a socket file."""
         connection = socket.socket(socket.AF_UNIX)
-        # While others crowd the endpoint, connecting waits its turn only if it blocks; with Python's own time-out it
-        # would be refused at once.
+        # While others crowd the endpoint, only a blocking connect waits its turn; with Python's own time-out it would
+        # be refused at once.
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TURN)
         try:
             with sockets.short(path) as address:
                 connection.connect(address)
-            connection.getpeername()  # a signal ends the wait for one's turn, which Python takes for connected
+            connection.getpeername()  # after a signal during the wait, Python wrongly assumes a connection
             connection.settimeout(_ANSWER_S)
         except (FileNotFoundError, ConnectionRefusedError):
             connection.close()
-            raise DeviceError(f"{path}: no hold is listening there; name its run with --run or --socket") from None
+            raise DeviceError(f"{path}: no hold is listening; name its run with --run or --socket") from None
         except BlockingIOError:
             connection.close()
             raise DeviceError(f"{path}: too many connections are waiting; try again") from None
@@ -62,7 +62,7 @@ class PortClient:
 
     @classmethod
     def tls(cls, host: str, port: int, context: ssl.SSLContext, notice: Callable[[str], None]) -> PortClient:
-        """Connect by TCP; the context holds the own certificate (`sockets.client_context`)."""
+        """Connect over TCP; the context holds our certificate (`sockets.client_context`)."""
         where = f"{host}:{port}"
         try:
             plain = socket.create_connection((host, port), _ANSWER_S)
@@ -83,12 +83,12 @@ class PortClient:
         except OSError as error:
             raise DeviceError(f"{self._where}: {os_reason(error)}") from None
         for message in self.messages():
-            if message.get("number") in (self._number, 0):  # 0: it could not be read far enough to find its number
+            if message.get("number") in (self._number, 0):  # 0: the hold could not read the request's number
                 return message
         raise DeviceError(f"{self._where}: the hold closed the connection without an answer")
 
     def messages(self) -> Iterator[Message]:
-        """What comes, until the hold ends; notices are handed on."""
+        """Yield messages until the hold ends; pass on notices."""
         while (message := self._next()) is not None:
             if "notice" in message:
                 self._notice(str(message["notice"]))
@@ -96,7 +96,7 @@ class PortClient:
                 yield message
 
     def patience(self, seconds: float) -> None:
-        """How long the next message may take."""
+        """Set how long the next message may take."""
         self._connection.settimeout(seconds)
 
     def close(self) -> None:
@@ -117,7 +117,7 @@ class PortClient:
             return None
         except TimeoutError:
             raise DeviceError(f"{self._where}: the hold does not answer; is it stopped or overloaded?") from None
-        except OSError as error:  # TLS: a refused certificate shows with the first byte that is read
+        except OSError as error:  # TLS: a refused certificate shows only when reading
             self.close()
             raise DeviceError(f"{self._where}: {error}") from None
         if not line.endswith(b"\n"):

@@ -15,7 +15,7 @@ from membrane_ctrl.model import errors, files, plain_json, run_status
 
 @dataclass(frozen=True, slots=True)
 class Where:
-    """Which hold is meant, and as whom."""
+    """The target hold, and the identity to use."""
 
     socket: Path | None = None
     run: Path | None = None
@@ -27,7 +27,7 @@ class Where:
 
 
 def ctl(request: dict[str, Any], where: Where, as_json: bool) -> int:
-    """Ask a running hold. Raises InputError for a refusal, DeviceError if nobody answers."""
+    """Send a request to a running hold. Raises InputError for a refusal, DeviceError without an answer."""
     action = request["do"]
     with _connect(where) as client:
         answer = client.ask(**request)
@@ -48,7 +48,7 @@ def ctl(request: dict[str, Any], where: Where, as_json: bool) -> int:
 
 
 def status_lines(status: dict[str, Any]) -> list[str]:
-    """The status for a person."""
+    """Format the status for people."""
     row, fault = status.get("row") or {}, status.get("fault")
     lines = [f"{status.get('run', '?')}: {status['state']} - {status['why'] or 'as it should be'}"]
     if fault:
@@ -77,7 +77,7 @@ def status_lines(status: dict[str, Any]) -> list[str]:
 
 def _geometry(geometry: dict[str, Any] | None) -> str:
     if geometry is None:
-        return "none in use yet"
+        return "not in use yet"
     made = f"{geometry['file']}, calibrated {geometry['calibrated_utc']}" if geometry["file"] else "as configured"
     return geometry["message"] or f"{made} (hash {geometry['hash']})"
 

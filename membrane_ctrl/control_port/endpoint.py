@@ -1,11 +1,11 @@
-"""A listening socket in the control process: lets in few at a time, and reopens after a failure.
+"""A listening socket in the control process that admits few clients at a time and reopens after a failure.
 
 `asyncio.start_server` would accept all connections at once; here each waits for the one before, so that a flood costs
-the tick no more than twenty handshakes a second.
+the ticks at most twenty handshakes a second.
 
-A peer that has not identified itself (no handshake, no request) is a stranger. The number of strangers is limited,
-per address as well: the longest waiting one makes room for a newcomer, so that nobody can block the queue. An address
-that comes too often is turned away at once.
+A peer that has not identified itself (no handshake, no request) is a stranger. The number of strangers is limited, in
+total and per address: the longest waiting one makes room for a newcomer, so that nobody can block the queue. An
+address that connects too often is refused at once.
 """
 
 import asyncio
@@ -16,31 +16,31 @@ from collections.abc import Awaitable, Callable
 
 from membrane_ctrl.model import clock, events, run_events
 
-BACKLOG = 64  # who waits while another comes in; the kernel turns away the rest
+BACKLOG = 64  # connections that may wait; the kernel refuses more
 _INSIDE_MOST = 32
 _STRANGERS_MOST, _STRANGERS_EACH = 16, 4
 _PAUSE_S = 0.05
-# Of one address: a person's terminal and a script or two; a flood gets a tenth of the handshakes
+# Per address: a person's terminal and a script or two; a flood gets a tenth of the handshakes
 _BURST, _PER_S = 10.0, 2.0
-_TURN_AWAY_S = 0.005  # costs 50 us: a hundredth of a processor
-_ADDRESSES_MOST = 1024  # remembered
-_LEAVE_S = 2.0  # then the run ends without them
+_TURN_AWAY_S = 0.005  # each costs 50 us: a hundredth of a processor
+_ADDRESSES_MOST = 1024  # addresses remembered
+_LEAVE_S = 2.0  # then the run ends without waiting for clients
 _AGAIN_S = 1.0
-_RESET = struct.pack("ii", 1, 0)  # SO_LINGER: what is turned away leaves nothing behind in the kernel
+_RESET = struct.pack("ii", 1, 0)  # SO_LINGER: a refused connection leaves nothing behind in the kernel
 
 LetIn = Callable[[], object]
 Welcome = Callable[[socket.socket, LetIn], Awaitable[None]]
 
 
 class Turns:
-    """How often an address may come: a token bucket each; the address that has been away longest is forgotten."""
+    """How often an address may connect: a token bucket each; forgets the address absent longest."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
         self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def take(self, address: str) -> bool:
-        """Whether it may come in now; then it has come."""
+        """Whether the address may connect now; counts the connection if so."""
         now_s = self._now()
         left, since_s = self._left.pop(address, (_BURST, now_s))
         left = min(_BURST, left + _PER_S * (now_s - since_s))
@@ -65,7 +65,7 @@ class Endpoint:
     tell : callable
         Records an event.
     refused : callable
-        Gets who was refused, and why.
+        Called with the refused peer and the reason.
     """
 
     def __init__(
@@ -82,15 +82,15 @@ class Endpoint:
         self._tell = tell
         self._refused = refused
         self._inside: set[asyncio.Task[None]] = set()
-        self._strangers: dict[asyncio.Task[None], str] = {}  # and their addresses, in the order they came
+        self._strangers: dict[asyncio.Task[None], str] = {}  # their addresses, in order of arrival
         self._task: asyncio.Task[None] | None = None
 
     def open(self) -> None:
-        """Begin to accept."""
+        """Start accepting."""
         self._task = asyncio.create_task(self._keep(), name=f"port {self._name}")
 
     async def close(self) -> None:
-        """End everything behind the endpoint."""
+        """End all connections."""
         tasks = [*self._inside, *([self._task] if self._task else [])]
         for task in tasks:
             task.cancel()
@@ -99,7 +99,7 @@ class Endpoint:
         self._listener.close()
 
     async def _keep(self) -> None:
-        """Accept for ever; report a failure and try again."""
+        """Accept forever; report failures and retry."""
         failures = 0
         turns = Turns(asyncio.get_running_loop().time)
         while True:
@@ -118,16 +118,16 @@ class Endpoint:
 
     async def _accept(self, turns: Turns) -> bool:
         connection, peer = await asyncio.get_running_loop().sock_accept(self._listener)
-        address = str(peer[0]) if isinstance(peer, tuple) else ""  # who comes by a socket file has none
+        address = str(peer[0]) if isinstance(peer, tuple) else ""  # clients of a socket file have none
         if address and not turns.take(address):
-            self._turn_away(connection, address, "comes too often")
+            self._turn_away(connection, address, "connects too often")
             return False
         if not self._room_for(address):
-            self._turn_away(connection, address, "too many are inside")
+            self._turn_away(connection, address, "too many connections")
             return True
         task = asyncio.create_task(self._look_after(connection), name=f"port {self._name} client")
         self._inside.add(task)
-        if address:  # the kernel names the others
+        if address:  # the kernel identifies the others
             self._strangers[task] = address
         task.add_done_callback(self._gone)
         return True
@@ -138,7 +138,7 @@ class Endpoint:
         self._refused(f"{self._name}:{address}", reason)
 
     def _room_for(self, address: str) -> bool:
-        """Whether a newcomer may come in; the longest waiting stranger of a crowded address goes for it."""
+        """Whether a newcomer may enter; drops the longest waiting stranger of a crowded address if needed."""
         each = Counter(self._strangers.values())
         crowded = each[address] >= _STRANGERS_EACH
         if not crowded and len(self._strangers) < _STRANGERS_MOST:
@@ -159,20 +159,20 @@ class Endpoint:
         assert task is not None
         try:
             await self._welcome(connection, lambda: self._strangers.pop(task, None))
-        except Exception as error:  # one client's trouble is nobody else's
+        except Exception as error:  # one client's error must not affect the others
             self._tell(run_events.PortFailed(self._name, f"{type(error).__name__}: {error}"))
         finally:
             connection.close()
 
 
-# Refusals are recorded, but nobody can fill the record with them: ten mistakes are all there; of a flood one in ten
-# seconds, with the count of the others
+# Refusals are recorded, but cannot fill the record: ten mistakes all appear; of a flood, one in ten seconds, with the
+# count of the others
 _REFUSAL_BURST = 10.0
 _REFUSALS_PER_S = 0.1
 
 
 class Refusals:
-    """Records refusals as a token bucket allows; `count` counts all."""
+    """Records refusals at the rate of a token bucket; `count` counts all."""
 
     def __init__(self, tell: Callable[[events.Event], None], now: Callable[[], float]) -> None:
         self._tell, self._now = tell, now
@@ -181,7 +181,7 @@ class Refusals:
         self.count = 0
 
     def record(self, who: str, command: str, reason: str, why: str = "") -> None:
-        """Count a refusal, and record it if the bucket allows."""
+        """Count a refusal, and record it if the rate allows."""
         self.count += 1
         now_s = self._now()
         self._left = min(_REFUSAL_BURST, self._left + _REFUSALS_PER_S * (now_s - self._since_s))

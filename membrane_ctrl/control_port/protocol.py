@@ -1,7 +1,7 @@
-"""One JSON object a line in either direction, and the limits that keep a message from costing a tick.
+"""One JSON object per line in either direction, and limits so that no message costs a tick.
 
-A request carries a number; its answer carries the same. What comes without a number was not asked for: the greeting,
-notices, and what `watch` streams.
+A request carries a number; its answer carries the same. Messages without a number are unsolicited: the greeting,
+notices, and the stream of `watch`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Action = Literal[Kind, Errand]
 
 
 class RequestError(ValueError):
-    """A message that is no request; the text is the answer."""
+    """A message that is not a valid request; the text is the answer."""
 
     def __init__(self, reason: str, number: int = 0) -> None:
         super().__init__(reason)
@@ -50,19 +50,19 @@ def _words(most_bytes: int) -> AfterValidator:
 
 
 class Request(Section):
-    """What a client sends."""
+    """A client's request."""
 
     number: Annotated[int, Field(ge=0, lt=2**53)] = 0  # chosen by the client, returned with the answer
-    # a command of `commands.TABLE`, or an errand: `status` once, `watch` (the status again and again), `release`
-    # (give the command back), `quiet` (acknowledge the alarms)
+    # a command of `commands.TABLE`, or `status` (once), `watch` (repeated status), `release` (give up command),
+    # `quiet` (acknowledge the alarms)
     do: Action
     why: Annotated[str, _words(WHY_BYTES)] = ""  # recorded with the command
-    value: float | None = None  # `setpoint`: um. `manual`: um/s. `gains`: s on trial, until they are kept or go back
-    text: Annotated[str, _words(TEXT_BYTES)] = ""  # `mark`: what to write. `latch`: why nobody may hold the mirror
+    value: float | None = None  # `setpoint`: um. `manual`: um/s. `gains`: trial time, s
+    text: Annotated[str, _words(TEXT_BYTES)] = ""  # `mark`: the remark. `latch`: why the mirror is locked
     loop: dict[str, bool | float] | None = None  # `gains`: the keys of `[loop]` that change
     experiment: dict[str, str | int | float] | None = None  # `tune`: an `ExperimentSpec`
-    take_over: bool = False  # take the command from whoever has it
-    period_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.0  # `watch`: from status to status
+    take_over: bool = False  # take command from whoever has it
+    period_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.0  # `watch`: interval
 
     @model_validator(mode="after")
     def _complete(self) -> Request:
@@ -78,7 +78,7 @@ class Request(Section):
 
 
 def parse(line: bytes) -> Request:
-    """The request in a line. Raises RequestError with one line that says what is wrong."""
+    """Parse a request. Raises RequestError with one line that says what is wrong."""
     try:
         return Request.model_validate_json(line, strict=True)
     except ValidationError as error:
@@ -87,12 +87,12 @@ def parse(line: bytes) -> Request:
 
 
 def encode(message: dict[str, Any]) -> bytes:
-    """A message as a line."""
+    """Encode a message as a line."""
     return json.dumps(message, allow_nan=False, default=str).encode() + b"\n"
 
 
 def _number_in(line: bytes) -> int:
-    """The number of a request that is wrong in another place, so that its sender knows which one was meant."""
+    """Number of an otherwise invalid request, so that its sender can match the answer."""
     try:
         number = json.loads(line)["number"]
     except (ValueError, TypeError, LookupError, RecursionError):
@@ -101,13 +101,13 @@ def _number_in(line: bytes) -> int:
 
 
 def _short(reason: str, most: int = 300) -> str:
-    """One printable line; what a client sent may be quoted in it."""
+    """One printable line, which may quote the client."""
     clean = "".join(c if c.isprintable() else "?" for c in reason)
     return clean if len(clean) <= most else clean[: most - 3] + "..."
 
 
 _LINE_S = 5.0  # to complete a line
-# A reader this far behind is dropped: a watcher of 10 Hz after a minute
+# A reader this far behind is dropped: a 10 Hz watcher after a minute
 _UNREAD_BYTES = 1 << 20
 _HANDSHAKE_S = 3.0
 
@@ -117,7 +117,7 @@ class SlowReaderError(ConnectionError):
 
 
 class Wire:
-    """Lines in, lines out."""
+    """Reads and writes lines."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._reader, self._writer = reader, writer
@@ -134,17 +134,17 @@ class Wire:
 
     @property
     def certificate(self) -> dict[str, Any]:
-        """What the peer's certificate says, as `ssl.SSLSocket.getpeercert`."""
+        """The peer's certificate, as from `ssl.SSLSocket.getpeercert`."""
         found: dict[str, Any] | None = self._writer.get_extra_info("peercert")
         return found or {}
 
     async def line(self) -> bytes | None:
         """The next line; None when the peer has gone. Raises RequestError if it is too long or too slow."""
         try:
-            first = await self._reader.read(1)  # a peer may think for hours between two lines
+            first = await self._reader.read(1)  # a peer may be silent for hours between lines
             if first in (b"", b"\n"):
                 return first or None
-            # not `wait_for`, which forgets a cancellation that comes together with its result
+            # not `wait_for`, which loses a cancellation that coincides with its result
             async with asyncio.timeout(_LINE_S):
                 rest = await self._reader.readuntil(b"\n")
         except asyncio.LimitOverrunError:
@@ -156,7 +156,7 @@ class Wire:
         return first + rest
 
     def send(self, message: dict[str, Any]) -> None:
-        """Send without waiting. Raises SlowReaderError (and ends the connection) when too much is unread."""
+        """Send without waiting. Raises SlowReaderError (and ends the connection) if too much is unread."""
         transport = self._writer.transport
         if transport.is_closing():
             return
@@ -166,15 +166,15 @@ class Wire:
         self._writer.write(encode(message))
 
     async def until(self, end: bytes) -> bytes:
-        """What comes up to `end`. Raises asyncio's LimitOverrunError or IncompleteReadError."""
+        """Read up to `end`. Raises asyncio's LimitOverrunError or IncompleteReadError."""
         return await self._reader.readuntil(end)
 
     def send_bytes(self, data: bytes) -> None:
-        """Send an answer that is no line."""
+        """Send an answer that is not a line."""
         self._writer.write(data)
 
     async def close(self) -> None:
-        """Send what is left, if that goes at once, and end."""
+        """Send remaining data if possible without waiting, and end."""
         self._writer.close()
         try:
             async with asyncio.timeout(1.0):
@@ -183,5 +183,5 @@ class Wire:
             self._writer.transport.abort()
 
     def abort(self) -> None:
-        """End now."""
+        """End the connection now."""
         self._writer.transport.abort()

@@ -1,7 +1,7 @@
-"""The port as the run sees it: hears what every tick decided, and hands commands to the next one.
+"""The port as the run sees it: receives every tick's outputs, and hands commands to the next tick.
 
 It shares one thread and one event loop with the ticks, so everything is bounded: connections, messages, their rate,
-unsent data. An endpoint that fails reopens (`endpoint.Endpoint`): the hold goes on, and signals still stop it.
+unsent data. A failed endpoint reopens (`endpoint.Endpoint`): the hold continues, and signals still stop it.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ from membrane_ctrl.control_port.session import FREE, Commander, Peer, PortSessio
 from membrane_ctrl.controller import commands, cross_check_plant, tick
 from membrane_ctrl.model import errors, events, run_events, run_status, states
 
-# Beyond these the longest silent connection is dropped: one person's terminals cannot lock out another's stop
+# Beyond these, the longest silent connection is dropped: one user's terminals cannot lock out another's `stop`
 _SESSIONS_MOST, _SESSIONS_EACH = 16, 4
 _ANSWER_S = 5.0
 _EXPIRED = "the certificate has expired"
@@ -30,16 +30,16 @@ _OVER = "the run is over"
 
 @dataclass(frozen=True, slots=True)
 class RunHooks:
-    """What the port needs of the run."""
+    """What the port needs from the run."""
 
     ask: Callable[[commands.Command], None]  # hands a command to the next tick
-    tell: Callable[[events.Event], None]  # puts an event on record
+    tell: Callable[[events.Event], None]  # records an event
     now: Callable[[], float]  # the run's clock
-    loop: Callable[[], schema.LoopConfig]  # the loop's settings as they are now
+    loop: Callable[[], schema.LoopConfig]  # present loop settings
 
 
 class Port:
-    """Commands in, answers and status out; `run` is the name of the run folder."""
+    """Takes commands, sends answers and status; `run` is the name of the run folder."""
 
     def __init__(self, config: port.PortConfig, listeners: sockets.Listeners, run: str, hooks: RunHooks) -> None:
         self._listeners, self._run, self._hooks = listeners, run, hooks
@@ -53,7 +53,7 @@ class Port:
         self._over = False
 
     def heard(self, outputs: tick.TickOutputs) -> None:
-        """Note what a tick decided, and answer those who asked."""
+        """Note a tick's outputs, and answer the clients whose commands it took."""
         self._status = self._status.after_row(outputs.row)
         for event in outputs.events:
             self._status = self._status.after_event(event, outputs.row.mono_s)
@@ -65,14 +65,14 @@ class Port:
                 future.set_result(refusal)
 
     def told(self, event: events.Event) -> None:
-        """Note what a child process reports."""
+        """Note a child process's report."""
         self._status = self._status.after_event(event)
         for session in self._sessions:
             session.event(event)
 
     @contextlib.asynccontextmanager
     async def open(self) -> AsyncIterator[None]:
-        """Let clients in for the length of a `with` block."""
+        """Accept clients for the duration of a `with` block."""
         listeners = self._listeners
         asked: list[tuple[str, socket.socket, Welcome]] = []
         if listeners.unix is not None:
@@ -99,7 +99,7 @@ class Port:
                 await endpoint.close()
 
     def status(self) -> dict[str, Any]:
-        """What `status` answers and `watch` streams."""
+        """The status for `status` and `watch`."""
         return {
             "run": self._run,
             **status_table(self._status),
@@ -109,7 +109,7 @@ class Port:
         }
 
     def metrics(self) -> str:
-        """The same for Prometheus."""
+        """The status for Prometheus."""
         return metrics_text(self._status, len(self._sessions), self._refusals.count)
 
     def _turned_away(self, who: str, reason: str) -> None:
@@ -127,7 +127,7 @@ class Port:
         assert self._listeners.tls is not None
         try:
             wire = await protocol.Wire.on(connection, self._listeners.tls.context)
-        except OSError as error:  # no certificate, an expired one, one of a stranger, no TLS at all, too slow
+        except OSError as error:  # certificate missing, expired or foreign; no TLS at all; too slow
             self._refusals.record("tls:unknown", "", f"handshake: {error}")
             return
         let_in()
@@ -165,7 +165,7 @@ class Port:
             self._turn_out(min(crowd, key=lambda session: session.heard_s), "too many connections: silent longest")
 
     async def _answer(self, session: PortSession, request: protocol.Request) -> dict[str, Any]:
-        """Do what is asked, or say why not; the controller records its own refusals."""
+        """Execute a request or answer why not; the controller records its own refusals."""
         peer = session.peer
         refusal = may_not(peer, request.do) or self._claim_command(peer, request)
         if not refusal and request.do not in commands.TABLE:
@@ -191,9 +191,7 @@ class Port:
             self._tell(run_events.CommanderChanged(peer.who, former or None, request.why))
             for session in self._sessions:
                 if session.peer.who == former:
-                    session.notice(
-                        f"{peer.who} has taken over the command" + (f": {request.why}" * bool(request.why))
-                    )
+                    session.notice(f"{peer.who} has taken over command" + (f": {request.why}" * bool(request.why)))
         return refusal
 
     def _run_errand(self, session: PortSession, request: protocol.Request) -> dict[str, Any]:
@@ -209,7 +207,7 @@ class Port:
         return {"ok": True, "status": self.status(), "loop": self._hooks.loop().model_dump()}
 
     def _command(self, peer: Peer, request: protocol.Request) -> commands.Command:
-        """The command of a request. Raises InputError for gains or an experiment that are none."""
+        """The command of a request. Raises InputError for invalid gains or an invalid experiment."""
         kind = next(kind for kind in commands.TABLE if kind == request.do)
         loop = None if request.loop is None else self._new_loop(request.loop)
         experiment = (
@@ -230,7 +228,7 @@ class Port:
         return loop
 
     async def _obeyed(self, command: commands.Command) -> str:
-        """Why the tick that took the command up refused it; empty if it obeyed."""
+        """Why the tick refused the command; empty if it executed it."""
         if self._over:
             return _OVER
         future: asyncio.Future[str] = asyncio.get_running_loop().create_future()
@@ -240,13 +238,13 @@ class Port:
             async with asyncio.timeout(_ANSWER_S):
                 return await future
         except TimeoutError:
-            return f"no tick took it up within {_ANSWER_S:g} s; it may still be obeyed"
+            return f"no tick took it within {_ANSWER_S:g} s; it may still be executed"
         finally:
             self._waiting.pop(command.number, None)
 
 
-# Prometheus text on localhost: every field of the newest tick as a gauge, and a few counts. Names keep the project's
-# units (`membrane_error_um`), as in alarms and telemetry.
+# Prometheus text on localhost: every field of the newest tick as a gauge, and a few counts. Names carry the units
+# (`membrane_error_um`), as in alarms and telemetry.
 
 _REQUEST_S = 2.0
 _COUNTERS = {"tick": "ticks_total", "missed_ticks": "missed_ticks_total"}
@@ -296,7 +294,7 @@ async def serve_metrics(connection: socket.socket, text: Callable[[], str]) -> N
 
 
 def status_table(status: run_status.RunStatus) -> dict[str, Any]:
-    """The status for people and programs: names instead of codes, None for what is not there."""
+    """The status for people and programs: names instead of codes, None for missing values."""
     row = status.row
     if row is None:
         return {"state": "starting", "why": "no tick has run yet"}

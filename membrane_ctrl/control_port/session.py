@@ -14,28 +14,28 @@ from membrane_ctrl.model.events import Event
 _RANK: dict[Role, int] = {"read": 0, "operate": 1, "tune": 2}
 _ERRANDS: dict[str, Role] = {"status": "read", "watch": "read", "release": "operate", "quiet": "operate"}
 
-# Nobody has to have the command for these: what stops the pump is always taken, the others move nothing
+# These need no command: stopping the pump is always accepted, and the others move nothing
 FREE = frozenset({"status", "watch", "stop", "latch", "mark", "release", "quiet"})
 
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """Who is at the other end of a connection: `unix:NAME` or `tls:NAME`, as the system or a certificate says."""
+    """The peer of a connection: `unix:NAME` or `tls:NAME`, as given by the system or a certificate."""
 
     who: str
     role: Role
 
 
 def may_not(peer: Peer, do: Action) -> str:
-    """Why the peer may not ask this at all; empty if it may."""
+    """Why the peer's role forbids this request; empty if it does not."""
     needed = TABLE[do].role if do in TABLE else _ERRANDS[do]
     if _RANK[peer.role] >= _RANK[needed]:
         return ""
-    return f"{do} takes the role {needed}; {peer.who} has {peer.role}"
+    return f"{do} needs the role {needed}; {peer.who} has {peer.role}"
 
 
 class Commander:
-    """One commander at a time: the first to command, until it releases the command, loses it, or is idle too long."""
+    """One commander at a time: the first client to command, until it releases or loses command or idles too long."""
 
     def __init__(self, lapses_s: float) -> None:
         self._lapses_s = lapses_s
@@ -43,26 +43,26 @@ class Commander:
         self._last_s = -math.inf
 
     def holder(self, now_s: float) -> str:
-        """Who has the command; empty if nobody has."""
+        """Who has command; empty if nobody."""
         return self._holder if now_s - self._last_s <= self._lapses_s else ""
 
     def claim(self, who: str, take_over: bool, now_s: float) -> str:
-        """Take or keep the command; returns why not, or an empty text."""
+        """Take or keep command; returns why not, or an empty text."""
         holder = self.holder(now_s)
         if holder not in ("", who) and not take_over:
-            return f"{holder} has the command; take it over (--take-over) or wait until it is given back"
+            return f"{holder} has command; take over with --take-over, or wait for its release"
         self._holder, self._last_s = who, now_s
         return ""
 
     def release(self, who: str) -> None:
-        """Release the command, if `who` has it."""
+        """Release command, if `who` has it."""
         if self._holder == who:
             self._holder = ""
 
 
-# A client that asks faster is read slower: what all of them ask together costs less than a tick in fifty
+# A client that sends faster is read more slowly: all requests together cost less than a tick in fifty
 _PAUSE_S = 0.1
-# A program that has sent so much nonsense in a row is not going to stop
+# A program that sends this many invalid requests in a row will not stop
 _NONSENSE_MOST = 10
 
 Answer = Callable[["PortSession", Request], Awaitable[dict[str, Any]]]
@@ -74,13 +74,13 @@ class PortSession:
 
     def __init__(self, wire: Wire, peer: Peer, status: Callable[[], dict[str, Any]]) -> None:
         self.peer = peer
-        self.heard_s = asyncio.get_running_loop().time()  # when the peer last asked something
+        self.heard_s = asyncio.get_running_loop().time()  # time of the peer's last request
         self._wire = wire
         self._status = status
         self._watch: asyncio.Task[None] | None = None
 
     async def run(self, greeting: dict[str, Any], answer: Answer, refused: Refused) -> None:
-        """Answer line after line until the peer goes."""
+        """Answer requests until the peer disconnects."""
         try:
             self._wire.send(greeting)
             await self._converse(answer, refused)
@@ -117,7 +117,7 @@ class PortSession:
             self._wire.send({"notice": text})
 
     def event(self, event: Event) -> None:
-        """Send an event to a peer that watches."""
+        """Send an event to a watching peer."""
         if self._watch is not None:
             with contextlib.suppress(SlowReaderError):
                 self._wire.send({"event": event.to_dict()})
@@ -135,6 +135,6 @@ class PortSession:
                 self._wire.send({"status": self._status()})
 
     def drop(self, why: str) -> None:
-        """End the connection, with a last word."""
+        """End the connection with a last message."""
         self.notice(why)
         self._wire.abort()

@@ -1,8 +1,8 @@
 """The sockets of the port: a socket file, TLS on TCP, metrics; bound before anything else of the run exists.
 
-The file system decides who may use the socket file, and its owner may tune. On TCP nobody gets in without a
-certificate signed by the configured authority: its common name (CN) is the peer's name, its organisational unit (OU)
-the role (read, operate or tune); without one of these the peer may only read.
+File permissions decide who may use the socket file; its owner may tune. On TCP every client needs a certificate
+signed by the configured authority: its common name (CN) is the peer's name, its organisational unit (OU) the role
+(read, operate or tune); if one of them is missing, the peer may only read.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ from membrane_ctrl.model.errors import DeviceError, InputError, os_reason
 
 SOCKET_NAME = "control.sock"
 _MODE = 0o660
-_PATH_BYTES = 107  # of `sun_path`, its closing zero left out
+_PATH_BYTES = 107  # of `sun_path`, without its final zero
 _CREDENTIALS = struct.Struct("3i")  # pid, uid, gid of SO_PEERCRED, unix(7)
 _SOMEBODY_THERE_S = 1.0
 
@@ -39,7 +39,7 @@ class UnixListener:
 
     def __init__(self, path: Path, group: str | None, group_role: Role) -> None:
         self._path, self._group_role = path, group_role
-        # looked up now, as a name service may take its time and a tick has none
+        # looked up now: a name service may be too slow for a tick
         self._names = {entry.pw_uid: entry.pw_name for entry in pwd.getpwall()}
         try:
             self._made_folder = not path.parent.exists()
@@ -52,14 +52,14 @@ class UnixListener:
         self._inode = path.stat().st_ino
 
     def peer(self, connection: socket.socket) -> session.Peer:
-        """Who has connected, as the kernel says."""
+        """Identity of the client, from the kernel."""
         raw = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
         _, uid, _ = _CREDENTIALS.unpack(raw)
         role: Role = "tune" if uid in (0, os.getuid()) else self._group_role
         return session.Peer(f"unix:{self._names.get(uid, uid)}", role)
 
     def close(self) -> None:
-        """Close it and remove the file, unless it has become another's; a folder made for it goes too, if empty."""
+        """Close it and remove the file, unless replaced by another; remove an empty folder made for it."""
         self.socket.close()
         with contextlib.suppress(OSError):
             if self._path.stat().st_ino == self._inode:
@@ -69,7 +69,7 @@ class UnixListener:
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove a socket file that nobody listens on: its owner was killed."""
+    """Remove a socket file without a listener, left by a killed process."""
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:
@@ -77,7 +77,7 @@ def _remove_stale(path: Path) -> None:
     if not stat.S_ISSOCK(mode):
         raise InputError(f"{path}: exists and is not a socket; remove it, or choose another path with port.socket")
     with socket.socket(socket.AF_UNIX) as probe, short(path) as address:
-        probe.settimeout(_SOMEBODY_THERE_S)  # of a listener that hangs the queue may be full
+        probe.settimeout(_SOMEBODY_THERE_S)  # a hung listener's queue may be full
         try:
             probe.connect(address)
         except ConnectionRefusedError:
@@ -92,7 +92,7 @@ def _remove_stale(path: Path) -> None:
 
 def _bound(path: Path, group: str | None) -> socket.socket:
     listener = socket.socket(socket.AF_UNIX)
-    umask = os.umask(0o777 & ~_MODE)  # the file must at no moment let in more than it shall
+    umask = os.umask(0o777 & ~_MODE)  # the file must never have wider permissions
     try:
         with short(path) as address:
             listener.bind(address)
@@ -102,7 +102,7 @@ def _bound(path: Path, group: str | None) -> socket.socket:
     except KeyError:
         listener.close()
         path.unlink()
-        raise InputError(f"port.group: this machine has no group {group!r}") from None
+        raise InputError(f"port.group: no group {group!r} on this machine") from None
     except OSError:
         listener.close()
         raise
@@ -114,7 +114,7 @@ def _bound(path: Path, group: str | None) -> socket.socket:
 
 @contextlib.contextmanager
 def short(path: Path) -> Iterator[str]:
-    """A name for the path that fits a socket address: itself, or one by way of its folder's open descriptor."""
+    """A path that fits a socket address: itself, or one through its folder's open descriptor."""
     if len(os.fsencode(path)) <= _PATH_BYTES:
         yield str(path)
         return
@@ -139,7 +139,7 @@ class TlsListener:
         self.socket = listen_tcp(config.host, config.port, "port.tls")
 
     def peer(self, certificate: dict[str, Any]) -> session.Peer:
-        """Name and role of a certificate (of `getpeercert`); the record needs a name: without, it may only read."""
+        """Name and role in a certificate (from `getpeercert`); without a name, which commands record, read only."""
         subject = {key: value for part in certificate.get("subject", ()) for key, value in part}
         name = "".join(c for c in subject.get("commonName", "") if c.isprintable()).strip()
         if not name:
@@ -148,7 +148,7 @@ class TlsListener:
         return session.Peer(who, _ROLES.get(subject.get("organizationalUnitName", ""), "read"))
 
     def lasts_s(self, certificate: dict[str, Any]) -> float:
-        """How long the certificate is valid from now on: a connection must not outlive it."""
+        """Remaining validity of the certificate: a connection must not outlive it."""
         return ssl.cert_time_to_seconds(certificate["notAfter"]) - time.time()
 
     def close(self) -> None:
@@ -157,18 +157,18 @@ class TlsListener:
 
 
 def server_context(config: TlsConfig) -> ssl.SSLContext:
-    """TLS 1.3, and a client certificate or nothing. Raises InputError naming the file."""
+    """TLS 1.3 with a mandatory client certificate. Raises InputError naming the file."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.verify_mode = ssl.CERT_REQUIRED
-    context.num_tickets = 0  # a resumed session would not look at the certificate's date again
+    context.num_tickets = 0  # a resumed session would not check the certificate's date again
     load_pair(context, Path(config.certificate_file), Path(config.key_file))
     load_authority(context, Path(config.client_ca_file))
     return context
 
 
 def client_context(certificate: Path, key: Path, authority: Path) -> ssl.SSLContext:
-    """The other side of `server_context`. Raises InputError naming the file."""
+    """The client's counterpart of `server_context`. Raises InputError naming the file."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     load_pair(context, certificate, key)
@@ -177,22 +177,22 @@ def client_context(certificate: Path, key: Path, authority: Path) -> ssl.SSLCont
 
 
 def load_pair(context: ssl.SSLContext, certificate: Path, key: Path) -> None:
-    """The own certificate and its key, which must not ask for a password. Raises InputError."""
+    """Load our certificate and its key, which must not need a password. Raises InputError."""
     for path in (certificate, key):
         _require_readable(path)
     try:
         context.load_cert_chain(certificate, key, password=lambda: "")
     except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
-        raise InputError(f"{certificate}, {key}: not a certificate with its unencrypted key ({error})") from None
+        raise InputError(f"{certificate}, {key}: not a certificate and its unencrypted key ({error})") from None
 
 
 def load_authority(context: ssl.SSLContext, authority: Path) -> None:
-    """Whose signature counts. Raises InputError."""
+    """Load the trusted authority. Raises InputError."""
     _require_readable(authority)
     try:
         context.load_verify_locations(authority)
     except (OSError, ValueError) as error:
-        raise InputError(f"{authority}: not a certificate of an authority ({error})") from None
+        raise InputError(f"{authority}: not an authority's certificate ({error})") from None
 
 
 def listen_tcp(host: str, port: int, field: str) -> socket.socket:
@@ -224,7 +224,7 @@ class Listeners:
 
     @property
     def addresses(self) -> dict[str, str]:
-        """Where they are, for people."""
+        """Their addresses, for people."""
         found = {"socket": str(self.path)} if self.unix else {}
         tcp = {"tls": self.tls.socket if self.tls else None, "metrics": self.metrics}
         for name, listener in tcp.items():
@@ -235,7 +235,7 @@ class Listeners:
 
 
 def listeners_for(config: PortConfig, logs_dir: Path, stack: contextlib.ExitStack) -> Listeners:
-    """Bind what the configuration asks for; the stack closes it. Raises InputError or DeviceError."""
+    """Bind the configured sockets; the stack closes them. Raises InputError or DeviceError."""
     if not config.enabled:
         return Listeners()
     path = Path(config.socket) if config.socket else logs_dir / SOCKET_NAME

@@ -1,7 +1,7 @@
-"""All that a controller remembers, as bytes, so that a replay can begin in the middle of a run, to the last bit.
+"""A controller's complete memory as bytes, so that a bit-exact replay can start in the middle of a run.
 
 Compressed JSON (`object_codec`). A run folder may come from anywhere: every attribute is checked against today's
-code, and memory of another layout is refused. The run's configuration is not in it, as the folder has it.
+code, and memory of another layout is refused. It omits the run's configuration, which the folder holds.
 """
 
 import json
@@ -21,11 +21,11 @@ _BYTES_MAX = 1 << 20  # a memory takes some 30 kB, decompressed
 
 
 class UnknownMemoryError(ValueError):
-    """Damaged, or of another layout; the message says what."""
+    """The memory is damaged or of another layout; the message says which."""
 
 
 def remember(controller: Controller) -> bytes:
-    """The controller's memory; empty during an experiment, which cannot be written down."""
+    """Encode the controller's memory; empty during an experiment, which cannot be encoded."""
     try:
         plain = object_codec.encode(controller, _specials(controller._config))
     except TypeError:
@@ -34,7 +34,7 @@ def remember(controller: Controller) -> bytes:
 
 
 def recall(memory: bytes, fresh: Controller) -> Controller:
-    """The controller of `remember`; `fresh` is a new one of the same configuration. Raises UnknownMemoryError."""
+    """Restore a memory into `fresh`, a new controller of the same configuration. Raises UnknownMemoryError."""
     config = fresh._config
     examples = (fresh, pump_obeys.ActuatorTest(config.pump, test_vent=True, rate_hz=config.loop.rate_hz))
     decoder = object_codec.Decoder(examples, _specials(config))
@@ -42,7 +42,7 @@ def recall(memory: bytes, fresh: Controller) -> Controller:
         expander = zlib.decompressobj()
         text = expander.decompress(memory, _BYTES_MAX)
         if not expander.eof:
-            raise object_codec.CodecError("it ends early, or is too long")
+            raise object_codec.CodecError("truncated or too long")
         controller = decoder.decode(json.loads(text), Controller)
     except (zlib.error, ValueError, RecursionError) as error:
         raise UnknownMemoryError(f"the recorded memory cannot be used: {error}") from None
@@ -51,7 +51,7 @@ def recall(memory: bytes, fresh: Controller) -> Controller:
 
 
 def _specials(config: Config) -> object_codec.Specials:
-    """What a memory holds that is not written attribute by attribute."""
+    """Types in a memory that are not encoded attribute by attribute."""
     sections = {"": config} | {name: getattr(config, name) for name in Config.model_fields}
     names = {id(section): name for name, section in sections.items()}
 
@@ -87,8 +87,8 @@ def _rule(data: Any, _: type) -> safety_rules.Rule:
 
 
 def _no_trial(_: Trial) -> Any:
-    raise TypeError("an experiment cannot be written down")
+    raise TypeError("an experiment cannot be encoded")
 
 
 def _no_trial_again(_: Any, __: type) -> Any:
-    raise object_codec.CodecError("an experiment is not taken up again")
+    raise object_codec.CodecError("an experiment cannot be continued")

@@ -1,4 +1,4 @@
-"""From a tick's inputs to the observation that safety judges and the reading that the loop may use."""
+"""Turns a tick's inputs into the observation that safety judges and the reading that the loop may use."""
 
 import math
 
@@ -6,17 +6,17 @@ from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller import safety_rules, tick
 
-_SLACK_PA = 20.0  # below it the gauge of a slack film may repeat its zero for hours
+_SLACK_PA = 20.0  # below it a slack film's gauge may repeat its zero for hours
 
 
 class _Repeats:
-    """How long a value has been equal to the last bit."""
+    """How long a value has been bit-identical."""
 
     def __init__(self) -> None:
         self._value = self._since_s = math.nan
 
     def same_s(self, value: float, now_s: float) -> float:
-        """In seconds; NaN changes nothing."""
+        """Add a value and return the time in seconds; NaN changes nothing."""
         if math.isfinite(value) and value != self._value:
             self._value, self._since_s = value, now_s
         return 0.0 if math.isnan(self._since_s) else now_s - self._since_s
@@ -25,7 +25,7 @@ class _Repeats:
 class _Jumps:
     """Refuses values impossibly far from the last good one; accepts the new place after ten in a row.
 
-    By then the safety table has tripped, and the film may really have moved unseen.
+    By then the safety table has tripped, and the film may indeed have moved unseen.
     """
 
     def __init__(self, step_max: float) -> None:
@@ -34,7 +34,7 @@ class _Jumps:
         self.count = 0
 
     def refuse(self, value: float) -> bool:
-        """Whether a value is a jump; NaN is none."""
+        """Whether a value is a jump; NaN is not."""
         if not math.isfinite(value):
             return False
         if abs(value - self._good) > self._step_max and self.count < 10:
@@ -46,7 +46,7 @@ class _Jumps:
 
 
 class Observer:
-    """Remembers what is needed to see stale, frozen and jumping input.
+    """Detects stale, frozen and jumping input.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Observer:
     displacement_um : float
         The laser reading that the loop may use; NaN without one.
     gauge_pressure_pa : float
-        The gauge's reading; NaN without one, or for a jump, which limits are judged on all the same.
+        The gauge reading; NaN without one or for a jump. The limits judge jumps too.
     commanded : tuple of float
         The last two pump commands, newest first.
     """
@@ -71,11 +71,11 @@ class Observer:
         self.displacement_um = self.gauge_pressure_pa = math.nan
 
     def wrote(self, command: BenchCommand) -> None:
-        """Note the tick's command, to compare it with the next read-backs."""
+        """Note the tick's command for comparison with the next read-backs."""
         self.commanded = (command.pump_fraction, self.commanded[0])
 
     def look(self, inputs: tick.TickInputs) -> None:
-        """Take the tick's reading: what is new, and what is a jump."""
+        """Take the tick's reading and find what is new or a jump."""
         reading = self.reading = inputs.reading
         now_s = inputs.now_s
         if math.isnan(self._last_read_s):  # ages count from the first tick
@@ -91,7 +91,7 @@ class Observer:
         self.gauge_pressure_pa = math.nan if self._gauge_jumps.refuse(gauge_pa) else gauge_pa
 
     def observe(self, inputs: tick.TickInputs, error_um: float) -> safety_rules.Observation:
-        """What the tick's inputs show, after `look`; what the control code knows itself is left empty."""
+        """Return what the inputs show, after `look`; the control code fills in what it knows itself."""
         reading, now_s = self.reading, inputs.now_s
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
         return safety_rules.Observation(
@@ -130,9 +130,9 @@ class Observer:
     def _mismatch(self, reading: BenchReading | None) -> float:
         """Distance of the read-back from the nearer of the last two commands: a tick of transport is no mismatch."""
         if reading is None:
-            return 0.0  # no reading has its own rules
+            return 0.0  # missing readings have rules of their own
         if not math.isfinite(reading.pump_fraction):
-            return math.inf  # nobody knows what the pump does
+            return math.inf  # the pump's state is unknown
         return min(abs(reading.pump_fraction - command) for command in self.commanded)
 
 

@@ -1,7 +1,7 @@
 """Does the pump obey? Its standstill when commanded off, and the actuator test before a hold. Pure.
 
-A pump that runs on shows in its read-back; if that is wrong, in the mirror, which rises although gas can only leak
-out. Warmer gas and a falling barometer lift it as well; both are measured and allowed for.
+A pump that still runs shows in its read-back or, if that is wrong, in a mirror that rises although gas can only leak
+out. Warmer gas and a falling barometer lift the mirror too; both are measured and allowed for.
 """
 
 import math
@@ -13,7 +13,7 @@ from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, StatesConfig
 from membrane_ctrl.control.filters import Slope
 
-# A flow controller's zero and a tachometer's last count are below this; a pump moves nothing below 0.1
+# A flow controller's zero and a tachometer's last count are below this; no pump moves gas below 0.1
 OFF_FRACTION = 0.02
 # Readings are averaged over blocks, which leaves 0.2 um and 0.1 Pa of noise at 50 Hz
 _BLOCK_S = 0.5
@@ -24,7 +24,7 @@ _RISE_MAX_UM = 30.0
 _PA_PER_UM = 0.05  # 3p/s is 0.065 Pa/um at the working point; less makes the gauge the slower check
 # The gas follows the air within 12 s: a change up to 40 s before the window still moves the mirror in it
 _WEATHER_BLOCKS = 120
-# The end of a run waits for so many blocks that show no rise as steep as a pump's: 3 um/s (weather: 2.2 um/s)
+# The end of a run waits for this many blocks without a rise as steep as a pump's: 3 um/s (weather: 2.2 um/s)
 _REST_BLOCKS = 5
 _REST_RISE_MAX_UM = 6.0
 
@@ -34,18 +34,18 @@ _Block = tuple[float, float, float, float, float]
 
 
 class Standstill:
-    """What is seen of the pump since it was commanded off.
+    """Observations of the pump since it was commanded off.
 
     Attributes
     ----------
     seen_off : bool
-        The newest reading, taken after a command of 0, says that the pump stands.
+        The newest reading, taken after a command of 0, shows the pump at rest.
     runs_on : str
         The read-back of a pump that should have stopped; empty if all is well.
     inflow : str
-        How the mirror rises although the pump is commanded off; empty if it does not.
+        Rise of the mirror although the pump is commanded off; empty if there is none.
     silent_s : float
-        Since the last reading.
+        Time since the last reading.
     """
 
     def __init__(self, loop: LoopConfig, states: StatesConfig) -> None:
@@ -60,7 +60,7 @@ class Standstill:
 
     @property
     def at_rest(self) -> bool:
-        """The pump stands by its read-back, and the mirror has not risen as by a pump for two seconds."""
+        """The read-back shows the pump at rest, and for two seconds the mirror has not risen as if pumped."""
         if not self.seen_off or len(self._blocks) < _REST_BLOCKS:
             return False
         rise_um = self._blocks[-1][1] - self._blocks[-_REST_BLOCKS][1]
@@ -78,7 +78,7 @@ class Standstill:
             self.seen_off, self.runs_on, self.inflow = False, "", ""
             return
         if not link_up:
-            self._on_since_s = math.nan  # what was commanded meanwhile has not arrived
+            self._on_since_s = math.nan  # commands sent meanwhile have not arrived
         if reading is None:
             self.seen_off = False
             return
@@ -86,7 +86,7 @@ class Standstill:
         self._look_at_mirror(now_s, reading)
 
     def _look_at_readback(self, now_s: float, readback: float) -> None:
-        self.seen_off = readback <= OFF_FRACTION  # false for NaN: what is not seen to stand may run
+        self.seen_off = readback <= OFF_FRACTION  # false for NaN: an unseen pump may run
         if self.seen_off:
             self._on_since_s, self.runs_on = math.nan, ""
             return
@@ -123,7 +123,7 @@ class Standstill:
         self.inflow = self._rise()
 
     def _rise(self) -> str:
-        """Laser and gauge must both show a rise beyond the weather's; without one of them the other decides."""
+        """Rise beyond the weather's in both laser and gauge; if one is missing, the other decides."""
         last = self._blocks[-1]
         first = next((block for block in reversed(self._blocks) if last[0] - block[0] >= _WINDOW_S), None)
         if first is None:
@@ -149,7 +149,7 @@ def _range(values: Iterable[float]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A part of the actuator test: commands, time for the response (lag 0.15 s, transport 0.1 s), time to measure."""
+    """A part of the actuator test: commands, response time (lag 0.15 s, transport 0.1 s), measuring time."""
 
     name: str
     pump_fraction: float
@@ -158,14 +158,14 @@ class Part:
     measure_s: float
 
 
-# The vent costs 7 um of height, which the pump has to bring back. The pump comes last and at 0.8: what it adds is on
-# the way to the setpoint anyway.
+# The vent costs 7 um of height, which the pump must restore. The pump comes last, at 0.8: its gas is needed on the
+# way to the setpoint anyway.
 PARTS = (
     Part("off", 0.0, 0.0, 0.0, 1.2),
     Part("vent", 0.0, 0.08, 0.35, 0.5),
     Part("pump", 0.8, 0.0, 0.5, 1.0),
 )
-_RATE_HZ = 50.0  # to which the parts' times belong
+_RATE_HZ = 50.0  # tick rate of the parts' times
 # At 50 Hz and with 1 um of noise the vent's speed has a standard deviation of 1.4 um/s, the pump's 0.6 um/s, and the
 # means of two 1.0 and 0.4 um/s. Three of them are clear; two and a half decide in the end.
 _VENT_CLEAR_UM_PER_S, _VENT_LEAST_UM_PER_S = 4.5, 2.5
@@ -173,20 +173,20 @@ _PUMP_CLEAR_SHARE, _PUMP_LEAST_SHARE, _PUMP_MOST_SHARE = 0.5, 0.3, 3.0
 
 
 class ActuatorTest:
-    """Does the film respond to vent and pump? Each tick obeys the commands of `part`, and gives `step` its reading.
+    """Does the film respond to vent and pump? Each tick executes the commands of `part` and gives `step` its reading.
 
     The speed of the centre in each part is the slope of the laser readings. The test checks sign and size within a
     factor: it finds a disconnected hose, a stuck valve or a laser on the wrong spot, not a pump 30 % too weak. After
-    an unclear response it runs again; then a clear response is enough, otherwise the mean of both decides. With 1 um
-    of noise a good bench needs that in one start of a hundred.
+    an unclear response it runs again; then a clear response suffices, otherwise the mean of both decides. With 1 um
+    of noise a good bench needs the second run in one start of a hundred.
 
     Parameters
     ----------
     pump : PumpConfig
     test_vent : bool
-        The bench has a vent, and the mirror has pressure to release.
+        Whether the bench has a vent and the mirror pressure to release.
     rate_hz : float
-        Tick rate; fewer readings a second take longer to show a slope.
+        Tick rate; fewer readings per second take longer to show a slope.
     """
 
     def __init__(self, pump: PumpConfig, test_vent: bool, rate_hz: float) -> None:
@@ -201,24 +201,24 @@ class ActuatorTest:
         self._elapsed_s = 0.0
 
     def again(self) -> None:
-        """Begin once more; what is unclear again is judged by the mean of both."""
+        """Start the second run; the mean of both decides if it is unclear too."""
         self._before = {name: slope.per_s for name, slope in self._speeds.items()}
         self._speeds = {part.name: Slope() for part in self._parts}
         self._elapsed_s = 0.0
 
     @property
     def is_second(self) -> bool:
-        """The test runs for the second and last time."""
+        """Whether the test runs for the second and last time."""
         return bool(self._before)
 
     @property
     def duration_s(self) -> float:
-        """Of all parts together."""
+        """Total duration of all parts."""
         return sum(part.wait_s + part.measure_s for part in self._parts)
 
     @property
     def part(self) -> Part | None:
-        """The part that is running; None when all are done."""
+        """The running part; None when all are done."""
         left_s = self._elapsed_s
         for part in self._parts:
             if left_s < part.wait_s + part.measure_s - 1e-9:
@@ -242,7 +242,7 @@ class ActuatorTest:
         return max(0.0, -self._speeds["off"].per_s)
 
     def failure(self) -> str:
-        """What did not respond, or on the first run not clearly; empty if all did."""
+        """What failed to respond, or in the first run to respond clearly; empty if nothing."""
         speeds = {name: slope.per_s for name, slope in self._speeds.items()}
         unclear = self._judged(speeds, _VENT_CLEAR_UM_PER_S, _PUMP_CLEAR_SHARE)
         if not (unclear and self._before):

@@ -1,4 +1,4 @@
-"""What the sensors of a held mirror show about each other and about the film: which is wrong, what wears out."""
+"""Compares the sensors of a held mirror with each other and the film: which is wrong, what is wearing out."""
 
 import math
 from dataclasses import dataclass
@@ -10,21 +10,21 @@ from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver, Plau
 from membrane_ctrl.model.states import State
 
 _WEATHER_STANDS_S = 10.0  # a single bad answer is not reported
-# No two cycles have the same noise; a shape that comes twice may be the same message
+# No two cycles have the same noise; a shape that appears twice may be a repeated message
 _REPEATS = 3
 
 
 @dataclass(frozen=True, slots=True)
 class HoldStatus:
-    """How the mirror is held."""
+    """State of the held mirror."""
 
-    # NaN for readings that are old, bad or a jump: a mean over ten seconds must not take in a bit error
+    # NaN for old or bad readings and jumps: a mean over ten seconds must not include a bit error
     laser_um: float
     gauge_pressure_pa: float
     setpoint_um: float  # as commanded
     trim_um: float  # by the shape loop
-    # what is left of the setpoint's ramp. The camera sees the film of a cycle ago, and the gauge is linear only near
-    # its reference: on a long ramp they would contradict a correct laser
+    # the rest of the setpoint's ramp. The camera lags by a cycle, and the gauge is linear only near its reference: on
+    # a long ramp they would contradict a correct laser
     ramp_left_um: float
     leak_um_per_s: float  # as the inner loop estimates it; NaN without
     flow_um_per_s: float  # of the pump; NaN without
@@ -32,14 +32,14 @@ class HoldStatus:
 
 
 class SensorConsistency:
-    """Asked on every tick, before safety judges.
+    """Consulted on every tick, before safety judges.
 
     Attributes
     ----------
     laser_lies, laser_gauge_apart, gas_excess : str
         As in `Observation`.
     camera_lies : str
-        What laser, gauge and camera show, if the camera is wrong: a reason for the shape loop.
+        Readings of laser, gauge and camera, if the camera is wrong: a reason for the shape loop.
     """
 
     def __init__(self, config: Config) -> None:
@@ -59,7 +59,7 @@ class SensorConsistency:
         self.laser_lies = self.camera_lies = self.laser_gauge_apart = self.gas_excess = ""
 
     def ask(self, inputs: tick.TickInputs, state: State, dt_s: float, held: HoldStatus) -> list[Event]:
-        """Look at a tick, and return what is new; only a held mirror is judged."""
+        """Observe a tick and return its new events; judges only a held mirror."""
         laser_um, gauge_pa = held.laser_um, held.gauge_pressure_pa
         if held.setpoint_um != self._setpoint_um:
             self._setpoint_um = held.setpoint_um
@@ -83,7 +83,7 @@ class SensorConsistency:
         return events
 
     def _rest(self) -> list[Event]:
-        """The mirror is not held, or not yet at its setpoint."""
+        """Reset: the mirror is not held, or not yet at its setpoint."""
         self._growth.moves()
         self.gas_excess = ""
         if self._plausibility.watching:
@@ -91,7 +91,7 @@ class SensorConsistency:
         return self._judge(film.Liar.NOBODY)
 
     def _look_at_camera(self, inputs: tick.TickInputs) -> None:
-        """Note when the camera last saw the film, and how often it repeated one shape to the last bit."""
+        """Note when the camera last saw the film, and how often it repeated one shape bit by bit."""
         estimate = inputs.estimate
         if estimate is None or estimate.verdict == "rejected":
             return
@@ -100,7 +100,7 @@ class SensorConsistency:
         self._sag_um = estimate.sag_um
 
     def _most_growth(self, inputs: tick.TickInputs) -> float:
-        """How far the leak may grow: without limit while the camera agrees with the laser."""
+        """Allowed growth of the leak: unlimited while the camera agrees with the laser."""
         if self._repeats >= _REPEATS:
             return self._leak_growth_max
         if not inputs.now_s - self._camera_s <= self._fresh_s:
@@ -108,7 +108,7 @@ class SensorConsistency:
         return math.inf if self._liar == film.Liar.NOBODY else film.CONTRADICTED_MOST
 
     def _judge_weather(self, inputs: tick.TickInputs, dt_s: float) -> list[Event]:
-        """Report once that a barometer or thermometer cannot be right; the loop ignores it."""
+        """Report once that a barometer or thermometer is implausible; the loop ignores it."""
         reading = inputs.reading
         if reading is None:
             return []
@@ -127,7 +127,7 @@ class SensorConsistency:
             self.camera_lies = "the camera repeats one shape to the last bit: restart it"
         elif liar != film.Liar.OPTICS:
             self.camera_lies = ""
-        elif not self.camera_lies:  # a reason whose numbers change is not a new one
+        elif not self.camera_lies:  # changed numbers do not make a new reason
             self.camera_lies = f"laser and gauge agree that the camera is wrong: {seen}"
         if liar == self._liar:
             return []

@@ -1,7 +1,7 @@
 """A geometry in a file: by hand, of another set, or the `geometry.toml` that `calibrate` writes.
 
-Of the last also the lens and the screen's pitch count, if they were calibrated. Its `[calibration]` carries a hash of
-its numbers, which results and runs name; a file whose numbers are no longer those is refused.
+The latter also gives the lens and the screen's pitch, if calibrated. Its `[calibration]` carries a hash of its
+numbers, which results and runs name; a file with edited numbers is refused.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ Table = TypeVar("Table", bound=Section)
 
 
 class LensTable(Section):
-    """`[camera]` of a calibrated geometry: the lens, and the camera that it belongs to."""
+    """`[camera]` of a calibrated geometry: the lens, and the camera it belongs to."""
 
     width_px: int
     height_px: int
@@ -29,12 +29,12 @@ class LensTable(Section):
     distortion: tuple[float, ...] = ()
 
     def over(self, camera: CameraConfig, where: Path) -> CameraConfig:
-        """The camera with this lens; raises InputError, naming the file, if it is another camera."""
+        """The camera with this lens. Raises InputError, naming the file, for a different camera."""
         for key in ("width_px", "height_px", "pixel_um"):
             if getattr(self, key) != getattr(camera, key):
                 raise errors.InputError(
                     f"{where}: camera.{key} = {getattr(self, key):g}, the frames' camera has "
-                    f"{getattr(camera, key):g}; a calibrated lens is valid for its own camera only"
+                    f"{getattr(camera, key):g}; a calibrated lens is valid only for its own camera"
                 )
         return camera.model_copy(update=self.model_dump())
 
@@ -46,7 +46,7 @@ class PitchTable(Section):
 
 
 class CalibrationTable(Section):
-    """What is read of `[calibration]`."""
+    """The fields read from `[calibration]`."""
 
     date_utc: str
     hash: str
@@ -57,31 +57,31 @@ class CalibrationTable(Section):
 
 @dataclass(frozen=True)
 class GeometryOrigin:
-    """Which geometry a result was made with."""
+    """Origin of the geometry used for a result."""
 
-    hash: str  # of its numbers: that of the file, or of what the set itself states
-    file: str = ""  # where it was read; empty for the set's own
-    calibrated_utc: str = ""  # when; empty if it is not a calibrated one
+    hash: str  # hash of its numbers, from the file or from the set's own statement
+    file: str = ""  # path; empty for the set's own
+    calibrated_utc: str = ""  # date; empty if not calibrated
 
     def table(self) -> dict[str, str | None]:
-        """For JSON."""
+        """The origin as a table for JSON."""
         return {"hash": self.hash, "file": self.file or None, "calibrated_utc": self.calibrated_utc or None}
 
 
 @dataclass(frozen=True)
 class GeometryFile:
-    """A geometry that was read."""
+    """A geometry read from a file."""
 
     path: Path
     geometry: GeometryConfig  # poses
-    lens: LensTable | None  # if they were calibrated
+    lens: LensTable | None  # None unless calibrated
     pitch: PitchTable | None
     calibration: CalibrationTable | None  # None for a file written by hand
     origin: GeometryOrigin
-    text: str  # all that the file says, the screen's height map in it and not beside it
+    text: str  # content of the file, with the screen's height map included
 
     def over(self, optics: OpticsConfig) -> OpticsConfig:
-        """The bench with this geometry instead of its own. Raises InputError if it is of another camera."""
+        """The bench with this geometry instead of its own. Raises InputError for a different camera."""
         camera, pattern = optics.camera, optics.pattern
         if self.lens is not None:
             camera = self.lens.over(camera, self.path)
@@ -92,9 +92,9 @@ class GeometryFile:
 
 
 def read_geometry(path: Path) -> GeometryFile:
-    """A geometry file: a `[geometry]` table as in `capture.toml`, its keys alone, or what `calibrate` wrote.
+    """Read a geometry file: a `[geometry]` table as in `capture.toml`, its keys alone, or a file from `calibrate`.
 
-    Raises InputError, also for calibrated numbers that were changed by hand.
+    Raises InputError, also for calibrated numbers edited by hand.
     """
     tables = toml_file.read_toml(path)
     calibrated = tables.get("schema") == plain_json.SCHEMA
@@ -110,8 +110,8 @@ def read_geometry(path: Path) -> GeometryFile:
     calibration = _part(tables, "calibration", CalibrationTable, path)
     if calibration is not None and calibration.hash != hashed:
         raise errors.InputError(
-            f"{path}: calibration.hash = {calibration.hash}, but that of the numbers is {hashed}: they were changed "
-            "after the calibration; calibrate again, or take [calibration] and schema out to use them as they are"
+            f"{path}: calibration.hash = {calibration.hash}, but the numbers have {hashed}: they were edited "
+            "after the calibration; calibrate again, or remove [calibration] and schema to use them anyway"
         )
     origin = GeometryOrigin(hashed, str(path), "" if calibration is None else calibration.date_utc)
     lens, pitch = _part(tables, "camera", LensTable, path), _part(tables, "pattern", PitchTable, path)
@@ -119,7 +119,7 @@ def read_geometry(path: Path) -> GeometryFile:
 
 
 def origin_of(optics: OpticsConfig) -> GeometryOrigin:
-    """Of a bench that states its own geometry."""
+    """Origin of a bench's own stated geometry."""
     lens = {key: getattr(optics.camera, key) for key in ("focal_mm", "distortion")}
     tables = {
         "geometry": optics.geometry.model_dump(exclude_none=True, exclude={"reference_displacement_um"}),
@@ -136,23 +136,23 @@ def _part(tables: dict[str, Any], name: str, model: type[Table], path: Path) -> 
     return None if table is None else toml_file.parse(table, model, f"{path}: {name}")
 
 
-# The geometry that a run measures with: that of `optics.geometry_file`, kept in the run's folder as it was.
+# The geometry that a run uses: that of `optics.geometry_file`, copied to the run's folder.
 
 KEPT = "geometry.toml"  # in the run's folder
 
 
 @dataclass(frozen=True)
 class InForce:
-    """What the cycles of a run measure with."""
+    """The geometry used by the cycles of a run."""
 
     optics: OpticsConfig  # the configuration's, with the calibrated geometry if there is one
-    origin: GeometryOrigin  # its name
-    calibration: CalibrationTable | None = None  # what a drift is seen against
-    text: str = ""  # what the file says; empty without one
-    note: str = ""  # why what the configuration states by hand is used although it names a file
+    origin: GeometryOrigin  # its origin
+    calibration: CalibrationTable | None = None  # reference for drift
+    text: str = ""  # content of the file; empty without one
+    note: str = ""  # why the stated geometry is used although the configuration names a file
 
     def keep(self, run_dir: Path) -> None:
-        """Leave a copy in the run's folder: whoever measures or looks back takes that. Raises InputError."""
+        """Copy the file to the run's folder, for its cycles and later reviews. Raises InputError."""
         if not self.text:
             return
         with errors.writing(run_dir / KEPT):
@@ -160,18 +160,18 @@ class InForce:
 
 
 def geometry_in_force(config: Config) -> InForce:
-    """Read the file that the configuration names.
+    """Read the file named in the configuration.
 
-    A file that is not there yet is no error: the first calibration of a bench has to be taken with what was measured
-    by hand. The note says so.
+    A missing file is not an error: the first calibration of a bench has to use the geometry measured by hand. The
+    note says so.
 
-    Raises InputError if the file is there and cannot be used.
+    Raises InputError if the file exists but cannot be used.
     """
     return _read(config.optics.geometry_file, config)
 
 
 def geometry_of_run(run_dir: Path | None, config: Config) -> InForce:
-    """The same of a run that has begun, from its folder."""
+    """The geometry in force of a started run, from its folder."""
     return _read(None if run_dir is None else run_dir / KEPT, config)
 
 
@@ -179,7 +179,7 @@ def _read(path: Path | None, config: Config) -> InForce:
     optics = config.optics
     if path is None or not path.exists():
         wanted = optics.geometry_file
-        note = f"{wanted} is not there yet: [optics.geometry] is used, as measured by hand" if wanted else ""
+        note = f"{wanted} does not exist yet: [optics.geometry] is used, as measured by hand" if wanted else ""
         return InForce(optics, origin_of(optics), note=note)
     file = read_geometry(path)
     return InForce(file.over(optics), file.origin, file.calibration, file.text)

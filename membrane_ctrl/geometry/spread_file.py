@@ -1,4 +1,4 @@
-"""How well a geometry is known, in files: its covariance, and what an auxiliary calibration has found.
+"""Files that state how well a geometry is known: its covariance, and the results of auxiliary calibrations.
 
 A geometry file carries a `[covariance]` table beside `[geometry]`: names = ["a_mm", "b_mm", "alpha_deg"], or of the
 twelve of the general form (see `metrology.uncertainty.geometry_spread`), and matrix = rows of their covariance. A
@@ -32,13 +32,13 @@ class CovarianceTable(Section):
 
 
 def read_spread(path: Path) -> GeometrySpread | None:
-    """The covariance that a geometry file gives; None if it has none. Raises InputError."""
+    """The covariance in a geometry file; None if it has none. Raises InputError."""
     table = toml_file.read_toml(path).get("covariance")
     if table is None:
         return None
     content = toml_file.parse(table, CovarianceTable, f"{path}: covariance")
     if any(len(row) != len(content.names) for row in content.matrix) or len(content.matrix) != len(content.names):
-        raise InputError(f"{path}: covariance.matrix: {len(content.names)} names need as many rows and columns")
+        raise InputError(f"{path}: covariance.matrix: needs {len(content.names)} rows and columns, one per name")
     try:
         return GeometrySpread(content.names, np.array(content.matrix, float))
     except ValueError as error:
@@ -46,12 +46,12 @@ def read_spread(path: Path) -> GeometrySpread | None:
 
 
 def spread_of(geometry: schema.GeometryConfig, file: Path | None) -> tuple[GeometrySpread, str]:
-    """How well a geometry is known, and where that is said; the first that there is.
+    """How well a geometry is known, and the source of that; the first available of:
 
-    The file's covariance, the geometry's own sigmas, the paper's instruments for the short form. A general form
+    the file's covariance, the geometry's own sigmas, the paper's instruments for the short form. A general form
     without a covariance is taken as exact.
 
-    Raises InputError if the file's covariance is of the other form.
+    Raises InputError if the file's covariance is for the other form.
     """
     given = None if file is None else read_spread(file)
     if given is not None:
@@ -72,9 +72,9 @@ SCHEMA = "membrane-prior/1"
 
 
 class PriorFile(Section):
-    """The file.
+    """The file of a prior.
 
-    `camera` and `geometry` stand instead of what the sets state; `sigmas` are those of `calibrate`'s parameters.
+    `camera` and `geometry` replace those stated in the sets; `sigmas` are those of `calibrate`'s parameters.
     """
 
     schema_: Annotated[str, Field(alias="schema")]
@@ -86,13 +86,13 @@ class PriorFile(Section):
 
 @dataclass(frozen=True)
 class Prior:
-    """A prior and where it was read."""
+    """A prior and its source."""
 
     path: Path
     content: PriorFile
 
     def over(self, optics: schema.OpticsConfig) -> schema.OpticsConfig:
-        """The bench with it. Raises InputError if it is of another camera."""
+        """The bench with this prior. Raises InputError for a different camera."""
         if self.content.camera is not None:
             optics = optics.model_copy(update={"camera": self.content.camera.over(optics.camera, self.path)})
         if self.content.geometry is None:
@@ -105,19 +105,19 @@ class Prior:
 
 
 def read_prior(path: Path) -> Prior:
-    """Read one. Raises InputError."""
+    """Read a prior. Raises InputError."""
     content = toml_file.load(path, PriorFile)
     if content.schema_ != SCHEMA:
         raise errors.InputError(
-            f"{path}: schema = {content.schema_}: a prior is {SCHEMA}; a geometry goes by --geometry"
+            f"{path}: schema = {content.schema_}: a prior has {SCHEMA}; pass a geometry with --geometry"
         )
     if unknown := set(content.sigmas) - set(NAMES):
-        raise errors.InputError(f"{path}: sigmas.{min(unknown)}: not a parameter; known are {', '.join(NAMES)}")
+        raise errors.InputError(f"{path}: sigmas.{min(unknown)}: not a parameter; known: {', '.join(NAMES)}")
     return Prior(path, content)
 
 
 def write_prior(path: Path, tables: dict[str, Any], made_by: str, made_of: Sequence[str], rms_px: float) -> None:
-    """Write `camera`, `geometry` or `sigmas` with where they come from. Raises InputError."""
+    """Write `camera`, `geometry` or `sigmas` with their origin. Raises InputError."""
     made = {
         "by": made_by,
         "date_utc": datetime.now(UTC).isoformat(timespec="seconds"),

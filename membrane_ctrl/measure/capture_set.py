@@ -1,7 +1,7 @@
 """Capture sets on disk (docs/interfaces.md, section 3): `capture.toml` and one image per frame, read and checked.
 
-What is wrong with the description of a set is an InputError. What is wrong with single frames (missing, unreadable,
-of another size or depth than the rest) is kept beside the frames: the measurement decides whether it can do without.
+An invalid description of a set is an InputError. Defects of single frames (missing, unreadable, different size or
+depth) are kept beside the frames: the measurement decides whether it can do without.
 """
 
 import math
@@ -26,7 +26,7 @@ from membrane_ctrl.model.arrays import FloatArray, Image
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.files import read_bytes
 
-_DEPTHS = (10, 12, 14, 16)  # bits of a sensor in 16-bit files, when the set does not say
+_DEPTHS = (10, 12, 14, 16)  # bits of a sensor in 16-bit files, if not stated
 _READERS = 2
 # All frames of a set are in memory at once: 18 of a camera of 16 megapixels.
 _PIXELS_MAX = 300_000_000
@@ -59,21 +59,19 @@ class CaptureFile(Section):
 
 @dataclass(frozen=True)
 class CaptureHead:
-    """What `capture.toml` says, checked and in order."""
+    """Content of `capture.toml`, checked and in order."""
 
     folder: Path  # of the set
     kind: Literal["full", "fringes"]
     reference: Path | None  # of a fringes set: the full set that anchors it
-    optics: (
-        schema.OpticsConfig
-    )  # geometry, camera, pattern and mirror; `camera.bits` is to be trusted only if `bits_stated`
-    bits_stated: bool  # whether the set says how deep its frames are
+    optics: schema.OpticsConfig  # geometry, camera, pattern and mirror; `camera.bits` is valid only if `bits_stated`
+    bits_stated: bool  # whether the set states its bit depth
     files: tuple[str, ...]  # in the order of the patterns
     patterns: tuple[Pattern, ...]  # x sinusoids, x Gray bits, y sinusoids, y Gray bits, white, black (of a full set)
-    time_s: FloatArray  # (frames,): NaN where the set says nothing
+    time_s: FloatArray  # (frames,): NaN where not stated
     displacement_um: FloatArray  # (frames,)
-    ignored: tuple[str, ...]  # keys of the file that are not known
-    geometry: GeometryOrigin  # which geometry is in `optics`
+    ignored: tuple[str, ...]  # unknown keys of the file
+    geometry: GeometryOrigin  # origin of the geometry in `optics`
 
 
 @dataclass(frozen=True)
@@ -87,9 +85,9 @@ class CaptureSet:
     frames : (frames, height, width) array
         uint8 or uint16; zeros where a frame is in `unusable`.
     unusable : dict from frame to reason
-        Frames that could not be read as the others.
+        Frames that could not be read like the others.
     lost : tuple of int
-        Those of them of which there is no picture at all.
+        Those among them without any picture.
     """
 
     head: CaptureHead
@@ -101,7 +99,7 @@ class CaptureSet:
 def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead:
     """Read `capture.toml`. Raises InputError.
 
-    `geometry` replaces the set's own, with the lens and the pitch that were calibrated with it.
+    `geometry` replaces the set's own, with the lens and pitch calibrated with it.
     """
     path = folder / "capture.toml"
     if not folder.is_dir():
@@ -122,7 +120,7 @@ def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead
             raise InputError(f"{path}: reference: a fringes set names the full set that anchors it")
         reference = (folder / content.reference).resolve()
     sections = ("geometry", "camera", "pattern", "mirror")
-    blamed = path if geometry is None else geometry.path  # what may not fit together is the screen and the pattern
+    blamed = path if geometry is None else geometry.path  # the screen and the pattern may be incompatible
     optics = toml_file.parse({name: getattr(content, name) for name in sections}, schema.OpticsConfig, str(blamed))
     if geometry is not None:
         optics = geometry.over(optics)
@@ -148,7 +146,7 @@ def read_set(folder: Path, geometry: GeometryFile | None = None) -> CaptureSet:
     if len(head.files) * camera.width_px * camera.height_px > _PIXELS_MAX:
         raise InputError(
             f"{folder / 'capture.toml'}: camera.width_px, height_px: {len(head.files)} frames of {camera.width_px} x "
-            f"{camera.height_px} pixels are more than the {_PIXELS_MAX / 1e6:.0f} million that a set may have"
+            f"{camera.height_px} pixels exceed the limit of {_PIXELS_MAX / 1e6:.0f} million for a set"
         )
     with ThreadPoolExecutor(_READERS) as pool:
         images = list(pool.map(_read_image, [folder / name for name in head.files]))
@@ -156,9 +154,9 @@ def read_set(folder: Path, geometry: GeometryFile | None = None) -> CaptureSet:
 
 
 def assemble(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet:
-    """Frames of one size and depth in one array; an image that is a text is the reason why there is none.
+    """Collect frames of one size and depth in one array; a text in place of an image is the reason for its absence.
 
-    Raises InputError if no frame is readable, or if most contradict the file's own camera.
+    Raises InputError if no frame is readable, or if most contradict the camera in the file.
     """
     path = head.folder / "capture.toml"
     good = [image for image in images if not isinstance(image, str)]
@@ -188,7 +186,7 @@ def assemble(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet:
 
 
 def anchored(head: CaptureHead, reference: CaptureHead) -> CaptureHead:
-    """A fringes set's head; the displacement for which its geometry holds is, unless stated, its reference's.
+    """Head of a fringes set; its geometry holds for the stated displacement, else for its reference's.
 
     Raises InputError if the two cannot belong together.
     """
@@ -200,12 +198,12 @@ def anchored(head: CaptureHead, reference: CaptureHead) -> CaptureHead:
         a, b = getattr(ours, section), getattr(theirs, section)
         for key in ("width_px", "height_px", "periods", "period_mm"):
             if getattr(a, key, None) != getattr(b, key, None):
-                raise InputError(f"{where}: {section}.{key} = {getattr(a, key)}, in the reference {getattr(b, key)}")
+                raise InputError(f"{where}: {section}.{key} = {getattr(a, key)}, the reference has {getattr(b, key)}")
     return replace(head, optics=_with_reference_displacement(ours, theirs.geometry.reference_displacement_um))
 
 
 def _with_reference_displacement(optics: schema.OpticsConfig, displacement_um: float | None) -> schema.OpticsConfig:
-    """The same with the displacement for which the geometry holds, unless it states one."""
+    """The head with the displacement for which its geometry holds, unless it states one."""
     geometry = optics.geometry
     if geometry.reference_displacement_um is not None or displacement_um is None:
         return optics
@@ -214,7 +212,7 @@ def _with_reference_displacement(optics: schema.OpticsConfig, displacement_um: f
 
 
 def _read_image(path: Path) -> Image | str:
-    """The image, or why there is none."""
+    """The image, or the reason for its absence."""
     try:
         image = decoded_image(read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_UNCHANGED)
     except FileNotFoundError:
@@ -229,7 +227,7 @@ def _read_image(path: Path) -> Image | str:
 
 
 def _depth(head: CaptureHead, frames: Image, path: Path) -> int:
-    """Bits of the sensor: as stated, else the least of the usual ones that holds the brightest pixel."""
+    """Bits of the sensor: as stated, else the smallest usual depth that holds the brightest pixel."""
     bits = head.optics.camera.bits
     if not head.bits_stated:
         return 8 if frames.dtype == np.uint8 else next(b for b in _DEPTHS if int(frames.max()) < 2**b)
@@ -244,14 +242,14 @@ def _require_inside(name: str, folder: Path, path: Path) -> None:
     """Raise InputError for a frame that is not the set's own: a set may come from anywhere."""
     try:
         inside = bool(name) and (folder / name).resolve().is_relative_to(folder.resolve())
-    except (OSError, ValueError, RuntimeError):  # a NUL, a name too long, links in a ring
+    except (OSError, ValueError, RuntimeError):  # a NUL, too long a name, circular links
         inside = False
     if not inside or Path(name).is_absolute() or ".." in Path(name).parts:
         raise InputError(f"{path}: frames: {name!r} is outside the set's folder")
 
 
 def _ordered(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]:
-    """Rows with their patterns in the order of the sequence. Raises InputError if one is missing or twice."""
+    """Rows with their patterns in the order of the sequence. Raises InputError for missing or duplicate ones."""
     found: dict[str, tuple[FrameRow, Pattern]] = {}
     for row in content.frames:
         if row.role in ("sin", "gray") and row.axis is None:
@@ -262,7 +260,7 @@ def _ordered(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]
             pattern = Pattern(row.role, row.axis or "", row.index, shift)
         if pattern.name in found:
             raise InputError(
-                f"{path}: frames: {pattern.name} is there twice ({found[pattern.name][0].file}, {row.file})"
+                f"{path}: frames: {pattern.name} appears twice ({found[pattern.name][0].file}, {row.file})"
             )
         found[pattern.name] = (row, pattern)
     names = [p.name for p in (full_sequence if content.kind == "full" else fringe_sequence)(content.pattern)]

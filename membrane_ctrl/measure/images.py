@@ -1,4 +1,4 @@
-"""Images of strangers, decoded: how large a picture is is read from its head before memory is taken for it."""
+"""Decodes untrusted images: reads a picture's size from its header before allocating memory for it."""
 
 import struct
 
@@ -7,9 +7,9 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import AnyArray
 
-# A file of 16-bit pixels that do not compress.
+# A file of incompressible 16-bit pixels.
 IMAGE_BYTES_MAX = 150_000_000
-# The largest sensors in use. Four channels of 16 bits, as a decoder may make of it, are 0.5 GB.
+# The largest sensors in use. A decoder may make four 16-bit channels of it, 0.5 GB.
 PIXELS_MAX = 64_000_000
 _PNG = b"\x89PNG\r\n\x1a\n"
 _TIFF = {b"II*\0": "<", b"MM\0*": ">"}
@@ -33,7 +33,7 @@ def decoded_image(data: bytes, flags: int) -> AnyArray:
     if size is None or min(size) < 1:
         raise ValueError("not an image")
     if size[0] * size[1] > PIXELS_MAX:
-        raise ValueError(f"{size[0]} x {size[1]} pixels, more than {PIXELS_MAX / 1e6:.0f} million are not decoded")
+        raise ValueError(f"{size[0]} x {size[1]} pixels exceed the limit of {PIXELS_MAX / 1e6:.0f} million")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
@@ -44,7 +44,7 @@ def decoded_image(data: bytes, flags: int) -> AnyArray:
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height as a file's head says them; None for a format that is not read here."""
+    """Width and height from a file's header; None for an unsupported format."""
     if data.startswith(_PNG):
         return struct.unpack_from(">II", data, 16)
     if order := _TIFF.get(data[:4]):

@@ -16,20 +16,20 @@ from membrane_ctrl.metrology.optics.surface import RadialProfile, radial_profile
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.arrays import FloatArray
 
-# A good pose leaves 0.4 mm and 0.0007 (simulated, a fifth of the sensor's pixels); a ring is round to 1 mm or so.
+# A good pose leaves 0.4 mm and 0.0007 (simulated, a fifth of the sensor's pixels); rings are round to about 1 mm.
 _RIM_OFF_MM, _RIM_SIZE = 3.0, 0.005
 
 
 def measure_command(
     folder: Path, geometry: Path | None, out: Path | None, as_json: bool, pictures: bool, rerun: bool
 ) -> int:
-    """Measure one set, write the result, say what came out. Returns the exit code; raises InputError."""
+    """Measure one set, write the result and report it. Returns the exit code; raises InputError."""
     if folder.suffix == ".h5":
         return facet_command(folder, as_json)
     measurement = measure_set(folder, None if geometry is None else read_geometry(geometry))
     for key in measurement.head.ignored:
-        print(f"{folder / 'capture.toml'}: {key}: not known, ignored", file=sys.stderr)
-    target = out.resolve() if out else folder / "result"  # a link that a person names is meant
+        print(f"{folder / 'capture.toml'}: {key}: unknown key, ignored", file=sys.stderr)
+    target = out.resolve() if out else folder / "result"  # follow a link that the user names
     light, outline = _outline(measurement)
     profile = _profile(measurement)
     bars = results.error_bars(measurement, geometry)
@@ -54,7 +54,7 @@ def measure_command(
 
 
 def _outline(measurement: Measurement) -> tuple[FloatArray, Outline | None]:
-    """The light in the picture, in bins, and the rim found in it."""
+    """Light of the picture in bins, and the rim found in it."""
     checked, optics = measurement.checked, measurement.head.optics
     if checked is None or measurement.full is None:
         return np.zeros((2, 2)), None
@@ -75,7 +75,7 @@ def _profile(measurement: Measurement) -> RadialProfile | None:
 def _lines(
     measurement: Measurement, profile: RadialProfile | None, outline: Outline | None, bars: results.ErrorBars | None
 ) -> list[str]:
-    """What a person wants to read."""
+    """The result as lines of text."""
     full = measurement.full
     lines = [f"verdict   {measurement.verdict}{': ' + measurement.reason if measurement.reason else ''}"]
     lines += [f"flagged   {item['file']}: {item['reason']}" for item in measurement.flagged_files()]
@@ -85,9 +85,9 @@ def _lines(
     residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
     coeffs = 1e3 * full.surface.coeffs_mm
     lines += [
-        f"sag       {full.surface.sag_mm:.4f} mm, 1 sigma {of_noise:.2g} um of noise"
-        + (f", {of_geometry:.3g} um of the geometry" if of_geometry > 0 else ""),
-        f"geometry  its spread: {bars.source}",
+        f"sag       {full.surface.sag_mm:.4f} mm, 1 sigma {of_noise:.2g} um from noise"
+        + (f", {of_geometry:.3g} um from the geometry" if of_geometry > 0 else ""),
+        f"geometry  uncertainty from {bars.source}",
         f"Hencky    {profile.sag_mm:.4f} mm, {profile.pressure_pa:.0f} Pa under the paper's film",
         f"figure    astigmatism {np.hypot(*coeffs[4:6]):.2f} um, coma {np.hypot(*coeffs[6:8]):.2f} um, "
         f"trefoil {np.hypot(*coeffs[8:10]):.2f} um (RMS)",
@@ -98,19 +98,19 @@ def _lines(
     if outline is not None:
         off = abs(outline.offset_mm) > _RIM_OFF_MM or abs(outline.size_ratio - 1) > _RIM_SIZE
         lines.append(
-            f"rim       {outline.offset_mm:.1f} mm from where the pose puts it, {outline.size_ratio:.4f} of its size"
-            + (": is the camera's pose right, and mirror.radius_mm?" if off else "")
+            f"rim       {outline.offset_mm:.1f} mm off the prediction, {outline.size_ratio:.4f} of the predicted size"
+            + (": check the camera's pose and mirror.radius_mm" if off else "")
         )
     return lines
 
 
-# `measure` of a SOFAST file: are its frames what they should be? Slopes need the poses that its own tool finds.
+# `measure` of a SOFAST file checks its frames only: slopes need the poses that SOFAST itself finds.
 
-_LEAST_PIXELS = 200  # fewer tell nothing of a frame
+_LEAST_PIXELS = 200  # fewer cannot judge a frame
 
 
 def facet_command(path: Path, as_json: bool) -> int:
-    """Check the frames and say what was found. Returns the exit code; raises InputError for what is no such file."""
+    """Check the frames and report. Returns the exit code; raises InputError if it is not a SOFAST file."""
     try:
         measurement = sofast.read_measurement(path)
     except (ValueError, OSError, ImportError) as error:
@@ -132,7 +132,7 @@ def facet_command(path: Path, as_json: bool) -> int:
 
 
 def _name(measurement: sofast.SofastMeasurement, flag: SeriesFlag) -> str:
-    """For a person: axis, periods a screen, step from 0."""
+    """Name for people: axis, periods per screen, step from 0."""
     if flag.axis in ("white", "black"):
         return flag.axis
     periods = measurement.periods_x if flag.axis == "x" else measurement.periods_y

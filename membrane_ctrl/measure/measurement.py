@@ -1,4 +1,4 @@
-"""One capture set on disk to its full result; `measure` and every analysis of many sets use it."""
+"""Measures one capture set on disk in full, for `measure` and every analysis of many sets."""
 
 import math
 import time
@@ -32,7 +32,7 @@ class Measurement:
     checked, full : Checked, FullResult or None
         None where the frames gave no figure.
     displacement_um : float
-        Mean laser reading of the sinusoids: the moment that the figure belongs to; NaN without.
+        Mean laser reading during the sinusoids, to which the figure belongs; NaN without readings.
     timing_s : dict
         Seconds for "load", "phase" and "reconstruct".
     """
@@ -47,7 +47,7 @@ class Measurement:
     timing_s: dict[str, float]
 
     def flagged_files(self) -> list[dict[str, str]]:
-        """The flags as files."""
+        """The flagged frames by file name."""
         return [{"file": self.head.files[flag.frame], "reason": flag.reason} for flag in self.flags]
 
 
@@ -64,9 +64,9 @@ def measure_set(
     folder : Path
         The set.
     geometry : GeometryFile, optional
-        Instead of the set's own.
+        Replaces the set's own.
     anchor : Anchor, optional
-        For a fringes set: its reference, if it has been read already (see `read_anchor`).
+        For a fringes set: its reference, if already read (see `read_anchor`).
     start : height function, optional
         Starting shape of the fit.
 
@@ -85,7 +85,7 @@ def measure_set(
 
 
 def read_anchor(folder: Path, geometry: GeometryFile | None = None) -> tuple[CaptureHead, Anchor]:
-    """The reference of fringes sets. Raises InputError if it gives no figure."""
+    """Read the reference of fringes sets. Raises InputError if it gives no figure."""
     capture = read_set(folder, geometry)
     if capture.head.kind != "full":
         raise errors.InputError(f"{folder / 'capture.toml'}: kind: a reference must be a full set")
@@ -98,8 +98,8 @@ def read_anchor(folder: Path, geometry: GeometryFile | None = None) -> tuple[Cap
 def stack_of(capture: CaptureSet) -> frame_stack.FrameStack:
     """The frames for the metrology.
 
-    Raises RejectedSetError if a picture is missing or unreadable. It could often be done without, but a set that was
-    not written whole is not to be trusted for the rest of it either.
+    Raises RejectedSetError if a picture is missing or unreadable. The rest would often suffice, but an incomplete set
+    deserves no trust.
     """
     if capture.lost:
         flags = tuple(integrity.Flag(k, capture.unusable[k], math.inf) for k in capture.lost)
@@ -113,7 +113,7 @@ def stack_of(capture: CaptureSet) -> frame_stack.FrameStack:
 def measure_capture(
     capture: CaptureSet, anchor: Anchor | None = None, start: HeightFunction | None = None, load_s: float = 0.0
 ) -> Measurement:
-    """Measure frames that are in memory; never raises for what they show."""
+    """Measure frames in memory; never raises, whatever they show."""
     optics = capture.head.optics
     mean_um = float("nan")
     begin = time.perf_counter()
@@ -136,7 +136,7 @@ def measure_capture(
 
 
 def noise_seen_adu(measurement: Measurement) -> float:
-    """Noise of a pixel as the phase steps show it; NaN for three steps, which always agree."""
+    """Pixel noise estimated from the phase steps; NaN for three steps, which always agree."""
     if measurement.checked is None or measurement.full is None:
         return float("nan")
     free = sum(len(used) - 3 for used in measurement.checked.view.used)
@@ -154,7 +154,7 @@ class SetFigure:
     checked, figure : Checked, BinFigure
         Its frames and its surface.
     verdict : "ok" or "degraded"
-        With its reason.
+        The verdict; `reason` explains it.
     time_s, displacement_um : float
         Means over the sinusoids; NaN where the set states none.
     """
@@ -168,14 +168,14 @@ class SetFigure:
     displacement_um: float
 
     def bench(self) -> TrialBench:
-        """For Monte Carlo trials."""
+        """The set's bench for Monte Carlo trials."""
         return TrialBench.of(self.head.optics, self.checked, self.figure)
 
 
 class Figures:
-    """Figures of sets, one after the other, if wanted with another geometry than their own.
+    """Figures of sets, one after the other, optionally with another geometry than their own.
 
-    The last reference, which most sets of a run share, is cached.
+    Caches the last reference, which most sets of a run share.
     """
 
     def __init__(self, geometry: GeometryFile | None = None) -> None:

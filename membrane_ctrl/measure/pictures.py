@@ -18,7 +18,7 @@ from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import move, scratch_folder
 from membrane_ctrl.model.terminal import plain
 
-_SHOWN_PX = 600  # a side, of maps of pixels
+_SHOWN_PX = 600  # side of pixel maps
 
 
 def draw_all(
@@ -29,7 +29,7 @@ def draw_all(
     outline: geometry.Outline | None,
     bars: ErrorBars | None,
 ) -> list[Path]:
-    """Draw everything; returns the files. `light` (H, W) is the scene of any size: white, or the fringes' mean."""
+    """Draw all pictures; returns the files. `light` (H, W), of any size, is the white frame or the fringes' mean."""
     files = [write_figure(out / "frames.png", _frames(measurement))]
     full = measurement.full
     if full is None or profile is None:
@@ -48,13 +48,13 @@ def draw_all(
 
 
 def _uncertainty(bars: ErrorBars) -> Figure:
-    """1 sigma from noise and, if its spread is one, from the geometry."""
+    """Draw 1 sigma from noise and, if known, from the geometry."""
     figure = Figure(figsize=(12, 4.8), layout="constrained")
     of_noise, of_geometry = bars.maps_um()
     left, right = figure.subplots(1, 2)
-    show_map(left, "1 sigma of pixel noise (nm)", bars.grid.axis_mm, 1e3 * of_noise, "magma")
+    show_map(left, "1 sigma from pixel noise (nm)", bars.grid.axis_mm, 1e3 * of_noise, "magma")
     if np.isfinite(of_geometry).any():
-        show_map(right, "1 sigma of the geometry (um)", bars.grid.axis_mm, of_geometry, "magma")
+        show_map(right, "1 sigma from the geometry (um)", bars.grid.axis_mm, of_geometry, "magma")
     return figure
 
 
@@ -65,7 +65,7 @@ def _map(title: str, axis: FloatArray, values: FloatArray, colours: str, even: b
 
 
 def show_map(axes: Any, title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False) -> None:
-    """A map with its colour scale; `even` centres the scale on 0."""
+    """Draw a map with its colour scale; `even` centres the scale on 0."""
     low, high = np.nanpercentile(values, [0.5, 99.5])
     if even:
         high = max(abs(low), abs(high))
@@ -77,7 +77,7 @@ def show_map(axes: Any, title: str, axis: FloatArray, values: FloatArray, colour
 
 
 def _slopes(full: FullResult) -> Figure:
-    """Slopes as measured, and what the fit leaves of them."""
+    """Draw the measured slopes and the residuals of the fit."""
     figure = Figure(figsize=(11, 9), layout="constrained")
     axes = figure.subplots(2, 2)
     grid = full.grid
@@ -96,7 +96,7 @@ def _slopes(full: FullResult) -> Figure:
 def _modulation(
     measurement: Measurement, full: FullResult, light: FloatArray, outline: geometry.Outline | None
 ) -> Figure:
-    """Fringe amplitude in the camera's picture, beside the light with the rim found in it."""
+    """Draw the fringe amplitude in the camera's picture beside the light with the detected rim."""
     camera = measurement.head.optics.camera
     swing = np.full(camera.width_px * camera.height_px, np.nan, np.float32)
     swing[full.index] = full.swing_adu
@@ -115,7 +115,7 @@ def _modulation(
 
 
 def _frames(measurement: Measurement) -> Figure:
-    """One tile a frame, the flagged ones with their reason."""
+    """Draw one tile per frame, the flagged ones with their reason."""
     names = [pattern.name for pattern in measurement.head.patterns]
     reasons = {flag.frame: plain(flag.reason) for flag in measurement.flags}
     figure = Figure(figsize=(9, 0.28 * len(names) + 1.2), layout="constrained")
@@ -160,13 +160,13 @@ def _convergence(full: FullResult) -> Figure:
 def result_recording(
     path: Path, application: str, blueprint: rrb.Blueprint | None = None
 ) -> Iterator[rr.RecordingStream]:
-    """A Rerun recording in a file `path` (.rrd), overwritten. Raises OSError if it does not reach the disk."""
+    """Write a Rerun recording to a file `path` (.rrd), overwriting it. Raises OSError if that fails."""
     recording = rr.RecordingStream(application)
     with scratch_folder(path.parent, ".recording-") as folder:
         try:
             recording.save(folder / path.name, default_blueprint=blueprint)
             yield recording
-            recording.flush()  # logging never says that a disk is full, this does
+            recording.flush()  # logging never reports a full disk, this does
         except RuntimeError as error:
             raise OSError(f"{path.name}: {error}") from None
         finally:
@@ -178,7 +178,7 @@ def result_recording(
 
 
 def log_pictures(recording: rr.RecordingStream, entity: str, pictures: Sequence[Path]) -> None:
-    """Every picture below an entity, by its file's name."""
+    """Log every picture below an entity, by file name."""
     for picture in pictures:
         recording.log(f"{entity}/{picture.stem}", rr.EncodedImage(path=picture), static=True)
 
@@ -193,7 +193,7 @@ def log_measurement(path: Path, measurement: Measurement, pictures: Sequence[Pat
         if full is not None:
             coeffs_um = 1e3 * full.surface.coeffs_mm
             recording.log("measure/zernike_um", rr.BarChart(coeffs_um[1:], abscissa=np.arange(2, 37)), static=True)
-            # row 0 of a picture is on top, that is at +y
+            # row 0 of a picture is at the top, i.e. at +y
             height = full.height_mm()[::-1].astype(np.float32)
             residual = (1e3 * full.residual_mm)[::-1].astype(np.float32)
             recording.log("measure/height_mm", rr.Tensor(height, dim_names=["y", "x"]), static=True)

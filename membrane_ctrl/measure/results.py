@@ -1,4 +1,4 @@
-"""What `measure` leaves in a folder: `result.json` and `height.npz` (docs/interfaces.md), and `details.json`."""
+"""The files written by `measure`: `result.json` and `height.npz` (docs/interfaces.md), and `details.json`."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ if TYPE_CHECKING:  # matplotlib takes a second to load
     from matplotlib.figure import Figure
 
 
-# How well a measured height is known, without any trials: both shares are linear (`metrology.uncertainty`), a few
-# dozen solutions of thinned points, 50 ms. The Monte Carlo of the `uncertainty` command agrees within 10 %.
+# Uncertainty of a measured height without trials: both parts are linear (`metrology.uncertainty`), a few dozen
+# solutions of thinned points, 50 ms. The Monte Carlo of the `uncertainty` command agrees within 10 %.
 
 
 @dataclass(frozen=True)
 class ErrorBars:
     """Covariances (36, 36) of the fit's parameters, mm^2."""
 
-    noise: FloatArray  # from the pixels' noise, or the scatter of the slopes if that is larger
-    geometry: FloatArray  # from the geometry's spread; zeros if the poses are taken as exact
-    source: str  # where that spread is stated
-    grid: monte_carlo.HeightMap  # where `maps_um` has its points
+    noise: FloatArray  # from pixel noise, or the scatter of the slopes if larger
+    geometry: FloatArray  # from the geometry's covariance; zeros if the poses count as exact
+    source: str  # source of that covariance
+    grid: monte_carlo.HeightMap  # grid of `maps_um`
 
     @property
     def sag_um(self) -> tuple[float, float]:
@@ -54,7 +54,7 @@ class ErrorBars:
 def error_bars(measurement: Measurement, geometry: Path | None) -> ErrorBars | None:
     """Error bars of a measurement; None if it has no figure.
 
-    Raises InputError if that covariance is none, or of the other form of geometry. `geometry` is the file
+    Raises InputError if the covariance is invalid or for the other form of geometry. `geometry` is the file
     with the covariance.
     """
     full, checked, optics = measurement.full, measurement.checked, measurement.head.optics
@@ -74,7 +74,7 @@ def error_bars(measurement: Measurement, geometry: Path | None) -> ErrorBars | N
         )
         of_geometry = monte_carlo.geometry_covariance(monte_carlo.geometry_jacobian(bench, spread), spread)
     except ArithmeticError:
-        of_geometry, source = np.full((PARAMETERS, PARAMETERS), np.nan), f"{source}: too wide to be a spread"
+        of_geometry, source = np.full((PARAMETERS, PARAMETERS), np.nan), f"{source}: too large to propagate"
     grid = monte_carlo.HeightMap.over(optics.mirror.analysis_radius_mm, optics.mirror.radius_mm)
     return ErrorBars(bins.parameter_covariance(full.fit, gain @ sigma_mm**2), of_geometry, source, grid)
 
@@ -124,7 +124,7 @@ def _fit_table(full: FullResult | None) -> dict[str, Any]:
 def details_table(
     measurement: Measurement, profile: RadialProfile | None, outline: Outline | None, bars: ErrorBars | None
 ) -> dict[str, Any]:
-    """What a person also asks for: sag, pressure, zonal residual, noise, the rim in the picture."""
+    """Further results: sag, pressure, zonal residual, noise, the rim in the picture."""
     full = measurement.full
     table: dict[str, Any] = {
         "set": str(measurement.head.folder),
@@ -162,7 +162,7 @@ def details_table(
 
 
 def write_result(out: Path, measurement: Measurement, details: dict[str, Any], bars: ErrorBars | None) -> None:
-    """Write `result.json`, `details.json` and, if there is a figure to be used, two maps. Raises OSError."""
+    """Write `result.json`, `details.json` and, with a usable figure, two maps. Raises OSError."""
     make_folder(out)
     write_json(out / "result.json", result_table(measurement))
     write_json(out / "details.json", details)

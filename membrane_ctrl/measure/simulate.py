@@ -13,7 +13,7 @@ from membrane_ctrl.sim.optics import film_shape, shade, simulate, simulation_spe
 
 @dataclass(frozen=True)
 class SimulateOptions:
-    """What the command was asked for; quantities as in `SimulationSpec`."""
+    """Options of the command; quantities as in `SimulationSpec`."""
 
     folder: Path
     config: Config
@@ -37,7 +37,7 @@ class SimulateOptions:
 def simulate_command(options: SimulateOptions) -> int:
     """Write a set, or a run of sets. Raises InputError."""
     if options.folder.exists() and any(options.folder.iterdir()):
-        raise errors.InputError(f"{options.folder}: is not empty; simulate writes into a new or empty folder")
+        raise errors.InputError(f"{options.folder}: is not empty; simulate needs a new or empty folder")
     try:
         spec = specification(options)
         with errors.writing(options.folder):
@@ -52,7 +52,7 @@ def simulate_command(options: SimulateOptions) -> int:
 
 
 def specification(options: SimulateOptions) -> simulation_spec.SimulationSpec:
-    """The set that the options describe. Raises ValueError naming what cannot be."""
+    """The set described by the options. Raises ValueError naming an impossible one."""
     optics = _optics(options)
     radius_mm = optics.mirror.radius_mm
     mounted = film_shape.typical_film(options.sag_mm, radius_mm, options.seed)
@@ -70,7 +70,7 @@ def specification(options: SimulateOptions) -> simulation_spec.SimulationSpec:
 
 
 def _optics(options: SimulateOptions) -> OpticsConfig:
-    """The configuration's optics with the options' depth, noise, steps and size."""
+    """The configuration's optics with the depth, noise, steps and size from the options."""
     optics = options.config.optics
     camera, pattern = optics.camera, optics.pattern
     changes: dict[str, object] = {}
@@ -97,7 +97,7 @@ def _optics(options: SimulateOptions) -> OpticsConfig:
 
 
 def _progress(sets: int) -> Callable[[int], None] | None:
-    """A line that counts, on a terminal only."""
+    """Count the sets in one line, on a terminal only."""
     if not sys.stderr.isatty():
         return None
     return lambda done: print(f"\r{done} of {sets} sets", end="" if done < sets else "\n", file=sys.stderr)

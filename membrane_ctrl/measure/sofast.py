@@ -1,4 +1,4 @@
-"""Frames of a measurement by SOFAST (OpenCSP, Sandia), from its HDF5 file; lengths become mm here."""
+"""Frames of a measurement by SOFAST (OpenCSP, Sandia), from its HDF5 file, with lengths converted to mm."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from membrane_ctrl.model.files import open_plain
 
 STEPS = 4  # SOFAST always takes four
 MM_PER_M = 1e3
-_ELEMENTS_MAX = 100_000_000  # 24 frames of 4 megapixels; each takes eight bytes once it is read
+_ELEMENTS_MAX = 100_000_000  # 24 frames of 4 megapixels; each pixel takes eight bytes in memory
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class SofastMeasurement:
 
     frames_x: FloatArray  # (F, 4, H, W): fringes that vary along the screen's x and y: frequency, step, row, column
     frames_y: FloatArray  # (F, 4, H, W)
-    periods_x: FloatArray  # (F,): periods a screen
+    periods_x: FloatArray  # (F,): periods per screen
     periods_y: FloatArray  # (F,)
     black: FloatArray  # (H, W)
     white: FloatArray  # (H, W)
@@ -30,7 +30,7 @@ class SofastMeasurement:
 
 
 def read_measurement(path: Path) -> SofastMeasurement:
-    """Frames and what belongs to them. Raises ValueError, FileNotFoundError or ImportError in one line."""
+    """Read frames and their data. Raises ValueError, FileNotFoundError or ImportError with one line."""
     with open_file(path) as file:
         group = "MeasurementSofastFringe"
         frames = np.moveaxis(floats(file, f"{group}/fringe_images"), 2, 0)
@@ -56,13 +56,13 @@ def read_measurement(path: Path) -> SofastMeasurement:
 
 
 def open_file(path: Path) -> Any:
-    """The file as h5py gives it (untyped). h5py is an optional extra: only this reader needs it."""
+    """Open the file with h5py (untyped), an optional extra that only this reader needs."""
     try:
         import h5py
     except ImportError:
         raise ImportError("SOFAST files need h5py: pip install 'membrane-ctrl[sofast]'") from None
     try:
-        open_plain(path, follow=True).close()  # h5py waits for a pipe that nobody writes to
+        open_plain(path, follow=True).close()  # h5py would wait forever for a pipe without a writer
         return h5py.File(path, "r")
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
@@ -71,7 +71,7 @@ def open_file(path: Path) -> Any:
 
 
 def item(file: Any, name: str) -> Any:
-    """A data set of the file itself: none behind a link to another file, and none of more than is ever measured."""
+    """A data set of the file itself; refuses links to other files and implausible sizes."""
     import h5py
 
     try:
@@ -86,9 +86,9 @@ def item(file: Any, name: str) -> Any:
         if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
             raise ValueError(f"{file.filename}: {name} is not a data set of this file")
         if found.size is None or found.size > _ELEMENTS_MAX:
-            raise ValueError(f"{file.filename}: {name} has {found.shape} elements, more than are read")
+            raise ValueError(f"{file.filename}: {name} has {found.shape} elements, too many to read")
         return found[()]
-    except (OSError, RuntimeError, KeyError, TypeError) as error:  # what a damaged file makes of HDF5
+    except (OSError, RuntimeError, KeyError, TypeError) as error:  # HDF5's errors for a damaged file
         raise ValueError(f"{file.filename}: {name} cannot be read ({error})") from None
 
 
@@ -102,18 +102,18 @@ def floats(file: Any, name: str) -> FloatArray:
 # SOFAST shows cos(2 pi p s - k pi / 2), s from 1 at column 0 to 0 at the last column, and from 1 at row 0 to 0 at the
 # last row; its screen coordinates have y the other way round, so the y fraction is 1 - s.
 SHIFTS_RAD = -equal_shifts(STEPS)
-_LIT_SHARE = 0.3  # of the swing of the bright pixels
+_LIT_SHARE = 0.3  # of the bright pixels' swing
 
 
 def lit_pixels(measurement: SofastMeasurement) -> BoolArray:
-    """Pixels (H, W) that see fringes: the median over the series of their swing, which no single frame can spoil."""
+    """Pixels (H, W) that see fringes: thresholds the median swing over the series, robust to single bad frames."""
     series = (*measurement.frames_y, *measurement.frames_x)
     swing = np.median([np.abs(phasors(steps, SHIFTS_RAD)) for steps in series], axis=0)
     return np.asarray(swing > _LIT_SHARE * np.percentile(swing, 95))
 
 
 def series_of(measurement: SofastMeasurement, mask: BoolArray) -> tuple[AxisSeries, AxisSeries]:
-    """The axes of a measurement at the pixels in `mask`, in the order in which they were taken."""
+    """The axes of a measurement at the pixels in `mask`, in the order of capture."""
     return (
         AxisSeries("y", measurement.frames_y[..., mask], measurement.periods_y, SHIFTS_RAD),
         AxisSeries("x", measurement.frames_x[..., mask], measurement.periods_x, SHIFTS_RAD),

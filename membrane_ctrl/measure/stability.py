@@ -15,7 +15,7 @@ from membrane_ctrl.model import errors, files, terminal
 
 @dataclass(frozen=True)
 class StabilityOptions:
-    """What the command was asked for."""
+    """Options of the command."""
 
     folder: Path
     out: Path | None
@@ -28,7 +28,7 @@ class StabilityOptions:
 
 
 def stability_command(options: StabilityOptions) -> int:
-    """Analyse a run, write tables and pictures, say what came out. Raises CommandError."""
+    """Analyse a run, write tables and pictures, and report. Raises CommandError."""
     out = options.out.resolve() if options.out else options.folder / "stability"
     figures = measurement.Figures(None if options.geometry is None else read_geometry(options.geometry))
     folders = set_folders(options.folder, out)
@@ -40,7 +40,7 @@ def stability_command(options: StabilityOptions) -> int:
             _analyse(folders, figures, run)
         if run.used == 0:
             raise errors.RejectedError(
-                f"{options.folder}: none of {len(folders)} sets gave a figure ({run.first_reason})"
+                f"{options.folder}: none of the {len(folders)} sets gave a figure ({run.first_reason})"
             )
         table = {"schema": "membrane-stability/1", "run": str(options.folder), "size_px": size_px} | run.table()
         results.write_json(out / "stability.json", table)
@@ -57,7 +57,7 @@ def set_folders(run: Path, out: Path) -> list[Path]:
     if not run.is_dir():
         raise errors.InputError(f"{run}: no such run of sets")
     if (run / "capture.toml").is_file():
-        raise errors.InputError(f"{run}: holds no capture sets; it is a capture set itself, give the folder above it")
+        raise errors.InputError(f"{run}: is itself a capture set; name the folder above it")
     found = sorted(path for path in run.iterdir() if path.is_dir() and path.resolve() != out.resolve())
     folders = [path for path in found if not (path / stability_run.SERIES).is_file()]
     if not folders:
@@ -66,11 +66,11 @@ def set_folders(run: Path, out: Path) -> list[Path]:
 
 
 def common_size(folders: Iterable[Path]) -> tuple[tuple[int, int], float]:
-    """Width and height in pixels, and the analysis radius in mm, that all sets of a run share.
+    """Width and height in pixels and analysis radius in mm, common to all sets of a run.
 
-    Sets whose description cannot be read are passed over here; the analysis counts them.
+    Skips sets with unreadable descriptions; the analysis counts them.
 
-    Raises InputError for two sizes in one run, naming a set of each; RejectedError if no description can be read.
+    Raises InputError for two sizes in one run, naming a set of each; RejectedError if no description is readable.
     """
     first: tuple[Path, tuple[int, int], float] | None = None
     reason = ""
@@ -86,7 +86,7 @@ def common_size(folders: Iterable[Path]) -> tuple[tuple[int, int], float]:
         elif size != first[1]:
             raise errors.InputError(
                 f"{folder / 'capture.toml'}: camera: {size[0]} x {size[1]} pixels, but {first[0].name} has "
-                f"{first[1][0]} x {first[1][1]}; a run has one size"
+                f"{first[1][0]} x {first[1][1]}; a run must have one size"
             )
     if first is None:
         raise errors.RejectedError(f"no set can be read: {reason}")
@@ -101,7 +101,7 @@ def points_mm(given: tuple[str, ...], analysis_radius_mm: float) -> dict[str, tu
         try:
             x, y = (float(part) for part in place.split(","))
         except ValueError:
-            raise errors.InputError(f"--point {text}: give NAME=X,Y in mm, as A=100,-200") from None
+            raise errors.InputError(f"--point {text}: give NAME=X,Y in mm, e.g. A=100,-200") from None
         if not name or not math.hypot(x, y) <= analysis_radius_mm:
             within = f"within {analysis_radius_mm:g} mm of the vertex"
             raise errors.InputError(f"--point {text}: needs a name and a place {within}")
@@ -110,10 +110,10 @@ def points_mm(given: tuple[str, ...], analysis_radius_mm: float) -> dict[str, tu
 
 
 def _analyse(folders: list[Path], figures: measurement.Figures, run: stability_run.StabilityRun) -> None:
-    """Every set, one after the other, with a bar on a terminal; a bad one is named and passed over."""
+    """Analyse the sets one after the other, with a bar on a terminal; name and skip bad ones."""
     for number, folder in enumerate(terminal.counted(folders, "sets")):
         try:
             run.add(folder.name, number, figures.of(folder))
         except errors.CommandError as error:
             run.skip(folder.name, str(error))
-            print(terminal.one_line(f"passed over {folder.name}: {error}"), file=sys.stderr)
+            print(terminal.one_line(f"skipped {folder.name}: {error}"), file=sys.stderr)

@@ -1,4 +1,4 @@
-"""The table of a stability run, one line a set, read back thinned for pictures; pictures and recording of the run."""
+"""The table of a stability run, one line per set, read back thinned for pictures; its pictures and recording."""
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,14 +19,14 @@ _ZERNIKE = tuple(f"z{j}_um" for j in range(1, 37))
 
 
 def series_head(points: Iterable[str]) -> tuple[str, ...]:
-    """Columns of `series.csv`, with those of the points whose height is followed; a bad set has the first three."""
+    """Columns of `series.csv`, including the tracked points; a bad set fills only the first three."""
     return (*_HEAD, *_NUMBERS, *(f"{name}_um" for name in points), *_ZERNIKE)
 
 
 def read_series(path: Path, points: int, most: int = 4000) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Times (n,), heights of the points (n, points) and coefficients (n, 36) of the sets that gave a figure.
+    """Read times (n,), point heights (n, points) and coefficients (n, 36) of the sets with a figure.
 
-    At most about `most` of them, evenly chosen, however long the run.
+    At most about `most` of them, evenly spaced, however long the run.
     """
     with path.open(newline="", encoding="utf-8") as file:
         stride = max(1, -(-(sum(1 for _ in file) - 1) // most))
@@ -41,7 +41,7 @@ def read_series(path: Path, points: int, most: int = 4000) -> tuple[FloatArray, 
 
 
 def draw_uncertainty(path: Path, axis_mm: FloatArray, height_um: FloatArray, rmse_um: FloatArray, pair: bool) -> None:
-    """Height, or its change, beside its RMSE; (n, n) maps."""
+    """Draw the height, or its change, beside its RMSE; (n, n) maps."""
     figure = Figure(figsize=(11, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     if pair:
@@ -60,7 +60,7 @@ def draw_stability(
     points: Mapping[str, tuple[float, float]],
     heights_um: FloatArray,
 ) -> None:
-    """The paper's figure: height at the named points (sets, points) in time, and the map of standard deviations."""
+    """Draw the paper's figure: point heights (sets, points) over time, and the map of standard deviations."""
     figure = Figure(figsize=(12, 2.2 * max(2, len(points))), layout="constrained")
     grid = figure.add_gridspec(len(points), 2, width_ratios=(1.4, 1))
     for k, name in enumerate(points):
@@ -78,7 +78,7 @@ def draw_stability(
 
 
 def draw_zernike(path: Path, time_s: FloatArray, coeffs_um: FloatArray) -> None:
-    """Changes of the terms (sets, 36) against their means: the eight that move most, named by Noll's index."""
+    """Draw the terms' changes (sets, 36) from their means: the eight that move most, by Noll index."""
     change = coeffs_um - coeffs_um.mean(axis=0)
     figure = Figure(figsize=(10, 5), layout="constrained")
     axes = figure.subplots()
@@ -90,7 +90,7 @@ def draw_zernike(path: Path, time_s: FloatArray, coeffs_um: FloatArray) -> None:
 
 
 def draw_pairs(path: Path, axis_mm: FloatArray, maps: Mapping[float, tuple[FloatArray, FloatArray]]) -> None:
-    """For each lag in s a pair's change of height beside its RMSE, in um."""
+    """Draw, for each lag in s, a pair's change of height beside its RMSE, in um."""
     figure = Figure(figsize=(11, 4.6 * len(maps)), layout="constrained")
     axes = figure.subplots(len(maps), 2, squeeze=False)
     for row, (lag_s, (change_um, rmse_um)) in zip(axes, maps.items(), strict=True):
@@ -109,19 +109,19 @@ def log_stability(
     lines: Sequence[str],
     pictures: Sequence[Path],
 ) -> None:
-    """Write a stability run as a recording `path` (.rrd), overwritten. Raises OSError if it cannot be written.
+    """Write a stability run to a recording `path` (.rrd), overwriting it. Raises OSError if it cannot be written.
 
     Parameters
     ----------
     heights_um, coeffs_um : (n, points), (n, 36) arrays
-        Shown against their means, without piston.
+        Shown relative to their means, without piston.
     sd_um : (m, m) array
         Map of standard deviations, rows along y, NaN outside.
     """
     terms = [f"Z{j}" for j in range(2, 37)]
     with result_recording(path, "membrane_ctrl_stability", _blueprint(pictures)) as recording:
         recording.log("stability/report", rr.TextDocument("\n".join(lines)), static=True)
-        # row 0 of a picture is on top, that is at +y
+        # row 0 of a picture is at the top, i.e. at +y
         sd = rr.Tensor(sd_um[::-1].astype(np.float32), dim_names=["y", "x"])
         recording.log("stability/sd_um", sd, static=True)
         for entity, names, values in (("points_um", points, heights_um), ("zernike_um", terms, coeffs_um[:, 1:])):
@@ -132,7 +132,7 @@ def log_stability(
 
 
 def _blueprint(pictures: Sequence[Path]) -> rrb.Blueprint:
-    """Plots over the whole run: without it they show a minute about the cursor."""
+    """Show plots over the whole run; the default is a minute around the cursor."""
     always = rr.TimeRangeBoundary.infinite()
     axis = rrb.TimeAxis(view_range=rr.TimeRange(start=always, end=always))
     plots = (

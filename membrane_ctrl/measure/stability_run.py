@@ -1,4 +1,4 @@
-"""What a stability analysis accumulates over its sets, and the files it leaves."""
+"""The accumulated statistics of a stability analysis, and its output files."""
 
 import contextlib
 import csv
@@ -17,7 +17,7 @@ from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo, st
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.arrays import FloatArray
 
-SERIES = "series.csv"  # also what tells a folder of results from a set
+SERIES = "series.csv"  # its presence also distinguishes a result folder from a set
 _NAMED_BAD = 100  # bad sets listed in the table; all of them are in series.csv
 _PAIR_HEAD = ("lag_s", "earlier", "later", "seconds", "change_rms_um", "rmse_mean_um", "rmse_max_um")
 
@@ -25,8 +25,8 @@ _PAIR_HEAD = ("lag_s", "earlier", "later", "seconds", "change_rms_um", "rmse_mea
 class StabilityRun:
     """Statistics over the sets of a run.
 
-    `out` is an existing folder for `series.csv`, `pairs.csv`, the SD map and the pictures; `points_mm` are the places
-    where the height is followed; `geometry` is the file that the sets' geometry is from, with its covariance.
+    `out` is an existing folder for `series.csv`, `pairs.csv`, the SD map and the pictures; `points_mm` are the
+    tracked points; `geometry` is the file of the sets' geometry, with its covariance.
     """
 
     def __init__(
@@ -73,12 +73,12 @@ class StabilityRun:
 
     @property
     def used(self) -> int:
-        """Sets that gave a figure."""
+        """Number of sets with a figure."""
         return self._parameters.count
 
     @property
     def first_reason(self) -> str:
-        """Why the first bad set is bad."""
+        """Reason of the first bad set."""
         return self._bad[0]["reason"] if self._bad else ""
 
     def skip(self, name: str, reason: str) -> None:
@@ -89,7 +89,7 @@ class StabilityRun:
         self._series.writerow((name, "rejected", reason))
 
     def add(self, name: str, number: int, one: measurement.SetFigure) -> None:
-        """Count a set; `number` is its place in the run, from which its noise is drawn."""
+        """Count a set; `number` is its place in the run, which seeds its noise."""
         grid, spread = self._grid_for(one), self._spread_for(one)
         surface = one.figure.fit.surface
         parameters = surface.parameters
@@ -148,7 +148,7 @@ class StabilityRun:
         }
 
     def lines(self) -> list[str]:
-        """What a person wants to read."""
+        """The result as lines of text."""
         table = self.table()
         sets = table["sets"]
         out = [
@@ -164,7 +164,7 @@ class StabilityRun:
         return [*out, f"height    RMSE {table['rmse_um']['mean']:.4g} um, shared by all sets ({self._source})"]
 
     def draw(self) -> list[Path]:
-        """Write the SD map and the pictures, and name these; the series must be closed. Raises OSError."""
+        """Write the SD map and the pictures and return the latter; the series must be closed. Raises OSError."""
         grid = self._grid
         if grid is None:
             return []
@@ -192,9 +192,9 @@ class StabilityRun:
         stability_results.log_stability(self._out / "stability.rrd", *followed, sd_um, self.lines(), pictures)
 
     def _followed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Times, heights of the points and terms of the sets that gave a figure."""
+        """Times, point heights and terms of the sets with a figure."""
         times, heights, coeffs = stability_results.read_series(self._out / SERIES, len(self._points_mm))
-        if not np.isfinite(times).all():  # sets without times: count them
+        if not np.isfinite(times).all():  # sets without times: use their numbers
             times = np.arange(len(times), dtype=float)
         return times, heights, coeffs
 
@@ -213,7 +213,7 @@ class StabilityRun:
         return self._spread
 
     def _sd_um(self) -> FloatArray:
-        """(points,) over the sets, at the points of the grid."""
+        """Standard deviations (points,) over the sets, at the grid points."""
         if self._grid is None:
             return np.zeros(1)
         return 1e3 * self._grid.sigma(self._parameters.covariance)

@@ -24,10 +24,10 @@ from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
 from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.arrays import FloatArray
 
-# Runs Monte Carlo trials: here, over the cores, or on a Dask cluster; the numbers are the same wherever they run.
+# Runs Monte Carlo trials: in this process, on all cores, or on a Dask cluster, with identical numbers.
 
-_BATCH = 100  # trials a job: a tenth of a second each, so that the bar moves and no worker waits for long
-# A process takes some two seconds to start (imports, compiled loops): less work than this is done here.
+_BATCH = 100  # trials per job: a tenth of a second, so that the bar moves and no worker waits for long
+# A process takes about two seconds to start (imports, compiled loops): less work than this stays in this process.
 _WORTH_PROCESSES = 5000
 _CONNECT_S = 10
 
@@ -43,9 +43,9 @@ def run_everywhere(
 ) -> FloatArray:
     """Parameters (trials, sets, 36) in mm as `monte_carlo.run_trials`, with a progress bar on a terminal.
 
-    `workers` is the number of processes, by default chosen by the amount of work; `scheduler` the address of a Dask
-    scheduler, as tcp://host:8786, to run there instead. Raises InputError if Dask is wanted and not installed, or the
-    spread is too wide for the fit to converge; DeviceError if the scheduler does not answer.
+    `workers` is the number of processes, by default according to the work; `scheduler` the address of a Dask
+    scheduler to use instead, e.g. tcp://host:8786. Raises InputError if Dask is not installed or the spread is too
+    wide for the fit to converge; DeviceError if the scheduler does not answer.
     """
     batches = [range(first, min(first + _BATCH, trials)) for first in range(0, trials, _BATCH)]
     job = partial(monte_carlo.run_trials, benches, spread, seed)
@@ -60,7 +60,7 @@ def run_everywhere(
 
 @contextmanager
 def _results(job: Any, batches: list[range], workers: int, scheduler: str | None) -> Iterator[Iterator[FloatArray]]:
-    """Results of the batches, in their order."""
+    """Results of the batches, in order."""
     if scheduler is not None:
         with _dask_client(scheduler) as client:
             yield (future.result() for future in client.map(job, batches, pure=False))
@@ -81,13 +81,13 @@ def _dask_client(address: str) -> Any:
         return distributed.Client(address, timeout=_CONNECT_S)
     except ValueError as error:
         raise errors.InputError(f"--scheduler {address}: {error}") from None
-    except OSError as error:  # a timeout is one
+    except OSError as error:  # includes time-outs
         raise errors.DeviceError(f"--scheduler {address}: does not answer ({error})") from None
 
 
 @dataclass(frozen=True)
 class UncertaintyOptions:
-    """What the command was asked for."""
+    """Options of the command."""
 
     folder: Path
     against: Path | None
@@ -111,14 +111,14 @@ class Spread:
 
 
 def uncertainty_command(options: UncertaintyOptions) -> int:
-    """Run the trials, write map, table and picture, say what came out. Raises CommandError."""
+    """Run the trials, write map, table and picture, and report. Raises CommandError."""
     figures = Figures(None if options.geometry is None else file.read_geometry(options.geometry))
     sets = [figures.of(folder) for folder in (options.folder, options.against) if folder is not None]
     spread, source = spread_file.spread_of(sets[0].head.optics.geometry, options.geometry)
-    print(f"geometry's spread: {source}", file=sys.stderr)
+    print(f"geometry uncertainty: {source}", file=sys.stderr)
     benches = [one.bench() for one in sets]
     if len({bench.optics.geometry for bench in benches}) > 1:
-        raise errors.InputError(f"{options.against}: geometry: not that of {options.folder}; a pair has one bench")
+        raise errors.InputError(f"{options.against}: geometry: differs from {options.folder}; a pair needs one bench")
     begin = time.perf_counter()
     parameters = run_everywhere(
         benches, spread, options.seed, options.trials, workers=options.workers, scheduler=options.scheduler
@@ -138,7 +138,7 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
 def _spread(
     benches: list[monte_carlo.TrialBench], spread: geometry_spread.GeometrySpread, parameters: FloatArray
 ) -> Spread:
-    """Of the only set, or of the first minus the second, trial by trial."""
+    """Spread of the only set, or of the first minus the second, trial by trial."""
     own = parameters[:, 0] if len(benches) == 1 else parameters[:, 0] - parameters[:, 1]
     noise = np.sum([monte_carlo.noise_covariance(bench) for bench in benches], axis=0)
     return Spread(monte_carlo.trial_covariance(own), monte_carlo.linear_covariance(benches, spread), noise)

@@ -1,4 +1,4 @@
-"""How a run opens in the viewer: one tab a question."""
+"""How a run opens in the viewer: one tab per question."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -12,7 +12,7 @@ from membrane_ctrl.model.states import Rung, ShapeState, State
 
 
 def run_blueprint(config: Config) -> rrb.Blueprint:
-    """The arrangement for a run; the shape tab is there only when the shape is measured."""
+    """The layout of a run; it has a shape tab only if the shape is measured."""
     tabs = [_overview(config), _loop(config), _environment(config), _timing(), _long_review()]
     if config.shape.enabled:
         tabs.insert(2, _shape(config))
@@ -26,7 +26,7 @@ def run_blueprint(config: Config) -> rrb.Blueprint:
 
 
 def _whole_run() -> rrb.TimeAxis:
-    """The whole run on the axis; without it, or with plots linked to one axis, half a minute about the cursor."""
+    """Show the whole run; the default, and plots linked to one axis, show half a minute around the cursor."""
     everything = rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
     return rrb.TimeAxis(view_range=everything)
 
@@ -43,7 +43,7 @@ def _plot(name: str, *paths: str, span: tuple[float, float] | None = None) -> rr
 
 
 def _error(config: Config) -> rrb.TimeSeriesView:
-    """Twice the band high: where the run began, tens of um off, would leave nothing to see of the hold."""
+    """Plot the error over twice the band: the start, tens of um off, would make the hold invisible."""
     span = (-2 * config.limits.band_um, 2 * config.limits.band_um)
     return _plot("Error and band, um", "/loop/error", "/truth/error", "/loop/band", span=span)
 
@@ -147,7 +147,7 @@ def _long_review() -> rrb.Vertical:
     )
 
 
-# State lanes: which words a lane may show, in which colours, and what the codes of a row mean.
+# State lanes: the words of a lane, their colours, and the meaning of a row's codes.
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +159,7 @@ class Lane:
     path : str
         Rerun entity.
     field : str
-        Telemetry field that holds the code; empty when the lane is not made from telemetry.
+        Telemetry field that holds the code; empty if the lane does not come from telemetry.
     words : dict
         Code to word.
     colours : dict
@@ -172,7 +172,7 @@ class Lane:
     colours: dict[str, int]
 
     def word(self, code: int) -> str:
-        """The word for a code; an unknown code is shown as it is."""
+        """The word for a code; an unknown code is shown as a number."""
         return self.words.get(code, f"code {code}")
 
 

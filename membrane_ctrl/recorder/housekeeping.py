@@ -1,4 +1,4 @@
-"""What the recorder does beside recording: looks at the disk, optimises closed segments, deletes old runs."""
+"""Side tasks of the recorder: watches the disk, optimises closed segments, deletes old runs."""
 
 import contextlib
 import importlib.util
@@ -15,20 +15,20 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.recorder.sink import LAYOUT, RecorderErrors, is_whole
 from membrane_ctrl.run_files import disk_budget, run_folder
 
-# Whether the run's folder is still the one that was begun, and another in its place if it is not.
+# Detects that the run's folder was removed or replaced, and makes a new one.
 
 
 class FolderWatch:
-    """Holds the folder open: as long as that is so its number is nobody else's, and it cannot be mistaken."""
+    """Holds the folder open, so that its inode number cannot be reused and identifies it."""
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir
         self._descriptor = _opened(run_dir)
-        # an `rm -r` that met a file just written leaves the folder, without what was in it
+        # an `rm -r` that meets a newly written file leaves the folder, but without its content
         self._has_config = (run_dir / run_folder.CONFIG).exists()
 
     def gone(self) -> bool:
-        """Whether the folder, or what was in it, was removed or moved. Raises OSError (not if it is missing)."""
+        """Whether the folder or its content was removed or moved. Raises OSError (not if it is missing)."""
         if self._descriptor is None or (self._has_config and not (self._run_dir / run_folder.CONFIG).exists()):
             return True
         try:
@@ -38,7 +38,7 @@ class FolderWatch:
         return not os.path.samestat(found, os.fstat(self._descriptor))
 
     def begin_anew(self, config: Config) -> None:
-        """Make the folder again, with the configuration in it. Raises OSError; then it is still `gone`."""
+        """Make the folder again, with its configuration. Raises OSError; the folder is then still `gone`."""
         self._run_dir.mkdir(parents=True, exist_ok=True)
         run_folder.write_config(self._run_dir, config)
         self.close()
@@ -46,7 +46,7 @@ class FolderWatch:
         self._has_config = True
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Release the folder."""
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
@@ -59,10 +59,10 @@ def _opened(folder: Path) -> int | None:
         return None
 
 
-# Closed segments through `rerun rrd optimize`, one at a time, in a process that steps back behind everything.
+# Runs closed segments through `rerun rrd optimize`, one at a time, in a process of lowest priority.
 #
-# It takes a third off a segment and the wait off opening it. The original is replaced in one step, and only by a
-# file that has its footer and was made without an error.
+# That shrinks a segment by a third and makes it open at once. The original is replaced atomically, and only by a file
+# that has its footer and was made without an error.
 
 
 _PACKAGE = importlib.util.find_spec("rerun_cli")
@@ -72,9 +72,9 @@ _RERUN = Path(_PACKAGE.origin).parent / "rerun"
 
 
 def optimize_command(source: Path, target: Path, *options: str) -> list[str]:
-    """The command that writes `target` from `source`; the binary itself, as its Python wrapper outlives a kill.
+    """The command that writes `target` from `source`; it names the binary, as its Python wrapper survives a kill.
 
-    An option may be another source.
+    Options may include another source.
     """
     return ["nice", "-n", "19", str(_RERUN), "rrd", "optimize", *options, str(source), "-o", str(target)]
 
@@ -87,7 +87,7 @@ def quiet_environment() -> dict[str, str]:
 class Optimizer:
     """Works through closed segments beside the recorder; call `poll` now and then.
 
-    What a killed recorder has left half done in the folder is removed.
+    Removes half-done files left by a killed recorder.
     """
 
     def __init__(self, run_dir: Path) -> None:
@@ -98,11 +98,11 @@ class Optimizer:
         self._source = self._part = Path()
 
     def add(self, path: Path) -> None:
-        """Take a closed segment on."""
+        """Queue a closed segment."""
         self._waiting.append(path)
 
     def poll(self) -> None:
-        """Put a finished file in place, start the next. Raises OSError, also for one that could not be optimised."""
+        """Put a finished file in place and start the next. Raises OSError, also for a failed optimisation."""
         if self._process is not None:
             code = self._process.poll()
             if code is None:
@@ -112,7 +112,7 @@ class Optimizer:
         if self._waiting:
             self._source = self._waiting.popleft()
             self._part = self._source.with_name(f".{self._source.name}.part")
-            # the run's layout, which only its first segment has
+            # the run's layout, which only the first segment contains
             layout = [str(path) for path in (self._source.with_name(LAYOUT),) if path.exists()]
             self._process = subprocess.Popen(
                 optimize_command(self._source, self._part, *layout),
@@ -128,15 +128,15 @@ class Optimizer:
             self._part.replace(self._source)
             return
         self._part.unlink(missing_ok=True)
-        raise OSError(f"{self._source.name} stays as it is: rrd optimize ended with {code}")
+        raise OSError(f"{self._source.name} is not optimised: rrd optimize ended with {code}")
 
     @property
     def busy(self) -> bool:
-        """Something is under way or waits."""
+        """Whether a segment is in progress or queued."""
         return self._process is not None or bool(self._waiting)
 
     def close(self) -> None:
-        """End what is under way; its segment stays as it is."""
+        """Abort the current optimisation; its segment stays as it is."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -144,17 +144,17 @@ class Optimizer:
             self._part.unlink(missing_ok=True)
 
 
-# Counting the bytes of a hundred runs takes a second of disk.
+# Counting the bytes of a hundred runs keeps the disk busy for a second.
 RETENTION_INTERVAL_S = 3600.0
-# At the run's end a person waits for the prompt, and a service manager is about to kill what is left. A segment of an
-# hour takes longer only on a very busy machine (docs/recording.md).
+# At the run's end a person waits for the prompt, and a service manager is about to kill remaining processes. A
+# one-hour segment takes longer only on a very busy machine (docs/recording.md).
 _OPTIMISE_LAST_S = 20.0
 _LOOK_S = 0.05
-_RUN = "retention: "  # and the run that cannot be deleted
+_RUN = "retention: "  # followed by the run that cannot be deleted
 
 
 class Housekeeping:
-    """One look each second; `detail` says what has to be left out."""
+    """Works once a second; `detail` says what to omit."""
 
     def __init__(self, run_dir: Path, clock: RunClock, config: RecordingConfig, errors: RecorderErrors) -> None:
         self._run_dir = run_dir
@@ -166,7 +166,7 @@ class Housekeeping:
         self.detail = disk_budget.DetailLevel.ALL
 
     def finish(self, closed: list[Path]) -> None:
-        """The run is over: optimise what is closed; what takes too long stays as it is."""
+        """At the end of the run, optimise closed segments, as far as time allows."""
         give_up_s = time.monotonic() + _OPTIMISE_LAST_S
         self._take(closed)
         while True:
@@ -181,7 +181,7 @@ class Housekeeping:
                 self._optimizer.add(path)
 
     def look(self, now_s: float, closed: list[Path]) -> None:
-        """Watch the disk, go on with what is under way; `closed` are segments to optimise."""
+        """Watch the disk and continue pending work; `closed` are segments to optimise."""
         self._errors.guarded("disk check", self._watch_disk)
         self._take(closed)
         self._errors.guarded("optimise", self._optimizer.poll)
@@ -202,16 +202,16 @@ class Housekeeping:
         config = self._config
         if config.keep_gb is None and config.keep_days is None:
             return
-        # the run's own axis: a wall clock that is set wrong meanwhile deletes nothing
+        # the run's own axis: a wall clock set wrong meanwhile must delete nothing
         now_utc = self._clock.utc(self._clock.now())
         disk_budget.delete_remains(self._run_dir.parent)
         runs = disk_budget.deletable_runs(self._run_dir.parent, self._run_dir, now_utc)
         gone = disk_budget.expired(
             runs, disk_budget.size_bytes(self._run_dir), config.keep_gb, config.keep_days, now_utc
         )
-        # a folder that a person has moved away by hand is no trouble any more
+        # a folder that a person has moved away is no longer an error
         self._errors.forget(_RUN, but={_RUN + run.folder.name for run, _ in gone})
-        for run, why in gone:  # one by one: a folder that cannot go must not keep the others
+        for run, why in gone:  # one by one: a folder that cannot be deleted must not block the others
             self._errors.guarded(_RUN + run.folder.name, partial(self._delete, run, why))
 
     def _delete(self, run: disk_budget.OldRun, why: str) -> None:
@@ -219,7 +219,7 @@ class Housekeeping:
         self._errors.report(run_events.RunDeleted(run.folder.name, why))
 
     def close(self) -> None:
-        """End what is under way."""
+        """Abort pending work."""
         with contextlib.suppress(OSError):
             self._optimizer.close()
             (self._run_dir / LAYOUT).unlink(missing_ok=True)

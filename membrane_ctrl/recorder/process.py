@@ -1,7 +1,7 @@
 """The recorder's process: started with `spawn`, fed by rings, ended by the run's "end" event.
 
 Rerun is imported here only after the process has started: the control process must not load it, and a stream
-that a forked child inherited loses what the child logs.
+inherited by a forked child loses what the child logs.
 """
 
 import os
@@ -29,45 +29,45 @@ from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
 if TYPE_CHECKING:
     from membrane_ctrl.recorder.sink import Recording
 
-# Rings are emptied this often: the ring of ticks has to hold a few of these.
+# Rings are emptied this often; the ring of ticks must hold a few intervals.
 POLL_S = 0.25
-# A recorder that has not got round for so long is replaced: half of what the rings hold, so that the next one
-# still finds everything. A disk that is slower than this for one second of a run is as good as gone.
+# A recorder silent for this long is replaced: half of the rings' capacity, so that the next one still finds
+# everything. A disk that needs longer for one second of a run is as good as gone.
 _ROUND_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
 class RecorderSpec:
-    """What the recorder's process needs; picklable."""
+    """Arguments of the recorder's process; picklable."""
 
     run_dir: Path
     run_name: str  # of the `.rrd` segments
     clock: RunClock
     config: Config
     inputs: RingAddress  # the ticks (`tick.pack_tick`)
-    events: RingAddress  # the one of kind "end" is the last
+    events: RingAddress  # the last one has the kind "end"
     shapes: RingAddress | None = None
     frames: FrameAddress | None = None  # for thumbnails
-    resumes: int = 0  # recorders of this run that have died before; this one goes on where they stopped
-    flush_s: float = 1.0 - POLL_S  # between writes: with the round it waits for, what a power cut may lose
+    resumes: int = 0  # earlier recorders of this run that died; this one continues where they stopped
+    flush_s: float = 1.0 - POLL_S  # between writes; a power cut may lose this plus one poll
 
 
 def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
-    """Record until the "end" event, until `processes.STOP`, or until the parent has died; then close and summarise.
+    """Record until the "end" event, `processes.STOP` or the parent's death; then close and summarise.
 
     Parameters
     ----------
     spec : RecorderSpec
         What to record and where.
     status : Connection or None
-        Gets events of the recorder, and each second that it is alive; one that cannot be taken at once is given up.
+        Gets the recorder's events, and a sign of life each second; drops those that cannot be sent at once.
     """
     asked = Flag()
-    # ctrl-C reaches the whole terminal group: the supervisor decides when the run is over, with the "end" event
+    # Ctrl-C reaches the whole terminal group, but the supervisor ends the run, with the "end" event
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(STOP, lambda *_: asked.set())
-    os.environ["RUST_LOG"] = "off"  # Rerun's own log would write over the console; its errors come as exceptions
-    # read when Rerun is imported: its allocator gives back at once what a closed segment leaves, or 30 MB would stay
+    os.environ["RUST_LOG"] = "off"  # Rerun's own log would spoil the console; its errors come as exceptions
+    # read at Rerun's import: makes its allocator free a closed segment's memory at once, else 30 MB would stay
     os.environ["MIMALLOC_PURGE_DELAY"] = "0"
     if not _record(spec, reporter(status), asked.is_set, lambda: not parent_lives()):
         os._exit(0)  # everything is written; Rerun's exit handler would wait for a dead writer
@@ -79,7 +79,7 @@ def _record(
     asked: Callable[[], bool],
     orphan: Callable[[], bool],
 ) -> bool:
-    """Record until the end; whether the process may end in the ordinary way."""
+    """Record until the end; returns whether the process may exit normally."""
     from membrane_ctrl.recorder.recorder import Recorder
     from membrane_ctrl.recorder.sink import Recording
 
@@ -92,7 +92,7 @@ def _record(
     recorder = Recorder(spec.run_dir, spec.clock, spec.config, rings, recording, thumbnails, report, spec.resumes)
     next_write_s = 0.0
     while not recorder.ended:
-        # asked before draining: what a parent put before it died is then seen in this round
+        # asked before draining, so that this round still sees a dying parent's last messages
         exit_word = "killed" if orphan() else "terminated" if asked() else ""
         recorder.drain()
         if exit_word and not recorder.ended:
@@ -116,17 +116,17 @@ def _end_event(clock: RunClock, exit_word: str) -> EventLine:
     return {"time_utc": clock.utc(now_s).isoformat(), "mono_s": now_s} | Ended(exit_word).to_dict()
 
 
-# Small pictures of the camera's frames, now and then.
+# Small pictures of camera frames, now and then.
 
 
-# Raw frames would be 1.7 TB a day; a set of eight thumbnails each half minute is about 0.3 GB.
+# Raw frames would be 1.7 TB a day; eight thumbnails every half minute are about 0.3 GB.
 THUMBNAIL_INTERVAL_S = 30.0
 THUMBNAIL_HEIGHT_PX = 256
 _JPEG_QUALITY = 80
 
 
 class Thumbnails:
-    """Takes the newest frame of each pattern from the shared frames, at most one set each `THUMBNAIL_INTERVAL_S`."""
+    """Sends the newest shared frame of each pattern, at most one set per `THUMBNAIL_INTERVAL_S`."""
 
     def __init__(self, recording: "Recording", address: FrameAddress) -> None:
         self._recording = recording
@@ -159,6 +159,6 @@ class Thumbnails:
 
 
 def _eight_bit(pixels: Pixels) -> NDArray[np.uint8]:
-    """JPEG takes 8 bits: of wider pixels the upper ones that are in use."""
+    """Reduce to JPEG's 8 bits: of wider pixels, the upper bits in use."""
     shift = max(0, int(pixels.max()).bit_length() - 8)
     return (pixels >> shift).astype(np.uint8)

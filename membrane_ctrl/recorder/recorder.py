@@ -1,4 +1,4 @@
-"""What the recorder does with what the rings bring: files, Rerun, summary. Nothing here may end it silently."""
+"""The recorder: turns ring messages into files, Rerun data and the summary. Nothing here may end it silently."""
 
 import contextlib
 import json
@@ -17,11 +17,11 @@ from membrane_ctrl.recorder import housekeeping, rerun_output, sink
 from membrane_ctrl.run_files import events, tables
 from membrane_ctrl.run_files.summary import Summary
 
-# A ring as the recorder reads it: each message once, also when another recorder goes on where one was killed.
+# A ring as the recorder reads it: each message once, even when a new recorder continues after a killed one.
 
 
 class Feed:
-    """Counts messages from the ring's first one on, and passes over those a former recorder has brought to the disk.
+    """Counts messages from the ring's first one, and skips those that an earlier recorder has written to disk.
 
     The reader is fresh: it starts at the oldest message still in the ring. `position` messages are recorded or lost,
     `dropped` of them overwritten before any recorder got to them.
@@ -35,7 +35,7 @@ class Feed:
         self.dropped = dropped
 
     def drain(self) -> list[bytes]:
-        """All messages since the last call that nobody has recorded yet."""
+        """Unrecorded messages since the last call."""
         messages = self._reader.drain()
         lost = self._reader.dropped - self._lost_by_reader
         self._lost_by_reader = self._reader.dropped
@@ -47,37 +47,37 @@ class Feed:
         return messages[known:]
 
 
-# What a recorder hands on to the one that takes its place: how far it got, and the statistics so far.
+# What a recorder hands to its successor: its progress, and the statistics so far.
 #
 # Plain JSON (`object_codec`), written and read by the same program and removed at the run's end.
 
 
 _NAME = ".recorder-state"
-_BYTES_MAX = 16_000_000  # it takes 0.2 MB, and 0.5 MB with all the transitions and faults that a summary lists
+_BYTES_MAX = 16_000_000  # usually 0.2 MB; 0.5 MB with all the transitions and faults that a summary lists
 _SPECIALS: object_codec.Specials = {shape_estimate.ShapeEstimate: object_codec.ESTIMATE}
 
 
 @dataclass(slots=True)
 class RecorderState:
-    """Everything of a recorder that is not in the run's files."""
+    """The state of a recorder that is not in the run's files."""
 
     summary: Summary
-    positions: dict[str, int] = field(default_factory=dict)  # of each ring: messages recorded or lost
-    dropped: dict[str, int] = field(default_factory=dict)  # of each ring: messages lost
-    reference: shape_estimate.ShapeEstimate | None = None  # what changes of the figure are told against
-    state: float = math.nan  # the controller's, in the last row
+    positions: dict[str, int] = field(default_factory=dict)  # per ring: messages recorded or lost
+    dropped: dict[str, int] = field(default_factory=dict)  # per ring: messages lost
+    reference: shape_estimate.ShapeEstimate | None = None  # reference for changes of the figure
+    state: float = math.nan  # of the controller, in the last row
     windows: tables.OpenWindows = field(default_factory=tables.OpenWindows)
     errors: int = 0
     rows_lost: int = 0
     events_lost: int = 0
     input_ticks_lost: int = 0
-    folder_anew_s: float | None = None  # when somebody had taken the folder away
+    folder_anew_s: float | None = None  # when the folder was found removed
 
 
 def save_state(run_dir: Path, state: RecorderState) -> None:
-    """Write the state in one step. Raises OSError.
+    """Write the state atomically. Raises OSError.
 
-    Not synced: it is of use after a killed recorder, not after a power cut, when the rings are gone as well.
+    Not synced: it serves after a killed recorder, not after a power cut, which also loses the rings.
     """
     part = run_dir / f"{_NAME}.part"
     with files.fresh_file(part) as file:
@@ -86,42 +86,42 @@ def save_state(run_dir: Path, state: RecorderState) -> None:
 
 
 def load_state(run_dir: Path) -> RecorderState | None:
-    """The state left behind; None if there is none that can be read."""
+    """Read the state left behind; None if there is none or it is unreadable."""
     decoder = object_codec.Decoder((RecorderState(Summary(Config())),), _SPECIALS)
     try:
         state = decoder.decode(json.loads(files.read_bytes(run_dir / _NAME, _BYTES_MAX)), RecorderState)
-    except (OSError, ValueError, RecursionError):  # the recorder begins anew and says so
+    except (OSError, ValueError, RecursionError):  # the recorder starts afresh and reports that
         return None
     assert isinstance(state, RecorderState)
     return state
 
 
 def remove_state(run_dir: Path) -> None:
-    """The run is over: nobody goes on."""
+    """Remove the state file of a finished run."""
     with contextlib.suppress(OSError):
         (run_dir / _NAME).unlink(missing_ok=True)
 
 
 class Recorder:
-    """Everything of a run that goes to the disk.
+    """Writes everything of a run to disk.
 
     Parameters
     ----------
     rings : dict
         Readers by name: "inputs" (the ticks), "events" and, if the shape is measured, "shapes".
     recording : Recording
-        The Rerun file, no segment begun yet.
+        The Rerun file, without a segment yet.
     report : callable
         Takes an event for the supervisor; never blocks, never raises.
     resumes : int
-        How many recorders of this run have died before.
+        Number of earlier recorders of this run that died.
 
     Attributes
     ----------
     ended : bool
-        The run's "end" event has come.
+        The run's "end" event has arrived.
     urgent : bool
-        Something has come that `write` should not wait for its second with.
+        A message has arrived for which `write` should not wait.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class Recorder:
         self.ended = self.urgent = False
 
     def drain(self) -> None:
-        """Take in what the rings hold; events go to `events.jsonl` at once."""
+        """Take all ring messages; events go to `events.jsonl` at once."""
         self._messages += self._feeds["inputs"].drain()
         if "shapes" in self._feeds:
             for message in self._feeds["shapes"].drain():
@@ -173,7 +173,7 @@ class Recorder:
         self.take_events([events.parse(message) for message in self._feeds["events"].drain()])
 
     def take_events(self, new: list[EventLine]) -> None:
-        """Take in events; an "end" among them ends the run."""
+        """Take events; an "end" among them ends the run."""
         for event in new:
             self._summary.add_event(event)
             self.urgent |= event.get("kind") in events.URGENT
@@ -188,7 +188,7 @@ class Recorder:
         self._errors.guarded("shape columns", lambda: self._columns.add_shape(estimate))
 
     def write(self) -> None:
-        """Bring what came since the last call to the disk, and see that it got there."""
+        """Write everything since the last call to disk, and sync it."""
         now_s = self._clock.now()
         self._errors.guarded("new run folder", lambda: self._see_folder(now_s))
         batch = self._assembler.take(self._messages)
@@ -206,20 +206,20 @@ class Recorder:
         guarded("state file", self._hand_on)
 
     def _see_folder(self, now_s: float) -> None:
-        """Go on in a new folder if the run's was taken away: writing to a deleted file goes without an error."""
+        """Continue in a new folder if the run's was removed: writing to a deleted file raises no error."""
         if not self._folder.gone():
             return
         self._folder.begin_anew(self._config)
         self._folder_anew_s = now_s
-        # never taken back: what is missing stays missing
-        what = f"{self._run_dir} was removed or moved, and is begun anew at {now_s:.1f} s"
-        self._errors.report_error("run folder", f"{what}; what was recorded before is not in it")
+        # never cleared: the lost part stays lost
+        what = f"{self._run_dir} was removed or moved; a new one starts at {now_s:.1f} s"
+        self._errors.report_error("run folder", f"{what}, without the earlier data")
         self._columns.leave_folder()
         self._rerun.leave_folder()
         self._events_file.begin_anew(self._events)
 
     def _hand_on(self) -> None:
-        """Leave behind what another recorder would need to go on from here."""
+        """Save the state that a successor would need."""
         state = RecorderState(
             self._summary,
             {name: feed.position for name, feed in self._feeds.items()},
@@ -239,7 +239,7 @@ class Recorder:
         return {name: feed.dropped for name, feed in self._feeds.items()}
 
     def finish(self, in_haste: bool = False) -> None:
-        """Last drain, close the recording with its footer, write `summary.json`, optimise unless `in_haste`."""
+        """Drain once more, close the recording with its footer, write `summary.json`, optimise unless `in_haste`."""
         self.drain()
         self.write()
         guarded = self._errors.guarded
@@ -254,8 +254,8 @@ class Recorder:
             "events_lost": self._events_lost + self._events_file.lost,
             "input_ticks_lost": self._input_ticks_lost + self._columns.lost_ticks,
             "restarts": self._resumes,
-            "folder_anew_s": self._folder_anew_s,  # None: it is the one that was begun
-            # without what the former recorder knew, the statistics begin with what the ring still had
+            "folder_anew_s": self._folder_anew_s,  # None: it is still the original
+            # without its predecessor's state, the statistics start with the oldest message in the ring
             "partial": self._began_anew and self._feeds["inputs"].dropped > 0,
         }
         text = plain_json.dumps_checked(self._summary.as_dict(self._dropped(), account), indent=2) + "\n"
@@ -263,7 +263,7 @@ class Recorder:
         self._events_file.close()
         self._folder.close()
         remove_state(self._run_dir)
-        # last, as nobody needs it: whoever is in a hurry may kill this process now
+        # last, as it is optional: this process may be killed now
         closed, self._rerun.closed = self._rerun.closed, []
         if not in_haste:
             self._housekeeping.finish(closed)

@@ -1,4 +1,4 @@
-"""What goes to Rerun each second, in segments; a writer that died is given a new file."""
+"""Writes to Rerun every second, in segments; replaces the file of a dead writer."""
 
 import math
 from pathlib import Path
@@ -10,12 +10,12 @@ from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.recorder import rerun_streams, sink
 from membrane_ctrl.run_files.disk_budget import DetailLevel
 
-# A full disk is tried again this often: a person who made room sees the recording go on.
+# A full disk is retried this often, so that recording continues soon after a person makes room.
 RETRY_S = 10.0
 
 
 class FrameSource(Protocol):
-    """Sends thumbnails when they are due (`thumbnails.Thumbnails`)."""
+    """Sends thumbnails when they are due (`process.Thumbnails`)."""
 
     def send(self, now_s: float) -> None:
         """Send a set if one is due."""
@@ -38,7 +38,7 @@ class RerunOutput:
         self._telemetry = rerun_streams.TelemetryStreams(recording, config)
         self.shapes = rerun_streams.ShapeStreams(recording)
         self.state = math.nan  # the controller's, in the last row
-        self.closed: list[Path] = []  # segments, since somebody last took them from here
+        self.closed: list[Path] = []  # closed segments, until taken from here
         self._alive = False
         self._segment_until_s = 0.0
         self._retry_s = 0.0
@@ -56,7 +56,7 @@ class RerunOutput:
         shapes: list[shape_estimate.ShapeEstimate],
         detail: DetailLevel,
     ) -> bool:
-        """One second's worth, until it is on the disk; False if it is lost to Rerun."""
+        """Send one second of data and sync it; False if Rerun lost it."""
         self._errors.guarded("shape reference", lambda: self._watch_hold(rows))
         if detail == DetailLevel.ESSENTIAL:
             self._stop()
@@ -83,7 +83,7 @@ class RerunOutput:
     def _sync(self) -> None:
         try:
             self._recording.sync()
-        except FileNotFoundError:  # somebody has deleted it under us
+        except FileNotFoundError:  # deleted while in use
             self._alive = False
             raise
 
@@ -113,13 +113,13 @@ class RerunOutput:
         return True
 
     def _stop(self) -> None:
-        """Close the file while there is room for its footer; with room again another is begun."""
+        """Close the file while there is room for its footer; a new one starts when there is room again."""
         if self._alive:
             self._alive = False
             self._errors.guarded("recording", self._recording.pause)
 
     def leave_folder(self) -> None:
-        """The run's folder was taken away, and another is in its place: go on there, at once."""
+        """Continue at once in the folder that replaces the run's removed one."""
         self._alive = False
         self._retry_s = 0.0
         self.closed.clear()

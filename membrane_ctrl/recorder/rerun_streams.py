@@ -1,4 +1,4 @@
-"""Telemetry rows to Rerun: one block of columns a stream, lanes where a code changed."""
+"""Telemetry rows to Rerun: one block of columns per stream, lanes where a code changed."""
 
 import math
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ _TIMES = frozenset({"time_utc", "mono_s", "kind"})
 
 
 def send_events(recording: sink.Recording, events: Sequence[EventLine]) -> None:
-    """Send events in their order."""
+    """Send events in order."""
     if not events:
         return
     time_s = np.array([float(event.get("mono_s") or 0.0) for event in events])
@@ -33,7 +33,7 @@ def send_events(recording: sink.Recording, events: Sequence[EventLine]) -> None:
 
 
 def event_text(event: EventLine) -> str:
-    """One line: the kind, then what the event says of itself."""
+    """One line: the kind, then the event's fields."""
     details = [
         f"{key} {_short(value)}" for key, value in event.items() if key not in _TIMES and value not in (None, "")
     ]
@@ -44,10 +44,10 @@ def _short(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-# Fewer rows for the viewer while nothing happens: every tick is in the other files (docs/recording.md).
+# Fewer rows for the viewer while nothing happens; every tick is in the other files (docs/recording.md).
 
 
-# What a person wants every tick of: around a change of these, and while the error is outside the band.
+# Every tick is recorded around a change of these, and while the error is outside the band.
 _CODES = ("state", "shape_state", "rung", "fault")
 _AFTER_S = 60.0
 _BEFORE_S = 10.0
@@ -56,7 +56,7 @@ _BEFORE_S = 10.0
 class QuietFilter:
     """Every tick for a minute after a change and ten seconds before it; otherwise `quiet_hz`.
 
-    An error beyond `band_um` is no quiet.
+    An error beyond `band_um` is not quiet.
     """
 
     def __init__(self, rate_hz: float, quiet_hz: float, band_um: float) -> None:
@@ -67,7 +67,7 @@ class QuietFilter:
         self._held: list[telemetry.Rows] = []
 
     def take(self, rows: telemetry.Rows) -> telemetry.Rows:
-        """The rows to send now, in time; those held back come along when something happens."""
+        """The rows to send now, in order of time; rows held back follow when something happens."""
         if self._every == 1 or not len(rows):
             return rows
         codes = rows[:, [telemetry.COLUMN[name] for name in _CODES]]
@@ -100,11 +100,11 @@ class TelemetryStreams:
         self._codes: dict[str, float] = {}
 
     def start_segment(self) -> None:
-        """Let every lane begin again: a new file does not know the state the last one ended in."""
+        """Restart every lane: a new file does not know the last state of the previous one."""
         self._codes.clear()
 
     def send(self, rows: telemetry.Rows) -> None:
-        """Send (n, len(FIELDS)) rows; a stream without any finite value is left out."""
+        """Send (n, len(FIELDS)) rows; omit streams without any finite value."""
         if not len(rows):
             return
         self._send_streams(self._quiet.take(rows))
@@ -139,15 +139,15 @@ class TelemetryStreams:
             self._codes[lane.field] = float(codes[-1])
 
 
-# Shape estimates to Rerun: every cycle its numbers, now and then its maps.
+# Shape estimates to Rerun: the numbers of every cycle, and maps now and then.
 
 
-# A map is 53 kB on the disk: one difference each minute is 76 MB a day. Nothing is lost, as the coefficients of
-# every cycle are there, from which any map can be made again. In the first minutes somebody is looking.
+# A map takes 53 kB on disk: one difference a minute is 76 MB a day. Nothing is lost, as any map can be rebuilt from
+# the coefficients of its cycle. In the first minutes somebody is watching.
 DIFFERENCE_INTERVAL_S = 60.0
 DIFFERENCE_EARLY_S, EARLY_S = 10.0, 300.0
 MAP_INTERVAL_S = 600.0
-# The colours of the difference map span at least this, so that noise does not look like a figure.
+# The difference map's colours span at least this, so that noise does not look like a figure.
 _DIFFERENCE_LEAST_UM = 0.5
 
 
@@ -165,7 +165,7 @@ class ShapeStreams:
         self._verdict = ""
 
     def start_segment(self) -> None:
-        """Say again in a new file what holds until it changes."""
+        """Repeat in a new file what holds until it changes."""
         self._next_map_s = -math.inf
         self._next_difference_s = -math.inf
         self._verdict = ""
@@ -175,7 +175,7 @@ class ShapeStreams:
         self._reference_from_s = from_s
 
     def send(self, estimate: shape_estimate.ShapeEstimate) -> None:
-        """Send one estimate at the middle of its exposures; of a rejected one only quality and verdict."""
+        """Send one estimate at the middle of its exposures; if rejected, only quality and verdict."""
         time_s = np.array([estimate.time_s])
         for stream, values in _quality(estimate).items():
             self._recording.scalars(stream.path, time_s, np.array([values]))
@@ -214,7 +214,7 @@ class ShapeStreams:
     def _send_map(
         self, kind: str, time_s: float, values: NDArray[np.float32], unit: str, span: tuple[float, float]
     ) -> None:
-        # NaN is drawn like the lowest value: a mask lies over it (`outside`, sent once a file)
+        # NaN is drawn like the lowest value: a mask covers it (`outside`, sent once per file)
         picture = rr.DepthImage(values, colormap="turbo", depth_range=span)
         self._recording.log(f"/shape/map/{kind}", time_s, picture)
         self._colours[f"{kind}, {unit}"] = span
@@ -233,7 +233,7 @@ def _legend(
     rows = "\n".join(f"| {name} | {low:.4g} | {high:.4g} |" for name, (low, high) in colours.items())
     reason = f" ({estimate.reason})" if estimate.reason else ""
     of_geometry = estimate.geometry_sag_sigma_um
-    geometry = f", ± {of_geometry:.3g} um of the geometry" if math.isfinite(of_geometry) else ""
+    geometry = f", ± {of_geometry:.3g} um from geometry" if math.isfinite(of_geometry) else ""
     return (
         f"| map | blue | red |\n|---|---|---|\n{rows}\n\n"
         f"- cycle {estimate.cycle}, {estimate.kind}: {estimate.verdict}{reason}\n"

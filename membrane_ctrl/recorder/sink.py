@@ -1,13 +1,12 @@
-"""The Rerun file: segments, time axes, statics, and a flush that says when the writer has died.
+"""The Rerun file: segments, time axes, statics, and a flush that reports a dead writer.
 
-Rerun facts behind this module (0.41, all reproduced): on a full disk `log` and `send_columns` go on without a
-word, only `flush` raises; `save` on a healthy stream starts a new file at once and loses no row; statics
-and properties have to be sent again after each `save`, and so would the blueprint, but each sending of one keeps 3 MB
-for ever (of a week of hours that would be 0.5 GB): it goes into the first file, and to the others when they are
-optimised (`optimizer`); segments with the same recording id are one
-recording in the viewer. When the writer died between taking a flush and answering it, `flush` times out, and then
-`save`, `disconnect`, the stream's destructor and Rerun's own exit handler wait for it for ever: such a stream is
-kept and left alone, and the process has to end without exit handlers.
+Rerun facts behind this module (0.41, all reproduced): on a full disk `log` and `send_columns` continue silently, only
+`flush` raises; `save` on a healthy stream starts a new file at once and loses no row; statics and properties must be
+sent again after each `save`, as must the blueprint, but sending one leaks 3 MB (0.5 GB in a week of hourly segments):
+it goes into the first file, and into the others when they are optimised (`housekeeping`); segments with the same
+recording id are one recording in the viewer. If the writer dies between taking a flush and answering it, `flush`
+times out, and then `save`, `disconnect`, the stream's destructor and Rerun's own exit handler wait forever: such a
+stream is kept untouched, and the process must end without exit handlers.
 """
 
 import traceback
@@ -32,25 +31,25 @@ APPLICATION = "membrane_ctrl"
 RUN_TIME = "run_time"
 UTC = "utc"
 OUTSIDE_CLASS = 1
-LAYOUT = ".layout.rbl"  # the blueprint in a file of its own, while the run is recorded
+LAYOUT = ".layout.rbl"  # the blueprint's own file, during the recording
 
-# A disk that takes longer than this to take a second of data (tens of kB) is as good as gone.
+# A disk that needs longer than this for a second of data (tens of kB) is as good as gone.
 _FLUSH_TIMEOUT_S = 5.0
 
 
-# Held by the module, so that no destructor ever runs.
+# Held by the module, so that no destructor runs.
 _abandoned: list[rr.RecordingStream] = []
 
 
 class RecordingError(Exception):
-    """The writer behind the Rerun stream is dead or could not be started; the message is Rerun's."""
+    """The writer behind the Rerun stream is dead or did not start; the message is Rerun's."""
 
 
 class Recording:
     """One Rerun recording in segments `<name>-000.rrd`, `-001.rrd`, ...
 
-    The folder's name is the recording's id, so that all segments are one recording. `first_segment` is not 0 when
-    another recorder has begun the run.
+    The folder's name is the recording's id, so that all segments are one recording. `first_segment` is not 0 if
+    an earlier recorder started the run.
     """
 
     def __init__(self, run_dir: Path, run_name: str, clock: RunClock, config: Config, first_segment: int = 0) -> None:
@@ -59,13 +58,13 @@ class Recording:
         self._origin = np.datetime64(clock.origin_utc.replace(tzinfo=None), "ns")
         self._config = config
         self._stream = self._new_stream()
-        self.stuck = False  # a stream was abandoned: Rerun's exit handler may wait for it for ever
-        self.path: Path | None = None  # the file there is
+        self.stuck = False  # a stream was abandoned: Rerun's exit handler may wait for it forever
+        self.path: Path | None = None  # the present file
         self.segments = first_segment  # number of the next file
         self._laid_out = False
 
     def next_segment(self) -> None:
-        """Close the file there is and go on in a new one. Raises RecordingError; then call it again later."""
+        """Close the present file and start a new one. Raises RecordingError; then call again later."""
         path = self._run_dir / f"{self._run_name}-{self.segments:03d}.rrd"
         try:
             self._stream.save(path)
@@ -82,7 +81,7 @@ class Recording:
         return rr.RecordingStream(APPLICATION, recording_id=self._run_dir.name)
 
     def _abandon(self) -> None:
-        """Go on with another stream and never touch the old one again (see the module's facts)."""
+        """Continue with another stream and never touch the old one again (see the module's facts)."""
         _abandoned.append(self._stream)
         self.stuck = True
         self._stream = self._new_stream()
@@ -91,7 +90,7 @@ class Recording:
     def _send_statics(self) -> None:
         stream = self._stream
         if not self._laid_out:
-            self._laid_out = True  # also if it fails: a full disk is tried again every few seconds
+            self._laid_out = True  # even on failure: a full disk is retried every few seconds
             blueprint = run_blueprint(self._config)
             stream.send_blueprint(blueprint)
             blueprint.save(APPLICATION, str(self._run_dir / LAYOUT))
@@ -126,18 +125,18 @@ class Recording:
         self.columns(path, time_s, rr.Scalars.columns(scalars=values))
 
     def log(self, path: str, time_s: float, archetype: rr.AsComponents) -> None:
-        """Send one thing at one time of the run."""
+        """Send one component at one time of the run."""
         nanoseconds = np.timedelta64(round(time_s * 1e9), "ns")
         self._stream.set_time(RUN_TIME, duration=nanoseconds)
         self._stream.set_time(UTC, timestamp=self._origin + nanoseconds)
         self._stream.log(path, archetype)
 
     def lay_out_again(self) -> None:
-        """The next segment is the first one that will be found: it gets the blueprint."""
+        """Send the blueprint with the next segment, which is now the first in the folder."""
         self._laid_out = False
 
     def flush(self) -> None:
-        """Bring everything sent to the file. Raises RecordingError if the writer has died since the last call."""
+        """Write everything sent to the file. Raises RecordingError if the writer has died since the last call."""
         try:
             self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except (RuntimeError, OSError) as error:
@@ -145,12 +144,12 @@ class Recording:
             raise RecordingError(str(error)) from None
 
     def pause(self) -> None:
-        """Close the file and begin no other; `next_segment` goes on. Raises RecordingError as `close`."""
+        """Close the file without a new one; `next_segment` continues. Raises RecordingError as `close`."""
         self.close()
         self._stream = self._new_stream()
 
     def sync(self) -> None:
-        """Wait until the disk has what was flushed: Rerun never asks it to. Raises OSError."""
+        """Sync flushed data to disk, which Rerun never does. Raises OSError."""
         if self.path is not None:
             sync_data(self.path)
 
@@ -160,19 +159,19 @@ class Recording:
         Raises
         ------
         RecordingError
-            If the file has no footer: then it is slow to open, and its last second may be missing.
+            If the file has no footer: it then opens slowly, and may lack its last second.
         """
         self.flush()
         self._stream.disconnect()
         path, self.path = self.path, None
         if path is not None and not is_whole(path):
-            raise RecordingError(f"{path}: closed without its footer; `membrane-ctrl repair` mends it")
+            raise RecordingError(f"{path}: closed without its footer; run `membrane-ctrl repair`")
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a closed file has its footer: `disconnect` does not say."""
+    """Whether a closed file has its footer, which `disconnect` does not report."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the reader's own way to say that there is none
+        warnings.simplefilter("ignore")  # the reader warns if there is none
         try:
             with segments.panics_are_faults():
                 RrdReader(path).store()
@@ -190,14 +189,14 @@ def _style(stream: streams.Stream) -> rr.SeriesLines:
     )
 
 
-# Trouble of the recorder: told once for as long as it is the same, and nothing of it ends the recorder.
+# Errors of the recorder: each is reported once until it changes, and none ends the recorder.
 
 
 Report = Callable[[Event], None]
 
 
 class RecorderErrors:
-    """Runs what may fail, and reports what did; `errors` counts the `RecorderError`s, also of recorders before."""
+    """Runs calls that may fail and reports failures; `errors` counts all `RecorderError`s, also predecessors'."""
 
     def __init__(self, report: Report, errors: int = 0) -> None:
         self.report = report
@@ -205,7 +204,7 @@ class RecorderErrors:
         self._trouble: dict[str, str] = {}
 
     def guarded(self, what: str, action: Callable[[], None]) -> None:
-        """Do it; what goes wrong is reported, and the rest of the recorder goes on."""
+        """Run a call; report its failure and let the recorder continue."""
         try:
             action()
         except (OSError, RecordingError) as error:
@@ -219,18 +218,18 @@ class RecorderErrors:
             self.recovered(what)
 
     def report_error(self, what: str, message: str, as_: type[RecorderError | DiskLow] = RecorderError) -> None:
-        """Report trouble once for as long as it is the same; the report says in `what` whose end to wait for."""
+        """Report an error once until it changes; `what` identifies it for `recovered`."""
         if self._trouble.get(what) != message:
             self._trouble[what] = message
             self.errors += as_ is RecorderError
             self.report(as_(what, message))
 
     def recovered(self, what: str) -> None:
-        """Say that it works again, if it did not."""
+        """Report that `what` works again, if it had failed."""
         if self._trouble.pop(what, None) is not None:
             self.report(RecorderRecovered(what, f"{what} works again"))
 
     def forget(self, prefix: str, but: set[str]) -> None:
-        """Say that trouble is over whose cause is there no longer: what begins with `prefix` and is not in `but`."""
+        """Report as over all errors that start with `prefix` and are not in `but`: their cause has gone."""
         for what in [what for what in self._trouble if what.startswith(prefix) and what not in but]:
             self.recovered(what)

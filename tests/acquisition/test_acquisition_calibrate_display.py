@@ -56,4 +56,4 @@ def test_the_correction_leaves_the_rounding_of_levels() -> None:
 def test_a_configuration_without_a_screen_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "lab.toml").write_text("")
     assert run(["calibrate-display", str(tmp_path / "lab.toml")]) == 2
-    assert "devices.camera, devices.screen: both are needed" in capsys.readouterr().err
+    assert "devices.camera and devices.screen are both needed" in capsys.readouterr().err

@@ -236,7 +236,7 @@ def test_files_of_urls_that_are_none(tmp_path: Path, apprise: list[tuple[str, st
     with pytest.raises(InputError, match="no URL found"):
         read_urls(Path(urls(tmp_path, "# nothing")))
     secret = urls(tmp_path, "mail://ok", "password-and-no-scheme")
-    with pytest.raises(InputError, match="URL 2 is not known") as refused:
+    with pytest.raises(InputError, match="URL 2: Apprise does not support it") as refused:
         apprise_senders(AlarmsConfig(urls_file=secret), "run")
     assert "password" not in str(refused.value)
 

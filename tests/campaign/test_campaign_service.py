@@ -183,7 +183,7 @@ def test_a_member_of_the_group_operates_and_a_stranger_does_not_come_near(room: 
     room.run("adduser --quiet ann membrane")
     room.start()
     assert "commander" in ctl(room, "ann", "status")
-    assert "gains takes the role tune" in ctl(room, "ann", "gains 'kp_per_s = 0.5'")
+    assert "gains needs the role tune" in ctl(room, "ann", "gains 'kp_per_s = 0.5'")
     assert "permission denied" in ctl(room, "eve", "status")
     assert "permission denied" in ctl(room, "eve", "stop")
     assert "stop: done" in ctl(room, "ann", "stop")

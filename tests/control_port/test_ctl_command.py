@@ -140,7 +140,7 @@ def test_what_stands_until_it_is_over_is_shown() -> None:
     status = status.after_row(ROW).after_event(from_dict(maintenance))
     lines = status_lines({"run": "r", **status_table(status)})
     assert any(line.split(maxsplit=1) == ["maintenance", maintenance["message"]] for line in lines)
-    assert any("none in use yet" in line for line in lines)
+    assert any("not in use yet" in line for line in lines)
     status = status.after_event(from_dict({"kind": "disk_low", "what": "disk", "message": "less than 500 MB free"}))
     lines = status_lines({"run": "r", **status_table(status)})
     assert any(line.split(maxsplit=1) == ["recording", "less than 500 MB free"] for line in lines)
@@ -153,7 +153,7 @@ def test_what_stands_until_it_is_over_is_shown() -> None:
 
 def test_nobody_there_is_one_line_and_exit_code_4(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["ctl", "status", "--socket", str(tmp_path / "control.sock")]) == 4
-    assert "no hold is listening there" in capsys.readouterr().err
+    assert "no hold is listening" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -134,7 +134,7 @@ async def test_a_flood_of_one_address_is_turned_away_unheard() -> None:
     await endpoint.close()
     assert heard.count("127.0.0.4") == 1
     assert 10 <= heard.count("127.0.0.3") <= 35
-    assert refused == [("tls:127.0.0.3", "comes too often")] * (40 - heard.count("127.0.0.3"))
+    assert refused == [("tls:127.0.0.3", "connects too often")] * (40 - heard.count("127.0.0.3"))
 
 
 async def test_the_socket_file_has_no_part_in_it(tmp_path: Path, config: PortConfig) -> None:

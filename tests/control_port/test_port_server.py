@@ -67,15 +67,15 @@ async def test_a_loop_that_does_not_tick_is_said(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("membrane_ctrl.control_port.server._ANSWER_S", 0.05)
     async with port_run(tmp_path) as run, client(run, ANN) as ann:
         run.ticking = False
-        assert "no tick took it up" in (await ann.ask(do="stop"))["refused"]
+        assert "no tick took it" in (await ann.ask(do="stop"))["refused"]
 
 
 async def test_a_role_that_is_too_low_is_refused_and_recorded(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run:
         async with client(run, EVE) as eve:
-            assert "takes the role operate" in (await eve.ask(do="stop", why="curious"))["refused"]
+            assert "needs the role operate" in (await eve.ask(do="stop", why="curious"))["refused"]
         async with client(run, ANN) as ann:
-            assert "takes the role tune" in (await ann.ask(do="gains", loop={"kp_per_s": 0.5}))["refused"]
+            assert "needs the role tune" in (await ann.ask(do="gains", loop={"kp_per_s": 0.5}))["refused"]
         assert [(e["who"], e["command"], e["why"]) for e in run.of_kind("refused")] == [
             ("unix:eve", "stop", "curious"),
             ("unix:ann", "gains", ""),
@@ -87,12 +87,12 @@ async def test_one_commander_at_a_time(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run, client(run, ANN) as ann, client(run, BOB) as bob:
         assert (await ann.ask(do="setpoint", value=1.0))["ok"]
         refused = await bob.ask(do="setpoint", value=2.0)
-        assert refused["refused"].startswith("unix:ann has the command")
+        assert refused["refused"].startswith("unix:ann has command")
         assert (await bob.ask(do="mark", text="bob was here"))["ok"], "a mark moves nothing"
         assert (await bob.ask(do="setpoint", value=2.0, take_over=True, why="shift"))["ok"]
         notice = await ann.get()
-        assert notice == {"notice": "unix:bob has taken over the command: shift"}
-        assert "unix:bob has the command" in (await ann.ask(do="setpoint", value=1.0))["refused"]
+        assert notice == {"notice": "unix:bob has taken over command: shift"}
+        assert "unix:bob has command" in (await ann.ask(do="setpoint", value=1.0))["refused"]
         assert [(e["who"], e["former"]) for e in run.of_kind("commander")] == [
             ("unix:ann", None),
             ("unix:bob", "unix:ann"),
@@ -122,7 +122,7 @@ async def test_gains_change_what_they_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("loop", "says"),
     [
-        ({"kp": 1.0}, "kp: unknown key; known are rate_hz"),
+        ({"kp": 1.0}, "kp: unknown key; known: rate_hz"),
         ({"kp_per_s": -1.0}, "kp_per_s: input should be greater"),
         ({"setpoint_um": 3.0}, "use the command setpoint"),
         ({"rate_hz": 100.0}, "tick rate cannot be changed"),
@@ -305,7 +305,7 @@ async def test_the_blocking_client(tmp_path: Path) -> None:
         assert greeting["run"] == "the-run"
         assert answer["ok"]
         assert run.asked[0].why == "client"
-    with pytest.raises(DeviceError, match="no hold is listening there"):
+    with pytest.raises(DeviceError, match="no hold is listening"):
         PortClient.unix(run.path, notices.append)
 
 

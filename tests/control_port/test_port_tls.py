@@ -176,9 +176,9 @@ def test_files_that_are_none_are_one_line(tmp_path: Path, lab: Authority) -> Non
     empty.write_text("")
     for field, path, says in [
         ("certificate_file", tmp_path / "none.pem", "no such file"),
-        ("certificate_file", empty, "not a certificate with its unencrypted key"),
-        ("key_file", lab.folder / "ca.key", "not a certificate with its unencrypted key"),
-        ("client_ca_file", empty, "not a certificate of an authority"),
+        ("certificate_file", empty, "not a certificate and its unencrypted key"),
+        ("key_file", lab.folder / "ca.key", "not a certificate and its unencrypted key"),
+        ("client_ca_file", empty, "not an authority's certificate"),
     ]:
         with pytest.raises(InputError, match=says):
             TlsListener(TlsConfig(port=0, **{**good, field: str(path)}))

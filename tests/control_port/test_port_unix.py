@@ -115,7 +115,7 @@ def test_a_path_longer_than_a_socket_address(tmp_path: Path) -> None:
 
 
 def test_a_group_that_is_none_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"port\.group: this machine has no group 'nobody-has-this'"):
+    with pytest.raises(InputError, match=r"port\.group: no group 'nobody-has-this' on this machine"):
         UnixListener(tmp_path / "control.sock", "nobody-has-this", "operate")
     assert not list(tmp_path.iterdir())
 

@@ -69,7 +69,7 @@ def test_a_lens_of_another_camera_is_refused(tmp_path: Path) -> None:
 def test_numbers_that_were_changed_after_the_calibration_are_refused(tmp_path: Path) -> None:
     path = calibrated(tmp_path / "g.toml")
     path.write_text(path.read_text().replace("2674.0", "2675.0"))
-    with pytest.raises(InputError, match=r"g\.toml: calibration\.hash = .*changed after the calibration"):
+    with pytest.raises(InputError, match=r"g\.toml: calibration\.hash = .*edited after the calibration"):
         read_geometry(path)
 
 
@@ -120,7 +120,7 @@ def test_without_a_file_yet_the_hand_counts_and_it_is_said(tmp_path: Path) -> No
     config = Config(optics=OpticsConfig(geometry_file=tmp_path / "g.toml"))
     there = geometry_in_force(config)
     assert there.optics == config.optics
-    assert "g.toml is not there yet: [optics.geometry] is used" in there.note
+    assert "g.toml does not exist yet: [optics.geometry] is used" in there.note
     there.keep(tmp_path)
     assert not (tmp_path / KEPT).exists()
     assert geometry_of_run(tmp_path, config).note == there.note

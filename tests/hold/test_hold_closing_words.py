@@ -24,9 +24,9 @@ def test_a_folder_that_is_gone_is_not_offered(tmp_path: Path, capsys: pytest.Cap
 
 def test_a_folder_begun_anew_says_from_when(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "summary.json").write_text(json.dumps({"recorder": {"folder_anew_s": 13.44}}))
-    assert "begins at 13.4 s" in words(tmp_path, capsys)
+    assert "starts at 13.4 s" in words(tmp_path, capsys)
     (tmp_path / "summary.json").write_text(json.dumps({"recorder": {"folder_anew_s": None}}))
-    assert "begins at" not in words(tmp_path, capsys)
+    assert "starts at" not in words(tmp_path, capsys)
 
 
 def test_only_a_recording_that_is_there_is_offered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

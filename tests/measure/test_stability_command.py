@@ -215,7 +215,7 @@ def test_no_set_gives_a_figure(spoiled: Path, tmp_path: Path, capsys: pytest.Cap
     [
         (["nowhere"], "no such run"),
         (["empty"], "holds no capture sets"),
-        (["run/0000"], "it is a capture set itself"),
+        (["run/0000"], "is itself a capture set"),
         (["run", "--point", "A=1"], "NAME=X,Y"),
         (["run", "--point", "A=400,400"], "within 475 mm"),
         (["run", "--trials", "1"], "--trials"),

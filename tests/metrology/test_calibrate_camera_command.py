@@ -59,7 +59,7 @@ def test_from_photographs_to_a_prior(bench: Path, tmp_path: Path, capsys: pytest
     assert found.noise_adu == 0.7
     focal_px = found.focal_mm / 20.7e-3
     assert abs(focal_px - TRUE.focal_px) < 5 * focal_px * report["sigmas"]["focal_relative"]
-    with pytest.raises(InputError, match="a calibrated lens is valid for its own camera only"):
+    with pytest.raises(InputError, match="a calibrated lens is valid only for its own camera"):
         prior.over(OpticsConfig())
 
 
@@ -67,7 +67,7 @@ def test_what_was_gained_is_said(bench: Path, tmp_path: Path, capsys: pytest.Cap
     assert run(words(bench, tmp_path / "camera.toml")) == 0
     said = capsys.readouterr().out
     assert "known before" in said
-    assert "left out, no board or a bad fit: wall.png" in said
+    assert "omitted, without a board or with a bad fit: wall.png" in said
     assert f"calibrate --prior {tmp_path / 'camera.toml'}" in said
 
 
@@ -78,7 +78,11 @@ def test_bad_input_is_one_line(bench: Path, tmp_path: Path, capsys: pytest.Captu
     cases = (
         (["calibrate-camera", str(empty)], 2, "holds no photographs"),
         (["calibrate-camera", str(tmp_path / "none")], 2, "no such folder"),
-        (["calibrate-camera", str(bench / "photographs")], 2, "408 x 342 pixels, the configuration's optics.camera"),
+        (
+            ["calibrate-camera", str(bench / "photographs")],
+            2,
+            "408 x 342 pixels, but the configuration's optics.camera",
+        ),
         (words(bench, out, "charuco:9x11"), 3, "at least 4 are needed"),
         (words(bench, out, "circles:9x11"), 2, "circles:9x11 is no board"),
         (
@@ -111,7 +115,7 @@ def test_bad_input_is_one_line(bench: Path, tmp_path: Path, capsys: pytest.Captu
 
 def test_priors_that_are_none_are_refused(tmp_path: Path) -> None:
     for text, says in (
-        ('schema = "membrane-geometry/1"', "a geometry goes by --geometry"),
+        ('schema = "membrane-geometry/1"', "pass a geometry with --geometry"),
         ('schema = "membrane-prior/1"\n[sigmas]\nb_m = 1.0', "sigmas.b_m: not a parameter"),
         ('schema = "membrane-prior/1"\n[sigmas]\nb_mm = 0.0', "sigmas.b_mm"),
     ):

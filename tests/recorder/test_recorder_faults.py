@@ -209,8 +209,8 @@ def test_a_run_folder_taken_away_is_begun_anew_and_said(tmp_path: Path, how: str
             bench.second(number)
         bench.recorder.finish()
         said = [report["message"] for report in bench.reports if report["kind"] == "recorder_error"]
-        what = f"{run_dir} was removed or moved, and is begun anew at 1.0 s"
-        assert said == [f"{what}; what was recorded before is not in it"]
+        what = f"{run_dir} was removed or moved; a new one starts at 1.0 s"
+        assert said == [f"{what}, without the earlier data"]
         assert "recorder_recovered" not in bench.kinds()
         assert times_s(bench) == [1, 2]
     assert config_file.load(run_dir / "config.toml", Config) == config

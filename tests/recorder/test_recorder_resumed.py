@@ -285,7 +285,7 @@ def test_a_segment_that_cannot_be_optimised_stays_as_it_is(tmp_path: Path) -> No
     optimizer.poll()
     assert optimizer._process is not None
     optimizer._process.wait(30.0)
-    with pytest.raises(OSError, match="stays as it is"):
+    with pytest.raises(OSError, match="is not optimised"):
         optimizer.poll()
     assert path.read_bytes() == b"no recording"
     assert list(tmp_path.iterdir()) == [path]
