@@ -176,7 +176,7 @@ def test_frames_of_another_size_than_configured_are_refused(bench: Bench) -> Non
     bench.camera.own_pixels = np.zeros((HEIGHT_PX, WIDTH_PX + 1), np.uint8)
     failure = bench.failed()
     assert failure.stage == "camera"
-    assert "camera gave 7 x 4 uint8, the configuration says 6 x 4 uint8" in failure.message
+    assert "camera gave 7 x 4 uint8, the configuration states 6 x 4 uint8" in failure.message
 
 
 def test_stopped_cycle_has_no_result_and_is_taken_again(bench: Bench) -> None:

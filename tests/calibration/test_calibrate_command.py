@@ -155,7 +155,7 @@ def test_sets_of_different_rigs_are_named(
     text = (other / "capture.toml").read_text().replace("a_mm = 2672.0", "a_mm = 2600.0")
     (other / "capture.toml").write_text(text)
     assert run(["calibrate", str(folders[0]), str(other), "--out", str(tmp_path / "g.toml")]) == 2
-    assert "other/capture.toml: geometry.a_mm: not that of" in capsys.readouterr().err
+    assert "other/capture.toml: geometry.a_mm: differs from" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

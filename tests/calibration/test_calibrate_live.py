@@ -67,7 +67,7 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
     assert "a figure after these sets: sag +-" in said
     assert "limits.gauge_pressure_max_pa allow" in said
     session = session_in(tmp_path)
-    assert f"go on with --session {session}" in said
+    assert f"continue with --session {session}" in said
     assert [path.name for path in (session / "sets").iterdir()] == ["set-1"]
     row = bench.hold.rows[-1]
     assert row.target_um == 0.0  # where it was
@@ -129,8 +129,8 @@ def test_a_fault_on_the_way_is_left_to_the_safety_table(
     bench.dark_at = 1
     assert run([*live, "--range-um", "1000", "--sets", "2", "--yes"]) == 4
     said = capsys.readouterr().err
-    assert "the mirror is not held but in state fault (" in said
-    assert "the mirror is left to whoever has the command; the shape loop is off" in said
+    assert "the mirror is not held, but in state fault (" in said
+    assert "the mirror is left to whoever has command; the shape loop is off" in said
     assert bench.asked[-1].value == 500.0  # on its way to the second set; nothing was asked for after the fault
 
 
@@ -141,7 +141,7 @@ def test_who_cannot_wait_for_the_way_back_leaves_the_hold_on_it(
     bench.interrupts_again = True
     assert run([*live, "--range-um", "1000", "--sets", "2", "--yes"]) == 130
     said = capsys.readouterr().err
-    assert "left: the hold ramps on to 0 um by itself; then switch the shape loop on" in said
+    assert "left: the hold continues its ramp to 0 um; then switch the shape loop on" in said
     assert bench.hold.rows[-1].target_um == 0.0
     assert bench.hold.rows[-1].displacement_um < -100.0
 
@@ -177,7 +177,7 @@ def test_without_a_camera_nothing_begins(
 ) -> None:
     bench.blind = True
     assert run([*live, "--yes"]) == 4
-    assert "no shape within 90 s; has this run a camera" in capsys.readouterr().err
+    assert "no shape within 90 s; does this run have a camera" in capsys.readouterr().err
     assert bench.asked == []
 
 
@@ -186,7 +186,7 @@ def test_somebody_elses_setpoint_ends_it(
 ) -> None:
     bench.meddles_at = 3  # after the setpoint of the first set
     assert run([*live, "--range-um", "1000", "--yes"]) == 4
-    assert "somebody else has moved the setpoint to 77 um" in capsys.readouterr().err
+    assert "someone else moved the setpoint to 77 um" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -171,8 +171,8 @@ def test_bad_sets_are_counted_and_named(spoiled: Path, tmp_path: Path, capsys: p
     assert "204 x 169" in bad["0002"]
     assert [row["verdict"] for row in rows(tmp_path / "out" / "series.csv")] == ["ok", "rejected", "rejected", "ok"]
     said = capsys.readouterr().err
-    assert "passed over 0001" in said
-    assert "passed over 0002" in said
+    assert "skipped 0001" in said
+    assert "skipped 0002" in said
 
 
 def test_a_set_with_one_bad_frame_is_used_and_counted(spoiled: Path, tmp_path: Path) -> None:
