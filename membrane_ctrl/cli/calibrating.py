@@ -122,12 +122,12 @@ def calibrate(
         if not folders:
             raise InputError("calibrate: name the capture sets, or use --live to take them from a running hold")
         if any((range_um, sets, yes, session, run, socket, take_over)):
-            raise InputError("calibrate SET...: --range-um, --sets, --yes, --session and the hold are for --live")
+            raise InputError("calibrate SET...: --range-um, --sets, --yes, --session and the hold need --live")
         return calibrate_command(solving)
     from membrane_ctrl.calibration.live import LiveOptions, calibrate_live
     from membrane_ctrl.control_port.ctl import Where
 
     if folders or out:
-        raise InputError("calibrate --live takes its sets into its session's folder: leave out SET... and --out")
+        raise InputError("calibrate --live stores its sets in its session folder: omit SET... and --out")
     where = Where(socket, run, logs=logs)
     return calibrate_live(LiveOptions(where, session, session_name, range_um, sets, yes, take_over, solving))

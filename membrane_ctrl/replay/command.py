@@ -48,7 +48,7 @@ class RecordedRun:
     config_damage: str = ""  # why this is not the run's configuration
 
     def differences(self, rows: Sequence[telemetry.TelemetryRow]) -> list[dict[str, tuple[float, float]] | None]:
-        """The fields in which each row differs from the one recorded then; None where the recording has none."""
+        """Fields in which each row differs from the recorded one; None where the recording has none."""
         from membrane_ctrl.replay.repair import read_rows
         from membrane_ctrl.run_files.segments import FAULTS
 
@@ -88,7 +88,7 @@ DECISION_SLACK_S = 0.5
 
 
 def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None, as_json: bool) -> int:
-    """Replay and report; exit 3 if a row or a decision is not the same, 0 if all are.
+    """Replay and report; exit 3 if a row or a decision differs, else 0.
 
     Raises
     ------
@@ -121,7 +121,7 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
                 "unknown; choose a part without a gap with --from and --to"
             )
         target = write_incident(run, found, to_test, begin, to_s)
-        print(f"written: {target}; say in its incident.toml what happened", file=sys.stderr)
+        print(f"written: {target}; describe the incident in its incident.toml", file=sys.stderr)
     return int(Exit.DONE if report["verdict"] in {"identical", "same rows"} else Exit.REJECTED)
 
 
@@ -176,7 +176,7 @@ def _report(run: RecordedRun, found: replays.Replay, begin: int, to_s: float) ->
 
 
 def _verdict(found: replays.Replay, only_words: bool, decisions_differ: bool, damaged: bool) -> str:
-    """Identical only if everything was compared; behind a gap another decision says nothing of the code."""
+    """The verdict: identical only if all was compared; decisions after a gap prove nothing about the code."""
     if (found.different and not only_words) or (decisions_differ and not found.gaps):
         return "different"
     if found.gaps or damaged or not found.compared:
