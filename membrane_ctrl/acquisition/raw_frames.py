@@ -163,7 +163,7 @@ class RawFrames:
         self.left_out += 1
         if why and why != self._told:
             self._told = why
-            self._tell(run_events.FramesLeftOut(self.left_out, f"frames are left out: {why}"))
+            self._tell(run_events.FramesLeftOut(self.left_out, f"frames are omitted: {why}"))
 
     def _collect(self) -> None:
         """Collect finished writes; drop a failed set, to which no other may refer."""

@@ -42,8 +42,8 @@ class LiveOptions:
 
 
 def calibrate_live(options: LiveOptions) -> int:
-    """Take what is missing of a session's sets, solve, and adopt if a person agrees. Returns the exit code."""
-    freed(options.solving.free)  # what is wrong with these is better known before the mirror moves
+    """Take a session's missing sets, solve, and adopt if a person agrees. Returns the exit code."""
+    freed(options.solving.free)  # check these before the mirror moves
     for path in options.solving.priors:
         read_prior(path)
     session = None
@@ -90,7 +90,7 @@ def take_sets(link: CaptureLink, session: CalibrationSession | None, options: Li
 
 
 def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
-    """Solve a session's sets, show old and new, put the new geometry in place if that is agreed."""
+    """Solve a session's sets, show old and new geometry, and adopt the new one if a person agrees."""
     start_um = session.head.start_um
     code = calibrate_command(
         replace(options.solving, folders=session.sets, out=session.geometry, reference_um=start_um)
