@@ -1,1 +1,1 @@
-"""From the configuration to devices, one program a device."""
+"""Devices from the configuration, with one program per device."""

@@ -1,4 +1,4 @@
-"""Makes the bench of devices that the configuration names; one program at a time may use a device."""
+"""Makes the bench of the configured devices; only one program at a time may use a device."""
 
 import asyncio
 import contextlib
@@ -23,7 +23,7 @@ from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.terminal import one_line
 
-# From a `[devices.<role>]` table to the driver that fills the role.
+# Makes the driver of a role from its `[devices.<role>]` table.
 
 
 ACTUATORS = ("pump", "vent")
@@ -36,9 +36,9 @@ _SERIAL_DRIVERS: dict[type[settings.Section], Callable[[Any], roles.Device]] = {
 
 
 def role_devices(devices: DevicesConfig) -> role_bench.RoleDevices:
-    """The drivers that the tables name, not yet connected; those on one serial bus share it.
+    """The drivers named in the tables, not yet connected; those on one serial bus share it.
 
-    Raises InputError (a port, URL, preset or setting that the driver does not take).
+    Raises InputError for a port, URL, preset or setting that the driver does not accept.
     """
     links = modbus_rtu.ModbusLinks()
     made: dict[str, Any] = {}
@@ -81,23 +81,23 @@ def _modbus_value(
 
 
 def map_keys(section: settings.ModbusMapConfig) -> dict[str, Any]:
-    """The keys of a map in the words of `drivers.modbus_map`."""
+    """The keys of a map, in the terms of `drivers.modbus_map`."""
     keys = section.model_dump(include={"function", "type", "word_order", "address", "raw", "value", "limits"})
     if section.identity_address is not None and section.identity_equals is not None:
         keys["identity"] = (section.identity_address, section.identity_equals)
     return keys
 
 
-# A board that boots or a network that comes up is given this long before the command gives up
+# A booting board or a starting network gets this long before the command gives up
 _PATIENCE_S = 5.0
 _PAUSE_S = 0.25
-_LAPSE_S = 1.0  # after the last moment at which a claim that nobody feeds has lapsed
+_LAPSE_S = 1.0  # beyond the longest life of an abandoned claim
 
 T = TypeVar("T")
 
 
 def open_bench(devices: DevicesConfig) -> roles.Bench:
-    """The bench that the configuration names, not yet connected. Raises InputError for what no device can be."""
+    """The configured bench, not yet connected. Raises InputError for impossible devices."""
     if devices.board is None:
         return role_bench.RoleBench(role_devices(devices), devices.watchdog_s)
     return pump_board(devices, devices.board)
@@ -112,15 +112,15 @@ def pump_board(devices: DevicesConfig, url: str) -> PumpBoard:
 
 
 async def connect(bench: roles.Bench, devices: DevicesConfig) -> roles.BenchIdentity:
-    """Open the bench; retry while a device is absent, fail at once if it is the wrong one.
+    """Open the bench; retry while a device is absent, fail at once if it is the wrong device.
 
-    Raises DeviceError (one line that names the device and what is wrong).
+    Raises DeviceError, naming the device and the problem in one line.
     """
-    return await patiently(bench.open, devices.board or "devices")  # a composed bench names the role itself
+    return await patiently(bench.open, devices.board or "devices")  # a bench of roles names the role itself
 
 
 async def patiently(attempt: Callable[[], Awaitable[T]], where: str) -> T:
-    """Repeat an attempt to connect; see `connect`."""
+    """Repeat an attempt to connect, as in `connect`."""
     loop = asyncio.get_running_loop()
     begin_s, patience_s = loop.time(), _PATIENCE_S
     failure = ""
@@ -130,32 +130,30 @@ async def patiently(attempt: Callable[[], Awaitable[T]], where: str) -> T:
         except roles.LinkError as error:
             if not (isinstance(error, roles.LinkWaitsError) and failure):
                 failure = str(error).removeprefix(f"{where}: ")
-            if isinstance(
-                error, roles.DeviceBusyError
-            ):  # the claim of a program that was killed lapses with its watchdog
+            if isinstance(error, roles.DeviceBusyError):  # a killed program's claim lapses with its watchdog
                 patience_s = max(patience_s, error.lapses_in_s + _LAPSE_S)
             if isinstance(error, roles.DeviceRefusedError) or loop.time() > begin_s + patience_s:
                 raise DeviceError(f"{where}: {failure}") from None
         await asyncio.sleep(_PAUSE_S)
 
 
-# One program a device on this machine, whichever folder or user it runs in.
+# One program per device on this machine, whatever its folder or user.
 #
-# A lock is a name in the kernel's table of abstract sockets (unix(7)): no file that a link could redirect, a sandbox
-# hide, another user own or a killed process leave behind. Who holds it is what the kernel says of the listener.
+# A lock is a name in the kernel's table of abstract sockets (unix(7)): not a file, which a link could redirect, a
+# sandbox hide, another user own or a killed process leave behind. The kernel identifies the listener that holds it.
 
 # of SO_PEERCRED: pid, uid, gid
 _CREDENTIALS = struct.Struct("3i")
-# Each refused program asks the holder's socket once who it is, and is never answered: the kernel keeps so many
+# Each refused program connects to the holder's socket once to identify it; the kernel queues this many
 _ASKERS = 4096
-_SHOWN = 100  # letters of the holder's command line
+_SHOWN = 100  # characters of the holder's command line
 
 
 @contextlib.contextmanager
 def locked(devices: Iterable[str]) -> Iterator[None]:
     """Claim these devices (`device_names`, `modbus_names`) until the end of the block or of the process.
 
-    Raises DeviceError (one line: which device another program uses, who that is, and what to do).
+    Raises DeviceError, naming the device, the program that uses it and the remedy in one line.
     """
     with contextlib.ExitStack() as stack:
         for device in sorted(set(devices)):
@@ -172,7 +170,7 @@ def locked(devices: Iterable[str]) -> Iterator[None]:
 
 
 def device_names(devices: DevicesConfig) -> set[str]:
-    """Names of the configured devices on this machine, however the configuration spells them."""
+    """Canonical names of the configured devices on this machine, however spelt."""
     if devices.board is not None:
         return modbus_names(devices.board, devices.unit_id)
     names: set[str] = set()
@@ -185,13 +183,13 @@ def device_names(devices: DevicesConfig) -> set[str]:
 
 
 def modbus_names(url: str, unit_id: int) -> set[str]:
-    """A Modbus device's names: of a serial line the line's, as it has one owner; of a host those of its addresses."""
+    """A Modbus device's names: that of its serial line, which has one owner, or those of its host's addresses."""
     if url.startswith("rtu:"):
         return {_serial_name(url.removeprefix("rtu://").partition("?")[0])}
     try:
         host, port = modbus_rtu.parse_tcp_url(url)
     except ValueError:
-        return {url}  # no device can be there: whoever opens it says so
+        return {url}  # impossible: opening it reports that
     return {f"{address} port {port} unit {unit_id}" for address in _addresses(host)}
 
 
@@ -199,7 +197,7 @@ def _serial_name(port: str) -> str:
     try:
         return os.path.realpath(serial_port.port_path(port))
     except roles.LinkError:
-        return port  # not plugged in, or not to be told from another
+        return port  # not plugged in, or ambiguous
 
 
 def _addresses(host: str) -> set[str]:
@@ -222,7 +220,7 @@ def _address(device: str) -> bytes:
 
 
 def _holder(address: bytes) -> str:
-    """The process that listens there, if it can be found out."""
+    """The process that listens there, if known."""
     with socket.socket(socket.AF_UNIX) as probe:
         probe.setblocking(False)
         try:

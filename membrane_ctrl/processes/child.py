@@ -2,8 +2,8 @@
 
 Ctrl-C, Ctrl-\\, a closed terminal and the SIGTERM of `timeout` or a shutdown reach every process of the group. Only
 the control process may act on them: the safe state comes before the end of recording and alarms. So the children
-block these signals from their first instruction on, and end on another one; examples/membrane-ctrl.service relies on
-it.
+block these signals from their first instruction on, and end on a different one; examples/membrane-ctrl.service relies
+on this.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from membrane_ctrl.model import events, terminal
 
 _CONTEXT = multiprocessing.get_context("spawn")
 _OF_THE_GROUP = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
-# Until a child has a handler for it, it simply ends.
+# A child without a handler for it yet simply ends.
 STOP = signal.SIGUSR1
 
 
@@ -33,7 +33,7 @@ class Child:
     name : str
         For messages and the process list.
     target : str
-        "package.module:function". The child imports it after it has set its priority, so that heavy imports do not
+        "package.module:function". The child imports it after setting its priority, so that heavy imports do not
         compete with the tick.
     args : tuple
         Picklable arguments of the function.
@@ -45,23 +45,23 @@ class Child:
         self._process = _CONTEXT.Process(target=_main, args=(target, args, nice), name=name, daemon=True)
 
     def start(self) -> None:
-        """Start it without waiting."""
-        resource_tracker.ensure_running()  # it unblocks signals when it starts
+        """Start the child without waiting."""
+        resource_tracker.ensure_running()  # which unblocks signals when it starts
         try:
             with _group_blocked():
                 self._process.start()
-        except BaseException:  # a signal came meanwhile, and the caller does not know of the child yet
+        except BaseException:  # a signal arrived, and the caller does not know the child yet
             self.stop(1.0)
             raise
 
     @property
     def pid(self) -> int | None:
-        """Its number; None before it was started."""
+        """Process id; None before the start."""
         return self._process.pid
 
     @property
     def alive(self) -> bool:
-        """It has not ended."""
+        """Whether the child has not ended."""
         return self._process.is_alive()
 
     @property
@@ -70,16 +70,16 @@ class Child:
         return self._process.exitcode
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for its own end; True if it came."""
+        """Wait for the child to end; True if it did."""
         self._process.join(timeout_s)
         return not self.alive
 
     def kill(self) -> None:
-        """Send SIGKILL, which a stopped process obeys as well, and do not wait."""
+        """Send SIGKILL, which even ends a stopped process, without waiting."""
         self._process.kill()
 
     def stop(self, timeout_s: float) -> None:
-        """Send `STOP`, and SIGKILL if the child has not ended in time."""
+        """Send `STOP`, then SIGKILL if the child does not end in time."""
         if self._process.pid is None:
             return
         if self.alive:
@@ -90,19 +90,19 @@ class Child:
 
 
 def leave_at_stop() -> None:
-    """Within a child: `STOP` ends it, with its context managers, and SIGINT is left to the control process."""
+    """Within a child: end on `STOP`, running its context managers, and leave SIGINT to the control process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(STOP, lambda number, frame: sys.exit(0))
 
 
 def parent_lives() -> bool:
-    """Whether the process that started this one is still there; True in a process that nobody here started."""
+    """Whether the parent still lives; True in a process that this module did not start."""
     parent = multiprocessing.parent_process()
     return parent is None or os.getppid() == parent.pid
 
 
 def _main(target: str, args: tuple[Any, ...], nice: int) -> None:
-    """Run the target, then leave at once: the interpreter's shutdown would complain of arrays in shared memory."""
+    """Run the target, then exit at once: the interpreter's shutdown would complain about arrays in shared memory."""
     os.nice(nice)
     module, function = target.split(":")
     code = 0
@@ -118,7 +118,7 @@ def _main(target: str, args: tuple[Any, ...], nice: int) -> None:
 
 @contextlib.contextmanager
 def _group_blocked() -> Iterator[None]:
-    """Block the group's signals, for the child from its first instruction on; this process gets them afterwards."""
+    """Block the group's signals while a child starts, which inherits the block; this process gets them afterwards."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_THE_GROUP)
     try:
         yield
@@ -127,12 +127,12 @@ def _group_blocked() -> Iterator[None]:
 
 
 def pipe() -> Any:
-    """Both ends of a two-way pipe between this process and a child."""
+    """Make a two-way pipe between this process and a child."""
     return _CONTEXT.Pipe()
 
 
 def reporter(status: Connection | None) -> Callable[[events.Event], None]:
-    """A function that sends an event over `status`, or drops it if the pipe is full; it never waits."""
+    """Return a function that sends an event over `status`, or drops it if the pipe is full; it never waits."""
     if status is None:
         return lambda event: None
     os.set_blocking(status.fileno(), False)
@@ -147,15 +147,15 @@ def reporter(status: Connection | None) -> Callable[[events.Event], None]:
 
 
 def _short(value: Any) -> Any:
-    """A message this short goes into a pipe whole or not at all."""
+    """Shorten a message so that a pipe takes it whole or not at all."""
     return value[:1000] if isinstance(value, str) else value
 
 
 def raise_priority() -> str:
     """Give this process, but not its children, a real-time class; returns "real-time" or "ordinary".
 
-    A tick takes some 2 % of a core, and the kernel keeps 5 % of each second for ordinary processes. Without the right
-    to it (root, CAP_SYS_NICE, or `LimitRTPRIO=` of the service) nothing changes.
+    A tick takes about 2 % of a core, and the kernel reserves 5 % of each second for ordinary processes. Without
+    permission (root, CAP_SYS_NICE, or `LimitRTPRIO=` of the service) nothing changes.
     """
     try:
         # the lowest real-time priority: above every ordinary process, below the kernel's own threads

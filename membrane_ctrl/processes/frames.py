@@ -2,7 +2,7 @@
 
 As in `membrane_ctrl.processes.ring`, one writer never waits, and each slot has its sequence number before and after
 the pixels. The first number changes before the camera touches the pixels, the second when the frame is whole; a
-reader keeps a copy only if the second was right before it copied, and the first afterwards.
+reader keeps a copy only if the second was correct before copying and the first afterwards.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ _SHARED_MEMORY_FOLDER = Path("/dev/shm")
 
 @dataclass(frozen=True, slots=True)
 class FrameHead:
-    """What is known of a stored frame."""
+    """Description of a stored frame."""
 
-    index: int  # count of the frames stored before it in the run; names the frame to `FrameReader.copy`
-    pattern: str  # what the screen showed (`firmware_iface.roles.Pattern.name`)
+    index: int  # number of frames stored earlier in the run; identifies the frame for `FrameReader.copy`
+    pattern: str  # pattern on the screen (`firmware_iface.roles.Pattern.name`)
     time_s: float  # start of exposure on the run's clock
-    displacement_um: float  # laser reading then, as far as it was known when the frame arrived; NaN if not
+    displacement_um: float  # laser reading then, if known when the frame arrived; else NaN
     cycle: int  # number of the measurement cycle
 
 
 class FrameRing:
     """Owns the shared memory of the last `slots` frames; create it in the process that outlives writer and readers.
 
-    Raises OSError without room in shared memory. The memory is reserved here: otherwise SIGBUS would end the writer.
+    Raises OSError without room in shared memory. Reserves the memory, as otherwise SIGBUS could kill the writer.
     """
 
     def __init__(self, slots: int, height_px: int, width_px: int, dtype: str = "uint8") -> None:
@@ -65,13 +65,13 @@ class FrameRing:
         return cls(slots, camera.height_px, camera.width_px, "uint8" if camera.bits == 8 else "uint16")
 
     def close(self) -> None:
-        """Free the memory; processes still attached keep it."""
+        """Free the memory; attached processes keep theirs."""
         self._memory.close()
         self._memory.unlink()
 
 
 class FrameSlot:
-    """A frame being taken: let the camera write into `pixels`, then `commit` it."""
+    """A frame being taken: let the camera write into `pixels`, then call `commit`."""
 
     def __init__(self, writer: FrameWriter, pixels: Pixels) -> None:
         self._writer = writer
@@ -83,7 +83,7 @@ class FrameSlot:
 
 
 class FrameWriter:
-    """The one writer. A frame's pixels stay as they are until `slots` more frames were begun."""
+    """The only writer. A frame's pixels stay unchanged until `slots` more frames have begun."""
 
     def __init__(self, address: FrameAddress) -> None:
         self._memory = SharedMemory(address.name)
@@ -91,7 +91,7 @@ class FrameWriter:
         self._next = self._slots.written()
 
     def begin(self) -> FrameSlot:
-        """The oldest slot, to be overwritten; one that was begun and not committed is begun again."""
+        """Return the oldest slot for overwriting; an uncommitted slot is reused."""
         self._slots.set_before(self._next)
         return FrameSlot(self, self._slots.pixels(self._next))
 
@@ -102,7 +102,7 @@ class FrameWriter:
         self._slots.set_written(self._next)
 
     def close(self) -> None:
-        """Detach. Raises BufferError while someone still holds the pixels of a slot."""
+        """Detach. Raises BufferError while the pixels of a slot are in use."""
         self._slots.release()
         self._memory.close()
 
@@ -144,8 +144,8 @@ class _FrameSlots:
         self._words = memory.buf.cast("Q")  # each assignment is one store (`membrane_ctrl.processes.ring`)
         self._stride = _stride(address)
         shape = (address.height_px, address.width_px)
-        # frombuffer keeps hold of the memory, so that closing under a living view raises; ndarray(buffer=...)
-        # would let it be unmapped, and the next look at a pixel would end the process
+        # frombuffer holds the memory, so that closing it under a live view raises; ndarray(buffer=...) would let
+        # it be unmapped, and the next access to a pixel would crash the process
         self._pixels: list[Pixels] = [
             np.frombuffer(memory.buf, address.dtype, prod(shape), _ALIGN_BYTES * 2 + k * self._stride).reshape(shape)
             for k in range(address.slots)
@@ -199,7 +199,7 @@ def _stride(address: FrameAddress) -> int:
 
 def _reserve(name: str, size_bytes: int) -> None:
     path = _SHARED_MEMORY_FOLDER / name.lstrip("/")
-    if not path.exists():  # another system than Linux: its shared memory is not a folder
+    if not path.exists():  # not Linux: shared memory is not a folder there
         return
     handle = os.open(path, os.O_RDWR)
     try:

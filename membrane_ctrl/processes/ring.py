@@ -1,14 +1,14 @@
 """A ring of messages in shared memory: one writer that never waits, any number of readers.
 
-The writer overwrites the oldest slot; a reader that was too slow counts the gap in the sequence numbers. Messages of
-a killed writer stay readable.
+The writer overwrites the oldest slot; a reader that was too slow counts the gap in the sequence numbers. A killed
+writer's messages stay readable.
 
 Counter and sequence numbers are 8-byte aligned and written through a memoryview of 8-byte words, which makes one
 store of each assignment. (`struct.pack_into` clears the bytes first, and a racing reader sees the counter as 0.)
-Each slot carries its sequence number before and after the message. A reader takes a message only if both are the
-expected one: it reads the last before it copies and the first afterwards. On x86-64 that is enough, because stores
-become visible in order. On ARM64 they may not, so each slot also has a CRC-32 of its message, seeded with its number:
-an incomplete message does not match, and the reader tries again at its next call.
+Each slot carries its sequence number before and after the message. A reader takes a message only if both are as
+expected: it reads the last before copying and the first afterwards. On x86-64 that suffices, because stores become
+visible in order. On ARM64 they may not, so each slot also has a CRC-32 of its message, seeded with its number: an
+incomplete message does not match, and the reader retries at its next call.
 """
 
 import json
@@ -31,17 +31,17 @@ _HEADER_BYTES = 64  # a cache line of its own for the write counter
 _SLOT_OVERHEAD = 3 * 8  # sequence; length and CRC-32; sequence again
 # The largest ring of a run, a minute of inputs at 1 kHz, is 32 MB
 _RING_BYTES_MAX = 1 << 27
-# A writer that goes round meanwhile takes a few tries; a newest slot that never fits is damage and must end `latest`
+# A writer that overtakes costs a few tries; a newest slot that never matches is damaged and must end `latest`
 _TRIES = 100
 
 
 class RingError(ValueError):
-    """The memory is no ring, or not the one that the address tells of."""
+    """The memory is not a ring, or not the one that the address describes."""
 
 
 @dataclass(frozen=True, slots=True)
 class RingAddress:
-    """What another process needs to read a ring (or to become its only writer)."""
+    """What another process needs to read a ring (or become its only writer)."""
 
     name: str
     slots: int
@@ -49,7 +49,7 @@ class RingAddress:
 
     @property
     def size_bytes(self) -> int:
-        """Size of the shared memory. Raises RingError if no ring of ours is like that."""
+        """Size of the shared memory. Raises RingError for impossible dimensions."""
         size_bytes = _HEADER_BYTES + self.slots * _stride(self.slot_bytes)
         if self.slots < 1 or self.slot_bytes < 0 or size_bytes > _RING_BYTES_MAX:
             raise RingError(f"a ring cannot have {self.slots} slots of {self.slot_bytes} bytes")
@@ -68,13 +68,13 @@ class Ring:
             words[_IS_RING], words[_SLOTS], words[_SLOT_BYTES] = _MAGIC, slots, slot_bytes
 
     def close(self) -> None:
-        """Free the memory; readers still attached keep it."""
+        """Free the memory; attached readers keep theirs."""
         self._memory.close()
         self._memory.unlink()
 
 
 class _Slots:
-    """The layout, over memory that is checked against its address. Raises RingError."""
+    """The layout, after checking the memory against its address. Raises RingError."""
 
     def __init__(self, memory: SharedMemory | mmap, address: RingAddress) -> None:
         whole = memoryview(memory) if isinstance(memory, mmap) else memory.buf
@@ -93,7 +93,7 @@ class _Slots:
 
     @property
     def written(self) -> int:
-        """Messages put so far."""
+        """Number of messages put so far."""
         return self.words[_WRITTEN]
 
     def span(self, index: int) -> tuple[int, int]:
@@ -102,16 +102,16 @@ class _Slots:
         return start // 8, (start + self._stride) // 8 - 1
 
     def close(self) -> None:
-        """Detach: memory with a view of it cannot be closed."""
+        """Detach: memory cannot be closed while viewed."""
         for view in self._views:
             view.release()
         self._memory.close()
 
-    __del__ = close  # before the memory's own end, which would complain of the views
+    __del__ = close  # before the memory's own end, which would complain about the views
 
 
 class RingWriter:
-    """The one writer of a ring. Raises RingError for what is none."""
+    """The only writer of a ring. Raises RingError if it is not a ring."""
 
     def __init__(self, address: RingAddress) -> None:
         self._slots = _Slots(SharedMemory(address.name), address)
@@ -139,9 +139,9 @@ class RingWriter:
 
 
 class RingReader:
-    """One reader; it starts at the oldest message still in the ring, and counts the messages it lost in `dropped`.
+    """One reader; it starts at the oldest message in the ring, and counts lost messages in `dropped`.
 
-    `memory` is the ring's, if the caller has mapped it. Raises RingError.
+    `memory` is the ring's, if the caller has already mapped it. Raises RingError.
     """
 
     def __init__(self, address: RingAddress, memory: mmap | None = None) -> None:
@@ -152,7 +152,7 @@ class RingReader:
         self.dropped = 0
 
     def drain(self, limit: int | None = None) -> list[bytes]:
-        """All messages since the last call (at most `limit`, and one round of the ring), oldest first."""
+        """Messages since the last call (at most `limit`, and one round of the ring), oldest first."""
         messages: list[bytes] = []
         for _ in range(self._slots.count):
             written = self._slots.written
@@ -173,7 +173,7 @@ class RingReader:
         return messages
 
     def latest(self) -> bytes | None:
-        """The newest message, or None if there is none yet; older ones are passed over and not counted."""
+        """The newest message, or None if there is none yet; skips older ones without counting them."""
         for _ in range(_TRIES):
             written = self._slots.written
             if not written:
@@ -184,7 +184,7 @@ class RingReader:
         return None
 
     def _not_there_yet(self) -> bool:
-        """Nobody has written over the message, so it has yet to become visible; True once for each message."""
+        """Whether the message, not overwritten, has yet to become visible; True once per message."""
         again = self._looked_at != self._read and self._read > self._slots.written - self._slots.count
         self._looked_at = self._read
         return again
@@ -206,7 +206,7 @@ class RingReader:
 
 @contextmanager
 def ring(slots: int, slot_bytes: int) -> Iterator[RingAddress]:
-    """A ring for the length of a `with` block."""
+    """A ring for the duration of a `with` block."""
     owner = Ring(slots, slot_bytes)
     try:
         yield owner.address
@@ -223,29 +223,29 @@ def _stride(slot_bytes: int) -> int:
     return (slot_bytes + _SLOT_OVERHEAD + 7) // 8 * 8
 
 
-# The rings of a run for programs that the run did not start: their addresses in its folder, `rings.json`.
+# The rings of a run for programs that the run did not start: `rings.json` in its folder has their addresses.
 #
 # Reading them costs the control process nothing, and they hold every tick of the last minute, which a session needs
-# (docs/decisions/79-tuning-sessions.md). The folder may come from anybody: only shared memory of this user that is
-# the ring it claims to be is opened, read-only.
+# (docs/decisions/79-tuning-sessions.md). The folder may be forged: only this user's shared memory that is the ring it
+# claims to be is opened, read-only.
 
 _FILE = "rings.json"
 _FILE_BYTES_MAX = 4096  # three rings take 250
-_NAME = re.compile(r"psm_[0-9a-f]{8}")  # as Python's `SharedMemory` names what it makes
+_NAME = re.compile(r"psm_[0-9a-f]{8}")  # the names that Python's `SharedMemory` gives
 _RINGS = frozenset({"telemetry", "events", "shapes"})
 _SHARED_MEMORY_FOLDER = Path("/dev/shm")
 
 
 def publish(run_dir: Path, rings: Mapping[str, RingAddress | None]) -> None:
-    """Write the addresses of the rings that there are. Raises OSError."""
+    """Write the addresses of the existing rings. Raises OSError."""
     found = {name: asdict(address) for name, address in rings.items() if address is not None}
     write_text_atomic(run_dir / _FILE, json.dumps(found, indent=1) + "\n")
 
 
 def attach(run_dir: Path) -> dict[str, RingReader]:
-    """Readers of a run's rings, each at its newest message.
+    """Return readers of a run's rings, each at its newest message.
 
-    Raises FileNotFoundError for a run that has published none or is over; OSError or RingError for foreign rings.
+    Raises FileNotFoundError if the run has published none or is over; OSError or RingError for foreign rings.
     """
     readers: dict[str, RingReader] = {}
     with ExitStack() as stack:
@@ -273,7 +273,7 @@ def _address(ring: str, values: dict[str, Any]) -> RingAddress:
 
 
 def _mapped(address: RingAddress) -> mmap:
-    """The ring's memory, read only. Raises OSError, RingError."""
+    """Map the ring's memory read-only. Raises OSError, RingError."""
     with open_plain(_SHARED_MEMORY_FOLDER / address.name) as file:
         found, size_bytes = os.fstat(file.fileno()), address.size_bytes
         if found.st_uid != os.geteuid():
@@ -285,7 +285,7 @@ def _mapped(address: RingAddress) -> mmap:
 
 @dataclass(frozen=True, slots=True)
 class FrameAddress:
-    """What another process needs to read the frames (or to become their only writer)."""
+    """What another process needs to read the frames (or become their only writer)."""
 
     name: str
     slots: int

@@ -1,10 +1,10 @@
-"""Codes columns of numbers so that zstd compresses them well, and decodes them to the last bit.
+"""Codes columns of numbers so that zstd compresses them well, and decodes them bit by bit.
 
-Each number becomes an integer. In a column of short decimals (a device counts in tenths of a micrometre, and 12.3 is
-the double nearest to 123 / 10) it is that whole number, in any other column the bits of the float. The codec stores
-the difference from the row before; in a column that nearly equals a sum of others, it stores the exclusive or with
-the bits of that sum. Bytes are sorted by place: the first byte of all rows, then the second. The field's metadata
-gives kind and sum; `codes`, stored with each batch, gives the code of each column.
+Each number becomes an integer: in a column of short decimals (a device counts in tenths of a micrometre, and 12.3 is
+the double nearest to 123 / 10) that count, in any other column the bits of the float. The codec stores the difference
+from the previous row or, in a column that nearly equals a sum of others, the exclusive or with the bits of that sum.
+Bytes are sorted by position: the first byte of all rows, then the second. The field's metadata give kind and sum;
+`codes`, stored with each batch, gives the code of each column.
 """
 
 import re
@@ -27,7 +27,7 @@ _WHOLE_MAX = 2.0**53
 
 
 def stored_schema(schema: pa.Schema) -> pa.Schema:
-    """A table's schema with numbers, and lists of a fixed number of them, as bytes; other columns stay."""
+    """A table's schema with numbers, and fixed-size lists of them, as bytes; other columns stay."""
     return pa.schema([_stored_field(field) for field in schema], metadata=schema.metadata)
 
 
@@ -41,19 +41,19 @@ def _stored_field(field: pa.Field) -> pa.Field:
 
 
 def kind_of(field: pa.Field) -> tuple[int, np.dtype[Any]] | None:
-    """Of a stored column: numbers a row, and their kind; None if it is stored as it is. Raises pa.ArrowInvalid."""
+    """Numbers per row of a stored column, and their kind; None if it is stored plainly. Raises pa.ArrowInvalid."""
     text = (field.metadata or {}).get(KIND)
     if text is None:
         return None
     found = _KIND.fullmatch(text)
     kind = np.dtype(found[2].decode()) if found else None
     if found is None or kind is None or field.type != pa.binary(int(found[1]) * kind.itemsize):
-        raise pa.ArrowInvalid(f"column {field.name} is not of the kind that it states")
+        raise pa.ArrowInvalid(f"column {field.name} does not have its stated kind")
     return int(found[1]), kind
 
 
 def encode(batch: pa.RecordBatch, schema: pa.Schema) -> tuple[pa.RecordBatch, bytes]:
-    """A batch in its stored schema, and its codes."""
+    """Encode a batch into its stored schema, with its codes."""
     arrays, codes = [], b""
     numbers = {field.name: _numbers(batch.column(field.name)) for field in schema if kind_of(field)}
     for field in schema:
@@ -75,7 +75,7 @@ def _numbers(column: pa.Array) -> NDArray[Any]:
 
 
 def _words(values: NDArray[Any], of_sum: NDArray[Any] | None) -> tuple[bytes, NDArray[Any]]:
-    """The code of (n, k) numbers, and the integers to store."""
+    """Choose the code of (n, k) numbers, and compute the integers to store."""
     bits = values.view(f"<u{values.dtype.itemsize}")
     if of_sum is not None:
         return OF_SUM, bits ^ of_sum.view(bits.dtype).reshape(bits.shape)
@@ -91,7 +91,7 @@ def _words(values: NDArray[Any], of_sum: NDArray[Any] | None) -> tuple[bytes, ND
                 break
     steps = np.diff(whole, axis=0, prepend=np.zeros_like(whole[:1]))
     signed = steps.view(f"<i{steps.dtype.itemsize}")
-    # the sign last: a small step down is a small number, too
+    # the sign comes last, so that a small negative step is a small number too
     return code, np.ascontiguousarray(((signed << 1) ^ (signed >> (8 * steps.dtype.itemsize - 1))).view(steps.dtype))
 
 
@@ -100,7 +100,7 @@ def _terms(text: bytes) -> list[str]:
 
 
 def _sum(terms: bytes, numbers: Mapping[str, NDArray[Any]], kind: np.dtype[Any]) -> NDArray[Any]:
-    """The sum of columns, those with a minus subtracted, in a column's kind."""
+    """The sum of columns, subtracting those with a minus, in a column's kind."""
     with np.errstate(all="ignore"):
         total: NDArray[Any] = np.zeros(1)
         for term in _terms(terms):
@@ -109,17 +109,17 @@ def _sum(terms: bytes, numbers: Mapping[str, NDArray[Any]], kind: np.dtype[Any])
 
 
 def needed(schema: pa.Schema, names: Sequence[str]) -> list[str]:
-    """Columns and those that they are sums of, each behind those that it needs. Raises pa.ArrowInvalid."""
+    """Columns and the summands of their sums, each after those it needs. Raises pa.ArrowInvalid."""
     found: dict[str, None] = {}
 
     def add(name: str, above: tuple[str, ...]) -> None:
         place = schema.get_field_index(name)  # -1 also where there are two
         stored = kind_of(schema.field(place)) if place >= 0 else None
         if name in above or place < 0 or (above and stored is None):
-            raise pa.ArrowInvalid(f"column {above[0] if above else name} is a sum of what is not there")
+            raise pa.ArrowInvalid(f"column {above[0] if above else name} is a sum of missing columns")
         terms = _terms((schema.field(place).metadata or {}).get(SUM, b"")) if stored else []
         if len(above) + len(terms) > _TERMS_MAX:
-            raise pa.ArrowInvalid(f"column {name} is a sum of too much")
+            raise pa.ArrowInvalid(f"column {name} is a sum of too many columns")
         for term in terms if name not in found else ():
             add(term.removeprefix("-"), (*above, name))
         found[name] = None
@@ -130,10 +130,10 @@ def needed(schema: pa.Schema, names: Sequence[str]) -> list[str]:
 
 
 def decode(batch: pa.RecordBatch, schema: pa.Schema, codes: bytes | None, names: Sequence[str]) -> pa.RecordBatch:
-    """Columns of a batch as numbers; the batch has those `needed`, the schema is of the whole file.
+    """Decode columns of a batch to numbers; the batch has those `needed`, the schema is the whole file's.
 
-    Without codes (of a journal or an earlier version) the columns are as they are. Raises pa.ArrowInvalid if codes or
-    columns are not those of `encode`.
+    Without codes (in a journal or an earlier version) the columns are plain. Raises pa.ArrowInvalid if codes or
+    columns do not come from `encode`.
     """
     if codes is None and not any(kind_of(schema.field(name)) for name in names):
         return batch.select(list(names))
@@ -167,5 +167,5 @@ def _decoded(code: bytes, words: NDArray[Any], kind: np.dtype[Any], of_sum: NDAr
     if code == BITS:
         return bits.view(kind)
     if kind != "<f8" or not code.isdigit() or int(code) > _DIGITS_MAX:
-        raise pa.ArrowInvalid("a batch has a code that is not known")
+        raise pa.ArrowInvalid("a batch has an unknown code")
     return np.asarray(bits.view("<i8") / 10.0 ** int(code))

@@ -1,7 +1,7 @@
-"""Tables beside the Rerun recording: Arrow streams that a crash leaves readable and that read back at disk speed.
+"""Tables beside the Rerun recording: Arrow streams that survive crashes and read back at disk speed.
 
-A table is `columns/<table>-000.arrows`, `-001`, ...: whole batches, no footer, so that what a killed recorder leaves
-is good up to its last batch, each under a checksum (`sealed_stream`). The batch it was filling is in a journal.
+A table is `columns/<table>-000.arrows`, `-001`, ...: whole batches, no footer, so that a killed recorder's file is
+good up to its last batch, each with a checksum (`sealed_stream`). The batch it was filling is in a journal.
 """
 
 import contextlib
@@ -20,15 +20,15 @@ from membrane_ctrl.model.files import sync_data
 from membrane_ctrl.run_files import column_codec
 from membrane_ctrl.run_files.sealed_stream import SealedStream, whole_batches
 
-# What a table has not written yet, on the disk all the same: a small file beside it that a crash leaves behind.
+# Rows that a table has not written yet are on disk too: in a small file beside it that survives a crash.
 #
-# A batch of a table has to be large to be worth its header, so rows wait for a minute and more. Meanwhile they go to
-# `columns/<table>-waiting.arrows` each second, an Arrow stream of many small batches, which ends with the large
-# batch it was made for. A reader takes it for the last file of the table; the next recorder takes its rows over.
+# A batch must be large to be worth its header, so rows wait for a minute or more. Meanwhile they go to
+# `columns/<table>-waiting.arrows` every second, an Arrow stream of many small batches, which ends with the large
+# batch it was made for. A reader treats it as the last file of the table; the next recorder takes over its rows.
 
 
 class Journal:
-    """The file of one table at `path`, while something waits; `kept` batches are in it."""
+    """One table's journal at `path`, while rows wait; `kept` batches are in it."""
 
     def __init__(self, path: Path, schema: pa.Schema) -> None:
         self._path = path
@@ -37,14 +37,14 @@ class Journal:
         self.kept = 0
 
     def left_behind(self) -> list[pa.RecordBatch]:
-        """Whole batches that a recorder has left; what it was writing when it was killed is not among them."""
+        """Whole batches left by an earlier recorder, without the one it was writing when killed."""
         found: list[pa.RecordBatch] = []
         with contextlib.suppress(OSError, pa.ArrowException):
             found.extend(batch for batch in whole_batches(self._path) if batch.schema.equals(self._schema))
         return found
 
     def keep(self, waiting: Sequence[pa.RecordBatch]) -> None:
-        """Add what is not yet in it, and sync. Raises OSError (full disk): the next call begins anew."""
+        """Add new batches and sync. Raises OSError (full disk): the next call then starts afresh."""
         if self.kept == len(waiting):
             return
         try:
@@ -60,7 +60,7 @@ class Journal:
         self.kept = len(waiting)
 
     def drop(self) -> None:
-        """Nothing waits any more."""
+        """Remove the journal, as nothing waits."""
         if self._stream is not None:
             self._stream.abandon()
         self._stream = None
@@ -69,7 +69,7 @@ class Journal:
             self._path.unlink(missing_ok=True)
 
     def _begin(self, waiting: Sequence[pa.RecordBatch]) -> None:
-        """A new file takes the old one's place once all is in it: what was left behind is never without a copy."""
+        """Replace the old file only once a new one is complete, so that its rows always have a copy."""
         self._path.parent.mkdir(exist_ok=True)
         part = self._path.with_suffix(".part")
         self._stream = SealedStream(part, self._schema)
@@ -82,17 +82,17 @@ FOLDER = "columns"
 SUFFIX = ".arrows"
 SCHEMA_NAME = "membrane-columns/1"
 PROGRAM = f"membrane-ctrl {__version__}"
-# A damaged head costs six hours at most.
+# A damaged header costs at most six hours.
 FILE_S = 6 * 3600.0
-# A person who was told that the disk is full makes room.
+# Time for a person to make room on a full disk.
 WAIT_S = 600.0
 
 
 class ColumnFile:
     """One table of a run, appended to in batches; its column `time_name` holds rising seconds of the run.
 
-    Rows wait in memory and in the journal until they span `batch_s`, and `WAIT_S` longer for a full disk. A `resumed`
-    recorder goes on where another died: with its journal, and without a row that it has written.
+    Rows wait in memory and in the journal until they span `batch_s`, and `WAIT_S` longer on a full disk. A `resumed`
+    recorder continues after one that died: with its journal, and without repeating rows it wrote.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class ColumnFile:
         self._batch_s = batch_s
         self._stored = column_codec.stored_schema(self._schema)
         self._waiting: deque[pa.RecordBatch] = deque()
-        self._until_s = -math.inf  # time of the last row taken in
+        self._until_s = -math.inf  # time of the last row taken
         self._number = 0
         self._path, self._head_bytes = self._folder, 0
         self._file_until_s = 0.0
@@ -119,7 +119,7 @@ class ColumnFile:
                 self._take(batch)
 
     def add(self, columns: Mapping[str, ArrayLike]) -> None:
-        """Take in rows that are later than those before. Raises OSError (full disk): they wait for the next call."""
+        """Take rows later than the previous ones. Raises OSError (full disk): they then wait for the next call."""
         arrays = [pa.array(columns[field.name], type=field.type) for field in self._schema]
         if not self._take(pa.record_batch(arrays, schema=self._schema)):
             return
@@ -193,14 +193,14 @@ class ColumnFile:
             stream.close()
 
     def leave_folder(self) -> None:
-        """The folder was removed: waiting rows go to its successor, written ones are not there."""
+        """Continue after the folder's removal: waiting rows go to its successor, written ones are lost."""
         with contextlib.suppress(OSError):
             self.close_file()
         self._journal.drop()
 
     @property
     def files(self) -> int:
-        """Files of the table that are there."""
+        """Existing files of the table."""
         return sum(1 for _ in self._folder.glob(f"{self._table}-[0-9]*{SUFFIX}"))
 
     def _open_for(self, time_s: float) -> SealedStream:
@@ -209,7 +209,7 @@ class ColumnFile:
         if self._stream is None:
             self._folder.mkdir(exist_ok=True)
             while (path := self._folder / f"{self._table}-{self._number:03d}{SUFFIX}").exists():
-                self._number += 1  # also those of a recorder that was killed
+                self._number += 1  # counting those of a killed recorder
             try:
                 self._stream = SealedStream(path, self._stored, "zstd")
                 self._path, self._head_bytes = path, path.stat().st_size

@@ -1,4 +1,4 @@
-"""Reads the tables beside a recording (`column_file`); reports what is damaged and gives the rest."""
+"""Reads the tables beside a recording (`column_file`); reports damage and returns the rest."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from membrane_ctrl.model.shape_estimate import UPPER_TERMS
 from membrane_ctrl.run_files import column_codec, sealed_stream, tables
 from membrane_ctrl.run_files.column_file import FOLDER, SUFFIX
 
-# Times that a file's rows cannot have: a flipped byte makes a second of the year 30 000 000 and a run as long.
+# Impossible times of rows: a flipped byte can make a time in the year 30 000 000, and a run that long.
 
 
 # A file of a table holds six hours, a segment at most a day (the limit of `recording.segment_s`).
@@ -33,37 +33,37 @@ def possible_times(time_s: FloatArray) -> BoolArray:
     return np.asarray(finite & (np.abs(time_s - np.median(time_s[finite])) <= _FILE_MAX_S))
 
 
-# The column that says when: of ticks, and of the other tables.
+# The time column: of ticks, and of the other tables.
 _TIMES = ("mono_s", "time_s")
-_LOOK_BYTES = 1 << 20  # holds the head and a first batch
-# Columns of `shapes` that are no numbers.
+_LOOK_BYTES = 1 << 20  # covers the header and a first batch
+# Columns of `shapes` that are not numbers.
 _WORDS = frozenset({"kind", "verdict", "reason"})
 _PLAIN = {"data": pa.binary(), "tracking_lost": pa.bool_()}
 _LISTS = {"coeffs_um": 36, "covariance_um2": 36 * 36, "upper_um2": UPPER_TERMS}
-# What is in memory at a time, whatever a file is: numbers of eight bytes, and what a batch holds besides.
+# Limit on memory at a time, whatever the file: numbers of eight bytes, and a batch's other content.
 _PART_CELLS = 24_000_000
 _PART_BYTES = 200_000_000
 
 
 def column_files(folder: Path, table: str) -> list[Path]:
-    """The files of a table in their order."""
+    """The files of a table, in order."""
     return sorted((folder / FOLDER).glob(f"{table}-*{SUFFIX}"))
 
 
 def missing_files(files: Sequence[Path], first: str, count: int = 0) -> list[str]:
-    """Names of files that are not there, of a table or recording whose files are numbered.
+    """Names of missing files of a table or recording with numbered files.
 
     Parameters
     ----------
     files : sequence of Path
-        Those that are there.
+        The existing ones.
     first : str
         Name of file 0: `ticks-000.arrows`.
     count : int
-        How many there should be, where that is known.
+        Number of files expected, if known.
     """
     pattern = re.fullmatch(r"(.*-)(\d+)(\.\w+)", first)
-    if pattern is None:  # somebody's own file
+    if pattern is None:  # a file of another origin
         return []
     stem, number, suffix = pattern.groups()
     there = {int(found[1]) for path in files if (found := re.search(r"-(\d+)\.\w+$", path.name))}
@@ -72,39 +72,39 @@ def missing_files(files: Sequence[Path], first: str, count: int = 0) -> list[str
 
 
 def read_file(path: Path, names: Sequence[str] | None, notes: list[str], over: bool = False) -> pa.Table | None:
-    """One file's columns in one table, as `read_parts`; None if nothing of it can be read."""
+    """Read one file's columns into one table, as `read_parts`; None if nothing is readable."""
     parts = read_parts(path, names, notes, over)
     found = list(itertools.islice(parts, 1))
     if not found:
         return None
     if next(parts, None) is not None:
-        add_note(notes, f"{path.name}: more rows than a recorder writes: what is behind the first is left out")
+        add_note(notes, f"{path.name}: more rows than a recorder writes: the rest is left out")
     return found[0]
 
 
 def read_parts(
     path: Path, names: Sequence[str] | None, notes: list[str], over: bool = False, cells: int = _PART_CELLS
 ) -> Iterator[pa.Table]:
-    """One file's columns, in parts of at most so many cells; none if nothing of it can be read.
+    """Read one file's columns, in parts of at most `cells` cells; none if nothing is readable.
 
     Parameters
     ----------
     path : Path
         An Arrow stream.
     names : sequence of str or None
-        Columns wanted (those that the file does not have are left out); None: all.
+        Columns to read (omitting those the file lacks); None: all.
     notes : list
-        Gets a line for a file that is damaged, or of a version without a wanted column.
+        Gets a line if the file is damaged, or of a version without a wanted column.
     over : bool
-        The file should have an end: it is its table's last one, and the run was closed.
+        The file should have an end mark: it is its table's last one, and the run was closed.
     cells : int
-        Of a part that has more than one batch.
+        Largest size of a part of several batches.
     """
     try:
-        # a plain read: the pages of a mapped file would count as ours
+        # a plain read: a mapped file's pages would count as our memory
         content = sealed_stream.unseal(read_bytes(path, sealed_stream.FILE_BYTES_MAX))
         if not content.data:
-            add_note(notes, f"{path.name}: cannot be read ({'its head is damaged' if content.damage else 'empty'})")
+            add_note(notes, f"{path.name}: cannot be read ({'its header is damaged' if content.damage else 'empty'})")
             return
         sealed_stream.require_bounded(content.data)
         for table in _parts(path, content, names, notes, over, cells):
@@ -156,20 +156,20 @@ def _note_damage(
     error: Exception | None,
 ) -> None:
     if error is not None:
-        add_note(notes, f"{path.name}: damaged or cut short behind batch {len(spans)} ({_first_line(error)})")
+        add_note(notes, f"{path.name}: damaged or truncated after batch {len(spans)} ({_first_line(error)})")
     if not content.sealed:
-        add_note(notes, "tables without checksums, of an earlier version: a flipped byte in them would not be seen")
+        add_note(notes, "tables of an earlier version, without checksums: flipped bytes would go unnoticed")
     for damage in content.damage:
         size_kb = damage.size_bytes / 1e3
-        what = "cut short" if damage.at_end and not content.ended else "damaged"
+        what = "truncated" if damage.at_end and not content.ended else "damaged"
         add_note(notes, f"{path.name}: {what}, {size_kb:.1f} kB: {_rows_lost(spans, damage)} left out")
     if content.sealed and over and not content.ended and not content.damage:
         lost = _rows_lost(spans, sealed_stream.Damage(len(spans), 0, True))
-        add_note(notes, f"{path.name}: without the mark of its end: {lost} missing, if there were any")
+        add_note(notes, f"{path.name}: without its end mark: {lost} missing, if any")
 
 
 def _is_ours(schema: pa.Schema, name: str) -> bool:
-    """Whether a column is of the kind that a recorder writes under its name, and there once."""
+    """Whether a column has the kind that a recorder writes under its name, and is unique."""
     places = schema.get_all_field_indices(name)
     kind = schema.field(places[0]).type
     stored = column_codec.kind_of(schema.field(places[0]))
@@ -187,7 +187,7 @@ def _is_ours(schema: pa.Schema, name: str) -> bool:
 
 
 def _possible(path: Path, table: pa.Table, notes: list[str]) -> pa.Table:
-    """Rows whose time can be: without a checksum it may be any number."""
+    """Rows with possible times: without a checksum they may be any number."""
     name = next((name for name in _TIMES if name in table.schema.names), None)
     if name is None:
         return table
@@ -198,13 +198,13 @@ def _possible(path: Path, table: pa.Table, notes: list[str]) -> pa.Table:
 
 
 def first_s(path: Path, time_name: str) -> float | None:
-    """Time of the first row; None if the file's beginning does not give it."""
+    """Time of the first row; None if unreadable."""
     times_s = first_column(path, time_name)
     return float(times_s[0]) if times_s.size else None
 
 
 def first_column(path: Path, name: str) -> FloatArray:
-    """A column of the first batch; empty if the file's beginning does not give it."""
+    """A column of the first batch; empty if unreadable."""
     try:
         with open_plain(path) as file:
             content = sealed_stream.unseal(file.read(_LOOK_BYTES))
@@ -219,7 +219,7 @@ def first_column(path: Path, name: str) -> FloatArray:
 
 
 def written_by(path: Path) -> str:
-    """The program that wrote a file; empty if it does not say."""
+    """The program that wrote a file; empty if not stated."""
     try:
         with open_plain(path) as file:
             schema = pa.ipc.open_stream(sealed_stream.unseal(file.read(_LOOK_BYTES)).data).schema
@@ -230,7 +230,7 @@ def written_by(path: Path) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Span:
-    """Times of a batch's first and last row; None where it does not say."""
+    """Times of a batch's first and last row; None if unknown."""
 
     first_s: float | None
     last_s: float | None
@@ -245,19 +245,19 @@ def _span(batch: pa.RecordBatch) -> _Span:
 
 
 def _rows_lost(spans: Sequence[_Span], damage: sealed_stream.Damage) -> str:
-    """The rows that a stretch has held, by the times of those around it."""
+    """Describe the rows lost in a damaged stretch, by the times around it."""
     after = damage.batches
     last_s = spans[after - 1].last_s if 0 < after <= len(spans) else None
     next_s = spans[after].first_s if after < len(spans) else None
     if last_s is not None and next_s is not None:
         return f"rows between {last_s:.2f} s and {next_s:.2f} s are"
     if last_s is not None:
-        return f"rows behind {last_s:.2f} s are"
+        return f"rows after {last_s:.2f} s are"
     return "all rows are" if next_s is None else f"rows before {next_s:.2f} s are"
 
 
 def add_note(notes: list[str], text: str) -> None:
-    """A line, once."""
+    """Add a line, once."""
     if text not in notes:
         notes.append(text)
 
@@ -266,29 +266,29 @@ def _first_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0][:120]
 
 
-# The rate of a run's ticks: what was recorded knows it better than a configuration that lost a line.
+# The rate of a run's ticks: the record is more reliable than a configuration that lost a line.
 
 
-# Rates in use are farther apart.
+# Rates in use differ by more.
 _DIFFERS = 0.05
-# Nobody sets 9.998 Hz; that is a clock's jitter.
+# Nobody sets 9.998 Hz; that is clock jitter.
 _WHOLE = 0.005
 
 
 def at_recorded_rate(config: Config, folder: Path, notes: list[str]) -> Config:
-    """The configuration with the rate of the run's first minute, if that is another; a note says so."""
+    """The configuration with the rate of the run's first minute, if that differs, and a note."""
     said_hz, found_hz = config.loop.rate_hz, recorded_rate_hz(folder)
     if found_hz is None or abs(found_hz / said_hz - 1) <= _DIFFERS:
         return config
     notes.append(
-        f"config.toml: loop.rate_hz is {said_hz:g} Hz (by default, if it is not there), the ticks come at "
-        f"{found_hz:.4g} Hz: what was recorded is taken"
+        f"config.toml: loop.rate_hz is {said_hz:g} Hz (or missing), but the record has ticks at "
+        f"{found_hz:.4g} Hz, which is used"
     )
     return config.model_copy(update={"loop": config.loop.model_copy(update={"rate_hz": found_hz})})
 
 
 def recorded_rate_hz(folder: Path) -> float | None:
-    """Ticks a second by the tables; None where they do not say."""
+    """Ticks per second in the tables; None if unknown."""
     for path in column_files(folder, tables.TICKS):
         spacing_s = _spacing_s(path)
         spacing_s = spacing_s[spacing_s > 0]
@@ -302,7 +302,7 @@ def recorded_rate_hz(folder: Path) -> float | None:
 
 
 def _spacing_s(path: Path) -> FloatArray:
-    """From when one of a file's first ticks was due to when the next was: `dt_s` is that and the jitter of both."""
+    """Time between the deadlines of a file's first ticks: `dt_s` is that plus the jitter of both."""
     dt_s, late_ms = (first_column(path, name) for name in ("dt_s", "lateness_ms"))
     return dt_s[1:] - 1e-3 * np.diff(np.nan_to_num(late_ms)) if late_ms.size == dt_s.size else dt_s
 

@@ -1,4 +1,4 @@
-"""Old runs go when they are too old or too many bytes; never the present one, and none that a person keeps."""
+"""Deletes runs that are too old or too large in total, but never the present one or one that a person keeps."""
 
 import os
 import re
@@ -14,15 +14,15 @@ from membrane_ctrl.model.files import folder_handle
 _RUN = re.compile(r"(\d{8}T\d{6}Z)-.+")
 _DOOMED = ".deleted-"
 _KEEP = ".keep"
-# A clock that is wrong by years must not take every run with it.
+# A clock that is wrong by years must not delete every run.
 _NEVER_TOO_OLD = 3
-# A run without a summary may be running, unless nothing in it has changed for this long.
+# A run without a summary may still be running, unless it has not changed for this long.
 _ABANDONED_AFTER = timedelta(hours=24)
 
 
 @dataclass(frozen=True, slots=True)
 class OldRun:
-    """A run folder that may be deleted: its name begins with its start."""
+    """A run folder that may be deleted; its name begins with its start time."""
 
     folder: Path
     started_utc: datetime
@@ -30,10 +30,10 @@ class OldRun:
 
 
 def deletable_runs(logs_dir: Path, present: Path, now_utc: datetime) -> list[OldRun]:
-    """Runs in `logs_dir`, oldest first, but for the present one, those that may still run, and those with a `.keep`.
+    """Runs in `logs_dir`, oldest first, except the present one, those that may still run, and those with a `.keep`.
 
-    Only folders that look like a run are looked at: a name that begins with a time, and `config.toml`. A link is
-    none: what it leads to lies elsewhere.
+    Considers only folders that look like a run: a name that begins with a time, and `config.toml`. Symbolic links do
+    not count: their targets are elsewhere.
     """
     found = []
     for folder in sorted(logs_dir.iterdir()):
@@ -46,14 +46,14 @@ def deletable_runs(logs_dir: Path, present: Path, now_utc: datetime) -> list[Old
             continue
         try:
             started = datetime.strptime(match[1], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
-        except ValueError:  # digits, but no time
+        except ValueError:  # digits, but not a time
             continue
         found.append(OldRun(folder, started, size_bytes(folder)))
     return found
 
 
 def size_bytes(folder: Path) -> int:
-    """Bytes of all files below a folder; one that goes away meanwhile counts nothing."""
+    """Bytes of all files below a folder; files deleted meanwhile count as nothing."""
     total = 0
     for path in folder.rglob("*"):
         try:
@@ -68,7 +68,7 @@ def _may_run(folder: Path, now_utc: datetime) -> bool:
         return False
     try:
         newest_s = max(path.lstat().st_mtime for path in folder.iterdir())
-    except OSError:  # something goes away while we look: somebody is at work there
+    except OSError:  # something changed meanwhile: somebody is at work there
         return True
     return now_utc - datetime.fromtimestamp(newest_s, UTC) < _ABANDONED_AFTER
 
@@ -76,9 +76,9 @@ def _may_run(folder: Path, now_utc: datetime) -> bool:
 def expired(
     runs: Sequence[OldRun], present_bytes: int, keep_gb: float | None, keep_days: float | None, now_utc: datetime
 ) -> list[tuple[OldRun, str]]:
-    """Which of the runs (oldest first) have to go, and why; the newest three are never too old.
+    """Which of the runs (oldest first) to delete, and why; the newest three are never too old.
 
-    The bytes of the present run count, and it stays. None is no limit.
+    The bytes of the present run count, but it stays. None means no limit.
     """
     total = present_bytes + sum(run.size_bytes for run in runs)
     gone: list[tuple[OldRun, str]] = []
@@ -87,7 +87,7 @@ def expired(
         if keep_days is not None and old_enough and now_utc - run.started_utc > timedelta(days=keep_days):
             gone.append((run, f"older than recording.keep_days = {keep_days:g}"))
         elif keep_gb is not None and total > keep_gb * 1e9:
-            gone.append((run, f"all runs are more than recording.keep_gb = {keep_gb:g}"))
+            gone.append((run, f"all runs exceed recording.keep_gb = {keep_gb:g}"))
         else:
             continue
         total -= run.size_bytes
@@ -95,20 +95,20 @@ def expired(
 
 
 def delete_run(run: OldRun) -> None:
-    """Delete a run; renamed first, so that what a crash leaves of it is no run. Raises OSError."""
+    """Delete a run; rename it first, so that a crash leaves nothing that looks like a run. Raises OSError."""
     doomed = f"{_DOOMED}{run.folder.name}"
     with folder_handle(run.folder.parent.resolve()) as logs:
         os.rename(run.folder.name, doomed, src_dir_fd=logs, dst_dir_fd=logs)
-        shutil.rmtree(doomed, dir_fd=logs)  # of a link in it the link goes
+        shutil.rmtree(doomed, dir_fd=logs)  # deletes links, not their targets
 
 
 def delete_remains(logs_dir: Path) -> None:
-    """Delete what a crash in `delete_run` has left; what does not go now goes another time."""
+    """Delete the remains of a crash in `delete_run`, as far as possible now."""
     for doomed in logs_dir.glob(f"{_DOOMED}*"):
         shutil.rmtree(doomed, ignore_errors=True)
 
 
-# What is still recorded when the disk runs low: pictures go first, numbers last.
+# What to record when the disk runs low: pictures are dropped first, numbers last.
 
 
 class DetailLevel(IntEnum):
@@ -116,17 +116,17 @@ class DetailLevel(IntEnum):
 
     ALL = 0
     NO_PICTURES = 1  # thumbnails and maps are half of a recording
-    ESSENTIAL = 2  # events, inputs of the ticks, summary: some kB/s, from which the run can be replayed
+    ESSENTIAL = 2  # events, tick inputs, summary: a few kB/s, enough to replay the run
 
 
-# In units of `recording.min_free_mb`: below it a person has been told, and what is left is for the essential.
+# In units of `recording.min_free_mb`, below which an alarm is raised and the rest is reserved for the essential.
 PICTURES_FROM, _RERUN_FROM = 2.0, 0.2
-# More must be free again than what a level began at, or it would come and go with every file.
+# Hysteresis, or a level would come and go with every file.
 _HYSTERESIS = 1.1
 
 
 def detail_level(free_mb: float, min_free_mb: float, before: DetailLevel) -> DetailLevel:
-    """How much to record with this much space left, after recording this much before."""
+    """Level of detail for this much free space, given the previous level."""
     level = _level(free_mb, min_free_mb)
     return max(level, min(before, _level(free_mb / _HYSTERESIS, min_free_mb)))
 

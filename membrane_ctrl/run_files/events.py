@@ -1,4 +1,4 @@
-"""`events.jsonl`: one JSON object a line, on the disk as soon as it is known."""
+"""`events.jsonl`: one JSON object per line, written as soon as known."""
 
 import json
 import os
@@ -16,7 +16,7 @@ _WAITING_MAX = 10_000
 
 
 def parse(message: bytes) -> EventLine:
-    """The event of a ring message; one that is not a JSON object becomes an event that says so."""
+    """The event in a ring message; anything but a JSON object becomes an event that says so."""
     try:
         event = json.loads(message)
     except (ValueError, RecursionError):
@@ -25,18 +25,18 @@ def parse(message: bytes) -> EventLine:
 
 
 class EventsFile:
-    """Appends events; after a failed write nothing is lost or torn, the next call goes on where it stopped.
+    """Appends events; after a failed write nothing is lost or torn, and the next call continues.
 
     Parameters
     ----------
     path : Path
     resumed : bool
-        A recorder was killed: half a line at the end goes, and what is there is not written again.
+        After a killed recorder: remove a torn last line, and do not repeat existing lines.
 
     Attributes
     ----------
     lost : int
-        Events given up because too many waited for a full disk.
+        Events dropped because too many waited on a full disk.
     """
 
     def __init__(self, path: Path, resumed: bool = False) -> None:
@@ -48,7 +48,7 @@ class EventsFile:
         self.lost = 0
 
     def append(self, events: Sequence[EventLine]) -> None:
-        """Write events, and those still waiting from before. Raises OSError (full disk)."""
+        """Write events, after those still waiting. Raises OSError (full disk)."""
         for event in events:
             line = dumps_checked(event).encode() + b"\n"
             if line in self._written:
@@ -56,7 +56,7 @@ class EventsFile:
             self._waiting.append(line)
             self._sync |= event.get("kind") in URGENT
         while len(self._waiting) > _WAITING_MAX:
-            # the front line may be half on the disk already: it stays, the one behind it goes
+            # the first line may already be half written: keep it, drop the second
             del self._waiting[1]
             self.lost += 1
         self._write()
@@ -76,8 +76,8 @@ class EventsFile:
             self._sync = False
 
     def begin_anew(self, recent: Sequence[EventLine]) -> None:
-        """The file was taken away: begin another, with those that had gone into it unseen. Raises OSError."""
-        gone = self._descriptor is not None  # not opened yet: nothing of it was taken
+        """Start a new file after the old one's removal, with the events written to it meanwhile. Raises OSError."""
+        gone = self._descriptor is not None  # not opened yet: nothing was lost
         self.close()
         self.append(recent if gone else [])
 
@@ -88,12 +88,12 @@ class EventsFile:
             self._descriptor = None
 
 
-# A killed recorder had handed on how far it was a second before: at most this much may come twice.
+# A killed recorder saved its progress up to a second earlier: at most this many events may come twice.
 _TAIL_BYTES = 1_000_000
 
 
 def _mend_tail(path: Path) -> frozenset[bytes]:
-    """Cut half a line off the end; the last whole lines."""
+    """Cut a torn line off the end; return the last whole lines."""
     if not path.exists():
         return frozenset()
     with path.open("r+b") as file:

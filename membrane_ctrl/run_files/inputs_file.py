@@ -1,4 +1,4 @@
-"""What the controller was given, tick by tick, for a replay (docs/replay.md)."""
+"""The controller's inputs, tick by tick, for a replay (docs/replay.md)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _TAIL, _SHAPE, _MEMORY = b"C", b"S", b"M"
 _FILE_BYTES_MAX = 300_000_000
 _BODY_BYTES_MAX = 16_000_000
 _HEAD_BYTES_MAX = 65_536
-# What a record's fields may be: no objects, no arrays.
+# Permitted field types of a record: no objects, no arrays.
 _CODES = {code: code for code in ("<i8", "<f8", "|u1", "<u4")}
 
 
@@ -55,20 +55,20 @@ class InputsReader:
     def __init__(self, folder: Path, paths: list[Path]) -> None:
         self._folder = folder
         self.paths = paths
-        self.program = ""  # that recorded the last file read
-        self.damage: list[str] = []  # what could not be read so far, one line a place
+        self.program = ""  # that wrote the last file read
+        self.damage: list[str] = []  # unreadable parts so far, one line per place
 
     def __iter__(self) -> Iterator[InputsFrame]:
-        """All frames in order; a tick that was written twice (a recorder that went on) comes once."""
+        """Yield all frames in order; ticks written twice (by a resumed recorder) appear once."""
         raise NotImplementedError
 
     def since(self, time_s: float) -> InputsReader:
-        """A reader that begins with the last memory before this time of the run, or earlier."""
+        """A reader that starts at the last memory before this time of the run, or earlier."""
         raise NotImplementedError
 
 
 def open_inputs(folder: Path) -> InputsReader:
-    """Reader of a run's inputs: of the tables, or of the `inputs-*.bin` of earlier versions."""
+    """Return a reader of a run's inputs, from the tables or from the `inputs-*.bin` of earlier versions."""
     earlier = sorted(folder.glob("inputs-*.bin"))
     if earlier:
         return FramesReader(folder, earlier)
@@ -76,12 +76,12 @@ def open_inputs(folder: Path) -> InputsReader:
 
 
 class TablesReader(InputsReader):
-    """Reads the tables `ticks`, `rare` and `shapes`, a batch of ticks after the other."""
+    """Reads the tables `ticks`, `rare` and `shapes`, one batch of ticks after the other."""
 
     _from_s = -math.inf
 
     def __iter__(self) -> Iterator[InputsFrame]:
-        """All frames in order, each with the rare parts and shapes up to its end."""
+        """Yield all frames in order, each with the rare parts and shapes up to its end."""
         last = 0
         rare = _Ahead((row.time_s, row) for row in self._rare())
         figures = _Ahead((estimate.time_s, estimate) for estimate in self._estimates())
@@ -97,15 +97,15 @@ class TablesReader(InputsReader):
             yield InputsFrame(records, tails, memories, {found.time_s: found for found in figures.until(until_s)})
 
     def since(self, time_s: float) -> InputsReader:
-        """A reader that begins with the last memory before this time of the run."""
+        """A reader that starts at the last memory before this time of the run."""
         found = TablesReader(self._folder, self.paths)
         times_s = [row.time_s for row in found._rare() if row.kind == tables.MEMORY and row.time_s <= time_s]
-        found.damage.clear()  # it is told again when the file is read
+        found.damage.clear()  # reported again when the file is read
         found._from_s = max(times_s, default=-math.inf)
         return found
 
     def _tables(self, table: str, names: Sequence[str], before_s: float = 0.0) -> Iterator[pa.Table]:
-        """A table's batches, without the files that end before the reader begins."""
+        """A table's batches, without files that end before the reader starts."""
         paths = column_reader.column_files(self._folder, table)
         begin_s = self._from_s - before_s
         time_name = "mono_s" if table == tables.TICKS else "time_s"
@@ -119,7 +119,7 @@ class TablesReader(InputsReader):
             yield from column_reader.read_parts(path, names, self.damage, cells=0)
 
     def _records(self, table: pa.Table) -> Records:
-        """The records of a batch: what they lack is NaN or 0; none without what every record has."""
+        """The records of a batch, missing fields as NaN or 0; none without the mandatory fields."""
         names = {tables.GIVEN[name] for name in _NEEDED}
         records = np.zeros(table.num_rows if names <= set(table.column_names) else 0, dtype=RECORD)
         for name, column in tables.GIVEN.items() if len(records) else ():
@@ -155,14 +155,14 @@ class _Rare:
 
 
 class _Ahead(Generic[T]):
-    """Things in the order of their times, given out up to a time."""
+    """Items in order of time, handed out up to a given time."""
 
     def __init__(self, timed: Iterator[tuple[float, T]]) -> None:
         self._timed = timed
         self._next = next(timed, None)
 
     def until(self, time_s: float) -> Iterator[T]:
-        """Those up to a time that were not given out before."""
+        """The items up to a time that were not handed out before."""
         while self._next is not None and self._next[0] <= time_s:
             yield self._next[1]
             self._next = next(self._timed, None)
@@ -171,12 +171,12 @@ class _Ahead(Generic[T]):
 class FramesReader(InputsReader):
     """Reads the `inputs-*.bin` of an earlier version, frame by frame.
 
-    A file is one line of JSON and then frames, one a second: magic, length, CRC-32, zlib of the number of ticks,
-    their records in columns, then parts of kind `C` (commands and ended tasks), `M` (memory), `S` (shape estimate).
+    A file is one line of JSON, then one frame per second: magic, length, CRC-32, zlib of the number of ticks, their
+    records in columns, then parts of kind `C` (commands and ended tasks), `M` (memory), `S` (shape estimate).
     """
 
     def __iter__(self) -> Iterator[InputsFrame]:
-        """All frames in order; a tick that was written twice comes once."""
+        """Yield all frames in order; ticks written twice appear once."""
         last = 0
         for path in self.paths:
             try:
@@ -199,27 +199,27 @@ class FramesReader(InputsReader):
                 yield InputsFrame(fresh, frame.tails, frame.memories, frame.estimates)
 
     def since(self, time_s: float) -> InputsReader:
-        """A reader that begins with the run."""
+        """A reader that starts with the run."""
         return FramesReader(self._folder, self.paths)
 
     def _kind_of(self, data: bytes, name: str) -> np.dtype[np.void] | None:
-        """The file's own record: one of an older program may lack a field, one of a newer have more."""
-        line, _, _ = data[:_HEAD_BYTES_MAX].partition(b"\n")  # of all of it the rest would be a copy
+        """The file's own record type: an older program's may lack fields, a newer one's may have more."""
+        line, _, _ = data[:_HEAD_BYTES_MAX].partition(b"\n")  # a full partition would copy the rest
         try:
             head = plain_json.loads(line.decode())
             fields = [(str(field), _CODES[code]) for field, code in head["fields"]]
             kind = np.dtype(fields)
             self.program = str(head["program"])
         except (ValueError, KeyError, TypeError):
-            self.damage.append(f"{name}: its first line is damaged; taken for one of this program")
+            self.damage.append(f"{name}: its first line is damaged; assuming this version's format")
             return RECORD
         if head.get("schema") != SCHEMA:
-            self.damage.append(f"{name}: {head.get('schema')} where {SCHEMA} is known")
+            self.damage.append(f"{name}: schema {head.get('schema')}, expected {SCHEMA}")
             return None
         return kind
 
     def _bodies(self, data: bytes, name: str) -> Iterator[bytes]:
-        """Bodies of all whole frames; between them anything may lie."""
+        """Bodies of all whole frames, with anything between them."""
         place = 0
         good_until = data.find(b"\n") + 1
         in_vain = 0
@@ -236,11 +236,11 @@ class FramesReader(InputsReader):
 
     def _note_damage(self, name: str, start: int, end: int) -> None:
         if end > start:
-            self.damage.append(f"{name}: {end - start} bytes at {start} are not readable")
+            self.damage.append(f"{name}: {end - start} bytes at {start} are unreadable")
 
 
 def _body_at(data: bytes, place: int) -> tuple[bytes | None, int]:
-    """A frame's body and where the frame ends; None if it is not whole, and how far it was looked at."""
+    """A frame's body and end; None and the end of the search if it is not whole."""
     if place + _HEAD.size > len(data):
         return None, place
     _, length, crc = _HEAD.unpack_from(data, place)
@@ -261,7 +261,7 @@ def _body_at(data: bytes, place: int) -> tuple[bytes | None, int]:
 def _frame_of(body: bytes, kind: np.dtype[np.void]) -> InputsFrame:
     (count,) = _COUNT.unpack_from(body)
     if len({*(kind.names or ()), *_NEEDED}) != len(kind.names or ()):
-        raise ValueError("without a field that every record has")
+        raise ValueError("a mandatory field is missing")
     records, taken = decode_columns(body[_COUNT.size :], kind, count)
     place = _COUNT.size + taken
     frame = InputsFrame(_known_fields(records), {}, {}, {})
@@ -280,7 +280,7 @@ def _frame_of(body: bytes, kind: np.dtype[np.void]) -> InputsFrame:
 
 
 def _known_fields(records: Records) -> Records:
-    """The records as ours: what they lack is NaN or 0."""
+    """Convert the records to ours, missing fields as NaN or 0."""
     if records.dtype == RECORD:
         return records
     ours = np.zeros(len(records), dtype=RECORD)
@@ -293,16 +293,16 @@ def _known_fields(records: Records) -> Records:
 
 
 # A column is code and data: code 0 to 6 is the number of decimals of values that are whole numbers over a power of
-# ten, as differences in 4 bytes; 255 is the exclusive or with the tick before. Bytes are sorted by their place.
+# ten, as differences in 4 bytes; 255 is the exclusive or with the tick before. Bytes are sorted by position.
 _AS_IT_IS = 255
 _DIGITS_MAX = 6
 
 
 def decode_columns(data: bytes, kind: np.dtype[np.void], count: int) -> tuple[NDArray[np.void], int]:
-    """(count,) records of a kind, and how many bytes of `data` they took. Raises ValueError if there are too few."""
-    # before the memory is taken: a count may be anything
+    """(count,) records of a kind, and the number of bytes of `data` used. Raises ValueError if there are too few."""
+    # before allocating memory: a count may be anything
     if count * sum(min(4, kind[name].itemsize) for name in kind.names or ()) > len(data):
-        raise ValueError(f"{count} ticks are said to be in {len(data)} bytes")
+        raise ValueError(f"{count} ticks cannot be in {len(data)} bytes")
     records = np.empty(count, dtype=kind)
     if not count:
         return records, 0

@@ -1,7 +1,7 @@
-"""The fault that outlives its run: written at a trip, respected at the next start, cleared by a person.
+"""A fault that outlives its run: written at a trip, respected at the next start, cleared by a person.
 
-One file beside the run folders. It is written without waiting for the disk (a tick has no time for that) and
-replaced as a whole, so that a reader sees the old one or the new one; one that cannot be read counts as a fault.
+One file beside the run folders. It is written without waiting for the disk (a tick has no time for that) and replaced
+atomically, so that a reader sees the old or the new one; an unreadable file counts as a fault.
 """
 
 import contextlib
@@ -15,17 +15,17 @@ NAME = "latched-fault.json"
 SCHEMA = "membrane-latched-fault/1"
 RESUMES_NAME = "resumes.json"
 _DAY_S = 86_400.0
-_RESUMES_MOST = 1000  # of a day, as `resume.most_per_day` takes at most
-# More than a fault takes; the least that a disk gives.
+_RESUMES_MOST = 1000  # per day, the upper limit of `resume.most_per_day`
+# More than a fault takes; the smallest unit of a disk.
 _RESERVE_BYTES = 4096
-# The room that an earlier run reserved is kept. A link in its place is not followed, for a pipe is not waited.
+# Keeps the room that an earlier run reserved. Does not follow links or wait for pipes.
 _IN_PLACE = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-_MOST_BYTES = 65536  # a longer file is none of ours, and is not read to its end
+_MOST_BYTES = 65536  # a longer file is not ours, and is not read to its end
 
 
 @dataclass(frozen=True, slots=True)
 class LatchedFault:
-    """What tripped, when, and where it is recorded."""
+    """What tripped, when, and the run that recorded it."""
 
     name: str
     cause: str
@@ -35,7 +35,7 @@ class LatchedFault:
     run: str
 
     def __str__(self) -> str:
-        """For one line."""
+        """The fault as one line."""
         seen = f" ({self.seen})" if self.seen else ""
         return " ".join(f"{self.name}: {self.cause}{seen}, {self.time_utc}, run {self.run}".split())
 
@@ -48,7 +48,7 @@ class LatchedFile:
         self._reserve = logs_dir / f".{NAME}.reserve"
 
     def read(self) -> LatchedFault | None:
-        """The latched fault, None if there is none. Never raises: what cannot be read is latched."""
+        """Read the latched fault, None if there is none. Never raises: an unreadable file counts as latched."""
         try:
             content = _content(self.path)
             if content is None:
@@ -69,16 +69,16 @@ class LatchedFile:
             self.reserve()
 
     def add(self, fault: LatchedFault) -> None:
-        """Latch, unless something is latched already: the first cause is the one that is told. Raises OSError."""
+        """Latch, unless a fault is latched already: the first cause is the one to report. Raises OSError."""
         if self.read() is None:
             self.write(fault)
 
     def reserve(self) -> None:
-        """Take the room for a fault while there is some: one on a full disk is latched as well. Raises OSError."""
+        """Reserve disk space for a fault, so that one on a full disk latches too. Raises OSError."""
         self._fill(bytes(_RESERVE_BYTES))
 
     def _fill(self, content: bytes) -> None:
-        """Write to the reserve, in the room that it has. What stands in its place and is no file goes."""
+        """Write to the reserved file, in its space. Removes anything in its place that is not a file."""
         try:
             number = os.open(self._reserve, _IN_PLACE, 0o644)
         except OSError:
@@ -89,12 +89,12 @@ class LatchedFile:
             file.truncate()
 
     def release(self) -> None:
-        """Give that room back."""
+        """Release that space."""
         with contextlib.suppress(OSError):
             self._reserve.unlink(missing_ok=True)
 
     def sync(self) -> None:
-        """Wait until it is on the disk, power cut or not; for the end of a run. Raises OSError."""
+        """Sync the file so that it survives a power cut; for the end of a run. Raises OSError."""
         if not self.path.exists():
             return
         for path in (self.path, self.path.parent):
@@ -105,7 +105,7 @@ class LatchedFile:
                 os.close(number)
 
     def clear(self) -> None:
-        """A person has looked at it, or the resume rule let it go. Raises OSError."""
+        """Clear the latch, after a person or the resume rule decided so. Raises OSError."""
         self.path.unlink(missing_ok=True)
 
     def _unreadable(self, why: str) -> LatchedFault:
@@ -115,30 +115,30 @@ class LatchedFile:
 
 
 class ResumeLog:
-    """When faults have cleared by themselves, so that a restart does not begin the day's number anew.
+    """When faults cleared automatically, so that a restart does not reset the day's count.
 
     Parameters
     ----------
     logs_dir : Path
-        Where run folders go.
+        Folder of the runs.
     """
 
     def __init__(self, logs_dir: Path) -> None:
         self.path = logs_dir / RESUMES_NAME
 
     def ages_s(self, now: datetime) -> tuple[float, ...]:
-        """How long ago those of the last day were, oldest first. Never raises: what cannot be read counts as full."""
+        """Ages of the last day's resumes, oldest first. Never raises: an unreadable file counts as full."""
         try:
             content = _content(self.path)
             stamps = [] if content is None else json.loads(content)
             ages_s = [(now - datetime.fromisoformat(stamp)).total_seconds() for stamp in stamps]
         except (OSError, ValueError, TypeError, RecursionError):
             return (0.0,) * _RESUMES_MOST
-        # one from the future (the clock was set back) counts as just now
+        # a future one (the clock was set back) counts as just now
         return tuple(sorted((max(0.0, age_s) for age_s in ages_s if age_s < _DAY_S), reverse=True))
 
     def add(self, when: datetime) -> None:
-        """Count one; those older than a day are left out. Raises OSError."""
+        """Add one and drop those older than a day. Raises OSError."""
         kept = [when - timedelta(seconds=age_s) for age_s in self.ages_s(when)][-_RESUMES_MOST:]
         scratch = self.path.with_name(f".{self.path.name}.new")
         scratch.write_text(json.dumps([stamp.isoformat() for stamp in (*kept, when)]) + "\n", encoding="utf-8")
@@ -146,13 +146,13 @@ class ResumeLog:
 
 
 def _content(path: Path) -> bytes | None:
-    """What is there; None if nothing is, not even a link whose aim is gone. Raises OSError or ValueError."""
+    """The content; None if there is nothing, not even a dangling link. Raises OSError or ValueError."""
     try:
         path.lstat()
     except FileNotFoundError:
         return None
-    if not path.is_file():  # of a pipe the first byte would be waited for
-        raise ValueError("no file")
+    if not path.is_file():  # reading a pipe would block
+        raise ValueError("not a file")
     with path.open("rb") as file:
         content = file.read(_MOST_BYTES + 1)
     if len(content) > _MOST_BYTES:

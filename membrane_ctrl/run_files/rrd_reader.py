@@ -1,6 +1,6 @@
-"""Telemetry and shapes out of Rerun segments: for runs without tables, and for a killed run's last minute.
+"""Telemetry and shapes from Rerun segments: for runs without tables, and for a killed run's last minute.
 
-Slow against the tables (a chunk an entity a second), but everything is in there.
+Slow compared with the tables (a chunk per entity and second), but complete.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,18 +16,18 @@ from membrane_ctrl.run_files.segments import FAULTS, read_chunks, salvage
 if TYPE_CHECKING:
     from rerun.chunk import Chunk
 
-REPAIRED = "repaired"  # below the run: what `repair` made of damaged files
+REPAIRED = "repaired"  # below the run: files repaired by `repair`
 _VALUES = "Scalars:scalars"
 _TIME = "run_time"
 
 
 def segments(folder: Path) -> list[Path]:
-    """The run's Rerun segments in their order."""
+    """The run's Rerun segments, in order."""
     return sorted(folder.glob("*.rrd"))
 
 
 def read_ticks(path: Path, names: Sequence[str], notes: list[str]) -> dict[str, Column]:
-    """Columns of telemetry from one segment, on the ticks of `/tick/record`; NaN where a stream has no row.
+    """Read telemetry columns from one segment, on the ticks of `/tick/record`; NaN where a stream has no row.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def read_ticks(path: Path, names: Sequence[str], notes: list[str]) -> dict[str, 
     names : sequence of str
         Fields of `TelemetryRow`, `mono_s` among them.
     notes : list
-        Gets a line when the segment is damaged.
+        Gets a line if the segment is damaged.
     """
     wanted = {stream.path: stream for stream in streams.STREAMS if any(line.field in names for line in stream.lines)}
     found = _scalars(path, {*wanted, "/tick/record"}, notes)
@@ -57,7 +57,7 @@ def read_ticks(path: Path, names: Sequence[str], notes: list[str]) -> dict[str, 
 
 
 def read_shapes(path: Path, notes: list[str]) -> dict[str, Column]:
-    """Shape estimates of one segment: `time_s`, `coeffs_um` (n, 36), changes of sag and laser, quality."""
+    """Read one segment's shape estimates: `time_s`, `coeffs_um` (n, 36), changes of sag and laser, quality."""
     found = _scalars(path, {stream.path for stream in streams.SHAPE_STREAMS}, notes)
     if streams.ZERNIKE.path not in found:
         return {}
@@ -90,7 +90,7 @@ def _seconds(clock_ns: IntArray) -> Column:
 
 
 def _scalars(path: Path, entities: set[str], notes: list[str]) -> dict[str, tuple[IntArray, Column]]:
-    """(times in ns, (n, m) values) of each entity with scalars, sorted by time."""
+    """(times in ns, (n, m) values) of each scalar entity, sorted by time."""
     parts: dict[str, list[tuple[IntArray, Column]]] = {}
     for entity, times, values in _chunks(path, entities, notes):
         parts.setdefault(entity, []).append((times, values))
@@ -127,18 +127,18 @@ def _readable(path: Path, entities: set[str], notes: list[str]) -> list["Chunk"]
     except FAULTS:
         pass
     else:
-        column_reader.add_note(notes, f"{path.name}: damaged or cut short, read from its copy in {REPAIRED}/ ({why})")
+        column_reader.add_note(notes, f"{path.name}: damaged or truncated, read from its copy in {REPAIRED}/ ({why})")
         return chunks
     try:
         chunks, lost_bytes = salvage(path, entities)
     except OSError as error:
         why, chunks, lost_bytes = error.strerror or str(error), [], 0
-    what = f"{lost_bytes / 1e3:.1f} kB of it are left out" if chunks else "nothing of it can be read"
-    column_reader.add_note(notes, f"{path.name}: damaged or cut short, {what} ({why})")
+    what = f"{lost_bytes / 1e3:.1f} kB of it are left out" if chunks else "all of it unreadable"
+    column_reader.add_note(notes, f"{path.name}: damaged or truncated, {what} ({why})")
     return chunks
 
 
-# A part of a run's telemetry out of its Rerun segments, reading those alone that may hold some of it.
+# Reads a part of a run's telemetry, opening only the Rerun segments that may hold some of it.
 
 
 Block = dict[str, Column]
@@ -147,7 +147,7 @@ Block = dict[str, Column]
 def segment_blocks(
     folder: Path, names: Sequence[str], start_s: float, end_s: float, notes: list[str]
 ) -> Iterator[Block]:
-    """Telemetry of the segments from `start_s` up to `end_s`, a block each; what is damaged of them is noted."""
+    """Telemetry of the segments from `start_s` up to `end_s`, one block each; notes damage."""
     paths = segments(folder)
     first = _last_begun(paths, start_s) if np.isfinite(start_s) else 0
     last = _last_begun(paths, end_s) if np.isfinite(end_s) else len(paths) - 1
@@ -167,11 +167,11 @@ def cut(block: Block, time_name: str, start_s: float, end_s: float) -> Block:
 
 
 def _last_begun(paths: Sequence[Path], time_s: float) -> int:
-    """Number of the last segment that begins before a time, or the first one: halves what is left at each look."""
+    """Number of the last segment that starts before a time, or of the first one, by bisection."""
     low, high = 0, len(paths)
     while high - low > 1:
         middle = (low + high) // 2
-        # a segment that gives no time gives no rows: the next one says where it is
+        # a segment without a time has no rows: use the next one's time
         looks = ((place, _first_s(paths[place])) for place in range(middle, high))
         place, begins_s = next(((place, at_s) for place, at_s in looks if at_s is not None), (middle, np.inf))
         low, high = (place, high) if begins_s <= time_s else (low, middle)
@@ -179,6 +179,6 @@ def _last_begun(paths: Sequence[Path], time_s: float) -> int:
 
 
 def _first_s(path: Path) -> float | None:
-    """Its first tick. That it is damaged is no note yet: it may be far from the part that is read."""
+    """Time of the first tick. Damage is not noted yet: it may be far from the part being read."""
     times_s = read_ticks(path, ["mono_s"], [])["mono_s"]
     return float(times_s[0]) if times_s.size else None

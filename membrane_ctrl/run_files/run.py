@@ -1,4 +1,4 @@
-"""A run folder as data: `open_run(path)`, then columns, levels, shapes, events. Nothing here ever writes."""
+"""A run folder as data: `open_run(path)`, then columns, levels, shapes, events. Nothing here writes."""
 
 import json
 from collections.abc import Generator, Iterator, Sequence
@@ -21,25 +21,25 @@ from membrane_ctrl.run_files.segments import is_closed
 from membrane_ctrl.run_files.shapes import Shapes
 
 Block = dict[str, Column]
-# Rerun rounds the time of a tick to the nanosecond; the next one is milliseconds away
+# Rerun rounds the time of a tick to a nanosecond; the next tick is milliseconds away
 _SAME_TICK_S = 1e-6
-# From the last tick to the end of a run, and what of a killed one is in the segments only.
+# From the last tick to the end of a run, and the part of a killed run that only the segments have.
 _WAY_DOWN_S = 60.0
-# A batch of a level spans minutes; in shorter gaps there was nothing to record.
+# A batch of a level spans minutes; shorter gaps had nothing to record.
 _HOLE_S = 30.0
 _FILES_MAX = 100_000  # ten years of hours
-# What a damaged line may say else is no time of a run, and dates end.
+# Damaged lines may hold impossible times, and dates have a limit.
 _YEARS = range(1970, 2200)
 _RUN_MAX_S = 1e9
 TABLES = (
     tables.TICKS, tables.RARE, *(tables.level_table(window_s) for window_s in tables.WINDOWS_S), tables.SHAPES,
 )  # fmt: skip
-_STAND_IN = "Rerun segments stand in for ticks that the tables lack: without every tick, and without checksums"
+_STAND_IN = "Rerun segments replace ticks missing from the tables, not all of them, and without checksums"
 
 
 @dataclass(frozen=True, slots=True)
 class _Reach:
-    """How far a table goes: last row given of a part, and last row known of, which may lie behind it; -inf: none."""
+    """How far a table reaches: the last row returned of a part, and the last known row, perhaps later; -inf: none."""
 
     given_s: float
     known_s: float
@@ -57,11 +57,11 @@ class Run:
     log : tuple of LoggedEvent
         `events.jsonl` and the annotations made later, in the order of time.
     summary : dict or None
-        `summary.json`; None while the run goes on, or if its recorder was killed.
+        `summary.json`; None during the run, or if its recorder was killed.
     origin_utc : datetime
         UTC at 0 s of the run.
     notes : list of str
-        What is missing or damaged, one line each; reading may add to it.
+        Missing and damaged parts, one line each; reading may add more.
     """
 
     folder: Path
@@ -82,7 +82,7 @@ class Run:
         return tuple(each.line for each in self.log)
 
     def utc(self, mono_s: float) -> datetime:
-        """UTC of a second of the run; for an impossible one, as in damaged tables, of its start."""
+        """UTC of a time of the run; an impossible time, as in damaged tables, gives the start."""
         return self.origin_utc + timedelta(seconds=mono_s if abs(mono_s) < _RUN_MAX_S else 0.0)
 
     def log_between(self, start_s: float, end_s: float) -> tuple[run_folder.LoggedEvent, ...]:
@@ -97,7 +97,7 @@ class Run:
         names : sequence of str, optional
             Fields of `telemetry.TelemetryRow`; all by default. `mono_s` is always there.
         start_s, end_s : float
-            Part of the run wanted.
+            Part of the run to read.
         """
         wanted = _with_time(names or FIELDS)
         blocks = [pa.table(block) for block in self.tick_blocks(wanted, start_s, end_s)]
@@ -105,10 +105,10 @@ class Run:
         return pa.concat_tables(blocks, promote_options="permissive") if blocks else empty
 
     def tick_blocks(self, names: Sequence[str], start_s: float = -np.inf, end_s: float = np.inf) -> Iterator[Block]:
-        """Telemetry in blocks of some hours, so that a month needs no more memory than a night."""
+        """Telemetry in blocks of a few hours, so that a month needs no more memory than a night."""
         wanted = _with_time(names)
         table = yield from self._table_blocks(tables.TICKS, "mono_s", wanted, start_s, end_s)
-        # a part that lies in a hole of the table; one behind its end is none
+        # a part that lies in a gap of the table, which the time after its end is not
         hole = table.given_s == -np.inf and start_s < table.known_s
         if not hole and (table.known_s >= end_s or self._reaches_end(table.known_s)):
             return
@@ -120,7 +120,7 @@ class Run:
             yield block
 
     def _reaches_end(self, until_s: float) -> bool:
-        """Whether a table that ends there has all that there was: a run without a summary may have more."""
+        """Whether a table that ends here is complete: a run without a summary may have more."""
         if self.summary is None or until_s == -np.inf:
             return False
         duration_s = self.summary.get("duration_s")
@@ -133,9 +133,9 @@ class Run:
         end_s: float = np.inf,
         names: Sequence[str] = tables.NAMES,
     ) -> Block:
-        """Overview: least, mean and greatest of each signal in windows of 1, 10 or 60 s (`run_files.tables`).
+        """Overview: minimum, mean and maximum of each signal in windows of 1, 10 or 60 s (`run_files.tables`).
 
-        What is not in the table of the level is made from the next finer one, in the end from the ticks.
+        Windows missing from the level's table are computed from the next finer one, ultimately from the ticks.
         """
         names = tuple(dict.fromkeys(("time_s", "rows", *names)))
         if window_s not in tables.WINDOWS_S:
@@ -144,7 +144,7 @@ class Run:
         time_s = np.concatenate([block["time_s"] for block in blocks] or [np.empty(0)])
         missing = _holes(time_s, window_s, start_s)
         until_s = float(time_s[-1]) + window_s if time_s.size else start_s
-        within = table.known_s >= end_s  # the table goes on behind the part
+        within = table.known_s >= end_s  # the table continues after the part
         if not time_s.size or (end_s - until_s > _HOLE_S if within else not self._reaches_end(until_s)):
             missing.append((until_s, end_s))
         for begins_s, ends_s in missing:
@@ -156,14 +156,14 @@ class Run:
         return {name: values[order] for name, values in level.items()}
 
     def _made_level(self, window_s: float, start_s: float, end_s: float, names: Sequence[str]) -> list[Block]:
-        """A part of a level, from the next finer one or from the ticks."""
+        """Compute a part of a level from the next finer one or from the ticks."""
         finer = {coarse: fine for fine, coarse in pairwise(tables.WINDOWS_S)}
         if window_s in finer:
             return [tables.coarser_level(self.level(finer[window_s], start_s, end_s, names), window_s)]
         return [tables.first_level(block) for block in self.tick_blocks(tables.TICK_FIELDS, start_s, end_s)]
 
     def shapes(self) -> Shapes:
-        """Every measured figure of the run."""
+        """Every shape estimate of the run."""
         files = column_reader.column_files(self.folder, tables.SHAPES)
         parts = (part for path in files for part in self._parts(path, files[-1], shapes.TABLE_COLUMNS))
         found = [shapes.from_table(table) for table in parts if table.num_rows]
@@ -173,9 +173,9 @@ class Run:
         return shapes.joined(found)
 
     def look_through(self) -> None:
-        """Check that every table and segment is whole, so that `notes` names the damage.
+        """Check every table and segment, so that `notes` names all damage.
 
-        A segment whose messages follow one another is not decoded: that would take minutes for a month.
+        A segment with consecutive messages is not decoded: that would take minutes for a month.
         """
         for table in TABLES:
             files = column_reader.column_files(self.folder, table)
@@ -187,14 +187,14 @@ class Run:
                 rrd_reader.read_ticks(path, ["mono_s"], self.notes)
 
     def _parts(self, path: Path, last: Path, names: Sequence[str]) -> Iterator[pa.Table]:
-        """Columns of a file; the last one of a run that was closed has an end."""
+        """Columns of a file; the last file of a closed run has an end mark."""
         closed = self.summary is not None and not self.summary.get("rebuilt")
         return column_reader.read_parts(path, names, self.notes, closed and path == last)
 
     def _table_blocks(
         self, table: str, time_name: str, names: Sequence[str], start_s: float, end_s: float
     ) -> Generator[Block, None, _Reach]:
-        """Blocks of a table's part; returns how far the table goes."""
+        """Yield blocks of a table's part; returns how far the table reaches."""
         files = column_reader.column_files(self.folder, table)
         limited = np.isfinite(start_s) or np.isfinite(end_s)
         starts = [column_reader.first_s(path, time_name) if limited else None for path in files]
@@ -218,7 +218,7 @@ class Run:
 
 
 def _listed(blocks: Generator[Block, None, _Reach]) -> tuple[list[Block], _Reach]:
-    """All blocks, and what their generator returns."""
+    """All blocks, and the generator's return value."""
     found: list[Block] = []
     while True:
         try:
@@ -228,7 +228,7 @@ def _listed(blocks: Generator[Block, None, _Reach]) -> tuple[list[Block], _Reach
 
 
 def open_run(path: Path | str) -> Run:
-    """Open a run folder, also of a run that is in progress, was killed, or lacks parts.
+    """Open a run folder, even of a run that is in progress, was killed, or lacks parts.
 
     Parameters
     ----------
@@ -238,7 +238,7 @@ def open_run(path: Path | str) -> Run:
     Raises
     ------
     InputError
-        If there is no such folder, or it holds nothing of a run.
+        If there is no such folder, or it contains nothing of a run.
     """
     folder = run_folder.find_folder(Path(path))
     notes: list[str] = []
@@ -259,7 +259,7 @@ def _is_closed(path: Path) -> bool:
 
 
 def _missing(folder: Path, summary: dict[str, Any] | None) -> list[str]:
-    """Tables and segments that are not there: by their numbers, and by the summary's count of them."""
+    """Missing tables and segments, found by their numbers and by the summary's count."""
     account = (summary or {}).get("recorder")
     counts = account if isinstance(account, dict) else {}
     counted = counts.get("tables")
@@ -267,21 +267,21 @@ def _missing(folder: Path, summary: dict[str, Any] | None) -> list[str]:
     for table in TABLES:
         count = _count(counted.get(table) if isinstance(counted, dict) else 0)
         gone = column_reader.missing_files(column_reader.column_files(folder, table), f"{table}-000{SUFFIX}", count)
-        notes += [f"{name}: missing; what it held is left out" for name in gone]
+        notes += [f"{name}: missing; its data are left out" for name in gone]
     segments = rrd_reader.segments(folder)
     ticks = bool(column_reader.column_files(folder, tables.TICKS))
     if not ticks and segments:
-        notes.append("the tables of ticks are missing; the Rerun segments stand in for them, without every tick")
+        notes.append("the tables of ticks are missing; Rerun segments replace them, without every tick")
     count = _count(counts.get("segments"))
     gone = column_reader.missing_files(
         segments, segments[0].name if segments else f"{folder.name[17:]}-000.rrd", count
     )
-    held = "its ticks are in the tables" if ticks else "what it held is left out"
+    held = "its ticks are in the tables" if ticks else "its data are left out"
     return notes + [f"{name}: missing; {held}" for name in gone]
 
 
 def _count(value: object) -> int:
-    """Of files, as the summary says: no run has as many as a damaged one may say."""
+    """Number of files according to the summary, if plausible."""
     return value if isinstance(value, int) and value <= _FILES_MAX else 0
 
 
@@ -305,7 +305,7 @@ def origin_of(folder: Path, log: Sequence[run_folder.LoggedEvent]) -> datetime:
 
 
 def _holes(time_s: Column, window_s: float, start_s: float) -> list[tuple[float, float]]:
-    """Parts that a level's windows leave out, in front of them and between them: batches that were damaged."""
+    """Gaps before and between a level's windows, left by damaged batches."""
     if not time_s.size:
         return []
     least_s = window_s + _HOLE_S
@@ -318,7 +318,7 @@ def _holes(time_s: Column, window_s: float, start_s: float) -> list[tuple[float,
 def _with_time(names: Sequence[str]) -> tuple[str, ...]:
     unknown = sorted(set(names) - set(FIELDS))
     if unknown:
-        raise ValueError(f"no such column: {', '.join(unknown)}; known are {json.dumps(FIELDS)}")
+        raise ValueError(f"no such column: {', '.join(unknown)}; known: {json.dumps(FIELDS)}")
     return tuple(dict.fromkeys(("mono_s", *names)))
 
 

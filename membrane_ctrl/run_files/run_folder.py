@@ -1,4 +1,4 @@
-"""The small files of a run folder, read so that what is broken is named and the rest is used."""
+"""The small files of a run folder; readers name what is broken and use the rest."""
 
 import errno
 import getpass
@@ -26,16 +26,16 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 def create_run_folder(logs_dir: Path, name: str, started_utc: datetime, config: Config) -> Path:
-    """Make `<logs_dir>/20261121T012345Z-<name>` with `config.toml`, every default written out.
+    """Make `<logs_dir>/20261121T012345Z-<name>` with `config.toml`, including every default.
 
-    A second run in the same second gets `-2` behind it.
+    A second run in the same second gets the suffix `-2`.
 
     Raises
     ------
     InputError
-        If the name has other characters than letters, digits, dot, dash and underscore.
+        If the name has characters other than letters, digits, dot, dash and underscore.
     DeviceError
-        If the folder cannot be written or the disk has less than `recording.min_free_mb` free: nothing is left.
+        If the folder cannot be written or the disk has less than `recording.min_free_mb` free; leaves nothing behind.
     """
     if not _NAME.fullmatch(name):
         raise errors.InputError(
@@ -61,7 +61,7 @@ def write_config(run_dir: Path, config: Config) -> None:
 
 
 def free_mb(folder: Path) -> float:
-    """Space left for us on the folder's disk in MB (1e6 bytes). Raises OSError."""
+    """Space available to us on the folder's disk in MB (1e6 bytes). Raises OSError."""
     return shutil.disk_usage(folder).free / 1e6
 
 
@@ -69,7 +69,7 @@ def _require_free(folder: Path, least_mb: float) -> None:
     left_mb = free_mb(folder)
     if left_mb < least_mb:
         raise errors.DeviceError(
-            f"{folder}: only {left_mb:.0f} MB free, recording.min_free_mb asks for {least_mb:.0f}; "
+            f"{folder}: only {left_mb:.0f} MB free, recording.min_free_mb requires {least_mb:.0f}; "
             "delete old runs or choose another disk with --logs"
         )
 
@@ -82,21 +82,21 @@ def _make_unique(logs_dir: Path, name: str) -> Path:
         except FileExistsError:
             continue
         return run_dir
-    raise FileExistsError(17, "a thousand runs of this second and name are there")
+    raise FileExistsError(17, "a thousand runs of this second and name exist")
 
 
 def _unwritable(folder: Path, error: OSError) -> errors.DeviceError:
     reason = errors.os_reason(error)
-    return errors.DeviceError(f"{folder}: cannot be written ({reason}); give a folder you may write with --logs DIR")
+    return errors.DeviceError(f"{folder}: cannot be written ({reason}); give a writable folder with --logs DIR")
 
 
-# A configuration of another version, or a damaged one: what this version understands of it.
+# The parts that this version understands of a damaged configuration, or one of another version.
 
 
 def understood(tables: dict[str, Any]) -> tuple[Config, list[str]]:
-    """A configuration without the keys that are not known or whose values cannot be, and the names of those.
+    """Return a configuration without unknown keys and invalid values, and the names of those.
 
-    A key that this version does not know says nothing about its neighbours: they stay as they were run.
+    An unknown key says nothing about its neighbours: they keep their values.
     """
     tables = _copied(tables)
     left_out: list[str] = []
@@ -104,20 +104,20 @@ def understood(tables: dict[str, Any]) -> tuple[Config, list[str]]:
         try:
             return Config.model_validate(tables), left_out
         except ValidationError as error:
-            # all at once: of ten thousand keys each alone would take as many looks at all of them
+            # all at once: removing ten thousand keys one by one would validate as many times
             names = [_take_out(tables, found["loc"]) for found in error.errors(include_url=False)]
-        if not any(names):  # tables that do not go together
+        if not any(names):  # incompatible tables
             return Config(), [*left_out, "tables that do not go together"]
         left_out += filter(None, names)
 
 
 def _take_out(tables: dict[str, Any], location: Sequence[int | str]) -> str:
-    """Delete the deepest key of an error's location that is there; its name, "" if none is."""
+    """Delete the deepest existing key of an error's location; returns its name, or ""."""
     inside: Any = tables
     path: list[str] = []
     found: tuple[dict[str, Any], str] | None = None
     for part in location:
-        # the tag of a union's member stands in a location, and not in the file
+        # a location contains the tag of a union's member, the file does not
         if isinstance(inside, dict) and isinstance(part, str) and part in inside:
             found = inside, part
             path.append(part)
@@ -136,7 +136,7 @@ def _copied(value: Any) -> Any:
     return [_copied(inner) for inner in value] if isinstance(value, list) else value
 
 
-# Marks made after a run: a file of their own beside the recording, which itself is never touched.
+# Marks made after a run go to a separate file: the recording itself is never changed.
 
 
 ANNOTATIONS_FILE = "annotations.jsonl"
@@ -152,9 +152,9 @@ def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> ev
     origin_utc : datetime
         UTC at 0 s of the run.
     mono_s : float
-        Where the mark belongs.
+        Time of the mark.
     text : str
-        What it says.
+        Text of the mark.
 
     Raises
     ------
@@ -180,25 +180,25 @@ def _user() -> str:
 
 
 _SUMMARY_SCHEMA = "membrane-summary/2"
-_SIGN_TURNED_SCHEMA = "membrane-summary/1"  # true centre minus target, where it now is target minus true centre
-# A fault campaign of months; a line is some 150 bytes.
+_SIGN_TURNED_SCHEMA = "membrane-summary/1"  # true centre minus target; it is now target minus true centre
+# Enough for a fault campaign of months; a line is about 150 bytes.
 EVENTS_BYTES_MAX = 64_000_000
 _RUN_MAX_S = 1e9  # thirty years
 _NAMED_MAX = 20
 
 
 def find_folder(path: Path) -> Path:
-    """The run's folder for a path to it or into it. Raises InputError if it is not a run."""
+    """The run's folder, given a path to it or into it. Raises InputError if it is not a run."""
     folder = path.parent if path.is_file() else path
     if not folder.exists():
-        raise errors.InputError(f"{path}: no such run; `membrane-ctrl runs` lists those there are")
+        raise errors.InputError(f"{path}: no such run; `membrane-ctrl runs` lists the runs")
     if not is_run(folder):
-        raise errors.InputError(f"{path}: not a run: neither events.jsonl nor a recording is in it")
+        raise errors.InputError(f"{path}: not a run: it contains neither events.jsonl nor a recording")
     return folder.resolve()
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a folder holds anything of a run."""
+    """Whether a folder contains anything of a run."""
     return folder.is_dir() and (
         (folder / "events.jsonl").exists() or any(folder.glob("*.rrd")) or any(folder.glob(f"{FOLDER}/*.arrows"))
     )
@@ -237,7 +237,7 @@ def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
     try:
         summary: Any = plain_json.loads(files.read_text(path))
     except FileNotFoundError:
-        notes.append("summary.json: missing; the run is still going, or its recorder was killed")
+        notes.append("summary.json: missing; the run is in progress, or its recorder was killed")
         return None
     except (OSError, ValueError) as error:
         notes.append(f"summary.json: cannot be read ({error})")
@@ -249,13 +249,13 @@ def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
         notes.append("summary.json: does not fit its checksum (damaged or edited); it is not used")
         return None
     if not is_moment(summary.get("duration_s", 0.0) or 0.0):
-        notes.append("summary.json: duration_s is no time of a run; it is not used")
+        notes.append("summary.json: impossible duration_s; it is not used")
         del summary["duration_s"]
     return _with_present_sign(summary)
 
 
 def _with_present_sign(summary: dict[str, Any]) -> dict[str, Any]:
-    """A summary of an earlier version, its true errors with the sign of `error_um`."""
+    """A summary of an earlier version, with its true errors in the sign of `error_um`."""
     if summary["schema"] == _SIGN_TURNED_SCHEMA:
         ends = summary.get("sag_error_um")
         for table, keys in ((summary, ("true_bias_um",)), (ends if isinstance(ends, dict) else {}, ("start", "end"))):
@@ -265,13 +265,13 @@ def _with_present_sign(summary: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_config(folder: Path, notes: list[str]) -> Config:
-    """`config.toml`; keys that this version does not understand are at their defaults, with a note."""
+    """`config.toml`; keys that this version does not understand get their defaults, with a note."""
     path = folder / "config.toml"
     notes += _config_damage(path)
     try:
         tables = toml_file.read_toml(path, follow=False)
     except errors.InputError as error:
-        notes.append(f"{error}; everything is taken at its default")
+        notes.append(f"{error}; all defaults are used")
         return Config()
     try:
         return toml_file.parse(tables, Config, "config.toml")
@@ -280,14 +280,14 @@ def read_config(folder: Path, notes: list[str]) -> Config:
         named = ", ".join(left_out[:_NAMED_MAX]) + (
             f" and {len(left_out) - _NAMED_MAX} more" * (len(left_out) > _NAMED_MAX)
         )
-        notes.append(f"{error}; left out, or taken at its default: {named}")
+        notes.append(f"{error}; omitted or at its default: {named}")
         return config
 
 
 def _config_damage(path: Path) -> list[str]:
     try:
         text = files.read_text(path)
-    except (OSError, ValueError):  # said by who reads it
+    except (OSError, ValueError):  # reported by whoever reads it
         return []
     if not text:
         return ["config.toml: empty; everything is taken at its default"]
@@ -325,5 +325,5 @@ def event_of(line: str) -> events.EventLine | None:
 
 
 def is_moment(value: object) -> bool:
-    """Whether a value is a second that a run can have; what a damaged or forged file says need not be."""
+    """Whether a value is a possible time of a run; damaged and forged files may hold anything."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < _RUN_MAX_S

@@ -1,9 +1,9 @@
-"""Arrow IPC streams whose messages carry their own CRC-32: a flipped byte takes its batch away, not its values.
+"""Arrow IPC streams with a CRC-32 per message: a flipped byte costs its batch instead of falsifying values.
 
-Any Arrow reader opens such a file. The seal is custom metadata of each message, text of fixed width: `seal:`, where
-in the message it stands, the message's length, and the CRC-32 of the message with that last number taken as zeros (as
-in the header of a tar file), all in hexadecimal. So whole messages are found, and found again behind damage,
-before Arrow sees a byte of them: its decoder trusts lengths and offsets.
+Any Arrow reader opens such a file. The seal is custom metadata of each message, text of fixed width: `seal:`, its
+position in the message, the message's length, and the CRC-32 of the message with that last number taken as zeros (as
+in the header of a tar file), all in hexadecimal. So whole messages are found, even after damage, before Arrow sees a
+byte of them: its decoder trusts lengths and offsets.
 """
 
 import io
@@ -20,22 +20,22 @@ import pyarrow as pa
 from membrane_ctrl.model.files import read_bytes
 from membrane_ctrl.run_files import column_codec
 
-# What an Arrow stream would take of memory, known before any is taken.
+# Computes the memory that an Arrow stream would need before allocating any.
 #
-# A compressed buffer begins with the size that it says it inflates to, and Arrow takes that much at once: four
-# megabytes may become four gigabytes. So the sizes of a batch are added up first, out of its head (a flatbuffer,
-# `Message.fbs` of the format), and what no recorder writes is refused.
+# A compressed buffer begins with its claimed inflated size, which Arrow allocates at once: four megabytes may become
+# four gigabytes. So the sizes of a batch are added up first, from its header (a flatbuffer, `Message.fbs` of the
+# format), and anything that no recorder writes is refused.
 
 
 # A recorder's batch is a minute of ticks at 200 Hz, or an hour of the coarsest level: 8 MB.
 BATCH_BYTES_MAX = 64_000_000
-# Six hours of ticks at 200 Hz are 0.3 GB on the disk.
+# Six hours of ticks at 200 Hz are 0.3 GB on disk.
 FILE_BYTES_MAX = 320_000_000
 _HEADER, _BUFFERS, _COMPRESSION = 2, 2, 3  # numbers of the fields in `Message` and in `RecordBatch`
 
 
 def require_bounded(data: bytes) -> None:
-    """Raise `pa.ArrowInvalid` if a batch would inflate to more than `BATCH_BYTES_MAX`, or is no batch of numbers."""
+    """Raise `pa.ArrowInvalid` if a batch would inflate beyond `BATCH_BYTES_MAX`, or is not a batch of numbers."""
     reader = pa.ipc.MessageReader.open_stream(data)
     for message in _messages(reader):
         if message.type == "schema":
@@ -45,23 +45,21 @@ def require_bounded(data: bytes) -> None:
         try:
             size = _inflated_bytes(memoryview(message.metadata), memoryview(message.body or b""))
         except (struct.error, IndexError):
-            raise pa.ArrowInvalid("the head of a batch is damaged") from None
+            raise pa.ArrowInvalid("the header of a batch is damaged") from None
         if size > BATCH_BYTES_MAX:
-            raise pa.ArrowInvalid(
-                f"a batch of {size / 1e6:.0f} MB; more than {BATCH_BYTES_MAX / 1e6:.0f} are not read"
-            )
+            raise pa.ArrowInvalid(f"a batch of {size / 1e6:.0f} MB exceeds the limit of {BATCH_BYTES_MAX / 1e6:.0f}")
 
 
 def _messages(reader: pa.ipc.MessageReader) -> Iterator[pa.ipc.Message]:
     while True:
         try:
             yield reader.read_next_message()
-        except (StopIteration, pa.ArrowException, OSError):  # cut short: whoever reads the batches meets it, too
+        except (StopIteration, pa.ArrowException, OSError):  # truncated: the batches' reader finds that, too
             return
 
 
 def _inflated_bytes(head: memoryview, body: memoryview) -> int:
-    """Bytes of all buffers of a batch, inflated; a buffer that is stored as it is says -1."""
+    """Inflated bytes of all buffers of a batch; an uncompressed buffer states -1."""
     batch = _table(head, _field(head, _table(head, 0), _HEADER))
     vector = _field(head, batch, _BUFFERS)
     if not vector:
@@ -82,12 +80,12 @@ def _inflated_bytes(head: memoryview, body: memoryview) -> int:
 
 
 def _table(head: memoryview, place: int) -> int:
-    """Where the table is that an offset at a place points to."""
+    """Position of the table to which the offset at a position points."""
     return place + _u32(head, place)
 
 
 def _field(head: memoryview, table: int, number: int) -> int:
-    """Where a table's field is; 0 if it does not have it."""
+    """Position of a table's field; 0 if absent."""
     (back,) = struct.unpack_from("<i", head, table)
     vtable = table - back
     (size,) = struct.unpack_from("<H", head, vtable)
@@ -110,9 +108,9 @@ _END = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # Arrow's end of a stream
 
 
 class SealedStream:
-    """Writes one file, new or replaced, a message at a time; `compression` is `zstd` or `lz4`.
+    """Writes one file, new or replaced, message by message; `compression` is `zstd` or `lz4`.
 
-    Raises OSError if the file cannot be made, or the disk does not take its head.
+    Raises OSError if the file or its header cannot be written.
     """
 
     def __init__(self, path: Path, schema: pa.Schema, compression: str | None = None) -> None:
@@ -123,18 +121,18 @@ class SealedStream:
         schema = schema.with_metadata(about)
         self._writer = pa.ipc.new_stream(self._message, schema, options=options)
         self._writer.write_batch(pa.RecordBatch.from_pylist([], schema))
-        self._take()  # Arrow's head comes with the first batch, ours is on the disk before it
+        self._take()  # Arrow writes its header with the first batch, we write it before
         self._file = pa.OSFile(str(path), "wb")
         self._file.write(_sealed(schema.serialize().to_pybytes()))
 
     def write(self, batch: pa.RecordBatch, codes: bytes | None = None) -> None:
-        """Append a batch. Raises OSError (full disk): half of it may be in the file, where readers pass over it."""
+        """Append a batch. Raises OSError (full disk): readers skip a half-written one."""
         about = {_KEY: _BLANK} if codes is None else {_KEY: _BLANK, _CODES: codes}
         self._writer.write_batch(batch, custom_metadata=about)
         self._file.write(_sealed(self._take()))
 
     def close(self) -> None:
-        """End the stream and close the file. Raises OSError; the file is closed all the same."""
+        """End the stream and close the file, even if that raises OSError."""
         with self._file:
             self._writer.close()
             self._file.write(self._take())
@@ -152,25 +150,25 @@ class SealedStream:
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """A stretch of a file that is no whole message."""
+    """A stretch of a file that is not a whole message."""
 
-    batches: int  # whole ones in front of it
+    batches: int  # whole ones before it
     size_bytes: int
-    at_end: bool  # nothing whole comes behind it
+    at_end: bool  # nothing whole follows
 
 
 @dataclass(frozen=True, slots=True)
 class Unsealed:
-    """What of a file may be given to Arrow."""
+    """The part of a file that Arrow may read."""
 
-    data: bytes  # a stream of whole messages; empty if the head, without which no batch can be read, is not whole
-    sealed: bool  # False: a file of a version without seals, as it is
-    ended: bool  # it was closed, not left by a killed recorder or cut
+    data: bytes  # a stream of whole messages; empty without a whole header, which every batch needs
+    sealed: bool  # False: an unchanged file of a version without seals
+    ended: bool  # closed, not left by a killed recorder or truncated
     damage: tuple[Damage, ...]
 
 
 def unseal(data: bytes) -> Unsealed:
-    """Sort out what is whole of a file's content."""
+    """Find the whole messages in a file's content."""
     ended = data.endswith(_END)
     if _SEAL.search(data) is None:
         return Unsealed(data, False, ended, ())
@@ -188,7 +186,7 @@ def unseal(data: bytes) -> Unsealed:
 
 
 def whole_batches(path: Path, names: list[str] | None = None) -> Iterator[pa.RecordBatch]:
-    """Batches of a file that are whole, with all columns or some. Raises OSError, pa.ArrowException."""
+    """Whole batches of a file, with all columns or some. Raises OSError, pa.ArrowException."""
     data = unseal(read_bytes(path, FILE_BYTES_MAX)).data
     if not data:
         return
@@ -197,11 +195,11 @@ def whole_batches(path: Path, names: list[str] | None = None) -> Iterator[pa.Rec
 
 
 def decoded_batches(data: bytes, names: Sequence[str] | None = None) -> Iterator[pa.RecordBatch]:
-    """Batches of an Arrow stream, with all columns or some, their numbers decoded. Raises pa.ArrowException."""
+    """Batches of an Arrow stream, with all columns or some, decoded. Raises pa.ArrowException."""
     schema = pa.ipc.open_stream(data).schema
     wanted = list(schema.names if names is None else names)
     fields = [schema.get_field_index(name) for name in column_codec.needed(schema, wanted)]
-    # one thread: buffers of a minute are too small to hand around
+    # one thread: buffers of a minute are too small to share out
     options = pa.ipc.IpcReadOptions(included_fields=fields, use_threads=False)
     reader = pa.ipc.open_stream(data, options=options)
     while True:
@@ -209,12 +207,12 @@ def decoded_batches(data: bytes, names: Sequence[str] | None = None) -> Iterator
             batch, about = reader.read_next_batch_with_custom_metadata()
         except StopIteration:
             return
-        batch.validate(full=True)  # Arrow trusts lengths and offsets otherwise, and reads what is not its own
+        batch.validate(full=True)  # otherwise Arrow trusts lengths and offsets, and may read foreign memory
         yield column_codec.decode(batch, schema, (about or {}).get(_CODES), wanted)
 
 
 def _sealed(message: bytes) -> bytes:
-    """The message with its blank seal filled in."""
+    """Fill in the message's blank seal."""
     place = message.index(_BLANK)
     until = place + len(_BLANK)
     text = b"seal:%04x%08x" % (place, len(message))
@@ -224,7 +222,7 @@ def _sealed(message: bytes) -> bytes:
 
 
 def _whole(data: bytes) -> Iterator[tuple[int, int]]:
-    """Start and end of each message whose seal is right."""
+    """Start and end of each message with a correct seal."""
     view = memoryview(data)
     end = 0
     in_vain = 0
@@ -234,7 +232,7 @@ def _whole(data: bytes) -> Iterator[tuple[int, int]]:
         start = place.start() - offset
         number = place.start(3)
         if start >= end and place.end() <= start + length <= len(data):
-            if in_vain > 2 * len(data):  # seals over seals, each to be summed up anew: nobody's damage
+            if in_vain > 2 * len(data):  # nested seals, each with its own checksum: forged, not damaged
                 return
             found = zlib.crc32(_NO_CRC, zlib.crc32(view[start:number]))
             if zlib.crc32(view[place.end() : start + length], found) == crc:

@@ -1,7 +1,7 @@
-"""How a Rerun segment is made up of messages, and what one would take of memory, known before any is taken.
+"""Finds the messages of a Rerun segment, and computes their memory needs before allocating any.
 
-A file is a head of 12 bytes, `RRF2`, version, options, and messages: kind and length (64-bit little endian each),
-then so many bytes (rerun's `re_log_encoding`, file format 2). Each message is whole in itself.
+A file has a header of 12 bytes (`RRF2`, version, options) and messages: kind and length (64-bit little endian each),
+then that many bytes (rerun's `re_log_encoding`, file format 2). Each message is self-contained.
 """
 
 import contextlib
@@ -17,29 +17,29 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from membrane_ctrl.model.files import open_plain
 
-if TYPE_CHECKING:  # a list of runs need not load Rerun
+if TYPE_CHECKING:  # listing runs need not load Rerun
     from rerun.chunk import Chunk
 
 HEAD_BYTES = 12
 MAGIC = b"RRF2"
 _MESSAGE = struct.Struct("<QQ")
-END = 0  # the last message of a file that was closed; a table of contents follows
+END = 0  # the last message of a closed file; a table of contents follows
 _DATA = 2
-KINDS = range(8)  # four are in use; a larger number is no kind but a place that was missed
-# A chunk is a second of an entity, a thumbnail or a map: some hundred kilobytes.
+KINDS = range(8)  # four are in use; a larger number means a wrong position
+# A chunk is a second of an entity, a thumbnail or a map: a few hundred kilobytes.
 _MESSAGE_BYTES_MAX = 64_000_000
 # An hour at 200 Hz holds 0.5 GB of numbers.
 _SEGMENT_BYTES_MAX = 700_000_000
 MESSAGES_MAX = 1_000_000
-_LOOK_BYTES = 65_536  # the fields in front of a message's data take a hundred
-_PLACE_MAX = 1 << 62  # no file has as many bytes
+_LOOK_BYTES = 65_536  # the fields before a message's data take a hundred
+_PLACE_MAX = 1 << 62  # no file is this large
 _BYTES = 2  # the kind of a field that has a length
 _UNCOMPRESSED_SIZE = 3 << 3  # field 3, a number
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentMessage:
-    """A message's place in its file, kind and length among its bytes."""
+    """A message's position in its file, including kind and length."""
 
     kind: int
     start: int
@@ -47,12 +47,12 @@ class SegmentMessage:
 
     @property
     def size(self) -> int:
-        """Bytes."""
+        """Size in bytes."""
         return self.end - self.start
 
 
 def heads(file: BinaryIO) -> Iterator[SegmentMessage]:
-    """Each message up to the end, as the file says it: none of it need be true."""
+    """Each message up to the end, as the file claims, true or not."""
     at = HEAD_BYTES
     while True:
         file.seek(at)
@@ -69,22 +69,22 @@ def heads(file: BinaryIO) -> Iterator[SegmentMessage]:
 
 @contextlib.contextmanager
 def panics_are_faults() -> Iterator[None]:
-    """Where Rerun's own code gives up on a file, Python gets what is no `Exception`: here it is a `RuntimeError`."""
+    """Turn a panic in Rerun's code, which is not an `Exception` in Python, into a `RuntimeError`."""
     try:
         yield
     except BaseException as error:
         if type(error).__name__ != "PanicException":
             raise
-        raise RuntimeError(f"Rerun gave up on it ({str(error)[:80]})") from None
+        raise RuntimeError(f"Rerun failed on it ({str(error)[:80]})") from None
 
 
 def require_bounded(path: Path) -> None:
-    """Look at a segment before Rerun does, which takes whatever memory a message asks for.
+    """Check a segment before Rerun, which allocates whatever memory a message requests.
 
     Raises
     ------
     OSError
-        No plain file, or one that would inflate to more than a recorder writes.
+        Not a regular file, or one that would inflate to more than a recorder writes.
     """
     total = end = 0
     with open_plain(path) as file:
@@ -100,7 +100,7 @@ def require_bounded(path: Path) -> None:
                 raise _too_large(path, f"more than {_SEGMENT_BYTES_MAX / 1e6:.0f} MB or {MESSAGES_MAX} messages")
         rest = os.fstat(file.fileno()).st_size - end
     if rest > _MESSAGE_BYTES_MAX:
-        raise _too_large(path, f"{rest / 1e6:.0f} MB that are no messages")
+        raise _too_large(path, f"{rest / 1e6:.0f} MB outside any message")
 
 
 def _too_large(path: Path, what: str) -> OSError:
@@ -108,9 +108,9 @@ def _too_large(path: Path, what: str) -> OSError:
 
 
 def _inflated_bytes(message: bytes) -> int:
-    """What a message's data inflates to, by its field `uncompressed_size`; its own size, if it does not say.
+    """Inflated size of a message's data, from its field `uncompressed_size`, else its own size.
 
-    A protocol buffer: each field a key and a number, or a key, a length and so many bytes. The data comes last.
+    A protocol buffer: each field is a key and a number, or a key, a length and that many bytes. The data come last.
     """
     place, stated = 0, len(message)
     while place < len(message):
@@ -120,13 +120,13 @@ def _inflated_bytes(message: bytes) -> int:
             stated = max(stated, value)
         elif key & 7 == _BYTES:
             place += value
-        elif key & 7:  # neither a number nor bytes: none of Rerun's
+        elif key & 7:  # neither a number nor bytes: not written by Rerun
             break
     return stated
 
 
 def _varint(data: bytes, place: int) -> tuple[int, int]:
-    """A number of seven bits a byte, and where it ends."""
+    """A number of seven bits per byte, and its end."""
     number = 0
     for shift in range(0, 70, 7):
         if place >= len(data):
@@ -139,15 +139,15 @@ def _varint(data: bytes, place: int) -> tuple[int, int]:
     return number, place
 
 
-# Where the messages of a Rerun recording begin, so that a reader may leave out a part of it.
+# Finds the messages of a Rerun recording, so that a reader may skip a part of it.
 
 
-STORE = 1  # which recording, or which blueprint, the messages behind it are of
-_FOOTER_BYTES = 32  # behind the last message: where its table of contents is
+STORE = 1  # the recording or blueprint to which the following messages belong
+_FOOTER_BYTES = 32  # after the last message: the position of the table of contents
 
 
 def first_message_after(path: Path, place: int) -> int:
-    """Where the first message at or behind `place` begins, the last one's end at most; 0 for another form of file."""
+    """Start of the first message at or after `place`, at most the last one's end; 0 for another kind of file."""
     at = HEAD_BYTES
     with open_plain(path) as file:
         if file.read(len(MAGIC)) != MAGIC:
@@ -162,9 +162,9 @@ def first_message_after(path: Path, place: int) -> int:
 
 
 def whole_messages(path: Path) -> list[SegmentMessage]:
-    """The messages that a file has in full, up to its end or to where what follows is none. Raises OSError.
+    """The complete messages of a file, up to its end or to the first invalid one. Raises OSError.
 
-    What is larger than a recorder writes is none: a sparse file may claim a terabyte.
+    A message larger than a recorder writes is invalid: a sparse file may claim a terabyte.
     """
     size = min(path.stat().st_size, _SEGMENT_BYTES_MAX)
     found: list[SegmentMessage] = []
@@ -181,7 +181,7 @@ def whole_messages(path: Path) -> list[SegmentMessage]:
 
 
 def is_closed(path: Path) -> bool:
-    """Whether messages follow one another to the end of a closed file; what is in them is not looked at.
+    """Whether consecutive messages reach the end of a closed file; does not read their content.
 
     Raises
     ------
@@ -191,16 +191,16 @@ def is_closed(path: Path) -> bool:
     return bool(found) and found[-1].kind == END and path.stat().st_size == found[-1].end + _FOOTER_BYTES
 
 
-# What is whole of a Rerun segment that Rerun refuses: cut anywhere, or damaged within.
+# Recovers the intact part of a Rerun segment that Rerun refuses: truncated, or damaged within.
 #
-# Rerun reads a file to its first fault, and of one that is cut short nothing. Here the messages that are whole are
-# copied to a temporary file and read from there; if one of them does not decode, halves are tried until it is alone.
-# The segment itself is only read.
+# Rerun reads a file up to its first fault, and nothing of a truncated one. Here the complete messages are copied to a
+# temporary file and read from there; if one does not decode, bisection isolates it. The segment itself is never
+# changed.
 
 
-# Rerun's ways to say that something cannot be read.
+# Rerun's errors for unreadable data.
 FAULTS = (RuntimeError, ValueError, OSError)
-# A disk's bad sector spoils a message or two; of a file spoiled all over, no more is looked for.
+# A bad sector destroys a message or two; beyond this, give up on the rest of the file.
 _FAULTS_MAX = 50
 
 
@@ -210,17 +210,17 @@ def read_chunks(path: Path, entities: set[str]) -> list["Chunk"]:
 
     require_bounded(path)
     with warnings.catch_warnings(), panics_are_faults():
-        warnings.simplefilter("ignore")  # the reader's way to say that a file has no footer
+        warnings.simplefilter("ignore")  # the reader warns about a missing footer
         return [chunk for chunk in RrdReader(path).stream() if chunk.entity_path in entities]
 
 
 def salvage(path: Path, entities: set[str]) -> tuple[list["Chunk"], int]:
-    """Chunks of some entities in a segment that Rerun refuses, and how many bytes of it are left out.
+    """Chunks of some entities in a segment that Rerun refuses, and the number of bytes lost.
 
     Raises
     ------
     OSError
-        If the segment cannot be read, or there is no room for the copy.
+        If the segment is unreadable, or there is no room for the copy.
     """
     found = whole_messages(path)
     size = path.lstat().st_size
@@ -238,13 +238,13 @@ def salvage(path: Path, entities: set[str]) -> tuple[list["Chunk"], int]:
 class _Copy:
     source: BinaryIO
     path: Path
-    stores: list[SegmentMessage]  # without them Rerun takes no other
+    stores: list[SegmentMessage]  # without them Rerun accepts no others
     entities: set[str]
     lost_bytes: int = 0
     faults: int = 0
 
     def chunks(self, part: list[SegmentMessage]) -> list["Chunk"]:
-        """Chunks of those messages of a part that decode."""
+        """Chunks of a part's decodable messages."""
         self.source.seek(0)
         with self.path.open("wb") as file:
             file.write(self.source.read(HEAD_BYTES))

@@ -18,7 +18,7 @@ from membrane_ctrl.model.arrays import Column
 
 @dataclass(frozen=True, slots=True)
 class Shapes:
-    """Cycles in their order; arrays (n,) unless said otherwise, NaN where nothing was recorded.
+    """Cycles in order; arrays (n,) unless stated otherwise, NaN where nothing was recorded.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class Shapes:
     coeffs_um : (n, 36) array
     verdict : (n,) array of str
     covariance_time_s : (k,) array
-        Of the cycles whose covariance was recorded.
+        Times of the cycles with a recorded covariance.
     covariance_um2 : (k, 36, 36) array
     """
 
@@ -48,7 +48,7 @@ class Shapes:
         return int(self.time_s.size)
 
     def select(self, wanted: NDArray[np.bool_]) -> Shapes:
-        """The cycles for which `wanted` (n,) is true; the covariances stay all."""
+        """The cycles for which `wanted` (n,) is true, with all covariances."""
         if wanted.all():
             return self  # a month of coefficients is 190 MB
         parts = {name: getattr(self, name)[wanted] for name in (*NUMBERS, "coeffs_um", "verdict")}
@@ -59,11 +59,11 @@ class Shapes:
         return self.parameters_um() @ height_basis(x, y)
 
     def parameters_um(self) -> Column:
-        """(n, 37): the 36 coefficients and the amplitude of the Hencky part beyond them."""
+        """(n, 37): the 36 coefficients and the amplitude of the additional Hencky part."""
         return np.column_stack((self.coeffs_um, self.hencky_um))
 
     def covariance_near(self, time_s: float) -> Column | None:
-        """(36, 36) um^2 recorded nearest to a time; None if none was."""
+        """Covariance (36, 36) in um^2 recorded nearest to a time; None if there is none."""
         if not self.covariance_time_s.size:
             return None
         return np.asarray(self.covariance_um2[np.argmin(np.abs(self.covariance_time_s - time_s))])
@@ -76,17 +76,17 @@ NUMBERS = (
 
 
 def height_basis(x: Column, y: Column) -> Column:
-    """(37, points): height of a unit of each parameter, from the vertex."""
+    """(37, points): height above the vertex per unit of each parameter."""
     units = np.eye(37)
     return np.stack([Surface(unit[:36], unit[36], 1.0).height(x, y) for unit in units])
 
 
-# Columns of the recorder's table that are read.
+# Columns read from the recorder's table.
 TABLE_COLUMNS = (*NUMBERS, "verdict", "coeffs_um", "covariance_um2")
 
 
 def from_table(table: pa.Table) -> Shapes:
-    """Shapes of the recorder's table, whatever columns it has."""
+    """Shapes from the recorder's table, whatever columns it has."""
     count = table.num_rows
     kept, covariances = _covariances(table)
     time_s = _numbers(table, "time_s")
@@ -100,7 +100,7 @@ def from_table(table: pa.Table) -> Shapes:
     )
 
 
-# All of an estimate.
+# All columns of an estimate.
 ESTIMATE_COLUMNS = (
     *shape_estimate.NUMBERS,
     "cycle",
@@ -125,7 +125,7 @@ def estimates(table: pa.Table) -> Iterator[shape_estimate.ShapeEstimate]:
 
 
 def from_columns(columns: Mapping[str, Column]) -> Shapes:
-    """Shapes of a Rerun segment (`rrd_reader.read_shapes`): the Hencky part and the covariance are not in there."""
+    """Shapes from a Rerun segment (`rrd_reader.read_shapes`), which lacks the Hencky part and the covariance."""
     count = columns["time_s"].size if columns else 0
     numbers = {name: columns.get(name, np.full(count, np.nan)) for name in NUMBERS}
     return Shapes(
@@ -138,12 +138,12 @@ def from_columns(columns: Mapping[str, Column]) -> Shapes:
 
 
 def joined(parts: list[Shapes]) -> Shapes:
-    """One after the other, each cycle once."""
+    """Concatenate shapes, each cycle once."""
     if not parts:
         return from_columns({})
     names = (*NUMBERS, "coeffs_um", "verdict", "covariance_time_s", "covariance_um2")
     whole = Shapes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
-    # a journal may repeat what the recorder had just written when it was killed
+    # a journal may repeat rows that the recorder wrote just before it was killed
     until_s = np.maximum.accumulate(np.concatenate(([-np.inf], whole.time_s)))[:-1]
     return whole.select(whole.time_s > until_s)
 
@@ -159,7 +159,7 @@ def _matrix(cells: pa.Array, count: int) -> Column:
 
 
 def _covariances(table: pa.Table) -> tuple[NDArray[np.int64], Column]:
-    """Rows that have one, and the (k, 36, 36) matrices."""
+    """Rows with a covariance, and the (k, 36, 36) matrices."""
     if "covariance_um2" not in table.column_names:
         return np.empty(0, dtype=np.int64), np.empty((0, 36, 36))
     cells = table.column("covariance_um2").combine_chunks()
@@ -174,7 +174,7 @@ def _covariances(table: pa.Table) -> tuple[NDArray[np.int64], Column]:
 
 Map = NDArray[np.float32]
 
-# 128 x 128 shows every one of the 36 terms (radial order 7) and is 66 kB a map.
+# 128 x 128 resolves all 36 terms (radial order 7) at 66 kB per map.
 MAP_PX = 128
 
 
@@ -184,7 +184,7 @@ def height_map_mm(estimate: shape_estimate.ShapeEstimate) -> Map:
     Returns
     -------
     (MAP_PX, MAP_PX) float32
-        mm; row 0 on top (+y), NaN outside the disc.
+        mm; row 0 at the top (+y), NaN outside the disc.
     """
     return _spread(_surface(estimate).height(*_points()))
 
@@ -197,7 +197,7 @@ def difference_map_um(estimate: shape_estimate.ShapeEstimate, reference: shape_e
 
 
 def uncertainty_map_um(covariance_um2: NDArray[np.float64]) -> Map:
-    """One standard deviation of the height, um: sqrt of z C z' with the row z of the 36 terms at each point."""
+    """Standard deviation of the height, um: sqrt of z C z' with the row z of the 36 terms at each point."""
     terms = zernike.values(*_points())
     variance = np.einsum("jp,jp->p", terms, covariance_um2 @ terms)
     return _spread(np.sqrt(np.maximum(variance, 0.0)))

@@ -1,7 +1,7 @@
-"""Where each field of a telemetry row is found in Rerun: the signals of one plot share one entity.
+"""The Rerun entity of each telemetry field: the signals of one plot share one entity.
 
-One entity of m scalars costs the writer and the viewer far less than m entities of one; the names of the lines
-are set once, with `SeriesLines`.
+One entity of m scalars costs the writer and the viewer far less than m entities of one; `SeriesLines` sets the names
+of the lines once.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from membrane_ctrl.model.telemetry import Rows, column
 
 Colour = tuple[int, int, int]
 
-# One colour for one thing in every plot (Okabe and Ito's palette, told apart by colour-blind readers too).
+# One colour per quantity in every plot (Okabe and Ito's palette, safe for colour-blind readers).
 BLUE: Colour = (86, 180, 233)
 ORANGE: Colour = (230, 159, 0)
 GREEN: Colour = (0, 158, 115)
@@ -46,7 +46,7 @@ class Stream:
         return np.stack([column(rows, line.field) for line in self.lines], axis=1)
 
 
-# Every field of a row but `mono_s`, which is the time axis, is in one stream and one only.
+# Every field of a row except `mono_s`, the time axis, is in exactly one stream.
 STREAMS: tuple[Stream, ...] = (
     Stream(
         "/loop/position",
@@ -94,7 +94,7 @@ STREAMS: tuple[Stream, ...] = (
     Stream("/tick/lateness", (Line("lateness_ms", "lateness ms", BLUE),)),
     Stream("/tick/dt", (Line("dt_s", "time between ticks s", BLUE),)),
     Stream("/tick/missed", (Line("missed_ticks", "ticks missed so far", RED, 2.0),)),
-    # read by programs rather than looked at: one entity, as each costs 32 bytes a row for its times and row id
+    # for programs rather than people: one entity, as each costs 32 bytes per row for its times and row id
     Stream(
         "/tick/record",
         (
@@ -110,7 +110,7 @@ STREAMS: tuple[Stream, ...] = (
     ),
 )
 
-# Made here from the rows, so that a plot answers without arithmetic.
+# Computed here from the rows, so that plots need no arithmetic.
 TRUE_ERROR = Stream("/truth/error", (Line("", "target minus true centre um", GREEN, 2.0),))
 BAND = Stream("/loop/band", (Line("", "+band um", GREY, 1.0), Line("", "-band um", GREY, 1.0)))
 OVERVIEW = Stream(
@@ -123,7 +123,7 @@ OVERVIEW = Stream(
 )
 DERIVED: tuple[Stream, ...] = (TRUE_ERROR, BAND, OVERVIEW)
 
-# Low orders that a film shows: the ones worth a line of their own. Noll index to name.
+# Low orders that a film shows, each worth a line. Noll index to name.
 LOW_ORDERS = {
     4: ("defocus Z4 um", BLUE),
     5: ("astigmatism Z5 um", ORANGE),
@@ -152,7 +152,7 @@ SHAPE_STREAMS: tuple[Stream, ...] = (ZERNIKE, CHANGE, SAG, RESIDUAL, QUALITY, MO
 
 
 def overview_um(rows: Rows) -> FloatArray:
-    """(1, 3) least, mean and greatest error of the rows; NaN when none of them has an error."""
+    """(1, 3) minimum, mean and maximum error of the rows; NaN if no row has an error."""
     error = column(rows, "error_um")
     error = error[np.isfinite(error)]
     if not error.size:

@@ -1,4 +1,4 @@
-"""`summary.json`: the figures of a run, computed as the rows come, in memory that does not grow with the run."""
+"""`summary.json`: the figures of a run, computed on the fly in constant memory."""
 
 import copy
 import math
@@ -12,21 +12,21 @@ from membrane_ctrl.model import shape_estimate, states, telemetry
 from membrane_ctrl.model.arrays import BoolArray, Column, FloatArray
 from membrane_ctrl.model.events import EventLine
 
-# Statistics of a run of any length in a fixed amount of memory.
+# Statistics of a run of any length in constant memory.
 
 
 Values = FloatArray
 
 
 class Moments:
-    """Mean and standard deviation of values that come in batches.
+    """Mean and standard deviation of values that arrive in batches.
 
     Batches are merged by the pairwise update of Chan, Golub and LeVeque (1979): with n, m the counts, d the
     difference of the means and S the sums of squared deviations,
 
         mean = mean_n + d m / (n + m),    S = S_n + S_m + d^2 n m / (n + m),
 
-    which does not cancel when the mean is large against the deviation.
+    which avoids cancellation when the mean is large compared with the deviation.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class Moments:
         self._squares = 0.0
 
     def add(self, values: Values) -> None:
-        """Take in a batch; values that are not finite are left out."""
+        """Add a batch, ignoring values that are not finite."""
         values = values[np.isfinite(values)]
         if not values.size:
             return
@@ -53,9 +53,9 @@ class Moments:
 
 
 class LogHistogram:
-    """Quantiles of positive values from bins of equal ratio between `low` and `high`, which have a bin each beyond.
+    """Quantiles of positive values from bins of equal ratio between `low` and `high`, with one more bin beyond each.
 
-    A quantile is given as its bin's geometric middle, so its relative error is at most sqrt(ratio) - 1; `largest` is
+    A quantile is its bin's geometric middle, so its relative error is at most sqrt(ratio) - 1; `largest` is
     exact.
     """
 
@@ -67,7 +67,7 @@ class LogHistogram:
         self.largest = math.nan
 
     def add(self, values: Values) -> None:
-        """Take in a batch; values that are not finite are left out."""
+        """Add a batch, ignoring values that are not finite."""
         values = values[np.isfinite(values)]
         if not values.size:
             return
@@ -78,7 +78,7 @@ class LogHistogram:
         self.largest = float(np.fmax(self.largest, values.max()))
 
     def quantile(self, share: float) -> float:
-        """The value that `share` of all values do not exceed; NaN without values."""
+        """The value not exceeded by `share` of all values; NaN without values."""
         if not self.count:
             return math.nan
         place = int(np.searchsorted(np.cumsum(self._bins), share * self.count))
@@ -143,12 +143,12 @@ SCHEMA = "membrane-summary/2"
 
 # The ramp has arrived when setpoint minus trim is this near to the target; far below the laser's 0.1 um steps.
 ARRIVED_UM = 0.01
-# Transitions and faults listed; the counters beside the lists go on (a device that flickers for a week).
+# Limits on listed transitions and faults; their counters continue (a device may flicker for a week).
 _LISTED_MAX = 1000
 
 
 class Summary:
-    """Takes in everything the recorder sees; `as_dict` is `summary.json` at any moment.
+    """Accumulates everything the recorder sees; `as_dict` gives `summary.json` at any time.
 
     "True" is the target minus what the twin knows of the mirror's centre: on a real bench those keys are null.
     """
@@ -177,7 +177,7 @@ class Summary:
         self._end: EventLine = {}
 
     def add_rows(self, rows: telemetry.Rows) -> None:
-        """Take in (n, len(FIELDS)) telemetry rows in their order."""
+        """Add (n, len(FIELDS)) telemetry rows, in order."""
         if not len(rows):
             return
         time_s = telemetry.column(rows, "mono_s")
@@ -205,7 +205,7 @@ class Summary:
         self._leak_um_per_s = float(leak[-1]) if leak.size else self._leak_um_per_s
 
     def add_event(self, event: EventLine) -> None:
-        """Take in one event; "fault", "geometry" and "end" matter here."""
+        """Add one event; only "fault", "geometry" and "end" matter."""
         if event.get("kind") == "fault":
             self._fault_count += 1
             if len(self._faults) < _LISTED_MAX:
@@ -216,20 +216,20 @@ class Summary:
             self._end = event
 
     def add_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
-        """Take in the result of a measurement cycle."""
+        """Add the result of a measurement cycle."""
         self._cycles += 1
         self._rejected += estimate.verdict == "rejected"
         self._latency_ms.add(np.array([estimate.latency_s * 1e3]))
 
     def as_dict(self, dropped: dict[str, int], recorder: dict[str, Any]) -> dict[str, Any]:
-        """`summary.json`; NaN where there is nothing to say.
+        """The content of `summary.json`; NaN for missing figures.
 
         Parameters
         ----------
         dropped : dict
-            Messages that were overwritten before the recorder read them, by ring ("telemetry", ...).
+            Messages overwritten before the recorder read them, by ring ("telemetry", ...).
         recorder : dict
-            The recorder's own account: files, errors.
+            The recorder's own data: files, errors.
         """
         true, means = self._true_um, self._true_1s_um.result()
         held = means if means["seconds"] else self._reading_1s_um.result()

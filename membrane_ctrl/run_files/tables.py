@@ -1,4 +1,4 @@
-"""What the tables beside the recording hold: every tick, what it was given, three overview levels, every shape."""
+"""The tables beside the recording: every tick with its inputs, three overview levels, every shape."""
 
 import math
 from collections.abc import Mapping
@@ -16,14 +16,14 @@ from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.run_files import column_codec
 from membrane_ctrl.run_files.column_file import ColumnFile
 
-# Overview levels: least, mean and greatest of each signal per 1 s, 10 s and 60 s, so that a month opens in seconds.
+# Overview levels: minimum, mean and maximum of each signal per 1, 10 and 60 s, so that a month opens in seconds.
 #
 # A level is a dict of columns: `time_s` (start of the window, a multiple of its length), `rows` (ticks in it), the
-# codes of `CODES` at its end (`fault`: the greatest) and `min_<signal>`, `mean_<signal>`, `max_<signal>`.
+# codes of `CODES` at its end (`fault`: the largest) and `min_<signal>`, `mean_<signal>`, `max_<signal>`.
 Columns = dict[str, Column]
 
 WINDOWS_S: tuple[float, ...] = (1.0, 10.0, 60.0)
-# What is looked at or searched for over hours; `true_error_um` is made here, on a real bench it is NaN.
+# Signals that people view or search over hours; `true_error_um` is computed here, and NaN on a real bench.
 SIGNALS: tuple[str, ...] = (
     "error_um",
     "true_error_um",
@@ -47,7 +47,7 @@ NAMES: tuple[str, ...] = (
     *CODES,
     *(f"{kind}_{name}" for name in SIGNALS for kind in ("min", "mean", "max")),
 )
-# The fields of a telemetry row that a level is made of.
+# The telemetry fields from which levels are computed.
 TICK_FIELDS: tuple[str, ...] = (
     "mono_s",
     *CODES,
@@ -58,7 +58,7 @@ TICK_FIELDS: tuple[str, ...] = (
 
 
 def first_level(ticks: Mapping[str, Column]) -> Columns:
-    """The 1 s level of ticks in their order; a window is given as far as it is there."""
+    """The 1 s level of consecutive ticks; incomplete windows are included."""
     time_s = ticks["mono_s"]
     if not time_s.size:
         return {name: np.empty(0) for name in NAMES}
@@ -74,9 +74,9 @@ def first_level(ticks: Mapping[str, Column]) -> Columns:
 
 
 def coarser_level(level: Mapping[str, Column], window_s: float) -> Columns:
-    """A level of longer windows out of a finer one; means are weighted with the number of ticks.
+    """A level of longer windows from a finer one; means are weighted by the number of ticks.
 
-    Signals and codes that the finer one does not have, the coarser one has not either.
+    The coarser level lacks the signals and codes that the finer one lacks.
     """
     if not level["time_s"].size:
         return {name: np.empty(0) for name in level}
@@ -92,8 +92,8 @@ def coarser_level(level: Mapping[str, Column], window_s: float) -> Columns:
 
 
 def _windows(time_s: Column, window_s: float) -> tuple[NDArray[np.intp], Column]:
-    """First row of each window that has rows, and the windows' starts in s."""
-    # the small part of a window: 59.9999999 is meant to be 60
+    """First row of each non-empty window, and the windows' starts in s."""
+    # a small fraction of a window: 59.9999999 means 60
     number = np.floor(time_s / window_s + 1e-9)
     starts = np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
     return starts, number[starts] * window_s
@@ -113,7 +113,7 @@ def _codes(table: Mapping[str, Column], starts: NDArray[np.intp]) -> Columns:
 def _mean(values: Column, weights: Column, starts: NDArray[np.intp]) -> Column:
     there = np.isfinite(values)
     total = np.add.reduceat(np.where(there, weights, 0.0), starts)
-    # the sum about a nearby value: 1e5 Pa and a change of mPa share one double without loss
+    # sum relative to a nearby value: a double can then hold 1e5 Pa and a change of mPa without loss
     base = np.where(there, values, 0.0)[starts]
     offset = np.repeat(base, np.diff(np.append(starts, values.size)))
     summed = np.add.reduceat(np.where(there, (values - offset) * weights, 0.0), starts)
@@ -123,12 +123,12 @@ def _mean(values: Column, weights: Column, starts: NDArray[np.intp]) -> Column:
 TICKS = "ticks"
 SHAPES = "shapes"
 RARE = "rare"
-# By the record's field: the column that holds it, exactly. Where the row has what was made of it, `given_<name>`.
+# By the record's field: the column that holds its exact value; `given_<name>` if the row has a derived value.
 GIVEN: dict[str, str] = {
     name: SAME.get(name, f"given_{name}" if name in telemetry.FIELDS else name) for name in RECORD.names or ()
 }
-# What a field of the row nearly always is: stored is how it differs. All others are in singles, finer than the
-# sensors behind them (1 mm to 0.1 nm), at half the size and half the reading time.
+# What a field of the row nearly always equals: the difference is stored. All others are single precision, finer than
+# their sensors (1 mm to 0.1 nm), at half the size and reading time.
 _SUMS = {
     **{name: column for name, column in GIVEN.items() if column.startswith("given_")},
     "filtered_um": "setpoint_um -error_um",
@@ -137,11 +137,11 @@ _SUMS = {
 }
 _TICK_BATCH_S = 60.0
 _RARE_BATCH_S = 600.0
-# Reading back costs as much a batch as a thousand rows.
+# Reading back a batch costs as much as a thousand rows.
 _SHAPE_BATCH_S = 300.0
-# A batch costs about 6 kB whatever is in it: the coarser a level, the longer its rows wait.
+# A batch costs about 6 kB whatever its content: the coarser a level, the longer its rows wait.
 _LEVEL_BATCH_S = {1.0: 300.0, 10.0: 600.0, 60.0: 3600.0}
-# Reports take a covariance now and then, which `covariance_um2` has: all of a month would be 3 GB.
+# Reports need a covariance only now and then, in `covariance_um2`: a month of all would be 3 GB.
 COVARIANCE_INTERVAL_S = 600.0
 COMMANDS, MEMORY = "commands", "memory"
 
@@ -152,7 +152,7 @@ def level_table(window_s: float) -> str:
 
 
 def tick_schema() -> pa.Schema:
-    """Columns of `ticks`: the fields of a telemetry row, then what else the tick was given."""
+    """Columns of `ticks`: the fields of a telemetry row, then the tick's other inputs."""
     exact = {column.removeprefix("given_") for column in GIVEN.values()}
     rows = [
         pa.field(
@@ -171,7 +171,7 @@ def tick_schema() -> pa.Schema:
 
 
 def rare_schema() -> pa.Schema:
-    """Columns of `rare`: the commands and ended tasks of a tick (JSON), the controller's memory before it."""
+    """Columns of `rare`: a tick's commands and ended tasks (JSON), and the controller's memory before it."""
     return pa.schema([("time_s", pa.float64()), ("tick", pa.int64()), ("kind", pa.string()), ("data", pa.binary())])
 
 
@@ -182,9 +182,9 @@ def level_schema() -> pa.Schema:
 
 
 def shape_schema() -> pa.Schema:
-    """Columns of `shapes`: all of an estimate.
+    """Columns of `shapes`: complete estimates.
 
-    `covariance_um2` is empty but for one cycle each `COVARIANCE_INTERVAL_S`, `upper_um2` has the upper half of each.
+    `covariance_um2` is set for one cycle per `COVARIANCE_INTERVAL_S`, `upper_um2` has every upper half.
     """
     return pa.schema(
         [
@@ -201,16 +201,16 @@ def shape_schema() -> pa.Schema:
 
 @dataclass(frozen=True, slots=True)
 class OpenWindows:
-    """Windows of the overview that are not over: what the recorder after a dead one needs to end them."""
+    """Unfinished windows of the overview, which a successor of a dead recorder needs to finish."""
 
-    # rows of the open window of 1 s
+    # rows of the open 1 s window
     ticks: Columns = field(default_factory=lambda: {name: np.empty(0) for name in TICK_FIELDS})
-    # by the coarser window in s: rows of the finer level that are in its open window
+    # by the coarser window in s: rows of the finer level in its open window
     levels: dict[float, Columns] = field(default_factory=dict)
 
 
 class ColumnTables:
-    """All tables of a run; `resumed` is from the recorder that died, None at the start of a run."""
+    """All tables of a run; `resumed` is the state of a dead recorder, None at the start of a run."""
 
     def __init__(self, run_dir: Path, resumed: OpenWindows | None = None) -> None:
         def table(name: str, schema: pa.Schema, time_name: str, batch_s: float) -> ColumnFile:
@@ -228,7 +228,7 @@ class ColumnTables:
         self._covariance_due_s = -math.inf
 
     def add_ticks(self, batch: TickBatch) -> None:
-        """Take in ticks in their order. Raises OSError (full disk)."""
+        """Add ticks, in order. Raises OSError (full disk)."""
         if not len(batch.rows):
             return
         row = {name: telemetry.column(batch.rows, name) for name in telemetry.FIELDS}
@@ -249,7 +249,7 @@ class ColumnTables:
             self._rare.add(rare)
 
     def add_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
-        """Take in the result of a measurement cycle. Raises OSError (full disk)."""
+        """Add the result of a measurement cycle. Raises OSError (full disk)."""
         row: dict[str, Any] = {
             field.name: [getattr(estimate, field.name, None)] for field in shape_schema() if field.name != "upper_um2"
         }
@@ -263,38 +263,38 @@ class ColumnTables:
 
     @property
     def open_windows(self) -> OpenWindows:
-        """To hand on."""
+        """Unfinished windows, for a successor."""
         return OpenWindows(self._open_ticks, self._open_levels)
 
     def sync(self) -> None:
-        """Wait until the disk has all rows, also those of batches that are not full. Raises OSError (full disk)."""
+        """Sync all rows, including those of unfinished batches. Raises OSError (full disk)."""
         for file in self._files:
             file.sync()
 
     def close(self) -> None:
-        """Write the windows still open and end all files. Raises OSError."""
+        """Write the open windows and end all files. Raises OSError."""
         self._advance(None)
         for file in self._files:
             file.close()
 
     def leave_folder(self) -> None:
-        """The run's folder was taken away, and another is in its place: go on there."""
+        """Continue in the folder that replaces the run's removed one."""
         for file in self._files:
             file.leave_folder()
 
     @property
     def lost(self) -> int:
-        """Rows of all tables that no file has."""
+        """Number of lost rows, over all tables."""
         return sum(file.lost for file in self._files)
 
     @property
     def lost_ticks(self) -> int:
-        """Ticks that no file has."""
+        """Number of lost ticks."""
         return self._ticks.lost
 
     @property
     def files(self) -> dict[str, int]:
-        """Files of each table: a reader that finds fewer knows that the last ones are missing."""
+        """Number of files per table: a reader that finds fewer knows that the last ones are missing."""
         levels = {level_table(window_s): file.files for window_s, file in self._levels.items()}
         return {TICKS: self._ticks.files, RARE: self._rare.files, SHAPES: self._shapes.files, **levels}
 
@@ -303,7 +303,7 @@ class ColumnTables:
         return (self._ticks, self._rare, self._shapes, *self._levels.values())
 
     def _advance(self, new: Columns | None) -> None:
-        """Close the windows that are over (all, if nothing new comes) and hand them to the next coarser level."""
+        """Close finished windows (all, at the end) and pass them to the next coarser level."""
         ticks = self._open_ticks
         if new is not None:
             ticks = {name: np.concatenate((ticks[name], new[name])) for name in TICK_FIELDS}
@@ -324,7 +324,7 @@ class ColumnTables:
 
 
 def _first_of_last(time_s: np.ndarray, window_s: float) -> int:
-    """Rows before the window that the last row is in: that one may go on."""
+    """Number of rows before the last row's window, which may be unfinished."""
     if not time_s.size:
         return 0
     number = np.floor(time_s / window_s + 1e-9)

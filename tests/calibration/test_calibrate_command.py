@@ -139,7 +139,7 @@ def test_a_set_with_a_bad_frame_is_used_with_a_word(
     report = json.loads(capsys.readouterr().out)
     (finding,) = report["findings"]
     assert not finding["fatal"]
-    assert finding["says"].startswith("spoilt: x_sin_2.png left out: "), finding
+    assert finding["says"].startswith("spoilt: x_sin_2.png omitted: "), finding
 
 
 def test_one_pressure_is_not_enough(folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -57,7 +57,7 @@ def test_the_rate_is_that_of_the_ticks(folder: Path, text: str | None) -> None:
         path.write_text(text)
     run = open_run(folder)
     path.write_text(kept)
-    assert any("ticks come at 10 Hz" in note for note in run.notes)
+    assert any("ticks at 10 Hz" in note for note in run.notes)
     found = analyse(run)
     assert found.ticks.hold_s == pytest.approx(HOURS * 3600, abs=1)
     assert found.reading is not None

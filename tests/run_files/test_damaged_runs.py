@@ -177,7 +177,7 @@ def test_a_table_without_its_end_is_named(sound: Path, tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-8])  # the mark of the end: cut between two messages
     run = open_run(folder)
     run.ticks()
-    assert any("ticks-000.arrows: without the mark of its end" in note for note in run.notes)
+    assert any("ticks-000.arrows: without its end mark" in note for note in run.notes)
 
 
 def test_the_last_file_of_a_table_is_missed_and_its_segment_stands_in(tmp_path: Path) -> None:
@@ -196,7 +196,7 @@ def test_the_last_file_of_a_table_is_missed_and_its_segment_stands_in(tmp_path: 
     run = open_run(folder)
     assert np.allclose(run.ticks(["mono_s"]).column("mono_s"), np.concatenate((early, late))[:, 0])
     assert any("ticks-001.arrows: missing" in note for note in run.notes)
-    assert any("Rerun segments stand in" in note for note in run.notes)
+    assert any("Rerun segments replace ticks" in note for note in run.notes)
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
@@ -211,7 +211,7 @@ def test_a_torn_segment_gives_its_whole_messages(tmp_path: Path, share: float) -
     assert 0.5 * share * len(rows) < count <= len(rows)
     assert np.allclose(found.column("displacement_um"), column(rows[:count], "displacement_um"), equal_nan=True)
     assert any(
-        "night-000.rrd: damaged or cut short" in note and "kB of it are left out" in note for note in run.notes
+        "night-000.rrd: damaged or truncated" in note and "kB of it are left out" in note for note in run.notes
     )
     assert _content(tmp_path) == before
 

@@ -138,7 +138,7 @@ def test_a_torn_table_gives_what_is_whole(tmp_path: Path) -> None:
     run = open_run(folder)
     assert 2000 < run.ticks().num_rows < 6000
     last_s = run.ticks(["mono_s"]).column("mono_s")[-1].as_py()
-    assert any("ticks-000.arrows: cut short" in note and f"behind {last_s:.2f} s" in note for note in run.notes)
+    assert any("ticks-000.arrows: truncated" in note and f"after {last_s:.2f} s" in note for note in run.notes)
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:

@@ -85,5 +85,5 @@ def test_a_part_in_a_hole_of_the_tables_comes_from_its_segment(tmp_path: Path) -
     run = open_run(tmp_path)
     found = run.ticks(["error_um"], 70.0, 110.0)
     assert found.num_rows == 400
-    assert any("Rerun segments stand in" in note for note in run.notes)
+    assert any("Rerun segments replace ticks" in note for note in run.notes)
     assert run.level(10.0, 70.0, 110.0)["time_s"].size == 4
