@@ -139,7 +139,7 @@ def _timing() -> rrb.Vertical:
 
 def _long_review() -> rrb.Vertical:
     return rrb.Vertical(
-        _plot("Error: least, mean and greatest of each second, um", "/overview/error", "/loop/band"),
+        _plot("Error: minimum, mean and maximum of each second, um", "/overview/error", "/loop/band"),
         _plot("Trim, um", "/shape/trim"),
         _lanes(),
         _text_log(),

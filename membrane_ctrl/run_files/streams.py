@@ -116,9 +116,9 @@ BAND = Stream("/loop/band", (Line("", "+band um", GREY, 1.0), Line("", "-band um
 OVERVIEW = Stream(
     "/overview/error",
     (
-        Line("", "error, least of a second um", GREY, 1.0),
+        Line("", "error, minimum of a second um", GREY, 1.0),
         Line("", "error, mean of a second um", BLUE),
-        Line("", "error, greatest of a second um", GREY, 1.0),
+        Line("", "error, maximum of a second um", GREY, 1.0),
     ),
 )
 DERIVED: tuple[Stream, ...] = (TRUE_ERROR, BAND, OVERVIEW)

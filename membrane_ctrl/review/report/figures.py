@@ -181,7 +181,7 @@ def surroundings(analysis: Analysis) -> str:
         flow.plot(time, level["mean_leak_um_per_s"], color=RED, label="leak")
         flow.set(title="Flow and leak, µm/s", xlabel=unit)
         flow.legend(loc="upper right", ncols=2)
-        late.plot(time, level["max_lateness_ms"], color=GREY, lw=0.8, label="greatest")
+        late.plot(time, level["max_lateness_ms"], color=GREY, lw=0.8, label="maximum")
         late.plot(time, level["mean_lateness_ms"], color=BLUE, label="mean")
         late.set(title="Lateness of the tick, ms", xlabel=unit)
         if np.nanmax(level["max_lateness_ms"], initial=0.0) > 0:

@@ -127,7 +127,7 @@ def _windows(analysis: Analysis) -> str:
         for window in (() if series is None else series.windows)
     ]
     band = f"in ±{analysis.run.config.limits.band_um:g} µm"
-    return _table(["", "means of", "count", "mean µm", "std µm", "p99.7 µm", "greatest µm", band], rows)
+    return _table(["", "means of", "count", "mean µm", "std µm", "p99.7 µm", "maximum µm", band], rows)
 
 
 def _details(analysis: Analysis) -> str:

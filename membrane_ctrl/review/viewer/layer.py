@@ -39,7 +39,7 @@ OVERVIEWS: dict[str, tuple[tuple[str, str, streams.Colour], ...]] = {
     "/overview/error": (
         ("min_error_um", "error, least um", streams.GREY),
         ("mean_error_um", "error, mean um", streams.BLUE),
-        ("max_error_um", "error, greatest um", streams.GREY),
+        ("max_error_um", "error, maximum um", streams.GREY),
     ),
     "/overview/true": (("mean_true_error_um", "true error, mean um", streams.GREEN),),
     "/overview/flow": (
@@ -53,7 +53,7 @@ OVERVIEWS: dict[str, tuple[tuple[str, str, streams.Colour], ...]] = {
     "/overview/temperature": (("mean_air_temperature_c", "air C", streams.ORANGE),),
     "/overview/lateness": (
         ("mean_lateness_ms", "lateness, mean ms", streams.BLUE),
-        ("max_lateness_ms", "lateness, greatest ms", streams.GREY),
+        ("max_lateness_ms", "lateness, maximum ms", streams.GREY),
     ),
     "/overview/missed": (("max_missed_ticks", "ticks missed so far", streams.RED),),
 }
