@@ -1,7 +1,7 @@
 """One clock through all code: seconds since the run's start on the system's monotonic axis.
 
 CLOCK_MONOTONIC is one axis for all processes of a machine, so a clock made from the same origin reads the same
-everywhere. UTC is taken once at the start: a stepped wall clock moves nothing.
+everywhere. UTC is read once at the start: a stepped wall clock has no effect.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class RunClock:
 
 
 def pause_s(failures: int, first_s: float = 1.0, longest_s: float = 60.0) -> float:
-    """How long to wait after so many failures in a row: `first_s`, doubled with each; 0 without a failure."""
+    """Wait after a number of consecutive failures: `first_s`, doubled with each; 0 without a failure."""
     return 0.0 if failures < 1 else min(longest_s, first_s * 2.0 ** min(failures - 1, 32))
 
 

@@ -18,13 +18,13 @@ class Exit(IntEnum):
 
 
 class CommandError(Exception):
-    """Ends a command: the message is the one line that says what, where and what to do."""
+    """Ends a command; the message is one line with the problem, its place and the remedy."""
 
     exit = Exit.BAD_INPUT
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """What is printed: one line, whatever line ends are in what it quotes."""
+        """The printed text: one line, even if quoted text has line ends."""
         return (str(self),)
 
 
@@ -33,7 +33,7 @@ class InputError(CommandError):
 
 
 class FindingsError(InputError):
-    """Several things that are wrong with the input, a line each."""
+    """Several problems with the input, one line each."""
 
     def __init__(self, lines: Sequence[str]) -> None:
         super().__init__("\n".join(lines))
@@ -57,7 +57,7 @@ class DeviceError(CommandError):
 
 
 def os_reason(error: OSError) -> str:
-    """What the operating system says, for use within a sentence."""
+    """The operating system's reason, for use within a sentence."""
     text = error.strerror or str(error)
     return text[:1].lower() + text[1:]
 

@@ -1,7 +1,7 @@
-"""Events of the controller, one class a kind; `run_events` has those of the processes around it.
+"""Events of the controller, one class per kind; `run_events` has those of the processes around it.
 
-As JSON they are the lines of `events.jsonl`, without their times. A field is a key of the line (`from_` is "from",
-which is a word of Python). Keys with None as default are left out when there is nothing to say.
+As JSON they are the lines of `events.jsonl`, without their times. A field is a key of the line (`from_` is "from", a
+Python keyword). Keys with None as default are omitted if None.
 """
 
 from dataclasses import MISSING, Field, dataclass, fields
@@ -15,7 +15,7 @@ KINDS: dict[str, type["Event"]] = {}
 @dataclass_transform(frozen_default=True)
 @dataclass(frozen=True)
 class Event:
-    """The base of all kinds; a class derived from it is a frozen dataclass."""
+    """The base of all kinds; derived classes are frozen dataclasses."""
 
     _kind: ClassVar[str]
     keys: ClassVar[tuple[tuple[Field[Any], str], ...]]  # the fields, each with its key in the line
@@ -29,7 +29,7 @@ class Event:
 
     @property
     def kind(self) -> str:
-        """As in the line."""
+        """Kind as in the line."""
         return self._kind
 
     def to_dict(self) -> EventLine:
@@ -47,13 +47,13 @@ class StateEntered(Event, kind="state"):
 
 
 class Why(Event, kind="why"):
-    """The operator's line has changed."""
+    """The operator's line changed."""
 
     why: str
 
 
 class Fault(Event, kind="fault"):
-    """A rule of the safety table has tripped."""
+    """A rule of the safety table tripped."""
 
     code: int
     name: str
@@ -66,7 +66,7 @@ class Fault(Event, kind="fault"):
 
 
 class Cleared(Event, kind="cleared"):
-    """The cause of a fault that only held the flow is gone."""
+    """The cause of a fault that only held the flow has gone."""
 
     name: str
 
@@ -78,14 +78,14 @@ class Resumed(Event, kind="resumed"):
 
 
 class ShapeLoopState(Event, kind="shape"):
-    """The shape loop has another state, or another reason for it."""
+    """The shape loop's state, or the reason for it, changed."""
 
     state: str
     reason: str
 
 
 class CommandTaken(Event, kind="command"):
-    """A tick has obeyed or refused a command."""
+    """A tick executed or refused a command."""
 
     command: str
     who: str
@@ -120,14 +120,14 @@ class Plausibility(Event, kind="plausibility"):
 
 
 class Maintenance(Event, kind="maintenance"):
-    """Something wears out, or will need a person."""
+    """Something is wearing out, or will need attention."""
 
     name: str
     message: str
 
 
 class MaintenanceOver(Event, kind="maintenance_over"):
-    """A maintenance message no longer holds."""
+    """A maintenance notice no longer applies."""
 
     name: str
     message: str

@@ -1,7 +1,7 @@
-"""Files in folders that may come from a stranger: plain files only, no link followed, every read bounded.
+"""Files in untrusted folders: regular files only, no link followed, every read bounded.
 
-A run folder or a capture set may come by mail or in an archive. Its files are opened through a handle of the folder
-and without following links. A write leaves the old file or the whole new one, also after a power cut.
+A run folder or a capture set may come by mail or in an archive. Its files are opened through a handle of the folder,
+without following links. A write leaves either the old or the complete new file, even after a power cut.
 
 The folder itself is trusted (a command resolves the path that the user named); its subfolders and files are not.
 """
@@ -16,10 +16,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, TextIO
 
-# A summary or a configuration is some kilobytes; JSON and TOML take fifty times their text once parsed.
+# A summary or a configuration is a few kilobytes; parsed JSON and TOML take fifty times the memory of their text.
 SMALL_BYTES = 4_000_000
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-# not blocking: a pipe without a writer would be waited for
+# non-blocking: opening a pipe without a writer would block
 _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _APPEND = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
@@ -56,34 +56,32 @@ def read_bytes(path: Path, most_bytes: int, follow: bool = False) -> bytes:
     """The content of a plain file. Raises OSError as `open_plain`, and for more than `most_bytes`."""
     with open_plain(path, follow) as file:
         size = os.fstat(file.fileno()).st_size
-        data = file.read(size) if size <= most_bytes else b""  # of one that grows, what there was
+        data = file.read(size) if size <= most_bytes else b""  # of a growing file, the part so far
     if size > most_bytes:
-        raise OSError(
-            errno.EFBIG, f"{size / 1e6:.0f} MB; more than {most_bytes / 1e6:.0f} MB are not read", str(path)
-        )
+        raise OSError(errno.EFBIG, f"{size / 1e6:.0f} MB, above the limit of {most_bytes / 1e6:.0f} MB", str(path))
     return data
 
 
 def read_text(path: Path, most_bytes: int = SMALL_BYTES, errors: str = "strict", follow: bool = False) -> str:
-    """The same as text. Raises UnicodeDecodeError as well, unless `errors` says otherwise."""
+    """As `read_bytes`, decoded. Raises also UnicodeDecodeError, depending on `errors`."""
     return read_bytes(path, most_bytes, follow).decode("utf-8", errors)
 
 
 def users(path: Path) -> Path:
-    """A path that the user named, with the links of its folder resolved; the file itself is replaced, link or not."""
+    """A path named by the user, with its folder's links resolved; writing replaces the file itself, link or not."""
     return path.parent.resolve() / path.name
 
 
 def write_text_atomic(path: Path, text: str) -> None:
-    """Write UTF-8 text beside `path`, sync it, and put it in place in one step. Raises OSError.
+    """Write UTF-8 text beside `path`, sync it, and move it into place atomically. Raises OSError.
 
-    A lone surrogate, which JSON may hold and UTF-8 may not, is written as JSON writes it.
+    A lone surrogate, allowed in JSON but not in UTF-8, is written as its JSON escape.
     """
     write_bytes_atomic(path, text.encode("utf-8", "backslashreplace"))
 
 
 def write_bytes_atomic(path: Path, data: bytes) -> None:
-    """The same with bytes."""
+    """As `write_text_atomic`, with bytes."""
     with folder_handle(path.parent) as folder:
         part = f".{path.name}.part"
         try:
@@ -99,13 +97,13 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
 
 
 def fresh_file(path: Path) -> BinaryIO:
-    """A new file for piecewise writing, in place of an old one. Raises OSError."""
+    """Open a new file for piecewise writing, replacing an old one. Raises OSError."""
     with folder_handle(path.parent) as folder:
         return _fresh(path.name, folder, path)
 
 
 def fresh_text(path: Path) -> TextIO:
-    """The same for text, line ends as they are given."""
+    """As `fresh_file`, for text, with line ends as given."""
     return io.TextIOWrapper(fresh_file(path), encoding="utf-8", newline="")
 
 
@@ -114,7 +112,7 @@ def append_text(path: Path, text: str) -> None:
     with folder_handle(path.parent) as folder:
         descriptor = _plain(_opened(path, _APPEND, folder), path)
         with os.fdopen(descriptor, "ab") as file:
-            # a second name may be that of a file elsewhere
+            # a second name may belong to a file elsewhere
             if os.fstat(file.fileno()).st_nlink > 1:
                 raise OSError(errno.EMLINK, "has a hard link elsewhere, and is not written", str(path))
             file.write(text.encode("utf-8", "backslashreplace"))
@@ -125,7 +123,7 @@ def move(source: Path, target: Path) -> None:
     with folder_handle(source.parent) as from_folder, folder_handle(target.parent) as folder:
         try:
             os.replace(source.name, target.name, src_dir_fd=from_folder, dst_dir_fd=folder)
-        except OSError as error:  # it names the file alone
+        except OSError as error:  # the error has only the file's name
             raise type(error)(error.errno, error.strerror, str(target)) from None
 
 
@@ -152,7 +150,7 @@ def scratch_folder(folder: Path, prefix: str) -> Iterator[Path]:
 
 
 def sync_data(path: Path) -> None:
-    """Wait until the disk has a file's content, whoever wrote it. Raises OSError."""
+    """Sync a file's content to disk, whoever wrote it. Raises OSError."""
     with open_plain(path) as file:
         os.fdatasync(file.fileno())
 
@@ -171,7 +169,7 @@ def _fresh(name: str, folder: int, path: Path) -> BinaryIO:
 
 
 def _plain(descriptor: int, path: Path) -> int:
-    """The descriptor, if it is of a plain file; else it is closed. Raises OSError."""
+    """The descriptor of a regular file; closes any other. Raises OSError."""
     mode = os.fstat(descriptor).st_mode
     if stat.S_ISREG(mode):
         return descriptor
@@ -182,7 +180,7 @@ def _plain(descriptor: int, path: Path) -> int:
 
 
 def _told(error: OSError, path: Path) -> OSError:
-    """An error in words: Linux reports a refused link in two ways, and names neither folder nor link."""
+    """A clearer error: Linux reports a refused link in two ways, without naming folder or link."""
     if path.is_symlink():
         return OSError(errno.ELOOP, "is a link, and links are not followed here", str(path))
     if error.errno == errno.ENXIO:  # a pipe without a reader, a socket

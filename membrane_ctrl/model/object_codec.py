@@ -1,4 +1,4 @@
-"""Objects of our own classes as plain data for JSON, and back, exact to the last bit.
+"""Converts objects of our classes to plain data for JSON and back, bit by bit.
 
 The reader makes only what the classes declare: the fields of a dataclass; of another class the attributes of an
 example, by the types that its methods annotate (`self.x: T = ...`) or else by those of the example's values. It calls
@@ -27,17 +27,17 @@ _SCALARS = frozenset({NoneType, bool, int, float, str})
 _SEQUENCES: tuple[type, ...] = (tuple, list, set, frozenset)
 _DTYPES = frozenset({"<f8", "<f4", "<i8", "|b1"})
 _OURS = ("membrane_ctrl.", "firmware_iface.")
-_CLASS = ""  # the key of an object's class; no attribute is called so
+_CLASS = ""  # the key of an object's class; no attribute has this name
 _INT_MAX = 2**63
 _MAXLEN_MAX = 1 << 20
 
 
 class CodecError(ValueError):
-    """Damaged data, or of another layout; the message says where."""
+    """The data are damaged or of another layout; the message says where."""
 
 
 class Special(NamedTuple):
-    """How the objects of a class, or of a class derived from it, are written otherwise; TypeError: they cannot be."""
+    """A custom encoding for a class and its subclasses; raises TypeError for objects that cannot be encoded."""
 
     encode: Callable[[Any], Any]
     decode: Callable[[Any, type], Any]
@@ -56,7 +56,7 @@ ESTIMATE = Special(lambda estimate: base64.b64encode(pack_estimate(estimate)).de
 
 
 def encode(value: object, specials: Specials) -> Any:
-    """Plain data. Raises TypeError for what cannot be written down, or would come back twice."""
+    """Encode an object. Raises TypeError for unsupported types, and for objects reachable by two ways."""
     return _encoded(value, specials, set())
 
 
@@ -100,9 +100,9 @@ def _special(kind: type, specials: Specials) -> Special | None:
 
 
 class Decoder:
-    """Makes objects of `encode`'s data; `examples` has an object of every class that is no dataclass.
+    """Makes objects from `encode`'s data; `examples` has an object of every class that is not a dataclass.
 
-    Raises TypeError for an attribute whose type the examples do not show.
+    Raises TypeError for an attribute whose type the examples do not reveal.
     """
 
     def __init__(self, examples: tuple[object, ...], specials: Specials) -> None:
@@ -130,7 +130,7 @@ class Decoder:
                 self._learn(value)
 
     def _learn_hint(self, hint: Any) -> None:
-        """Learn dataclasses that no example holds, such as the result of a test that has not run."""
+        """Learn dataclasses absent from the examples, such as the result of a test that has not run."""
         for part in get_args(hint):
             self._learn_hint(part)
         if not isinstance(hint, type) or hint in self._classes or self._is_leaf(hint) or not is_dataclass(hint):
@@ -143,7 +143,7 @@ class Decoder:
         return issubclass(kind, Enum) or _special(kind, self._specials) is not None
 
     def decode(self, data: Any, hint: Any, where: str = "") -> Any:
-        """The object of type `hint`. Raises CodecError."""
+        """Decode an object of type `hint`. Raises CodecError."""
         where = where or getattr(hint, "__name__", str(hint))
         origin, parts = get_origin(hint), get_args(hint)
         if hint is Any:

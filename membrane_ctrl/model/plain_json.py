@@ -1,7 +1,7 @@
 """JSON for every reader, and safe reading of foreign JSON.
 
-NaN and infinity are written as null. Text that is deeper or longer than any of ours is refused before it takes memory
-or the stack.
+NaN and infinity are written as null. Text deeper or longer than any of ours is refused before it exhausts memory or
+the stack.
 """
 
 import hashlib
@@ -12,19 +12,19 @@ import zlib
 from collections.abc import Mapping
 from typing import Any
 
-# What a file of many values may hold in all: a value of two letters takes 64 bytes of memory, so many 200 MB at most.
+# Limit on the values in a file: a value of two characters takes 64 bytes of memory, this many at most 200 MB.
 ELEMENTS_MAX = 6_000_000
 _DEPTH_MAX = 32
-_DIGITS_MAX = 19  # of a 64-bit counter; beyond, a number is a float
+_DIGITS_MAX = 19  # enough for a 64-bit counter; longer numbers are floats
 
 
 def dumps(value: Any, indent: int | None = None) -> str:
-    """JSON text; NaN and infinity become null, what JSON does not know becomes its `str`."""
+    """JSON text; NaN and infinity become null, unsupported types become their `str`."""
     return json.dumps(_finite(value), ensure_ascii=False, default=str, allow_nan=False, indent=indent)
 
 
 def loads(text: str) -> Any:
-    """The value of a JSON text. Raises ValueError, also for one that is too deep."""
+    """The value of a JSON text. Raises ValueError, also for excessive depth."""
     try:
         value = json.loads(text, parse_int=_number)
     except RecursionError:
@@ -39,7 +39,7 @@ def loads(text: str) -> Any:
 
 
 def elements(text: str) -> int:
-    """At most so many values are in a JSON text."""
+    """Upper bound on the number of values in a JSON text."""
     return text.count(",") + text.count("[") + text.count("{")
 
 
@@ -57,9 +57,9 @@ def _finite(value: Any) -> Any:
     return value
 
 
-# Checksums of the small files of a run. A JSON object gets a last member `crc32`, of its values and not of its
-# spelling: another program may rewrite it. The configuration gets a first line, a comment, with that of its text.
-# What has no checksum (of an earlier version, a later note) is accepted.
+# Checksums of a run's small files. A JSON object gets a last member `crc32` over its values, not their spelling:
+# other programs may rewrite it. The configuration gets a comment as its first line, with the checksum of its text.
+# Files without a checksum (from an earlier version, or a later note) are accepted.
 
 KEY = "crc32"
 _COMMENT = "# as run; CRC-32 of the text below: "
@@ -67,24 +67,24 @@ _LINE = re.compile(re.escape(_COMMENT) + r"([0-9a-f]{8})\n")
 
 
 def dumps_checked(table: dict[str, Any], indent: int | None = None) -> str:
-    """JSON text of an object with its checksum."""
+    """JSON text of an object, with its checksum."""
     plain = json.loads(dumps(table))
     return dumps({**plain, KEY: _crc(plain)}, indent)
 
 
 def take_checksum(table: dict[str, Any]) -> bool:
-    """Remove the checksum of an object that was read; True if it was right or missing."""
+    """Remove an object's checksum after reading; True if correct or missing."""
     said = table.pop(KEY, None)
     return said is None or said == _crc(table)
 
 
 def with_comment(text: str) -> str:
-    """The text, with its checksum in front."""
+    """The text, preceded by its checksum."""
     return f"{_COMMENT}{zlib.crc32(text.encode()):08x}\n{text}"
 
 
 def comment_is_right(text: str) -> bool:
-    """Whether the checksum in the first line is right; True without one."""
+    """Whether the checksum in the first line is correct; True without one."""
     line = _LINE.match(text)
     if line is None:
         return not text.startswith(_COMMENT)
@@ -100,7 +100,7 @@ _HASHED = ("geometry", "covariance", "parameters", "camera", "pattern")
 
 
 def content_hash(tables: Mapping[str, Any]) -> str:
-    """Sixteen digits that name a geometry in results and runs, whatever the order or layout of its tables."""
+    """Sixteen digits that identify a geometry in results and runs, whatever the order or layout of its tables."""
     content = {key: tables[key] for key in _HASHED if key in tables}
     text = json.dumps(content, sort_keys=True, default=list)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -5,11 +5,11 @@ from typing import Any
 
 from membrane_ctrl.model.events import KINDS, Event, EventLine
 
-# The control process.
+# Events of the control process.
 
 
 class Started(Event, kind="start"):
-    """The run begins."""
+    """The run starts."""
 
     devices: str
     priority: str
@@ -32,7 +32,7 @@ class NoClaim(Event, kind="no_claim"):
 
 
 class Link(Event, kind="link"):
-    """The link to the board has failed or is back."""
+    """The link to the board failed or returned."""
 
     message: str
     up: bool
@@ -64,7 +64,7 @@ class LatchWritten(Event, kind="latch_written"):
 
 
 class Alive(Event, kind="alive"):
-    """A child is at work; only on its pipe."""
+    """A child's sign of life; sent only on its pipe."""
 
     for_s: float
 
@@ -102,7 +102,7 @@ class ChildGivenUp(Event, kind="child_given_up"):
 
 
 class AcquisitionState(Event, kind="acquisition"):
-    """What the acquisition does, in words."""
+    """The acquisition's state, in words."""
 
     state: str
     message: str
@@ -120,7 +120,7 @@ class GeometryInForce(Event, kind="geometry"):
 
 
 class Capture(Event, kind="capture"):
-    """The result of `capture`: where the set is, or why there is none."""
+    """The result of `capture`: the set's folder, or the reason for its absence."""
 
     cycle: int | None = None
     set: str | None = None
@@ -210,7 +210,7 @@ class PortOpen(Event, kind="port_open"):
 
 
 class CommanderChanged(Event, kind="commander"):
-    """Who has the command now, and who had it before."""
+    """Who has command now, and who had it before."""
 
     who: str | None
     former: str | None
@@ -218,7 +218,7 @@ class CommanderChanged(Event, kind="commander"):
 
 
 class Refused(Event, kind="refused"):
-    """The port has refused a request, and perhaps others that are not recorded."""
+    """The port refused a request, and perhaps others not recorded."""
 
     who: str
     command: str
@@ -268,18 +268,18 @@ class UnknownEvent(Event):
 
     @property
     def kind(self) -> str:
-        """As in the line; "?" if it has none."""
+        """Kind as in the line; "?" if missing."""
         return str(self.line.get("kind", "?"))
 
     def to_dict(self) -> EventLine:
-        """The line as it came."""
+        """The line, unchanged."""
         return dict(self.line)
 
 
 def from_dict(line: EventLine) -> Event:
     """The event of a line, without its times; never raises.
 
-    Keys that an earlier version did not write are empty; what cannot be understood is an `UnknownEvent`.
+    Keys missing in earlier versions are empty; anything unintelligible is an `UnknownEvent`.
     """
     cls = KINDS.get(line["kind"]) if isinstance(line.get("kind"), str) else None
     if cls is None:
@@ -289,7 +289,7 @@ def from_dict(line: EventLine) -> Event:
         value = values[field.name] = line[key] if key in line else _EMPTY.get(field.type)
         if not _fits(value, field.type):
             return UnknownEvent(line)
-    if cls is Link and "up" not in line:  # before it had a field of its own the words were all there was
+    if cls is Link and "up" not in line:  # earlier versions had only the words
         values["up"] = values["message"] == CONNECTED_AGAIN
     return cls(**values)
 

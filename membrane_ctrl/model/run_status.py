@@ -1,4 +1,4 @@
-"""The state of a run, put together from its ticks and events: for everyone who shows it, or is told of it."""
+"""The state of a run, assembled from its ticks and events, for all displays and notices."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from typing import Any
 from membrane_ctrl.model import events, run_events, telemetry
 
 _GONE = "no recorder runs"
-_LONGEST = 300  # letters of one trouble in the status; the event has all
+_LONGEST = 300  # characters of one failure in the status; the event has the full text
 
 
 @dataclass(frozen=True, slots=True)
 class RunStatus:
-    """The newest tick, and what the events since the start leave standing."""
+    """The newest tick, and the state that follows from all events so far."""
 
     row: telemetry.TelemetryRow | None = None  # of the newest tick; None before the first one
     since_s: float = 0.0  # when the run entered its state
     why: str = ""  # the controller's last reason
-    fault: events.Fault | None = None  # that stands
-    last_fault: events.Fault | None = None  # the newest
-    last_fault_s: float = math.nan  # when it came
+    fault: events.Fault | None = None  # the standing fault
+    last_fault: events.Fault | None = None  # the newest fault
+    last_fault_s: float = math.nan  # its time
     faults: int = 0  # so far in the run
     shape_reason: str = ""  # of the shape loop
     acquisition: run_events.AcquisitionState | None = None  # the acquisition's last report
     geometry: run_events.GeometryInForce | None = None  # used by the cycles
-    maintenance: Mapping[str, str] = field(default_factory=dict)  # what a person should look at, by name
-    # trouble of the recording, by what is affected. A full disk may keep `events.jsonl` from reporting itself
+    maintenance: Mapping[str, str] = field(default_factory=dict)  # active maintenance notices, by name
+    # failures of the recording, by subject. A full disk may prevent `events.jsonl` from reporting itself
     recording: Mapping[str, str] = field(default_factory=dict)
     loop: Mapping[str, Any] | None = None  # gains set during the run; None: those of the configuration
     kept_loop: Mapping[str, Any] | None = None  # what a trial goes back to
@@ -42,16 +42,16 @@ class RunStatus:
 
     @property
     def recording_words(self) -> str:
-        """All trouble of the recording in one line; empty when all is recorded."""
+        """All failures of the recording in one line; empty if there are none."""
         return "; ".join(self.recording.values())
 
     def after_row(self, row: telemetry.TelemetryRow) -> RunStatus:
-        """One tick later."""
+        """The status after a tick."""
         same = self.row is not None and row.state == self.row.state
         return replace(self, row=row, since_s=self.since_s if same else row.mono_s)
 
     def after_event(self, event: events.Event, mono_s: float = math.nan) -> RunStatus:
-        """What an event of the run leaves behind; most change nothing."""
+        """The status after an event; most change nothing."""
         match event:
             case events.Why():
                 return replace(self, why=event.why)
@@ -100,7 +100,7 @@ def _recording(standing: Mapping[str, str], event: events.Event) -> Mapping[str,
         case run_events.ChildEnded(child="recorder") | run_events.ChildGivenUp(child="recorder"):
             return {**standing, "recorder": _GONE}
         case run_events.ChildRestarted(child="recorder"):
-            return {}  # the next one reports what still stands
+            return {}  # the next recorder reports remaining failures
     return standing
 
 

@@ -1,9 +1,9 @@
 """The result of a measurement cycle, and its bytes for control, recorder and sessions.
 
-One line of JSON with the numbers and words, then the coefficients, then the upper half of the covariance in singles:
-a variance known to 1e-7 is known better than its noise model, and what the controller is given has to be recorded to
-the last bit. Earlier versions also wrote whole matrices and doubles. A reader checks every length, type and range
-first, because a run folder may come from anywhere.
+One line of JSON with the numbers and words, then the coefficients, then the upper half of the covariance in single
+precision: a variance to 1e-7 is more precise than its noise model, and the controller's inputs must be recorded
+exactly. Earlier versions also wrote whole matrices and doubles. A reader checks every length, type and range first,
+because a run folder may come from anywhere.
 """
 
 import json
@@ -37,16 +37,16 @@ class ShapeEstimate:
     sag_sigma_um: float  # its standard deviation from `covariance_um2`
     displacement_um: float  # mean laser reading during the exposures (NaN without a laser)
     slope_residual_urad: float  # RMS of measured minus fitted slopes
-    valid_fraction: float  # share of the analysis area that gave a slope
+    valid_fraction: float  # share of the analysis area with a slope
     modulation_median_adu: float  # fringe quality
     saturated_fraction: float
     verdict: Verdict
     reason: str = ""
     latency_s: float = float("nan")  # last frame to this result (filled by the acquisition)
     cycle: int = 0  # number of the cycle in the run (filled by the acquisition)
-    # standard deviation of the sag from the geometry's, common to all cycles; NaN if that is not stated
+    # standard deviation of the sag due to the geometry, common to all cycles; NaN if not stated
     geometry_sag_sigma_um: float = float("nan")
-    tracking_lost: bool = False  # the phases cannot be followed from the last cycle: a full one is needed
+    tracking_lost: bool = False  # the phases cannot be tracked from the last cycle: a full one is needed
 
 
 _WORDS = {"kind": get_args(Kind), "verdict": get_args(Verdict)}
@@ -58,29 +58,29 @@ _UPPER = np.triu_indices(TERMS)
 UPPER_TERMS = _UPPER[0].size
 _LINE_BYTES_MAX = 8192  # the numbers take 0.5 kB; the rest is room for a reason
 _COEFFS_BYTES = 8 * TERMS
-_LARGEST = 1e300  # no infinity, and no whole number that a float cannot hold
+_LARGEST = 1e300  # excludes infinity, and integers that a float cannot hold
 
 
 def pack_estimate(estimate: ShapeEstimate) -> bytes:
-    """A shape estimate as bytes, exact to the last bit but for the covariance, which is rounded to singles."""
+    """A shape estimate as bytes, bit-exact except for the covariance, which is rounded to single precision."""
     head = {field.name: getattr(estimate, field.name) for field in fields(ShapeEstimate) if field.name not in _ARRAYS}
     return packed_parts(head, estimate.coeffs_um, upper_half(estimate.covariance_um2))
 
 
 def upper_half(covariance_um2: FloatArray) -> NDArray[np.float32]:
-    """(666,) singles: the upper half of a symmetric (36, 36) matrix, row by row."""
+    """(666,) float32: the upper half of a symmetric (36, 36) matrix, row by row."""
     return ((covariance_um2 + covariance_um2.T) / 2)[_UPPER].astype("<f4")
 
 
 def packed_parts(head: Mapping[str, Any], coeffs_um: FloatArray, upper_um2: NDArray[np.float32]) -> bytes:
-    """The bytes of an estimate's numbers and words, (36,) coefficients and (666,) upper half."""
+    """Bytes of an estimate's numbers and words, (36,) coefficients and (666,) upper half."""
     line = json.dumps({**head, "terms": TERMS, "symmetric": True, "single": True}, default=float)
     arrays = np.asarray(coeffs_um, dtype="<f8").tobytes() + np.asarray(upper_um2, dtype="<f4").tobytes()
     return line.encode() + b"\n" + arrays
 
 
 def unpack_estimate(data: bytes) -> ShapeEstimate:
-    """The estimate of `pack_estimate`. Raises ValueError if these are not its bytes."""
+    """Decode the bytes of `pack_estimate`. Raises ValueError for anything else."""
     line, _, arrays = data.partition(b"\n")
     if len(line) > _LINE_BYTES_MAX:
         raise ValueError(f"shape estimate: {len(line)} bytes where at most {_LINE_BYTES_MAX} are expected")
@@ -114,7 +114,7 @@ def _checked(head: Any) -> tuple[bool, bool]:
     if layout[0] != TERMS or not all(isinstance(flag, bool) for flag in layout[1:]):
         raise ValueError(f"shape estimate: not of {TERMS} terms")
     for name in NUMBERS:
-        value = head.get(name, math.nan)  # what an older version did not know is NaN
+        value = head.get(name, math.nan)  # fields missing in older versions are NaN
         if type(value) not in (float, int) or abs(value) > _LARGEST:
             raise ValueError(f"shape estimate: {name} is not a number")
         head[name] = float(value)
@@ -131,17 +131,17 @@ def _checked(head: Any) -> tuple[bool, bool]:
     return layout[1], layout[2]
 
 
-# Fringes weaker than this share of the sensor's range: at 2 % (5 of 255) the noise of the phase passes 0.06 rad a
-# pixel and rounding no longer averages out; at 6 % something is wrong with exposure, focus or screen.
+# Fringes weaker than this share of the sensor's range: at 2 % (5 of 255) the phase noise exceeds 0.06 rad per pixel
+# and rounding no longer averages out; at 6 % something is wrong with exposure, focus or screen.
 MODULATION_REJECTED_SHARE = 0.02
 MODULATION_DEGRADED_SHARE = 0.06
-# Saturated pixels bend the phase by harmonics; their bins are left out, so a few (glints) do no harm.
+# Saturated pixels bend the phase by harmonics; their bins are omitted, so a few (glints) do no harm.
 SATURATED_REJECTED_FRACTION = 0.20
 SATURATED_DEGRADED_FRACTION = 0.005
 # 36 terms over a disc with a quarter missing are extrapolated there.
 VALID_REJECTED_FRACTION = 0.5
 VALID_DEGRADED_FRACTION = 0.9
-# Wrinkles and ripple leave some tens of microradian; a wrong fringe order leaves 8700 at its place.
+# Wrinkles and ripple leave a few tens of microradians; a wrong fringe order leaves 8700 locally.
 RESIDUAL_REJECTED_URAD = 1000.0
 RESIDUAL_DEGRADED_URAD = 200.0
 
@@ -154,7 +154,7 @@ class Quality:
     saturated_fraction: float  # share of the points with a saturated pixel
     valid_fraction: float  # share of the analysis area that gave a slope
     residual_urad: float  # RMS of measured minus fitted slopes
-    converged: bool  # whether the fit stood still at its end
+    converged: bool  # whether the fit converged
 
 
 def judge(quality: Quality) -> tuple[Verdict, str]:

@@ -1,4 +1,4 @@
-"""The words for states and rungs, in one place for code, files and Rerun paths; their order is their code."""
+"""Names of states and rungs, in one place for code, files and Rerun paths; their order gives their codes."""
 
 from enum import IntEnum
 
@@ -27,7 +27,7 @@ class ShapeState(IntEnum):
 
 
 class Rung(IntEnum):
-    """The safe levels, by the name that telemetry has for them; each times out into the next."""
+    """The safe levels, by their names in telemetry; each times out into the next."""
 
     NONE = 0
     HOLD_FLOW = 1

@@ -1,4 +1,4 @@
-"""One row of telemetry a tick: what the recorder stores and the console shows.
+"""One row of telemetry per tick, which the recorder stores and the console shows.
 
 A row crosses to the other processes as plain doubles, so that writing it costs the tick a few microseconds.
 Codes (state, shape state, fault, rung) are small integers; their names are in `states.py`.
@@ -16,7 +16,7 @@ from membrane_ctrl.model.arrays import Column, FloatArray
 
 @dataclass(frozen=True, slots=True)
 class TelemetryRow:
-    """Everything one tick saw, decided and wrote; NaN where there was nothing."""
+    """What one tick read, decided and wrote; NaN for missing values."""
 
     mono_s: float  # the run's clock at the start of the tick
     tick: float
@@ -27,8 +27,8 @@ class TelemetryRow:
     shape_state: float
     rung: float
     fault: float  # 0: none
-    target_um: float  # where the setpoint ramp is heading
-    setpoint_um: float  # what the loop is given, trim included
+    target_um: float  # end of the setpoint ramp
+    setpoint_um: float  # setpoint given to the loop, including the trim
     displacement_um: float
     filtered_um: float
     error_um: float
@@ -51,7 +51,7 @@ class TelemetryRow:
     device_time_s: float
     leak_um_per_s: float
     trim_um: float
-    truth_displacement_um: float  # twin only: what the mirror's centre really does
+    truth_displacement_um: float  # twin only: the centre's true displacement
     truth_laser_bias_um: float  # twin only
 
     def pack(self) -> bytes:
@@ -60,12 +60,12 @@ class TelemetryRow:
 
     @classmethod
     def unpack(cls, message: bytes) -> "TelemetryRow":
-        """The row of `pack`. Raises struct.error."""
+        """Decode the row of `pack`. Raises struct.error."""
         return cls(*_STRUCT.unpack(message))
 
 
 FIELDS: tuple[str, ...] = tuple(field.name for field in fields(TelemetryRow))
-_values = attrgetter(*FIELDS)  # astuple would copy deeply: 15 us a tick
+_values = attrgetter(*FIELDS)  # astuple would copy deeply: 15 us per tick
 _STRUCT = struct.Struct(f"<{len(FIELDS)}d")
 ROW_BYTES = _STRUCT.size
 
@@ -99,6 +99,6 @@ def true_error_um(ticks: Mapping[str, Column]) -> Column:
 
 
 def changes(codes: FloatArray, before: float) -> list[tuple[int, int]]:
-    """Where a code changes: (row, new code) for each, the first row compared with `before` (NaN: nothing before)."""
+    """Changes of a code: (row, new code) for each, comparing the first row with `before` (NaN: none)."""
     previous = np.concatenate(([before], codes[:-1]))
     return [(int(row), int(codes[row])) for row in np.flatnonzero((codes != previous) & np.isfinite(codes))]

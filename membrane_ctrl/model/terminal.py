@@ -1,7 +1,7 @@
-"""What may reach a terminal: text and line ends. Every command prints through this module.
+"""Lets only text and line ends reach a terminal. Every command prints through this module.
 
-Text from files and the network may hold control bytes, which a terminal obeys, and bidirectional marks, which change
-the order of a line. Each such character becomes its JSON escape, so that JSON stays JSON and keeps its meaning.
+Text from files and the network may contain control bytes, which a terminal executes, and bidirectional marks, which
+reorder a line. Each such character becomes its JSON escape, so that JSON stays JSON and keeps its meaning.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar, cast
 
-if TYPE_CHECKING:  # a command that draws no table need not load it
+if TYPE_CHECKING:  # commands without a table need not load it
     from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderableType, RenderResult
 
 
@@ -25,20 +25,20 @@ _KEPT = frozenset("\n\t")
 
 
 def plain(text: str) -> str:
-    """The text with every character that a terminal might obey as its JSON escape."""
+    """The text with every character that a terminal might execute replaced by its JSON escape."""
     if text.isprintable():
         return text
     return "".join(_escape(letter) if _refused(letter) else letter for letter in text)
 
 
 def one_line(text: str) -> str:
-    """The same in one line: a line end is a space."""
+    """As `plain`, in one line: spaces replace line ends."""
     return plain(" ".join(text.split("\n")))
 
 
 @contextlib.contextmanager
 def only_text() -> Iterator[None]:
-    """Within it, whatever is printed by any part of the program is only text."""
+    """Within this context, all output of the program is reduced to plain text."""
     with (
         contextlib.redirect_stdout(cast("TextIO", _Text(sys.stdout))),
         contextlib.redirect_stderr(cast("TextIO", _Text(sys.stderr))),
@@ -47,7 +47,7 @@ def only_text() -> Iterator[None]:
 
 
 def table_console(stderr: bool = False, width: int | None = None) -> Console:
-    """A Rich console for tables: Rich's own colours pass, control characters in the cells do not."""
+    """A Rich console for tables that passes Rich's own colours, but no control characters in the cells."""
     from rich.console import Console
 
     made = Console(stderr=stderr, width=width)
@@ -56,18 +56,16 @@ def table_console(stderr: bool = False, width: int | None = None) -> Console:
 
 
 def counted(items: Iterable[_T], what: str, total: int | None = None) -> Iterable[_T]:
-    """The items, with a bar on stderr while they are taken, if that is a terminal."""
+    """Yield the items, with a progress bar on stderr if that is a terminal."""
     from rich.progress import track
 
     rich, on = table_console(stderr=True), sys.stderr.isatty()
-    rich.file = getattr(
-        sys.stderr, "rich_proxied_file", sys.stderr
-    )  # while it draws, Rich stands in front of `_Text`
+    rich.file = getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # while it draws, Rich replaces `_Text`
     return track(items, what, total, console=rich, transient=True, disable=not on)
 
 
 class Plain:
-    """What Rich draws, without control characters; for a `Live`, which bypasses a console's hooks."""
+    """Removes control characters from what Rich draws, for a `Live`, which bypasses a console's hooks."""
 
     def __init__(self, inner: RenderableType) -> None:
         self._inner = inner
@@ -85,20 +83,20 @@ class _Cells:
 
 
 class _Text:
-    """A stream in front of another."""
+    """A stream that filters another."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
-        # where Rich writes, which colours what it prints: its cells are looked through in `table_console`
+        # Rich writes here, with colours: `table_console` has filtered its cells
         self.rich_proxied_file = getattr(stream, "rich_proxied_file", stream)
 
     def write(self, text: str) -> int:
-        """Write what of a text is text."""
+        """Write a text, reduced to plain text."""
         self._stream.write(plain(text))
         return len(text)
 
     def writelines(self, lines: Any) -> None:
-        """Write several."""
+        """Write several lines."""
         for line in lines:
             self.write(line)
 
@@ -119,7 +117,7 @@ def _escape(letter: str) -> str:
 def ends_as_by_ctrl_c() -> Iterator[None]:
     """SIGTERM and SIGHUP raise KeyboardInterrupt inside, so that the command cleans up.
 
-    An ignored SIGHUP stays ignored: `nohup` asks to go on without the terminal.
+    An ignored SIGHUP stays ignored: `nohup` means to continue without the terminal.
     """
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
     for number, handler in before.items():

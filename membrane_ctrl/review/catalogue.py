@@ -1,4 +1,4 @@
-"""The runs there are: listed, filtered, shown, pruned."""
+"""The catalogue of runs: list, filter, show, prune."""
 
 import hashlib
 import math
@@ -19,7 +19,7 @@ _LEVEL_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class RunEntry:
-    """A run in one line."""
+    """One line of the catalogue."""
 
     folder: Path
     started_utc: datetime
@@ -47,7 +47,7 @@ class RunEntry:
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """Which runs are wanted; None: any."""
+    """Criteria for runs; None: any."""
 
     since_utc: datetime | None = None
     until_utc: datetime | None = None
@@ -58,7 +58,7 @@ class Filter:
     text: str | None = None
 
     def takes(self, entry: RunEntry) -> bool:
-        """Whether an entry is wanted."""
+        """Whether an entry meets the criteria."""
         return (
             (self.since_utc is None or entry.started_utc >= self.since_utc)
             and (self.until_utc is None or entry.started_utc < self.until_utc)
@@ -83,7 +83,7 @@ def _require_folder(logs_dir: Path) -> None:
 
 
 def _entry_or_why(folder: Path) -> RunEntry:
-    """A folder that cannot be looked into costs its line, not the list."""
+    """An entry; an unreadable folder gives a line that says so, not an error."""
     try:
         return entry(folder)
     except OSError as error:
@@ -93,7 +93,7 @@ def _entry_or_why(folder: Path) -> RunEntry:
 
 
 def entry(folder: Path) -> RunEntry:
-    """One run's line, from its small files only, and of one without a summary from the end of its seconds."""
+    """One run's line, from its small files only; without a summary, also from the end of its 1 s level."""
     notes: list[str] = []
     log = run_folder.read_events(folder, notes)
     summary: dict[str, Any] = run_folder.read_summary(folder, notes) or {}
@@ -119,9 +119,9 @@ def entry(folder: Path) -> RunEntry:
 
 
 def resolve(run: Path, logs_dir: Path = Path("logs")) -> Path:
-    """The folder meant: a path; a run's name, or the end of it, below `logs`; or `last`.
+    """Find the run's folder: a path; a run's name, or the end of it, below `logs`; or `last`.
 
-    Raises InputError if no run, or more than one, is meant.
+    Raises InputError if no run, or more than one, matches.
     """
     if run.exists() or not logs_dir.is_dir():
         return run
@@ -136,7 +136,7 @@ def resolve(run: Path, logs_dir: Path = Path("logs")) -> Path:
 
 
 def _folders(logs_dir: Path) -> list[Path]:
-    """The folders of runs, by their names; hidden ones are what is left of runs that were deleted."""
+    """The folders of runs, by name; hidden ones are remains of deleted runs."""
     return [
         folder for folder in sorted(logs_dir.iterdir()) if not folder.name.startswith(".") and _may_be_run(folder)
     ]
@@ -145,14 +145,14 @@ def _folders(logs_dir: Path) -> list[Path]:
 def _may_be_run(folder: Path) -> bool:
     try:
         return run_folder.is_run(folder)
-    except OSError:  # it may not be looked into: whether it is one is not known
+    except OSError:  # unreadable: unknown whether it is a run
         return True
 
 
 def to_prune(
     logs_dir: Path, now_utc: datetime, keep_days: float | None, keep_gb: float | None
 ) -> list[tuple[disk_budget.OldRun, str]]:
-    """The runs that the recorder's retention rule (`recording.retention`) gives up, and why; oldest first."""
+    """The runs that the recorder's retention rule (`disk_budget`) would delete, and why; oldest first."""
     _require_folder(logs_dir)
     if keep_days is None and keep_gb is None:
         raise errors.InputError("runs prune: give --keep-days, --keep-gb or both")
@@ -161,7 +161,7 @@ def to_prune(
 
 
 def prune(runs: Sequence[disk_budget.OldRun]) -> dict[Path, str]:
-    """Delete the folders of runs; one that cannot be deleted keeps no other. Returns those that stay, and why."""
+    """Delete the folders of runs, skipping undeletable ones. Returns those that stay, and why."""
     stay: dict[Path, str] = {}
     for run in runs:
         try:
@@ -178,7 +178,7 @@ def as_dict(run: RunEntry) -> dict[str, Any]:
 
 
 def _recorded_s(folder: Path) -> float:
-    """How far the seconds of a run go, by the last file that has some."""
+    """End of a run's 1 s level, from its last non-empty file."""
     for path in reversed(column_reader.column_files(folder, tables.level_table(_LEVEL_S))):
         table = column_reader.read_file(path, ["time_s"], [])
         if table is not None and table.num_rows:

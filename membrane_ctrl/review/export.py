@@ -19,14 +19,14 @@ from membrane_ctrl.run_files.streams import STREAMS
 
 
 def refuse_originals(folder: Path) -> None:
-    """Raises InputError if a folder is a run's own, or its tables', whichever run that is.
+    """Raises InputError if a folder belongs to any run, or to its tables.
 
-    A folder of exported files has `events.jsonl`, too, and may be written again.
+    A folder of exported files also has `events.jsonl`, and may be overwritten.
     """
     folder = folder.resolve()
     at = folder.parent if folder.name == FOLDER else folder
     if (at / "config.toml").exists() or any(at.glob("*.rrd")) or any(at.glob(f"{FOLDER}/*.arrows")):
-        raise errors.InputError(f"{folder}: this folder holds the recorder's files; choose another folder")
+        raise errors.InputError(f"{folder}: this folder contains the recorder's files; choose another folder")
 
 
 FORMATS = ("parquet", "csv", "hdf5")
@@ -40,8 +40,8 @@ def export(
 ) -> list[Path]:
     """Write a run's columns.
 
-    Raises InputError if the format or a stream is not known, h5py is missing, the run has nothing of what is wanted,
-    or the folder is one of a run; DeviceError if the folder cannot be written.
+    Raises InputError if the format or a stream is unknown, h5py is missing, the run has none of the requested data,
+    or the folder belongs to a run; DeviceError if the folder cannot be written.
 
     Parameters
     ----------
@@ -55,12 +55,12 @@ def export(
         Part of the run.
     """
     if to not in FORMATS:
-        raise errors.InputError(f"--to {to}: known are {', '.join(FORMATS)}")
+        raise errors.InputError(f"--to {to}: known: {', '.join(FORMATS)}")
     fields, extras = _selected(streams)
     refuse_originals(out)
     with errors.writing(out, errors.DeviceError):
         make_folder(out)
-        # beside what is there already, so that an export that fails leaves that alone
+        # beside existing files, so that a failed export leaves those unchanged
         with scratch_folder(out, ".export-") as folder:
             files = (_hdf5 if to == "hdf5" else _files)(run, to, folder, fields, extras, start_s, end_s)
             for path in files:
@@ -97,11 +97,11 @@ def _say_if_missing(run: Run, telemetry: bool) -> None:
 
 
 def _nothing(run: Run) -> errors.InputError:
-    return errors.InputError("; ".join((f"{run.folder}: nothing to export of what is wanted", *run.notes)))
+    return errors.InputError("; ".join((f"{run.folder}: none of the requested data to export", *run.notes)))
 
 
 def shape_table(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> pa.Table:
-    """One row a cycle: time, Z1..Z36 in um, sag, quality, verdict."""
+    """One row per cycle: time, Z1..Z36 in um, sag, quality, verdict."""
     shapes = run.shapes()
     shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
     names = (*_SHAPE_COLUMNS, "slope_residual_urad", "valid_fraction", "latency_s")
@@ -112,7 +112,7 @@ def shape_table(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -
 
 
 def _selected(streams: Sequence[str]) -> tuple[tuple[str, ...], set[str]]:
-    """Fields of telemetry and other tables that are meant."""
+    """The requested telemetry fields and other tables."""
     if not streams:
         return FIELDS, {SHAPES, EVENTS}
     by_path = {stream.path: [line.field for line in stream.lines] for stream in STREAMS}
@@ -127,13 +127,13 @@ def _selected(streams: Sequence[str]) -> tuple[tuple[str, ...], set[str]]:
             fields += by_path[name]
         else:
             raise errors.InputError(
-                f"--streams {name}: known are {', '.join([*by_path, SHAPES, EVENTS])} and telemetry fields"
+                f"--streams {name}: known: {', '.join([*by_path, SHAPES, EVENTS])} and telemetry fields"
             )
     return (tuple(dict.fromkeys(["mono_s", *fields])) if fields else ()), extras
 
 
 def _tables(tables: Iterator[pa.Table], path: Path, to: str) -> list[Path]:
-    """Write tables of one schema behind each other; nothing is written if there are none."""
+    """Write tables of one schema one after the other; without tables, write nothing."""
     writer = None
     try:
         for table in tables:

@@ -54,7 +54,7 @@ def show_command(run: Path, json: bool) -> int:
 
 
 def prune_command(logs: Path, keep_days: float | None, keep_gb: float | None, delete: bool, json: bool) -> int:
-    """What the retention rule gives up; deleted only with `delete`."""
+    """List the runs that the retention rule would delete; delete them only with `delete`."""
     gone = catalogue.to_prune(logs, datetime.now(UTC), keep_days, keep_gb)
     stay = catalogue.prune([run for run, _ in gone]) if delete else {}
     gone = [(run, why) for run, why in gone if run.folder not in stay]
@@ -103,7 +103,7 @@ def export_command(
 
 
 def _day(text: str | None) -> datetime | None:
-    """A date or a moment, in UTC."""
+    """A date or a time, in UTC."""
     if text is None:
         return None
     try:
@@ -114,7 +114,7 @@ def _day(text: str | None) -> datetime | None:
 
 
 def _console() -> Console:
-    """As wide as the terminal; into a file or pipe, as wide as the table."""
+    """A console as wide as the terminal or, for a file or pipe, the table."""
     return terminal.table_console(width=None if sys.stdout.isatty() else 170)
 
 

@@ -24,26 +24,26 @@ def span(seconds: float) -> str:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number to so many digits; a dash for none."""
+    """A number to the given digits; a dash for none."""
     if value is None or not math.isfinite(value):
         return "–"
     return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"
 
 
 def one_line(text: str) -> str:
-    """What people wrote, in one line: a space for line ends and whatever else cannot be printed."""
+    """A person's text in one line: spaces replace line ends and other unprintable characters."""
     return "".join(letter if letter.isprintable() else " " for letter in text)
 
 
 def moment_s(text: str, origin_utc: datetime) -> float:
-    """Seconds of the run for a moment as written: `03:12[:30]` (UTC), ISO 8601, or `+90s`, `+1h5m` from its start.
+    """Seconds of the run for a written time: `03:12[:30]` (UTC), ISO 8601, or `+90s`, `+1h5m` from its start.
 
-    A time of the day is the first such after the start of the run.
+    A time of day means its first occurrence after the start of the run.
 
     Raises InputError if it is none of these.
     """
     text = text.strip()
-    if re.fullmatch(r"\+ *0+[dhms]?", text):  # the start: no duration, but a moment
+    if re.fullmatch(r"\+ *0+[dhms]?", text):  # the start, which is not a valid duration
         return 0.0
     if text.startswith("+"):
         return parse_duration_s(text[1:])
@@ -52,7 +52,7 @@ def moment_s(text: str, origin_utc: datetime) -> float:
         if clock:
             day = origin_utc.replace(hour=int(clock[1]), minute=int(clock[2]), second=0, microsecond=0)
             moment = day + timedelta(seconds=float(clock[3] or 0))
-            # the minute in which the run began is meant, not the one of the next day
+            # this means the minute in which the run began, not the one of the next day
             if moment < origin_utc - timedelta(seconds=60):
                 moment += timedelta(days=1)
         else:
@@ -64,7 +64,7 @@ def moment_s(text: str, origin_utc: datetime) -> float:
 
 
 def part_s(run: Run, start: str | None, end: str | None) -> tuple[float, float]:
-    """The part of a run between two moments as written; None: unlimited. Raises InputError."""
+    """The part of a run between two written times; None: unlimited. Raises InputError."""
     start_s = -math.inf if start is None else moment_s(start, run.origin_utc)
     until_s = math.inf if end is None else moment_s(end, run.origin_utc)
     if not start_s < until_s:
@@ -73,12 +73,12 @@ def part_s(run: Run, start: str | None, end: str | None) -> tuple[float, float]:
 
 
 def end_s(run: Run) -> float:
-    """End of what a run has, in seconds from its start, rounded up to whole minutes; 0 if it has nothing."""
+    """End of a run's data, in seconds from its start, rounded up to whole minutes; 0 without data."""
     time_s = run.level(_LEVEL_S, names=("rows",))["time_s"]
     return float(time_s[-1]) + _LEVEL_S if time_s.size else 0.0
 
 
 def not_in(run: Run, asked: str) -> InputError:
-    """The error for a moment outside a run."""
+    """The error for a time outside a run."""
     went = f"{run.utc(0):%Y-%m-%d %H:%M} to {run.utc(end_s(run)):%Y-%m-%d %H:%M} UTC"
     return InputError(f"{asked}: not in the run, which lasted from {went}")

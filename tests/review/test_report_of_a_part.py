@@ -63,4 +63,4 @@ def test_a_part_is_set_against_the_same_part_or_says_that_it_is_not(
     table = json.loads((tmp_path / "o" / "report.json").read_text())["compared_with"]
     assert table["whole_run"] is whole
     page = (tmp_path / "o" / "report.html").read_text()
-    assert ("Part of this run, all of the other" in page) is (whole and bool(part))
+    assert ("Part of this run against the whole other run" in page) is (whole and bool(part))

@@ -236,7 +236,7 @@ def test_a_place_that_cannot_be_written_is_said_before_the_work(logs: Path, tmp_
     assert command(["review", str(folder), "--screenshot", str(tmp_path / "absent" / "p.png")]) == 4
     assert "cannot be written" in capsys.readouterr().err
     assert command(["review", str(folder), "--save", str(folder / "night-000.rrd")]) == 2
-    assert "among what the recorder wrote" in capsys.readouterr().err
+    assert "in a folder of the recorder" in capsys.readouterr().err
     with socket.create_server(("127.0.0.1", 0)) as taken:
         assert command(["review", str(folder), "--web", "--port", str(taken.getsockname()[1])]) == 4
     assert "choose another --port" in capsys.readouterr().err
@@ -251,7 +251,7 @@ def test_nothing_to_show_is_explained_and_beside_another_run_only_noted(
     assert command(["review", str(broken), "--save", str(target)]) == 2
     said = capsys.readouterr().err
     assert "1 line cannot be read" in said
-    assert said.splitlines()[-1].endswith("no telemetry can be read")
+    assert said.splitlines()[-1].endswith("no readable telemetry")
     assert command(["review", str(broken), str(whole), "--save", str(target)]) == 0
     assert "broken: not shown" in capsys.readouterr().err
     assert entities(target)["/overview/error"] > 0

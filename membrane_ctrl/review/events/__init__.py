@@ -1,1 +1,1 @@
-"""Events found in a run that nobody reported."""
+"""Detection of unreported events in a run."""

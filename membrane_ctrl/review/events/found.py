@@ -1,4 +1,4 @@
-"""Events detected in a run: what a person would circle on the timeline, with time, size and confidence."""
+"""Detects what a person would circle on a run's timeline, with time, size and confidence."""
 
 from collections.abc import Callable, Iterable
 
@@ -11,36 +11,36 @@ from membrane_ctrl.review.events import steps
 from membrane_ctrl.run_files import summary, tables
 from membrane_ctrl.run_files.shapes import Shapes
 
-# Columns of the 1 s level that are looked at.
+# Columns of the 1 s level used here.
 LEVEL_COLUMNS = (
     "state", "fault", "min_ambient_pressure_pa", "mean_ambient_pressure_pa", "mean_flow_um_per_s",
     "mean_feedforward_um_per_s", "min_displacement_um", "mean_displacement_um", "max_displacement_um",
     "max_displacement_quality", "max_lateness_ms", "mean_error_um", "mean_air_temperature_c", "mean_leak_um_per_s",
 )  # fmt: skip
 _WEATHER = {"mean_ambient_pressure_pa": "barometer lost", "mean_air_temperature_c": "thermometer lost"}
-# A door is 20 Pa, weather within two seconds a few Pa (gusty: 1.8 Pa, 1 sigma).
+# A door is 20 Pa; weather within two seconds is a few Pa (gusty: 1.8 Pa, 1 sigma).
 DOOR_LEAST_PA = 6.0
 DOOR_LEAST_SIGMAS = 5.5
-# Means of five minutes tell a tenth of the leak; what matters to the hold is a quarter.
+# Means of five minutes resolve a tenth of the leak; a quarter matters to the hold.
 LEAK_LEAST_SHARE = 0.2
 LEAK_LEAST_UM_PER_S = 0.03
 LEAK_LEAST_SIGMAS = 6.0
 LEAK_HALF_MIN = 5
-# The loop brings the mirror back after a door, and after a time without a reading.
+# Time in which the loop returns the mirror after a door or missing readings.
 DOOR_MOVES_S = 5
 LOST_MOVES_S = 3
 LATE_LEAST_MS = 5.0
 LATE_LEAST_RATIO = 8.0
 LATE_BURST_S = 10.0
 LATE_BURST_LEAST = 3
-# Half as much noise again, over ten minutes on both sides.
+# Noise 1.5 times higher, over ten minutes on both sides.
 SPREAD_LEAST = np.log(1.5)
 SPREAD_LEAST_SIGMAS = 6.0
 SPREAD_HALF_MIN = 10
 
 
 def find_events(level: steps.Level, shapes: Shapes, band_um: float) -> list[steps.FoundEvent]:
-    """All events of a run in the order of time.
+    """All events of a run, in order of time.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def find_events(level: steps.Level, shapes: Shapes, band_um: float) -> list[step
     shapes : Shapes
         May be empty.
     band_um : float
-        The run's `limits.band_um`: what leaves it for no other reason is an excursion.
+        The run's `limits.band_um`: leaving it without another cause is an excursion.
     """
     found: list[steps.FoundEvent] = []
     if level["time_s"].size:
@@ -66,7 +66,7 @@ def find_events(level: steps.Level, shapes: Shapes, band_um: float) -> list[step
 
 
 def pressure_steps(level: steps.Level) -> list[steps.FoundEvent]:
-    """Doors: the air pressure steps within some seconds."""
+    """Doors: steps of the air pressure within a few seconds."""
     values = level["mean_ambient_pressure_pa"]
     found = doors.door_steps(values, level["min_ambient_pressure_pa"], DOOR_LEAST_PA, DOOR_LEAST_SIGMAS)
     places = values.size * len(doors.LAGS)
@@ -77,7 +77,7 @@ def pressure_steps(level: steps.Level) -> list[steps.FoundEvent]:
 
 
 def leak_steps(level: steps.Level) -> list[steps.FoundEvent]:
-    """The flow that holds the mirror steps, and the weather (what is fed forward) does not explain it."""
+    """Steps of the holding flow that the weather (the feed-forward) does not explain."""
     minutes = tables.coarser_level(_held(level), 60.0)
     whole = minutes["rows"] > 0.5 * np.nanmedian(minutes["rows"])
     leak = minutes["mean_flow_um_per_s"] - np.nan_to_num(minutes["mean_feedforward_um_per_s"])
@@ -96,12 +96,12 @@ def leak_steps(level: steps.Level) -> list[steps.FoundEvent]:
 
 
 def laser_glitches(level: steps.Level) -> list[steps.FoundEvent]:
-    """Readings that jump and jump back, while neither the air pressure nor a loss of the laser explains it."""
+    """Readings that jump and jump back, not explained by air pressure or a lost laser."""
     lost = level["max_displacement_quality"] > 0
     barometer = level["mean_ambient_pressure_pa"]
     stepped = np.zeros(lost.size, dtype=bool)
     stepped[[round(step.time_s - level["time_s"][0]) for step in pressure_steps(level)]] = True
-    # a slow barometer tells of a door when it comes to it
+    # a slow barometer shows a door late
     slow_s = doors.update_s(barometer)
     stepped = steps.widened(stepped, DOOR_MOVES_S + (slow_s if slow_s > 1 else 0))
     usable = (level["state"] == State.HOLD) & ~stepped & ~steps.widened(lost, LOST_MOVES_S)
@@ -119,14 +119,14 @@ def laser_glitches(level: steps.Level) -> list[steps.FoundEvent]:
 
 
 def laser_losses(level: steps.Level) -> list[steps.FoundEvent]:
-    """The laser said that its reading is no good, or gave none."""
+    """The laser flagged its reading as bad, or gave none."""
     bad = (level["max_displacement_quality"] > 0) | ~np.isfinite(level["mean_displacement_um"])
     bad &= (level["state"] == State.HOLD) & (level["rows"] > 0)
     return _losses("laser lost", bad, level, 1)
 
 
 def weather_losses(level: steps.Level) -> list[steps.FoundEvent]:
-    """A barometer or thermometer that has given values gives none: what is fed forward then misses the weather."""
+    """A barometer or thermometer stops giving values: the feed-forward then misses the weather."""
     found: list[steps.FoundEvent] = []
     for name, kind in _WEATHER.items():
         there = np.isfinite(level[name])
@@ -141,7 +141,7 @@ def _losses(kind: str, lost: BoolArray, level: steps.Level, join: int) -> list[s
 
 
 def lateness_bursts(level: steps.Level) -> list[steps.FoundEvent]:
-    """Several late ticks close together; a single one is any machine's."""
+    """Several late ticks close together; single ones occur on any machine."""
     worst = level["max_lateness_ms"]
     usual = float(np.nanmedian(worst)) if np.isfinite(worst).any() else 0.0
     late = worst > max(LATE_LEAST_MS, LATE_LEAST_RATIO * usual)
@@ -178,14 +178,14 @@ def noise_changes(level: steps.Level) -> list[steps.FoundEvent]:
 
 
 def _held(level: steps.Level) -> steps.Level:
-    """The level with NaN where the mirror was not held, so that no step is seen where a hold begins."""
+    """The level with NaN where the mirror was not held, so that the start of a hold is not a step."""
     held = level["state"] == State.HOLD
     kept = {"time_s", "rows", "state"}
     return {name: values if name in kept else np.where(held, values, np.nan) for name, values in level.items()}
 
 
 def _even(level: steps.Level) -> steps.Level:
-    """The level with a row for every second; NaN where the run has none."""
+    """The level with a row for every second; NaN for missing ones."""
     second = np.rint(level["time_s"]).astype(np.int64)
     place = second - second[0]
     size = int(place[-1]) + 1

@@ -1,4 +1,4 @@
-"""Laser readings that jump and jump back: spikes within a second, and glitches that last up to a minute."""
+"""Laser readings that jump and jump back (spikes within a second, glitches of up to a minute), and doors."""
 
 from dataclasses import dataclass, replace
 
@@ -8,16 +8,16 @@ from scipy import ndimage
 from membrane_ctrl.model.arrays import BoolArray, Column, IntArray
 from membrane_ctrl.review.events.steps import FoundStep, differences, local_sigma
 
-# A laser's noise is 1 um; the film makes no spike of a single tick.
+# A laser's noise is 1 um; the film cannot make a spike of a single tick.
 GLITCH_LEAST_UM = 4.0
 GLITCH_LEAST_SIGMAS = 8.0
-# What lasts longer the loop has followed and the camera contradicted.
+# Longer ones the loop follows and the camera contradicts.
 GLITCH_LONGEST_S = 60
-# Longer than spikes, shorter than what weather and loop do.
+# Longer than spikes, shorter than effects of weather and loop.
 _BASE_S = 7
 # A glitch within a second leaves the mirror where it was.
 _MOVED_MOST = 0.3
-# Both edges are of one size, but for what the loop does within two seconds: up to 4 um/s.
+# Both edges have the same size, except for the loop's action within two seconds: up to 4 um/s.
 _EDGES_ALIKE = 0.5
 _EDGE_S = 2
 
@@ -33,16 +33,16 @@ class Glitch:
 
 
 def glitches(low_um: Column, mean_um: Column, high_um: Column, usable: BoolArray, calm: BoolArray) -> list[Glitch]:
-    """Spikes and longer glitches, one for each that happened.
+    """Spikes and longer glitches, each once.
 
     Parameters
     ----------
     low_um, mean_um, high_um : (n,) arrays
-        Least, mean and greatest reading of each second.
+        Minimum, mean and maximum reading of each second.
     usable : (n,) array
         Seconds in which the mirror is held, and neither a step of the air pressure moved it nor the laser was lost.
     calm : (n,) array
-        Those in which a barometer says so: without one, a door that is closed again looks like a long glitch.
+        Seconds that a barometer confirms as calm: without one, a door closed again looks like a long glitch.
     """
     if not np.isfinite(mean_um).any():
         return []
@@ -55,7 +55,7 @@ def glitches(low_um: Column, mean_um: Column, high_um: Column, usable: BoolArray
 
 
 def _farthest(low_um: Column, mean_um: Column, high_um: Column) -> Column:
-    """(n,) the reading of each second that is farthest from where the seconds around it are, against that."""
+    """(n,) per second, the largest deviation of a reading from the surrounding seconds."""
     rows = np.arange(mean_um.size)
     there = np.isfinite(mean_um)
     base = ndimage.median_filter(np.interp(rows, rows[there], mean_um[there]), _BASE_S, mode="nearest")
@@ -64,7 +64,7 @@ def _farthest(low_um: Column, mean_um: Column, high_um: Column) -> Column:
 
 
 def _sized(glitch: Glitch, size_um: Column) -> Glitch:
-    """Of a short one the size is that of its readings: the mean of a second tells of a part of it."""
+    """Take the size of a short glitch from its readings: the mean of a second dilutes it."""
     if glitch.last - glitch.first > _BASE_S // 2:
         return glitch
     part = size_um[glitch.first - 1 : glitch.last + 2]
@@ -72,7 +72,7 @@ def _sized(glitch: Glitch, size_um: Column) -> Glitch:
 
 
 def _spikes(size_um: Column, mean_um: Column, usable: BoolArray) -> list[Glitch]:
-    """A reading far from where the seconds around it are, while the mirror before and after is where it was."""
+    """A reading far from the surrounding seconds, with the mirror unmoved before and after."""
     far = np.abs(size_um)
     usual = float(np.nanmedian(far))
     sigma = local_sigma(far - usual)
@@ -98,14 +98,14 @@ def _edges(mean_um: Column, usable: BoolArray) -> list[Glitch]:
     found = []
     for row in best:
         score = float(size[row] / max(sigma[row], 1e-9))
-        # of the two seconds the one that changed more
+        # the one of the two seconds that changed more
         at = row + int(abs(mean_um[row + 1] - mean_um[row]) > abs(mean_um[row] - mean_um[row - 1]))
         found.append(Glitch(at, at, float(change[row]), score))
     return found
 
 
 def _pairs(edges: list[Glitch]) -> list[Glitch]:
-    """Edges with their edges back; others are no glitches."""
+    """Pairs of opposite edges; unpaired edges are not glitches."""
     found: list[Glitch] = []
     for place, edge in enumerate(edges):
         if found and edge.first <= found[-1].last:
@@ -117,7 +117,7 @@ def _pairs(edges: list[Glitch]) -> list[Glitch]:
 
 
 def _back(edge: Glitch, later: list[Glitch]) -> Glitch | None:
-    """The greatest edge back before the next one like this: a loop that follows at full speed makes lesser ones."""
+    """The largest opposite edge before the next equal one: a loop at full speed makes smaller ones."""
     best = None
     for other in later:
         if other.first > edge.first + GLITCH_LONGEST_S or _alike(edge.size_um, other.size_um):
@@ -131,25 +131,25 @@ def _alike(size_um: float, other_um: float) -> bool:
     return size_um * other_um > 0 and _EDGES_ALIKE <= abs(size_um / other_um) <= 1 / _EDGES_ALIKE
 
 
-# A door takes up to 5 s, and what begins within a second takes a window more; longer changes are weather.
+# A door takes up to 5 s, and a start within a second adds a window; longer changes are weather.
 LAGS = (1, 2, 3, 4, 6, 8)
 # Nine in ten differences are weather: a coarse barometer repeats its value in more than half of the windows.
 _USUAL_SHARE = 0.9
-# The difference of two rounded values has this standard deviation, in steps of the rounding.
+# Standard deviation of the difference of two rounded values, in rounding steps.
 _ROUNDING = 6**-0.5
-# A barometer that is slower than this tells of no door.
+# A slower barometer cannot detect doors.
 _SLOWEST_S = 120
-# A value every third second changes two seconds of three, if it comes in the middle of one; more is no period.
+# A value every third second changes two seconds of three if it comes within one; more is not a period.
 _ALWAYS_NEW = 0.85
-# Of the times between new values: one that is shorter by chance is no period.
+# Of the times between new values: an interval that is short by chance is not the period.
 _LOW_SHARE = 0.02
-# The best window is the one that stands out most from the weather; the step may go a second beyond it.
+# The best window stands out most from the weather; the step may extend a second beyond it.
 _BEYOND = 1
 
 
 @dataclass(frozen=True, slots=True)
 class _Candidates:
-    """Windows that differ enough: first row, length, difference and its sigmas."""
+    """Windows with a sufficient difference: first row, length, difference and its sigmas."""
 
     row: IntArray
     lag: IntArray
@@ -158,21 +158,21 @@ class _Candidates:
 
 
 def door_steps(mean_pa: Column, reading_pa: Column, least_pa: float, least_sigmas: float) -> list[FoundStep]:
-    """Steps of the air pressure, one for each that happened; of a door that is closed at once, both.
+    """Steps of the air pressure, each once; both of a door that is closed at once.
 
     Parameters
     ----------
     mean_pa : (n,) array
-        Means of a second each, NaN where there is none.
+        One-second means, NaN where missing.
     reading_pa : (n,) array
-        A single reading of each second, that shows in which steps the barometer counts.
+        One reading per second, which shows the barometer's resolution.
     least_sigmas : float
-        Against the differences nearby of windows as long.
+        Relative to nearby differences of equally long windows.
     """
     every = update_s(mean_pa)
     floor_pa = _ROUNDING * quantum(reading_pa)
     values = mean_pa[::every]
-    # two values at least: a step may fall on the one between
+    # at least two values: a step may fall on the one between
     lags = tuple(lag for lag in LAGS if lag <= 2 or lag * every <= LAGS[-1])
     found = _candidates(values, lags, floor_pa, least_pa, least_sigmas)
     chosen = sorted(_chosen(found, values.size), key=lambda place: int(found.row[place]))
@@ -187,21 +187,21 @@ def door_steps(mean_pa: Column, reading_pa: Column, least_pa: float, least_sigma
 
 
 def update_s(mean_pa: Column) -> int:
-    """Seconds for which the barometer repeats a value; 1 when most seconds have their own."""
+    """Seconds for which the barometer repeats a value; 1 if most seconds have a new one."""
     new = np.concatenate(([False], np.nan_to_num(np.diff(mean_pa)) != 0))
     if np.count_nonzero(new) > _ALWAYS_NEW * np.count_nonzero(np.isfinite(mean_pa)):
         return 1
-    # a value that comes within a second changes the mean of two
+    # a new value within a second changes two means
     begins = np.flatnonzero(new & ~np.concatenate(([False], new[:-1])))
     if begins.size < 2:
         return 1
     between_s = int(np.quantile(np.diff(begins), _LOW_SHARE, method="lower"))
-    # two seconds are those of a coarse barometer, too, that goes to and fro between two values
+    # two seconds also result from a coarse barometer that alternates between two values
     return between_s if 2 < between_s <= _SLOWEST_S else 1
 
 
 def quantum(reading_pa: Column) -> float:
-    """The step in which readings count, Pa: about the least change there is; next to 0 of a fine barometer."""
+    """The resolution of the readings, Pa: about the smallest change; almost 0 for a fine barometer."""
     change = np.abs(np.diff(reading_pa))
     change = change[np.isfinite(change) & (change > 0)]
     return float(np.quantile(change, _LOW_SHARE)) if change.size else 0.0
@@ -211,7 +211,7 @@ def _candidates(
     values: Column, lags: tuple[int, ...], floor_pa: float, least_pa: float, least_sigmas: float
 ) -> _Candidates:
     parts = []
-    for lag in lags:  # one after the other: of a month each is 20 MB
+    for lag in lags:  # one after the other: each takes 20 MB for a month
         change = values[lag:] - values[:-lag]
         sigma = np.fmax(local_sigma(change, _USUAL_SHARE), max(floor_pa, 1e-9))
         rows = np.flatnonzero((np.abs(change) >= least_pa) & (np.abs(change) >= least_sigmas * sigma))
@@ -221,7 +221,7 @@ def _candidates(
 
 
 def _chosen(found: _Candidates, rows: int) -> list[int]:
-    """The windows that stand out most; others nearby with the same sign are of the same step."""
+    """The windows that stand out most; others nearby with the same sign belong to the same step."""
     reach = LAGS[-1]
     taken = np.zeros((2, rows), dtype=bool)
     chosen = []
@@ -235,7 +235,7 @@ def _chosen(found: _Candidates, rows: int) -> list[int]:
 
 
 def _whole_size(values: Column, row: int, lag: int, size: float) -> float:
-    """The greatest change of windows that hold this one and reach a little beyond it."""
+    """The largest change of slightly wider windows that contain this one."""
     sign = np.sign(size)
     before = sign * values[max(0, row - _BEYOND) : row + 1]
     after = sign * values[row + lag : row + lag + _BEYOND + 1]

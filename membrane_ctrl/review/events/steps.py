@@ -1,4 +1,4 @@
-"""Steps in a noisy series: the mean behind a place against the mean before it."""
+"""Steps in a noisy series: the mean after a place compared with the mean before it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from membrane_ctrl.model.arrays import BoolArray, Column, FloatArray
 from membrane_ctrl.model.states import State
 from membrane_ctrl.run_files.shapes import Shapes
 
-# The noise is judged over stretches of this many values: weather changes over a night.
+# The noise is estimated over stretches of this many values: weather changes over a night.
 _STRETCH = 3600
 
 
 @dataclass(frozen=True, slots=True)
 class FoundStep:
-    """A step found."""
+    """A detected step."""
 
     row: int  # place in the series
     size: float  # after minus before, in the series' unit
@@ -25,27 +25,27 @@ class FoundStep:
 
 
 def steps(values: Column, half: int, skip: int, least: float, least_sigmas: float) -> list[FoundStep]:
-    """Steps of at least `least` and `least_sigmas`, one for each that happened.
+    """Steps of at least `least` and `least_sigmas`, each once.
 
     Parameters
     ----------
     values : (n,) array
-        Equally spaced; NaN where there is nothing, which no step crosses.
+        Equally spaced; NaN for gaps, which no step crosses.
     half : int
         Values averaged on each side.
     skip : int
-        Values left out between the sides: how long a step may take.
+        Values skipped between the sides: the longest duration of a step.
     least : float
-        Unit of the values.
+        In the unit of the values.
     least_sigmas : float
-        Against the robust spread of the differences nearby.
+        Relative to the robust spread of nearby differences.
     """
     difference = differences(values, half, skip)
     sigma = local_sigma(difference)
     size = np.nan_to_num(np.abs(difference))
     score = np.where(sigma > 0, size / np.maximum(sigma, 1e-300), np.inf)
     found = (size >= least) & (score >= least_sigmas)
-    # the greatest within reach stands for all of one step
+    # the largest within reach represents the whole step
     reach = 2 * half + skip
     peak = found & (size >= ndimage.maximum_filter1d(size, 2 * reach + 1, mode="constant"))
     rows = np.flatnonzero(peak)
@@ -55,7 +55,7 @@ def steps(values: Column, half: int, skip: int, least: float, least_sigmas: floa
 
 
 def differences(values: Column, half: int, skip: int) -> Column:
-    """(n,) mean of the `half` values behind a place minus that of those before it; NaN at the ends and at gaps."""
+    """(n,) mean of the `half` values after a place minus that before it; NaN at the ends and at gaps."""
     result = np.full(values.size, np.nan)
     span = 2 * half + skip
     if values.size < span:
@@ -71,12 +71,12 @@ def local_sigma(values: Column, share: float = 0.5) -> Column:
     """(n,) robust standard deviation of stretches of the series, constant within each, about 0.
 
     The quantile `share` of the absolute values is compared with that of a normal distribution. Half (the median) is
-    the most robust, and blind to values that mostly repeat.
+    the most robust, but fails for values that mostly repeat.
     """
     result = np.full(values.size, np.nan)
     sigmas = float(special.ndtri(0.5 * (1 + share)))
     for first in range(0, values.size, _STRETCH):
-        # the last stretch is a full one, too
+        # the last stretch is full-length too
         start = max(0, min(first, values.size - _STRETCH))
         part = values[start : first + _STRETCH]
         part = np.abs(part[np.isfinite(part)])
@@ -85,7 +85,7 @@ def local_sigma(values: Column, share: float = 0.5) -> Column:
 
 
 def confidence(sigmas: float, looked_at: int) -> float:
-    """1 minus the chance that noise alone (normal) makes a step this high anywhere in `looked_at` places."""
+    """1 minus the probability that (normal) noise alone makes a step this high anywhere in `looked_at` places."""
     return float(max(0.0, 1.0 - looked_at * special.erfc(sigmas / np.sqrt(2))))
 
 
@@ -94,32 +94,32 @@ Level = dict[str, FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class FoundEvent:
-    """An event that nobody reported."""
+    """A detected event."""
 
     # "pressure step", "leak step", "laser glitch", "laser lost", "barometer lost", "thermometer lost",
     # "lateness burst", "noise change", "shape jump" or "excursion"
     kind: str
-    time_s: float  # when it happened
+    time_s: float  # time of the event
     start_s: float  # time range of the run that shows it
     end_s: float
     size: float  # in `unit`
     unit: str
-    confidence: float  # 1 minus the chance that noise alone looks like this somewhere in the run
+    confidence: float  # 1 minus the probability that noise alone looks like this somewhere in the run
 
 
 def event_around(kind: str, table: Level, row: int, half_s: float, size: float, unit: str, sure: float) -> FoundEvent:
-    """An event with a range about it of some times what it was found in."""
+    """An event with a time range of several detection windows around it."""
     time_s = float(table["time_s"][row])
     return FoundEvent(kind, time_s, time_s - 30 * half_s**0.5, time_s + 30 * half_s**0.5, size, unit, sure)
 
 
 def widened(flags: BoolArray, rows: int) -> BoolArray:
-    """True rows and so many on each side of them."""
+    """True flags, widened by `rows` on each side."""
     return np.asarray(ndimage.maximum_filter1d(flags, 2 * rows + 1, mode="constant", cval=0), dtype=bool)
 
 
 def runs(flags: BoolArray, join: int) -> list[tuple[int, int]]:
-    """First and last row of each stretch of true rows; those `join` or fewer apart are one."""
+    """First and last row of each stretch of true rows, joining those at most `join` apart."""
     rows = np.flatnonzero(flags)
     if not rows.size:
         return []
@@ -127,18 +127,18 @@ def runs(flags: BoolArray, join: int) -> list[tuple[int, int]]:
     return [(int(part[0]), int(part[-1])) for part in parts]
 
 
-# After what explains it: what the loop needs to be back in the band (a leak of 1.2 um/s and 40 um: 32 s).
+# After the cause: the time for the loop to return to the band (a leak of 1.2 um/s and 40 um: 32 s).
 BACK_S = 30
-# Means of so many seconds tell a setpoint on its way from noise.
+# Means of this many seconds distinguish a ramping setpoint from noise.
 RAMP_HALF_S = 5
-# An event timed to a second may be found some after its effect begins.
+# An event timed to a second may be detected some seconds after its effect begins.
 TIMED_S = 5.0
-# These are timed to minutes; what they explain is within their range.
+# These are timed to minutes; they explain excursions within their range.
 _TIMED_TO_MINUTES = ("leak step", "noise change")
 
 
 def excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -> list[FoundEvent]:
-    """The 1 s mean of the error leaves the band, and no fault, pause, ramp or event known explains it."""
+    """The 1 s mean of the error leaves the band without a fault, pause, ramp or event that explains it."""
     time_s, error_um = level["time_s"], level["mean_error_um"]
     out = (np.abs(error_um) > band_um) & (level["state"] == State.HOLD)
     # a loop that waits has no estimate of the leak; in runs of earlier versions it repeats its error
@@ -161,20 +161,20 @@ def excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -> lis
 JUMP_LEAST_UM = 0.3
 JUMP_LEAST_SIGMAS = 8.0
 JUMP_HALF_CYCLES = 5
-# From cycle to cycle; a setpoint's ramp is faster, and frames of a mirror that moves do not fit each other.
+# Between cycles; a setpoint's ramp is faster, and frames of a moving mirror are inconsistent.
 JUMP_STILL_UM = 2.0
 # Standard deviation over median absolute deviation, of normal noise.
 _SIGMA_OVER_MAD = 1.4826
 
 
 def shape_jumps(shapes: Shapes, held: BoolArray) -> list[FoundEvent]:
-    """The figure beside its sag (terms 5 to 11, without what a deeper bowl has of them) steps between cycles."""
+    """Steps of the figure between cycles (terms 5 to 11, less the share of a deeper bowl)."""
     moved_um = np.abs(np.diff(shapes.displacement_um, prepend=np.nan, append=np.nan))
     still = ~(np.fmax(moved_um[:-1], moved_um[1:]) > JUMP_STILL_UM)
     good = held & still & (shapes.verdict != "rejected")
     if np.count_nonzero(good) < 4 * JUMP_HALF_CYCLES:
         return []
-    # of a month all 36 terms are 190 MB
+    # all 36 terms of a month take 190 MB
     terms = shapes.coeffs_um[good, 4:11] - np.outer(shapes.sag_um[good], zernike_projection()[4:11])
     change = np.stack([differences(term, JUMP_HALF_CYCLES, 0) for term in terms.T])
     size = np.sqrt((change**2).sum(axis=0))

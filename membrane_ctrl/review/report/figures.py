@@ -44,7 +44,7 @@ _STYLE: dict[Any, Any] = {
     "figure.facecolor": "none",
     "axes.facecolor": "white",
     "path.simplify_threshold": 0.3,
-    # the same report twice is the same text
+    # makes reports reproducible
     "svg.hashsalt": "membrane",
     "svg.fonttype": "none",
 }
@@ -61,7 +61,7 @@ def picture(rows: int = 1, columns: int = 1, height_in: float = 3.0, **subplots:
 def svg(figure: Figure) -> str:
     """The figure as an `<svg>` element that scales with the page."""
     with mpl.rc_context(_STYLE), warnings.catch_warnings():
-        # letters are text in the page, drawn with the reader's fonts
+        # text stays text in the page, in the reader's fonts
         warnings.filterwarnings("ignore", r"Glyph \d+ .* missing from font")
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None})
@@ -70,7 +70,7 @@ def svg(figure: Figure) -> str:
     return re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1))
 
 
-# A cycle or a second that is left out now and then is no gap.
+# An occasional missing cycle or second is not a gap.
 _STEPS = 3.0
 _LEAST_S = 5.0
 
@@ -94,13 +94,13 @@ _STATE_COLOURS = {
     State.STANDBY: "#c9ccd1", State.CHECK: "#9ecae1", State.INFLATE: "#56b4e9", State.SETTLE: ORANGE,
     State.HOLD: GREEN, State.MANUAL: VIOLET, State.TUNE: "#f0e442", State.LOWER: ORANGE, State.FAULT: RED,
 }  # fmt: skip
-# Of a mark's text: more would not fit beside its line, and the timeline has all of it.
+# Of a mark's text: more would not fit beside its line; the timeline has the full text.
 _LETTERS_MOST = 40
 _FOUND_COLOURS = {"pressure step": VIOLET, "leak step": ORANGE, "noise change": ORANGE, "shape jump": BLUE}
 
 
 def hours_or_less(time_s: Column | float, span_s: float) -> tuple[Any, str]:
-    """Times in the unit that suits the span, and its name."""
+    """Times in a unit that suits the span, and the unit."""
     for unit_s, least, name in ((86400.0, 3, "d"), (3600.0, 3, "h"), (60.0, 5, "min")):
         if span_s >= least * unit_s:
             return np.asarray(time_s) / unit_s, name
@@ -108,7 +108,7 @@ def hours_or_less(time_s: Column | float, span_s: float) -> tuple[Any, str]:
 
 
 def overview(analysis: Analysis) -> str:
-    """Error with its envelope, the band, states, what was found and marked."""
+    """Error with its envelope, the band, states, detected events and marks."""
     level, band_um = broken_at_gaps(analysis.level), analysis.run.config.limits.band_um
     span_s = analysis.ticks.end_s - analysis.ticks.start_s
     time, unit = hours_or_less(level["time_s"], span_s)
@@ -248,7 +248,7 @@ def stability(shape: shape_review.ShapeReview) -> str:
             sd.annotate(name, (x, y), color="white", fontsize=8, xytext=(4, 3), textcoords="offset points")
         loops.plot(time, lines["laser"], color=GREY, lw=0.9, label="laser (in the loop)")
         loops.plot(time, lines["sag"], color=BLUE, lw=0.9, label="sag by the camera")
-        loops.set(title="In the loop and out of it: change of the centre, µm", xlabel=unit)
+        loops.set(title="Change of the centre by laser and by camera, µm", xlabel=unit)
         loops.legend(loc="upper right", ncols=2)
         _drift(drift, shape)
         return svg(figure)
@@ -261,13 +261,13 @@ def _drift(plot: Any, shape: shape_review.ShapeReview) -> None:
     colours = [RED if term.significant else GREY for term in shape.drift_um_per_hour]
     if np.isfinite(rate).any():
         plot.bar(noll, rate, yerr=reach, color=colours, error_kw={"lw": 0.7, "ecolor": "#555"})
-        # one term that wandered, and whose interval says nothing, would hide all the others
+        # a wandering term with a meaningless interval would hide all the others
         plot.set_yscale("symlog", linthresh=4 * max(float(np.nanmedian(reach)), 1e-6), linscale=2)
     plot.set(title="Drift of the terms, µm/h (95 %)", xlabel="Noll index")
 
 
 def pairs(shape: shape_review.ShapeReview) -> str:
-    """Height change of a pair of cycles 1 and 10 minutes apart, and its uncertainty."""
+    """Height change of cycles 1 and 10 minutes apart, and its uncertainty."""
     with picture(len(shape.pairs), 2, 3.4 * len(shape.pairs), squeeze=False) as (figure, plots):
         for (change, sigma), pair in zip(plots, shape.pairs, strict=True):
             most = float(np.nanmax(np.abs(pair.change_um))) or 1e-3

@@ -1,4 +1,4 @@
-"""The report for people, one HTML file with everything in it; and the command `report`, which writes it."""
+"""The report for people, one self-contained HTML file, and the command `report`, which writes it."""
 
 import html
 import shlex
@@ -50,14 +50,14 @@ footer{margin-top:30px;color:#889;font-size:12px}
 """
 
 
-# A month has thousands of lines; the file beside the report has all.
+# A month has thousands of lines; the JSON report has them all.
 _LINES_MOST = 200
 READING, TRUE = "reading (in the loop)", "true centre (twin)"
 _HIDDEN = {"time_utc", "mono_s", "kind", "exit_code", "made_utc"}
 
 
 def render(analysis: Analysis, other: Analysis | None = None, differences: Sequence[compare.Difference] = ()) -> str:
-    """HTML of a report, if wanted with another run and the differences from it (`compare.compare`)."""
+    """HTML of a report, optionally with another run and the differences from it (`compare.compare`)."""
     run = analysis.run
     word, sentence = verdict(analysis)
     parts = [
@@ -68,7 +68,7 @@ def render(analysis: Analysis, other: Analysis | None = None, differences: Seque
         _anomalies(analysis),
         f"<figure>{figures.overview(analysis)}</figure>",
         _section("Detected events", _found(analysis)),
-        _section("How well it was held", _windows(analysis) + _details(analysis)),
+        _section("Hold quality", _windows(analysis) + _details(analysis)),
         f"<figure>{figures.distributions(analysis)}</figure>",
         _section("Pump, leak, feed-forward, ticks", _pump(analysis)),
         f"<figure>{figures.surroundings(analysis)}</figure>",
@@ -150,7 +150,7 @@ def _bands(series: ErrorSeries) -> str:
     if not there:
         return "too short to say"
     said = [f"{number(b.from_hz)}–{number(b.high_hz)} Hz: {number(b.rms_um)} µm" for b in there]
-    return f"{'; '.join(said)}; not seen: what is slower than {span(spectra.unseen_s(there))}"
+    return f"{'; '.join(said)}; not resolved: motion slower than {span(spectra.unseen_s(there))}"
 
 
 def _pump(analysis: Analysis) -> str:
@@ -163,7 +163,7 @@ def _pump(analysis: Analysis) -> str:
         ("wear", f"{number(pump.starts_per_hour)} starts and {number(pump.travel_per_hour)} full strokes an hour"),
         ("at a limit", f"{100 * pump.saturated_share:.2f} % of ticks"),
         ("leak", f"{number(median)} µm/s (from {number(least)} to {number(most)})"),
-        ("lateness", f"p50 {number(late.quantile(0.5))}, p99 {number(late.quantile(0.99))}, greatest "
+        ("lateness", f"p50 {number(late.quantile(0.5))}, p99 {number(late.quantile(0.99))}, maximum "
                      f"{number(late.largest)} ms; {ticks.missed_ticks} ticks missed"),
     ]  # fmt: skip
     if benefit is not None:
@@ -202,7 +202,7 @@ def _compared(analysis: Analysis, other: Analysis, differences: Sequence[compare
     ]
     _, sentence = verdict(other)
     if analysis.is_part and not other.is_part:
-        sentence = f"Part of this run, all of the other. {sentence}"
+        sentence = f"Part of this run against the whole other run. {sentence}"
     table = _table(["", "this run", "other run", "", "difference", "p", ""], rows)
     return f"<p>{_text(sentence)}</p>{table}"
 
@@ -253,7 +253,7 @@ def _text(text: str) -> str:
 
 # `membrane-ctrl report RUN`: the page, the JSON beside it, and the verdict on the terminal.
 
-# A terminal shows no more at once; the page has all of them.
+# A terminal shows no more at once; the page has them all.
 _SHOWN_MOST = 20
 
 
@@ -274,7 +274,7 @@ def report_command(
             "report": report_table(other),
             "differences": [asdict(difference) | {"said": difference.said} for difference in differences],
         }
-    folder = out.resolve() if out else opened.folder / "report"  # a link that a person names is meant
+    folder = out.resolve() if out else opened.folder / "report"  # follow a link that the user names
     text = plain_json.dumps(table, indent=1)
     page = render(analysis, other, differences)
     with errors.writing(folder, errors.DeviceError, "; choose another folder with --out"):
@@ -289,7 +289,7 @@ def report_command(
 
 
 def _other(run: Run, start: str | None, end: str | None) -> Analysis:
-    """The run to compare with: its same part if that counts from the start, else all, for times of day differ."""
+    """The run to compare with: the same part if counted from the start, else all, as times of day differ."""
     from_start = all(text is None or text.strip().startswith("+") for text in (start, end))
     return analyse(run, *part_s(run, start, end)) if from_start else analyse(run)
 

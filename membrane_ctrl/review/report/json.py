@@ -13,16 +13,16 @@ from membrane_ctrl.run_files.run_folder import LoggedEvent, logged
 
 Word = Literal["good", "look", "bad"]
 
-# Anomalies that end the claim that the mirror was held.
+# Anomalies that contradict the claim that the mirror was held.
 _GRAVE = {"fault", "band left", "never settled"}
-# Single readings that fail to come are any laser's.
+# Any laser misses single readings.
 _UNREAD_LEAST_S = 1.0
-# Every hold begins with some seconds that do not count; more is a setpoint on its way.
+# Every hold starts with some seconds that do not count; more means a ramping setpoint.
 _MOVING_LEAST_S = 60.0
 
 
 def verdict(analysis: Analysis) -> tuple[Word, str]:
-    """One word for a colour, and the sentence."""
+    """A word that selects the colour, and the verdict as a sentence."""
     run, ticks = analysis.run, analysis.ticks
     series = analysis.true or analysis.reading
     whole = span(ticks.end_s - ticks.start_s)
@@ -67,7 +67,7 @@ _TOLD = (
 
 
 def report_table(analysis: Analysis) -> dict[str, Any]:
-    """All figures of the report (`membrane-report/1`); NaN where there is nothing to say."""
+    """All figures of the report (`membrane-report/1`); NaN where there is none."""
     run, ticks = analysis.run, analysis.ticks
     word, sentence = verdict(analysis)
     late = ticks.lateness_ms

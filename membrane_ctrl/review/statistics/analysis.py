@@ -21,15 +21,15 @@ from membrane_ctrl.run_files import summary
 from membrane_ctrl.run_files.run import Block, Run
 
 WINDOWS_S = (1, 4, 60)
-# A level with about this many rows makes a picture.
+# Pictures use a level with about this many rows.
 _PICTURE_ROWS = 9000
-# The slope is fitted to minutes, of a short run to seconds.
+# The slope is fitted to minutes or, in a short run, to seconds.
 _SLOPE_MINUTES_FROM_S = 3600.0
-# A missed tick or a glitch is bridged by a straight line, or no segment of a spectrum would be whole.
+# A straight line bridges a missed tick or a glitch; otherwise no segment of a spectrum would be complete.
 FILLED_S = 0.5
-# Of the seconds, whose spectrum is used below 0.1 Hz at most: what a laser without light for a moment leaves.
+# Of the 1 s means, whose spectrum is used below 0.1 Hz: gaps left by a laser without light for a moment.
 _FILLED_SECONDS = 5
-# A day has slower and larger motions than any hold; longer means say no more than the slope.
+# A day has slower and larger motions than any hold; longer means add nothing to the slope.
 _ALLAN_LONGEST_S = 1e5
 
 
@@ -41,7 +41,7 @@ class ErrorSeries:
     seconds_um: Column  # (2, n): times and means of the 1 s windows
     allan: spectra.Allan
     spectrum: spectra.Spectrum  # of the ticks
-    # Of the 1 s means, in segments of half the hold: for what is slower than the segments of `spectrum`
+    # Of the 1 s means, in segments of half the hold: for motion slower than the segments of `spectrum`
     slow: spectra.Spectrum
     drift: FittedSlope  # um per hour
 
@@ -57,7 +57,7 @@ class Benefit:
 
 @dataclass(frozen=True, slots=True)
 class Anomaly:
-    """One thing: its name, and what was seen."""
+    """One anomaly: its name and the observation."""
 
     name: str
     seen: str
@@ -65,22 +65,22 @@ class Anomaly:
 
 @dataclass(frozen=True, slots=True)
 class Analysis:
-    """What is known of a run.
+    """Results of the analysis of a run.
 
     Attributes
     ----------
     run : Run
     part_s : tuple
-        Part of the run that was asked for.
+        Requested part of the run.
     ticks : HoldPass
     level : dict
         Overview for the pictures; its windows are `level_s` long.
     level_s : float
     reading, true : ErrorSeries or None
-        None when there is nothing settled (or, of `true`, on a real bench).
+        None if nothing is settled (or, for `true`, on a real bench).
     benefit : Benefit or None
     leak_um_per_s : tuple
-        Median, least and greatest minute of the leak estimate while held.
+        Median, minimum and maximum of the leak estimate's minutes while held.
     found : tuple of FoundEvent
     shape : ShapeReview or None
     anomalies : tuple of Anomaly
@@ -101,7 +101,7 @@ class Analysis:
 
     @property
     def is_part(self) -> bool:
-        """Whether a part of the run was asked for."""
+        """Whether only a part of the run was requested."""
         return any(map(math.isfinite, self.part_s))
 
 
@@ -117,7 +117,7 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
     Raises
     ------
     InputError
-        If there is no tick in it.
+        If the part has no ticks.
     """
     seconds = run.level(1.0, start_s, end_s, LEVEL_COLUMNS)
     if not seconds["time_s"].size:
@@ -125,7 +125,7 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
         raise errors.InputError(f"{run.folder}: nothing to report: no telemetry in this part of the run{known}")
     span_s = (float(seconds["time_s"][0]), float(seconds["time_s"][-1]) + 1.0)
     found, shape = _found_and_shape(run, seconds, start_s, end_s)
-    del seconds  # of a month a quarter of a GB, and what comes needs more
+    del seconds  # a month takes a quarter of a GB, and the next steps need more
     ticks = hold_pass(run, span_s, (start_s, end_s))
     level_s = next((w for w in (1.0, 10.0) if (span_s[1] - span_s[0]) / w <= _PICTURE_ROWS), 60.0)
     level = run.level(level_s, start_s, end_s)
@@ -142,7 +142,7 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
 def _found_and_shape(
     run: Run, seconds: Block, start_s: float, end_s: float
 ) -> tuple[tuple[FoundEvent, ...], shape_review.ShapeReview | None]:
-    """What needs the cycles; they are let go again before the ticks are read."""
+    """Run the analyses that need the cycles, which are released before the ticks are read."""
     shapes = run.shapes()
     shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
     mirror = run.config.optics.mirror
@@ -174,7 +174,7 @@ def _series(run: Run, ticks: HoldPass, which: int) -> ErrorSeries | None:
 
 
 def slow_spectrum(time_s: Column, means: Column) -> spectra.Spectrum:
-    """Spectrum of 1 s means in segments half as long as the longest stretch without a gap: three of a whole hold.
+    """Spectrum of 1 s means in segments half as long as the longest gapless stretch: three in a whole hold.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def fill_short_gaps(values: Singles, most: int) -> Singles:
 
 
 def _first(grid: Singles) -> int:
-    """Places in front of the first value."""
+    """Places before the first value."""
     return int(np.argmax(np.isfinite(grid)))
 
 
@@ -227,24 +227,24 @@ def _leak(level: Block) -> tuple[float, float, float]:
 
 
 def _tracking(level: Block) -> float:
-    """Share of the time held in which the shape loop moved the setpoint."""
+    """Share of the held time in which the shape loop moved the setpoint."""
     state = level["shape_state"][level["state"] == states.State.HOLD]
     state = state[np.isfinite(state)]
     return float((state == states.ShapeState.TRACKING).mean()) if state.size else math.nan
 
 
-# What is not as it should be, by name and with the figure that says so.
+# Anomalies, by name and with the figure that shows them.
 
-# 95 % in band is what noise alone leaves of single ticks; of seconds a hold keeps all.
+# Noise alone leaves 95 % of single ticks in the band; a hold keeps all of its seconds there.
 _IN_BAND_LEAST = 0.999
 _BIAS_MOST_UM = 0.1
 _LATE_P99_MOST_MS = 5.0
 _REJECTED_MOST = 0.02
 _THIN = (
     "without every tick: means are those of the 1 s level; single readings, their histogram, spectrum, Allan "
-    "deviation and pump are those of the ticks that are there, and what the feed-forward was worth is not known"
+    "deviation and pump are those of the existing ticks, and the benefit of the feed-forward is unknown"
 )
-# Every hold waits some seconds for its first cycles.
+# Every hold waits a few seconds for its first cycles.
 _TRACKING_LEAST = 0.8
 _UNTRACKED_MOST_S = 60.0
 # Below this a one-sided pump loses the band (docs/physics.md).
@@ -264,7 +264,7 @@ def _anomalies(
     found: Sequence[FoundEvent],
     shape: shape_review.ShapeReview | None,
 ) -> tuple[Anomaly, ...]:
-    """All of a part of a run, the gravest first."""
+    """All anomalies of a part of a run, the gravest first."""
     odd = [Anomaly("incomplete recording", note) for note in run.notes]
     names = Counter(each.event.name for each in run.log_between(*part_s) if isinstance(each.event, events.Fault))
     odd += [Anomaly("fault", f"{name}, {count} time{'s' * (count > 1)}") for name, count in names.most_common()]

@@ -25,9 +25,9 @@ class Difference:
     unit: str
     ours: float
     theirs: float
-    # Chance of a difference as large between runs that are alike; NaN where there is no test
+    # Probability of a difference this large between equal runs; NaN without a test
     p_value: float = math.nan
-    note: str = ""  # why there is none, or what the test does not know; empty: nothing to say
+    note: str = ""  # why there is no test, or a caveat of the test; may be empty
 
     @property
     def said(self) -> str:
@@ -79,7 +79,7 @@ def _series(name: str, a: ErrorSeries, b: ErrorSeries, offset_um: float, tracks:
 def _of_mean(offset_um: float, tracks: bool) -> str:
     if offset_um > 0:
         return f"with ±{offset_um:.2g} µm for the references of the shape loops"
-    return f"{_STRETCHES}; nor does it know the reference of the shape loop" if tracks else ""
+    return f"{_STRETCHES}, and ignores the reference of the shape loop" if tracks else ""
 
 
 def _loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
@@ -114,7 +114,7 @@ def _figure(ours: Analysis, theirs: Analysis) -> list[Difference]:
                  cycle_s)
         for name, height in ours.shape.points_um.items()
     ]  # fmt: skip
-    # the least of three tests, times three: Bonferroni's
+    # the smallest p of three tests, times three (Bonferroni)
     least = float(np.minimum(1.0, len(points) * np.min(points)))
     parting = ours.shape.disagreement, theirs.shape.disagreement
     return [
@@ -125,7 +125,7 @@ def _figure(ours: Analysis, theirs: Analysis) -> list[Difference]:
 
 
 def _tested(name: str, unit: str, ours: float, theirs: float, p_value: float, note: str = "") -> Difference:
-    """A row that says so where it has no test."""
+    """A row, which states if it has no test."""
     if math.isnan(p_value) and not note.startswith("no test"):
         note = _SHORT
     return Difference(name, unit, ours, theirs, p_value, note)
@@ -143,10 +143,10 @@ def _tracks(analysis: Analysis) -> bool:
 
 
 def _reference_um(analysis: Analysis) -> float:
-    """Standard error (um) of the reference of the shape loop, an offset of the true centre for all of the run.
+    """Standard error (um) of the shape loop's reference, an offset of the true centre for the whole run.
 
-    From the scatter of sag minus laser from cycle to cycle, as the data have it; 0 when the loop does not track or
-    too few cycles were measured.
+    From the observed scatter of sag minus laser between cycles; 0 if the loop does not track or there are
+    too few cycles.
     """
     shape = analysis.shape
     if shape is None or shape.time_s.size < 2 * SHAPES or not _tracks(analysis):

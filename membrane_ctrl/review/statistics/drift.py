@@ -1,4 +1,4 @@
-"""A straight line through correlated samples, with a confidence interval that knows they are correlated."""
+"""A straight line through correlated samples, with a confidence interval that allows for the correlation."""
 
 import math
 from dataclasses import dataclass
@@ -9,10 +9,10 @@ from scipy import special, stats
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.review.statistics.windows import group_starts
 
-# Rounds of g and of the variance that the line took up: the coverage of short records is right after three, and
-# more leave the shortest no degree of freedom, whose interval then says nothing.
+# Iterations of g and of the variance absorbed by the line: three give short records the right coverage; more leave
+# the shortest records no degree of freedom, and so a meaningless interval.
 _BIAS_ROUNDS = 3
-# Of the variance; with more the correlation would be made of the correction.
+# Of the variance; beyond, the correction itself would dominate the correlation.
 _TAKEN_MOST = 0.5
 
 
@@ -23,7 +23,7 @@ class FittedSlope:
     per_hour: float  # unit of the values per hour
     low: float  # 95 % confidence interval
     high: float
-    effective_samples: float  # independent samples that would say as much; NaN when there are too few values
+    effective_samples: float  # equivalent number of independent samples; NaN with too few values
 
     @property
     def significant(self) -> bool:
@@ -44,7 +44,7 @@ def slope(time_s: Column, values: Column) -> FittedSlope:
     Parameters
     ----------
     time_s, values : (n,) arrays
-        Equally spaced but for gaps; values that are not finite are left out.
+        Equally spaced except for gaps; values that are not finite are ignored.
     """
     there = np.isfinite(values)
     hours, values = time_s[there] / 3600.0, values[there]
@@ -86,25 +86,25 @@ def _times(residual: Column) -> tuple[float, float]:
     return factor, of_square
 
 
-# Whether two series differ, asked of blocks of time that count as independent.
-# Five minutes forget the weather (30 s) and the air (300 s) well enough to count as independent; a short run is cut
-# into eight, which makes its test a rough one.
+# Tests whether two series differ, using blocks of time that count as independent.
+# After five minutes the effects of weather (30 s) and air (300 s) have decayed enough for independence; a short run
+# is cut into eight blocks, which makes its test a rough one.
 _BLOCK_S = 300.0
 _LEAST_BLOCKS = 8
-# A variance needs this many values of its block.
+# Least number of values in a block for a variance.
 _LEAST_VALUES = 5
-# Fewer blocks have no variance that a test could use.
+# Fewer blocks have no usable variance.
 _LEAST_TESTED = 3
 
 
 def block_s(a_s: Column, b_s: Column, window_s: float) -> float:
-    """Length of the blocks of two series at these times, the same for both: a longer block holds slower motion."""
+    """Common block length of two series at these times: unequal blocks would include different motion."""
     spans_s = [float(np.ptp(time_s)) if time_s.size else 0.0 for time_s in (a_s, b_s)]
     return max(min(_BLOCK_S, min(spans_s) / _LEAST_BLOCKS), _LEAST_VALUES * window_s)
 
 
 def blocks(time_s: Column, values: Column, length_s: float) -> tuple[Column, Column]:
-    """Mean and log variance of each block; the logarithm without its bias, which depends on the number of values."""
+    """Mean and log variance of each block; the logarithm is corrected for its bias from the number of values."""
     there = np.isfinite(values)
     time_s, values = time_s[there], values[there]
     if values.size < _LEAST_TESTED or length_s <= 0:
@@ -172,7 +172,7 @@ def mean_p(a: Column, b: Column, window_s: float = 1.0, offset: float = 0.0) -> 
     Parameters
     ----------
     window_s : float
-        Of a value.
+        Length of a value's window.
     offset : float
         Standard deviation that the difference has beside that between blocks: what all blocks of a run share.
     """

@@ -1,4 +1,4 @@
-"""One pass over every tick of a run: everything of the report that needs single ticks, in memory for two series."""
+"""One pass over every tick of a run, for all parts of the report that need single ticks, in bounded memory."""
 
 import math
 from collections.abc import Mapping
@@ -13,32 +13,32 @@ from membrane_ctrl.review.statistics import windows
 from membrane_ctrl.run_files import summary
 from membrane_ctrl.run_files.run import Block, Run
 
-# Seconds of which the ticks are not all there (segments while nothing happens): their means are in the 1 s level.
+# Seconds with incomplete ticks (segments in quiet times), whose means come from the 1 s level.
 
 LEVEL_COLUMNS = ("state", "mean_displacement_um", "mean_true_error_um")
 
 
 class ThinSeconds:
-    """Finds them, over blocks in order of time."""
+    """Finds thin seconds, over blocks in order of time."""
 
     def __init__(self, rate_hz: float) -> None:
         self._least = summary.least_ticks(1.0, rate_hz)
         self._parts: list[tuple[windows.Seconds, Column]] = []
 
     def add(self, time_s: Column, setpoint_um: Column, settled: BoolArray) -> None:
-        """Take in (n,) times, setpoints and whether each tick is settled."""
+        """Add (n,) times, setpoints and whether each tick is settled."""
         if not time_s.size:
             return
         second = np.floor(time_s + 1e-9).astype(np.int32)
         starts = windows.group_starts(second)
         rows = np.stack((np.ones(time_s.size), settled.astype(np.float64), setpoint_um))
         sums = np.add.reduceat(rows, starts, axis=1)
-        # a second that two blocks share is thin in both
+        # a second shared by two blocks is thin in both
         thin = (sums[0] < self._least) & (sums[1] > 0)
         self._parts.append((second[starts][thin], sums[:, thin]))
 
     def result(self) -> tuple[windows.Seconds, Column]:
-        """(k,) seconds whose few ticks are all settled, (k,) their mean setpoint in um."""
+        """(k,) thin seconds with all ticks settled, (k,) their mean setpoint in um."""
         if not self._parts:
             return np.empty(0, dtype=np.int32), np.empty(0)
         second = np.concatenate([part[0] for part in self._parts])
@@ -52,7 +52,7 @@ class ThinSeconds:
 
 @dataclass(frozen=True, slots=True)
 class LevelMeans:
-    """Means of (k,) thin seconds by the level: with the ticks they had, errors in um, NaN where there is none."""
+    """Means of (k,) thin seconds from the level: their ticks, errors in um, NaN where missing."""
 
     second: windows.Seconds
     ticks: Column
@@ -61,7 +61,7 @@ class LevelMeans:
 
 
 def level_means(run: Run, second: windows.Seconds, setpoint_um: Column) -> LevelMeans:
-    """What the 1 s level knows of thin seconds, as far as its own are whole."""
+    """Means of thin seconds from the 1 s level, as far as the level's are complete."""
     level: Block = run.level(1.0, float(second[0]), float(second[-1]) + 1.0, LEVEL_COLUMNS)
     _, place, row = np.intersect1d(second, np.rint(level["time_s"]).astype(np.int32), return_indices=True)
     whole = (level["rows"][row] >= summary.least_ticks(1.0, run.config.loop.rate_hz)) & (
@@ -73,9 +73,9 @@ def level_means(run: Run, second: windows.Seconds, setpoint_um: Column) -> Level
 
 
 def filled(seconds: windows.SecondsOf, means: LevelMeans, error_um: Column) -> windows.SecondsOf:
-    """Sums over seconds, with those of the level in the place of the thin ones.
+    """Sums over seconds, replacing thin ones by the level's.
 
-    What the feed-forward kept away (the second row) needs every tick before it: it is nowhere known then.
+    The error prevented by the feed-forward (the second row) needs every earlier tick: it is then unknown.
     """
     there = np.isfinite(error_um)
     second, counts, sums = seconds
@@ -91,34 +91,34 @@ NAMES = (
     *summary.FIELDS, "truth_displacement_um", "feedforward_um_per_s", "flow_wanted_um_per_s",
     "pump_fraction", "lateness_ms", "missed_ticks",
 )  # fmt: skip
-# Which error: a tick without a reading has a true centre all the same, so each has sums of its own,
+# Kind of error: a tick without a reading still has a true centre, so each kind has its own sums,
 READING, TRUE = range(2)
 # and these are their rows.
 ERROR, KEPT_AWAY = range(2)
-# The histogram reaches this many bands to each side, in bins of a fiftieth of a band.
+# The histogram extends this many bands to each side, in bins of a fiftieth of a band.
 _HISTOGRAM_BANDS = 5
 _HISTOGRAM_BINS = 500
-# A second here and there has lost ticks, beside a damaged batch or by a slow machine: it is left out, the rest kept.
+# A few seconds lose ticks to a damaged batch or a slow machine: those are omitted, the rest kept.
 _THIN_FROM = 0.05
-# A flow wanted beyond what the pump can give by less than this is single precision.
+# A wanted flow that exceeds the pump's range by less than this is a rounding error of single precision.
 _SATURATED_UM_PER_S = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class PumpActivity:
-    """What the pump did while the mirror was held."""
+    """Activity of the pump while the mirror was held."""
 
     mean_fraction: float
     std_fraction: float
-    travel_per_hour: float  # sum of the changes of its command: what wears it
+    travel_per_hour: float  # sum of its command's changes, a measure of wear
     starts_per_hour: float
     running_share: float
-    saturated_share: float  # of ticks that wanted less than no flow, or more than the full one
+    saturated_share: float  # of ticks that wanted less than zero or more than full flow
 
 
 @dataclass(frozen=True, slots=True)
 class HoldPass:
-    """What single ticks say."""
+    """Results from single ticks."""
 
     ticks: int
     settled: int  # those with a reading
@@ -149,7 +149,7 @@ class HoldPass:
 
 
 def hold_pass(run: Run, span_s: tuple[float, float], part_s: tuple[float, float] = (-np.inf, np.inf)) -> HoldPass:
-    """Go once through a run, or a part of it; `span_s` is its first and last second, from a level."""
+    """Pass once through a run, or a part of it; `span_s` is its first and last second, from a level."""
     collected = _Collector(run, span_s, math.isfinite(part_s[0]))
     for block in run.tick_blocks(NAMES, *part_s):
         collected.add(block)
@@ -163,7 +163,7 @@ def hold_pass(run: Run, span_s: tuple[float, float], part_s: tuple[float, float]
 
 
 def _with_level(ticks: HoldPass, means: LevelMeans) -> HoldPass:
-    """The means of seconds whose ticks are not all there, from the level."""
+    """Means of seconds with incomplete ticks, from the level."""
     reading, true = ticks.seconds
     if means.second.size <= _THIN_FROM * reading[0].size:
         return ticks
@@ -191,7 +191,7 @@ class _Collector:
         self._ticks = self._counted = self._unread = self._inside = 0
         self._times = {name: windows.HeldTime(run.config.recording.quiet_hz) for name in ("hold", *summary.PARTS)}
         self.thin = ThinSeconds(loop.rate_hz)
-        # the running count at the beginning: of a part its first tick's, which says what was before
+        # the running count at the start: for a part that of its first tick, which includes earlier ones
         self._missed_before = math.nan if from_within else 0.0
         self._missed = 0.0
         self._span = (math.nan, math.nan)

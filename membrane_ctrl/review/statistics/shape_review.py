@@ -1,4 +1,4 @@
-"""The figure over a run: what the paper shows of half an hour, of any hold."""
+"""The figure over a run: the paper's half-hour analysis, for any hold."""
 
 from dataclasses import dataclass
 
@@ -8,11 +8,11 @@ from membrane_ctrl.model.arrays import BoolArray, Column
 from membrane_ctrl.review.statistics.drift import FittedSlope, slope
 from membrane_ctrl.run_files.shapes import MAP_PX, Shapes, height_basis
 
-# Monitored points on the unit disc: within the analysis area, at three radii and azimuths (the paper's A, B and C
-# are given in a figure only).
+# Monitored points on the unit disc: within the analysis area, at three radii and azimuths (the paper gives A, B and C
+# only in a figure).
 POINTS: dict[str, tuple[float, float]] = {"A": (0.0, 0.3), "B": (-0.52, -0.3), "C": (0.74, -0.43)}
 PAIRS_S = (60.0, 600.0)
-# Slopes are fitted to means of so many cycles that no more than this many values are left.
+# Slopes are fitted to means over enough cycles to leave at most this many values.
 _SLOPE_VALUES = 5000
 _LEAST_CYCLES = 3
 
@@ -27,8 +27,8 @@ class CyclePair:
     sigma_um: Column | None  # (MAP_PX, MAP_PX): 1 sigma of that change from both covariances
     rms_um: float  # over the area
     mean_sigma_um: float
-    all_rms_um: float  # RMS change of all pairs so far apart
-    pairs: int  # of those, how many
+    all_rms_um: float  # RMS change of all pairs this far apart
+    pairs: int  # their number
 
 
 @dataclass(frozen=True, slots=True)

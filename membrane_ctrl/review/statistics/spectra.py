@@ -10,10 +10,10 @@ from scipy import signal
 
 from membrane_ctrl.model.arrays import AnyArray, Column, IntArray
 
-# Enough segments for an estimate that is good to a third, and no segment longer than shows one more decade.
+# Enough segments for an estimate good to a third, and segments only long enough for one more decade.
 _SEGMENTS = 8
 _LONGEST = 1 << 15
-# Segments transformed at once: what bounds the memory.
+# Segments transformed at once, to bound the memory.
 _BATCH = 32
 
 
@@ -23,7 +23,7 @@ class Spectrum:
 
     frequency_hz: Column  # (k,)
     density: Column  # (k,): unit squared per Hz
-    segments: int  # averaged; 0: nothing was long enough
+    segments: int  # number averaged; 0: nothing was long enough
 
     def band_rms(self, low_hz: float, high_hz: float) -> float:
         """RMS between two frequencies, low one excluded; NaN if no frequency lies there."""
@@ -40,9 +40,9 @@ def power_spectrum(values: AnyArray, rate_hz: float, length: int | None = None) 
     Parameters
     ----------
     values : (n,) array
-        NaN where there is a gap: a segment with one is left out.
+        NaN in gaps: segments with gaps are omitted.
     length : int, optional
-        Of a segment; by default an eighth of the series, at most 32768.
+        Length of a segment; by default an eighth of the series, at most 32768.
     """
     if length is None:
         length = min(_LONGEST, 1 << max(3, int(np.log2(max(values.size, 8) * 2 / (_SEGMENTS + 1)))))
@@ -61,7 +61,7 @@ def power_spectrum(values: AnyArray, rate_hz: float, length: int | None = None) 
         count += len(batch)
     scale = 1.0 / (rate_hz * (window**2).sum())
     density = power * scale / count if count else np.full(frequency_hz.size, np.nan)
-    # the other half of the plane; 0 and, for an even length, half the rate have none
+    # add the negative frequencies; 0 and, for an even length, half the rate have none
     density[1 : -1 if length % 2 == 0 else None] *= 2
     return Spectrum(frequency_hz, density, count)
 
@@ -72,7 +72,7 @@ class Allan:
 
     tau_s: Column  # (k,): averaging times
     deviation: Column  # (k,): same unit as the series
-    windows: IntArray  # (k,): differences of neighbouring means that went in
+    windows: IntArray  # (k,): number of differences of neighbouring means
 
 
 def allan_deviation(values: AnyArray, period_s: float, lengths: IntArray | None = None) -> Allan:
@@ -82,17 +82,17 @@ def allan_deviation(values: AnyArray, period_s: float, lengths: IntArray | None 
 
         sigma^2(tau) = < (x[i + 2m] - 2 x[i + m] + x[i])^2 > / (2 m^2)
 
-    (IEEE 1139; Riley, NIST SP 1065, eq. 10 with y for frequency). A triple with a gap in it is left out.
+    (IEEE 1139; Riley, NIST SP 1065, eq. 10 with y for frequency). Triples with gaps are omitted.
 
     Parameters
     ----------
     values : (n,) array
-        NaN where there is a gap.
+        NaN in gaps.
     period_s : float
-        Between values.
+        Time between values.
     lengths : (k,) array of int, optional
-        Samples in each tau; powers of two up to a quarter of the series by default, where some four independent
-        means are left.
+        Samples in each tau; by default powers of two up to a quarter of the series, which leaves about four
+        independent means.
     """
     there = np.isfinite(values)
     count = int(there.sum())
@@ -127,11 +127,11 @@ def _second_differences(total: Column, gaps: AnyArray, m: int) -> tuple[float, i
     return square, count
 
 
-# Decades of frequency whose RMS is given; the last ends at half the tick rate. The first is that of days.
+# Decades of frequency with an RMS; the last ends at half the tick rate. The first is that of days.
 BANDS_HZ = (1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)
-# A Hann window smears over two lines to each side: from the fourth on a band has nothing of what is slower.
+# A Hann window leaks two lines to each side: from the fourth line on, a band contains no slower motion.
 _RESOLVED_LINES = 4
-# Above this the mean of a second takes away what is looked for (0.1 Hz: 2 % of its amplitude).
+# Above this, one-second means attenuate the signal (0.1 Hz: by 2 %).
 _SLOW_MOST_HZ = 0.1
 
 
@@ -141,25 +141,25 @@ class Band:
 
     low_hz: float
     high_hz: float
-    # Lowest frequency that was seen: above `low_hz` when the series is too short for the whole band; NaN when it is
-    # too short for any of it
+    # Lowest frequency resolved: above `low_hz` if the series is too short for the whole band; NaN if it is too short
+    # for any of it
     from_hz: float
-    rms_um: float  # NaN if nothing was seen
+    rms_um: float  # NaN if nothing is resolved
 
 
 def bands(fast: Spectrum, slow: Spectrum) -> list[Band]:
-    """RMS in each of `BANDS_HZ`: of the ticks' spectrum where it resolves a band, below of that of the 1 s means."""
+    """RMS in each of `BANDS_HZ`: from the ticks' spectrum where it resolves a band, else from the 1 s means."""
     edges = [*BANDS_HZ, float(fast.frequency_hz[-1])]
     return [_band(slow if _is_slow(fast, slow, low, high) else fast, low, high) for low, high in pairwise(edges)]
 
 
 def unseen_s(found: list[Band]) -> float:
-    """The period (s) from which on motion is in none of the bands; NaN when none has anything."""
+    """The period (s) beyond which no band includes the motion; NaN if all bands are empty."""
     return max((1 / band.from_hz for band in found if math.isfinite(band.from_hz)), default=math.nan)
 
 
 def density(fast: Spectrum, slow: Spectrum) -> tuple[Column, Column]:
-    """Frequencies (Hz) and one density: of the 1 s means below what the ticks' spectrum resolves."""
+    """Frequencies (Hz) and one density, which uses the 1 s means below the resolution of the ticks' spectrum."""
     resolved_hz = min(_RESOLVED_LINES * float(fast.frequency_hz[1]), _SLOW_MOST_HZ)
     below = slow.frequency_hz < resolved_hz if slow.segments else np.zeros(slow.frequency_hz.size, dtype=bool)
     above = fast.frequency_hz >= (resolved_hz if slow.segments else 0.0)

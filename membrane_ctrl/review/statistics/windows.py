@@ -1,4 +1,4 @@
-"""Means over windows of seconds, and what is said of them."""
+"""Means over windows of seconds, and their statistics."""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from scipy import signal
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column, IntArray, Singles
 from membrane_ctrl.run_files.summary import least_ticks
 
-# Of a month there are millions: single precision, which counts ticks exactly.
+# A month has millions: single precision, which counts ticks exactly.
 Seconds = AnyArray
 Counts = Singles
 SecondsOf = tuple[Seconds, Counts, Column]
@@ -17,7 +17,7 @@ SecondsOf = tuple[Seconds, Counts, Column]
 
 @dataclass(frozen=True, slots=True)
 class WindowStatistics:
-    """Statistics of means over windows of one length; NaN without windows, and one alone has no `std_um`."""
+    """Statistics of means over windows of one length; NaN without windows; a single window has no `std_um`."""
 
     window_s: float  # 0: single ticks
     count: int
@@ -29,12 +29,12 @@ class WindowStatistics:
 
 
 def group_starts(number: AnyArray) -> IntArray:
-    """Where each run of equal numbers begins."""
+    """Starts of the runs of equal numbers."""
     return np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
 
 
 class SecondSums:
-    """Sums over whole seconds of the run of several series at once, from blocks in order of time."""
+    """Sums over whole seconds of the run, of several series at once, from blocks in order of time."""
 
     def __init__(self, series: int) -> None:
         self._parts: list[SecondsOf] = []
@@ -50,7 +50,7 @@ class SecondSums:
         self._parts.append((second[starts], counts, np.add.reduceat(values, starts, axis=1)))
 
     def result(self) -> SecondsOf:
-        """(k,) seconds that have ticks, (k,) their ticks, (series, k) sums."""
+        """(k,) seconds with ticks, (k,) numbers of ticks, (series, k) sums."""
         if not self._parts:
             return np.empty(0, dtype=np.int32), np.empty(0, dtype=np.float32), np.empty((self._series, 0))
         second, counts, sums = (np.concatenate(parts, axis=-1) for parts in zip(*self._parts, strict=True))
@@ -61,7 +61,7 @@ class SecondSums:
 def window_means(
     second: Seconds, counts: Counts, sums: Column, window_s: int, rate_hz: float
 ) -> tuple[Column, Column]:
-    """Middles (k,) in s and means of the windows that have at least `least_ticks`, from (n,) sums of `SecondSums`."""
+    """Middles (k,) in s and means of the windows with at least `least_ticks`, from (n,) sums of `SecondSums`."""
     if not second.size:
         return np.empty(0), np.empty(0)
     number = second // window_s
@@ -87,13 +87,13 @@ def describe(means_um: Column, window_s: float, band_um: float) -> WindowStatist
     )
 
 
-# Segments have some rows a second while nothing happens, and now and then one comes late.
+# In quiet times segments have a few rows per second, some of them late.
 _ROWS_APART = 2.0
 _LEAST_GAP_S = 2.0
 
 
 class HeldTime:
-    """Sum of the times between ticks whose first is held, over blocks that come in their order.
+    """Sum of the tick intervals that start in a hold, over consecutive blocks.
 
     `quiet_hz` is the lowest rate of recorded rows. A gap longer than two of its periods is a loss.
     """
@@ -118,15 +118,15 @@ class HeldTime:
 
 
 class WithoutFeedforward:
-    """Adds to the error what the feed-forward's flow kept away, from blocks that come in their order.
+    """Adds to the error what the feed-forward's flow prevented, from consecutive blocks.
 
-    The mirror's centre is nearly an integrator of the flow. A speed v that is not fed forward reaches the error
-    through the closed loop of a PI controller,
+    The mirror's centre nearly integrates the flow. A speed v without feed-forward reaches the error through the
+    closed loop of a PI controller,
 
         e / v = s / (s^2 + Kp s + Kp / Ti),
 
-    here by the bilinear transform. Dead time and pump lag (0.26 s together) are left out: they hardly change what a
-    disturbance of tens of seconds does, and make the benefit look a little smaller than it is.
+    here by the bilinear transform. Dead time and pump lag (0.26 s together) are ignored: they hardly change the
+    effect of a disturbance of tens of seconds, and make the benefit appear slightly too small.
     """
 
     def __init__(self, kp_per_s: float, ti_s: float, period_s: float) -> None:
@@ -135,7 +135,7 @@ class WithoutFeedforward:
         self._state = np.zeros(2)
 
     def kept_away_um(self, feedforward_um_per_s: Column) -> Column:
-        """(n,) um by which the error would have been larger; gaps count as no flow."""
+        """(n,) um by which the error would have been larger; gaps count as zero flow."""
         flow = np.nan_to_num(np.asarray(feedforward_um_per_s, dtype=np.float64))
         kept, self._state = signal.lfilter(self._numerator, self._denominator, flow, zi=self._state)
         return np.asarray(kept, dtype=np.float64)

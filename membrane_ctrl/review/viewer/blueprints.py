@@ -1,4 +1,4 @@
-"""How a review opens: a tab a question, all on the time range asked for."""
+"""How a review opens: one tab per question, all on the requested time range."""
 
 from collections.abc import Sequence
 
@@ -15,13 +15,13 @@ class ReviewBlueprint:
     Parameters
     ----------
     prefixes : sequence of str
-        In front of the runs' paths; `("",)` for one run alone.
+        Before the runs' paths; `("",)` for a single run.
     span_s : tuple or None
         Time range to show, on the review's timeline; None: everything.
     band_um : float
-        The plots of the error are three bands high.
+        The error plots span three bands.
     maps_um : sequence of float
-        Scale of each run's maps; NaN for one without.
+        Scale of each run's maps; NaN without maps.
     """
 
     def __init__(
@@ -33,7 +33,7 @@ class ReviewBlueprint:
         self._maps_um = maps_um
 
     def made(self, tab: str = "overview") -> rrb.Blueprint:
-        """The blueprint, with `tab` (one of `TABS`) in front."""
+        """The blueprint, with `tab` (one of `TABS`) selected."""
         tabs = [self._overview(), self._loop(), self._shape(), self._faults(), self._tuning()]
         selection = None
         if self._span_s is not None:
@@ -139,7 +139,7 @@ class ReviewBlueprint:
         paths = ("/loop/error", "/truth/displacement", "/loop/band")
         return rrb.Vertical(
             self._plot("Reading, filtered, setpoint, um", "/loop/position"),
-            self._plot("True and seen error, um", *paths, span=self._error_span_um),
+            self._plot("True and measured error, um", *paths, span=self._error_span_um),
             rrb.Horizontal(
                 self._plot("P, I, D, feed-forward, um/s", "/loop/terms"),
                 self._plot("Flow wanted and given, um/s", "/loop/flow"),
@@ -150,6 +150,6 @@ class ReviewBlueprint:
 
 
 def _map_name(run: str, most_um: float) -> str:
-    """The viewer draws no colour scale, so the name says it."""
+    """The map's name includes its colour scale, which the viewer does not draw."""
     scale = f", um: blue {-most_um:.2g}, green 0, red {most_um:+.2g}" if most_um == most_um else ""
     return f"{run} Height since the hold's first cycle{scale}".strip()

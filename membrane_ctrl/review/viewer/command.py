@@ -1,4 +1,4 @@
-"""`membrane-ctrl review RUN...`: the timeline of one run or several, on the moment asked for."""
+"""`membrane-ctrl review RUN...`: the timeline of one or several runs, at the requested time."""
 
 import math
 import sys
@@ -14,13 +14,13 @@ from membrane_ctrl.review.viewer.layer import Layer
 from membrane_ctrl.run_files.run import Run, open_run
 
 _THIS_MACHINE = "127.0.0.1"
-# Seen about a moment asked for with --at or --around.
+# Time shown around --at or --around.
 _AROUND_S = 120.0
 
 
 @dataclass(frozen=True, slots=True)
 class ReviewOptions:
-    """What `review` was asked for; see `membrane-ctrl review --help`."""
+    """Options of `review`; see `membrane-ctrl review --help`."""
 
     runs: Sequence[Path]
     at: str | None = None
@@ -71,13 +71,13 @@ def _show(file: Path, options: ReviewOptions, cursor_s: float | None) -> int:
 
 
 def _require_sense(options: ReviewOptions) -> None:
-    """No option that is unknown, or that would be passed over in silence."""
+    """Refuse unknown values, and options that would be silently ignored."""
     if options.tab not in blueprints.TABS:
-        raise errors.InputError(f"--tab {options.tab}: known are {', '.join(blueprints.TABS)}")
+        raise errors.InputError(f"--tab {options.tab}: known: {', '.join(blueprints.TABS)}")
     if options.align not in {"hold", "start", "utc"}:
-        raise errors.InputError(f"--align {options.align}: known are hold, start, utc")
+        raise errors.InputError(f"--align {options.align}: known: hold, start, utc")
     if options.around is not None and not options.around.strip():
-        raise errors.InputError("--around: say which event, e.g. --around hold")
+        raise errors.InputError("--around: name an event, e.g. --around hold")
     moments = (options.at, options.around, options.start or options.end)
     if sum(moment is not None for moment in moments) > 1:
         raise errors.InputError("--at, --around, --from with --to: only one of these at a time")
@@ -88,15 +88,15 @@ def _require_sense(options: ReviewOptions) -> None:
     if len(options.runs) != 1:
         raise errors.InputError("--live: one run at a time")
     if any(part is not None for part in (*moments, options.save, options.screenshot)):
-        raise errors.InputError("--live follows the run as it goes on: leave out --at, --from, --save and the like")
+        raise errors.InputError("--live follows the run in progress: omit --at, --from, --save and similar options")
     if options.bind != _THIS_MACHINE:
-        raise errors.InputError("--live serves this machine only: leave out --bind and use the ssh line it prints")
+        raise errors.InputError("--live serves this machine only: omit --bind and use the printed ssh line")
 
 
 def _require_writable(target: Path, runs: Sequence[Run]) -> None:
-    """Said before the work, not after it."""
+    """Check the target before the work, not after it."""
     if any(target.resolve().parent == run.folder.resolve() for run in runs):
-        raise errors.InputError(f"{target}: lies among what the recorder wrote; choose another folder")
+        raise errors.InputError(f"{target}: is in a folder of the recorder; choose another folder")
     with errors.writing(target, errors.DeviceError, "; choose another place"):
         new = not target.exists()
         target.open("ab").close()
@@ -107,19 +107,19 @@ def _require_writable(target: Path, runs: Sequence[Run]) -> None:
 def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> float | None:
     """Write the recording that the viewer opens.
 
-    Raises InputError if a time or an event asked for is not in the first run, or no run has telemetry.
+    Raises InputError if the first run lacks a requested time or event, or no run has telemetry.
 
     Parameters
     ----------
     runs : sequence of Run
-        One, or several that are laid over each other.
+        One run, or several to overlay.
     file : Path
-        To write.
+        File to write.
 
     Returns
     -------
     float or None
-        Second of the timeline that was asked for: the moment, or where the part begins.
+        Requested second of the timeline: the given time, or the start of the part.
     """
     runs = _with_telemetry(runs)
     span_s = _span(runs[0], options)
@@ -142,18 +142,18 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> floa
 
 
 def _with_telemetry(runs: Sequence[Run]) -> list[Run]:
-    """The runs that can be shown; of the others it is noted that they cannot."""
+    """The runs that can be shown; adds a note to the others."""
     there = [run for run in runs if words.end_s(run)]
     if not there:
-        raise errors.InputError(f"{', '.join(str(run.folder) for run in runs)}: no telemetry can be read")
+        raise errors.InputError(f"{', '.join(str(run.folder) for run in runs)}: no readable telemetry")
     for run in runs:
         if run not in there:
-            run.notes.append("not shown: its telemetry cannot be read")
+            run.notes.append("not shown: no readable telemetry")
     return there
 
 
 def _span(run: Run, options: ReviewOptions) -> tuple[float, float] | None:
-    """The part of the run asked for, in its seconds."""
+    """The requested part of the run, in seconds."""
     if options.start is not None or options.end is not None:
         start_s, end_s = words.part_s(run, options.start, options.end)
         if start_s >= words.end_s(run):
@@ -173,9 +173,9 @@ def _span(run: Run, options: ReviewOptions) -> tuple[float, float] | None:
 
 
 def _around(run: Run, what: str) -> float:
-    """Time of the first event whose kind, name, state, text or command contains `what`; found ones count, too."""
+    """Time of the first event, recorded or detected, whose kind, name, state, text or command contains `what`."""
     wanted = what.lower()
-    # `hold` is the state, not the command that led to it
+    # `hold` means the state, not the command that led to it
     for keys in (("kind", "name", "state", "text"), ("command",)):
         for each in run.log:
             if any(wanted in str(each.line.get(key, "")).lower() for key in keys):
@@ -188,11 +188,11 @@ def _around(run: Run, what: str) -> float:
             return item.time_s
     told = {str(e.get("name") or e.get("state") or e.get("command") or e.get("kind")) for e in run.events}
     named = sorted(told - {"why"} | {item.kind for item in found})
-    raise errors.InputError(f"--around {what}: no such event in {run.name}; there are {', '.join(named)}")
+    raise errors.InputError(f"--around {what}: no such event in {run.name}; known: {', '.join(named)}")
 
 
 def _zeros(runs: Sequence[Run], align: str) -> list[float]:
-    """The second of each run that the timeline calls 0."""
+    """The second of each run at 0 on the timeline."""
     if len(runs) == 1 or align == "start":
         return [0.0] * len(runs)
     if align == "utc":

@@ -1,6 +1,6 @@
-"""What the viewer is given: a recording of its own, made from the tables in a second; the run is only read.
+"""The viewer's input: a separate recording, made from the tables in a second; the run is only read.
 
-Overview levels over the whole run; every tick of the part that is looked at, where that is not too much to draw; the
+It has the overview levels of the whole run; every tick of the requested part, unless that is too much to draw; the
 figure with maps; states; events, marks and detected events.
 """
 
@@ -37,7 +37,7 @@ _RUN_COLOURS: tuple[streams.Colour, ...] = (streams.BLUE, streams.ORANGE, stream
 # Plots of a level: signals (column, name, colour) by path.
 OVERVIEWS: dict[str, tuple[tuple[str, str, streams.Colour], ...]] = {
     "/overview/error": (
-        ("min_error_um", "error, least um", streams.GREY),
+        ("min_error_um", "error, minimum um", streams.GREY),
         ("mean_error_um", "error, mean um", streams.BLUE),
         ("max_error_um", "error, maximum um", streams.GREY),
     ),
@@ -72,26 +72,26 @@ class Layer:
         self._origin = np.datetime64(0, "ns")
 
     def blueprint(self, blueprint: rr.blueprint.Blueprint) -> None:
-        """The arrangement that the file opens with."""
+        """The layout in which the file opens."""
         self._stream.send_blueprint(blueprint)
 
     def close(self) -> None:
-        """Bring everything to the file."""
+        """Write everything to the file."""
         self._stream.flush()
         self._stream.disconnect()
 
     def add(self, run: Run, prefix: str, zero_s: float, part_s: tuple[float, float]) -> float:
-        """Add a run; returns the scale of its maps: their greatest change of height, um; NaN without maps.
+        """Add a run; returns the scale of its maps: their largest change of height, um; NaN without maps.
 
         Parameters
         ----------
         prefix : str
-            In front of its paths; empty for a run alone.
+            Before its paths; empty for a single run.
         zero_s : float
-            Second of the run that the timeline calls 0.
+            Second of the run at 0 on the timeline.
         part_s : tuple
-            What is looked at: shown tick by tick, if that is not too much, and all that logs and maps hold, since a
-            cursor that stands at the end of the recording would show those of the end.
+            Requested part: shown tick by tick unless too long; logs and maps hold only this part, as otherwise a
+            cursor at the end of the recording would show those of the end.
         """
         self._prefix, self._shift_s = prefix, zero_s
         self._label = f"{prefix.strip('/')} " if prefix else ""
@@ -159,7 +159,7 @@ class Layer:
             self._scalars("/found/marks", times, np.zeros((len(found), 1)))
 
     def _log(self, run: Run, path: str, time_s: Column, texts: list[str], levels: list[str]) -> None:
-        """Lines that begin with the time of the day, which is what people ask for."""
+        """Log lines that begin with the time of day."""
         lines = [
             f"{self._label}{run.utc(at_s):%H:%M:%S} {text}" for at_s, text in zip(time_s.tolist(), texts, strict=True)
         ]
@@ -180,11 +180,11 @@ class Layer:
         self._style("/shape/residual", [("slope residual urad", streams.BLUE)])
         self._scalars("/shape/residual", shown.time_s, shown.slope_residual_urad[:, np.newaxis])
         seen = (shown.time_s >= part_s[0]) & (shown.time_s <= part_s[1])
-        seen |= ~seen.any()  # nothing measured there: all, rather than no map
+        seen |= ~seen.any()  # nothing measured there: show all rather than no map
         return self._maps(shown.time_s[seen], parameters[seen])
 
     def _maps(self, time_s: Column, parameters: Column) -> float:
-        """Height changes against the first cycle of the hold, on one scale, so that they may be played."""
+        """Height changes since the first cycle of the hold, on a common scale for playback."""
         axis = (np.arange(_MAP_PX) + 0.5) * 2 / _MAP_PX - 1
         x, y = np.meshgrid(axis, -axis)
         inside = np.hypot(x, y) <= 1.0
@@ -227,7 +227,7 @@ class Layer:
 
 
 def _of_run(colour: streams.Colour, number: int) -> streams.Colour:
-    """Runs that lie over each other differ by colour; what is grey in one alone is the dark shade."""
+    """Colours of overlaid runs; a signal that is grey in a single run gets the dark shade."""
     red, green, blue = _RUN_COLOURS[number % len(_RUN_COLOURS)]
     return (red // 2, green // 2, blue // 2) if colour == streams.GREY else (red, green, blue)
 
@@ -237,13 +237,13 @@ def _nanoseconds(time_s: Column) -> AnyArray:
 
 
 def _end_s(run: Run) -> float:
-    """How long the run is, by its summary or, of a killed run, its levels."""
+    """End of the run, from its summary or, for a killed run, its levels."""
     duration = (run.summary or {}).get("duration_s")
     return float(duration) if isinstance(duration, (int, float)) else end_s(run)
 
 
 def _some(count: int, most: int) -> BoolArray:
-    """(count,) true for at most `most` places, evenly spread, the first among them."""
+    """(count,) True at no more than `most` evenly spaced places, including the first."""
     chosen = np.zeros(count, dtype=bool)
     chosen[:: max(1, -(-count // most))] = True
     return chosen

@@ -1,4 +1,4 @@
-"""Starts the viewer on a review: on this screen, for a browser, into a picture, or following a run that goes on."""
+"""Starts the viewer on a review: on this screen, for a browser, to a picture, or following a run in progress."""
 
 import argparse
 import os
@@ -21,21 +21,21 @@ from membrane_ctrl.run_files.segments import first_message_after
 
 # The recorder flushes every second.
 _FOLLOW_S = 0.5
-# A window opens in a few seconds, by a software driver in ten.
+# A window opens in a few seconds, with a software driver in ten.
 _CURSOR_S = 30.0
 _CURSOR_AGAIN_S = 0.2
 _CHUNK_BYTES = 1 << 20
-_RECENT_BYTES = 20 << 20  # ten minutes at 50 Hz, as they are written
+_RECENT_BYTES = 20 << 20  # ten minutes at 50 Hz, as recorded
 _STYLE_BYTES = 1 << 20  # blueprint, colours and names come first, in a tenth of this
 
 
 def viewer_command(*arguments: str) -> list[str]:
-    """The viewer itself: the `rerun` command is a Python shim, and ending that would leave the viewer behind."""
+    """The viewer's binary: the `rerun` command is a Python shim, and ending that would leave the viewer running."""
     return [str(Path(rerun_cli.__file__).parent / "rerun"), *arguments]
 
 
 def show(files: list[Path], at_s: float | None = None) -> int:
-    """Open files on this machine's screen, at a second of `run_time`; returns when the window is closed."""
+    """Open files on this machine's screen, at a second of `run_time`; return when the window is closed."""
     _require_screen()
     port = free_port()
     command = viewer_command("--bind", "127.0.0.1", "--port", str(port), *(str(path) for path in files))
@@ -43,9 +43,9 @@ def show(files: list[Path], at_s: float | None = None) -> int:
 
 
 def put_cursor(process: subprocess.Popen[bytes], port: int, at_s: float, most_s: float = _CURSOR_S) -> None:
-    """Put the time cursor of a viewer there as soon as it has opened its files; a blueprint cannot say it.
+    """Set a viewer's time cursor once its files are open, which a blueprint cannot do.
 
-    A viewer that does not answer in time is left as it opened: the plots show the part asked for all the same.
+    A viewer that does not answer in time is left unchanged: its plots show the requested part anyway.
     """
     until_s = time.monotonic() + most_s
     while time.monotonic() < until_s and process.poll() is None:
@@ -63,7 +63,7 @@ def serve(files: list[Path], bind: str, port: int) -> int:
     """Serve files to browsers until interrupted.
 
     Raises DeviceError if it cannot listen there, or the viewer does not start. `bind` is 127.0.0.1, or
-    an address of this machine for viewers elsewhere; `port` is that of the page, 0 for a free one.
+    an address of this machine for remote viewers; `port` is that of the page, 0 for a free one.
     """
     port = port or free_port()
     _require_listening(bind, port)
@@ -74,9 +74,9 @@ def serve(files: list[Path], bind: str, port: int) -> int:
 
 
 def live(folder: Path, web: bool, port: int = 0) -> int:
-    """Show a run that is still going, by reading behind its recorder: the run does not know that it is watched.
+    """Show a run in progress by reading its files, without affecting the run.
 
-    The segments are piped into a server of their own, which the viewer (or, with `web`, a browser) connects to: a
+    The segments are piped into a separate server, to which the viewer (or, with `web`, a browser) connects: a
     viewer that reads its standard input itself draws nothing before the input ends.
     """
     data_port, port = free_port(), port or free_port()
@@ -108,11 +108,11 @@ def live(folder: Path, web: bool, port: int = 0) -> int:
 
 def _require_screen() -> None:
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise errors.DeviceError("no screen here: use --web and open the address in a browser, or --screenshot FILE")
+        raise errors.DeviceError("no screen: use --web and open the address in a browser, or --screenshot FILE")
 
 
 def _say_where(bind: str, port: int, data_port: int) -> None:
-    """The page's address, and how another machine gets to it."""
+    """Print the page's address, and how to reach it from another machine."""
     host = "127.0.0.1" if bind == "127.0.0.1" else socket.gethostname()
     page = f"http://{host}:{port}/?url=rerun%2Bhttp%3A%2F%2F{host}%3A{data_port}%2Fproxy"
     print(f"open {page}", file=sys.stderr)
@@ -124,10 +124,10 @@ def _say_where(bind: str, port: int, data_port: int) -> None:
 def follow(
     folder: Path, out: IO[bytes], wanted: Callable[[], bool], sleep: Callable[[float], None] = time.sleep
 ) -> None:
-    """Copy what is new of a run as it grows, segment by segment, until it has its summary or nobody looks.
+    """Copy a growing run, segment by segment, until it has its summary or the viewer closes.
 
-    It begins some minutes back: a browser takes in a few times what comes, and would be hours behind a night. Before
-    that comes the beginning of the segment, which says how everything is to be drawn.
+    It starts a few minutes back: a browser reads only a few times faster than a run grows, and would be hours behind
+    after a night. The start of the segment precedes that, as it defines how to draw everything.
 
     Raises BrokenPipeError when the reader has gone.
     """
@@ -159,7 +159,7 @@ def _grown(folder: Path, wanted: Callable[[], bool], sleep: Callable[[float], No
 
 
 def _recent(files: list[Path]) -> tuple[int, int, bytes]:
-    """Number of the segment to begin with, the place in it, and what has to come before that."""
+    """The first segment's number, the position in it, and the bytes that must precede it."""
     sizes = [file.lstat().st_size for file in files]
     number = max(0, len(files) - 1)
     if number > 0 and sizes[number] < _RECENT_BYTES:
@@ -173,7 +173,7 @@ def _recent(files: list[Path]) -> tuple[int, int, bytes]:
 
 
 def _require_listening(bind: str, port: int) -> None:
-    """The viewer says nothing of a port that is taken."""
+    """Check the port, as the viewer does not report a busy one."""
     try:
         with socket.socket(socket.AF_INET6 if ":" in bind else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -184,7 +184,7 @@ def _require_listening(bind: str, port: int) -> None:
 
 
 def free_port() -> int:
-    """A TCP port that nobody listens on now."""
+    """A currently free TCP port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -207,9 +207,9 @@ def _environment() -> dict[str, str]:
     return {**os.environ, "RUST_LOG": os.environ.get("RUST_LOG", "error")}
 
 
-# A picture of a run as the viewer opens it, without a screen; it needs a Vulkan driver, Mesa's software one will do.
+# A picture of a run as the viewer opens it, without a screen; needs a Vulkan driver, e.g. Mesa's software one.
 
-# The viewer is ready when two pictures in a row are the same, which on two cores takes about 7 s for a short run.
+# The viewer is ready when two consecutive pictures are equal, about 7 s for a short run on two cores.
 _WAIT_S = 60.0
 _BETWEEN_S = 0.5
 
@@ -217,13 +217,13 @@ _BETWEEN_S = 0.5
 def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:
     """PNG of the whole run, at its end.
 
-    Raises FileNotFoundError if there is no recording in the folder; ValueError if the recording has no such tab;
-    RuntimeError if the viewer does not start (no Vulkan driver) or does not come to rest. All segments
-    of the run are opened; `tab` is the name of a tab of the blueprint.
+    Raises FileNotFoundError if the folder has no recording; ValueError if the recording has no such tab;
+    RuntimeError if the viewer does not start (no Vulkan driver) or its picture keeps changing. Opens all
+    segments of the run; `tab` is the name of a tab of the blueprint.
     """
     files = [str(path.resolve()) for path in segments(run_dir)]
     if not files:
-        raise FileNotFoundError(f"{run_dir}: no .rrd file in it")
+        raise FileNotFoundError(f"{run_dir}: contains no .rrd file")
     with _headless() as viewer:
         viewer.open(files)
         _show_tab(viewer, tab)
@@ -266,12 +266,12 @@ def _at_rest(viewer: ViewerClient) -> bytes:
             return picture
         before = picture
         time.sleep(_BETWEEN_S)
-    raise RuntimeError(f"the viewer's picture still changed after {_WAIT_S:.0f} s")
+    raise RuntimeError(f"the viewer's picture still changes after {_WAIT_S:.0f} s")
 
 
 @contextmanager
 def _headless() -> Iterator[ViewerClient]:
-    """A headless viewer that only this machine can reach; `ViewerClient.spawn` would listen on every interface."""
+    """A headless viewer reachable only from this machine; `ViewerClient.spawn` would listen on every interface."""
     port = free_port()
     command = viewer_command("--headless", "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen")
     with subprocess.Popen(command, env=_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
