@@ -72,7 +72,7 @@ def open_run(folder: Path) -> RecordedRun:
         raise InputError(f"{folder}: not a run folder (no config.toml)")
     inputs = inputs_file.open_inputs(folder)
     if not inputs.paths:
-        raise InputError(f"{folder}: no inputs: there is no table of ticks in columns/")
+        raise InputError(f"{folder}: no recorded inputs (no table of ticks in columns/)")
     log = run_folder.read_events(folder, [])
     cut = not any(isinstance(each.event, run_events.Ended) for each in log)
     decisions = replays.decisions_of((each.mono_s, each.event) for each in log)

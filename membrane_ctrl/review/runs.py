@@ -22,7 +22,7 @@ from membrane_ctrl.run_files.run_folder import add_mark
 
 
 def list_command(logs: Path, wanted: catalogue.Filter, since: str | None, until: str | None, json: bool) -> int:
-    """The table of runs that pass a filter."""
+    """Print the table of runs that pass a filter."""
     wanted = replace(wanted, since_utc=_day(since), until_utc=_day(until))
     found = catalogue.entries(logs, wanted)
     if json:
@@ -33,7 +33,7 @@ def list_command(logs: Path, wanted: catalogue.Filter, since: str | None, until:
 
 
 def show_command(run: Path, json: bool) -> int:
-    """One run: its line of the catalogue, its states and faults, what is missing of it."""
+    """Print one run: its line of the catalogue, its states and faults, its missing parts."""
     opened = open_run(catalogue.resolve(run))
     opened.look_through()
     entry = catalogue.entry(opened.folder)
@@ -91,7 +91,7 @@ def mark_command(words: Sequence[str], at: str | None) -> int:
 def export_command(
     run: Path, to: str, out: Path | None, streams: list[str], start: str | None, end: str | None
 ) -> int:
-    """Write a run for other programs and say where."""
+    """Write a run for other programs and report where."""
     opened = open_run(catalogue.resolve(run))
     folder = out.resolve() if out else opened.folder / "export"
     files = export(opened, to, folder, streams, *part_s(opened, start, end))

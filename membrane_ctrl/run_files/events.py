@@ -11,7 +11,7 @@ from membrane_ctrl.model.plain_json import dumps_checked
 
 # What is on the disk at once: a power cut may follow.
 URGENT = frozenset({"fault", "end"})
-# While the disk is full events wait here; a fault campaign makes some hundred.
+# Events that wait while the disk is full; a fault campaign makes a few hundred.
 _WAITING_MAX = 10_000
 
 

@@ -53,9 +53,9 @@ class Run:
     ----------
     folder : Path
     config : Config
-        As run; of another version, the keys that can be read, the rest at their defaults.
+        As run; from another version, the readable keys, with defaults for the rest.
     log : tuple of LoggedEvent
-        `events.jsonl` and the annotations made later, in the order of time.
+        `events.jsonl` and later annotations, in order of time.
     summary : dict or None
         `summary.json`; None during the run, or if its recorder was killed.
     origin_utc : datetime
@@ -209,7 +209,7 @@ class Run:
                     continue
                 block = {name: _array(read, name) for name in names}
                 known_s = max(known_s, block[time_name][-1] if block[time_name].size else -np.inf)
-                # a journal may repeat what the recorder had just written when it was killed
+                # a journal may repeat rows that the recorder wrote just before it was killed
                 block = rrd_reader.cut(block, time_name, max(start_s, np.nextafter(last_s, np.inf)), end_s)
                 if block[time_name].size:
                     last_s = float(block[time_name][-1])
@@ -245,7 +245,7 @@ def open_run(path: Path | str) -> Run:
     log = run_folder.read_events(folder, notes)
     summary = run_folder.read_summary(folder, notes)
     if summary and summary.get("exit") and not any(isinstance(each.event, run_events.Ended) for each in log):
-        notes.append("events.jsonl: lines are missing, the last one at least: the run has ended, and no line says so")
+        notes.append("events.jsonl: at least the last line is missing: the run has ended without an end event")
     notes += _missing(folder, summary)
     config = column_reader.at_recorded_rate(run_folder.read_config(folder, notes), folder, notes)
     return Run(folder, config, log, summary, origin_of(folder, log), notes)
@@ -286,7 +286,7 @@ def _count(value: object) -> int:
 
 
 def origin_of(folder: Path, log: Sequence[run_folder.LoggedEvent]) -> datetime:
-    """UTC at 0 s of a run: from its first event that says both, else from the folder's name or age."""
+    """UTC at 0 s of a run: from its first event with both times, else from the folder's name or age."""
     for each in log:
         try:
             moment = datetime.fromisoformat(each.line["time_utc"])

@@ -56,7 +56,7 @@ def create_run_folder(logs_dir: Path, name: str, started_utc: datetime, config: 
 
 
 def write_config(run_dir: Path, config: Config) -> None:
-    """Write `config.toml`, every default written out. Raises OSError."""
+    """Write `config.toml`, including every default. Raises OSError."""
     files.write_text_atomic(run_dir / CONFIG, plain_json.with_comment(toml_file.dump(config)))
 
 
@@ -143,7 +143,7 @@ ANNOTATIONS_FILE = "annotations.jsonl"
 
 
 def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> events.EventLine:
-    """Append a mark at a second of the run; it stands among the run's events from then on.
+    """Append a mark at a time of the run; it then counts among the run's events.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ def logged(line: events.EventLine) -> LoggedEvent:
 
 
 def read_events(folder: Path, notes: list[str]) -> tuple[LoggedEvent, ...]:
-    """Events and annotations in the order of time; lines that are no JSON object are counted in `notes`."""
+    """Events and annotations in order of time; `notes` counts lines that are not JSON objects."""
     told = _json_lines(folder / "events.jsonl", notes)
     if not (folder / "events.jsonl").exists():
         notes.append("events.jsonl: missing; states are taken from the telemetry")
@@ -246,7 +246,7 @@ def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
         notes.append(f"summary.json: not of schema {_SUMMARY_SCHEMA}; its figures are not used")
         return {} if not isinstance(summary, dict) else summary
     if not plain_json.take_checksum(summary):
-        notes.append("summary.json: does not fit its checksum (damaged or edited); it is not used")
+        notes.append("summary.json: checksum mismatch (damaged or edited); it is not used")
         return None
     if not is_moment(summary.get("duration_s", 0.0) or 0.0):
         notes.append("summary.json: impossible duration_s; it is not used")
@@ -290,9 +290,9 @@ def _config_damage(path: Path) -> list[str]:
     except (OSError, ValueError):  # reported by whoever reads it
         return []
     if not text:
-        return ["config.toml: empty; everything is taken at its default"]
+        return ["config.toml: empty; all defaults are used"]
     right = plain_json.comment_is_right(text)
-    return [] if right else ["config.toml: does not fit its checksum (damaged or edited); its values are doubtful"]
+    return [] if right else ["config.toml: checksum mismatch (damaged or edited); its values are doubtful"]
 
 
 def _json_lines(path: Path, notes: list[str]) -> list[events.EventLine]:
@@ -307,12 +307,12 @@ def _json_lines(path: Path, notes: list[str]) -> list[events.EventLine]:
         return []
     lines = [event_of(line) for line in text.splitlines()]
     if broken := lines.count(None):
-        notes.append(f"{path.name}: {broken} line{'s' * (broken > 1)} cannot be read, or not trusted: left out")
+        notes.append(f"{path.name}: {broken} line{'s' * (broken > 1)} unreadable or untrustworthy: left out")
     return [line for line in lines if line is not None]
 
 
 def event_of(line: str) -> events.EventLine | None:
-    """The event in a line, if it is one: an object that fits its checksum, of a known form and a time that can be."""
+    """The event in a line, if valid: an object of a known form with a correct checksum and a possible time."""
     try:
         event = plain_json.loads(line)
     except ValueError:

@@ -114,7 +114,7 @@ ESTIMATE_COLUMNS = (
 
 
 def estimates(table: pa.Table) -> Iterator[shape_estimate.ShapeEstimate]:
-    """The estimates of the recorder's table, as the controller got them. Raises ValueError if they are none."""
+    """The estimates in the recorder's table, as given to the controller. Raises ValueError if they are invalid."""
     names = ESTIMATE_COLUMNS[:-2]
     heads = zip(*(table.column(name).to_pylist() for name in names), strict=True)
     coeffs = _matrix(table.column("coeffs_um").combine_chunks(), table.num_rows)
@@ -179,7 +179,7 @@ MAP_PX = 128
 
 
 def height_map_mm(estimate: shape_estimate.ShapeEstimate) -> Map:
-    """Height over the mirror's disc, from the vertex.
+    """Height over the mirror's disc, above the vertex.
 
     Returns
     -------
@@ -190,7 +190,7 @@ def height_map_mm(estimate: shape_estimate.ShapeEstimate) -> Map:
 
 
 def difference_map_um(estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate) -> Map:
-    """Height now minus height of the reference, each from its own vertex; um, as `height_map_mm`."""
+    """Height minus that of the reference, each above its own vertex; um, as `height_map_mm`."""
     now, before = _surface(estimate), _surface(reference)
     change = Surface(now.coeffs_mm - before.coeffs_mm, now.hencky_mm - before.hencky_mm, 1.0)
     return _spread(change.height(*_points()) * 1e3)
@@ -209,7 +209,7 @@ def outside_disc() -> NDArray[np.uint8]:
 
 
 def _surface(estimate: shape_estimate.ShapeEstimate) -> Surface:
-    """Over the unit disc: a map does not ask how large the mirror is."""
+    """The surface over the unit disc: maps do not depend on the mirror's size."""
     return Surface(estimate.coeffs_um * 1e-3, estimate.hencky_um * 1e-3, 1.0)
 
 

@@ -149,7 +149,7 @@ def _found(plot: Any, analysis: Analysis, span_s: float) -> None:
 
 
 def _lane(lane: Any, analysis: Analysis, span_s: float) -> None:
-    """States as coloured stretches, named where there is room."""
+    """States as coloured bars, named where there is room."""
     states = [(at.mono_s, at.event.state) for at in timeline(analysis) if isinstance(at.event, events.StateEntered)]
     edges_s = [start_s for start_s, _ in states]
     edges_s.append(max(analysis.ticks.end_s, *edges_s, 0.0))

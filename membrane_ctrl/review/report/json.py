@@ -111,7 +111,7 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
 
 
 def timeline(analysis: Analysis) -> list[LoggedEvent]:
-    """State changes, faults, commands and marks in their order; without events, states from the telemetry."""
+    """State changes, faults, commands and marks, in order; without events, states from the telemetry."""
     told = [each for each in analysis.run.log if isinstance(each.event, _TOLD)]
     if not any(isinstance(each.event, events.StateEntered) for each in told):
         time_s, codes = analysis.level["time_s"], analysis.level["state"]
