@@ -1,4 +1,4 @@
-"""The sensor as a grid of bins: rays of their centres, and what averaging over a bin does to a curved phase."""
+"""The sensor as a grid of bins: rays of their centres, and the effect of averaging a curved phase over a bin."""
 
 import math
 

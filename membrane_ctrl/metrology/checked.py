@@ -45,7 +45,7 @@ class Checked:
 
     stack: frame_stack.FrameStack  # the frames, swapped ones put back
     binned: frame_stack.Binned  # the frames over bins
-    view: evidence.BinView  # what the usable frames say
+    view: evidence.BinView  # evidence from the usable frames
     phase_rad: FloatArray  # (2, rows, columns): absolute phases of the bins
     near: BoolArray  # (rows, columns): bins that may see the mirror
     tracer: reconstruct.Tracer  # the bench, with the vertex where the laser saw it
@@ -54,7 +54,7 @@ class Checked:
 
     @property
     def verdict(self) -> tuple[Verdict, str]:
-        """What the frames alone say: "ok", or "degraded" with what was done about the bad ones."""
+        """Verdict from the frames alone: "ok", or "degraded" with the treatment of bad ones."""
         if not self.flags:
             return "ok", ""
         return "degraded", f"{len(self.flags)} frame(s) flagged; the figure leaves out what they spoil"
@@ -78,7 +78,7 @@ class RejectedSetError(evidence.NoFigureError):
 
 
 def vertex_z_mm(optics: OpticsConfig, displacement_um: float) -> float:
-    """Where the vertex stands at a displacement: z = -(d - reference)."""
+    """Position of the vertex at a displacement: z = -(d - reference)."""
     reference = optics.geometry.reference_displacement_um
     return 0.0 if reference is None or not math.isfinite(displacement_um) else -(displacement_um - reference) * 1e-3
 
@@ -228,7 +228,7 @@ def _believable(stack: frame_stack.FrameStack, flags: list[integrity.Flag]) -> l
 
 
 def _merged(flags: list[integrity.Flag], known: dict[int, integrity.Flag]) -> tuple[integrity.Flag, ...]:
-    """All flags in the order of the frames; the latest inspection knows best, and what is known before it stays."""
+    """All flags in the order of the frames; the latest inspection takes precedence, earlier findings remain."""
     named = {**known, **{flag.frame: flag for flag in flags if known.get(flag.frame, flag).swapped_with is None}}
     return tuple(named[frame] for frame in sorted(named))
 

@@ -1,4 +1,4 @@
-"""The full result of a checked set: slopes at every pixel, robust fit, and the zonal map of what the fit leaves."""
+"""The full result of a checked set: slopes at every pixel, robust fit, and the zonal map of the residual."""
 
 import math
 from dataclasses import dataclass, replace
@@ -32,9 +32,9 @@ class FullResult:
     fit: reconstruct.Fit  # the surface: Hencky excess and 36 terms; `changes_mm` of all iterations from the start
     index: IntArray  # (n,): pixels inside the analysis radius that gave slopes, counted row by row
     field: FloatArray  # (6, n): x, y in mm, measured slopes, fitted slopes
-    weights: FloatArray  # (n,): what each had to say in the fit
+    weights: FloatArray  # (n,): weight in the fit
     swing_adu: Singles  # (n,): the smaller of the two fringe amplitudes
-    # (n,): what the sinusoids leave of the frames: noise, motion, the display's harmonics
+    # (n,): residual of the frames after the sinusoids: noise, motion, the display's harmonics
     rest_adu: Singles
     grid: zonal.ResidualGrid  # mean slope residuals in cells
     residual_mm: FloatArray  # (m, m): height over the fit, 0 at the vertex; NaN where nothing was measured
@@ -47,7 +47,7 @@ class FullResult:
         return self.fit.surface
 
     def height_mm(self) -> FloatArray:
-        """Height above the vertex (m, m) on `grid.axis_mm`: the fit and what it leaves; NaN where not measured."""
+        """Height above the vertex (m, m) on `grid.axis_mm`: the fit plus its residual; NaN where not measured."""
         x, y = np.meshgrid(self.grid.axis_mm, self.grid.axis_mm)
         return self.surface.height(x, y) + self.residual_mm
 
@@ -91,7 +91,7 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
 
 
 def _rays(geometry: Geometry, column: IntArray, row: IntArray) -> FloatArray:
-    """Rays of pixels, in parts: what is needed on the way to them is larger than they are."""
+    """Rays of pixels, in parts, because the intermediate results are larger."""
     out = np.empty((3, column.size))
     for start in range(0, column.size, _PART):
         part = slice(start, start + _PART)
@@ -123,7 +123,7 @@ def reconstruct_full(
     pixels: PixelPoints,
     start: reconstruct.HeightFunction | None = None,
 ) -> FullResult:
-    """Fit the pixels and integrate what the fit leaves.
+    """Fit the pixels and integrate the residual.
 
     `start` is the starting shape, by default the paper's parabola of 40 mm.
     """

@@ -47,7 +47,7 @@ def worth_correcting(displacement_um: FloatArray, noise_um: float) -> bool:
     """Whether the readings show motion beyond the laser's noise.
 
     A swing of 1 um standard deviation left in the frames costs 0.3 um RMS of figure; correcting with 1 um of pure
-    noise costs 0.12 um (both measured on the twin). Above 1.5 times the noise nearly all of what is seen is motion.
+    noise costs 0.12 um (both measured on the twin). Above 1.5 times the noise nearly all of it is motion.
     """
     return bool(np.all(np.isfinite(displacement_um)) and np.std(displacement_um) > 1.5 * noise_um)
 

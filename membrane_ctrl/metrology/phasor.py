@@ -91,7 +91,7 @@ class Binner:
     Parameters
     ----------
     height_px, width_px : int
-        Size of the frames; what does not fill a bin at the right and lower edge is left out.
+        Size of the frames; incomplete bins at the right and lower edge are omitted.
     bin_px : int
         Side of a bin.
     full_scale_adu : int
@@ -197,7 +197,7 @@ def _still(c, s, slope, turn_real, turn_imag, mirror_real, mirror_imag):  # type
 
 @kernel
 def _angle(c, s, last_cos, last_sin, change, size):  # type: ignore[no-untyped-def]
-    """Angle of c + is against the last phase, and its length; c + is is left with length 1."""
+    """Angle of c + i s relative to the last phase, and its length; normalises c + i s to length 1."""
     for p in range(c.size):
         length = math.sqrt(c[p] * c[p] + s[p] * s[p])
         scale = 1 / (length + 1e-300)

@@ -97,7 +97,7 @@ def _say_if_missing(run: Run, telemetry: bool) -> None:
 
 
 def _nothing(run: Run) -> errors.InputError:
-    return errors.InputError("; ".join((f"{run.folder}: none of the requested data to export", *run.notes)))
+    return errors.InputError("; ".join((f"{run.folder}: nothing to export of the requested data", *run.notes)))
 
 
 def shape_table(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> pa.Table:

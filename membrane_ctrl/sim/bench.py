@@ -21,7 +21,7 @@ from membrane_ctrl.sim.lab import Lab
 from membrane_ctrl.sim.plant import STEP_S, BenchEvent, Plant
 from membrane_ctrl.sim.sensors import TRUTH_BYTES, Truth
 
-_PERIOD_S = 0.004  # below the sensors' 5 ms, so that each of their samples is out on time
+_PERIOD_S = 0.004  # below the sensors' 5 ms, so that each sample is on time
 _STEPS_AT_ONCE = 4000  # some 10 ms of work: after a stall, clients are answered while the plant catches up
 
 
@@ -38,8 +38,8 @@ class BenchSpec:
     truth: RingAddress | None = None  # where to publish `Truth.pack()` with every sample
     # how long the bench outlives the process that started it, so that the tripped watchdog can be seen
     linger_s: float = 5.0
-    events: tuple[BenchEvent, ...] = ()  # what happens when, in plant time (0 at the start)
-    lab: DevicesConfig | None = None  # serve these instruments in place of the pump board
+    events: tuple[BenchEvent, ...] = ()  # events in plant time (0 at the start)
+    lab: DevicesConfig | None = None  # serve these instruments instead of the pump board
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +54,12 @@ class BenchReport:
 def serve(spec: BenchSpec, ready: Connection) -> None:
     """Serve the bench in a spawned process until `processes.STOP`, or until `linger_s` after the parent's end.
 
-    `ready` gets one BenchReport; a bench that cannot be built or cannot listen says so there and ends. SIGINT is
+    `ready` gets one BenchReport; a bench that cannot be built or cannot listen reports that and ends. SIGINT is
     ignored: Ctrl-C goes to the whole terminal, and the bench must outlive the controller's safe stop.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if spec.speed <= 1.0:
-        raise_priority()  # it stands for devices with processors of their own; faster than that it may use up a core
+        raise_priority()  # it represents devices with their own processors; at higher speeds it may use up a core
     asyncio.run(_serve(spec, ready))
 
 
@@ -92,7 +92,7 @@ async def _serve(spec: BenchSpec, ready: Connection) -> None:
 
 
 async def _keep_running(bench: "LiveBench", spec: BenchSpec, stop: asyncio.Event) -> None:
-    """Step the bench on absolute deadlines until told to stop."""
+    """Step the bench on absolute deadlines until stopped."""
     orphaned_s: float | None = None
     deadline_s = time.monotonic()
     while not stop.is_set():
@@ -138,9 +138,9 @@ class LiveBench:
         self._plant.actuate(pump_fraction, vent_fraction)
 
     def catch_up(self) -> None:
-        """Bring the plant to the clock, after a long stall in several calls.
+        """Advance the plant to the clock, after a long stall in several calls.
 
-        Of several samples that are due, only the last could be seen by a client; the counter counts all.
+        Of several due samples a client could see only the last; the counter counts all.
         """
         due_s = (self._now() - self._start_s) * self._speed - self._plant.time_s
         steps = min(int(due_s / STEP_S), _STEPS_AT_ONCE)
@@ -180,7 +180,7 @@ class TwinProcess:
     """A running simulated bench."""
 
     config: Config  # the run's configuration with the twin's own address as its device
-    truth: RingAddress  # where the twin publishes what its mirror really does
+    truth: RingAddress  # where the twin publishes its mirror's true state
 
     @classmethod
     def started(
@@ -188,7 +188,7 @@ class TwinProcess:
     ) -> "TwinProcess":
         """Start the twin and wait until it listens; the stack ends it. Raises DeviceError, e.g. for a busy port.
 
-        With `lab` it answers as the instruments that the configuration names, else as the pump board.
+        With `lab` it answers as the configured instruments, else as the pump board.
         """
         truth = stack.enter_context(ring(_TRUTHS_KEPT, TRUTH_BYTES))
         spec = BenchSpec(
@@ -219,7 +219,7 @@ _STOPS = {signal.SIGINT, signal.SIGTERM}
 
 
 def serve_twin(config: Config, speed: float) -> int:
-    """Serve until SIGINT or SIGTERM; says on stderr where it listens. Raises DeviceError, e.g. for a busy port."""
+    """Serve until SIGINT or SIGTERM; print the address on stderr. Raises DeviceError, e.g. for a busy port."""
     spec = BenchSpec(config.twin, config.pump, RunClock.start(), config.twin.port, speed=speed, linger_s=0.0)
     with contextlib.ExitStack() as stack:
         url = f"tcp://127.0.0.1:{_started(spec, stack).port}"

@@ -29,7 +29,7 @@ POISSON_PET = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Hencky:
-    """What gas and optics see of a film.
+    """A film's solution, as used by gas and optics.
 
     Everything but the profile is a number: w0 / (a q^(1/3)) and the volume under the film / (pi a^2 w0), 0.65344 and
     0.5214 for nu = 0.3. `profile[k]` multiplies u^k: height above the vertex for a sag of 1.
@@ -109,7 +109,7 @@ BACK_FILM = Film(thickness_um=10.0, creep_per_decade=0.02)
 NOMINAL_SAG_MM = float(MIRROR_FILM.sag_mm_per_root_pa(SETTLED_S)) * NOMINAL_PRESSURE_PA ** (1 / 3)
 
 
-# The nitrogen between the films: how much there is, how warm it is, and the pressure that follows.
+# The nitrogen between the films: its amount, its temperature, and the resulting pressure.
 #
 # Amounts and flows are in mL at reference conditions (nominal absolute pressure, 23 deg C), as a mass-flow meter
 # counts them: one mL is always the same number of molecules.
@@ -138,13 +138,13 @@ class Gas:
 
         Ideal gas in films of volume V = c p^(1/3): with u = p^(1/3), (ambient + u^3) c u = P V of the gas. The left
         side is convex and almost linear in u (u^3 is 0.6 % of ambient), so that one Newton step from the last u is
-        exact to 1e-11 in the twin's small steps; what a sudden jump leaves is gone with the next.
+        exact to 1e-11 in the twin's small steps; the next step removes the error of a sudden jump.
 
         `added_ml` is reference mL in minus out, `follow` the share of the difference to the air temperature that is
         made up in this step, `volume` the c of both films in m^3 per Pa^(1/3).
         """
         amount_ml = self.amount_ml + added_ml
-        self.amount_ml = amount_ml if amount_ml > 0.0 else 0.0  # a third of the time of max(), in every step
+        self.amount_ml = amount_ml if amount_ml > 0.0 else 0.0  # a third of the time of max()
         self.temperature_k += (air_k - self.temperature_k) * follow
         pv = self.amount_ml * JOULE_PER_ML * self.temperature_k / REFERENCE_K
         u = self.root_pa

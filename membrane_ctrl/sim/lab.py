@@ -1,4 +1,4 @@
-"""The instruments that a configuration names, emulated in bytes over one plant: what a lab has instead of the board.
+"""Emulates a configuration's instruments byte by byte over one plant: a lab without a pump board.
 
 Each serial port of the configuration becomes a pseudo-terminal, each Modbus TCP address a port of this machine; the
 drivers are given these in place of the real ones.
@@ -22,7 +22,7 @@ from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.instruments.bench import map_keys
 
 _GATEWAY_NO_RESPONSE = 11
-_PRESSURE_FULL_MBAR = 10.0  # an EL-PRESS of 1 kPa, as the mirror's 600 Pa wants
+_PRESSURE_FULL_MBAR = 10.0  # an EL-PRESS of 1 kPa suits the mirror's 600 Pa
 _FLOW_FULL_MLN_MIN = 360.0  # 6 mL/s
 _VERSION = 100  # V1.00
 _READ_INPUT = 4
@@ -59,7 +59,7 @@ class Lab:
                 self.serial[url] = modbus_server.RtuBusEmulator(line, handlers)
 
     async def start(self) -> DevicesConfig:
-        """Plug everything in; the configuration with the addresses that now answer. Raises OSError."""
+        """Plug everything in; returns the configuration with the emulators' addresses. Raises OSError."""
         self._folder = tempfile.TemporaryDirectory(prefix="membrane-lab-")
         for number, (port, device) in enumerate(self.serial.items()):
             self.wires[port] = serial_device.PtyWire(device, Path(self._folder.name, f"tty{number}"))
@@ -93,7 +93,7 @@ class Lab:
         return section.model_copy(update={"link": self._address(section.link)})
 
     def _address(self, url: str) -> str:
-        """Where the emulators of a Modbus URL answer."""
+        """Address of the emulators of a Modbus URL."""
         if url in self._servers:
             return f"tcp://127.0.0.1:{self._servers[url].port}"
         _, mark, options = url.partition("?")
@@ -161,7 +161,7 @@ class Lab:
         )
 
     def _sensor(self, role: str) -> Callable[[], float]:
-        """What the sensor of a role sees now, in the role's unit."""
+        """Present value of a role's sensor, in the role's unit."""
         names: Mapping[str, str] = {
             "displacement": "displacement_um",
             "gauge_pressure": "gauge_pressure_pa",
@@ -206,7 +206,7 @@ class MapDevice:
         self.restart()
 
     def restart(self) -> None:
-        """Power-up: every output at the raw value 0, and the plant is told what that means, if anything."""
+        """Power up: every output at the raw value 0, with its effect on the plant, if any."""
         self._written = {found.address + n: 0 for found in self._outputs for n in range(found.words)}
         for found, tell in self._outputs.items():
             self._tell(found, tell)
@@ -234,7 +234,7 @@ class MapDevice:
 
     def _tell(self, found: ValueMap, tell: Callable[[float], None]) -> None:
         value = found.decode([self._written[found.address + n] for n in range(found.words)])
-        # a current below 4 mA is a broken wire to what hangs on the output: off
+        # a current below 4 mA means a broken wire to the driven device: off
         tell(value if found.allows(value) else 0.0)
 
 

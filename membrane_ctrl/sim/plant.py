@@ -2,7 +2,7 @@
 
 Plain floats in a plain loop: a step is some 30 operations, which NumPy would make slower, and a compiled kernel
 would add its start-up to every process for a plant that is already 1000 times faster than real time.
-What does not depend on the state (surroundings, creep) is made with NumPy for a block of steps ahead.
+NumPy computes what does not depend on the state (surroundings, creep) for a block of steps ahead.
 """
 
 import math
@@ -19,7 +19,7 @@ from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim import film, sensors
 
-# The diaphragm pump: adds gas only, sticks at low command, answers late.
+# The diaphragm pump: adds gas only, sticks at low commands, responds late.
 
 
 LAG_S = 0.15  # motor and diaphragm
@@ -47,7 +47,7 @@ class PumpModel:
     def hold(self, flow_ml_per_s: float) -> float:
         """Settle at the command that delivers this flow, and return it.
 
-        A flow so small that the pump would stall leaves it off.
+        The pump stays off if the flow is too small to keep it running.
         """
         command = self._dead + flow_ml_per_s / self._ml_per_s_per_fraction
         self._running = self._stall <= command <= 1
@@ -80,7 +80,7 @@ SCENARIOS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What acts on the bench in each step of a block; arrays (steps,), filled in place."""
+    """The bench's surroundings in each step of a block; arrays (steps,), filled in place."""
 
     time_s: Series  # plant time of each step
     ambient_pa: Series
@@ -94,7 +94,7 @@ class BenchEvent(Protocol):
     """Something that happens to the bench at a time; picklable."""
 
     def apply(self, on: Surroundings) -> None:
-        """Add itself to what the surroundings do."""
+        """Add the event's effect to the surroundings."""
 
 
 class OrnsteinUhlenbeck:
@@ -119,7 +119,7 @@ class OrnsteinUhlenbeck:
 
 
 class Disturbance:
-    """What the surroundings do, in blocks of consecutive steps: scenario, drift of the laser's mount, events."""
+    """The surroundings in blocks of consecutive steps: scenario, drift of the laser's mount, events."""
 
     def __init__(
         self, config: TwinConfig, events: Sequence[BenchEvent], step_s: float, rng: np.random.Generator
@@ -167,7 +167,7 @@ NOMINAL_UM_PER_ML = (
 
 
 def gas_compliance_ml_per_pa() -> float:
-    """C = dV_gas/dp = V/(3p) + V/P of the nominal mirror: what the leak's time constant refers to."""
+    """C = dV_gas/dp = V/(3p) + V/P of the nominal mirror, the basis of the leak's time constant."""
     volume_ml = 1e6 * _NOMINAL_VOLUME * _NOMINAL_GAS.root_pa
     return volume_ml / (3 * film.NOMINAL_PRESSURE_PA) + volume_ml / (
         film.STANDARD_AMBIENT_PA + film.NOMINAL_PRESSURE_PA
@@ -216,9 +216,9 @@ class Plant:
         self._vent_fraction = vent_fraction
 
     def advance(self, duration_s: float) -> None:
-        """Let time pass, in whole steps; what is left of a step is kept for the next call."""
+        """Advance time in whole steps; the rest of a step is kept for the next call."""
         due = self._rest + duration_s / STEP_S
-        steps = math.floor(due + 1e-6)  # 0.02 s is four steps, whatever 0.02 is in binary
+        steps = math.floor(due + 1e-6)  # 0.02 s is four steps despite binary rounding
         self._rest = due - steps
         while steps > 0:
             if self._index + 1 == _BLOCK_STEPS:
@@ -232,7 +232,7 @@ class Plant:
         return self.sample_of(self.truth())
 
     def sample_of(self, truth: sensors.Truth) -> BoardSample:
-        """The same from a known truth."""
+        """A sample from a known truth."""
         return self._sensors.read(truth)
 
     def truth(self) -> sensors.Truth:

@@ -1,4 +1,4 @@
-"""What the bench's sensors read of the true state."""
+"""Readings of the bench's sensors from the true state."""
 
 import struct
 from dataclasses import astuple, dataclass, fields
@@ -8,7 +8,7 @@ import numpy as np
 from firmware_iface.emulators.board_state import BoardSample
 from membrane_ctrl.config.schema import TwinConfig
 
-# What really is, beside what the sensors say: for the recording and the optics, never for the controller.
+# The true state, for the recording and the optics, never for the controller.
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +23,8 @@ class Truth:
     ambient_pressure_pa: float
     air_temperature_c: float
     gas_temperature_c: float
-    laser_bias_um: float  # what the laser reads too much, from its mount
-    laser_lost: float  # 1 while the laser gets no light back
+    laser_bias_um: float  # error of the laser due to its mount
+    laser_lost: float  # 1 while the laser receives no light
     leak_um_per_s: float  # speed at which the leak alone lets the centre down
     pump_um_per_s: float  # speed at which the pump's flow lifts it
     vent_um_per_s: float

@@ -1,4 +1,4 @@
-"""Shapes made from the twin's truth: what a measurement cycle would say, without rendering a frame.
+"""Shapes from the twin's truth: the results of measurement cycles, without rendering frames.
 
 For runs of days in virtual time and for the fault campaign; the real cycle runs on rendered frames (`optics.camera`).
 """
@@ -22,8 +22,8 @@ EXPOSURES_S = 0.9  # first to last frame of that cycle: over it the laser's read
 class TruthShape:
     """A `ShapeSource`; equal seeds give equal shapes.
 
-    `sag_sigma_um` is the standard deviation of a cycle's sag; a bench whose frames are worse than rendered ones has
-    more.
+    `sag_sigma_um` is the standard deviation of a cycle's sag, larger for a bench whose frames are worse than
+    rendered ones.
     """
 
     def __init__(self, bench: VirtualBench, config: Config, seed: int, sag_sigma_um: float = SAG_SIGMA_UM) -> None:

@@ -1,7 +1,7 @@
 """The pump board in virtual time: its registers, its watchdog and its latches around the twin's plant, no wire.
 
-The driver is the one of a real bench; only its link ends in memory. What can go wrong with sensors, link, board and
-actuators is a set of switches (`Wrong`), so that a scenario or a campaign turns them while time runs.
+The driver is that of a real bench; only its link ends in memory. Failures of sensors, link, board and actuators are
+switches (`Wrong`), which a scenario or a campaign changes at run time.
 """
 
 import contextlib
@@ -22,10 +22,10 @@ _LASER_NO_LIGHT = 1
 
 @dataclass(slots=True)
 class Wrong:
-    """What is wrong now; all off at first. Fractions and offsets are NaN or 0 when off."""
+    """Present failures, initially none. Fractions and offsets are NaN or 0 when off."""
 
     no_light: bool = False  # the laser has no reading
-    laser_offset_um: float = 0.0  # it reads this much too much
+    laser_offset_um: float = 0.0  # error of its reading
     laser_stuck: bool = False  # it repeats its value, with samples that advance
     samples_frozen: bool = False  # the board answers with the same sample again and again
     gauge_lost: bool = False

@@ -290,7 +290,7 @@ def test_what_is_no_facet_file(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_error_bars(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert measured(made / "0000", tmp_path)[0] == 0
     said = capsys.readouterr().out
-    assert "of noise" in said
+    assert "from noise" in said
     assert "the paper's 2 mm, 2 mm and 0.3 degrees assumed" in said
     details = json.loads((tmp_path / "details.json").read_text())["sag_sigma_um"]
     sigma = np.load(tmp_path / "sigma.npz")

@@ -219,7 +219,7 @@ def test_a_window_limits_the_ticks_and_runs_lie_over_each_other(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("asked", "said"),
     [("--at +9h", "not in the run"), ("--at 25:00", "write 03:12"), ("--around explosion", "no such event"),
-     ("--around= ", "say which event"), ("--tab x", "--tab"), ("--align x", "--align"),
+     ("--around= ", "name an event"), ("--tab x", "--tab"), ("--align x", "--align"),
      ("--from +20s --to +10s", "not before"), ("--from +3h --to +4h", "not in the run"),
      ("--to 2020-01-01", "not in the run"), ("--at +10s --around hold", "only one"), ("--port 9", "only with --web"),
      ("--live", "--live follows")],

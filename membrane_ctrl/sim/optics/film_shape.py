@@ -213,7 +213,7 @@ class Bump:
 
 @dataclass(frozen=True, slots=True)
 class FilmShape:
-    """The film as the twin knows it. Raises ValueError that names the field and what would be right."""
+    """The twin's film. Raises ValueError naming the field and a valid value."""
 
     sag_mm: float  # depth of the bowl (rim above vertex, without the other terms) at displacement 0
     radius_mm: float = 500.0
@@ -248,7 +248,7 @@ class FilmShape:
         return np.reshape(flat, np.shape(x_mm))
 
     def coeffs_um(self, displacement_um: float = 0.0) -> FloatArray | None:
-        """Noll j = 1..36 of the whole surface, 0 at the vertex; None if the 36 terms cannot carry it.
+        """Noll j = 1..36 of the whole surface, 0 at the vertex; None if 36 terms cannot represent it.
 
         A paraboloid s rho^2 is s/(2 sqrt 3) of Z4 = sqrt(3) (2 rho^2 - 1) above a piston of s/2.
         """
@@ -289,7 +289,7 @@ def _terms(film: FilmShape) -> FilmTerms:
 
 
 def typical_film(sag_mm: float, radius_mm: float, seed: int) -> FilmShape:
-    """A mounted film: a Hencky bowl with the figure that clamping by hand leaves.
+    """A mounted film: a Hencky bowl with the figure errors of clamping by hand.
 
     0.3 mm of astigmatism, 0.1 mm of coma and 0.05 mm of trefoil, each in a direction drawn from the seed,
     and 10 um RMS spread over the terms above.

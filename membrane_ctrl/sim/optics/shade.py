@@ -1,4 +1,4 @@
-"""From traced nodes to counts: one compiled pass over the picture, about ten nanoseconds a pixel.
+"""Turns traced nodes into counts: one compiled pass over the picture, about ten nanoseconds per pixel.
 
 Nodes stand every `step` pixels, one before the first pixel and two after the last. Between them a cubic through four
 nodes (Lagrange) in each direction; with step 1 every pixel is a node and nothing is interpolated.
@@ -109,7 +109,7 @@ def shade(
     column_loss, row_loss = loss
     quantiles, sigma, seed = noise
     radius2_mm2 = radius_mm * radius_mm
-    # three arrays and not rows of one: a view taken per pixel costs more than the pixel
+    # three arrays, not rows of one: a view taken per pixel costs more than the pixel
     line_x, line_y, line_r2 = np.empty(nodes.shape[2]), np.empty(nodes.shape[2]), np.empty(nodes.shape[2])
     state, bits = np.uint64(seed) * _MIX_1, np.uint64(0)
     for row in range(height):
@@ -136,7 +136,7 @@ def shade(
                 out[row, column] = min(max(counts + 0.5, 0.0), full)
 
 
-# What a pattern puts on the screen, as the light level (0..1) at each place along one axis.
+# A pattern's light level (0..1) at each place along one axis of the screen.
 #
 # s is measured from the low edge of the pattern region, a square centred on O'; outside it the screen is dark.
 
@@ -147,9 +147,9 @@ _SINE_CELLS = 16384
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """From the pattern's level to the camera's counts.
+    """Conversion of the pattern's level to the camera's counts.
 
-    Raises ValueError that names the field and what would be right.
+    Raises ValueError naming the field and a valid value.
     """
 
     dark_fraction: float = 0.02  # counts without light, of full scale
@@ -177,7 +177,7 @@ class LevelTable:
     """Light along an axis in cells `cell_mm` wide.
 
     A smooth table is one period, repeated and interpolated, with one value more than cells so that the last cell has
-    an end; the other is one value a cell over the whole region.
+    an end; the other has one value per cell over the whole region.
     """
 
     values: FloatArray
@@ -226,5 +226,5 @@ def pattern_sequence(kind: str, config: PatternConfig, shifts_rad: tuple[float, 
 
 
 def _lit(levels: FloatArray, light: Light) -> FloatArray:
-    """Share of a white screen's light: gamma, and what leaks through a black screen."""
+    """Share of a white screen's light: gamma, and the leak of a black screen."""
     return np.asarray(light.leak + (1.0 - light.leak) * np.clip(levels, 0.0, 1.0) ** light.gamma)

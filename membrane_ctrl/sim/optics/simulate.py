@@ -1,4 +1,4 @@
-"""Capture sets with known truth: the twin's pictures in the files that a real bench writes."""
+"""Capture sets with known truth: the twin's pictures in a real bench's file format."""
 
 import json
 from collections.abc import Callable
@@ -15,18 +15,18 @@ from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
 
-# The `capture.toml` of a simulated set, and the truth beside it.
+# The `capture.toml` of a simulated set, and its truth.
 _GRID = 201  # odd, so that the vertex is a point of the truth's map
 
 
 def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, Any]:
-    """The content of `capture.toml` (schema membrane-capture/1); `readings_um` (frames,) is what the laser said."""
+    """The content of `capture.toml` (schema membrane-capture/1); `readings_um` (frames,) are the laser's readings."""
     geometry = _written(spec.stated_geometry or spec.optics.geometry)
     if spec.laser:
         geometry["reference_displacement_um"] = spec.reference_um
     camera = _written(spec.optics.camera)
     if spec.optics.camera.bits == 8:
-        del camera["bits"]  # what a reader takes for granted
+        del camera["bits"]  # the default of readers
     camera["principal_px"] = list(spec.optics.camera.principal)
     table: dict[str, Any] = {"schema": "membrane-capture/1", "kind": spec.kind}
     if spec.reference:
@@ -47,12 +47,12 @@ def write_capture_toml(folder: Path, spec: SimulationSpec, readings_um: FloatArr
 
 
 def write_truth(folder: Path, spec: SimulationSpec) -> None:
-    """Write what the set was made of.
+    """Write the truth of a set.
 
     `truth.npz`: `x_mm` (W,), `y_mm` (H,), `h_mm` (H, W) above the vertex, NaN outside the rim, at the mean
     displacement of the sinusoids; `h_per_sag` (H, W), its change with sag; `displacement_um` (frames,); `coeffs_um`
-    (36,), Noll j = 1..36 with the surface 0 at the vertex, when the 36 terms carry the shape.
-    `truth.json`: the same numbers without the maps, and everything that was asked for.
+    (36,), Noll j = 1..36 with the surface 0 at the vertex, if 36 terms represent the shape.
+    `truth.json`: the same numbers without the maps, and the request.
     """
     displacement_um = np.array([spec.displacement_um(frame) for frame in range(len(spec.patterns))])
     fringes = np.array([pattern.role == "sin" for pattern in spec.patterns])
@@ -86,7 +86,7 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
 
 
 def _written(section: settings.Section) -> dict[str, Any]:
-    """A configuration table as written: without what is absent, and without lists that are empty."""
+    """A configuration table as written, without absent fields and empty lists."""
     return {key: value for key, value in section.model_dump(mode="json", exclude_none=True).items() if value != []}
 
 
@@ -103,13 +103,13 @@ def _frame_row(spec: SimulationSpec, frame: int, reading_um: float) -> dict[str,
     return row
 
 
-# noise does not compress: harder levels cost time and save nothing
+# noise does not compress: higher levels cost time and save nothing
 _PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 
 
 @dataclass(frozen=True, slots=True)
 class _Exposure:
-    """What truly happened for one file."""
+    """The true exposure behind one file."""
 
     pattern: roles.Pattern
     displacement_um: float
@@ -128,10 +128,10 @@ def simulate_run(
     interval_s: float = 4.0,
     on_set: Callable[[int], None] | None = None,
 ) -> None:
-    """Write a run: `0000` is the full set, the others are fringes that lean on it; one clock and one motion for all.
+    """Write a run: `0000` is the full set, the others are fringes anchored to it; one clock and one motion for all.
 
-    Each set has a folder. The first set's motion runs on through the others, its faults stay its own; sets start
-    `interval_s` apart. `on_set` is told the number of sets written, after each. Raises ValueError if the first set is
+    Each set has a folder. The first set's motion continues through the others, its faults do not; sets start
+    `interval_s` apart. `on_set` gets the number of sets written, after each. Raises ValueError if the first set is
     not full, lists its displacements, or the sets overlap in time.
     """
     if spec.kind != "full" or spec.displacements_um:
@@ -156,7 +156,7 @@ def simulate_run(
 
 
 def _anchored(spec: SimulationSpec) -> SimulationSpec:
-    """The same with the geometry's reference displacement written out, so that all sets of a run share it."""
+    """The specification with an explicit reference displacement of the geometry, common to all sets of a run."""
     stated = spec.stated_geometry or spec.optics.geometry
     return replace(spec, stated_geometry=stated.model_copy(update={"reference_displacement_um": spec.reference_um}))
 
@@ -190,7 +190,7 @@ def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> 
 
 
 def _exposures(spec: SimulationSpec) -> list[_Exposure]:
-    """What was truly shown, where the film truly was and how long the exposure truly took, frame by frame."""
+    """The true pattern, film position and exposure time of each frame."""
     exposures = [_Exposure(pattern, spec.displacement_um(frame)) for frame, pattern in enumerate(spec.patterns)]
     place = {pattern.name: frame for frame, pattern in enumerate(spec.patterns)}
     for fault in spec.faults:

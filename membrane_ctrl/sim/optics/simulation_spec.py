@@ -1,4 +1,4 @@
-"""What a simulated capture set is made of, checked before anything is written."""
+"""The specification of a simulated capture set, checked before anything is written."""
 
 from dataclasses import dataclass, field
 from math import isfinite, pi, sin
@@ -8,14 +8,14 @@ from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
 from membrane_ctrl.sim.optics import film_shape, shade, trace
 
-# Faults that a simulated set can carry: what goes wrong with single frames on a real bench.
+# Faults of single frames on a real bench, for simulated sets.
 
 
 FaultKind = Literal[
     "stale", "swapped", "missing", "saturated", "dark", "flicker", "moved", "wrong_size", "wrong_depth"
 ]
 
-# Strength of a fault that has one: exposure against nominal, or um of film displacement
+# Strength of a fault: relative exposure, or um of film displacement
 _DEFAULT_AMOUNT: dict[FaultKind, float] = {"saturated": 2.0, "dark": 0.05, "flicker": 0.8, "moved": 200.0}
 
 
@@ -24,11 +24,11 @@ class FrameFault:
     """One fault of one frame."""
 
     # "stale" (the picture of the frame before, byte for byte), "swapped" (with the frame after), "missing" (listed
-    # but not written), "saturated", "dark", "flicker" (wrong exposure), "moved" (the film stood elsewhere and the
-    # laser did not say so), "wrong_size" (one row short), "wrong_depth" (8 for 16 bit and the reverse)
+    # but not written), "saturated", "dark", "flicker" (wrong exposure), "moved" (the film moved unnoticed by the
+    # laser), "wrong_size" (one row short), "wrong_depth" (8 for 16 bit or the reverse)
     kind: FaultKind
     frame: str  # the frame's name, as `x_sin_2`
-    amount: float | None = None  # exposure against nominal, or um for "moved"; None: a usual one
+    amount: float | None = None  # relative exposure, or um for "moved"; None: a typical one
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(FaultKind):
@@ -38,14 +38,14 @@ class FrameFault:
 
     @property
     def strength(self) -> float:
-        """The amount, or the usual one of this kind."""
+        """The amount, or the typical one of this kind."""
         return _DEFAULT_AMOUNT[self.kind] if self.amount is None else self.amount
 
     @classmethod
     def parse(cls, text: str) -> "FrameFault":
         """Read `kind:frame` or `kind:frame:amount`.
 
-        Raises ValueError if the text has another form, names no known kind or its amount is not a number.
+        Raises ValueError if the form, the kind or the amount is invalid.
         """
         kind, _, rest = text.partition(":")
         frame, _, amount = rest.partition(":")
@@ -61,7 +61,7 @@ class FrameFault:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Where the film's centre is: start + drift t + amplitude sin(2 pi frequency t + phase)."""
+    """Position of the film's centre: start + drift t + amplitude sin(2 pi frequency t + phase)."""
 
     start_um: float = 0.0
     drift_um_per_s: float = 0.0
@@ -70,14 +70,14 @@ class Motion:
     phase_rad: float = 0.0
 
     def at_um(self, time_s: float) -> float:
-        """Displacement at a moment."""
+        """Displacement at a time."""
         swing = self.amplitude_um * sin(2.0 * pi * self.frequency_hz * time_s + self.phase_rad)
         return self.start_um + self.drift_um_per_s * time_s + swing
 
 
 @dataclass(frozen=True, slots=True)
 class SimulationSpec:
-    """One simulated capture set. Raises ValueError that names the field and what would be right."""
+    """One simulated capture set. Raises ValueError naming the field and a valid value."""
 
     # the bench as it truly is, with the camera's depth (`bits`) and noise and the pattern's steps
     optics: OpticsConfig
@@ -92,12 +92,12 @@ class SimulationSpec:
     frame_interval_s: float = 0.1
     laser: bool = True  # whether the frames carry the laser's reading
     laser_noise_um: float = 0.0  # standard deviation of that reading
-    stated_geometry: GeometryConfig | None = None  # what `capture.toml` says, when it is not the truth
+    stated_geometry: GeometryConfig | None = None  # geometry in `capture.toml` if not the true one
     light: shade.Light = field(default_factory=shade.Light)
     screen_error: trace.ScreenError | None = None
     exact: bool = False
     seed: int = 1
-    faults: tuple[FrameFault, ...] = ()  # what goes wrong with single frames
+    faults: tuple[FrameFault, ...] = ()  # faults of single frames
 
     def __post_init__(self) -> None:
         if self.kind == "fringes" and not self.reference:
@@ -128,7 +128,7 @@ class SimulationSpec:
 
     @property
     def patterns(self) -> list[Pattern]:
-        """What is shown, frame by frame."""
+        """The patterns, frame by frame."""
         return shade.pattern_sequence(self.kind, self.optics.pattern, self.shifts_rad)
 
     def time_s(self, frame: int) -> float:
@@ -136,7 +136,7 @@ class SimulationSpec:
         return self.start_s + frame * self.frame_interval_s
 
     def displacement_um(self, frame: int) -> float:
-        """Where the film truly is during a frame (faults aside)."""
+        """True position of the film during a frame (faults aside)."""
         return self.displacements_um[frame] if self.displacements_um else self.motion.at_um(self.time_s(frame))
 
     @property

@@ -12,10 +12,10 @@ from membrane_ctrl.config.schema import CameraConfig, GeometryConfig
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.sim.optics.film_shape import FilmTerms, height_and_slopes
 
-# Camera and screen of the twin as exact poses: rays out of the pinhole, and the plane they end on.
+# Camera and screen of the twin as exact poses: rays from the pinhole, and the plane where they end.
 #
 # World: origin at the mirror's vertex, x horizontal, y up, z out of the reflective side; mm.
-_UNDISTORT_STEPS = 200  # each gains a digit or so on a usual lens
+_UNDISTORT_STEPS = 200  # each gains about a digit with a usual lens
 _UNDISTORT_TOLERANCE = 1e-14  # tangent of the ray's angle
 
 
@@ -31,7 +31,7 @@ class CameraPose:
 class ScreenPose:
     """O' as `origin_mm` and the unit vectors of `s_x` and `s_y`, each (3,), in world; bow and height map of the face.
 
-    The face stands off the plane by bow_per_mm (s_x^2 + s_y^2) and the map, towards s_x x s_y, which points at the
+    The face departs from the plane by bow_per_mm (s_x^2 + s_y^2) and the map, towards s_x x s_y, which points at the
     mirror.
     """
 
@@ -44,7 +44,7 @@ class ScreenPose:
 
 @dataclass(frozen=True, slots=True)
 class ScreenError:
-    """What a screen does that its nominal pose does not say.
+    """Deviation of a screen from its nominal pose.
 
     `tilt_about_x_deg` and `tilt_about_y_deg` turn it about its own s_x and s_y axes (right-handed); `bow_mm` is how
     far the face stands towards the mirror 200 mm away from O' (paraboloid; s_x and s_y count along the flat plane).
@@ -123,14 +123,14 @@ def _turned(vector: FloatArray, axis: FloatArray, angle_rad: float) -> FloatArra
     return vector * cos(angle_rad) + np.cross(axis, vector) * sin(angle_rad)
 
 
-# The twin's screen face: rays carried from the screen's plane to a face that stands off it.
+# The twin's screen face: rays continued from the screen's plane to the true face.
 #
-# A ray that crosses the plane at (u, v) with tangents (a, b) to its normal is at (u + a w, v + b w) when it is w off
-# the plane. On the face w = c (u^2 + v^2) + map(u, v): found by putting one into the other again and again, which
-# gains the product of the face's slope and the tangents, a factor of 50 or more, a time.
+# A ray that crosses the plane at (u, v) with tangents (a, b) to its normal is at (u + a w, v + b w) at a distance w
+# from the plane. On the face w = c (u^2 + v^2) + map(u, v): solved by fixed-point iteration, each step of which gains
+# the product of the face's slope and the tangents, a factor of 50 or more.
 
 _TOLERANCE_MM = 1e-11
-_FACE_MAX_STEPS = 50  # a face that a ray grazes may never settle
+_FACE_MAX_STEPS = 50  # a grazing ray may never converge
 
 
 def onto_face(
@@ -157,8 +157,8 @@ def _spline(height_map: HeightMapConfig) -> RectBivariateSpline:
     return RectBivariateSpline(height_map.s_y_mm, height_map.s_x_mm, height_map.heights_mm, kx=rows, ky=columns)
 
 
-_BEYOND = 1.1  # rays that pass further out than this share of the radius are not traced: polynomials run away there
-_MAX_STEPS = 20  # Newton needs 4 on any bowl; a ray grazing the film may never settle
+_BEYOND = 1.1  # rays beyond this share of the radius are not traced: polynomials diverge there
+_MAX_STEPS = 20  # Newton needs 4 on any bowl; a grazing ray may never converge
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +204,7 @@ def trace(
 def _film_distance(
     start: FloatArray, direction: FloatArray, film: FilmTerms, sag_mm: float, vertex_z_mm: float, guess_mm: float
 ) -> float:
-    """Path from `start` to the film along a unit vector; NaN if Newton does not settle.
+    """Path from `start` to the film along a unit vector; NaN if Newton does not converge.
 
     f(t) = z(t) - vertex_z - h(x(t), y(t)) = 0 with f' = d_z - h_x d_x - h_y d_y.
     """
