@@ -1,1 +1,1 @@
-"""Everything that knows a byte: the register map, links, drivers and emulators of devices."""
+"""Everything at byte level: the register map, links, drivers and emulators of devices."""

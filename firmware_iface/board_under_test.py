@@ -1,4 +1,4 @@
-"""A board under test: how the conformance test talks to it, and how it says that something is wrong."""
+"""A board under test: the conformance test's access to it, and its errors."""
 
 import asyncio
 import secrets
@@ -15,17 +15,17 @@ _U32_MAX = 2**32 - 1
 
 
 class ConformanceError(Exception):
-    """The board did not do what it must; the message says what it did."""
+    """The board violated a requirement; the message says how."""
 
 
 def require(right: bool, problem: str) -> None:
-    """Raise ConformanceError with the problem unless the board did right."""
+    """Raise ConformanceError with the problem unless the board behaved correctly."""
     if not right:
         raise ConformanceError(problem)
 
 
 class BoardUnderTest:
-    """A board (connected), the claim that the test has on it, and its heartbeat; the board's clock is what counts."""
+    """A connected board, the test's claim on it, and its heartbeat; times are those of the board's clock."""
 
     def __init__(self, link: ModbusLink, sleep: Callable[[float], Awaitable[None]] = asyncio.sleep) -> None:
         self._link = link
@@ -70,7 +70,7 @@ class BoardUnderTest:
         await self._put("reset", {"clear_faults": 0xFFFF, "clear_key": key or self._key})
 
     async def _rest(self) -> None:
-        """Pump off, faults cleared, watchdog off: how every check begins and ends."""
+        """Pump off, faults cleared, watchdog off: the state before and after every check."""
         steps: tuple[Callable[[], Awaitable[None]], ...] = (
             partial(self._arm, REST_S), self._clear, partial(self._write, 0.0), partial(self._arm, arm=0.0),
         )  # fmt: skip
@@ -80,7 +80,7 @@ class BoardUnderTest:
             except roles.LinkDownError:
                 raise
             except roles.LinkError:
-                continue  # what the board cannot do is said by the check that asks for it
+                continue  # the check of this feature reports that the board lacks it
 
     async def _tripped(self, after: str) -> None:
         found = await self._sensors()
@@ -98,7 +98,7 @@ class BoardUnderTest:
         raise ConformanceError(f"accepts {what}, which is outside its {why}")
 
     async def _busy(self, write: Awaitable[None], what: str) -> None:
-        """A write that has to be refused because somebody else holds the board."""
+        """Expect the refusal of a write because another program holds the board."""
         try:
             await write
         except roles.DeviceBusyError:
@@ -108,7 +108,7 @@ class BoardUnderTest:
         raise ConformanceError(f"accepts {what}")
 
     def _claim(self, key: int, period_s: float = REST_S, arm: float = 1.0) -> Awaitable[None]:
-        """Somebody else's claim."""
+        """Another program's claim."""
         claim = {"claim_id": self._id ^ 1 or 2, "claim_key": key}
         return self._put("settings", {"watchdog_period_s": period_s, "watchdog_arm": arm, **claim})
 

@@ -1,7 +1,7 @@
-"""Does a board do what a pump board must do? Any board is asked over its own protocol, nothing else is touched.
+"""Tests whether a board does what a pump board must, over its own protocol and without touching anything else.
 
-What is tested, and why, is in docs/firmware.md; each check names its section. The pump is commanded to a few per cent
-for moments: do not run it on a mirror that must not move.
+docs/firmware.md explains the requirements; each check names its section. The pump is briefly commanded to a few per
+cent: do not run it on a mirror that must not move.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ _Check = tuple[str, str, Callable[[], Awaitable[None]]]  # its name, the section
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """The result of one check: `problem` is empty when it passed, else what the board did wrong."""
+    """The result of one check: `problem` is empty if it passed, else the board's violation."""
 
     check: str
     section: str
@@ -30,19 +30,17 @@ class CheckResult:
 
 
 class Conformance(board_under_test.BoardUnderTest):
-    """The checks, in the order they are made."""
+    """The checks, in order."""
 
     async def run(self) -> list[CheckResult]:
-        """Make all checks; the first one decides whether the others mean anything.
+        """Run all checks; the first decides whether the others are meaningful.
 
         Raises LinkDownError (the board went away), DeviceBusyError (another program holds it).
         """
         findings = [await self._made("identity", "Registers", self._identity)]
         if findings[0].problem:
             return findings
-        with contextlib.suppress(
-            roles.DeviceRefusedError
-        ):  # what cannot be armed is said by the check that asks for it
+        with contextlib.suppress(roles.DeviceRefusedError):  # the check of the watchdog reports a failure to arm it
             await self._arm(REST_S)
         await self._rest()
         for check, section, test in self._checks():
@@ -315,9 +313,9 @@ def _outside(register: register_map.Register) -> list[int]:
 
 
 async def examine(url: str, unit_id: int = 1, timeout_s: float = 0.5) -> list[CheckResult]:
-    """All findings about the board at a Modbus URL.
+    """Return all findings about the board at a Modbus URL.
 
-    Raises LinkError if it is not there or another program holds it, ValueError for the URL.
+    Raises LinkError if it is absent or another program holds it, ValueError for a bad URL.
     """
     link = ModbusLinks().link(url, unit_id, timeout_s)
     await link.connect()

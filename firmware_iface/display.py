@@ -1,4 +1,4 @@
-"""What is shown on the screen and what is learnt of it, as pure functions of images and numbers."""
+"""The screen's patterns, and measurements of the screen, as pure functions of images and numbers."""
 
 import math
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ FloatArray = NDArray[np.float64]
 # The display's response, measured with a grey ramp, and the levels that make its light linear.
 
 RAMP_LEVELS = tuple(round(255 * step / 16) for step in range(17))  # a cubic between 17 points is off by < 0.2 %
-# Light of the levels in between, of the whole; less is a ramp that saw nothing
+# Least share of the light between the end levels; less means that the ramp was not seen
 _LEAST_SWING_ADU = 10.0
-# A step back by more than this share of the whole is no noise: something moved, or the display adapts its light
+# A step back by more than this share is not noise: something moved, or the display adapts its light
 _LARGEST_STEP_BACK = 0.02
 
 
@@ -28,7 +28,7 @@ class DisplayResponse:
 
     @property
     def gamma(self) -> float:
-        """Exponent of the power law that is nearest to the middle half of the ramp; for people."""
+        """Exponent of the power law that best fits the middle half of the ramp; for people."""
         middle = (self.light > 0.1) & (self.light < 0.9)
         x, y = np.log(self.levels[middle] / 255.0), np.log(self.light[middle])
         return float(np.sum(x * y) / np.sum(x * x))
@@ -44,7 +44,7 @@ class DisplayResponse:
 
 
 def linear_response() -> DisplayResponse:
-    """A display whose light is its level."""
+    """A display whose light is proportional to its level."""
     return DisplayResponse(np.array([0.0, 255.0]), np.array([0.0, 1.0]))
 
 
@@ -137,7 +137,7 @@ def pattern_light(pattern: Pattern, raster: ScreenRaster) -> NDArray[np.float32]
 
 
 def checkerboard(width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """Black and white pixel by pixel: what no scaler passes on."""
+    """Black and white pixel by pixel, which no scaler reproduces."""
     return np.asarray(np.indices((height_px, width_px)).sum(axis=0) % 2 * 255, np.uint8)
 
 
@@ -155,11 +155,11 @@ def _profile(pattern: Pattern, s_mm: FloatArray, period_mm: float) -> FloatArray
     raise ValueError(f"pattern {pattern.name!r}: role must be sin, gray (bit 1..{_GRAY_BITS}), white or black")
 
 
-# How long a display needs from the command to show a pattern until a frame may be exposed.
+# The time a display needs from the command until a frame may be exposed.
 #
-# After a step the light of a panel stands still for a latency L (queue, refresh, scan) and then approaches its end as
-# exp(-(t - L) / tau). Frames exposed at known times after the step give both; the wait is where less than one of 256
-# levels is left: L + tau ln 256. Doubling a settle time that was seen would double the latency too.
+# After a step a panel's light stays constant for a latency L (queue, refresh, scan) and then approaches its end as
+# exp(-(t - L) / tau). Frames exposed at known times after the step give both; the wait ends when less than one of 256
+# levels remains: L + tau ln 256. Doubling an observed settle time would double the latency too.
 
 _LEFT = 1.0 / 256.0  # of the step: one level
 _FIT_FROM, _FIT_TO = 0.6, 1.0 / 32.0  # of the step; below, noise bends the logarithm
@@ -170,37 +170,37 @@ _BLOCK_PX = 16  # the mean of 256 pixels has a sixteenth of their noise
 
 @dataclass(frozen=True, slots=True)
 class Settling:
-    """What was found."""
+    """Result of the measurement."""
 
     settle_s: float  # from the command to the start of an exposure
-    latency_s: float  # of the model; NaN where the display was too fast for the camera to see it on its way
+    latency_s: float  # of the model; NaN if the display was too fast for the camera to see the transition
     tau_s: float
 
 
 def share_left(frame: ArrayLike, before: ArrayLike, after: ArrayLike) -> float:
-    """How much of a step is left in a frame: the worst block's difference from the end, over the largest step.
+    """Remaining share of a step in a frame: the worst block's difference from the end, over the largest step.
 
     Each picture is (H, W); `before` is from before the step, `after` from long after it.
     """
     end = block_means(after)
     step = np.abs(block_means(before) - end)
-    # the worst block but a thousandth: a glint or a dead pixel is no display
+    # the worst block except a thousandth, to exclude glints and dead pixels
     return float(np.quantile(np.abs(block_means(frame) - end), 0.999) / max(float(np.quantile(step, 0.999)), 1e-9))
 
 
 def settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settling:
     """Latency, time constant and the time to wait.
 
-    `delay_s` (K,) are the starts of the exposures after the command, of any number of steps together; `left` (K,)
-    what was left of the step (`share_left`), `noise` what `left` is when nothing is. Raises ValueError if the display
-    never settles.
+    `delay_s` (K,) are the starts of the exposures after the command, from any number of steps; `left` (K,) the
+    remaining shares of the step (`share_left`), `noise` the value of `left` at the end. Raises ValueError if the
+    display never settles.
     """
     delays, shares = np.asarray(delay_s, np.float64), np.asarray(left, np.float64)
     order = np.argsort(delays)
     delays, shares = delays[order], shares[order]
     floor = max(_FIT_TO, _NOISE_SIGMAS * noise)
     unsettled = np.flatnonzero(shares > floor)
-    if unsettled.size == 0:  # faster than the first frame; what that had left goes no slower than the rest went
+    if unsettled.size == 0:  # faster than the first frame; its remainder decays at least as fast
         still = max(float(shares[0]), _LEFT)
         return Settling(float(delays[0]) * math.log(_LEFT) / math.log(still), math.nan, math.nan)
     if unsettled[-1] == len(delays) - 1:
@@ -208,10 +208,10 @@ def settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settlin
             f"{100 * shares[-1]:.0f} % of a step is left after {delays[-1]:.2f} s: does the camera see the screen, "
             "and is its light steady (dynamic backlight, another lamp)?"
         )
-    seen_s = float(delays[unsettled[-1] + 1])  # the first frame after which all are good
+    seen_s = float(delays[unsettled[-1] + 1])  # the first of the good frames
     falling = (shares < _FIT_FROM) & (shares > floor)
     if np.count_nonzero(falling) < _LEAST_POINTS or np.ptp(delays[falling]) <= 0:
-        # too fast to fit: from _FIT_FROM to the floor in no more than this, and no slower afterwards
+        # too fast to fit: at most this long from _FIT_FROM to the floor, and no slower afterwards
         before = np.flatnonzero(shares[: unsettled[-1] + 1] >= _FIT_FROM)
         fell_s = seen_s - (float(delays[before[-1]]) if before.size else 0.0)
         rest_s = fell_s * max(0.0, math.log(floor / _LEFT)) / math.log(_FIT_FROM / floor)
@@ -220,12 +220,12 @@ def settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settlin
     if slope >= 0:
         return Settling(2 * seen_s, math.nan, math.nan)
     tau_s, latency_s = -1.0 / slope, offset / -slope
-    # a display slower at its tail than at its start is believed
+    # accept a display whose tail is slower than its start
     return Settling(max(latency_s - tau_s * math.log(_LEFT), seen_s), float(latency_s), float(tau_s))
 
 
 def block_means(image: ArrayLike) -> FloatArray:
-    """Means of square blocks, the incomplete ones at the edges left out; of small images the pixels themselves."""
+    """Means of square blocks without incomplete ones at the edges; for small images the pixels themselves."""
     pixels = np.asarray(image, np.float64)
     side = max(1, min(_BLOCK_PX, min(pixels.shape) // 8))
     rows, columns = (length // side for length in pixels.shape)
@@ -233,11 +233,11 @@ def block_means(image: ArrayLike) -> FloatArray:
     return np.asarray(blocks.mean(axis=(1, 3)))
 
 
-# Is the camera's exposure right for the screen? From one frame of white and one of black.
+# Checks the camera's exposure of the screen, from one frame of white and one of black.
 
 _SATURATED_SHARE = 0.001  # of the pixels: dust and glints
-_TARGET = 0.8  # of full scale, for the brightest pixels but a hundredth
-_LEAST = 0.25  # below, noise and steps of the converter are three times what they need to be
+_TARGET = 0.8  # of full scale, for the 99th percentile
+_LEAST = 0.25  # below, noise and converter steps are three times larger than necessary
 _LEAST_CONTRAST = 3.0
 
 
@@ -247,7 +247,7 @@ def exposure_problem(
     full_scale_adu: int,
     exposure_ms: float,
 ) -> str:
-    """What is wrong, with the remedy, in frames (H, W) of a white and a black screen; empty when nothing is."""
+    """The problem and its remedy, from frames (H, W) of a white and a black screen; empty if none."""
     saturated = float(np.mean(white >= full_scale_adu))
     bright, dark = float(np.quantile(white, 0.99)), float(np.quantile(black, 0.99))
     if saturated > _SATURATED_SHARE:
@@ -273,7 +273,7 @@ def _two_digits(number: float) -> str:
     return f"{float(f'{number:.2g}'):g}"
 
 
-# Does the screen show every pixel as it is sent? A one-pixel checkerboard tells, unresolved by the camera.
+# Checks whether the screen shows every pixel as sent, with a one-pixel checkerboard that the camera does not resolve.
 #
 # Shown as sent, half of the pixels are lit, and a camera that cannot tell them apart sees half of the white screen's
 # light everywhere. A scaler in between mixes neighbours before the display's gamma: 0 and 255 become 127, which is a
@@ -288,7 +288,7 @@ _LARGEST_BAND = 0.10
 
 
 def checkerboard_problem(seen: ArrayLike, white: ArrayLike, black: ArrayLike) -> str:
-    """What is wrong, with the remedy, in frames (H, W) of checkerboard, white and black; empty when nothing is."""
+    """The problem and its remedy, from frames (H, W) of checkerboard, white and black; empty if none."""
     dark = block_means(black)
     full = block_means(white) - dark
     lit = full > _LIT_SHARE * float(np.max(full))

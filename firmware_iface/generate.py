@@ -1,7 +1,7 @@
-"""Writes what is made from the register map: `docs/registers.md` and `membrane_board.h`.
+"""Writes the files generated from the register map: `docs/registers.md` and `membrane_board.h`.
 
-Run `python -m firmware_iface.generate` after a change of the map; with `--check` it writes nothing and exits with 1
-when a file is out of date.
+Run `python -m firmware_iface.generate` after changing the map; with `--check` it writes nothing and exits with 1
+if a file is out of date.
 """
 
 import argparse
@@ -100,7 +100,7 @@ def _define(name: str, value: str, comment: str = "") -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write the files, or say which are out of date; returns the exit code."""
+    """Write the files, or report which are out of date; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m firmware_iface.generate", description=__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 when a file is out of date")
     check = parser.parse_args(arguments).check

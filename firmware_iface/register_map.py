@@ -25,7 +25,7 @@ _REGISTER_KEYS = {"name", "address", "type", "unit", "counts_per_unit", "min", "
 
 
 class RegisterMapError(ValueError):
-    """The map file is not usable; the message names the register and what would be right."""
+    """The map file is unusable; the message names the register and the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +145,7 @@ class RegisterMap:
         return {fault.name: fault.mask for fault in self.faults}[name]
 
     def of_version(self, version: int) -> "RegisterMap":
-        """The map as boards of an earlier version have it. Raises RegisterMapError for one that is not known."""
+        """The map of boards of an earlier version. Raises RegisterMapError for an unknown version."""
         if not 1 <= version <= self.map_version:
             raise RegisterMapError(f"map version {version} is none of 1..{self.map_version}")
         had = {
@@ -157,7 +157,7 @@ class RegisterMap:
 
 
 def make_block(name: str, access: str, meaning: str, registers: Sequence[Register]) -> Block:
-    """A block from registers that follow each other."""
+    """A block of consecutive registers."""
     layout = struct.Struct(">" + "".join(_TYPES[register.type][0] for register in registers))
     return Block(name, access, meaning, tuple(registers), layout)
 
@@ -178,7 +178,7 @@ def known_maps() -> dict[int, RegisterMap]:
 def load(path: Path) -> RegisterMap:
     """Read and check a map.
 
-    Raises RegisterMapError for a file that is no such map, and for overlaps, gaps, wrong order, unknown types or
+    Raises RegisterMapError for a file that is not a map, and for overlaps, gaps, wrong order, unknown types or
     keys, missing limits and names that do not end in their unit.
     """
     try:

@@ -1,14 +1,14 @@
-"""A `Bench` composed of single devices, one a role.
+"""A `Bench` composed of single devices, one per role.
 
-The loop's two ends decide whether the bench is there. Without the pump (and the vent, if there is one) nothing can be
-made safe, so their errors are raised, and a lost link of theirs is a lost link of the bench. A sensor that fails is
-a missing value: NaN, on which the controller holds the flow, ramps down or does without, and the sensor is opened
-again in the background, so that a cable put back is a good reading within its back-off.
+The actuators decide whether the bench is there. Without the pump (and the vent, if there is one) nothing can be made
+safe, so their errors are raised, and the loss of their link is the loss of the bench's. A failed sensor is a missing
+value: NaN, on which the controller holds the flow, ramps down or continues without it, and the sensor is reopened in
+the background, so that a replugged cable gives good readings within its back-off.
 
-Watchdog: only the pump board has one of its own. An instrument keeps the last setpoint it was given, so this bench
-watches itself: no `write` within `watchdog_s` and it sets the pump to 0 and says so. That covers a controller that
-hangs in a tick, not one that is killed: then the last flow stays until the gas is shut off by hand or by a relief
-valve. docs/decisions/35-single-instruments.md and `check` say so.
+Watchdog: only the pump board has its own. An instrument keeps its last setpoint, so this bench watches itself:
+without a `write` within `watchdog_s` it sets the pump to 0 and reports that. This covers a controller that hangs in a
+tick, not one that is killed: then the last flow continues until the gas is shut off by hand or by a relief valve, as
+docs/decisions/35-single-instruments.md and `check` state.
 """
 
 import asyncio
@@ -39,7 +39,7 @@ class RoleDevices:
     thermometer: roles.Thermometer | None = None
 
     def by_role(self) -> dict[str, roles.Device]:
-        """The filled ones, the actuators last: nothing may move gas before the sensors are there."""
+        """The filled roles, actuators last: nothing may move gas before the sensors are connected."""
         filled: dict[str, roles.Device | None] = {
             "displacement": self.displacement,
             "gauge_pressure": self.gauge_pressure,
@@ -58,7 +58,7 @@ class RoleBench:
         self._devices = devices
         self._watchdog_s = watchdog_s
         self._clock = clock
-        self._tasks: dict[str, asyncio.Task[None]] = {}  # which open a lost sensor again, by its role
+        self._tasks: dict[str, asyncio.Task[None]] = {}  # reopening lost sensors, by role
         self._watchdog: asyncio.Task[None] | None = None
         self._last_sample = roles.DisplacementSample(math.nan, NO_ANSWER, 0, 0.0)
         self._fed_s = math.inf
@@ -67,12 +67,12 @@ class RoleBench:
         self.identities: dict[str, roles.DeviceIdentity] = {}
 
     async def open(self) -> roles.BenchIdentity:
-        """Open every device, sensors first, and start the watchdog; what it has latched stays.
+        """Open every device, sensors first, and start the watchdog; its latches stay.
 
-        Raises LinkError (the first device that is not there or not as the configuration says, with its role).
+        Raises LinkError, naming the role of the first device that is absent or not as configured.
         """
-        await self._stop_reopening()  # the watchdog of an opening before stays: the pump may still run
-        if self._commanded > 0:  # it was lost while it ran: it must not wait for a sensor that is gone as well
+        await self._stop_reopening()  # an earlier watchdog stays: the pump may still run
+        if self._commanded > 0:  # lost while running: stopping it must not wait for lost sensors
             with contextlib.suppress(Exception):
                 await self._devices.pump.open()
                 await self._devices.pump.set_pump(0.0)
@@ -98,9 +98,9 @@ class RoleBench:
         )
 
     async def read(self) -> roles.BenchReading:
-        """All sensors at once; what a sensor cannot say is NaN.
+        """Read all sensors at once; missing values are NaN.
 
-        Raises LinkError (pump or vent gave no valid answer; LinkDownError when its link is gone, or the watchdog has
+        Raises LinkError (pump or vent gave no valid answer; LinkDownError if its link is lost, or the watchdog has
         ended).
         """
         await self._require_watchdog()
@@ -127,15 +127,15 @@ class RoleBench:
     async def write(self, command: roles.BenchCommand) -> None:
         """Command pump and vent at once, and feed the watchdog; after a trip the pump stays off.
 
-        Raises ValueError (a fraction that is not within 0..1, or NaN; nothing is sent), LinkError (the device may or
-        may not have it; the other one was commanded all the same).
+        Raises ValueError (a fraction outside 0..1, or NaN; nothing is sent), LinkError (the device may or may not
+        have received it; the other one was commanded anyway).
         """
         for name, fraction in (("pump", command.pump_fraction), ("vent", command.vent_fraction)):
             if not 0.0 <= fraction <= 1.0:
                 raise ValueError(f"{name}_fraction = {fraction} is not within 0..1")
         await self._require_watchdog()
         pump = 0.0 if self._tripped else command.pump_fraction
-        self._commanded = max(self._commanded, pump)  # it may have the new one before it has answered
+        self._commanded = max(self._commanded, pump)  # the pump may have it before it answers
         actions = [_answer("pump", self._devices.pump.set_pump(pump))]
         if self._devices.vent is not None:
             actions.append(_answer("vent", self._devices.vent.set_vent(command.vent_fraction)))
@@ -181,7 +181,7 @@ class RoleBench:
         return pump_fraction, vent_fraction
 
     async def _sample(self) -> roles.DisplacementSample:
-        """The newest sample; without one the last counter and time, which then stand still."""
+        """The newest sample; without one, the last counter and time, which then do not advance."""
         last = self._last_sample
         self._last_sample = replace(last, displacement_um=math.nan, quality=NO_ANSWER)
         if "displacement" not in self._tasks:
@@ -205,7 +205,7 @@ class RoleBench:
             self._tasks[role] = asyncio.create_task(self._reopen(role), name=f"open {role} again")
 
     async def _reopen(self, role: str) -> None:
-        """Open a lost sensor again, until the same one is back; another in its place is a person's to put right."""
+        """Reopen a lost sensor until the same one is back; a different one in its place needs a person."""
         device = self._devices.by_role()[role]
         while True:
             with contextlib.suppress(roles.LinkError):
@@ -215,7 +215,7 @@ class RoleBench:
         del self._tasks[role]
 
     async def _watch(self) -> None:
-        """The software watchdog: whatever a driver raises, it tries again a quarter of a period later."""
+        """The software watchdog: after any exception of a driver, it retries a quarter of a period later."""
         while True:
             await asyncio.sleep(self._watchdog_s / 4)
             if self._commanded > 0 and self._clock() - self._fed_s > self._watchdog_s:
@@ -225,10 +225,10 @@ class RoleBench:
                     self._commanded = 0.0
 
     async def _require_watchdog(self) -> None:
-        """Nothing is read or commanded without the watchdog.
+        """Refuse to read or command without the watchdog.
 
-        A watchdog that has ended leaves a pump that nobody stops: it gets its 0 here, and the bench counts as lost
-        until it is opened again, which starts another watchdog.
+        A watchdog that has ended leaves an unguarded pump: it is set to 0 here, and the bench counts as lost until it
+        is reopened, which starts another watchdog.
         """
         if self._watchdog is not None and not self._watchdog.done():
             return
@@ -254,13 +254,13 @@ async def _stopped(tasks: list[asyncio.Task[None]]) -> None:
 
 
 def _ending(task: asyncio.Task[None]) -> str:
-    """How a task has ended that was to run for ever."""
+    """How a task ended that should run forever."""
     error = None if task.cancelled() else task.exception()
     return "was cancelled" if error is None else f"ended with {type(error).__name__}: {error}"
 
 
 async def _answer(role: str, asked: Awaitable[T]) -> T:
-    """A device's answer; what it raises that no driver should is a fault of that device, not the end of the run."""
+    """A device's answer; an unexpected exception is a fault of that device, not the end of the run."""
     try:
         return await asked
     except roles.LinkError:

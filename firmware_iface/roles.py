@@ -1,6 +1,6 @@
-"""What the controller needs of devices: the roles, and the values that cross.
+"""The controller's interface to devices: the roles, and the values exchanged.
 
-A driver converts to these units at its edge; nothing behind it knows registers, counts or byte orders.
+A driver converts to these units; nothing beyond it knows registers, counts or byte orders.
 """
 
 import math
@@ -11,14 +11,14 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-Clock = Callable[[], float]  # seconds on any axis that does not go back
+Clock = Callable[[], float]  # seconds on any monotonic axis
 
-# The mask of `Bench.clear_faults` that clears whatever is latched
+# The mask of `Bench.clear_faults` that clears all latches
 ALL_FAULTS = 0xFFFF
 
 
 class LinkError(Exception):
-    """A device did not give a valid answer. The message says what, where and what to do."""
+    """A device gave no valid answer. The message says what, where and what to do."""
 
 
 class LinkDownError(LinkError):
@@ -26,7 +26,7 @@ class LinkDownError(LinkError):
 
 
 class LinkWaitsError(LinkDownError):
-    """Too early for the next attempt to connect; why the last one failed was reported."""
+    """Too early for the next attempt to connect; the last failure was already reported."""
 
 
 class DeviceRefusedError(LinkError):
@@ -36,7 +36,7 @@ class DeviceRefusedError(LinkError):
 class DeviceBusyError(LinkError):
     """Another program holds the device, or the device is busy; it may be free later.
 
-    `lapses_in_s`: after this time the other's claim has ended if nobody feeds its watchdog; 0 if nothing is known.
+    `lapses_in_s`: time until the other's claim ends unless its watchdog is fed; 0 if unknown.
     """
 
     def __init__(self, message: str, lapses_in_s: float = 0.0) -> None:
@@ -52,9 +52,9 @@ FOREIGN_CLAIM, FOREIGN_PERIOD = 1, 2
 class BenchReading:
     """One consistent sample of all sensors.
 
-    `sample_counter` and `device_time_s` advance with every sample of the device, so that a frozen value is seen.
-    A quantity the bench does not have is NaN. `displacement_quality` is 0 when good (else the laser's error code).
-    `foreign` says what of the claim and the watchdog is no longer as this program set it (FOREIGN_ bits).
+    `sample_counter` and `device_time_s` advance with every sample of the device, to reveal frozen values. Quantities
+    the bench lacks are NaN. `displacement_quality` is 0 when good (else the laser's error code). `foreign` tells
+    which of claim and watchdog another program has changed (FOREIGN_ bits).
     """
 
     displacement_um: float
@@ -90,7 +90,7 @@ class BenchIdentity:
     watchdog_s: float
     gauge_pressure_limit_pa: float = math.inf  # the board's own limit
     pump_limit_fraction: float = 1.0
-    displacement_range_um: tuple[float, float] = (-math.inf, math.inf)  # what the sensor can show
+    displacement_range_um: tuple[float, float] = (-math.inf, math.inf)  # range of the sensor
     gauge_range_pa: tuple[float, float] = (-math.inf, math.inf)
 
 
@@ -107,13 +107,13 @@ class Bench(Protocol):
         """Write pump and vent, and feed the watchdog. Raises LinkError."""
 
     async def clear_faults(self, mask: int) -> None:
-        """Clear those bits of what the devices have latched, and no others. Raises LinkError.
+        """Clear these latched bits of the devices, and no others. Raises LinkError.
 
-        Everything (`ALL_FAULTS`) only ever because a person said so.
+        All (`ALL_FAULTS`) only at a person's request.
         """
 
     def dead_guards(self) -> tuple[str, ...]:
-        """Names of what ought to watch this bench and no longer runs; asked in every tick."""
+        """Names of this bench's guards that no longer run; checked in every tick."""
 
     async def close(self) -> None:
         """Close the link; the caller has written the safe state before. Never raises."""
@@ -121,9 +121,9 @@ class Bench(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class DeviceIdentity:
-    """Who answered: kind ("optoNCDT 1420"), serial number and firmware as the device says them.
+    """Identity of a device: kind ("optoNCDT 1420"), serial number and firmware as reported.
 
-    `shows` is the range of a sensor in its role's unit, infinite where the driver does not know it.
+    `shows` is the range of a sensor in its role's unit, infinite if unknown to the driver.
     """
 
     kind: str
@@ -135,11 +135,11 @@ class DeviceIdentity:
 
 @dataclass(frozen=True, slots=True)
 class DisplacementSample:
-    """The newest sample; of a streaming sensor the median of all that came since the last one.
+    """The newest sample; for a streaming sensor the median of all values since the last one.
 
     `quality` is 0 when good, else the device's error code, and then `displacement_um` is NaN. Counter and time
-    advance with new data only; the driver makes them where the device has none (valid messages so far, time of
-    arrival).
+    advance only with new data; the driver provides them if the device has none (valid messages so far, time
+    of arrival).
     """
 
     displacement_um: float
@@ -151,15 +151,15 @@ class DisplacementSample:
 class Device(Protocol):
     """One instrument; it fills one role or several.
 
-    A quantity that is read more slowly than the tick (a barometer at 4800 baud) is refreshed by a task of the driver,
-    which serves the newest value and NaN once that is older than a stated limit.
+    A task of the driver refreshes quantities slower than the tick (a barometer at 4800 baud); the driver returns the
+    newest value, or NaN once it is older than a stated limit.
     """
 
     async def open(self) -> DeviceIdentity:
         """Connect, check the identity, apply the settings and read them back; again after every lost link.
 
-        Raises LinkError (no valid answer; LinkDownError without a connection), DeviceRefusedError (another device
-        than the configuration names, or one that does not take its settings).
+        Raises LinkError (no valid answer; LinkDownError without a connection), DeviceRefusedError (not the configured
+        device, or one that does not accept its settings).
         """
 
     async def close(self) -> None:
@@ -198,23 +198,23 @@ class Thermometer(Device, Protocol):
 
 
 class Pump(Device, Protocol):
-    """What adds gas: a pump, or a flow controller on a bottle."""
+    """The source of gas: a pump, or a flow controller on a bottle."""
 
     async def set_pump(self, fraction: float) -> None:
-        """Command it, 0..1 of full scale. Raises LinkError: the device may or may not have it."""
+        """Command it, 0..1 of full scale. Raises LinkError: the device may or may not have received it."""
 
     async def pump_fraction(self) -> float:
-        """What the device says it was commanded (or gives). Raises LinkError."""
+        """The commanded (or actual) value reported by the device. Raises LinkError."""
 
 
 class Vent(Device, Protocol):
-    """What lets gas out."""
+    """The valve that lets gas out."""
 
     async def set_vent(self, fraction: float) -> None:
-        """Open it, 0..1. Raises LinkError: the device may or may not have it."""
+        """Open it, 0..1. Raises LinkError: the device may or may not have received it."""
 
     async def vent_fraction(self) -> float:
-        """What the device says it was commanded (or gives). Raises LinkError."""
+        """The commanded (or actual) value reported by the device. Raises LinkError."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,7 +248,7 @@ class Screen(Protocol):
     """Shows patterns."""
 
     def show(self, pattern: Pattern) -> None:
-        """Show the pattern; returns when it is lit and settled."""
+        """Show the pattern; returns when it is displayed and settled."""
 
     def close(self) -> None:
         """Release the screen."""
@@ -258,18 +258,18 @@ class Camera(Protocol):
     """Takes frames."""
 
     def grab(self, out: Pixels | None = None) -> Frame:
-        """Trigger one exposure and return it, in `out` if the camera is able to. Raises LinkError."""
+        """Trigger one exposure and return it, in `out` if the camera supports that. Raises LinkError."""
 
     def close(self) -> None:
         """Release the camera."""
 
 
-# One lost packet spoils a frame; three spoilt in a row are no accident
+# One lost packet destroys a frame; three in a row are not an accident
 TRIES = 3
 
 
 class FrameLostError(LinkError):
-    """One exposure gave no whole frame; the camera is there and may be asked again."""
+    """An exposure gave no complete frame; the camera is present and may try again."""
 
 
 @runtime_checkable

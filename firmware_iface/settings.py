@@ -1,4 +1,4 @@
-"""What can be set of each driver: its table in the configuration, with the limits and the defaults."""
+"""The settings of each driver: its table in the configuration, with limits and defaults."""
 
 from typing import Annotated, Any, Literal, get_args
 
@@ -13,7 +13,7 @@ class Section(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _truth_is_no_number(cls, table: Any) -> Any:
-        """Pydantic takes `true` for 1.0, and a key left over from a switch would pass for a quantity."""
+        """Refuse booleans: pydantic takes `true` for 1.0, so a leftover switch would pass as a quantity."""
         if isinstance(table, dict):
             for name, value in table.items():
                 field = cls.model_fields.get(name)
@@ -33,8 +33,8 @@ def _takes_truth(annotation: Any) -> bool:
 UnitId = Annotated[int, Field(ge=1, le=247)]
 Timeout = Annotated[float, Field(gt=0, le=5)]
 Baud = Annotated[int, Field(ge=300, le=1_000_000)]
-Direction = Literal[-1, 1]  # -1: the laser is behind the mirror, a deeper bowl comes nearer to it
-StepMax = Annotated[float, Field(gt=0, le=10_000)]  # a reading farther than this from both before it is not believed
+Direction = Literal[-1, 1]  # -1: the laser is behind the mirror, and a deeper bowl is nearer to it
+StepMax = Annotated[float, Field(gt=0, le=10_000)]  # readings farther than this from both previous ones are rejected
 Word = Annotated[int, Field(ge=0, le=0xFFFF)]
 Port = Annotated[str, Field(min_length=1)]  # /dev/ttyUSB0, or usb:VID:PID[:SERIAL]
 ModbusUrl = Annotated[str, Field(pattern=r"^(tcp|rtu)://")]  # tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200
@@ -51,7 +51,7 @@ class Optoncdt1420Config(Section):
     zero_mm: float | None = None  # distance from the start of the range at displacement 0; its middle when absent
     direction: Direction = -1
     step_max_um: StepMax = 50.0
-    timeout_s: Timeout = 0.2  # for an answer, and for a value to come when none has since the last reading
+    timeout_s: Timeout = 0.2  # for an answer, and for a new value after a reading
 
     @model_validator(mode="after")
     def _rate(self) -> "Optoncdt1420Config":
@@ -85,8 +85,8 @@ class VaisalaPtb330Config(Section):
     driver: Literal["vaisala_ptb330"] = "vaisala_ptb330"
     port: Port
     baud: Baud = 4800
-    period_s: Annotated[float, Field(gt=0, le=60)] = 0.2  # between two questions; a message takes 80 ms at 4800 baud
-    age_max_s: Annotated[float, Field(gt=0, le=600)] = 3.0  # NaN when the measurement counter stood still for longer
+    period_s: Annotated[float, Field(gt=0, le=60)] = 0.2  # between requests; a message takes 80 ms at 4800 baud
+    age_max_s: Annotated[float, Field(gt=0, le=600)] = 3.0  # NaN if the measurement counter stands still longer
     timeout_s: Timeout = 0.3
 
 
@@ -123,7 +123,7 @@ class BronkhorstProparConfig(Section):
 
 
 class ModbusMapConfig(Section):
-    """Any device with Modbus registers; one register of it is the role's value.
+    """Any device with Modbus registers, one of which is the role's value.
 
     `raw` and `value` are two points of the straight line between the register and the role's unit.
     """
@@ -139,7 +139,7 @@ class ModbusMapConfig(Section):
     address: Word
     raw: tuple[float, float] | None = None
     value: tuple[float, float]
-    limits: tuple[float, float] | None = None  # values outside are refused; the span of `value` when absent
+    limits: tuple[float, float] | None = None  # values outside are refused; by default the span of `value`
     identity_address: Word | None = None
     identity_equals: Word | None = None
 
@@ -166,14 +166,14 @@ class AravisCameraConfig(Section):
     """A GenICam camera (USB3 Vision or GigE Vision)."""
 
     driver: Literal["aravis"] = "aravis"
-    camera: str = ""  # as `devices` lists it, or its address; empty: the first that is found
+    camera: str = ""  # as listed by `devices`, or its address; empty: the first one found
     # Bayer needs no demosaicing: each pixel's phase is independent of its gain
     pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16", "BayerRG8", "BayerGR8", "BayerGB8", "BayerBG8"] = (
         "Mono8"
     )
     exposure_ms: Annotated[float, Field(gt=0, le=10_000)] = 20.0
     gain_db: Annotated[float, Field(ge=0, le=48)] = 0.0
-    packet_bytes: Annotated[int, Field(ge=0, le=65_000)] = 0  # GigE Vision; 0: as the camera and the network agree
+    packet_bytes: Annotated[int, Field(ge=0, le=65_000)] = 0  # GigE Vision; 0: negotiated by camera and network
     timeout_s: Annotated[float, Field(gt=0, le=60)] = 1.0  # for a frame, from the end of its exposure
 
     @property

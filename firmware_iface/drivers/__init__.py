@@ -1,1 +1,1 @@
-"""Drivers: one file a device, each fills a role of `roles.py`."""
+"""Drivers: one file per device, each of which fills a role of `roles.py`."""

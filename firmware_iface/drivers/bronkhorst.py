@@ -69,7 +69,7 @@ class ParameterPort(Protocol):
         """Connect, unless that is done."""
 
     async def number(self, parameter: InstrumentParameter) -> float:
-        """A number, believed only if a flipped bit would have been seen."""
+        """Read a number in a way that detects flipped bits."""
 
     async def text(self, parameter: InstrumentParameter) -> str:
         """A text."""
@@ -109,7 +109,7 @@ async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> 
 class BronkhorstFlow:
     """An EL-FLOW as the pump: fraction 1 is its capacity. Only the instrument `serial` is accepted; empty: any.
 
-    It has no watchdog of its own: without a host it goes on with its last setpoint.
+    It has no watchdog: without a host it continues with its last setpoint.
     """
 
     def __init__(self, port: ParameterPort, serial: str = "") -> None:
@@ -173,7 +173,7 @@ class BronkhorstPressure:
         return replace(identity, shows=(low * self._full_pa, high * self._full_pa))
 
     async def gauge_pressure_pa(self) -> float:
-        """The measured value. Raises LinkError, also for one that the instrument cannot have."""
+        """The measured value. Raises LinkError, also for impossible values."""
         value_pa = await self._port.number(FMEASURE) * self._unit_pa
         low, high = self._FRACTIONS
         if math.isnan(self._full_pa):
@@ -209,7 +209,7 @@ def register_of(parameter: InstrumentParameter) -> tuple[int, int]:
 
 
 class ModbusParameters:
-    """Parameters of the instrument behind a link. The link's checksum is what a flipped bit is seen by."""
+    """Parameters of the instrument behind a link. The link's checksum detects flipped bits."""
 
     def __init__(self, link: ModbusLink) -> None:
         self._link = link

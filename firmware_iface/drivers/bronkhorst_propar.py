@@ -1,8 +1,8 @@
 """Bronkhorst parameters over ProPar on a serial line, in its binary form.
 
 Source: manual 9.17.027. Binary, because its messages carry a sequence number: an answer is never taken for that of
-another question. What ProPar lacks is a checksum. So every number is asked for three times in one message, and what
-was written is read back; a flipped bit then makes answers that differ.
+another question. ProPar lacks a checksum. So every number is requested three times in one message, and written
+values are read back; a flipped bit then makes the answers differ.
 """
 
 import struct
@@ -62,7 +62,7 @@ def ascii_frame(message: ProparMessage) -> bytes:
 
 
 def split_binary(heard: bytes) -> tuple[list[ProparMessage], bytes]:
-    """The whole messages in what was heard, and the bytes left over; broken ones are left out."""
+    """The complete messages received, and the remaining bytes; drops broken ones."""
     messages: list[ProparMessage] = []
     while (start := heard.find(b"\x10\x02")) >= 0:
         body, at = bytearray(), start + 2
@@ -78,7 +78,7 @@ def split_binary(heard: bytes) -> tuple[list[ProparMessage], bytes]:
 
 
 def parse_ascii(line: bytes) -> ProparMessage | None:
-    """The message in a line, None if it is none."""
+    """The message in a line, None if invalid."""
     try:
         raw = bytes.fromhex(line.strip().removeprefix(b":").decode("ascii"))
     except ValueError:
@@ -143,7 +143,7 @@ def values(data: bytes) -> list[tuple[int, int, bytes]]:
 MANUAL = "Bronkhorst 9.17.027, sections 3.4 to 3.6"
 _QUIET_S = 0.1
 _ANSWER_BYTES = 50  # the longest: a text of 16 characters, or three floats, with every byte doubled
-# Two copies are hit at the same bit once in a million messages on a line where a tenth of them is hit at all
+# On a line with errors in a tenth of the messages, two copies are hit at the same bit once in a million
 _COPIES = 3
 _REFUSALS = (3, 4, 5, 6, 13)  # status: the request itself is wrong for this instrument
 _SEQUENCES = 256
@@ -151,7 +151,7 @@ _FORMATS = {"u8": ">B", "u16": ">H", "f32": ">f"}
 
 
 class ProparParameters:
-    """Parameters of one instrument on a line of its own; node 128 is whichever is at the end of the cable."""
+    """Parameters of one instrument on its own line; node 128 is whichever is at the end of the cable."""
 
     def __init__(self, port: serial_port.SerialPort, node: int = 128, timeout_s: float = 0.2) -> None:
         self._port = port
@@ -241,7 +241,7 @@ class ProparParameters:
 
 
 def _taker(sequence: int, node: int) -> Callable[[bytes], bytes | None]:
-    """Finds the answer with this sequence number; others are late and thrown away."""
+    """Finds the answer with this sequence number; discards others, which are late."""
 
     def take(heard: bytes) -> bytes | None:
         for message in split_binary(heard)[0]:

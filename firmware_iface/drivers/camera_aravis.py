@@ -2,9 +2,9 @@
 
 Standards: GenICam SFNC 2.7 (features' names), GigE Vision 2.0, USB3 Vision 1.1; aravis 0.8 manual.
 
-Every exposure is asked for by software trigger, so that a frame belongs to the pattern that was on the screen. A
-frame that does not come whole is lost and counted; `grab` takes it again. After a timeout the stream is started
-anew, since a late frame would be taken for the answer to the next trigger.
+A software trigger starts every exposure, so that a frame belongs to the pattern on the screen. An incomplete frame is
+counted as lost, and `grab` retakes it. After a timeout the stream is restarted, as a late frame would be taken for
+the answer to the next trigger.
 """
 
 import ctypes
@@ -24,10 +24,10 @@ from firmware_iface.links import aravis as arv
 _BUFFERS = 3
 # Room for one frame of 5 MB in the kernel while the reading thread has no core
 _SOCKET_BYTES = 8 << 20
-# A stream that was just started misses the first trigger (seen on loopback without it)
+# A newly started stream misses the first trigger (seen on loopback without this)
 _STREAM_READY_S = 0.2
 _AUTO_OFF, _CONTINUOUS, _ADJUST_NEVER, _NO_PACKET_SOCKET = 0, 0, 0, 1  # arvenums.h, arvgvdevice.h, arvgvstream.h
-_RANGE_CHECKED = 1  # arvdevice.h; by default the library writes values that the camera does not take
+_RANGE_CHECKED = 1  # arvdevice.h; by default the library writes values outside the camera's range
 _SUCCESS = 0  # ArvBufferStatus
 _GONE = (arv.NOT_CONNECTED, arv.TRANSFER_ERROR, arv.TIMEOUT)
 _TAKEN = (arv.NOT_CONTROLLER, arv.ACCESS_DENIED, arv.BUSY)
@@ -35,7 +35,7 @@ _TAKEN = (arv.NOT_CONTROLLER, arv.ACCESS_DENIED, arv.BUSY)
 
 @dataclass(slots=True)
 class FrameCounts:
-    """What became of the triggers: `taken` whole, `incomplete`, `missing` (nothing came), and `reconnects`."""
+    """Fate of the triggers: `taken` whole, `incomplete`, `missing` (nothing came), and `reconnects`."""
 
     taken: int = 0
     incomplete: int = 0
@@ -47,7 +47,7 @@ class AravisCamera:
     """The camera; opened by the first exposure, and again by the next one after its link was lost.
 
     A sensor of another size than `width_px` and `height_px` is refused; `now` and `sleep` are the run's clock.
-    `counts` tells what became of the triggers.
+    `counts` has the fate of the triggers.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class AravisCamera:
             self.open()
         library = arv.aravis()
         while buffer := library.call("arv_stream_try_pop_buffer", self._stream):
-            library.call("arv_stream_push_buffer", self._stream, buffer)  # came unasked
+            library.call("arv_stream_push_buffer", self._stream, buffer)  # arrived unrequested
         time_s = self._now()
         try:
             library.call("arv_camera_software_trigger", self._camera)
@@ -161,7 +161,7 @@ class AravisCamera:
         self._camera = self._pending = None
 
     def _abandon(self) -> None:
-        """Drop a camera that does not answer, in a thread: the library takes 10 s to close it."""
+        """Drop a camera that does not answer, in a thread, as the library takes 10 s to close it."""
         left = [instance for instance in (self._stream, self._camera) if instance is not None]
         self._stream = self._camera = self._pending = None
         unref = arv.aravis().call
@@ -188,7 +188,7 @@ class AravisCamera:
         return roles.DeviceIdentity(f"{vendor} {model}", serial, "", self.describe()["settings"])
 
     def _look_whether_ours(self) -> None:
-        """A GigE Vision camera lets anyone read, and ignores what others than its controller write."""
+        """Check control: a GigE Vision camera lets anyone read, but ignores writes except its controller's."""
         call = arv.aravis().call
         device = call("arv_camera_get_device", self._camera)
         call("arv_device_set_range_check_policy", device, _RANGE_CHECKED)
@@ -242,7 +242,7 @@ class AravisCamera:
         library, camera = arv.aravis(), self._camera
         gige = bool(library.call("arv_camera_is_gv_device", camera))
         if gige:
-            library.call("arv_camera_gv_set_stream_options", camera, _NO_PACKET_SOCKET)  # that one wants root
+            library.call("arv_camera_gv_set_stream_options", camera, _NO_PACKET_SOCKET)  # packet sockets need root
             if self.config.packet_bytes:
                 library.call("arv_camera_gv_set_packet_size_adjustment", camera, _ADJUST_NEVER)
                 library.call("arv_camera_gv_set_packet_size", camera, self.config.packet_bytes)
@@ -310,14 +310,14 @@ class AravisCamera:
         return out
 
     def _told(self, error: roles.LinkError, doing: str) -> roles.LinkError:
-        """The error with the camera's name and the remedy."""
+        """A link error with the camera's name and the remedy."""
         name, message = self._name, str(error)
         code = error.code if isinstance(error, arv.AravisError) else -1
         if code in _TAKEN:
             return roles.LinkError(f"{name}: in use by another program ({message}); close it, then try again")
         if code == arv.NOT_FOUND:
             return roles.LinkDownError(
-                f"{name}: not found; is it on and plugged in? `membrane-ctrl devices` lists what is"
+                f"{name}: not found; is it on and plugged in? `membrane-ctrl devices` lists the cameras"
             )
         if code in _GONE:
             return roles.LinkDownError(f"{name}: {doing}: no answer ({message}); is it on and plugged in?")

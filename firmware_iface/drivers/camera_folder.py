@@ -1,6 +1,6 @@
-"""A folder of pictures as role Camera: one file an exposure, in the order of their names, over and over.
+"""A folder of pictures as role Camera: one file per exposure, in order of name, repeated endlessly.
 
-For trying the cycle without a camera: pictures of a bench, or what `membrane-ctrl simulate` writes.
+For trying the cycle without a camera, with pictures of a bench or from `membrane-ctrl simulate`.
 """
 
 import time
@@ -15,7 +15,7 @@ _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm")
 
 
 class FolderCamera:
-    """The camera, and the screen beside it: after `show(pattern)` the picture of that name comes.
+    """Camera and screen: after `show(pattern)` the next picture is the one of that name.
 
     The pictures are 8 or 16 bit grey and of one size; `x_sin_0.png` is the picture of the pattern `x_sin_0`.
     """
@@ -26,7 +26,7 @@ class FolderCamera:
         self._next = 0
 
     def open(self) -> DeviceIdentity:
-        """Look what is there. Raises LinkError without pictures, DeviceRefusedError for another size."""
+        """List the pictures. Raises LinkError without pictures, DeviceRefusedError for another size."""
         if self._folder.is_dir():
             self._files = sorted(path for path in self._folder.iterdir() if path.suffix.lower() in _SUFFIXES)
         if not self._files:

@@ -1,8 +1,8 @@
 """USB cameras without GenICam (UVC) through OpenCV's VideoCapture: role Camera.
 
 Source: OpenCV 4 documentation, `cv::VideoCapture` and `VideoCaptureProperties`. Such a camera runs freely and keeps
-frames in a queue; a frame belongs to a pattern only if it was begun after the pattern was lit, so that everything
-which may have been begun before is read and thrown away.
+frames in a queue; a frame belongs to a pattern only if it started after the pattern was lit, so earlier frames are
+read and discarded.
 """
 
 import time
@@ -14,7 +14,7 @@ import numpy as np
 
 from firmware_iface import roles, settings
 
-# One in the driver's queue although one was asked for, and one whose exposure had begun
+# One in the driver's queue, although its length is set to one, and one whose exposure had started
 _STALE_FRAMES = 2
 _EXPOSURE_MANUAL = 1.0  # V4L2's number; 3 is automatic
 
@@ -86,7 +86,7 @@ class UvcCamera:
         return roles.DeviceIdentity("UVC camera", "", "", self.describe()["settings"])
 
     def grab(self, out: roles.Levels | None = None) -> roles.Frame:
-        """The next whole frame that was begun after the call, as grey (the green channel of a colour camera).
+        """The next complete frame that starts after the call, as grey (the green channel of a colour camera).
 
         Raises LinkDownError (the camera went away).
         """

@@ -1,12 +1,12 @@
 """Keyence DL-RS1A communication unit on RS-232, with the sensor amplifiers of the IL, IG and GT2 series.
 
 Manual: DL-RS1A user's manual, IL edition (96081E): settings page 7, commands pages 8-10, data numbers pages 11-12,
-error numbers page 16. A command ends in CR or CR LF, an answer in CR LF; CR alone is taken, too.
+error numbers page 16. A command ends in CR or CR LF, an answer in CR LF; CR alone is accepted too.
 
 `SR,ii,038` reads the internal value (R.V.) of amplifier ii: unlike the judgment value of `M0`, neither a zero shift
 at the amplifier's own keys nor a hold setting moves it, and its answer says what it answers. The protocol has no
 checksum. Even parity at the unit's switches (and here) stops most hit bytes; a value that differs from both before it
-by more than `step_max_um` is not believed; a smaller error passes as noise.
+by more than `step_max_um` is rejected; a smaller error passes as noise.
 """
 
 import asyncio

@@ -21,12 +21,12 @@ class ValueMap:
 
     address: int  # of its first register, counted from 0
     value: tuple[float, float]  # two values in the role's unit ...
-    raw: tuple[float, float]  # ... and what the register holds at them; between and beyond them a straight line
+    raw: tuple[float, float]  # ... and the register's contents there; linear between and beyond them
     limits: tuple[float, float]  # values outside are refused, read or written
     function: str = "holding"  # "holding" or "input"
     type: str = "u16"  # "u16", "i16", "u32", "i32" or "f32"
     word_order: str = "big"  # of the two registers of a 32-bit type: "big" word first, or "little"
-    # a holding register and what it must hold, if the device can be told from others so
+    # a holding register and its required content, if that identifies the device
     identity: tuple[int, int] | None = None
     version_address: int | None = None  # a holding register with the device's version, to be shown
 
@@ -36,7 +36,7 @@ class ValueMap:
         return struct.calcsize(">" + _FORMATS[self.type]) // 2
 
     def decode(self, words: list[int]) -> float:
-        """Registers to a value; NaN for a float that is none."""
+        """Registers to a value; NaN for a float that is not a number."""
         ordered = words if self.word_order == "big" else words[::-1]
         (raw,) = struct.unpack(">" + _FORMATS[self.type], struct.pack(f">{len(ordered)}H", *ordered))
         (raw_0, raw_1), (value_0, value_1) = self.raw, self.value
@@ -58,7 +58,7 @@ class ValueMap:
 
 
 def preset(name: str) -> dict[str, Any]:
-    """The defaults of a preset. Raises ValueError for one that is not there."""
+    """The defaults of a preset. Raises ValueError for an unknown one."""
     path = PRESETS / f"{name}.toml"
     if not path.is_file():
         known = ", ".join(sorted(found.stem for found in PRESETS.glob("*.toml")))
@@ -76,7 +76,7 @@ def make_map(given: dict[str, Any], preset_name: str = "") -> tuple[ValueMap, bo
     fence = bool(defaults.pop("fence", True))
     keys = {**defaults, **{key: value for key, value in given.items() if value is not None}}
     if "raw" not in keys:
-        raise ValueError("raw is missing: what the register holds at the two values")
+        raise ValueError("raw is missing: the register's contents at the two values")
     keys.setdefault("limits", (min(keys["value"]), max(keys["value"])))
     settings: dict[str, Any] = {
         key: tuple(found) if isinstance(found, list) else found for key, found in keys.items()
@@ -102,7 +102,7 @@ def _check_raw(made: ValueMap, raw_limits: list[float] | None) -> None:
 class ModbusValue:
     """One value of a Modbus device, in the role that the configuration gives it.
 
-    `rest` is what an actuator is left at on opening and closing; None leaves it as it is.
+    `rest` is an actuator's value after opening and closing; None leaves it unchanged.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class ModbusValue:
         await self._link.close()
 
     def describe(self) -> dict[str, str]:
-        """Where the value is."""
+        """Location of the value."""
         found = {"port": self._link.name, "register": f"{self._map.function} {self._map.address}, {self._map.type}"}
         return found if self._rest is None else {**found, "watchdog": "none known: check what its output does alone"}
 

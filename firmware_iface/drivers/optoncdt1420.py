@@ -5,8 +5,8 @@ in 7.5.2 (pages 65-67). A command ends in LF, its answer in `->` (line ends behi
 before that. It may repeat the command and write a rate as `4`, `4.0` or `4 kHz`.
 
 The sensor streams; a reading is the mean of the middle half of everything since the last one (at 4 kHz and 50 Hz: 40
-of 80 values). A hit byte, which nothing in the protocol shows, is one outlier among many and left out; and unlike the
-median, the mean resolves less than a digital step (0.8 um at 50 mm range).
+of 80 values). A corrupted byte, which the protocol cannot detect, is one outlier among many and is dropped; and
+unlike the median, the mean resolves less than a digital step (0.8 um at 50 mm range).
 
 In the stream (pages 65-67) a value is 18 bits in three bytes of six, marked in their two highest bits: low `00`,
 middle `01`, high `10` for the first value of a measurement and `11` for further ones. Here a measurement is distance
@@ -29,8 +29,8 @@ _IN_RANGE = (643, 64_877)  # page 65: below and above are reserves, measured but
 _PROMPT = b"->"
 _ERROR = re.compile(r"E(\d{3})([^\r\n]*)")
 _RATE = re.compile(r"(\d+(?:\.\d*)?)(?: ?kHz)?")
-_MIDDLE_MIN = 8  # of fewer values the median
-_BATCHES_MAX = 1024  # of a caller that stays away; old ones go first
+_MIDDLE_MIN = 8  # the median for fewer values
+_BATCHES_MAX = 1024  # for an absent caller; old ones go first
 _SILENT_MAX = 3  # readings without a single value: the sensor restarted or lost its power
 _BYTES = 6  # a measurement
 _COUNTER_MODULUS = 2**18
@@ -115,13 +115,13 @@ class Optoncdt1420:
         self._settle_anew()
         self._port.open(self)
         try:
-            with contextlib.suppress(roles.DeviceRefusedError):  # refused with what was said to it half before
+            with contextlib.suppress(roles.DeviceRefusedError):  # refused together with a half-sent earlier command
                 await self._command("OUTPUT NONE")
             await self._command("OUTPUT NONE")
             identity = await self._identify()
             for setting in self._settings():
                 await self._set(setting)
-            self._port.write(b"OUTPUT RS422\n")  # what the stream is mixed with the answer to this is skipped
+            self._port.write(b"OUTPUT RS422\n")  # stream data mixed with this answer are skipped
             self._heard = None
             await self._first_readings()
         except roles.LinkError:

@@ -1,1 +1,1 @@
-"""Links: how bytes get to a device and back, and what may be believed of them."""
+"""Links: how bytes get to a device and back, and which answers are trustworthy."""

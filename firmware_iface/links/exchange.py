@@ -1,14 +1,14 @@
-"""Question and answer over a line that has no transaction numbers, so that an answer is never another question's.
+"""Requests and answers over a line without transaction numbers, without ever mixing them up.
 
-A device that answers late is the danger: its answer to the question that was given up looks like the answer to the
-next one. Three rules keep them apart.
+The danger is a device that answers late: its answer to an abandoned question looks like the answer to the next one.
+Three rules keep them apart.
 
-1. One question is on the wire at a time and stays there until it is answered or its time is over, whatever became of
-   the caller: a cancelled caller leaves nothing behind.
-2. After any loss (no answer, a wrong one, bytes that nobody asked for) nothing is sent until the line was quiet for
+1. One question is on the wire at a time and stays there until answered or timed out, whatever happens to the caller:
+   a cancelled caller leaves nothing behind.
+2. After any loss (no answer, a wrong one, unsolicited bytes) nothing is sent until the line has been quiet for
    `quiet_s`.
-3. Then a *fence* is asked first: a harmless question whose answer cannot be mistaken for any other. Devices answer in
-   order, so when the fence is answered, whatever was owed before has come (and was thrown away) or never will.
+3. Then comes a *fence*: a harmless question with an unmistakable answer. Devices answer in order, so once the fence
+   is answered, any earlier answer has come (and was discarded) or never will.
 """
 
 import asyncio
@@ -28,13 +28,13 @@ _FAILURES_MAX = 5
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is sent, and how its answer is known."""
+    """A request, and how to recognise its answer."""
 
-    data: bytes  # sent as it is
-    # of all bytes heard so far: the answer, None while more must come. Raises LinkError when they are no answer
+    data: bytes  # sent unchanged
+    # from all bytes so far: the answer, None while incomplete. Raises LinkError for anything else
     take: Callable[[bytes], bytes | None]
     answer_bytes: int  # length of the longest answer: its time on the wire comes on top of the device's own
-    what: str  # for messages: device and what is asked
+    what: str  # for messages: device and request
 
 
 class SerialExchange:
@@ -51,9 +51,9 @@ class SerialExchange:
         self._quiet_s = quiet_s
         self._blank = blank
         self._key_turns: defaultdict[int, asyncio.Lock] = defaultdict(asyncio.Lock)
-        self._turn = asyncio.Lock()  # released when the question has ended, whatever became of its caller
+        self._turn = asyncio.Lock()  # released when the question ends, whatever happens to its caller
         self._in_flight: asyncio.Task[bytes] | None = None
-        self._sure: set[int] = set()  # devices that owe no answer
+        self._sure: set[int] = set()  # devices without outstanding answers
         self._failures = 0
         self._noisy = False
         self._last_byte_s = 0.0
@@ -62,10 +62,10 @@ class SerialExchange:
         self._answer: asyncio.Future[bytes] | None = None
 
     def connect(self, greeting: bytes = b"") -> None:
-        """Open the line; answers that devices still owe to an earlier user are discarded.
+        """Open the line; discard outstanding answers to an earlier user.
 
-        The greeting is sent at once and its answer discarded: for a device that talks unasked until
-        told to stop. Raises LinkDownError if the port does not open.
+        The greeting is sent at once and its answer discarded, for devices that talk unasked until
+        stopped. Raises LinkDownError if the port does not open.
         """
         self.port.open(self)
         self._sure.clear()
@@ -83,7 +83,7 @@ class SerialExchange:
             await asyncio.wait([self._in_flight])
 
     async def ask(self, question: Question, timeout_s: float, fence: Question | None, key: int = 0) -> bytes:
-        """The answer to a question, which is asked once: nothing is ever sent again by itself.
+        """Ask a question once and return its answer; nothing is ever resent automatically.
 
         Devices (`key`) that wait are served in turn, each with one question. The device has `timeout_s`; the time on
         the wire comes on top. A device that has no fence (None) is protected by `quiet_s` alone. Raises LinkError (no

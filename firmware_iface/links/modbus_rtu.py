@@ -1,6 +1,6 @@
 """Modbus RTU with checked answers: several devices on one serial bus, each with the interface of the TCP link.
 
-RTU has no transaction numbers. What keeps a late answer from being taken for the next one is in `exchange`; the fence
+RTU has no transaction numbers. `exchange` prevents a late answer from being taken for the next one; the fence
 is "return query data" (function 8, sub-function 0) with a number that counts up: it comes back as sent, or as an
 exception of function 8, and neither can be taken for anything else.
 
@@ -66,7 +66,7 @@ def parse_rtu_url(url: str) -> tuple[str, serial_port.SerialSettings]:
 class RtuBus:
     """A serial bus with any number of Modbus devices, served in turn.
 
-    After a loss it is silent for `quiet_s`, as long as devices are usually late at most.
+    After a loss it is silent for `quiet_s`, the usual upper limit of late answers.
     """
 
     def __init__(self, port: serial_port.SerialPort, quiet_s: float = 0.2) -> None:
@@ -86,16 +86,16 @@ class RtuBus:
         return GuardedModbusRtu(self, unit_id, timeout_s, fence)
 
     def next_token(self) -> int:
-        """A number that no recent fence had."""
+        """A number not used by recent fences."""
         self._tokens = (self._tokens + 1) % _TOKENS
         return self._tokens
 
 
 class GuardedModbusRtu:
-    """One Modbus RTU device of a bus: whoever connects first opens the bus, whoever closes it closes it for all.
+    """One Modbus RTU device of a bus: the first to connect opens the bus, any one closes it for all.
 
-    The device has `timeout_s`; the time on the wire comes on top. `fence` is False for a device that is silent on
-    function 8 instead of refusing it.
+    The device has `timeout_s`, plus the time on the wire. `fence` is False for a device that ignores function 8
+    instead of refusing it.
     """
 
     def __init__(self, bus: RtuBus, unit_id: int, timeout_s: float, fence: bool = True) -> None:
@@ -143,7 +143,7 @@ class GuardedModbusRtu:
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         """Write holding registers (function code 16) and check the echo.
 
-        Raises LinkError (no valid reply in time: the device may or may not have carried it out), LinkDownError (the
+        Raises LinkError (no valid reply in time: the device may or may not have executed it), LinkDownError (the
         port is gone; the same holds), DeviceRefusedError (the device refused and changed nothing).
         """
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"

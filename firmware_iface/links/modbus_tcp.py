@@ -1,4 +1,4 @@
-"""Modbus TCP with the checks and the prompt errors that the library's client lacks.
+"""Modbus TCP with checks and prompt errors that the library's client lacks.
 
 It closes these gaps of pymodbus 3.16: a reply with too few registers, of another function or with transaction
 id 0 is accepted; a connection lost in mid-request waits for the full timeout; a retry sends a write again; a server
@@ -18,7 +18,7 @@ from pymodbus.pdu import ExceptionResponse, ModbusPDU
 from firmware_iface.links import serial_port
 from firmware_iface.roles import Clock, DeviceBusyError, DeviceRefusedError, LinkDownError, LinkError, LinkWaitsError
 
-# What Modbus means, whichever wire it comes over.
+# Modbus semantics, independent of the transport.
 
 READ_HOLDING, READ_INPUT, WRITE_SINGLE, DIAGNOSTICS, WRITE_MULTIPLE = 3, 4, 6, 8, 16
 EXCEPTION_FLAG = 0x80
@@ -32,7 +32,7 @@ EXCEPTIONS = {
     10: "gateway path unavailable",
     11: "no device behind the gateway",
 }
-_REFUSALS = (1, 2, 3)  # the request itself is wrong for this device; the others may pass
+_REFUSALS = (1, 2, 3)  # the request itself is wrong for this device; the others may be temporary
 _BUSY = 6
 
 
@@ -72,20 +72,20 @@ def exception_error(what: str, code: int) -> LinkError:
     return kind(f"{what}: exception {code} ({EXCEPTIONS.get(code, 'unknown')})")
 
 
-# the library reports in its log what is raised here as well; without a handler it would write into the console
+# the library also logs what is raised here; without a handler it would write to the console
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
-# a peer that lost its power sends no end of connection: after this many unanswered requests in a row, and one more
-# that finds the count used up, the connection is given up (the count is the library's)
+# a peer that lost its power does not close the connection: after this many unanswered requests in a row, and one more
+# that finds the count exhausted, the connection is abandoned (the count is the library's)
 _UNANSWERED_MAX = 3
 
 
 class GuardedModbusTcp:
     """One Modbus TCP device; `timeout_s` is for connecting and for each reply.
 
-    One request is in flight at a time. One that was sent when its caller is cancelled still runs to its reply or
-    timeout, so that nothing is ever abandoned on the wire. Nothing is sent twice, and nothing reconnects by itself:
-    the owner calls `connect`, which refuses to try before its back-off (0.1 s, doubling to 5 s) is over.
+    One request is in flight at a time. After its caller is cancelled, a sent request still runs to its reply or
+    timeout, so that nothing is abandoned on the wire. Nothing is sent twice or reconnects automatically: the owner
+    calls `connect`, which refuses to try before its back-off (0.1 s, doubling to 5 s) is over.
     """
 
     def __init__(self, host: str, port: int, unit_id: int, timeout_s: float, clock: Clock = time.monotonic) -> None:
@@ -94,7 +94,7 @@ class GuardedModbusTcp:
         self._timeout_s = timeout_s
         self._clock = clock
         self._client: AsyncModbusTcpClient | None = None
-        self._turn = asyncio.Lock()  # released when the request has ended, whatever became of its caller
+        self._turn = asyncio.Lock()  # released when the request ends, whatever happens to its caller
         self._in_flight: asyncio.Task[ModbusPDU] | None = None
         self._back_off = serial_port.BackOff()
 
@@ -212,7 +212,7 @@ class GuardedModbusTcp:
     def _ended(self, task: asyncio.Task[ModbusPDU]) -> None:
         self._turn.release()
         if not task.cancelled():
-            task.exception()  # of a cancelled caller nobody else looks at it
+            task.exception()  # for a cancelled caller nobody else retrieves it
 
     async def _transact(
         self, send: Callable[[AsyncModbusTcpClient], Awaitable[ModbusPDU]], function_code: int, what: str
@@ -243,7 +243,7 @@ def _check(reply: ModbusPDU, function_code: int, transaction_id: int, what: str)
 
 
 def _fail_in_flight(client: AsyncModbusTcpClient, message: str) -> None:
-    """End the wait for a reply that cannot come any more."""
-    waiting = client.ctx.response_future  # before the first request there is one that nobody awaits
+    """End the wait for a reply that can no longer come."""
+    waiting = client.ctx.response_future  # initially a future that nobody awaits
     if not waiting.done() and client.ctx.request_transaction_id:
         waiting.set_exception(LinkDownError(message))

@@ -1,4 +1,4 @@
-"""A serial port on the event loop: bytes in as they come, link-down as soon as the kernel knows.
+"""A serial port on the event loop: delivers bytes as they arrive, and reports a lost link at once.
 
 Through `loop.add_reader` on the port's own descriptor: no thread, no polling, and a pulled plug makes the descriptor
 readable at once. pyserial opens and configures the port, nothing more.
@@ -21,10 +21,10 @@ from serial.tools import list_ports
 
 from firmware_iface.roles import Clock, DeviceRefusedError, LinkDownError, LinkError, LinkWaitsError
 
-# How long to leave a device alone after a failed attempt to connect.
+# Waits between failed attempts to connect to a device.
 
 
-# quick enough for a cable put back, slow enough not to hammer a server that accepts and hangs up
+# quick enough for a replugged cable, slow enough not to hammer a server that accepts and hangs up
 FIRST_S = 0.1
 LONGEST_S = 5.0
 
@@ -32,8 +32,8 @@ LONGEST_S = 5.0
 class BackOff:
     """Doubling waits between attempts.
 
-    Every attempt counts as failed until `succeeded` is called; a connection that is accepted and dropped before one
-    valid answer is therefore no success.
+    Every attempt counts as failed until `succeeded` is called, so a connection dropped before the first valid answer
+    is not a success.
     """
 
     def __init__(self) -> None:
@@ -50,13 +50,13 @@ class BackOff:
         self._earliest_s = now_s + self._wait_s
 
     def succeeded(self) -> None:
-        """A valid answer came: the next attempt may be made at once."""
+        """Note a valid answer: the next attempt may follow at once."""
         self._wait_s = 0.0
         self._earliest_s = float("-inf")
 
 
 _READ_BYTES = 65_536
-# a port that is not there costs one look-up: no reason to back off, and a replug is to be found at once
+# a missing port costs only one look-up: no reason to back off, and a replug must be found at once
 _ABSENT_S = 0.1
 _REMEDIES = {
     errno.EACCES: "no permission; add yourself to the port's group (dialout) and log in again",
@@ -88,7 +88,7 @@ class SerialSettings:
 
     @property
     def char_s(self) -> float:
-        """How long one character takes, start bit included."""
+        """Duration of one character, including the start bit."""
         return (1 + self.data_bits + (self.parity != "N") + self.stop_bits) / self.baud
 
     def __str__(self) -> str:
@@ -96,10 +96,10 @@ class SerialSettings:
 
 
 class Receiver(Protocol):
-    """What a port tells its user, from within the event loop."""
+    """Callbacks of a port, within the event loop."""
 
     def received(self, data: bytes) -> None:
-        """Bytes came."""
+        """Bytes have arrived."""
 
     def lost(self, error: LinkDownError) -> None:
         """The port is gone and closed."""
@@ -108,7 +108,7 @@ class Receiver(Protocol):
 class SerialPort:
     """A serial port of this machine.
 
-    It is a path or `usb:VID:PID[:SERIAL]`, looked up at every `open` so that a replug in another socket is found.
+    It is a path or `usb:VID:PID[:SERIAL]`, looked up at every `open`, so that a replug in another socket works.
     Raises ValueError if the name is neither.
     """
 
@@ -175,7 +175,7 @@ class SerialPort:
             raise LinkError(f"{self._port}: only {written} of {len(data)} bytes could be sent; is the line held?")
 
     def succeeded(self) -> None:
-        """A valid answer came: the next `open` may be at once."""
+        """Note a valid answer: the next `open` may follow at once."""
         self._back_off.succeeded()
 
     def close(self) -> None:
@@ -249,7 +249,7 @@ def _opened(path: str, name: str, settings: SerialSettings) -> Any:
 
 
 def _errno(error: BaseException) -> int:
-    """Of a SerialException, which has it itself, or of the termios.error that it was raised from; else 0."""
+    """Error number of a SerialException or of the termios.error that caused it; else 0."""
     for source in (error, error.__context__):
         for code in (getattr(source, "errno", None), *getattr(source, "args", ())[:1]):
             if isinstance(code, int):
@@ -258,20 +258,20 @@ def _errno(error: BaseException) -> int:
 
 
 def _drop_wrong_parity(descriptor: int) -> None:
-    """Have the kernel check the parity of what comes in, which pyserial leaves off: a hit byte is a missing byte."""
+    """Enable the kernel's parity check of input, which pyserial leaves off: a corrupted byte is then missing."""
     attributes = termios.tcgetattr(descriptor)
     attributes[0] |= termios.INPCK | termios.IGNPAR
     termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
 
 
-# Serial ports by what they are (USB identity) instead of where they were plugged in.
+# Serial ports by identity (USB) instead of by socket.
 
 _USB_NAME = re.compile(r"usb:([0-9A-Fa-f]{4}):([0-9A-Fa-f]{4})(?::(.+))?")
 
 
 @dataclass(frozen=True, slots=True)
 class PortInfo:
-    """A serial port of this machine: where it is, the name that finds it again after a replug, what it says it is."""
+    """A serial port of this machine: its path, the name that survives a replug, its own description."""
 
     path: str
     usb_name: str
@@ -293,7 +293,7 @@ def check_port_name(name: str) -> str:
 
 
 def port_path(name: str, comports: Callable[[], Iterable[Any]] = list_ports.comports) -> str:
-    """Where the port of this name is now.
+    """Present path of the port with this name.
 
     Raises LinkDownError (not plugged in), DeviceRefusedError (several adapters answer to the name).
     """

@@ -1,10 +1,10 @@
-"""Do laser, gauge, pump and camera tell the same story of the film? Without the camera first. Pure.
+"""Checks that laser, gauge, pump and camera agree about the film; first without the camera. Pure.
 
 gauge   w ~ p^(1/3) (Hencky), so a change of gauge pressure is a change of sag. Both are the film's own: weather,
-        temperature and leak move laser and gauge alike, so whatever parts them is a sensor or its mount.
+        temperature and leak move laser and gauge alike, so a difference comes from a sensor or its mount.
 nominal the pressure that a mirror of this kind has at the laser's reading, known within a factor: units and scale.
-gas     a laser that creeps makes the loop pump against it. That looks like a leak that grows; a camera that still
-        sees the film in its place tells the two apart.
+gas     a creeping laser makes the loop pump against it. That looks like a growing leak; a camera that sees the
+        film unmoved distinguishes the two.
 """
 
 import math
@@ -17,29 +17,29 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 # 0.5 Pa of noise per sample are then 0.7 um at 10 Hz and 2.3 um at 1 Hz
 SMOOTH_S = 10.0
-# Before this the means still hold the first samples' noise.
+# Before this the first samples' noise still dominates the means.
 WARM_S = 3 * SMOOTH_S
 # Creep of 10 um/min is 20 um ahead of this reference; the 2 um/min of a mount that warms up are 4 um.
 SINCE_MINUTES_S = 120.0
-# Creep of 17 um an hour is 100 um ahead; a fresh film's own (1 % of compliance in a day) is 31 um.
+# Creep of 17 um/h is 100 um ahead; a fresh film's own (1 % of compliance in a day) is 31 um.
 SINCE_HOURS_S = 6 * 3600.0
-# On a long way the sag's own uncertainty (pre-strain, a laser that is not zero where it is said to be) counts.
+# On a long way the sag's own uncertainty matters (pre-strain, an offset of the laser's zero).
 LAW_SHARE = 0.3
 # Film, laser's zero and Young's modulus are known well enough for this; a wrong unit is off by ten.
 NOMINAL_FACTOR = 2.0
 NOMINAL_SLACK_PA = 20.0
 NOMINAL_S = 1.0
-# Below this the film is slack, and the gauge's zero is a large part of what it reads.
+# Below this the film is slack, and the gauge's zero is a large part of its reading.
 TAUT_PA = 100.0
 
 LEAK_REFERENCE_S = 3600.0
-# As long as the mean of the leak is.
+# As long as the averaging time of the leak.
 LEAK_STANDS_S = 60.0
 # The loop moves the flow by 0.15 um/s: of a mean over this, 0.03 um/s.
 FLOW_MEAN_S = 15.0
-# Of what a mirror takes at least: a share of next to nothing says nothing.
+# Least gas taken by a mirror: a ratio to almost nothing is meaningless.
 LEAK_LEAST_UM_PER_S = 0.8
-# Where a camera contradicts the laser, gas that agrees with the camera outvotes a gauge that sees nothing.
+# If a camera contradicts the laser, gas that agrees with the camera outvotes a gauge that sees nothing.
 CONTRADICTED_MOST = 1.25
 
 
@@ -54,12 +54,12 @@ class _Since:
     root: float = math.nan
 
     def apart(self, laser_um: float, trim_um: float, root: float, sag_um: float, dt_s: float) -> str:
-        """What the two have seen, if it cannot both be true; `root` is the cube root of the gauge pressure."""
+        """Both readings, if they contradict each other; `root` is the cube root of the gauge pressure."""
         if math.isnan(self.laser_um):
             self.laser_um, self.trim_um, self.root = laser_um, trim_um, root
         by_laser_um, trimmed_um = laser_um - self.laser_um, trim_um - self.trim_um
         by_gauge_um = (sag_um - by_laser_um) * (root / self.root - 1)
-        # A laser whose drift the shape loop has taken out has not moved the film.
+        # A laser drift that the shape loop has compensated has not moved the film.
         apart_um = min(abs(by_laser_um - by_gauge_um), abs(by_laser_um - trimmed_um - by_gauge_um))
         if apart_um > self.limit_um + LAW_SHARE * min(abs(by_laser_um), abs(by_gauge_um)):
             return f"laser {by_laser_um:+.0f} um, gauge {by_gauge_um:+.0f} um"
@@ -80,21 +80,21 @@ class LeakGrowth:
     _stands_s: float = 0.0
 
     def reset(self) -> None:
-        """Forget what it used to take."""
+        """Forget the usual consumption."""
         self._usual.reset(math.nan)
         self._flow.reset(math.nan)
         self.moves()
 
     def moves(self) -> None:
-        """The setpoint is on its way: the mean holds what the ramp took, with the error of the pump's map."""
+        """The setpoint ramps: the mean includes the ramp's gas, with the error of the pump's map."""
         self._still_s = self._stands_s = 0.0
 
     def step(self, leak_um_per_s: float, flow_um_per_s: float, most: float, dt_s: float) -> str:
-        """One tick of a held mirror; what is wrong, if so. NaN for what is not known.
+        """Process one tick of a held mirror and return any problem. NaN for unknown values.
 
-        The leak is the inner loop's estimate, without what the feed-forward adds, and a thermometer that lies shifts
-        it; a film that really takes more gas gets more. `most`: times what the film used to take; infinite where a
-        camera sees that it stands still.
+        The leak is the inner loop's estimate, without the feed-forward's share, and a faulty thermometer shifts it;
+        a film that really takes more gas gets more. `most`: times the usual consumption; infinite if a camera
+        sees the film stand still.
         """
         if not (math.isfinite(leak_um_per_s) and math.isfinite(flow_um_per_s)):
             return ""
@@ -107,7 +107,7 @@ class LeakGrowth:
         excess_um_per_s = (most - 1) * max(usual_um_per_s, LEAK_LEAST_UM_PER_S)
         if not takes_um_per_s > usual_um_per_s + excess_um_per_s:
             self._stands_s = 0.0
-            # the larger of the two, for a thermometer that lies may shift the estimate down for long
+            # the larger of the two, as a faulty thermometer may shift the estimate down for long
             known = math.isfinite(self._usual.value)
             self._usual.update(max(leak_um_per_s, flow_um_per_s) if known else leak_um_per_s, dt_s)
             return ""
@@ -140,15 +140,15 @@ class FilmMonitor:
         return self._seen_s > 0.0
 
     def step(self, dt_s: float, laser_um: float, trim_um: float, gauge_pressure_pa: float) -> str:
-        """One tick; what laser and gauge have seen, if it does not fit. NaN without a (good) reading.
+        """Process one tick and return both readings if they contradict each other. NaN without a good reading.
 
-        `trim_um` is what the shape loop has added to the setpoint: the laser's drift as the camera sees it.
+        `trim_um` is the shape loop's addition to the setpoint: the laser's drift as seen by the camera.
         """
-        # Both or none: two means that began their lag together differ by no way that the film goes.
+        # Both or none: two means that started together do not differ because of the film's motion.
         if not (math.isfinite(laser_um) and math.isfinite(gauge_pressure_pa)):
             return ""
         laser_um = self._laser.update(laser_um, dt_s)
-        # A mean of the root goes with the mean of the sag on any way; a mean of the pressure does not.
+        # The mean of the root always follows the mean of the sag; the mean of the pressure does not.
         root = self._root.update(math.cbrt(gauge_pressure_pa), dt_s)
         self._seen_s += dt_s
         if strange := self._not_nominal(laser_um, root**3):
@@ -163,7 +163,7 @@ class FilmMonitor:
 
     @property
     def _taut(self) -> bool:
-        """There is a reference: a gauge that falls to nothing from now on is no slack film."""
+        """There is a reference: from now on, a gauge that falls to zero does not mean a slack film."""
         return math.isfinite(self._since[0].root)
 
     def _not_nominal(self, laser_um: float, gauge_pa: float) -> str:
@@ -175,14 +175,14 @@ class FilmMonitor:
         return f"the gauge reads {gauge_pa:.0f} Pa; this sag needs about {wanted_pa:.0f} Pa"
 
 
-# Laser against optics, with the gauge pressure as arbiter: which one is wrong?
+# Laser against optics, with the gauge pressure as arbiter.
 #
 # All three see the sag of the mirror film change: the laser as d, the camera as sag, the gauge as pressure, which for
 # a Hencky film (w ~ p^(1/3)) is dw = w / (3 p) dp. The gauge is too noisy to hold a mirror with (0.5 Pa are 10 um),
 # but its mean over ten seconds is good to about a micrometre, and knows nothing of mounts and cameras.
 #
-# Compared are changes against references that follow slowly while all agree, so that what drifts slowly (a laser's
-# mount, a gauge's zero, creep) is no lie; the shape loop is there for that.
+# Changes are compared with references that follow slowly while all agree, so that slow drift (a laser's mount, a
+# gauge's zero, creep) does not count as a contradiction; the shape loop handles it.
 
 # A laser's mount at 2 um/min is then 4 um ahead of its reference: less than the limit of 10 um.
 REFERENCE_S = 120.0
@@ -201,19 +201,19 @@ class Liar(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """Changes of sag since the reference as the three see it, um."""
+    """Changes of sag since the reference, as seen by the three, um."""
 
     laser_um: float
     optics_um: float
     gauge_um: float
 
     def __str__(self) -> str:
-        """For one line."""
+        """Format the changes as one line."""
         return f"laser {self.laser_um:+.1f} um, camera {self.optics_um:+.1f} um, gauge {self.gauge_um:+.1f} um"
 
 
 class PlausibilityCheck:
-    """Judges on every tick; says NOBODY without a camera, for two sensors can only disagree.
+    """Judges on every tick; NOBODY without a camera, as two sensors can only disagree.
 
     Laser and camera may be `limit_um` apart (`shape.disagreement_max_um`). `changes` are NaN until there is a
     reference.
@@ -240,7 +240,7 @@ class PlausibilityCheck:
     def step(
         self, dt_s: float, displacement_um: float, gauge_pressure_pa: float, estimate: ShapeEstimate | None
     ) -> Liar:
-        """One tick of a held mirror; NaN without a good reading, the estimate in the tick in which it arrives."""
+        """Process one tick of a held mirror; NaN without a good reading; the estimate only in its tick of arrival."""
         if math.isfinite(displacement_um):
             self._laser.update(displacement_um, dt_s)
         if math.isfinite(gauge_pressure_pa):
@@ -271,7 +271,7 @@ class PlausibilityCheck:
             self._reference = a, b, c
             return
         if self.liar in (Liar.LASER, Liar.OPTICS):
-            return  # it stands until the two agree again: a gauge that drifts meanwhile accuses nobody else
+            return  # the verdict stands until the two agree again: a drifting gauge must not accuse the other
         to_laser_um, to_optics_um = abs(self.changes.gauge_um - laser), abs(self.changes.gauge_um - optics)
         if to_optics_um * CLEARER < to_laser_um:
             self.liar = Liar.LASER

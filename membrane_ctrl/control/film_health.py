@@ -1,7 +1,7 @@
 """Slow changes that lead to a failure, detected early in hourly means. Pure.
 
-leak      mean loss of gas; a seam that opens makes it grow until the pump cannot keep up
-reserve   what the pump has left above the leak
+leak      mean loss of gas; an opening seam makes it grow until the pump cannot keep up
+reserve   the pump's flow in excess of the leak
 tight     a mirror that loses too little gas cannot be lowered (control/film_health.py)
 creep     at a held sag p J = const (Hencky, J the compliance): as the film gives the pressure falls, dJ/J = -dp/p
 """
@@ -10,7 +10,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-# How fast the mirror loses gas, from what the pump gives and the centre does.
+# The mirror's loss of gas, from the pump's flow and the motion of the centre.
 #
 # Balance of gas, as speed of the centre:  dy/dt = v - leak + w,  and the feed-forward is -w as far as it is known, so
 #
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 # The mean of dy/dt is a difference of two readings: the laser's noise falls with the window, not with its root.
 
 
-# Long against the loop (6.5 s) and short against a leak that somebody opens.
+# Long compared with the loop (6.5 s), short compared with a leak that somebody opens.
 WINDOW_S = 60.0
 
 # Before this the readings' noise and the pump's lag are a tenth of the leak.
@@ -29,15 +29,15 @@ FIRST_S = 10.0
 # than this to make up for, the pump stops and starts, and in the end the band of 2 um is lost (docs/control.md).
 TOO_TIGHT_UM_PER_S = 0.4
 
-# A warning that is given is kept until the leak is clearly above the limit again.
+# A warning stands until the leak is clearly above the limit again.
 TOO_TIGHT_END_UM_PER_S = 0.45
 
-# As a mean over less than this the weather alone could give the warning.
+# With a shorter mean, weather alone could cause the warning.
 JUDGE_S = 30.0
 
 
 class LeakEstimate:
-    """Mean loss of gas (leak and bleed together) over the last minute, or over all there is until then."""
+    """Mean loss of gas (leak and bleed together) over the last minute, or over a shorter record."""
 
     def __init__(self) -> None:
         self._mean_um_per_s = 0.0
@@ -67,19 +67,19 @@ class LeakEstimate:
         self._last_um = filtered_um
 
     def pause(self) -> None:
-        """Nothing was seen in this step: leave it out."""
+        """Skip a step without a reading."""
         self._last_um = math.nan
 
 
 HOUR_S = 3600.0
 DAY_HOURS = 24
-# A day of typical weather moves an hourly mean by some per cent; half as much again is the seam.
+# A day of typical weather moves an hourly mean by a few per cent; growth by half means the seam.
 LEAK_GREW = 1.5
 # The loop needs room for gusts: below this share of the pump's flow for the leak there is enough.
 RESERVE_SHARE = 0.6
-# The laws of both films give 0.7 % in the first day and 0.15 % in the second; more than this is no creep of the law.
+# Both films' creep laws give 0.7 % on the first day and 0.15 % on the second; more than this is not regular creep.
 CREEP_PER_DAY = 0.01
-# Warned of again only after it has been clearly better.
+# Warn again only after a clear improvement.
 BETTER = 0.9
 
 
@@ -101,7 +101,7 @@ class FilmWarning:
 
 
 class FilmHealth:
-    """Collects a held mirror's hours and warns once of what gets worse; the pump has `flow_max_um_per_s`."""
+    """Collects a held mirror's hours and warns once about each deterioration; the pump has `flow_max_um_per_s`."""
 
     def __init__(self, flow_max_um_per_s: float) -> None:
         self._flow_max_um_per_s = flow_max_um_per_s
@@ -111,7 +111,7 @@ class FilmHealth:
         self._begin_hour()
 
     def step(self, dt_s: float, leak_um_per_s: float, gauge_pressure_pa: float) -> tuple[FilmWarning, ...]:
-        """One tick of a held mirror; what is newly worth a warning, or no longer, at the end of an hour."""
+        """Process one tick of a held mirror; at the end of an hour, return new and withdrawn warnings."""
         if not (math.isfinite(leak_um_per_s) and math.isfinite(gauge_pressure_pa)):
             return ()
         self._held_s += dt_s
@@ -126,7 +126,7 @@ class FilmHealth:
         return tuple(self._news(hour, self._first))
 
     def setpoint_moved(self) -> None:
-        """The sag is another one from now on: pressures before and after cannot be compared."""
+        """The sag has changed: pressures before and after are not comparable."""
         self._hours.clear()
         self._begin_hour()
 

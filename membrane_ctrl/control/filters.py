@@ -4,7 +4,7 @@ import math
 
 
 def smoothing(dt_s: float, time_constant_s: float) -> float:
-    """Share of the way a first-order lag goes in one step, 1 - exp(-dt / T); 1 without a lag."""
+    """Step fraction of a first-order lag, 1 - exp(-dt / T); 1 without a lag."""
     return -math.expm1(-dt_s / time_constant_s) if time_constant_s > 0 else 1.0
 
 
@@ -20,7 +20,7 @@ class LowPass:
         self.value = value
 
     def update(self, given: float, dt_s: float) -> float:
-        """Output after `given` was there for `dt_s`."""
+        """Output after `given` was applied for `dt_s`."""
         if math.isnan(self.value):
             self.value = given
         self.value += smoothing(dt_s, self.time_constant_s) * (given - self.value)
@@ -30,10 +30,10 @@ class LowPass:
 class LagRate:
     """Rate of change of a signal behind a first-order lag, (x - lag(x)) / T, that survives the signal's absence.
 
-    The mean rate over a step is what the lag moved, divided by the step, so that the rate integrates to exactly the
-    lag's own movement; T = 0 is the bare difference quotient. While the signal is absent (NaN) the last value stands
-    and the rate dies away; when it is back, the lag is placed where the rate goes on from its present value, whatever
-    the signal did meanwhile: neither is a bump. A step of more than `step_max` is taken for an absence.
+    The mean rate over a step is the lag's change divided by the step, so that the rate integrates exactly to the
+    lag's own movement; T = 0 gives the plain difference quotient. While the signal is absent (NaN) the last value
+    stands and the rate decays; on its return the lag is placed so that the rate continues from its present value:
+    neither makes a bump. A step of more than `step_max` counts as an absence.
     """
 
     def __init__(self, time_constant_s: float, step_max: float = math.inf) -> None:
@@ -75,7 +75,7 @@ class Slope:
         self._t = self._y = self._tt = self._ty = 0.0
 
     def add(self, time_s: float, value: float) -> None:
-        """Take one sample; one that is not finite is passed over."""
+        """Add one sample, ignoring one that is not finite."""
         if not math.isfinite(value):
             return
         if self._n == 0:
@@ -102,13 +102,13 @@ class Slope:
 #
 #     value += (1 - beta^2) r,    rate += (1 - beta)^2 r / dt
 #
-# Both poles lie at beta: critically damped. A steady drift is followed without error (a single lag would stay behind
-# by rate x T). A drift of rate v that begins suddenly is behind by v t exp(-t / T): at most v T / e. Noise of
-# standard deviation sigma a reading comes through as sigma sqrt(1.25 dt / T).
+# Both poles lie at beta: critically damped. A steady drift is tracked without error (a single lag would trail
+# by rate x T). After a sudden onset of a drift v the tracker trails by v t exp(-t / T): at most v T / e. Noise of
+# standard deviation sigma per reading becomes sigma sqrt(1.25 dt / T).
 
 
 class DriftTracker:
-    """Value and rate of a drift that is 0 at the beginning; T is `memory_s`."""
+    """Value and rate of a drift that is initially 0; T is `memory_s`."""
 
     def __init__(self, memory_s: float) -> None:
         self._memory_s = memory_s
@@ -117,9 +117,9 @@ class DriftTracker:
         self._rate_um_per_s = 0.0
 
     def begin(self, time_s: float) -> None:
-        """The drift is 0 at this time, and its rate is taken for 0.
+        """Set drift and rate to 0 at this time.
 
-        A short memory at first would find an old drift sooner, but its noise would move a mirror that stands still.
+        An initially short memory would find an old drift sooner, but its noise would move a still mirror.
         """
         self._time_s = time_s
         self._value_um = self._rate_um_per_s = 0.0

@@ -2,10 +2,10 @@
 
     q = q_full (d - dead) / (1 - dead)   while it runs; starts at `start`, stalls below `stall`   (docs/physics.md)
 
-Between rest and the least running flow there is nothing: a wanted flow in that gap goes to the nearer end, so that
-the error of the gap has no sign of its own. (Always running on would add gas that nothing takes away, always stopping
-would leave the least flow missing: each is a bias.) What remains is left to the integrator, which is not told of
-the gap: it sees the error that follows.
+There is no flow between rest and the least running flow: a wanted flow in that gap goes to the nearer end, so that
+the error of the gap has no fixed sign. (Always running would add gas that nothing removes, always stopping would lose
+the least flow: each is a bias.) The rest is left to the integrator, which does not know about the gap, but sees
+the resulting error.
 """
 
 import math
@@ -13,7 +13,7 @@ import math
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.filters import LagRate
 
-# Above the stall command by this much, so that a rounded register or a cold pump does not stall.
+# Margin above the stall command, so that a rounded register or a cold pump does not stall.
 STALL_MARGIN = 0.005
 
 # A stopped pump gets the start command for this long: about its lag (0.15 s), in which it adds less than 0.1 um.
@@ -21,7 +21,7 @@ KICK_S = 0.1
 
 
 class PumpCurve:
-    """The inverse of the pump; it remembers whether it left the pump running."""
+    """The inverse of the pump, which remembers whether the pump runs."""
 
     def __init__(self, pump: PumpConfig) -> None:
         self._pump = pump
@@ -34,7 +34,7 @@ class PumpCurve:
         return self.flow(self._least_fraction)
 
     def stopped(self) -> None:
-        """The pump was stopped by somebody else: the next flow starts it."""
+        """Note that something else stopped the pump: the next flow starts it."""
         self._kick_left_s = KICK_S
 
     def flow(self, fraction: float) -> float:
@@ -43,7 +43,7 @@ class PumpCurve:
         return max(0.0, pump.flow_full_um_per_s * (fraction - pump.dead_fraction) / (1.0 - pump.dead_fraction))
 
     def command(self, flow_um_per_s: float, dt_s: float) -> float:
-        """Command for a flow; the pump is kicked when it stands still."""
+        """Command for a flow; a stopped pump gets a start pulse."""
         if flow_um_per_s < 0.5 * self.least_flow_um_per_s:
             self.stopped()
             return 0.0
@@ -63,19 +63,19 @@ class PumpCurve:
 #
 #     v = -g_p d/dt lag(p, T_f) - g_T d/dt lag(T_air, T_g)
 #
-# T_f is only there to keep the barometer's noise from the pump; T_g is the physics itself and needs no more filter.
+# T_f only keeps the barometer's noise from the pump; T_g is physical and needs no further filter.
 
 
-# From one tick to the next no weather and no door does this (a slammed one: 100 Pa); a sensor that fails does, as one
-# that says 85 or -127 C
+# Neither weather nor a door (slammed: 100 Pa) changes this much between ticks, but a failed sensor does, such as one
+# that reads 85 or -127 C
 _STEP_MAX_PA, _STEP_MAX_K = 500.0, 2.0
-# Where people work, from 5000 m to a mine; hPa, mmHg and psi are far outside, and so are K for C
+# Any workplace from 5000 m to a mine; hPa, mmHg and psi are far outside, and so are K for C
 _PRESSURE_PA = (50e3, 110e3)
 _TEMPERATURE_C = (-20.0, 60.0)
 
 
 def weather_fault(ambient_pressure_pa: float, air_temperature_c: float) -> str:
-    """Says which of the two reads something impossible; an absent sensor (NaN) does not."""
+    """Name the sensor with an impossible reading; absent ones (NaN) do not count."""
     if not _believed(ambient_pressure_pa, _PRESSURE_PA):
         return f"the barometer reads {ambient_pressure_pa:g} Pa: check its unit; the feed-forward does without it"
     if not _believed(air_temperature_c, _TEMPERATURE_C):
@@ -88,10 +88,10 @@ def _believed(value: float, within: tuple[float, float]) -> bool:
 
 
 class FeedForward:
-    """Feed-forward from barometer and air thermometer; either may be switched off, or come and go (NaN), at any time.
+    """Feed-forward from barometer and air thermometer; either may be switched off, or drop out (NaN), at any time.
 
-    A value that jumps further than the weather can, or that no place where people work has, is a sensor's own, and
-    moves nothing.
+    A value that jumps further than weather can, or is outside the range of any workplace, is a sensor fault and has
+    no effect.
     """
 
     def __init__(self, loop: LoopConfig) -> None:
@@ -100,13 +100,13 @@ class FeedForward:
         self.set_gains(loop)
 
     def set_gains(self, loop: LoopConfig) -> None:
-        """Take new gains, switches and time constants; a channel switched off dies away like a lost sensor."""
+        """Set gains, switches and time constants; a channel switched off decays like a lost sensor."""
         self._loop = loop
         self._pressure.time_constant_s = loop.feedforward_filter_s
         self._temperature.time_constant_s = loop.gas_follows_air_s
 
     def update(self, ambient_pressure_pa: float, air_temperature_c: float, dt_s: float) -> float:
-        """Flow in um/s; NaN for a quantity that is not there."""
+        """Flow in um/s; NaN for a missing quantity."""
         loop = self._loop
         use_pressure = loop.feedforward_barometer and _believed(ambient_pressure_pa, _PRESSURE_PA)
         use_temperature = loop.feedforward_temperature and _believed(air_temperature_c, _TEMPERATURE_C)

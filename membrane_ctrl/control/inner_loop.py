@@ -16,9 +16,9 @@ from membrane_ctrl.model.arrays import ComplexArray, FloatArray
 
 @dataclass(frozen=True, slots=True)
 class LoopInput:
-    """What one tick knows."""
+    """Inputs of one tick."""
 
-    target_um: float  # where the setpoint is to go, without the trim
+    target_um: float  # end of the setpoint's ramp, without the trim
     trim_um: float  # the shape loop's share of the setpoint; it changes slowly and is added behind the ramp
     displacement_um: float  # laser reading, as read
     ambient_pressure_pa: float  # NaN without a sensor
@@ -27,7 +27,7 @@ class LoopInput:
 
 @dataclass(frozen=True, slots=True)
 class LoopOutput:
-    """What one tick decided, and from what."""
+    """Results of one tick, with their components."""
 
     setpoint_um: float  # ramp and trim
     filtered_um: float  # NaN in a tick without a reading
@@ -44,7 +44,7 @@ class LoopOutput:
     too_tight: bool  # the mirror loses too little gas to be held within the band
 
 
-# of a tick in which the loop has not run
+# for a tick in which the loop did not run
 NO_OUTPUT = LoopOutput(
     setpoint_um=math.nan,
     filtered_um=math.nan,
@@ -65,7 +65,7 @@ NO_OUTPUT = LoopOutput(
 class InnerLoop:
     """Two-degree-of-freedom PI(D) with feed-forward, on flow as a speed of the mirror's centre.
 
-    Call exactly one of `step`, `stale` and `follow` a tick; any may follow any other without a bump.
+    Call exactly one of `step`, `stale` and `follow` per tick; they may follow each other without a bump.
     """
 
     def __init__(self, loop: LoopConfig, pump: PumpConfig) -> None:
@@ -91,9 +91,9 @@ class InnerLoop:
         return self._pid.integral_um_per_s
 
     def start(self, displacement_um: float, flow_um_per_s: float) -> None:
-        """Begin at a reading: the setpoint ramps from there, the integrator stands at the flow.
+        """Start at a reading: the setpoint ramps from there, the integrator stands at the flow.
 
-        The flow is what the pump gives now, or the mean that it is known to need.
+        The flow is the pump's present flow, or the mean it is known to need.
         """
         self._measured.reset(displacement_um)
         self._stand_at(displacement_um)
@@ -103,7 +103,7 @@ class InnerLoop:
         self._leak.pause()
 
     def step(self, given: LoopInput, dt_s: float) -> LoopOutput:
-        """One automatic tick; a reading that is not finite is missing (`stale`). The caller keeps `dt_s` above 0."""
+        """Run one automatic tick; a reading that is not finite counts as missing (`stale`). `dt_s` must exceed 0."""
         if not math.isfinite(given.displacement_um):
             return self.stale(given, dt_s)
         before_um = self._measured.value
@@ -137,10 +137,10 @@ class InnerLoop:
         return self._output(pid.PidTerms(0.0, mean_um_per_s, 0.0), 0.0, mean_um_per_s, fraction, filtered_um)
 
     def follow(self, given: LoopInput, flow_um_per_s: float, dt_s: float) -> LoopOutput:
-        """One tick in which somebody else gives the flow (manual, tuning, ramp-down), within the pump's range.
+        """Run one tick with an external flow (manual, tuning, ramp-down), within the pump's range.
 
-        The setpoint stands at the reading (the last one that was finite) and the integrator at the flow, so that
-        `step` goes on from there; the target is not used.
+        The setpoint stands at the last finite reading and the integrator at the flow, so that `step` continues from
+        there; the target is not used.
         """
         seen = math.isfinite(given.displacement_um)
         if seen:
@@ -161,7 +161,7 @@ class InnerLoop:
         return replace(self._output(terms, weather_um_per_s, flow_um_per_s, fraction, filtered_um), error_um=math.nan)
 
     def follow_raw(self, given: LoopInput, fraction: float, dt_s: float) -> LoopOutput:
-        """`follow` with the pump's command itself, put out as it is; whether the pump runs is not known."""
+        """`follow` with a raw pump command, which is output unchanged; whether the pump runs is unknown."""
         flow_um_per_s = self._curve.flow(fraction)
         output = self.follow(given, flow_um_per_s, dt_s)
         self._curve.stopped()
@@ -188,13 +188,13 @@ class InnerLoop:
         self._pid.set_gains(_gains(loop))
 
     def _stand_at(self, setpoint_um: float) -> None:
-        """Let all that follows the setpoint stand still at it."""
+        """Put everything that follows the setpoint to rest there."""
         self._setpoint_um = self._shaped_um = setpoint_um
         self._weight.reset(setpoint_um)
         self._matched.reset(setpoint_um)
 
     def _follow_setpoint(self, given: LoopInput, filtered_um: float, dt_s: float) -> tuple[float, float]:
-        """Advance the setpoint; the loop's error in um and the ramp's own speed in um/s."""
+        """Advance the setpoint; return the loop's error in um and the ramp's own speed in um/s."""
         if math.isnan(self._setpoint_um):
             self._stand_at(filtered_um)
         if math.isnan(self._ramp.value_um):
@@ -202,8 +202,8 @@ class InnerLoop:
         base_um = self._ramp.advance(given.target_um, self._pid.integral_um_per_s, dt_s)
         self._setpoint_um = base_um + given.trim_um
         shaped_um = self._weight.update(self._setpoint_um, dt_s)
-        # An integrating mirror follows a ramp with a flow equal to the ramp's speed. Bounded, for the trim's
-        # steps are in it too.
+        # An integrating mirror follows a ramp with a flow equal to the ramp's speed. Bounded, as it includes the
+        # trim's steps.
         limit_um_per_s = self._loop.setpoint_ramp_um_per_s
         speed_um_per_s = min(max((shaped_um - self._shaped_um) / dt_s, -limit_um_per_s), limit_um_per_s)
         self._shaped_um = shaped_um
@@ -264,7 +264,7 @@ def open_loop(loop: LoopConfig, omega: FloatArray) -> ComplexArray:
 def peak_sensitivity(loop: LoopConfig) -> float:
     """Return the largest amplification of a disturbance at any frequency; infinity for an unstable loop.
 
-    1.4 is what the defaults stay below. A loop with `kp_per_s` 0 has none: NaN.
+    The defaults stay below 1.4. NaN for a loop with `kp_per_s` 0.
     """
     if loop.kp_per_s == 0.0:
         return math.nan

@@ -6,9 +6,9 @@
 v is u within the pump's range [0, v_max].
 Source: Astrom and Hagglund, Advanced PID Control (2006), sections 3.4 and 3.5.
 
-The feed-forward is added behind, and what the limits cut from it is not told to the integrator. Gusts are cut on one
-side only, for the pump takes no gas away. In the steady state dI/dt = 0, so back-calculation would turn a mean cut
-(v - u) into a mean error -(v - u) / K: measured, 0.18 um with gusts, and 0.00 without it.
+The feed-forward is added afterwards, and the integrator ignores what the limits cut from it. Gusts are cut on one
+side only, as the pump removes no gas. In the steady state dI/dt = 0, so back-calculation would turn a mean cut
+(v - u) into a mean error -(v - u) / K: measured with gusts, 0.18 um, and 0.00 without it.
 """
 
 import math
@@ -43,7 +43,7 @@ class PidTerms:
 class Pid:
     """The controller's memory: the integrator and the last error and measurement rate (for bumpless changes).
 
-    The integrator stays within 0, for the pump takes no gas away, and `flow_max_um_per_s`.
+    The integrator stays between 0, as the pump removes no gas, and `flow_max_um_per_s`.
     """
 
     def __init__(self, gains: PidGains, flow_max_um_per_s: float) -> None:
@@ -109,14 +109,14 @@ class FlowLimiter:
         return self.place(min(max(wanted_um_per_s, low), high))
 
 
-# The setpoint's way to its target: a ramp the pump can follow, and the weight of the second degree of freedom.
+# The setpoint's path to its target: a ramp the pump can follow, and the weight of the second degree of freedom.
 
 
-# The ramp's last part is exponential with this time constant: it ends without a kink that the pump's lag
+# The ramp's last part is exponential with this time constant, to avoid a kink that the pump's lag
 # (0.15 s) and transport (0.075 s) would turn into overshoot.
 APPROACH_S = 1.0
 
-# Share of the pump's free range that a ramp may ask for; the rest stays with the feedback.
+# Share of the pump's free range available to a ramp; the rest is for the feedback.
 RAMP_SHARE = 0.8
 
 
@@ -131,8 +131,8 @@ class SetpointRamp:
     def advance(self, target_um: float, mean_flow_um_per_s: float, dt_s: float) -> float:
         """Setpoint after one step towards `target_um`.
 
-        The pump only adds gas: the mirror falls no faster than it leaks, and the leak is what the mean flow makes
-        up for. So a fall is limited to a share of the mean flow, a rise to a share of what is left above it.
+        The pump only adds gas: the mirror falls no faster than it leaks, and the mean flow balances the leak. So a
+        fall is limited to a share of the mean flow, a rise to a share of the flow above it.
         """
         down = min(self.rate_um_per_s, RAMP_SHARE * mean_flow_um_per_s)
         up = min(self.rate_um_per_s, RAMP_SHARE * (self.flow_max_um_per_s - mean_flow_um_per_s))
@@ -154,10 +154,10 @@ class SetpointWeight:
         self._slow = LowPass(ti_s)
 
     def reset(self, setpoint_um: float) -> None:
-        """Stand still at a setpoint."""
+        """Come to rest at a setpoint."""
         self._slow.reset(setpoint_um)
 
     def update(self, setpoint_um: float, dt_s: float) -> float:
-        """Setpoint as the loop is to see it."""
+        """Setpoint as seen by the loop."""
         slow_um = self._slow.update(setpoint_um, dt_s)
         return slow_um + self.weight * (setpoint_um - slow_um)

@@ -6,8 +6,8 @@ stays where it is, so the change of sag is the change of d. Against a reference 
     b = (change of the laser) - (change of sag),    both at the time of the exposures.
 
 With the trim at b the inner loop holds y = target + b, that is d = target. b does not depend on the setpoint, so a
-setpoint moved by the user is never taken for drift, and the trim feeds nothing back: there is no loop to become
-unstable, only a tracker to tune.
+user's setpoint change never counts as drift, and the trim closes no feedback loop that could become unstable: there
+is only a tracker to tune.
 """
 
 import math
@@ -23,7 +23,7 @@ from membrane_ctrl.model.arrays import FloatArray
 # The reference of the shape loop: the mean of the first shapes.
 
 
-# What the reference is off stays as an offset of the figure for good: the mean has less than half the scatter of one,
+# An error of the reference remains as an offset of the figure: the mean has less than half the scatter of one shape,
 # at the price of a few cycles without the trim.
 SHAPES = 5
 
@@ -66,8 +66,8 @@ class ReferenceMean:
 #
 #     d = (s' W dc) / (s' W s),    var d = 1 / (s' W s),    W = (C + f^2 I)^-1
 #
-# C is what pixel noise makes: nanometres, and nearly singular where terms are hard to tell apart. Taken alone it
-# would put all weight on a few terms whose *model* error (the film's motion between frames, geometry, gamma) is far
+# C comes from pixel noise: nanometres, and nearly singular where terms are hard to separate. Alone it would put all
+# weight on a few terms whose *model* error (the film's motion between frames, geometry, gamma) is far
 # larger. f stands for that: it is the same for every term, and bounds the condition of W.
 
 
@@ -107,10 +107,10 @@ def sag_change(
 
 @dataclass(frozen=True, slots=True)
 class ShapeOutput:
-    """What the shape loop does, and why."""
+    """Output of the shape loop, with its reason."""
 
     state: states.ShapeState
-    reason: str  # why it is not tracking, or what holds it back; empty when there is nothing to say
+    reason: str  # why it does not track, or what limits it; may be empty
     trim_um: float  # to be added to the setpoint
     # change of sag since lock as last admitted, and its standard deviation; NaN until there is one
     sag_change_um: float
@@ -136,14 +136,14 @@ class ShapeLoop:
         self._settled_since_s = math.inf
 
     def switch(self, on: bool, now_s: float) -> None:
-        """On: a new reference is taken, from the trim as it stands. Off: the trim is held."""
+        """Switch on, taking a new reference from the present trim, or off, holding the trim."""
         if on and self._state == states.ShapeState.OFF:
             self.lock(now_s)
         elif not on:
             self._state, self._reason = states.ShapeState.OFF, "switched off"
 
     def lock(self, now_s: float) -> None:
-        """Take the figure from now on as the reference; the trim stands meanwhile."""
+        """Take the figure from now on as the reference; hold the trim meanwhile."""
         self._state, self._reason = states.ShapeState.WAITING, "waiting for the first shape"
         self._reference = ReferenceMean()
         self._change = SagChange(math.nan, math.nan)
@@ -160,8 +160,8 @@ class ShapeLoop:
     ) -> ShapeOutput:
         """One tick.
 
-        The estimate is given only when it is new; `settled`: the inner loop holds its setpoint; `distrust` says why
-        the camera is not to be believed, if so.
+        The estimate is given only when new; `settled`: the inner loop holds its setpoint; `distrust`: why the
+        camera must not be believed, if so.
         """
         if not settled:
             self._settled_since_s = math.inf
@@ -189,7 +189,7 @@ class ShapeLoop:
     def _refusal(
         self, now_s: float, estimate: shape_estimate.ShapeEstimate | None, displacement_um: float, settled: bool
     ) -> str:
-        """Why nothing may be learnt in this tick; empty if it may."""
+        """Why this tick's estimate must not be used; empty if it may be."""
         config = self._config
         if not settled:
             return "the inner loop is not settled"
@@ -219,7 +219,7 @@ class ShapeLoop:
         self._reason = reason
 
     def _admit(self, estimate: shape_estimate.ShapeEstimate) -> None:
-        """Learn from an estimate: the reference first, the drift then, unless camera and laser disagree on it."""
+        """Use an estimate: for the reference first, then for the drift, unless camera and laser disagree."""
         if self._state == states.ShapeState.WAITING:
             self._admitted_s = estimate.time_s
             self._reference.take(estimate)
@@ -240,7 +240,7 @@ class ShapeLoop:
         self._state, self._reason = states.ShapeState.TRACKING, ""
 
     def _move_trim(self, now_s: float, dt_s: float) -> None:
-        """Bring the trim to the drift, bounded in rate and range."""
+        """Move the trim to the drift, bounded in rate and range."""
         config = self._config
         goal_um = self._base_um + self._drift.at(now_s)
         bounded_um = min(max(goal_um, -config.trim_max_um), config.trim_max_um)

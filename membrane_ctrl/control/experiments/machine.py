@@ -1,8 +1,8 @@
 """Experiments as step machines: one reading in, one flow out, no clock and no I/O.
 
-Whoever runs them calls `step` once a tick and hands the mirror back to the loop when it says `Finished`. Every
-machine is run inside an `ExcursionGuard`, which ends it before the mirror is further from where it stood than it
-may go.
+The caller runs `step` once per tick and returns the mirror to the loop on `Finished`. Every machine runs inside an
+`ExcursionGuard`, which ends it before the mirror exceeds its permitted excursion from where it
+stood.
 """
 
 import math
@@ -14,12 +14,12 @@ import numpy as np
 
 from membrane_ctrl.control.filters import LowPass
 
-# What an experiment sees of a tick.
+# An experiment's view of a tick.
 
 
 @dataclass(frozen=True, slots=True)
 class BenchSample:
-    """One sample of the bench; NaN for what the bench does not have or has lost."""
+    """One sample of the bench; NaN for missing and lost values."""
 
     displacement_um: float
     ambient_pressure_pa: float = float("nan")
@@ -27,12 +27,12 @@ class BenchSample:
 
 
 FAST_S, SLOW_S = 0.1, 0.4  # of the two filters whose difference is the speed
-_LOST_MAX_S = 0.3  # as long as the safety table bears a stale reading
+_LOST_MAX_S = 0.3  # as long as the safety table tolerates a stale reading
 
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """The end of an experiment: done, or why not and what would help."""
+    """The end of an experiment: completed, or the reason and a remedy."""
 
     completed: bool
     reason: str
@@ -40,13 +40,13 @@ class Finished:
 
 @dataclass(frozen=True, slots=True)
 class Around:
-    """What an experiment is made about."""
+    """The operating point of an experiment."""
 
     holding_flow_um_per_s: float  # mean flow of the loop before it
     least_flow_um_per_s: float  # of the pump while it runs
     full_flow_um_per_s: float
     laser_um: float  # standard deviation of a reading
-    limit_um: float = 10.0  # furthest the centre may go from where it stood
+    limit_um: float = 10.0  # largest excursion of the centre from where it stood
 
     def within(self, flow_um_per_s: float) -> float:
         """The nearest flow of a running pump."""
@@ -57,7 +57,7 @@ class Experiment(Protocol):
     """A step machine."""
 
     def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
-        """Flow in um/s to put out until the next reading, or the end."""
+        """Flow in um/s until the next reading, or the end."""
 
 
 class CentreMotion:
@@ -68,7 +68,7 @@ class CentreMotion:
         self.lost_s = 0.0
 
     def update(self, displacement_um: float, dt_s: float) -> None:
-        """Take a reading; a lost one is counted and leaves the rest."""
+        """Take a reading; count a lost one, changing nothing else."""
         if not math.isfinite(displacement_um):
             self.lost_s += dt_s
             return
@@ -87,17 +87,17 @@ class CentreMotion:
         return (self._fast.value - self._slow.value) / (SLOW_S - FAST_S)
 
 
-# A mirror that moves goes on moving for the pump's delay (0.24 s, up to twice that on a slow bench) after the flow
-# is taken back, and the filter is 0.1 s late.
+# A moving mirror continues for the pump's delay (0.24 s, up to twice that on a slow bench) after the flow is
+# reduced, and the filter is 0.1 s late.
 COAST_S = 0.5
 
 
 class ExcursionGuard:
     """Lets an experiment run while the centre can still be stopped within the limit.
 
-    The centre is judged where it will have come to rest, position + speed x `COAST_S`, with three standard deviations
-    of that figure's own noise in hand: more with fewer readings in a second. Raises ValueError if that leaves nothing
-    of the limit; the message says what would help.
+    The centre is judged where it will come to rest, position + speed x `COAST_S`, with a margin of three standard
+    deviations of that figure's own noise, which grows with fewer readings per second. Raises ValueError, with a
+    remedy, if the margin uses up the limit.
     """
 
     def __init__(self, experiment: Experiment, around: Around, centre_um: float, rate_hz: float) -> None:
@@ -143,8 +143,8 @@ class ExcursionGuard:
 class Patterned:
     """A flow that follows a pattern (s to um/s) about the holding flow, with a weak pull back to where it began.
 
-    The pull is there because the holding flow is never quite known and the mirror integrates the difference; it is
-    slow enough to leave the pattern alone, and harmless to the identification, which knows the flow.
+    The pull is needed because the holding flow is never known exactly and the mirror integrates the difference; it is
+    too slow to disturb the pattern, and harmless to the identification, which knows the flow.
     """
 
     PULL_PER_S = 0.15
@@ -179,7 +179,7 @@ _SHARE = 0.25  # of the excursion limit: the weather, the pull and the laser's n
 
 
 def steps(around: Around, gain: float, hold_s: float = 2.0) -> Pattern:
-    """Up, back, down, back, each for `hold_s`: what the eye wants to see."""
+    """Up, back, down, back, each for `hold_s`: easy to judge by eye."""
     up, down = room(around)
     size = min(up, down, _SHARE * around.limit_um / (gain * hold_s))
     levels = (size, 0.0, -size, 0.0)
@@ -187,9 +187,9 @@ def steps(around: Around, gain: float, hold_s: float = 2.0) -> Pattern:
 
 
 def doublets(around: Around, gain: float, pulse_s: float = 0.3) -> Pattern:
-    """Short pulses up, each followed by as much down: many steep edges, which is what tells dead time from lag.
+    """Short pulses up, each followed by an equal one down: many steep edges, which separate dead time from lag.
 
-    The way down is as small as the leak, so it takes longer; the mean flow is the holding flow.
+    The downward flow is limited by the leak, so it takes longer; the mean flow is the holding flow.
     """
     up, down = room(around)
     size = min(up, _SHARE * around.limit_um / (gain * pulse_s))
@@ -239,7 +239,7 @@ OVERSHOOT_SHARE = 0.2
 _GROWTH = 1.6
 _FIRST_MAX_UM_PER_S = 1.5
 _OVERSHOOT_LEAST_UM = 0.2  # smaller ones are noise
-# A half cycle of 5 um takes this long where leak + bleed are 0.06 um/s: nothing can be held there.
+# A half cycle of 5 um takes this long if leak + bleed are 0.06 um/s, where no mirror can be held.
 _PATIENCE_S = 90.0
 
 
@@ -286,9 +286,9 @@ class Relay:
         return around.within(around.holding_flow_um_per_s + swing)
 
     def _switch(self) -> None:
-        """Turn round; the way before this one, whose overshoot is now known, is made faster or slower."""
+        """Reverse; adapt the flow of the previous half cycle, whose overshoot is now known."""
         wanted_um = OVERSHOOT_SHARE * self._around.limit_um
-        # the guard stops what would coast further than that, however short the true delay
+        # the guard stops anything that would coast further, however short the true delay
         fastest_um_per_s = wanted_um / COAST_S
         if self._time_s > self._at_centre_s:
             self._speeds_um_per_s[self._direction] = self._threshold_um / (self._time_s - self._at_centre_s)

@@ -1,8 +1,8 @@
-"""What the pump does at low commands, measured on the mirror: leak, start, stall, and flow against command.
+"""Maps the pump at low commands, measured on the mirror: leak, start, stall, and flow against command.
 
 The mirror is the flow meter: its speed is the flow less the leak. A probe is a few seconds of one command, from
-rest or from running; between probes the mirror is brought back to where it stood. Start and stall
-are found by bisection, the leak with the pump off, the curve from two commands above.
+rest or from running; between probes the mirror returns to where it stood. Start and stall come from bisection, the
+leak from a probe with the pump off, the curve from two commands above.
 """
 
 import math
