@@ -39,7 +39,7 @@ class LoopOutput:
     flow_wanted_um_per_s: float  # before the limits
     flow_um_per_s: float
     pump_fraction: float  # command, 0..1
-    saturated: bool  # more was wanted than the pump has, or less than nothing
+    saturated: bool  # the wanted flow exceeds the pump's, or is negative
     leak_um_per_s: float  # estimated loss of gas, NaN in a tick without an estimate
     too_tight: bool  # the mirror loses too little gas to be held within the band
 
@@ -212,7 +212,7 @@ class InnerLoop:
     def _output(
         self, terms: pid.PidTerms, feedforward: float, wanted: float, fraction: float, filtered_um: float
     ) -> LoopOutput:
-        """The tick as it is told; flows in um/s."""
+        """The outputs of the tick; flows in um/s."""
         return LoopOutput(
             setpoint_um=self._setpoint_um,
             filtered_um=filtered_um,

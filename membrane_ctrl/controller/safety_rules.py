@@ -23,9 +23,9 @@ class Observation:
     reading_age_s: float  # since the last answer of the device
     # since the device's sample counter and time last advanced; a repeated answer does not count
     advance_age_s: float
-    displacement_um: float  # the laser's reading as it came, NaN if it was bad or absent
-    displacement_valid: bool  # it is finite, new, of good quality, and no jump
-    jumps: int  # readings in a row refused for a jump
+    displacement_um: float  # raw laser reading, NaN if bad or absent
+    displacement_valid: bool  # finite, new, of good quality, not a jump
+    jumps: int  # consecutive readings refused as jumps
     error_um: float  # setpoint minus reading; NaN outside the loop, and in a pause
     gauge_pressure_pa: float
     pump_mismatch: float  # |command - read-back|, the smaller of the last two commands'

@@ -308,7 +308,7 @@ def _begin(scene: Scene, leak_um_per_s: float) -> State:
 
 
 def _drive(scene: Scene, target_um: float) -> inner_loop.LoopOutput:
-    """Let the loop drive the pump: automatic with a reading to trust, the held mean flow without one."""
+    """Let the loop drive the pump: automatic with a valid reading, held mean flow without one."""
     drive = scene.loop.step if scene.levels.rung == Rung.NONE else scene.loop.stale
     output = drive(_given(scene, target_um), scene.dt_s)
     scene.give(output)

@@ -229,7 +229,7 @@ def _legend(
     reference: shape_estimate.ShapeEstimate,
     colours: dict[str, tuple[float, float]],
 ) -> str:
-    """Markdown: what the maps' colours mean, and the cycle in one line each."""
+    """Markdown: the meaning of the maps' colours, and one line per cycle."""
     rows = "\n".join(f"| {name} | {low:.4g} | {high:.4g} |" for name, (low, high) in colours.items())
     reason = f" ({estimate.reason})" if estimate.reason else ""
     of_geometry = estimate.geometry_sag_sigma_um
@@ -238,7 +238,7 @@ def _legend(
         f"| map | blue | red |\n|---|---|---|\n{rows}\n\n"
         f"- cycle {estimate.cycle}, {estimate.kind}: {estimate.verdict}{reason}\n"
         f"- changes are against cycle {reference.cycle}, at {reference.time_s:.0f} s\n"
-        f"- sag {estimate.sag_um / 1e3:.4f} mm ± {estimate.sag_sigma_um:.3f} um of noise{geometry}\n"
+        f"- sag {estimate.sag_um / 1e3:.4f} mm ± {estimate.sag_sigma_um:.3f} um from noise{geometry}\n"
         f"- slope residual {estimate.slope_residual_urad:.2f} urad, {100 * estimate.valid_fraction:.1f} % valid\n"
     )
 

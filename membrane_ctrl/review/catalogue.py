@@ -23,7 +23,7 @@ class RunEntry:
 
     folder: Path
     started_utc: datetime
-    duration_s: float  # of a run that goes on, or whose recorder was killed, as far as its tables go; NaN without any
+    duration_s: float  # up to the end of its tables if in progress or if its recorder was killed; NaN without tables
     std_um: float  # of 1 s means of what was meant to be held: of the true centre on the twin, else of the reading
     in_band: float  # share of these within the band
     faults: int
@@ -33,7 +33,7 @@ class RunEntry:
     configuration: str  # first 8 digits of the SHA-256 of `config.toml`
     size_mb: float
     marks: int  # annotations
-    kept: bool  # the folder has a file `.keep`: it is never pruned
+    kept: bool  # the folder has a file `.keep` and is never pruned
     held_s: float = math.nan  # these are the parts of a run as `summary.HoldParts` tells them
     faults_s: float = math.nan
     paused_s: float = math.nan

@@ -141,7 +141,7 @@ class SecondMeans:
 
 SCHEMA = "membrane-summary/2"
 
-# The ramp has arrived when setpoint minus trim is this near to the target; far below the laser's 0.1 um steps.
+# The ramp has ended when setpoint minus trim is this near the target; far below the laser's 0.1 um steps.
 ARRIVED_UM = 0.01
 # Limits on listed transitions and faults; their counters continue (a device may flicker for a week).
 _LISTED_MAX = 1000
@@ -289,7 +289,7 @@ class HoldParts:
 
     def __init__(self, band_um: float) -> None:
         self._band_um = band_um
-        self._since_s = math.nan  # last moment that was not settled; NaN: not in hold
+        self._since_s = math.nan  # last unsettled time; NaN: not in hold
         self._let_go_s = math.nan  # last moment that nothing held it; NaN: it has been back since
         self._away_s = math.nan  # last moment that it was outside the band since
 

@@ -167,14 +167,14 @@ def _variances_p(a: Column, b: Column) -> float:
 
 
 def mean_p(a: Column, b: Column, window_s: float = 1.0, offset: float = 0.0) -> float:
-    """Chance of means as different between series (times and values) that are alike; NaN: too short.
+    """Probability of means this different between equal series (times and values); NaN: too short.
 
     Parameters
     ----------
     window_s : float
         Length of a value's window.
     offset : float
-        Standard deviation that the difference has beside that between blocks: what all blocks of a run share.
+        Standard deviation of the difference common to all blocks of a run, in addition to that between blocks.
     """
     length_s = block_s(a[0], b[0], window_s)
     return welch_p(blocks(a[0], a[1], length_s)[0], blocks(b[0], b[1], length_s)[0], offset, correlated=True)

@@ -131,8 +131,8 @@ class HoldPass:
     faults_s: float
     paused_s: float
     moving_s: float  # the setpoint on its way, or not yet settled
-    thin_s: float  # settled seconds whose ticks are not all there: their means are those of the level
-    uncovered_s: float  # those whose means the level has not either: no statistics cover them
+    thin_s: float  # settled seconds with incomplete ticks, whose means come from the level
+    uncovered_s: float  # those missing in the level too: no statistics cover them
     # (n,) each: setpoint minus laser reading, target minus true centre; on a grid of ticks, NaN where not settled
     reading_um: Singles
     true_um: Singles
@@ -235,7 +235,7 @@ class _Collector:
     def result(self) -> HoldPass:
         reading, true = (sums.result() for sums in self._seconds)
         times_s = {name: time.result_s(self._period_s) for name, time in self._times.items()}
-        if true[0].size:  # what was kept away is asked of one of the two only: of a month 20 MB
+        if true[0].size:  # the prevented error is needed for only one of the two: 20 MB for a month
             reading = reading[0], reading[1], reading[2][:KEPT_AWAY].copy()
         return HoldPass(
             ticks=self._ticks,
