@@ -207,7 +207,7 @@ def test_no_set_gives_a_figure(spoiled: Path, tmp_path: Path, capsys: pytest.Cap
     shutil.rmtree(spoiled / "0000")  # the reference of all
     for options in ([], ["--out", str(tmp_path / "out")]):  # what the first leaves behind is no set
         assert run(["stability", str(spoiled), *options]) == 3
-        assert "none of 3 sets" in capsys.readouterr().err
+        assert "none of the 3 sets" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

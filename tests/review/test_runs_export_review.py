@@ -250,7 +250,7 @@ def test_nothing_to_show_is_explained_and_beside_another_run_only_noted(
     (broken / "events.jsonl").write_text('{"kind": "start", "mono_s": 0.0}\n{"kin')
     assert command(["review", str(broken), "--save", str(target)]) == 2
     said = capsys.readouterr().err
-    assert "1 line cannot be read" in said
+    assert "1 line unreadable" in said
     assert said.splitlines()[-1].endswith("no readable telemetry")
     assert command(["review", str(broken), str(whole), "--save", str(target)]) == 0
     assert "broken: not shown" in capsys.readouterr().err
