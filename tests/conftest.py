@@ -12,6 +12,8 @@ import pytest
 from hypothesis import settings
 from steady_loop import SteadyLoop
 
+from tests.support.undrawn import undrawn_figures
+
 settings.register_profile("seeded", derandomize=True, deadline=None)
 settings.load_profile("seeded")
 
@@ -37,6 +39,13 @@ def signals_are_heeded() -> Iterator[None]:
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+@pytest.fixture
+def undrawn() -> Iterator[None]:
+    """For a test that looks at no picture; those of its module's fixtures are drawn before."""
+    with undrawn_figures():
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -83,7 +83,7 @@ def test_from_folders_to_a_better_figure(
 
 def test_uncertainty_draws_from_the_file(folders: list[Path], tmp_path: Path) -> None:
     out, where = tmp_path / "geometry.toml", tmp_path / "uncertainty"
-    assert run(["calibrate", *map(str, folders[::2]), "--out", str(out)]) == 0
+    assert run(["calibrate", *map(str, folders[::2]), "--out", str(out), "--no-pictures"]) == 0
     words = ["uncertainty", str(folders[2]), "--geometry", str(out), "--out", str(where), "--trials", "20"]
     assert run([*words, "--workers", "1"]) == 0
     assert where.is_dir()

@@ -23,19 +23,24 @@ def at(name: str) -> Situation:
     return next(situation for situation in SITUATIONS if situation.name == name)
 
 
-def two_situations(case: Case) -> set[Situation]:
-    """`hold`, and another one: over all faults, each of them."""
-    return {at("hold"), SITUATIONS[CASES.index(case) % len(SITUATIONS)]}
+# These take more than a second each.
+LONG = {
+    "a_creeping_laser", "a_creeping_laser_without_a_camera", "a_seam_that_opens", "manual_has_an_end",
+    "resumes_of_a_day", "the_board_alone_keeps_its_limit", "two_orders_in_one_tick", "vent_and_stop_from_everywhere",
+    "venting_to_the_end",
+}  # fmt: skip
+NAMES = [story.__name__ for story in (*STORIES, *HOLDS)]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name.replace(" ", "_"))
-def test_every_fault_in_two_situations(case: Case) -> None:
-    found = [run_case(case, situation, seed=12) for situation in sorted(two_situations(case), key=SITUATIONS.index)]
-    assert not [violation for result in found for violation in result.violations]
+@pytest.mark.parametrize("number", range(len(CASES)), ids=[case.name.replace(" ", "_") for case in CASES])
+def test_every_fault_in_one_situation(number: int) -> None:
+    """Every other fault in `hold`; the rest in each situation in turn."""
+    situation = SITUATIONS[number // 2 % len(SITUATIONS)] if number % 2 else at("hold")
+    assert not run_case(CASES[number], situation, seed=12).violations
 
 
-@pytest.mark.parametrize("name", [story.__name__ for story in (*STORIES, *HOLDS)])
-def test_every_story(name: str) -> None:
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in LONG])
+def test_every_short_story(name: str) -> None:
     assert not run_story(name).violations
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
+import threading
 from collections.abc import Callable, Coroutine
 from functools import partial
 from pathlib import Path
@@ -301,6 +302,8 @@ def test_the_vendors_own_master_reads_and_writes_the_emulator(
         answers += [instrument.readParameter(205), instrument.readParameter(92)]
         instrument.master.propar.run = False
         instrument.master.propar.serial_read_thread.join()
+        # the handler's thread has no end of its own and asks every millisecond: from now on it waits
+        instrument.master.propar.read_propar_message = threading.Event().wait
         instrument.master.propar.serial.close()
         return answers
 

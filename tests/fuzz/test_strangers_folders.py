@@ -91,6 +91,7 @@ def rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 # ---------------------------------------------------------------------------------------------------------- links
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("words", "names"),
     [
@@ -145,6 +146,7 @@ def test_a_linked_folder_is_refused_in_one_line(
     assert secret.read_text() == "secret"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_folder_that_the_user_names_may_be_a_link(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "far").mkdir()
     (tmp_path / "near").symlink_to(tmp_path / "far")
@@ -188,6 +190,7 @@ def peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_four_megabytes_of_a_table_that_would_be_four_gigabytes(folder: Path, capsys: Said) -> None:
     path = folder / "columns" / "ticks-000.arrows"
     schema = tick_schema()
@@ -475,6 +478,7 @@ def test_a_height_map_is_of_the_sets_own_folder(sets: Path, capsys: Said) -> Non
 # ---------------------------------------------------------------------------------------------------------- words
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_no_control_byte_of_a_run_is_printed(earlier: Path, capsys: Said) -> None:
     events = [json.loads(line) for line in (earlier / "events.jsonl").read_text().splitlines()]
     for event in events:

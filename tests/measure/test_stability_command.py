@@ -17,6 +17,7 @@ from rerun.chunk import RrdReader
 
 from membrane_ctrl.cli import run
 
+pytestmark = pytest.mark.usefixtures("undrawn")  # but for `result`, which is made before
 SETS, INTERVAL_S, DRIFT_UM_PER_S = 13, 60.0, 0.02
 
 

@@ -68,6 +68,7 @@ def test_a_set(analysed: Callable[..., dict[str, Any]], tmp_path: Path, capsys: 
     assert cv2.imread(str(tmp_path / "out" / "uncertainty.png")) is not None
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_pair_shares_its_geometry(
     made: Path, analysed: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -76,18 +77,21 @@ def test_a_pair_shares_its_geometry(
     assert "change of height" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_seeds(analysed: Callable[..., dict[str, Any]]) -> None:
     first, again, other = analysed("--seed", "7"), analysed("--seed", "7"), analysed("--seed", "8")
     assert again["rmse_um"] == pytest.approx(first["rmse_um"], rel=1e-9)
     assert other["rmse_um"]["mean"] != pytest.approx(first["rmse_um"]["mean"], rel=1e-6)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_workers_change_nothing(analysed: Callable[..., dict[str, Any]]) -> None:
     options = ("--trials", "110")  # two batches
     alone, together = analysed(*options, "--workers", "1"), analysed(*options, "--workers", "2")
     assert together["rmse_um"] == pytest.approx(alone["rmse_um"], rel=1e-9)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_stated_sigmas_and_a_covariance(analysed: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
     geometry = tmp_path / "geometry.toml"
     geometry.write_text(SHORT + "alpha_sigma_deg = 0.03\n")
@@ -102,6 +106,7 @@ def test_stated_sigmas_and_a_covariance(analysed: Callable[..., dict[str, Any]],
     assert opposite["rmse_um"]["mean"] < 0.5 * alike["rmse_um"]["mean"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_general_poses(
     analysed: Callable[..., dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -130,7 +130,7 @@ def test_a_dead_writer_gets_a_new_file_and_no_row_is_lost(bench: Bench, monkeypa
     monkeypatch.setattr(FlakyRecording, "flush", flush)
     bench.second(1)
     bench.second(2)
-    bench.recorder.finish()
+    bench.recorder.finish(in_haste=True)
     assert bench.kinds() == ["recorder_error", "recorder_recovered", "recorder_done"]
     assert bench.recording.segments == 2
     assert times_s(bench) == [0, 1, 2]
@@ -145,7 +145,7 @@ def test_a_full_disk_is_reported_once_counted_and_recovered_from(bench: Bench) -
     bench.recording.full = False
     back_s = int(2 + 2 * RETRY_S)
     bench.second(back_s)
-    bench.recorder.finish()
+    bench.recorder.finish(in_haste=True)
     assert bench.kinds()[-2:] == ["recorder_recovered", "recorder_done"]
     # second 1 was on its way when the disk was full: here it can still arrive, on a real disk it would not
     assert set(times_s(bench)) - {1} == {0, back_s}
@@ -158,7 +158,7 @@ def test_a_file_that_was_not_closed_whole_is_reported(bench: Bench, monkeypatch:
     bench.second(0)
     monkeypatch.setattr(FlakyRecording, "sync", lambda _: None)
     (bench.run_dir / "test-000.rrd").unlink()
-    bench.recorder.finish()
+    bench.recorder.finish(in_haste=True)
     assert bench.kinds() == ["recorder_error", "recorder_done"]
     assert "closed without its footer" in bench.reports[0]["message"]
 
@@ -168,7 +168,7 @@ def test_a_segment_deleted_under_the_recorder_is_reported_and_another_begun(benc
     (bench.run_dir / "test-000.rrd").unlink()
     bench.second(1)
     bench.second(2)
-    bench.recorder.finish()
+    bench.recorder.finish(in_haste=True)
     assert bench.kinds() == ["recorder_error", "recorder_recovered", "recorder_done"]
     assert times_s(bench) == [2]
 
@@ -207,7 +207,7 @@ def test_a_run_folder_taken_away_is_begun_anew_and_said(tmp_path: Path, how: str
         bench.writers["events"].put(b'{"kind": "mark", "mono_s": 0.9}')
         for number in (1, 2):
             bench.second(number)
-        bench.recorder.finish()
+        bench.recorder.finish(in_haste=True)
         said = [report["message"] for report in bench.reports if report["kind"] == "recorder_error"]
         what = f"{run_dir} was removed or moved; a new one starts at 1.0 s"
         assert said == [f"{what}, without the earlier data"]
@@ -229,7 +229,7 @@ def test_segments_are_changed_in_time_without_losing_a_row(bench: Bench) -> None
         bench.writers["inputs"].put(message_of(row))
     bench.recorder.drain()
     bench.recorder.write()
-    bench.recorder.finish()
+    bench.recorder.finish(in_haste=True)
     assert sorted(path.name for path in bench.run_dir.glob("*.rrd")) == ["test-000.rrd", "test-001.rrd"]
     assert times_s(bench) == [0, 1, 2]
 
@@ -238,7 +238,7 @@ def test_a_broken_shape_is_reported_and_the_next_one_taken(bench: Bench) -> None
     bench.writers["shapes"].put(b"no shape")
     bench.writers["shapes"].put(pack_estimate(shape_of(1.0, 1)))
     bench.second(0)
-    bench.recorder.finish()
+    bench.recorder.finish(in_haste=True)
     assert bench.kinds() == ["recorder_error", "recorder_recovered", "recorder_done"]
     assert "shape estimate: JSONDecodeError" in bench.reports[0]["message"]
     assert json.loads((bench.run_dir / "summary.json").read_text())["cycles"] == 1
@@ -258,7 +258,7 @@ def test_events_that_cannot_be_written_are_reported_and_come_later(
     assert "events.jsonl: [Errno 28] No space left on device" in bench.reports[0]["message"]
     monkeypatch.setattr(recorder_module.events.os, "open", real_open)
     bench.second(1)
-    bench.recorder.finish()
+    bench.recorder.finish(in_haste=True)
     text = (bench.run_dir / "events.jsonl").read_text()
     assert text == dumps_checked({"kind": "fault", "mono_s": 0.5}) + "\n"
 
@@ -280,10 +280,10 @@ def test_inputs_that_met_a_full_disk_come_later_or_are_counted(
         patch.setattr(Journal, "keep", full)
         seconds(3, 4)
         if not room_again:
-            bench.recorder.finish()
+            bench.recorder.finish(in_haste=True)
     if room_again:
         seconds(7, 2)
-        bench.recorder.finish()
+        bench.recorder.finish(in_haste=True)
     found = [int(tick) for frame in open_inputs(bench.run_dir) for tick in frame.records["tick"]]
     account = json.loads((bench.run_dir / "summary.json").read_text())["recorder"]
     assert found == list(range(1, 450 if room_again else 150))  # what the journal had before

@@ -111,7 +111,7 @@ def test_the_next_recorder_goes_on_and_everything_is_there_once(tmp_path: Path, 
         run.second(second, number)
     run.event("end", 12.0)
     second.drain()
-    second.finish()
+    second.finish(in_haste=True)
     ticks = recorded(tmp_path)[:, 1]
     assert np.array_equal(np.sort(ticks), np.arange(600))
     numbers = [json.loads(line)["mono_s"] for line in (tmp_path / "events.jsonl").read_text().splitlines()]
@@ -167,7 +167,7 @@ def test_without_what_the_first_knew_the_statistics_begin_with_what_the_ring_has
     run.second(second, 1)
     run.event("end", 2.0)
     second.drain()
-    second.finish()
+    second.finish(in_haste=True)
     assert run.summary["recorder"]["partial"] is partial
     assert run.summary["ticks"] == ticks
     assert run.summary["dropped"]["inputs"] == max(0, 100 - rows_kept)
@@ -210,7 +210,7 @@ def test_on_the_last_megabytes_rerun_stops_and_goes_on_when_there_is_room(
     run.second(recorder, 2)
     run.event("end", 3.0)
     recorder.drain()
-    recorder.finish()
+    recorder.finish(in_haste=True)
     assert {int(moment) for moment in scalars(tmp_path / "test-001.rrd", "/loop/error")[0]} == {2}
     assert [report["kind"] for report in run.reports] == ["disk_low", "recorder_recovered", "recorder_done"]
     assert run.summary["ticks"] == 150
@@ -225,7 +225,7 @@ def test_with_little_room_maps_are_left_out(
     recorder = run.recorder(0)
     run.writers["shapes"].put(pack_estimate(shape_of(0.5, 0)))
     run.second(recorder, 0)
-    recorder.finish()
+    recorder.finish(in_haste=True)
     assert recorder._housekeeping.detail == DetailLevel.NO_PICTURES
     data = (tmp_path / "test-000.rrd").read_bytes()
     assert len(scalars(tmp_path / "test-000.rrd", "/shape/zernike")[0]) == 1

@@ -55,6 +55,7 @@ def test_its_replay_begins_with_the_run(
     assert abs(report["ticks"] - TICKS) < 50  # today's code may be through a little earlier
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("command", [["runs", "--logs"], ["report"]])
 def test_it_is_listed_and_reported(earlier: Path, command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     where = earlier.parent if command[0] == "runs" else earlier

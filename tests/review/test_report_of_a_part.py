@@ -46,6 +46,7 @@ def test_faults_and_missed_ticks_of_a_part_are_its_own(folder: Path) -> None:
     assert _seen(folder, -float("inf"), 100.0)["missed ticks"].startswith("5 of")
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("part", "whole", "said"),
     [

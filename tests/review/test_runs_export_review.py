@@ -143,6 +143,7 @@ def test_export_of_some_streams_and_a_part(tmp_path: Path) -> None:
         export(run, "csv", tmp_path / "file")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_mark_made_later_is_an_event_and_touches_nothing_else(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.05)
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}

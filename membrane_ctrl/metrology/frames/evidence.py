@@ -13,6 +13,7 @@ what does not belong there.
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -78,6 +79,12 @@ class _Template:
     columns: FloatArray
     sure: BoolArray
 
+    @cached_property
+    def wave(self) -> FloatArray:
+        """The pattern there; times a picture of deviation 1 it is their correlation."""
+        wave = self.columns[1][self.sure]
+        return np.asarray((wave - wave.mean()) / (wave.size * max(wave.std(), 1e-6)))
+
 
 def _template(stack: FrameStack, scene: SampledBins, frame: int, reading_um: float) -> _Template:
     pattern = stack.patterns[frame]
@@ -132,11 +139,9 @@ def _best(seen: FloatArray, templates: dict[int, _Template], light: FloatArray, 
     for frame, template in templates.items():
         if template.role not in ("sin", "gray"):
             continue
-        wave = template.columns[1]
-        sure = template.sure
-        if np.std(picture[sure]) < 0.02 * flat or np.std(wave[sure]) < 1e-6:
-            continue
-        likeness = float(np.corrcoef(picture[sure], wave[sure])[0, 1])
+        shown = picture[template.sure]
+        deviation = float(np.std(shown))
+        likeness = float(shown @ template.wave) / deviation if deviation >= 0.02 * flat else 0.0
         if likeness > best + (0.0 if frame == own else 1e-3):
             best, where = likeness, frame
     return where
