@@ -54,6 +54,7 @@ def start_again(folder: Path, *options: str) -> subprocess.CompletedProcess[str]
     )
 
 
+@pytest.mark.real_time
 async def test_a_stopped_process_stops_the_pump_and_what_was_latched_keeps_the_next_hold_down(tmp_path: Path) -> None:
     plant = make_plant()
     async with running(tmp_path, plant) as run:

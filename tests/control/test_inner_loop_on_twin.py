@@ -117,6 +117,7 @@ def test_pump_it_was_not_told_of(true_pump: PumpConfig) -> None:
     assert abs(held.after(40.0).mean()) < 0.1
 
 
+@pytest.mark.campaign
 def test_benchmark_has_every_figure() -> None:
     figures = run(seeds=1, duration_s=20.0)
     assert figures["steady"]["typical"][ALL]["std_um"] < figures["steady"]["typical"]["laser"]["std_um"]

@@ -219,7 +219,7 @@ def test_a_mirror_that_cannot_follow_is_given_up() -> None:
 
 def test_a_flat_mirror_is_filled_in_hours_and_held() -> None:
     twin = TwinConfig(scenario="calm", laser_noise_um=0.3, from_flat=True)
-    loop = LoopConfig(rate_hz=5.0)
+    loop = LoopConfig(rate_hz=2.0, measurement_filter_s=0.25)
     limits = LimitsConfig(displacement_min_um=-40_000.0)
     run = Run(Config(twin=twin, loop=loop, limits=limits), 4.0 * 3600)
     assert run.states == ["check", "inflate", "settle", "hold", "lower"], run.of("fault")

@@ -380,14 +380,15 @@ async def _reopen(driver: PumpBoard) -> None:
     raise AssertionError("the board cannot be opened any more")
 
 
-async def test_2000_transactions_with_random_faults_accept_no_wrong_value(
-    board: PumpBoardEmulator, plant: CountingPlant
+@pytest.mark.parametrize("count", [400, pytest.param(1250, marks=pytest.mark.campaign)])
+async def test_no_wrong_value_is_accepted_under_random_faults(
+    board: PumpBoardEmulator, plant: CountingPlant, count: int
 ) -> None:
     source = random.Random(20_260)
     driver = impatient(board, timeout_s=0.01)
     await _reopen(driver)
     accepted = refused = 0
-    for _ in range(1250):
+    for _ in range(count):
         seen = plant.counter
         command = BenchCommand(source.randrange(50_001) / 50_000, source.randrange(50_001) / 50_000)
         try:
@@ -405,6 +406,6 @@ async def test_2000_transactions_with_random_faults_accept_no_wrong_value(
                 board.faults = Faults()
                 await _reopen(driver)
     board.faults = Faults()
-    assert accepted > 500
-    assert refused > 150
+    assert accepted > 0.4 * count
+    assert refused > 0.12 * count
     await driver.close()

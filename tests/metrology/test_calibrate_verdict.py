@@ -24,13 +24,13 @@ Edit = Callable[[SetPhases], SetPhases]
 
 @cache
 def good() -> Truth:
-    return make(VALUES, 3, points=1500)
+    return make(VALUES, 3, points=600)
 
 
 def yawed(degrees: float, *which: int) -> Truth:
     other = VALUES.copy()
     other[NAMES.index("camera_yaw_deg")] += degrees
-    return make(VALUES, 3, points=1500, bumped=dict.fromkeys(which, other))
+    return make(VALUES, 3, points=600, bumped=dict.fromkeys(which, other))
 
 
 def judged(truth: Truth, sets: tuple[SetPhases, ...] | None = None) -> tuple[CalibrationFinding, ...]:
@@ -133,7 +133,7 @@ def test_bins_are_not_averaged_about_a_bench_that_was_not_found() -> None:
 
 def test_one_set_of_another_rig_is_named() -> None:
     other = VALUES + SIGMAS * np.random.default_rng(9).normal(size=len(NAMES))
-    (finding,) = judged(make(VALUES, 3, points=1500, bumped={1: other}))
+    (finding,) = judged(make(VALUES, 3, points=600, bumped={1: other}))
     assert finding.fatal
     assert finding.sets == (1,)
 
@@ -147,7 +147,7 @@ def test_sets_of_many_rigs_are_refused() -> None:
 
 
 def test_a_bow_is_told_by_its_pattern() -> None:
-    bent = make(VALUES, 3, points=1500, bow_mm=1.0)
+    bent = make(VALUES, 3, points=600, bow_mm=1.0)
     (finding,) = judged(bent)
     assert finding.fatal
     assert "the pattern of bow_mm = " in finding.says
@@ -155,7 +155,7 @@ def test_a_bow_is_told_by_its_pattern() -> None:
     solution = solve(bent.problem(SIGMAS))
     assert suspects(solution)[0].value == pytest.approx(1.0, abs=0.15)
     # a tenth of a hundredth is seen by nobody
-    assert judged(make(VALUES, 3, points=1500, bow_mm=0.001)) == ()
+    assert judged(make(VALUES, 3, points=600, bow_mm=0.001)) == ()
 
 
 def test_a_set_with_bad_fringes_hardly_counts_and_is_named() -> None:
@@ -168,7 +168,7 @@ def test_a_set_with_bad_fringes_hardly_counts_and_is_named() -> None:
 
 
 def test_sets_that_are_close_are_used_with_a_word() -> None:
-    near = make(VALUES, 3, points=1500, sags_mm=(36.0, 36.5, 37.0, 37.5, 38.0))
+    near = make(VALUES, 3, points=600, sags_mm=(36.0, 36.5, 37.0, 37.5, 38.0))
     (finding,) = judged(near)
     assert not finding.fatal
     assert "8 mm would determine the sag better" in finding.says
