@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import tomllib
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +49,17 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [root / f"set{k}" for k in range(len(MOVED_UM))]
 
 
+@pytest.fixture(scope="module")
+def calibrated(folders: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of their calibration, beside `geometry.toml` and a picture."""
+    out = tmp_path_factory.mktemp("calibrated")
+    said = io.StringIO()
+    with redirect_stdout(said):
+        assert run(["calibrate", *map(str, folders), "--out", str(out / "geometry.toml"), "--json"]) == 0
+    (out / "report.json").write_text(said.getvalue())
+    return out / "report.json"
+
+
 def figure_error_um(height: Path, truth: Path) -> float:
     """RMS error without the best plane; the truth is the twin's film, sampled where it was measured."""
     measured, moved = np.load(height), float(np.load(truth)["displacement_um"][0])
@@ -57,15 +70,11 @@ def figure_error_um(height: Path, truth: Path) -> float:
     return 1e3 * float(np.std(error - plane @ np.linalg.lstsq(plane, error, rcond=None)[0]))
 
 
-def test_from_folders_to_a_better_figure(
-    folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "geometry.toml"
-    assert run(["calibrate", *map(str, folders), "--out", str(out), "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+def test_from_folders_to_a_better_figure(folders: list[Path], calibrated: Path, tmp_path: Path) -> None:
+    out, report = calibrated.with_name("geometry.toml"), json.loads(calibrated.read_text())
     assert report["verdict"] == "ok"
     assert report["findings"] == []
-    assert (tmp_path / "geometry-residuals.png").stat().st_size > 10_000
+    assert calibrated.with_name("geometry-residuals.png").stat().st_size > 10_000
     assert report["hash"] == tomllib.loads(out.read_text())["calibration"]["hash"]
     found = {row["name"]: row for row in report["parameters"]}
     for name, true in (("a_mm", 2.0), ("alpha_deg", 0.3), ("screen_turn_x_deg", 0.5), ("screen_turn_y_deg", -0.5)):
@@ -81,9 +90,9 @@ def test_from_folders_to_a_better_figure(
     assert figure_error_um(after / "height.npz", truth) < 2
 
 
-def test_uncertainty_draws_from_the_file(folders: list[Path], tmp_path: Path) -> None:
-    out, where = tmp_path / "geometry.toml", tmp_path / "uncertainty"
-    assert run(["calibrate", *map(str, folders[::2]), "--out", str(out), "--no-pictures"]) == 0
+@pytest.mark.usefixtures("undrawn")
+def test_uncertainty_draws_from_the_file(folders: list[Path], calibrated: Path, tmp_path: Path) -> None:
+    out, where = calibrated.with_name("geometry.toml"), tmp_path / "uncertainty"
     words = ["uncertainty", str(folders[2]), "--geometry", str(out), "--out", str(where), "--trials", "20"]
     assert run([*words, "--workers", "1"]) == 0
     assert where.is_dir()

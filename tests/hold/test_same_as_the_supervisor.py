@@ -31,7 +31,7 @@ from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.virtual_time import run_virtual as in_virtual_time
 
 # a power of two, so that the supervisor's sum of periods is exact and both tick at the same instants to the bit
-RATE_HZ = 64.0
+RATE_HZ = 32.0
 CONFIG = Config(loop=LoopConfig(rate_hz=RATE_HZ), twin=TwinConfig(seed=11))
 LASTS_S = 60.0
 FAULT_S, OVER_S = 30.0, 33.0

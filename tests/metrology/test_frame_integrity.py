@@ -120,7 +120,8 @@ def test_two_of_three_steps_that_were_swapped_are_put_back(frame: str) -> None:
 
 @pytest.mark.parametrize("kind", ["stale", "swapped", "flicker", "moved"])
 @pytest.mark.parametrize(
-    ("steps", "gamma"), [(4, 2.2), *(pytest.param(*more, marks=pytest.mark.campaign) for more in ((5, 2.2), (8, 1.8)))]
+    ("steps", "gamma"),
+    [(4, 2.2), *(pytest.param(*more, marks=pytest.mark.campaign) for more in ((5, 2.2), (8, 1.8)))],
 )
 def test_faults_are_seen_through_the_displays_gamma(kind: str, steps: int, gamma: float) -> None:
     flagged, _, wrong = named(kind, "x_sin_1", steps, gamma)

@@ -265,7 +265,7 @@ def listens(port: int) -> bool:
 
 
 @pytest.mark.usefixtures("signals_are_heeded")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.campaign)])
 def test_a_review_that_is_ended_leaves_nothing_behind(logs: Path, tmp_path: Path, number: signal.Signals) -> None:
     command_line = [sys.executable, "-m", "membrane_ctrl", "review", str(logs / "20261121T180000Z-night"), "--web"]
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
