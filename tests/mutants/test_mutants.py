@@ -11,7 +11,8 @@ from mutants import CAMPAIGN_GOAL, DOCUMENT, ROOT, TESTS_GOAL, load
 
 
 def test_every_mutation_applies_exactly_once_and_is_python(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mutants, "_sources", lambda _, found=list(mutants._sources(ROOT)): found)  # read once
+    sources = list(mutants._sources(ROOT))
+    monkeypatch.setattr(mutants, "_sources", lambda _: sources)  # not read again for each
     for mutant in load()[0]:
         text = mutant.place(ROOT).read_text(encoding="utf-8")
         assert mutant.applied(text) != text, mutant.what

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 
-def _empty(self: object, file: IO[Any], format: str, **_: object) -> None:
-    file.write("<svg></svg>" if format == "svg" else cv2.imencode(".png", np.zeros((1, 1)))[1].tobytes())
+def _empty(self: object, file: IO[Any], **options: object) -> None:
+    file.write("<svg></svg>" if options["format"] == "svg" else cv2.imencode(".png", np.zeros((1, 1)))[1].tobytes())
 
 
 @contextmanager

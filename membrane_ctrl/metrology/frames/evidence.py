@@ -13,7 +13,6 @@ what does not belong there.
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -62,12 +61,13 @@ def gather(stack: FrameStack, binned: Binned, scene: SampledBins, readable: list
     """Evidence of all readable frames."""
     scene = scene.thinned()
     readings = stack.displacement_um - np.nan_to_num(stack.mean_reading_um)
-    templates = {k: _template(stack, scene, k, float(np.nan_to_num(readings[k]))) for k in range(len(stack.patterns))}
+    templates = [_template(stack, scene, k, float(np.nan_to_num(reading))) for k, reading in enumerate(readings)]
+    waves = [template.wave() for template in templates]
     out = {}
     for k in readable:
         seen = binned.means[k].reshape(-1)[scene.index].astype(float)
         saturated = float(np.mean(binned.saturated[k].reshape(-1)[scene.index]))
-        out[k] = _evidence(seen, templates[k], scene.light, saturated, _best(seen, templates, scene.light, k))
+        out[k] = _evidence(seen, templates[k], scene.light, saturated, _best(seen, waves, scene.light, k))
     return out
 
 
@@ -79,11 +79,10 @@ class _Template:
     columns: FloatArray
     sure: BoolArray
 
-    @cached_property
-    def wave(self) -> FloatArray:
-        """The pattern there; times a picture of deviation 1 it is their correlation."""
-        wave = self.columns[1][self.sure]
-        return np.asarray((wave - wave.mean()) / (wave.size * max(wave.std(), 1e-6)))
+    def wave(self) -> tuple[BoolArray, FloatArray]:
+        """The sure bins, and the pattern there: times a picture of deviation 1 it is their correlation."""
+        wave = self.columns[:2][-1][self.sure]
+        return self.sure, (wave - wave.mean()) / (wave.size * max(wave.std(), 1e-6))
 
 
 def _template(stack: FrameStack, scene: SampledBins, frame: int, reading_um: float) -> _Template:
@@ -128,7 +127,7 @@ def _evidence(seen: FloatArray, template: _Template, light: FloatArray, saturate
     return Evidence(float(solved[0]), 0.0, 0.0, 0.0, rest, saturated, shows)
 
 
-def _best(seen: FloatArray, templates: dict[int, _Template], light: FloatArray, own: int) -> int:
+def _best(seen: FloatArray, waves: list[tuple[BoolArray, FloatArray]], light: FloatArray, own: int) -> int:
     """The pattern that the frame looks like most: largest correlation of the picture over the light.
 
     A flat picture, white or black, correlates with nothing: then its own is as good as any.
@@ -136,12 +135,9 @@ def _best(seen: FloatArray, templates: dict[int, _Template], light: FloatArray, 
     picture = seen / np.maximum(light, 1e-9)
     flat = max(float(np.mean(picture)), 1e-9)
     best, where = 0.7, own  # less than 0.7 is no likeness: a sinusoid and its square wave have 0.9
-    for frame, template in templates.items():
-        if template.role not in ("sin", "gray"):
-            continue
-        shown = picture[template.sure]
-        deviation = float(np.std(shown))
-        likeness = float(shown @ template.wave) / deviation if deviation >= 0.02 * flat else 0.0
+    for frame, (sure, wave) in enumerate(waves):
+        deviation = float(np.std(picture[sure]))
+        likeness = float(picture[sure] @ wave) / deviation if deviation >= 0.02 * flat else 0.0
         if likeness > best + (0.0 if frame == own else 1e-3):
             best, where = likeness, frame
     return where
