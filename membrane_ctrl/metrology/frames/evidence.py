@@ -60,8 +60,8 @@ class Evidence:
 def gather(stack: FrameStack, binned: Binned, scene: SampledBins, readable: list[int]) -> dict[int, Evidence]:
     """Evidence of all readable frames."""
     scene = scene.thinned()
-    readings = stack.displacement_um - np.nan_to_num(stack.mean_reading_um)
-    templates = [_template(stack, scene, k, float(np.nan_to_num(reading))) for k, reading in enumerate(readings)]
+    readings = np.nan_to_num(stack.displacement_um - np.nan_to_num(stack.mean_reading_um))
+    templates = [_template(stack, scene, k, float(reading)) for k, reading in enumerate(readings)]
     waves = [template.wave() for template in templates]
     out = {}
     for k in readable:
