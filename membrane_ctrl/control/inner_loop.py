@@ -29,37 +29,22 @@ class LoopInput:
 class LoopOutput:
     """Results of one tick, with their components."""
 
-    setpoint_um: float  # ramp and trim
-    filtered_um: float  # NaN in a tick without a reading
-    error_um: float  # setpoint minus filtered reading; NaN without one, and while the setpoint follows the mirror
-    p_um_per_s: float
-    i_um_per_s: float
-    d_um_per_s: float
-    feedforward_um_per_s: float  # the ramp's own speed included
-    flow_wanted_um_per_s: float  # before the limits
-    flow_um_per_s: float
-    pump_fraction: float  # command, 0..1
-    saturated: bool  # the wanted flow exceeds the pump's, or is negative
-    leak_um_per_s: float  # estimated loss of gas, NaN in a tick without an estimate
-    too_tight: bool  # the mirror loses too little gas to be held within the band
+    setpoint_um: float = math.nan  # ramp and trim
+    filtered_um: float = math.nan  # NaN in a tick without a reading
+    error_um: float = math.nan  # setpoint minus filtered reading; NaN without one, and while another sets the flow
+    p_um_per_s: float = math.nan
+    i_um_per_s: float = math.nan
+    d_um_per_s: float = math.nan
+    feedforward_um_per_s: float = math.nan  # the ramp's own speed included
+    flow_wanted_um_per_s: float = math.nan  # before the limits
+    flow_um_per_s: float = math.nan
+    pump_fraction: float = 0.0  # command, 0..1
+    saturated: bool = False  # the wanted flow exceeds the pump's, or is negative
+    leak_um_per_s: float = math.nan  # estimated loss of gas, NaN in a tick without an estimate
+    too_tight: bool = False  # the mirror loses too little gas to be held within the band
 
 
-# for a tick in which the loop did not run
-NO_OUTPUT = LoopOutput(
-    setpoint_um=math.nan,
-    filtered_um=math.nan,
-    error_um=math.nan,
-    p_um_per_s=math.nan,
-    i_um_per_s=math.nan,
-    d_um_per_s=math.nan,
-    feedforward_um_per_s=math.nan,
-    flow_wanted_um_per_s=math.nan,
-    flow_um_per_s=math.nan,
-    pump_fraction=0.0,
-    saturated=False,
-    leak_um_per_s=math.nan,
-    too_tight=False,
-)
+NO_OUTPUT = LoopOutput()  # for a tick in which the loop did not run
 
 
 class InnerLoop:
@@ -166,13 +151,8 @@ class InnerLoop:
         output = self.follow(given, flow_um_per_s, dt_s)
         self._curve.stopped()
         self._leak.pause()
-        return replace(
-            output,
-            feedforward_um_per_s=0.0,
-            flow_um_per_s=self._curve.flow(fraction),
-            pump_fraction=fraction,
-            leak_um_per_s=math.nan,
-        )
+        output = replace(output, feedforward_um_per_s=0.0, leak_um_per_s=math.nan)
+        return replace(output, flow_um_per_s=self._curve.flow(fraction), pump_fraction=fraction)
 
     def set_gains(self, loop: LoopConfig) -> None:
         """Take new settings without a bump in the flow."""

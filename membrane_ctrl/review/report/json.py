@@ -49,9 +49,8 @@ def verdict(analysis: Analysis) -> tuple[Word, str]:
 def beside(faults_s: float, paused_s: float, moving_s: float, whole_s: float) -> list[str]:
     """What there was beside the hold, with its share of the whole time; NaN where that is not known."""
     parts = (("faults", faults_s, 0.0), ("paused", paused_s, 0.0), ("moving or settling", moving_s, _MOVING_LEAST_S))
-    return [
-        f"{name} {span(time_s)} ({100 * time_s / whole_s:.2g} %)" for name, time_s, least in parts if time_s > least
-    ]
+    told = [(name, time_s) for name, time_s, least_s in parts if time_s > least_s]
+    return [f"{name} {span(time_s)} ({100 * time_s / max(whole_s, time_s):.3g} %)" for name, time_s in told]
 
 
 def _what(names: list[str]) -> str:
