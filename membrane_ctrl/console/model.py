@@ -84,7 +84,7 @@ class ConsoleView:
     last_fault: str  # the newest of them, with its time
     too_tight: bool  # the leak is too small for the band
     gains: str  # in force, with the countdown of a trial
-    recording: str  # what keeps the run from being recorded; empty if nothing does
+    recording: str  # what prevents recording; empty if nothing does
     shape: ShapeView
 
 

@@ -1,4 +1,4 @@
-"""The folder of a session, `<logs>/tuning/<UTC>-<name>/`: what each step left, and which steps are done."""
+"""The folder of a session, `<logs>/tuning/<UTC>-<name>/`: the results of its steps, and which steps are done."""
 
 import json
 import math
@@ -16,12 +16,12 @@ from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.model import errors, files, plain_json
 
 T = TypeVar("T")
-_LARGEST = 1e60  # no quantity is near it; its fourth power is a number still
-_PLAIN_BYTES_MAX = 64_000_000  # candidates with their curves are some megabytes
+_LARGEST = 1e60  # no quantity is near it; its fourth power is still finite
+_PLAIN_BYTES_MAX = 64_000_000  # candidates with their curves take a few megabytes
 
 
 def plain(value: Any) -> Any:
-    """What JSON can hold; numbers that are not finite become words."""
+    """Plain JSON data; numbers that are not finite become words."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
     if is_dataclass(value) and not isinstance(value, type):
@@ -38,7 +38,7 @@ def plain(value: Any) -> Any:
 
 
 def built(kind: type[T], data: Any) -> T:
-    """The value of a type from its plain form. Raises TypeError, ValueError or KeyError if it is none."""
+    """Build a value of a type from its plain form. Raises TypeError, ValueError or KeyError if it is invalid."""
     return cast(T, _built(kind, data))
 
 
@@ -48,7 +48,7 @@ def _built(kind: Any, data: Any) -> Any:
         return None if data is None else _built(next(a for a in arguments if a is not type(None)), data)
     if origin is Literal:
         if data not in arguments:
-            raise ValueError(f"{data!r} is none of {arguments}")
+            raise ValueError(f"{data!r} is not one of {arguments}")
         return data
     if origin is tuple:
         inner = [arguments[0]] * len(data) if arguments[-1] is Ellipsis else arguments
@@ -62,17 +62,17 @@ def _built(kind: Any, data: Any) -> Any:
         return cast(Any, kind)(**{f.name: _built(hints[f.name], data[f.name]) for f in fields(kind)})
     value = kind(data)
     if isinstance(value, float) and _LARGEST < abs(value) < math.inf:
-        raise ValueError(f"{value:g} is no quantity")
+        raise ValueError(f"{value:g} is not a plausible quantity")
     return value
 
 
 def write(path: Path, value: Any) -> None:
-    """Write a result in one step."""
+    """Write a result atomically."""
     files.write_text_atomic(files.users(path), json.dumps(plain(value), indent=1, allow_nan=False) + "\n")
 
 
 def read(path: Path, kind: type[T]) -> T:
-    """Read a result back. Raises InputError (one line) if it is not there or is no such result."""
+    """Read a result. Raises InputError (one line) if it is missing or invalid."""
     try:
         return built(kind, plain_json.loads(files.read_text(files.users(path), _PLAIN_BYTES_MAX)))
     except FileNotFoundError:
@@ -85,7 +85,7 @@ def read(path: Path, kind: type[T]) -> T:
 
 FORMAT = "membrane-session/1"
 STEPS = ("characterise", "identify", "observe", "design", "preview", "apply", "verify")
-# What a step leaves; the first file is the sign that it is done.
+# The results of a step; the first file marks it as done.
 FILES: dict[str, tuple[str, ...]] = {
     "characterise": ("experiments.json", "experiments.npz"),
     "identify": ("identified.json",),
@@ -120,11 +120,11 @@ class SessionFolder:
     config: schema.Config
 
     def file(self, name: str) -> Path:
-        """A file in it."""
+        """Path of a file in the folder."""
         return self.path / name
 
     def content(self, name: str) -> bytes:
-        """All of a file that people read. Raises InputError if it is no plain file."""
+        """The content of a file for people. Raises InputError if it is not a regular file."""
         path = self.file(name)
         try:
             return files.read_bytes(files.users(path), _BYTES_MAX)
@@ -132,29 +132,29 @@ class SessionFolder:
             raise errors.InputError(f"{path}: {errors.os_reason(error)}") from None
 
     def candidates(self) -> str:
-        """The table of candidates, Markdown of at least a head, a rule and a row. Raises InputError."""
+        """The table of candidates, Markdown with at least a head, a rule and a row. Raises InputError."""
         text = self.content("candidates.md").decode("utf-8", "replace")
         if len(text.splitlines()) < 3:
             raise errors.InputError(f"{self.file('candidates.md')}: damaged; repeat the step design")
         return text
 
     def result(self, step: str, name: str, kind: type[T]) -> T:
-        """What a step left in a file. Raises InputError if the step is not done, or the file is damaged."""
+        """Read a step's result. Raises InputError if the step is not done, or the file is damaged."""
         self.require(step)
         return read(self.file(name), kind)
 
     def done(self, step: str) -> bool:
-        """The step has left its result."""
+        """Whether the step has left its result."""
         return self.file(FILES[step][0]).exists()
 
     def require(self, *steps: str) -> None:
-        """Raises InputError naming the first of the steps that is not done."""
+        """Raises InputError naming the first step that is not done."""
         for step in steps:
             if not self.done(step):
                 raise errors.InputError(f"{self.path}: {step} is missing; run `membrane-ctrl tune {step}` first")
 
     def begin(self, step: str) -> None:
-        """The step is about to be done (again): what it and the steps behind it left is gone."""
+        """Prepare a step, possibly again: remove its results and those of later steps."""
         for later in STEPS[STEPS.index(step) :]:
             for name in FILES[later]:
                 try:
@@ -166,7 +166,7 @@ class SessionFolder:
 
 
 def fresh_folder(parent: Path, name: str, now: datetime) -> Path:
-    """Make `<UTC>-<name>` in a folder; errors as `begin_session`."""
+    """Make `<UTC>-<name>` in a folder; raises like `begin_session`."""
     if not _NAME.fullmatch(name):
         raise errors.InputError(
             f"session name {name!r}: use letters, digits, '.', '-' and '_' (at most 64, no '.' in front)"
@@ -181,11 +181,11 @@ def fresh_folder(parent: Path, name: str, now: datetime) -> Path:
         except OSError as error:
             raise errors.DeviceError(f"{parent}: cannot be written ({errors.os_reason(error)})") from None
         return path
-    raise errors.DeviceError(f"{parent}: has a thousand sessions {stem} already")
+    raise errors.DeviceError(f"{parent}: already has a thousand sessions {stem}")
 
 
 class Head(Protocol):
-    """What the `session.json` of every kind of session has."""
+    """The fields common to every kind of `session.json`."""
 
     @property
     def format(self) -> str:
@@ -211,10 +211,10 @@ def begin_session(parent: Path, name: str, head: Head, config: schema.Config) ->
 
 
 def read_session(path: Path, kind: type[H], known: str) -> tuple[H, schema.Config]:
-    """Head and configuration of a session of the `known` format. Raises InputError if it is none."""
+    """Read head and configuration of a session of the `known` format. Raises InputError if it is not one."""
     head = read(path / "session.json", kind)
     if head.format != known:
-        raise errors.InputError(f"{path}/session.json: format {head.format!r}, {known!r} is known")
+        raise errors.InputError(f"{path}/session.json: format {head.format!r}, expected {known!r}")
     return head, toml_file.load(path / "config.toml", schema.Config)
 
 
@@ -226,19 +226,19 @@ def now_utc() -> str:
 def create_session(
     logs: Path, name: str, author: str, source: str, config: schema.Config, before: schema.LoopConfig
 ) -> SessionFolder:
-    """Begin a tuning session; errors as `begin_session`."""
+    """Start a tuning session; raises like `begin_session`."""
     head = SessionHead(FORMAT, name, author, source, now_utc(), before)
     return SessionFolder(begin_session(logs / "tuning", name, head, config), head, config)
 
 
 def open_session(path: Path) -> SessionFolder:
-    """An existing tuning session. Raises InputError if it is none."""
+    """Open an existing tuning session. Raises InputError if it is not one."""
     return SessionFolder(path, *read_session(path, SessionHead, FORMAT))
 
 
 def newest_session(logs: Path) -> SessionFolder:
-    """The one to go on with. Raises InputError if there is none."""
+    """The newest session, to continue. Raises InputError if there is none."""
     found = max((logs / "tuning").glob("*/session.json"), default=None)
     if found is None:
-        raise errors.InputError(f"{logs / 'tuning'}: no session yet; begin with `membrane-ctrl tune characterise`")
+        raise errors.InputError(f"{logs / 'tuning'}: no session yet; start with `membrane-ctrl tune characterise`")
     return open_session(found.parent)

@@ -1,4 +1,4 @@
-"""A running hold for a session: commands through its control port, ticks, events and shapes from its rings."""
+"""A session's access to a running hold: commands through its control port; ticks, events, shapes from its rings."""
 
 import contextlib
 import math
@@ -23,12 +23,12 @@ from membrane_ctrl.run_files import events
 
 
 class HoldError(Exception):
-    """The hold refuses a command, or has left its state or ended."""
+    """The hold refused a command, left its state or ended."""
 
 
 @dataclass(frozen=True, slots=True)
 class News:
-    """What has come since the last call, each in its order."""
+    """Ticks, events and shapes since the last call, each in order."""
 
     rows: tuple[telemetry.TelemetryRow, ...]
     events: tuple[Event, ...]
@@ -36,24 +36,24 @@ class News:
 
 
 class HoldLink(Protocol):
-    """A hold as a session sees it: commands in, ticks and events out. The twin and the control port each give one."""
+    """A session's view of a hold: commands in, ticks and events out. Twin and control port each provide one."""
 
     @property
     def config(self) -> schema.Config:
-        """Of the run."""
+        """Configuration of the run."""
         ...
 
     @property
     def name(self) -> str:
-        """Where the data come from: a run folder, or the twin."""
+        """Source of the data: a run folder, or the twin."""
         ...
 
     def ask(self, command: Command) -> None:
-        """Hand a command to the next tick. Raises HoldError with the reason if it is refused."""
+        """Hand a command to the next tick. Raises HoldError with the reason if refused."""
         ...
 
     def news(self) -> News:
-        """Wait a moment, then return what has come. Raises HoldError if the hold has ended."""
+        """Wait briefly, then return the news. Raises HoldError if the hold has ended."""
         ...
 
     def close(self) -> None:
@@ -62,11 +62,11 @@ class HoldLink(Protocol):
 
 
 _NEWS_S = 0.2
-_SILENT_S = 5.0  # without a tick a run has ended, or is in worse trouble than a session can help with
+_SILENT_S = 5.0  # after this long without a tick, the run has ended or hangs
 
 
 class LiveHold:
-    """A `HoldLink` on a run of this machine; with `take_over` its first command takes over from another commander.
+    """A `HoldLink` to a run on this machine; with `take_over` its first command takes over from another commander.
 
     Raises InputError if `run_dir` is not the folder of the client's run, or has no rings.
     """
@@ -88,7 +88,7 @@ class LiveHold:
         self._heard_s = time.monotonic()
 
     def ask(self, command: Command) -> None:
-        """Through the port; who asks is what the port makes of us."""
+        """Send a command through the port, which determines our name."""
         request: dict[str, object] = {"do": command.kind, "why": command.why, "take_over": self._take_over}
         if math.isfinite(command.value):
             request["value"] = command.value
@@ -105,7 +105,7 @@ class LiveHold:
             raise HoldError(f"refused: {answer.get('refused')}")
 
     def news(self) -> News:
-        """What has come in a fifth of a second."""
+        """The news of a fifth of a second."""
         time.sleep(_NEWS_S)
         try:
             found = self._read_rings()
@@ -127,8 +127,8 @@ class LiveHold:
         )
 
     def close(self) -> None:
-        """Give the command back and hang up; the hold goes on."""
-        with contextlib.suppress(errors.DeviceError):  # the hold may have gone first
+        """Release command and disconnect; the hold continues."""
+        with contextlib.suppress(errors.DeviceError):  # the hold may have ended first
             self._client.ask(do="release", why="tuning session over")
         self._client.close()
         for reader in self._readers.values():
@@ -137,12 +137,12 @@ class LiveHold:
 
 @contextlib.contextmanager
 def live_hold(where: Where, take_over: bool, needs_operate: str = "") -> Iterator[LiveHold]:
-    """A link to the hold that is meant; InputError if a command that `needs_operate` may only read."""
+    """Yield a link to the selected hold; InputError if `needs_operate` names a command and the role is read."""
     socket = socket_path(where)
     client = PortClient.unix(socket, lambda text: print(f"notice: {text}", file=sys.stderr))
     try:
         if needs_operate and client.greeting["role"] == "read":
-            raise errors.InputError(f"{needs_operate} takes the role operate; {client.greeting['you']} has read")
+            raise errors.InputError(f"{needs_operate} needs the role operate; {client.greeting['you']} has read")
         link = LiveHold(client, where.run or socket.parent / str(client.greeting["run"]), take_over)
     except BaseException:
         client.close()
@@ -151,13 +151,13 @@ def live_hold(where: Where, take_over: bool, needs_operate: str = "") -> Iterato
         yield link
 
 
-# How far a step is and how long it will take, on stderr: a live line on a terminal, a line a minute elsewhere.
+# Progress of a step and the time left, on stderr: a live line on a terminal, otherwise a line per minute.
 
 _EVERY_S = {True: 1.0, False: 60.0}
 
 
 class Progress:
-    """Counts the recorded seconds of a session; raises KeyboardInterrupt at a safe place once one was asked for."""
+    """Counts the recorded seconds of a session; raises a requested KeyboardInterrupt at a safe place."""
 
     def __init__(self) -> None:
         self._live = sys.stderr.isatty()
@@ -166,13 +166,13 @@ class Progress:
         self.interrupted = False
 
     def begin(self, step: str, planned_s: float, after_s: float) -> None:
-        """A step that takes about so long, and so much after it."""
+        """Start a step with its planned duration, and that of the later steps."""
         self._step, self._planned_s, self._after_s = step, planned_s, after_s
         self._done_s = self._shown_s = 0.0
         self.say(f"{step}" + (f": about {_clock(planned_s)}" if planned_s else ""))
 
     def __call__(self, seconds: float) -> None:
-        """So much more has been recorded."""
+        """Note additional recorded seconds."""
         if self.interrupted:
             self.interrupted = False
             raise KeyboardInterrupt
@@ -187,12 +187,12 @@ class Progress:
         print(f"\r\033[K{line}" if self._live else line, end="" if self._live else "\n", file=sys.stderr, flush=True)
 
     def say(self, line: str) -> None:
-        """A line that stays."""
+        """Print a permanent line."""
         print(f"\r\033[K{line}" if self._live else line, file=sys.stderr, flush=True)
 
     @contextlib.contextmanager
     def catching(self) -> Iterator[None]:
-        """Ctrl-C and SIGTERM are taken note of and raised at the next tick, not in the middle of a command."""
+        """Note Ctrl-C and SIGTERM, and raise them at the next tick, not in the middle of a command."""
 
         def note(number: int, frame: FrameType | None) -> None:
             self.interrupted = True

@@ -1,1 +1,1 @@
-"""From a record to a model of plant and disturbance."""
+"""Models of plant and disturbance from a record."""

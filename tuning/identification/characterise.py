@@ -1,4 +1,4 @@
-"""The first step of a session: relay until the gain is known, doublets until the dead time is, all within bounds."""
+"""The first step of a session: relay until the gain is known, doublets until the dead time is, within bounds."""
 
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -9,18 +9,18 @@ from membrane_ctrl.control.experiments import machine, trial
 from tuning.identification.identify import Identified, identify, independence, prediction_errors, two_gains, whiteness
 from tuning.identification.records import Record
 
-# Whether the data carry a proposal; if not, what was wrong with them and which experiment would help.
+# Whether the data support a proposal; if not, the problem and the experiment that would help.
 
 _LOST_MAX = 0.01
-_GAIN_SIGMA_MAX = 0.10  # k beyond +-20 % (2 sigma) moves Ms and the variance by more than designs differ
+_GAIN_SIGMA_MAX = 0.10  # an error of k beyond +-20 % (2 sigma) changes Ms and variance by more than designs differ
 _GAIN_SIGMA_GOOD = 0.03
 _DELAY_SIGMA_MAX_S = 0.1
-_UNANSWERED = 5.0  # k below this many standard errors: the pump did nothing that could be told from the weather
+_UNANSWERED = 5.0  # k below this many standard errors: the pump's effect is lost in the weather
 _JUMP_SIGMAS = 8.0  # of 10^4 residuals none is beyond 5
 _P_MIN = 1e-4
 _BENT_SIGMAS = 5.0  # sound benches show up to 2.7 in 192 sessions, pumps that saturate at 0.6 of the command 9
-_BENT_SHARE = 0.2  # of k; less than that the margins bear
-_WORSE_MAX = 1.5  # innovation on new data over that of the fit
+_BENT_SHARE = 0.2  # of k; the margins tolerate less
+_WORSE_MAX = 1.5  # innovation on new data relative to the fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,20 +29,20 @@ class FitQuality:
 
     # "ok"; "degraded": usable, the uncertainty is larger than it should be; "refused": no proposal
     verdict: Literal["ok", "degraded", "refused"]
-    reasons: tuple[str, ...]  # what was found, each with what would help
+    reasons: tuple[str, ...]  # the findings, each with a remedy
 
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """A fit on data that were not used for it."""
+    """A fit tested on data not used for it."""
 
-    innovation_ratio: float  # one-step prediction error there over that of the fit
+    innovation_ratio: float  # one-step prediction error relative to the fit
     whiteness_p: float  # as in `Identified`
     independence_p: float
 
 
 def validate(identified: Identified, fresh: Record, settle_s: float = 2.0) -> Validation:
-    """Predict a fresh record with a fitted model; the noise filter's start is left out."""
+    """Predict a fresh record with a fitted model, without the noise filter's start-up."""
     errors = prediction_errors(
         fresh, identified.model, identified.noise, identified.pressure_gain_um_per_pa if fresh.has_barometer else 0.0
     )[round(settle_s / fresh.dt_s) :]
@@ -65,7 +65,7 @@ def judge(record: Record, identified: Identified, validation: Validation | None 
 
 
 def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str]]:
-    """What forbids a proposal, and what only widens its error bars."""
+    """Findings that forbid a proposal, and those that only widen its error bars."""
     model, sigma = identified.model, identified.sigma
     refused: list[str] = []
     degraded: list[str] = []
@@ -94,7 +94,7 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
 
 
 def _bent(record: Record, identified: Identified) -> list[str]:
-    """What is wrong if one gain does not do for both halves of the pump."""
+    """The problem, if one gain does not describe both halves of the pump's range."""
     found = two_gains(record, identified)
     least = max(_BENT_SIGMAS * found.difference_sigma, _BENT_SHARE * identified.model.gain)
     if abs(found.above - found.below) < least:
@@ -111,19 +111,19 @@ _SETTLE_S, _QUIET_S, _BETWEEN_S = 20.0, 40.0, 15.0
 _RELAY_S, _DOUBLETS_S = 120.0, 60.0
 _VALIDATE_LEAST_S = 10.0
 
-# One relay and one round of doublets, with the holds between: what most benches take.
+# One relay and one round of doublets, with the holds between: enough for most benches.
 TYPICAL_S = _SETTLE_S + _QUIET_S + _RELAY_S + _DOUBLETS_S + 2 * _BETWEEN_S
 
 
 class ExperimentRig(Protocol):
-    """What characterising needs: `rig.Rig` on a bench, or `rig.HoldRig` on a running hold."""
+    """The rig needed for characterising: `rig.Rig` on a bench, or `rig.HoldRig` on a running hold."""
 
     def hold(self, duration_s: float) -> Record:
         """Hold for a time."""
         ...
 
     def around(self, held: Record, limit_um: float) -> machine.Around:
-        """The frame of an experiment."""
+        """Operating point of an experiment."""
         ...
 
     def perform(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished]:
@@ -133,21 +133,21 @@ class ExperimentRig(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Experiments:
-    """What the experiments left, raw."""
+    """Raw results of the experiments."""
 
     around: machine.Around  # holding flow, laser noise, limits
     record: Record  # relays, the holds between, doublets, without a gap
-    relays_s: float  # how much of it is relays with the holds behind them
-    pulses_s: tuple[float, float]  # start and end of the longest doublets in it
+    relays_s: float  # duration of the relays with the holds after them
+    pulses_s: tuple[float, float]  # start and end of the longest doublets
     finished: machine.Finished  # how the last relay ended
 
 
 @dataclass(frozen=True, slots=True)
 class Characterised:
-    """What the experiments gave."""
+    """Fit and verdict of the experiments."""
 
     experiments: Experiments
-    identified: Identified  # fit to all of it
+    identified: Identified  # fit to the whole record
     quality: FitQuality  # verdict; the doublets are predicted with a fit to the relays alone
 
 
@@ -158,7 +158,7 @@ class ExperimentError(Exception):
 def spec_of(
     kind: trial.ExperimentKind, around: machine.Around, duration_s: float, gain: float = 1.0
 ) -> trial.ExperimentSpec:
-    """The specification of an experiment in a frame. Raises pydantic.ValidationError outside its bounds."""
+    """The specification of an experiment at an operating point. Raises pydantic.ValidationError out of bounds."""
     return trial.ExperimentSpec(
         kind=kind,
         duration_s=duration_s,
@@ -170,22 +170,22 @@ def spec_of(
 
 
 def characterise(rig: ExperimentRig, limit_um: float = 10.0) -> Characterised:
-    """Experiments and fit in one; see `experiment` for what is raised."""
+    """Run the experiments and fit them; raises like `experiment`."""
     return fitted(experiment(rig, limit_um))
 
 
 def experiment(rig: ExperimentRig, limit_um: float = 10.0) -> Experiments:
-    """Hold, relay, doublets on a rig that holds its mirror.
+    """Hold, relay and doublets on a rig that holds its mirror.
 
-    A relay that was stopped is thrown away and repeated: whatever stopped it is no disturbance of the kind that the
-    fit knows. Doublets that were stopped are kept.
+    A stopped relay is discarded and repeated: the fit does not model whatever stopped it. Stopped doublets are
+    kept.
 
     Raises ExperimentError if no relay could be completed; ValueError if the pump has no room about the holding flow:
     the mirror is too tight or too leaky.
     """
     rig.hold(_SETTLE_S)
     around = rig.around(rig.hold(_QUIET_S), limit_um)
-    machine.room(around)  # a relay without it would only say that it was stopped
+    machine.room(around)  # without room a relay would only report that it was stopped
     relays, finished = _relays(rig, around)
     gain = identify(relays).model.gain
     whole = relays
@@ -201,7 +201,7 @@ def experiment(rig: ExperimentRig, limit_um: float = 10.0) -> Experiments:
 
 
 def fitted(done: Experiments) -> Characterised:
-    """The fit to all experiments, judged on doublets that a fit to the relays alone has to predict."""
+    """Fit all experiments; judge by the doublets, which a fit to the relays alone must predict."""
     found = identify(done.record)
     start_s, stop_s = done.pulses_s
     checked = None

@@ -1,11 +1,11 @@
-"""What moves the mirror and what only moves the reading: intensities from a quiet hold.
+"""Separates motion of the mirror from noise of the reading: intensities from a quiet hold.
 
-The flow's share is taken out of the readings, z = y - k int v(t - theta) dt, whatever loop made the flow. What is
-left is the weather and the laser's noise. Its increments have the spectrum (per sample, dt S)
+The response to the flow is removed from the readings, z = y - k int v(t - theta) dt, whatever loop made the flow. The
+rest is the weather and the laser's noise. Its increments have the spectrum (per sample, dt S)
 
     |1 - e^(-j w dt)|^2 r  +  q_fast dt  +  q_slow dt / (1 + w^2 tau^2)
 
-r: laser noise (um^2 a sample), q_fast: a random walk (air pressure), q_slow: a random walk that reaches the gas
+r: laser noise (um^2 per sample), q_fast: a random walk (air pressure), q_slow: a random walk that reaches the gas
 through the film, tau = 12 s (air temperature). Without the last term this is the IMA(1,1) process. The
 intensities maximise Whittle's likelihood, sum of log S + I / S over the periodogram I of the tapered increments.
 Source: Percival and Walden, Spectral Analysis for Univariate Time Series (2020), sections 6.3 and 9.
@@ -23,28 +23,28 @@ from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.control.filters import smoothing
 from tuning.identification import loop_model, records
 
-# Slower than this the loop does not care, and a random walk is no longer what weather does.
+# Slower motion does not matter to the loop, and weather is no longer a random walk.
 _SLOWEST_S = 100.0
-_FLOOR = 1e-12  # um^2: an intensity that is not there
-_LARGEST = 1e9  # um^2 a second: the film bursts before
+_FLOOR = 1e-12  # um^2: stands for a zero intensity
+_LARGEST = 1e9  # um^2/s: the film would burst
 _HANN_LOSS = 35.0 / 18.0  # neighbouring frequencies of a Hann taper share this much
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """White noise on a reading and the walk of what it reads."""
+    """White noise of a reading and the random walk of its quantity."""
 
     white: float  # standard deviation of a sample
     fast: float  # intensities of the walks: variance per second
     slow: float
-    slow_s: float  # lag behind which the slow walk comes
-    white_sigma: float  # relative standard errors of the variance of each
+    slow_s: float  # lag of the slow walk
+    white_sigma: float  # relative standard error of each variance
     fast_sigma: float
     slow_sigma: float
     dt_s: float  # sample time that `white` belongs to
 
     def __post_init__(self) -> None:
-        """Raises ValueError for what no fit finds: a file may say anything."""
+        """Raises ValueError for impossible fits, as a file may hold anything."""
         if not all(0 <= part <= _LARGEST for part in (self.white, self.fast, self.slow, self.slow_s, self.dt_s)):
             raise ValueError(f"noise of {self.white:g} and walks of {self.fast:g} and {self.slow:g}")
 
@@ -59,16 +59,16 @@ class Noise:
 
 
 def undriven_um(record: records.Record, model: loop_model.PlantModel) -> records.Series:
-    """z: the readings without what the pump and the mean leak did, (n,) um."""
+    """z: the readings without the effect of pump and mean leak, (n,) um."""
     driven = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
     return record.filled_displacement_um() - model.gain * driven
 
 
 def fit_noise(series: records.Series, dt_s: float, slow_s: float) -> Noise:
-    """Intensities of white noise and walks in a series; a straight trend does not matter.
+    """Fit the intensities of white noise and walks in a series; a straight trend has no effect.
 
-    Raises ValueError if the series is shorter than two of the slowest periods looked at. `slow_s` is the lag of the
-    slow walk; 0 omits it.
+    Raises ValueError if the series is shorter than two of the slowest periods used. `slow_s` is the lag of the slow
+    walk; 0 omits it.
     """
     if series.size * dt_s < 2 * _SLOWEST_S:
         raise ValueError(f"{series.size * dt_s:.0f} s of hold are too short: {2 * _SLOWEST_S:.0f} s at least")
@@ -97,7 +97,7 @@ def fit_noise(series: records.Series, dt_s: float, slow_s: float) -> Noise:
 
 
 def _periodogram(increments: records.Series, dt_s: float) -> tuple[records.Series, records.Series]:
-    """Angular frequencies from the slowest that matters to Nyquist, and tapered power a sample."""
+    """Angular frequencies from the slowest that matters to Nyquist, and tapered power per sample."""
     taper = hann(increments.size, sym=False)
     taper /= math.sqrt(float(taper @ taper))
     power = np.abs(np.fft.rfft((increments - increments.mean()) * taper)) ** 2
@@ -115,23 +115,23 @@ def _periodogram(increments: records.Series, dt_s: float) -> tuple[records.Serie
 # filter, which is taken off the diagonal of the normal equations.
 # Source: Fuller, Measurement Error Models (1987), section 2.2.
 
-_BLOCK_S = 0.5  # below a second a barometer's noise hides its signal; above, its events blur
+_BLOCK_S = 0.5  # with shorter blocks a barometer's noise hides its signal; longer ones blur events
 
 
 @dataclass(frozen=True, slots=True)
 class WeatherGain:
-    """A gain, its standard error, and how the sensor's quantity wanders."""
+    """A gain, its standard error, and the random walk of the sensor's quantity."""
 
     gain: float  # um per Pa or um per K
     sigma: float
     walk: float  # variance per second of the quantity's random walk, Pa^2/s or K^2/s
     noise: float  # standard deviation of a reading
-    lag_s: float  # lag behind which the quantity reaches the centre
+    lag_s: float  # lag of the quantity's effect on the centre
 
     def agreed(self, configured: float) -> float:
-        """Gain to use: the fitted one where the record knows it to 10 %, else the configured one if they agree.
+        """Gain to use: the fitted one if known to 10 %, else the configured one if they agree.
 
-        Weather that does not move says nothing about its gain; the physics of the bench then knows better.
+        Steady weather reveals nothing about its gain; the bench's physics is then the better source.
         """
         if self.sigma <= 0.1 * abs(self.gain):
             return self.gain
@@ -155,7 +155,7 @@ def lagged(series: records.Series, lag_s: float, dt_s: float) -> records.Series:
 
 
 def fit_weather(record: records.Record, model: loop_model.PlantModel, gas_follows_air_s: float) -> WeatherFit:
-    """Regress what the pump did not do on the weather.
+    """Regress the motion not caused by the pump on the weather.
 
     `record` is a quiet hold of some minutes, `gas_follows_air_s` the lag of the gas behind the air.
     """
@@ -169,7 +169,7 @@ def fit_weather(record: records.Record, model: loop_model.PlantModel, gas_follow
         return WeatherFit(None, None, z)
     noises = [fit_noise(series, record.dt_s, 0.0) for series, _ in channels]
     columns = [lagged(series, lag_s, record.dt_s) for series, lag_s in channels]
-    # only noise that passes the lag is left of a lagged sensor's: dt / (2 T) of its variance
+    # of a lagged sensor's noise only dt / (2 T) of the variance passes the lag
     shares = [1.0 if lag_s == 0 else record.dt_s / (2 * lag_s) for _, lag_s in channels]
     per_block = max(1, round(_BLOCK_S / record.dt_s))
     variances = np.array([n.white**2 * share / per_block for n, share in zip(noises, shares, strict=True)])
@@ -189,7 +189,7 @@ def fit_weather(record: records.Record, model: loop_model.PlantModel, gas_follow
 def _regress(
     z: records.Series, columns: list[records.Series], variances: records.Series, per_block: int
 ) -> tuple[records.Series, records.Series]:
-    """Gains and their standard errors, with the noise's beta that fits best."""
+    """Gains and their standard errors, with the best-fitting beta of the noise."""
     used = z.size // per_block * per_block
     blocks = np.array([column[:used].reshape(-1, per_block).mean(axis=1) for column in (z, *columns)])
     moved = np.diff(blocks, axis=1)
@@ -199,7 +199,7 @@ def _regress(
         white = lfilter([1.0], [1.0, -beta], moved, axis=1)
         target, given = white[0], white[1:]
         normal = given @ given.T
-        # a sensor that shows nothing but noise must not turn the matrix singular
+        # a sensor that shows only noise must not make the matrix singular
         noise = np.minimum(2 * variances / (1 + beta) * target.size, 0.9 * np.diag(normal))
         inverse = np.linalg.inv(normal - np.diag(noise))
         gains = inverse @ given @ target
@@ -212,15 +212,15 @@ def _regress(
     return gains, sigmas
 
 
-# All that moves the mirror, as spectra: what is explained by the weather's sensors and what is not.
+# All disturbances of the mirror, as spectra: explained by the weather sensors, and not.
 
 
 @dataclass(frozen=True, slots=True)
 class DisturbanceModel:
-    """What moves the centre, and what the laser adds."""
+    """Disturbances of the centre, and the laser's noise."""
 
     rest: Noise  # the laser's noise and the walks that no weather sensor explains
-    barometer: WeatherGain | None  # what the sensors explain
+    barometer: WeatherGain | None  # the part explained by the sensors
     air: WeatherGain | None
 
     @property

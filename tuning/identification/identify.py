@@ -1,18 +1,18 @@
 """Gain and dead time from a record, by prediction error with a noise model.
 
-The reading is y = k x - leak t + g_p p + n, with x the way a mirror of gain 1 would have gone (`driven_um`). Weather
+The reading is y = k x - leak t + g_p p + n, with x the path of a mirror of gain 1 (`driven_um`). Weather
 wanders and the laser is noisy: n is a random walk plus white noise, which is an IMA(1,1) process
 
     n[i] - n[i-1] = (1 - beta B) e[i],    e white, B one sample back.
 
-Weather that reaches the gas through the film (air temperature, 12 s) is a walk with a memory of its own. Left out,
-it makes k too small wherever the flow answers the readings (by 3 % in gusty weather): so the increments get a pole,
+Weather that reaches the gas through the film (air temperature, 12 s) is a walk with its own memory. Omitting
+it makes k too small where the flow responds to the readings (by 3 % in gusty weather): so the increments get a pole,
 
     n[i] - n[i-1] = (1 - beta B) (1 - gamma B) / (1 - phi B) e[i],    phi = exp(-dt / 12 s),
 
-which is IMA(1,1) for gamma = phi. Minimising the sum of e^2 over (k, leak, theta, T, beta, gamma) weights what the
-record knows with what disturbs it. Plain output error takes n for white and is biased; the describing function of a
-relay knows only one frequency.
+which is IMA(1,1) for gamma = phi. Minimising the sum of e^2 over (k, leak, theta, T, beta, gamma) weights the record
+by its disturbance. Plain output error assumes white n and is biased; the describing function of a relay uses only
+one frequency.
 Source: Ljung, System Identification (1999), sections 7.2 and 9.4 (covariance from the gradient of e).
 """
 
@@ -27,9 +27,9 @@ from scipy.stats import chi2
 
 from tuning.identification import loop_model, records
 
-_FILM_S = 12.0  # how the gas follows the air (estimate; a factor of 2 does not matter)
-_BETA_MAX = 0.9999  # 1 would be a reading without any disturbance
-_LAG_MIN_S, _LAG_MAX_S = 0.01, 2.0  # a film pump answers within seconds, and a faster lag than a tick is none
+_FILM_S = 12.0  # lag of the gas behind the air (estimate; a factor of 2 does not matter)
+_BETA_MAX = 0.9999  # 1 would mean a reading without disturbance
+_LAG_MIN_S, _LAG_MAX_S = 0.01, 2.0  # a film pump responds within seconds, and a lag below a tick does not matter
 _DEAD_TIME_MAX_S = 3.0
 _STARTS_S = (0.03, 0.1, 0.3, 0.6, 1.0, 1.6)
 _LAG_START_S = 0.1
@@ -54,7 +54,7 @@ class NoiseModel:
 
 @dataclass(frozen=True, slots=True)
 class Sigma:
-    """Standard errors of the identified numbers."""
+    """Standard errors of the identified parameters."""
 
     gain: float
     dead_time_s: float
@@ -65,13 +65,13 @@ class Sigma:
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """A fitted model and how far it can be trusted."""
+    """A fitted model and its reliability."""
 
     model: loop_model.PlantModel
     sigma: Sigma  # standard errors
     covariance: records.Series  # (4, 4): of gain, dead time, lag, leak
     noise: NoiseModel
-    # Of the barometer, 0 without one; a nuisance here, which the barometer's noise makes too small
+    # Of the barometer, 0 without one; a nuisance parameter, biased low by the barometer's noise
     pressure_gain_um_per_pa: float
     innovation_um: float  # standard deviation of the one-step prediction error
     # Probability of residuals at least as coloured, and as correlated with past flow, if the model were true
@@ -84,7 +84,7 @@ class Identified:
 def prediction_errors(
     record: records.Record, model: loop_model.PlantModel, noise: NoiseModel, pressure_gain_um_per_pa: float = 0.0
 ) -> records.Series:
-    """One-step prediction errors of a model on a record, (n - 1,) um; the first are the filter's start.
+    """One-step prediction errors of a model on a record, (n - 1,) um; the first ones include the filter's start-up.
 
     `pressure_gain_um_per_pa` is the barometer's effect on the centre; 0 omits it.
     """
@@ -96,12 +96,12 @@ def prediction_errors(
 
 
 def identify(record: records.Record) -> Identified:
-    """Fit the model; the barometer, if there is one, takes its share out of the noise.
+    """Fit the model; a barometer, if present, explains part of the noise.
 
     Raises ValueError if the record is too short, has no reading, or the flow never changed.
     """
     if len(record) < 10 * _LAGS:
-        raise ValueError(f"{record.duration_s:.1f} s is too short to identify anything")
+        raise ValueError(f"{record.duration_s:.1f} s is too short for an identification")
     if np.ptp(record.flow_um_per_s) <= 0:
         raise ValueError("the flow never changed: run the relay experiment")
 
@@ -114,8 +114,8 @@ def identify(record: records.Record) -> Identified:
     residual = errors(q)
     innovation_um = float(np.sqrt(np.sum(residual**2) / (residual.size - q.size)))
     covariance = innovation_um**2 * np.linalg.pinv(best.jac.T @ best.jac)
-    # Within a sample the model knows no time: where command and reading fall in it is as good as anywhere, and with
-    # little noise the fit is surer of the dead time than the sample allows.
+    # The model does not resolve times within a sample, and with little noise the fit would claim a dead time more
+    # precise than a sample allows.
     covariance[1, 1] += record.dt_s**2 / 12
     return Identified(
         model=loop_model.PlantModel(*(float(v) for v in q[:4])),
@@ -132,7 +132,7 @@ def identify(record: records.Record) -> Identified:
 
 
 def _best_fit(errors: Callable[[records.Series], records.Series], record: records.Record) -> OptimizeResult:
-    """Least squares from the most promising dead time: the criterion has more than one valley in it."""
+    """Least squares from the most promising dead time, as the criterion has several minima."""
     extra = [-0.3] if record.has_barometer and np.ptp(record.ambient_pressure_pa) > 0 else []
     low = [-np.inf, 0.0, _LAG_MIN_S, -np.inf, 0.0, _GAMMA_MIN] + [-np.inf] * len(extra)
     high = [np.inf, _DEAD_TIME_MAX_S, _LAG_MAX_S, np.inf, _BETA_MAX, _BETA_MAX] + [np.inf] * len(extra)
@@ -148,7 +148,7 @@ def _best_fit(errors: Callable[[records.Series], records.Series], record: record
 
 
 def _start(record: records.Record, dead_time_s: float, extra: list[float]) -> records.Series:
-    """Gain and leak that go best with a dead time, by linear least squares on the prefiltered record."""
+    """Best gain and leak for a dead time, by linear least squares on the prefiltered record."""
     unit = loop_model.PlantModel(1.0, dead_time_s, _LAG_START_S, 0.0)
     x = np.diff(loop_model.driven_um(record.flow_um_per_s, unit.dead_time_s, unit.lag_s, record.dt_s))
     columns = np.array([x, np.full(x.size, -record.dt_s), np.diff(record.filled_displacement_um())])
@@ -173,17 +173,17 @@ def whiteness(residual: records.Series, fitted: int = 0) -> float:
 
 
 def independence(residual: records.Series, change: records.Series) -> float:
-    """Probability of residuals this correlated with earlier changes of the flow, had the model left nothing."""
+    """Probability of residuals this correlated with earlier changes of the flow, if the model were complete."""
     e = (residual - residual.mean()) / residual.std()
     u = change - change.mean()
     n = e.size
-    # from lag 1 on: the flow of a tick may well answer the reading of that tick
+    # from lag 1 on: a tick's flow may respond to its own reading
     past = np.array([u[_LAGS - lag : n - lag] for lag in range(1, _LAGS + 1)])
     cross = past @ e[_LAGS:]
     return float(chi2.sf(cross @ np.linalg.pinv(past @ past.T) @ cross, _LAGS))
 
 
-# Whether the pump is as strong above the holding flow as below it: one that saturates or stalls is not.
+# Tests whether the pump is as strong above the holding flow as below, which a saturating or stalling pump is not.
 #
 # A relay has two flows, and a straight line goes through any two points; the holds about it are the third. A pump
 # that saturates is then a weak one to a fit with a single gain, and gains made for that are too high for what the
@@ -200,9 +200,9 @@ _SAME = 1e-6  # with two flows in the whole record, x_above is x and t but for r
 
 @dataclass(frozen=True, slots=True)
 class TwoGains:
-    """The pump above and below the holding flow."""
+    """Gains of the pump above and below the holding flow."""
 
-    below: float  # gain of either part
+    below: float  # gain of each part
     above: float
     difference_sigma: float  # standard error of `above - below`; infinite if the flow had two values only
 

@@ -3,8 +3,8 @@
     L = C F P,   P = k exp(-j w (theta + h / 2 + write)) / (j w (1 + j w T)),
     C = K (1 + 1 / (j w Ti) + j w Td),   F = 1 / (1 + j w Tf)
 
-h / 2 is what a command held for a sample comes late on average. A Pade approximation would move the margins by as
-much as the designs differ; a frequency response needs none.
+h / 2 is the mean delay of a command held for a sample. A Pade approximation would shift the margins by as much as the
+designs differ; a frequency response needs none.
 """
 
 import math
@@ -33,16 +33,16 @@ class PlantModel:
     # theta, from a reading's tick to the first gas in the mirror (half a sample of holding comes on top)
     dead_time_s: float
     lag_s: float  # T
-    leak_um_per_s: float  # what leak and bleed take away
+    leak_um_per_s: float  # loss through leak and bleed
 
     @property
     def delay_s(self) -> float:
-        """Dead time and lag together: what a ramp comes late by."""
+        """Dead time plus lag, the delay of a ramp."""
         return self.dead_time_s + self.lag_s
 
     @property
     def holding_flow_um_per_s(self) -> float:
-        """Commanded flow that makes up for the leak."""
+        """Commanded flow that balances the leak."""
         return self.leak_um_per_s / self.gain
 
 
@@ -55,12 +55,12 @@ def delayed(series: Series, delay_s: float, dt_s: float) -> Series:
 
 
 def driven_um(flow_um_per_s: Series, dead_time_s: float, lag_s: float, dt_s: float) -> Series:
-    """Way of the centre for unit gain, at each reading, for a flow held between readings; exact.
+    """Path of the centre for unit gain, at each reading, for a flow held between readings; exact.
 
     From T dq/dt = v - q follows the integral of q = integral of v - T q (+ constant). The integral of a held flow is
     a broken line, so interpolating it between samples is exact for any delay. Within a sample the delayed flow
-    changes once, after the share f of the sample: q[i+1] = a q[i] + b1 v[i-m-1] + b2 v[i-m]. The flow's first value
-    is taken to have stood for ever; the way is 0 at the first reading.
+    changes once, after the share f of the sample: q[i+1] = a q[i] + b1 v[i-m-1] + b2 v[i-m]. The flow before the
+    record is assumed equal to its first value; the path is 0 at the first reading.
     """
     first = flow_um_per_s[0]
     change = flow_um_per_s - first
@@ -80,7 +80,7 @@ _SLOWEST_RAD_PER_S = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """A controller: K in 1/s, times in s; the filter stands before all three terms."""
+    """A controller: K in 1/s, times in s; the filter precedes all three terms."""
 
     kp_per_s: float
     ti_s: float
@@ -121,7 +121,7 @@ def loop_response(gains: Gains, model: PlantModel, w_rad_per_s: Series, dt_s: fl
     return controller_response(gains, w_rad_per_s) * pump_response(model, w_rad_per_s, dt_s) * integrator
 
 
-# How far a loop is from instability, on the exact frequency response.
+# Stability margins of a loop, from the exact frequency response.
 
 _POINTS = 3000  # 0.3 % apart: margins to better than 1 %
 _FINE_DT_S = 1e-3

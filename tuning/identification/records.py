@@ -1,4 +1,4 @@
-"""What a tuning step works on: evenly sampled columns of what was commanded and what was read."""
+"""The data of a tuning step: evenly sampled columns of commands and readings."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Series = FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """Evenly sampled readings and the flow that was commanded right after each of them."""
+    """Evenly sampled readings and the flow commanded right after each of them."""
 
     dt_s: float  # sample time
     flow_um_per_s: Series  # (n,): commanded flow as the pump's nominal curve has it, from each reading until the next
@@ -31,7 +31,7 @@ class Record:
 
     @classmethod
     def from_samples(cls, dt_s: float, flows_um_per_s: Sequence[float], samples: Sequence[BenchSample]) -> Record:
-        """Columns of samples and of the flows that followed them."""
+        """Make a record from samples and the flows that followed them."""
         columns = [[getattr(sample, field.name) for sample in samples] for field in fields(BenchSample)]
         return cls(dt_s, np.array(flows_um_per_s, dtype=float), *(np.array(c, dtype=float) for c in columns))
 
@@ -59,12 +59,12 @@ class Record:
         return float(np.mean(~np.isfinite(self.displacement_um)))
 
     def part(self, start_s: float, stop_s: float) -> Record:
-        """The samples from `start_s` until before `stop_s`."""
+        """The samples from `start_s` up to, but excluding, `stop_s`."""
         cut = slice(round(start_s / self.dt_s), round(stop_s / self.dt_s))
         return Record(self.dt_s, *(column[cut] for column in self._columns()))
 
     def followed_by(self, *later: Record) -> Record:
-        """This and what came right after it, as one record. Raises ValueError for different sample times."""
+        """Join this record and its continuation. Raises ValueError for different sample times."""
         if any(part.dt_s != self.dt_s for part in later):
             raise ValueError("records of different sample times cannot be joined")
         columns = zip(*(part._columns() for part in (self, *later)), strict=True)
@@ -78,7 +78,7 @@ class Record:
         return np.interp(np.arange(len(self)), np.flatnonzero(good), self.displacement_um[good])
 
     def sha256(self) -> str:
-        """Hash of the data, to say what gains were made from."""
+        """Hash of the data, which identifies the origin of gains."""
         digest = hashlib.sha256(np.float64(self.dt_s).tobytes())
         for column in self._columns():
             digest.update(np.ascontiguousarray(column).tobytes())
@@ -88,10 +88,10 @@ class Record:
         return tuple(getattr(self, name) for name in _COLUMNS)
 
 
-# Raw data of a session: one compressed file a record, checked by its hash when it is read back.
+# Raw data of a session: one compressed file per record, checked by its hash when read.
 
 _BYTES_MAX = 200_000_000  # four columns of a day at 50 Hz are 140 MB
-# What NumPy and the archive raise, depending on the byte that is wrong.
+# Exceptions of NumPy and the archive, depending on the damaged byte.
 _DAMAGED = (
     *(OSError, ValueError, TypeError, KeyError, AttributeError, MemoryError, EOFError, NotImplementedError),
     *(zipfile.BadZipFile, zlib.error),
@@ -100,7 +100,7 @@ _COLUMNS = ("flow_um_per_s", "displacement_um", "ambient_pressure_pa", "air_temp
 
 
 def save_record(path: Path, record: Record) -> None:
-    """Write a record in one step."""
+    """Write a record atomically."""
     file = io.BytesIO()
     columns = {name: getattr(record, name) for name in _COLUMNS}
     np.savez_compressed(file, dt_s=np.float64(record.dt_s), sha256=np.array(record.sha256()), **columns)
@@ -108,7 +108,7 @@ def save_record(path: Path, record: Record) -> None:
 
 
 def load_record(path: Path) -> Record:
-    """Read a record. Raises InputError if it is not there, damaged, or not what was written."""
+    """Read a record. Raises InputError if it is missing, damaged, or altered."""
     try:
         with files.open_plain(files.users(path)) as file, np.load(file, allow_pickle=False) as found:
             if sum(member.file_size for member in found.zip.infolist()) > _BYTES_MAX:
@@ -120,5 +120,5 @@ def load_record(path: Path) -> Record:
     except _DAMAGED as error:
         raise errors.InputError(f"{path}: damaged ({error}); repeat the step that wrote it") from None
     if record.sha256() != hashed:
-        raise errors.InputError(f"{path}: the data are not those that were written (hash differs)")
+        raise errors.InputError(f"{path}: the data have been altered (hash differs)")
     return record

@@ -1,4 +1,4 @@
-"""The shape loop: how the figure answers to sag, how noisy and how steady its measurement is, and the time constant.
+"""The shape loop: the figure's response to sag, noise and drift of its measurement, and the time constant.
 
 A small step of the setpoint moves the sag by a known amount: the change of the Zernike vector over it is the
 sensitivity. Sag by deflectometry less the laser's reading is, while the mirror is held, the deflectometry's noise and
@@ -21,21 +21,21 @@ from membrane_ctrl.sessions.live_hold import HoldError
 from tuning.identification.records import Series
 from tuning.rig import HoldRig
 
-# White noise on a random walk, at any times: how much of each, and how much walk the data still permit.
+# White noise on a random walk, at any times: the amount of each, and the largest walk that the data permit.
 #
 # The likelihood of the local level model by its Kalman filter, with the noise's variance concentrated out, over the
 # ratio of walk to noise. Source: Durbin and Koopman, Time Series Analysis by State Space Methods (2012), chapter 2.
 
-_RATIOS = np.geomspace(1e-9, 10.0, 61)  # variance of the walk in a cycle over that of the noise
-_DROP = 2.0  # of the log likelihood: 95 % on one side, and some for the grid
+_RATIOS = np.geomspace(1e-9, 10.0, 61)  # variance of the walk per cycle over that of the noise
+_DROP = 2.0  # of the log likelihood: 95 % one-sided, with some margin for the grid
 
 
 @dataclass(frozen=True, slots=True)
 class LocalLevel:
-    """What was found."""
+    """Result of the fit."""
 
     white: float  # standard deviation of the noise
-    walk: float  # variance of the walk a second; where no walk is seen, the most that the data permit
+    walk: float  # variance of the walk per second; if no walk is seen, the largest that the data permit
     seen: bool  # the data are much less likely without a walk
 
 
@@ -55,7 +55,7 @@ def fit_local_level(values: FloatArray, times_s: FloatArray) -> LocalLevel:
 
 
 def _likelihood(values: FloatArray, steps: FloatArray, ratio: float) -> tuple[float, float]:
-    """Log likelihood and the noise's variance for a ratio; the first value only starts the filter."""
+    """Log likelihood and noise variance for a ratio; the first value only initialises the filter."""
     level, spread = float(values[0]), 1.0
     squares = logs = 0.0
     for value, step in zip(values[1:].tolist(), steps.tolist(), strict=True):
@@ -73,30 +73,30 @@ def _likelihood(values: FloatArray, steps: FloatArray, ratio: float) -> tuple[fl
 
 
 STEP_UM = 5.0
-_LEVEL_S, _SETTLE_S = 60.0, 12.0  # of each level; the ramp, the loop's recovery, and a cycle begun before it
+_LEVEL_S, _SETTLE_S = 60.0, 12.0  # of each level; the ramp, the loop's recovery, and a cycle started earlier
 TYPICAL_S = 3 * (_LEVEL_S + _SETTLE_S)
 _LEAST_CYCLES = 8
-# Shorter than ten cycles it would follow the noise; longer than an hour nobody has seen the drift.
+# Below ten cycles it would follow the noise; beyond an hour the drift is unknown.
 _CYCLES_MIN, _TAU_MAX_S = 10.0, 3600.0
 
 
 @dataclass(frozen=True, slots=True)
 class ShapeLoopFit:
-    """What was found."""
+    """Result of the fit."""
 
     sensitivity: Series  # (36,): change of the coefficients per um of sag, and standard errors
     sensitivity_sigma: Series  # (36,)
     agreement: float  # cosine between it and the one assumed, piston left out; 1 is the same direction
-    scale: float  # sag seen by deflectometry per um of the laser's
+    scale: float  # sag by deflectometry per um of laser reading
     sigma_um: float  # noise of a cycle
-    cycle_s: float  # from result to result
+    cycle_s: float  # between results
     drift_um_per_sqrt_h: float  # between laser and deflectometry
-    drift_seen: bool  # otherwise no drift was seen, and the figure is the most that there may be
+    drift_seen: bool  # otherwise no drift was seen, and the figure is its upper bound
     time_constant_s: float  # proposed for `shape.time_constant_s`
 
 
 def step_experiment(rig: HoldRig, setpoint_um: float, restore: bool) -> list[list[ShapeEstimate]]:
-    """Hold low, high, low with the shape loop off; the shapes of each level.
+    """Hold low, high, low with the shape loop off; return the shapes of each level.
 
     It ends at `setpoint_um`, the hold's own; `restore` switches the shape loop on again.
     """
@@ -114,7 +114,7 @@ def step_experiment(rig: HoldRig, setpoint_um: float, restore: bool) -> list[lis
         if restore:
             rig.shape_loop(True, "shape loop: the step is over")
     if min(len(level) for level in levels) < _LEAST_CYCLES:
-        raise HoldError(f"fewer than {_LEAST_CYCLES} shapes a level: is the shape measured every few seconds?")
+        raise HoldError(f"fewer than {_LEAST_CYCLES} shapes per level: is the shape measured every few seconds?")
     return levels
 
 

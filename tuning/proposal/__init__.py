@@ -1,1 +1,1 @@
-"""From a model to gains, and whether they keep what they promise."""
+"""Gains from a model, and their verification."""

@@ -1,7 +1,7 @@
-"""Gains from a model, by the rules people know and by searching.
+"""Gains from a model, by well-known rules and by search.
 
-All take lags as dead time (delay = theta + T + filter + half a sample): an integrator with delay is
-what the rules are made for, and the pump's lag of a tenth of the loop's time constant does not earn a D term.
+All treat lags as dead time (delay = theta + T + filter + half a sample): the rules are made for an integrator with
+delay, and the pump's lag of a tenth of the loop's time constant does not justify a D term.
 """
 
 import cmath
@@ -17,36 +17,36 @@ from tuning.identification import loop_model, records
 from tuning.identification.disturbance import DisturbanceModel
 from tuning.proposal.prediction import predict
 
-# Filters tried by the search: none costs more phase than the loop has.
+# Filters tried by the search; none costs too much phase.
 _FILTERS_S = (0.03, 0.05, 0.1, 0.2, 0.4)
 # Bounds of the search in K times delay and Ti over delay.
 _GAIN_RANGE = (0.01, 1.0)
 _TI_RANGE = (2.0, 400.0)
-RECOVERED_UM = 0.5  # a load step is over when the centre stays this near: the most a mean of 60 s may be off
-_LONGEST_S, _LOOK_S = 600.0, 0.02  # a recovery is looked for this long, this finely
-_STEEP = 1e3  # a loop that breaks a demand costs more than any variance
+RECOVERED_UM = 0.5  # a load step is over when the centre stays this near, the limit for a mean of 60 s
+_LONGEST_S, _LOOK_S = 600.0, 0.02  # duration and step of the search for the recovery
+_STEEP = 1e3  # violating a demand costs more than any variance
 
 
 @dataclass(frozen=True, slots=True)
 class Demands:
-    """What every proposal must keep, whatever it does to the variance."""
+    """Demands on every proposal, whatever their effect on the variance."""
 
     ms: float = 1.4  # largest sensitivity
-    # A change of the leak this large must move the centre no further: half the leak of a sound mirror, and the band.
-    # Without it a mirror that the weather leaves alone would get no gain at all.
+    # A step of the leak by half that of a sound mirror must not move the centre further than the band. Without this
+    # demand, a mirror without weather would get no gain at all.
     load_step_um_per_s: float = 0.6
     load_peak_um: float = 2.0
     recovery_s: float = 60.0  # three integral times at most
-    # Standard deviations of the feedback's flow between the holding flow and none, and of its change in a tick within
-    # the rate limit: beyond, the limits cut the noise on one side and a bias is left
+    # Standard deviations of the feedback's flow between the holding flow and zero, and of its change per tick within
+    # the rate limit: beyond, the limits clip the noise on one side and leave a bias
     pump_sigmas: float = 1.7
     # Price of the feedback's flow (share of the holding flow, squared) in the logarithm of the standard deviation;
-    # 0.3 suits the simulated pump, whose stalls and starts spoil the last per cent of prediction
+    # 0.3 suits the simulated pump, whose stalls and starts limit the prediction to a few per cent
     activity_weight: float = 0.3
 
 
 def load_peak_um(gains: loop_model.Gains, model: loop_model.PlantModel, step_um_per_s: float) -> float:
-    """Largest excursion after a step of the leak; the loop's delay as time in which nothing answers.
+    """Largest excursion after a step of the leak; the loop's delay counts as time without response.
 
     y'' + k K y' + k K / Ti y = D delta(t): a step D of the speed peaks at
     D / w0 exp(-zeta w0 t), with w0 = sqrt(k K / Ti) and zeta = sqrt(k K Ti) / 2, where the speed is back to 0.
@@ -65,11 +65,11 @@ def load_peak_um(gains: loop_model.Gains, model: loop_model.PlantModel, step_um_
 def load_recovery_s(gains: loop_model.Gains, model: loop_model.PlantModel, step_um_per_s: float) -> float:
     """Time after a step of the leak until the centre stays within `RECOVERED_UM`; infinite if it never does.
 
-    The answer to the equation of `load_peak_um`, D (exp(r1 t) - exp(r2 t)) / (r1 - r2) with its roots r1 and r2,
-    begun after the loop's delay.
+    The solution of the equation of `load_peak_um`, D (exp(r1 t) - exp(r2 t)) / (r1 - r2) with its roots r1 and r2,
+    starting after the loop's delay.
     """
     speed_per_s, stiffness = model.gain * gains.kp_per_s, model.gain * gains.kp_per_s / gains.ti_s
-    root = cmath.sqrt(speed_per_s**2 - 4 * stiffness) or 1e-9  # of a double root the limit, to nine digits
+    root = cmath.sqrt(speed_per_s**2 - 4 * stiffness) or 1e-9  # the limit of a double root, to nine digits
     time_s = np.arange(0.0, _LONGEST_S, _LOOK_S)
     slow, fast = (np.exp((sign * root - speed_per_s) / 2 * time_s) for sign in (1, -1))
     away_um = step_um_per_s * ((slow - fast) / root).real
@@ -109,12 +109,12 @@ def lambda_tuned(model: loop_model.PlantModel, dt_s: float, filter_s: float, fac
 
 
 def ziegler_nichols(ultimate_gain_per_s: float, ultimate_period_s: float) -> loop_model.Gains:
-    """The hobby tuners' PID from a relay: K = 0.6 Ku, Ti = Tu / 2, Td = Tu / 8, no filter on D."""
+    """The Ziegler-Nichols PID from a relay: K = 0.6 Ku, Ti = Tu / 2, Td = Tu / 8, no filter on D."""
     return loop_model.Gains(0.6 * ultimate_gain_per_s, ultimate_period_s / 2, ultimate_period_s / 8, 0.0)
 
 
 def max_ki(model: loop_model.PlantModel, dt_s: float, filter_s: float, ms: float) -> loop_model.Gains:
-    """PI with the largest K / Ti that keeps the sensitivity below `ms`: best against a step of the leak."""
+    """PI with the largest K / Ti at a sensitivity below `ms`: best against a step of the leak."""
     start = simc(model, dt_s, filter_s)
     return _search(model, dt_s, start, ms, lambda gains: -math.log(gains.kp_per_s / gains.ti_s))
 
@@ -124,9 +124,9 @@ def least_variance(
 ) -> loop_model.Gains:
     """PI and filter with the least predicted variance of the true centre, within the demands.
 
-    No D: at best it takes 1 % off the prediction, for twice the pump's activity, which then costs more than that.
+    No D: at best it improves the prediction by 1 %, for twice the pump's activity, which costs more.
 
-    Of `loop` only the feed-forward counts, not the gains.
+    Only the feed-forward of `loop` matters, not its gains.
     """
     dt_s = disturbance.rest.dt_s
 
@@ -150,7 +150,7 @@ def _search(
     ms: float,
     cost: Callable[[loop_model.Gains], float],
 ) -> loop_model.Gains:
-    """PI with the least cost at the filter of `start`, the sensitivity kept below `ms`; in logarithms."""
+    """PI with the least cost at the filter of `start`, with the sensitivity below `ms`; in logarithms."""
     delay_s = effective_delay_s(model, dt_s, start.filter_s)
     low = np.log([_GAIN_RANGE[0] / (model.gain * delay_s), _TI_RANGE[0] * delay_s])
     high = np.log([_GAIN_RANGE[1] / (model.gain * delay_s), _TI_RANGE[1] * delay_s])

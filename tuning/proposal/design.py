@@ -1,4 +1,4 @@
-"""From what was identified to a proposal: all candidates side by side, and the one that is proposed."""
+"""Turns identified models into a proposal: all candidates side by side, and the proposed one."""
 
 import math
 from collections import deque
@@ -14,18 +14,18 @@ from tuning.proposal import candidates as rules
 from tuning.proposal.prediction import Predicted, Robustness, least_std_um, predict, robustness
 from tuning.rig import Rig
 
-# The fitted plant as a bench: what a proposal does on it with the real one-sided pump, before anything is applied.
+# The fitted plant as a bench: previews a proposal with the real one-sided pump before anything is applied.
 #
-# Linear prediction knows nothing of a pump that only adds gas, stalls and starts. Here the real loop drives a pump
+# Linear prediction ignores that the pump only adds gas, stalls and starts. Here the real loop drives a pump
 # with the configured curve in front of the identified delay, lag, gain and leak, in the identified weather.
 
-_SUBSTEPS = 4  # a tick: a dead time is then met within 2.5 ms at 50 Hz
+_SUBSTEPS = 4  # per tick: resolves a dead time to 2.5 ms at 50 Hz
 _SETTLE_S = 30.0
-_LEVEL_PA, _LEVEL_C = 101_325.0, 23.0  # any: only changes count
+_LEVEL_PA, _LEVEL_C = 101_325.0, 23.0  # arbitrary: only changes matter
 
 
 class ModelBench:
-    """A simulated bench made of what was identified; equal seeds give equal weather.
+    """A simulated bench made from the identified models; equal seeds give equal weather.
 
     `leak_step` has the time in s and the size in um/s of a step of the leak.
     """
@@ -54,7 +54,7 @@ class ModelBench:
         self.true_um: list[float] = []
 
     def exchange(self, pump_fraction: float, vent_fraction: float) -> BenchSample:
-        """One tick. The vent stands where it stood when the leak was identified."""
+        """Run one tick. The vent is assumed as during the identification of the leak."""
         pump = self._pump
         self._running = pump_fraction >= (pump.stall_fraction if self._running else pump.start_fraction)
         share = (pump_fraction - pump.dead_fraction) / (1 - pump.dead_fraction)
@@ -69,7 +69,7 @@ class ModelBench:
         return self._read(self._weather_um())
 
     def _weather_um(self) -> float:
-        """Advance the weather by a tick; how far it has moved the centre."""
+        """Advance the weather by a tick; return its effect on the centre."""
         of, walks = self._disturbance, self._walks
         barometer, air = of.barometer, of.air
         kicks = (of.rest.fast, of.rest.slow, 0.0, barometer.walk if barometer else 0.0, air.walk if air else 0.0, 0.0)
@@ -96,7 +96,7 @@ class ModelBench:
 
 @dataclass(frozen=True, slots=True)
 class Preview:
-    """What the fitted twin did."""
+    """Result on the fitted twin."""
 
     std_um: float  # of the true centre
     bias_um: float  # target minus true centre
@@ -138,9 +138,9 @@ def _held(
     return np.array(bench.true_um)[round(_SETTLE_S * loop.rate_hz) :]
 
 
-# The hobby tuners' relay on this loop sees a limit cycle at the frequency where the phase is -180 deg, w d = pi / 2:
-# Ku = pi / (2 k d), Tu = 4 d. Noise makes theirs larger still.
-_RULE_FILTER_S = 0.2  # what the rules that do not choose a filter get, against the laser's noise
+# The Ziegler-Nichols relay on this loop sees a limit cycle where the phase is -180 deg, w d = pi / 2:
+# Ku = pi / (2 k d), Tu = 4 d. Noise makes theirs even larger.
+_RULE_FILTER_S = 0.2  # for rules that do not choose a filter, against the laser's noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,29 +152,29 @@ class Candidate:
     margins: loop_model.Margins
     predicted: Predicted | None  # None for an unstable loop
     ratio: float  # predicted standard deviation over the least possible
-    # After the demanded step of the leak, by formula: furthest excursion, and how long until it is over
+    # After the demanded step of the leak, by formula: largest excursion, and duration
     load_peak_um: float
     load_recovery_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """What the tuner proposes, and why."""
+    """The tuner's proposal, with its reasons."""
 
     loop: LoopConfig  # the configuration with the proposed gains and feed-forward
     chosen: Candidate
-    candidates: tuple[Candidate, ...]  # all of them, the chosen one and the present gains included
-    least_std_um: float  # the bound
+    candidates: tuple[Candidate, ...]  # including the chosen one and the present gains
+    least_std_um: float  # the lower bound
     preview: Preview  # of the chosen one on the fitted twin
     robustness: Robustness
 
 
 class RefusedError(Exception):
-    """The data do not carry a proposal; the message says why and which experiment would help."""
+    """The data do not support a proposal; the message says why and which experiment would help."""
 
 
 def feedforward_settings(loop: LoopConfig, disturbance: DisturbanceModel) -> LoopConfig:
-    """The loop with the fitted weather gains where the data know them (`WeatherGain.agreed`)."""
+    """The loop with the fitted weather gains where the data determine them (`WeatherGain.agreed`)."""
     changed: dict[str, float] = {}
     if disturbance.barometer is not None:
         changed["barometer_gain_um_per_pa"] = disturbance.barometer.agreed(loop.barometer_gain_um_per_pa)
@@ -212,7 +212,7 @@ def candidate(
 def candidates(
     model: loop_model.PlantModel, disturbance: DisturbanceModel, loop: LoopConfig, demands: rules.Demands
 ) -> tuple[Candidate, ...]:
-    """All candidates; the first is the one to propose."""
+    """All candidates, the proposed one first."""
     dt_s, filter_s = disturbance.rest.dt_s, _RULE_FILTER_S
     delay_s = rules.effective_delay_s(model, dt_s, filter_s)
     named = {
@@ -254,7 +254,7 @@ def propose(
     rows = candidates(model, disturbance, settled, demands)
     chosen = rows[0]
     if not chosen.margins.stable or chosen.margins.ms > 1.02 * demands.ms:  # the search's grid is good to 1 %
-        raise RefusedError(f"no gains keep Ms <= {demands.ms:g} on this plant: a smaller delay is needed")
+        raise RefusedError(f"no gains achieve Ms <= {demands.ms:g} on this plant: reduce the delay")
     proposed = chosen.gains.applied_to(settled)
     return Proposal(
         loop=proposed,

@@ -1,9 +1,9 @@
-"""Standard deviations: what a design will give, and the least that any controller could.
+"""Standard deviations: the prediction for a design, and the lower bound for any controller.
 
 Predicted: the true centre is S d - T n for a disturbance d and laser noise n; its variance is the integral of its
-spectrum. Least: nobody acts sooner than the dead time, so the error is at least that of the best prediction of the
-disturbance over it (Astrom, Introduction to Stochastic Control Theory, 1970, chapter 6). The pump's lag is no limit
-of its own: it can be inverted.
+spectrum. Bound: no controller acts before the dead time, so the error is at least that of the best prediction of the
+disturbance over it (Astrom, Introduction to Stochastic Control Theory, 1970, chapter 6). The pump's lag is no limit:
+it can be inverted.
 """
 
 import math
@@ -32,7 +32,7 @@ class Predicted:
 def predict(
     gains: loop_model.Gains, model: loop_model.PlantModel, disturbance: DisturbanceModel, loop: LoopConfig
 ) -> Predicted:
-    """Linear prediction for a stable loop; a pump at its limit is the preview's to see."""
+    """Linear prediction for a stable loop; only the preview includes the pump's limits."""
     dt_s = disturbance.rest.dt_s
     w = loop_model.frequencies(dt_s)
     response = loop_model.loop_response(gains, model, w, dt_s)
@@ -47,7 +47,7 @@ def predict(
 def least_std_um(
     model: loop_model.PlantModel, disturbance: DisturbanceModel, loop: LoopConfig, write_s: float = 0.0
 ) -> float:
-    """Bound for the sensors that the loop's feed-forward uses; a weather it does not use is disturbance only.
+    """Bound for the sensors that the loop's feed-forward uses; unused weather counts as disturbance.
 
     `write_s` is the time from a reading to its command, if the model's dead time does not include it.
     """
@@ -68,9 +68,9 @@ def least_std_um(
     return float(np.sqrt(centre @ (transition @ after @ transition.T + kicks) @ centre))
 
 
-# A walk that returns after an hour is one for the loop, and keeps what the laser cannot tell apart bounded.
+# A walk that returns after an hour is equivalent for the loop, and bounds what the laser cannot distinguish.
 _RETURN_S = 3600.0
-# Intensity of a walk that was not seen, um^2/s: 1 nm in a second; zero would leave the filter without a solution.
+# Intensity of an unseen walk, um^2/s: 1 nm in a second; zero would leave the filter without a solution.
 _UNSEEN = 1e-6
 
 
@@ -95,7 +95,7 @@ def _discrete(drift: Matrix, diffusion: Matrix, step_s: float) -> tuple[Matrix, 
     return transition, transition @ block[:n, n:]
 
 
-# What a proposal does on the plants that the data allow: draws from the covariance of the fit.
+# Evaluates a proposal on plants permitted by the data, drawn from the covariance of the fit.
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +131,6 @@ def robustness(
     stds = np.array(
         [predict(gains, p, disturbance, loop).std_um if ok else np.inf for p, ok in zip(plants, stable, strict=True)]
     )
-    # the next value above: a quantile between a number and infinity would be neither
+    # the next value above: interpolating between a number and infinity is impossible
     peak_p95, std_p95 = (float(np.quantile(values, 0.95, method="higher")) for values in (peaks, stds))
     return Robustness(peak_p95, std_p95, float(stable.mean()))

@@ -1,12 +1,12 @@
-"""Whether new gains keep what was promised: ten minutes of hold, judged in stages, against the gains before them.
+"""Verifies new gains: ten minutes of hold, judged in stages, against the previous gains.
 
-The true centre is not seen, and the laser's noise is ten times its movement. What the readings have in common over
-lags of up to a second is nearly all movement; how much is the loop's answer to noise is known from the model:
+The true centre is unknown, and the laser's noise is ten times its motion. The correlation of readings over lags of up
+to a second is nearly all motion; the model gives the loop's response to noise:
 
     var x = var x predicted + mean of (cov(y[i], y[i + l]) seen - predicted),  0 < l dt <= 1 s.
 
-The weather of these ten minutes is not that of the hour before. So the comparison is with what the *old* gains would
-have done in it: the weather is taken out of the same record (`observe`) and the old loop's answer to it predicted
+The weather of these ten minutes differs from that of the hour before. So the comparison is with the *old* gains in
+the same weather: that is taken from the same record (`observe`), and the old loop's response to it predicted
 (docs/decisions/78-gains-on-trial.md).
 """
 
@@ -21,27 +21,27 @@ from tuning.gains_file import GainsFile
 from tuning.identification import disturbance, identify, loop_model, records
 from tuning.proposal.prediction import least_std_um, predict
 
-# Time of a stage, and growth that ends the trial there: early on only what is plainly wrong, for a minute of weather
-# scatters by a third; at the end the 10 % that are asked for.
+# Time of a stage, and growth that ends the trial there: early on only plain failures, as a minute of weather scatters
+# by a third; at the end the required 10 %.
 STAGES = ((60.0, 2.0), (180.0, 1.5), (300.0, 1.3), (600.0, 1.10))
 SETTLE_LEAST_S, _SETTLE_MOST_S = 20.0, 120.0
-_SETTLE_TIME_CONSTANTS = 4.0  # of the loop's slowest mode: 2 % is left of what the change of gains stirred up
-_OBSERVE_LEAST_S = 300.0  # before that the weather of the session stands for the present one
+_SETTLE_TIME_CONSTANTS = 4.0  # of the loop's slowest mode: 2 % of the transient from the change of gains is left
+_OBSERVE_LEAST_S = 300.0  # before that, the session's weather is assumed
 MS_MAX = 2.0  # sensitivity seen; its estimate scatters by a tenth
 _SEGMENT_S = 20.0
 _RESONANCE_LEAST_S = 180.0  # 17 half-overlapping segments: power to a quarter
-_LAGS_S = 1.0  # shorter than the centre remembers (2 s and more), and 50 times as many pairs as one lag has
+_LAGS_S = 1.0  # shorter than the centre's memory (2 s and more), with 50 times as many pairs as one lag
 _POINTS = 3000
 _BAND = 1.3  # width of a band in frequency, as a factor
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """One look."""
+    """One stage's result."""
 
     time_s: float
     std_um: float  # of the centre, from the record
-    before_um: float  # what the old gains would have given in this weather
+    before_um: float  # prediction for the old gains in this weather
     growth: float  # ratio of the two
     growth_max: float  # the limit
     ms: float  # sensitivity seen; NaN while the record is too short
@@ -50,7 +50,7 @@ class Stage:
 
 
 def settle_s(loop: LoopConfig) -> float:
-    """How long the centre needs to forget the change to these gains.
+    """Settling time of the centre after the change to these gains.
 
     Without delay and filter the loop around the film's integral is s^2 + K s + K / Ti = 0 (Td is small beside both);
     its slowest root has the real part (K - sqrt(K^2 - 4 K / Ti)) / 2, or K / 2 where it swings.
@@ -63,7 +63,7 @@ def settle_s(loop: LoopConfig) -> float:
 
 @dataclass(frozen=True, slots=True)
 class VerificationTrial:
-    """What is compared with what."""
+    """The data of the comparison."""
 
     model: loop_model.PlantModel
     weather: disturbance.DisturbanceModel
@@ -72,7 +72,7 @@ class VerificationTrial:
 
 
 def centre_std_um(off_um: records.Series, trial: VerificationTrial, weather: disturbance.DisturbanceModel) -> float:
-    """Standard deviation of the centre without the laser's noise; 0 where less than nothing is left.
+    """Standard deviation of the centre without the laser's noise; 0 if the estimate is negative.
 
     `off_um` (n,) are readings less setpoint; they correct the prediction for this weather.
     """
@@ -91,9 +91,9 @@ def centre_std_um(off_um: records.Series, trial: VerificationTrial, weather: dis
 
 
 def seen_sensitivity(off_um: records.Series, trial: VerificationTrial) -> float:
-    """Largest sensitivity, from where the spectrum stands out above the one the model predicts.
+    """Largest sensitivity, from the excess of the spectrum over the model's prediction.
 
-    A plant whose gain or delay has grown shows as a peak near the crossover. The level of the weather does not
+    Increased gain or delay of the plant shows as a peak near the crossover. The level of the weather does not
     matter: only the shape is compared, each band with the median band.
     """
     gains, dt_s = loop_model.Gains.of(trial.after), trial.weather.rest.dt_s
@@ -112,7 +112,7 @@ def seen_sensitivity(off_um: records.Series, trial: VerificationTrial) -> float:
 
 
 def look(record: records.Record, setpoint_um: records.Series, trial: VerificationTrial, growth_max: float) -> Stage:
-    """Judge what there is of the record; the setpoint of each sample is what the centre is compared with."""
+    """Judge the record so far, comparing the centre with each sample's setpoint."""
     off_um = record.filled_displacement_um() - setpoint_um
     weather = trial.weather
     if record.duration_s >= _OBSERVE_LEAST_S:
@@ -129,12 +129,12 @@ def look(record: records.Record, setpoint_um: records.Series, trial: Verificatio
     return Stage(record.duration_s, std_um, before_um, growth, growth_max, ms, record.lost_fraction, reason)
 
 
-# Whether a loop has aged, from a hold that nobody disturbs: what the weather's own excitation tells.
+# Detects an aged loop in an undisturbed hold, from excitation by the weather.
 #
-# The gain k from natural excitation is known to 10 or 20 % only; that is enough to see a pump that has lost a third.
+# Natural excitation gives the gain k to only 10 or 20 %, enough to detect a pump that has lost a third.
 
 LEAST_S = 300.0
-# Of what these gains should give: they are 1.05 to 1.4 times the bound by design, with feed-forward 2.
+# Relative to the prediction for these gains, by design 1.05 to 1.4 times the bound, with feed-forward 2.
 _RATIO_GROWTH = 1.4
 _LEAK_CHANGE = 0.3  # of the leak: the pump's curve and the room for the feedback have moved
 _K_SIGMAS, _K_CHANGE = 3.0, 0.15
@@ -142,22 +142,22 @@ _K_SIGMAS, _K_CHANGE = 3.0, 0.15
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """What a hold shows."""
+    """Findings from a hold."""
 
     std_um: float
-    least_std_um: float  # the least that any controller could reach in this weather
+    least_std_um: float  # lower bound for any controller in this weather
     ratio: float  # of the two, now
     ratio_designed: float  # when the gains were made
     gain: float  # k from natural excitation; NaN if it could not be fitted
     gain_sigma: float
-    leak_um_per_s: float  # mean speed the pump makes up for
-    suggestions: tuple[str, ...]  # why a session is due; empty if it is not
+    leak_um_per_s: float  # mean speed balanced by the pump
+    suggestions: tuple[str, ...]  # why a session is due; empty if none is
 
 
 def health(record: records.Record, setpoint_um: records.Series, loop: LoopConfig, made: GainsFile) -> Health:
     """Judge a quiet hold against the file its gains come from. Raises ValueError if it is shorter than `LEAST_S`."""
     if record.duration_s < LEAST_S:
-        raise ValueError(f"{record.duration_s:.0f} s of hold are too short to judge a loop: {LEAST_S:.0f} s at least")
+        raise ValueError(f"{record.duration_s:.0f} s of hold are too short to judge a loop: need {LEAST_S:.0f} s")
     model = made.plant.model
     weather = disturbance.observe(record, model, loop)
     off_um = record.filled_displacement_um() - setpoint_um
@@ -171,19 +171,19 @@ def health(record: records.Record, setpoint_um: records.Series, loop: LoopConfig
         ratio = std_um / (designed * least_um)
         found.append(f"the centre moves {ratio:.1f} times as much as these gains should allow")
     if abs(leak_um_per_s - model.leak_um_per_s) > _LEAK_CHANGE * model.leak_um_per_s:
-        found.append(f"the leak is {leak_um_per_s:.2f} um/s, it was {model.leak_um_per_s:.2f} um/s")
+        found.append(f"the leak is {leak_um_per_s:.2f} um/s, formerly {model.leak_um_per_s:.2f} um/s")
     spread = math.hypot(gain_sigma, made.plant.gain_sigma)
     if abs(gain - model.gain) > max(_K_SIGMAS * spread, _K_CHANGE * model.gain):
-        found.append(f"k is {gain:.2f} +- {gain_sigma:.2f}, it was {model.gain:.2f}")
+        found.append(f"k is {gain:.2f} +- {gain_sigma:.2f}, formerly {model.gain:.2f}")
     return Health(std_um, least_um, std_um / least_um, designed, gain, gain_sigma, leak_um_per_s, tuple(found))
 
 
 def _natural_gain(record: records.Record, loop: LoopConfig) -> tuple[float, float]:
     """Gain and standard error without any experiment; NaN where the flow hardly moved.
 
-    With feed-forward most of the flow answers the air's temperature, and what both do to the centre cancels: k would
-    look far too small. What the air does by itself is known from the loop's own gain, which a pump does not change;
-    the barometer's share is fitted beside k.
+    With feed-forward most of the flow responds to the air's temperature, and their effects on the centre cancel: k
+    would appear far too small. The effect of the air alone is known from the loop's own gain, which a pump does not
+    change; the barometer's share is fitted beside k.
     """
     if record.has_thermometer:
         gas_k = disturbance.lagged(record.air_temperature_c, loop.gas_follows_air_s, record.dt_s)

@@ -92,7 +92,7 @@ def _loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
     late = [np.stack((part[0], np.log(np.maximum(part[1], 1e-6)))) for part in late]
     same = ours.level_s == theirs.level_s
     late_p = mean_p(late[0], late[1], window_s) if same else math.nan
-    late_note = f"tested by the greatest of each {window_s:g} s" if same else "no test: levels of different length"
+    late_note = f"tested by the maximum of each {window_s:g} s" if same else "no test: levels of different length"
     return [
         _tested("leak", "µm/s", ours.leak_um_per_s[0], theirs.leak_um_per_s[0],
                 mean_p(leak[0], leak[1], window_s), _STRETCHES),
