@@ -50,7 +50,7 @@ def test_a_gauge_in_another_unit_keeps_the_mirror_down_from_the_start(by: float)
     assert story.noticed in {"laser_gauge_apart", "over_pressure"}
 
 
-@pytest.mark.parametrize("other_world", [False, True])
+@pytest.mark.parametrize("other_world", [False, pytest.param(True, marks=pytest.mark.campaign)])
 def test_an_hour_of_everything_that_is_no_fault_of_a_sensor_is_held(other_world: bool) -> None:
     assert quiet_hours(4, other_world, 0.5).alarms == ()
 

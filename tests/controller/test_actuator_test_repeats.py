@@ -16,7 +16,7 @@ from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.virtual_record import run_virtual
 
 
-@pytest.mark.parametrize("rate_hz", [5.0, 10.0, 20.0, 50.0])
+@pytest.mark.parametrize("rate_hz", [5.0, 10.0, 20.0, pytest.param(50.0, marks=pytest.mark.campaign)])
 def test_the_film_of_the_twin_passes_at_any_rate(rate_hz: float) -> None:
     for seed in range(12):
         config = Config(
@@ -26,7 +26,7 @@ def test_the_film_of_the_twin_passes_at_any_rate(rate_hz: float) -> None:
         assert any(row.state == State.INFLATE for row in rows), seed
 
 
-@pytest.mark.parametrize("rate_hz", [10.0, 25.0, 100.0])
+@pytest.mark.parametrize("rate_hz", [10.0, 25.0, pytest.param(100.0, marks=pytest.mark.campaign)])
 @pytest.mark.parametrize("wrong", [{"pump_share": 0.0}, {"vent_stuck_fraction": 0.0}], ids=["pump", "vent"])
 def test_the_twin_is_not_inflated_with_a_dead_actuator_at_any_rate(rate_hz: float, wrong: dict[str, float]) -> None:
     config = Config(loop=LoopConfig(rate_hz=rate_hz), shape=ShapeConfig(enabled=False))
@@ -67,7 +67,9 @@ def test_noise_alone_complains_hardly_ever_and_asks_twice_rarely(rate_hz: float)
     assert sum(test.is_second for test in tests) <= 9  # 3 %
 
 
-@pytest.mark.parametrize("rate_hz", [10.0, 25.0, 50.0, 100.0])
+@pytest.mark.parametrize(
+    "rate_hz", [10.0, 25.0, *(pytest.param(rate, marks=pytest.mark.campaign) for rate in (50.0, 100.0))]
+)
 @pytest.mark.parametrize(("pump_share", "vent_um_per_s"), [(0.0, 100.0), (1.0, 0.0)], ids=["pump", "vent"])
 def test_noise_alone_hides_a_dead_actuator_hardly_ever(
     rate_hz: float, pump_share: float, vent_um_per_s: float

@@ -11,12 +11,21 @@ import pytest
 NOTEBOOK = Path(__file__).parents[2] / "examples" / "tuning.ipynb"
 
 
-def test_the_notebook_runs_from_top_to_bottom(capsys: pytest.CaptureFixture[str]) -> None:
+def code() -> list[str]:
     cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+
+
+def test_what_the_notebook_imports_is_there() -> None:
+    lines = "\n".join(code()).splitlines()
+    exec("\n".join(line for line in lines if line.startswith(("from ", "import "))), {})
+
+
+@pytest.mark.campaign
+def test_the_notebook_runs_from_top_to_bottom(capsys: pytest.CaptureFixture[str]) -> None:
     space: dict[str, Any] = {}
-    for number, cell in enumerate(cells):
-        if cell["cell_type"] == "code":
-            exec(compile("".join(cell["source"]), f"cell {number}", "exec"), space)
+    for number, source in enumerate(code()):
+        exec(compile(source, f"cell {number}", "exec"), space)
     said = capsys.readouterr().out
     assert "Ziegler-Nichols" in said
     assert space["done"].quality.verdict in ("ok", "degraded")
