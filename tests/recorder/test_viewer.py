@@ -48,6 +48,7 @@ def share_near(png: bytes, colour: tuple[int, int, int]) -> float:
     return float((np.abs(picture - colour).max(axis=2) <= 25).mean())
 
 
+@pytest.mark.campaign
 def test_overview_shows_the_error_and_the_states(run_dir: Path) -> None:
     png = screenshot(run_dir)
     assert share_near(png, ERROR_BLUE) > 0.002

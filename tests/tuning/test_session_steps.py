@@ -143,7 +143,7 @@ def test_a_loop_in_order_suggests_nothing_and_an_aged_one_says_why() -> None:
     assert any("leak" in suggestion for suggestion in leaky.suggestions)
 
 
-@pytest.mark.parametrize("gain", [1.0, 0.6])
+@pytest.mark.parametrize("gain", [0.6, pytest.param(1.0, marks=pytest.mark.campaign)])
 def test_the_gain_is_seen_although_the_feed_forward_cancels_the_weather(gain: float) -> None:
     """A slow loop whose flow is nearly all feed-forward; the pump as it was, and one that has lost 40 %."""
     rest = Noise(1.0, 1e-4, 1e-4, 12.0, 0.05, 0.1, 0.1, 0.02)
