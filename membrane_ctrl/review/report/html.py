@@ -121,7 +121,7 @@ def _windows(analysis: Analysis) -> str:
             f"{window.window_s:g} s",
             f"{window.count}",
             *(number(v) for v in (window.mean_um, window.std_um, window.p99_7_um, window.max_um)),
-            f"{number(100 * window.in_band, 6)} %" if window.count else number(math.nan),
+            f"{number(100 * window.in_band, 6)} %" if window.count else number(window.in_band),
         ]
         for name, series in ((READING, analysis.reading), (TRUE, analysis.true))
         for window in (() if series is None else series.windows)
