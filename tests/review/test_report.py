@@ -184,9 +184,7 @@ def test_a_run_that_never_held(tmp_path: Path) -> None:
     write_run(tmp_path / "run", iter([(rows, [])]))
     analysis = analyse(open_run(tmp_path / "run"))
     assert report_table(analysis)["verdict"] == "bad"
-    page = render(analysis)
-    assert "Not held" in page
-    assert "– %" not in page  # a share of nothing is a dash alone
+    assert "Not held" in render(analysis)
 
 
 def test_a_mark_may_say_anything(quiet_run: Path, tmp_path: Path) -> None:
@@ -214,6 +212,13 @@ def test_one_window_has_no_spread(quiet_run: Path) -> None:
     assert analysis.reading is not None
     minutes = analysis.reading.windows[2]
     assert (minutes.count, np.isnan(minutes.std_um), np.isfinite(minutes.max_um)) == (1, True, True)
+
+
+def test_no_window_has_no_share(quiet_run: Path) -> None:
+    analysis = analyse(open_run(quiet_run), 59.5, 95.0)
+    assert analysis.reading is not None
+    assert analysis.reading.windows[2].count == 0
+    assert "– %" not in render(analysis)
 
 
 def test_nothing_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
