@@ -26,7 +26,7 @@ _MOVES = frozenset({"characterise", "observe", "apply", "verify"})
 
 @dataclass(frozen=True, slots=True)
 class TuneOptions:
-    """What the command line asked for."""
+    """Options of the command line."""
 
     config: Config
     twin: bool

@@ -53,8 +53,8 @@ class PumpBoard:
                 f"watchdog_s = {watchdog_s:g}: the board takes {period.minimum:g} .. {period.maximum:g} s"
             )
         self._watchdog_s = period.to_value(period.to_raw(watchdog_s))  # as the board will say it back
-        # The same for every opening by this object: a claim whose answer was lost is simply made again. The name is
-        # for everybody to read, the key for nobody.
+        # The same for every opening by this object, so that a claim whose answer was lost can be repeated. The name
+        # is public, the key is secret.
         self._claim_id, self._claim_key = (1 + secrets.randbelow(_U32_MAX) for _ in range(2))
         self._armed = False  # by this object, since it last connected
         self._heartbeat = 0

@@ -114,7 +114,7 @@ class PygameScreen:
         self._flip(self._surfaces[pattern])
 
     def wait(self) -> None:
-        """Return when what was begun is lit and settled."""
+        """Return when the pattern is displayed and settled."""
         self._sleep(max(0.0, self._shown_s + self.settle_s - self._now()))
 
     def show_levels(self, levels: Levels) -> None:

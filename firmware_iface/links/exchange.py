@@ -21,7 +21,7 @@ from firmware_iface.links.serial_port import SerialPort
 from firmware_iface.roles import DeviceIdentity, LinkDownError, LinkError
 
 _SHOWN_BYTES = 24
-# so many questions in a row without a valid answer, and the line is closed: its owner then opens it again, which also
+# after this many questions without a valid answer the line is closed: its owner then opens it again, which also
 # applies the settings that a device loses with its power
 _FAILURES_MAX = 5
 

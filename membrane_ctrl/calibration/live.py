@@ -29,7 +29,7 @@ _NEARLY_ALL = 0.9  # of the good range: more would hardly help
 
 @dataclass(frozen=True, slots=True)
 class LiveOptions:
-    """What the command line asked for; sets and output of `solving` are the session's."""
+    """Options of the command line; sets and output of `solving` are the session's."""
 
     where: Where
     session: Path | None

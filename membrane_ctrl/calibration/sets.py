@@ -56,7 +56,7 @@ def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.Se
 
 @dataclass(frozen=True)
 class CalibrateOptions:
-    """What the command was asked for."""
+    """Options of the command."""
 
     folders: Sequence[Path]  # capture sets
     geometry: Path | None  # geometry measured by hand, replacing the sets'

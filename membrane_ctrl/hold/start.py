@@ -39,7 +39,7 @@ from membrane_ctrl.sim.bench import TwinProcess
 
 @dataclass(frozen=True, slots=True)
 class HoldOptions:
-    """What the command line asked for."""
+    """Options of the command line."""
 
     config: Config
     source: str  # origin of the configuration, for messages

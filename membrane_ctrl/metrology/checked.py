@@ -57,7 +57,7 @@ class Checked:
         """Verdict from the frames alone: "ok", or "degraded" with the treatment of bad ones."""
         if not self.flags:
             return "ok", ""
-        return "degraded", f"{len(self.flags)} frame(s) flagged; the figure leaves out what they spoil"
+        return "degraded", f"{len(self.flags)} frame(s) flagged; the figure excludes the affected data"
 
     def places_px(self, index: IntArray) -> FloatArray:
         """Column and row (2, n) of bins' centres."""
@@ -108,7 +108,7 @@ def _doubt(stack: frame_stack.FrameStack, flags: tuple[integrity.Flag, ...]) -> 
     blamed = [f for f in flags if stack.patterns[f.frame].role == "sin" and f.reason.startswith(by_prediction)]
     if len(blamed) < _MANY_BLAMED:
         return ""
-    return "; with so many frames blamed, is this the geometry, and are these the axes, of these pictures?"
+    return "; with this many frames blamed, check the geometry and the axes of these pictures"
 
 
 def _believable_surface(checked: Checked) -> bool:
@@ -150,7 +150,7 @@ def _check(
     anchor: Anchor | None,
     rounds: int = _ROUNDS,
 ) -> Checked:
-    """The set as it is, frames that do not belong left out in so many rounds. Raises RejectedSetError."""
+    """The set as it is, without frames that do not belong, in a limited number of rounds. Raises RejectedSetError."""
     geometry = Geometry.from_config(optics)
     grid = bins.BinGrid(geometry, optics.camera, binned.bin_px)
     near = grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)

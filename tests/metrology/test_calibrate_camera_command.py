@@ -84,7 +84,7 @@ def test_bad_input_is_one_line(bench: Path, tmp_path: Path, capsys: pytest.Captu
             "408 x 342 pixels, but the configuration's optics.camera",
         ),
         (words(bench, out, "charuco:9x11"), 3, "at least 4 are needed"),
-        (words(bench, out, "circles:9x11"), 2, "circles:9x11 is no board"),
+        (words(bench, out, "circles:9x11"), 2, "circles:9x11 is not a board"),
         (
             ["calibrate-board", str(tmp_path / "b.png"), "--width-px", "90", "--height-px", "90", "--square-px", "9"],
             2,

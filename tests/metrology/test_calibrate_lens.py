@@ -74,7 +74,7 @@ def test_the_picture_is_exact_to_the_pixel() -> None:
 @pytest.mark.parametrize(
     ("text", "square_px", "says"),
     [
-        ("charuco:11", 48, "no board"),
+        ("charuco:11", 48, "not a board"),
         ("charuco:3x9", 48, "at least 4 squares"),
         ("charuco:11x9", 50, "a multiple of 8"),
         ("charuco:11x9", 80, "880 x 720 pixels, the screen 640 x 480"),

@@ -246,5 +246,5 @@ def test_geometry_that_sees_no_mirror_is_rejected() -> None:
 def test_a_picture_upside_down_is_asked_about() -> None:
     stack = good_set(bench())
     stack.frames[:] = stack.frames[:, ::-1].copy()
-    with pytest.raises(RejectedSetError, match="is this the geometry"):
+    with pytest.raises(RejectedSetError, match="check the geometry"):
         check(stack, bench())

@@ -80,7 +80,7 @@ def test_it_leaves_gains_that_are_kept_and_justified(done: SessionFolder) -> Non
 def test_the_report_stands_alone_and_the_recording_is_there(done: SessionFolder) -> None:
     text = done.file("report.html").read_text(encoding="utf-8")
     assert text.count("data:image/png;base64,") == 4
-    assert "http" not in text
+    assert "://" not in text  # base64 may spell "http" by chance
     for word in ("Ziegler-Nichols", "eve", "Verification", "kept"):
         assert word in text
     assert done.file("session.rrd").stat().st_size > 100_000

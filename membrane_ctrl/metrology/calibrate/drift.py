@@ -61,7 +61,7 @@ class DriftMonitor:
         elif ratio > GROWN and not self.says:
             self.says = (
                 f"calibrate again: the fit leaves {now_urad:.2f} urad of slope, "
-                f"the calibrated geometry promises {now_urad / ratio:.2f}"
+                f"the calibrated geometry predicts {now_urad / ratio:.2f}"
             )
 
 

@@ -140,7 +140,9 @@ class Board:
         """From "charuco:15x9". Raises ValueError."""
         found = re.fullmatch(r"(charuco|chessboard):(\d{1,3})x(\d{1,3})", text)
         if found is None:
-            raise ValueError(f"{text} is no board: KIND:COLUMNSxROWS of squares, as charuco:15x9 or chessboard:10x7")
+            raise ValueError(
+                f"{text} is not a board: KIND:COLUMNSxROWS of squares, e.g. charuco:15x9, chessboard:10x7"
+            )
         board = cls(found[1], int(found[2]), int(found[3]))
         if min(board.columns, board.rows) < 4 or (board.columns * board.rows > 2 * _MARKERS):
             raise ValueError(f"{text}: a board has at least 4 squares each way and at most {2 * _MARKERS} in all")

@@ -79,7 +79,7 @@ def sigmas(free: Mapping[str, float] | None = None) -> FloatArray:
     own = {p.name: p.sigma for p in (*POSE, LASER)}
     for name, sigma in (free or {}).items():
         if name not in NAMES:
-            raise ValueError(f"{name} is not a parameter; known are {', '.join(NAMES)}")
+            raise ValueError(f"{name} is not a parameter; known: {', '.join(NAMES)}")
         if not (np.isfinite(sigma) and sigma >= 0):
             raise ValueError(f"{name}: a sigma must be 0 or more, it is {sigma:g}")
         own[name] = sigma
@@ -167,7 +167,7 @@ def _hinge(pinhole_mm: FloatArray, origin_mm: FloatArray) -> FloatArray:
     across = np.cross(pinhole_mm, origin_mm)
     length = float(np.linalg.norm(across))
     if length < 1e-6 * float(np.linalg.norm(pinhole_mm) * np.linalg.norm(origin_mm)):
-        raise ValueError("camera and screen stand in one line with the vertex: alpha has no meaning")
+        raise ValueError("camera and screen are in line with the vertex: alpha is undefined")
     return across / length
 
 

@@ -131,7 +131,7 @@ def _ellipse(points_px: FloatArray) -> FloatArray:
     centre = np.linalg.solve(form, [-d / 2, -e / 2])
     values, axes = np.linalg.eigh(form / (1 + centre @ form @ centre))
     if values.min() <= 0:
-        raise ValueError("the rim is no ellipse")
+        raise ValueError("the rim is not an ellipse")
     theta = 2 * np.pi * np.arange(_POINTS) / _POINTS
     round_ = axes @ (np.stack([np.cos(theta), np.sin(theta)]) / np.sqrt(values)[:, None])
     return np.asarray(middle[:, None] + size * (centre[:, None] + round_))

@@ -166,7 +166,7 @@ def rim_harmonics() -> FloatArray:
 def averaged(
     bench: parameters.BenchGeometry, phases: residuals.SetPhases, state: SetState, about: int
 ) -> residuals.SetPhases:
-    """The set with about so many points; robust, each with the noise of its mean."""
+    """The set reduced to about that many points; robust, each with the noise of its mean."""
     left = residuals.residual_mm(bench, phases, state.surface, state.vertex_z_mm)
     weights = Trust.seen(phases, left).weights / phases.sigma_mm**2
     width, height = np.ptp(phases.column_px), np.ptp(phases.row_px)

@@ -125,7 +125,7 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
         moved = step(sums, problem.sigmas)
         sigmas = np.sqrt(np.diag(moved.covariance))
         if not (np.isfinite(moved.delta).all() and np.isfinite(sigmas).all()):
-            raise ValueError("the sets lead the calibration astray: they do not show the stated bench")
+            raise ValueError("the calibration diverges: the sets do not show the stated bench")
         changes.append(float(np.max(np.abs(moved.delta[sigmas > 0]) / sigmas[sigmas > 0], initial=0.0)))
         if progress is not None:
             progress(len(changes), changes[-1])

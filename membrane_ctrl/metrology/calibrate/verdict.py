@@ -37,7 +37,7 @@ def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
     seen_um = float(np.ptp(sag_um))
     if max(spread_um, seen_um) < LEAST_SPREAD_UM:
         says = (
-            f"the sets are only {max(spread_um, seen_um):.0f} um apart: they tell no more than one of them; "
+            f"the sets are only {max(spread_um, seen_um):.0f} um apart: they add nothing to one of them; "
             f"at least {LEAST_SPREAD_UM / 1000:.0f} mm are needed, {GOOD_SPREAD_UM / 1000:.0f} mm are good"
         )
         return (CalibrationFinding(True, says),)

@@ -195,7 +195,7 @@ def look(stack: FrameStack, binned: Binned, excluded: Collection[int], estimate:
     seen = _middle([*swing] if third is None else [*swing, third])
     brightest = float(np.percentile(seen, 95))
     if not brightest > _LEAST_SWING_ADU:
-        raise NoFigureError(f"no fringes: they swing by {brightest:.2g} ADU where they swing most")
+        raise NoFigureError(f"no fringes: their largest swing is {brightest:.2g} ADU")
     mask = seen > CONTRAST_SHARE * brightest
     mask &= np.minimum(*swing) > FRINGE_SHARE * seen
     mask &= ~saturated
