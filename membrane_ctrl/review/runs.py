@@ -15,8 +15,7 @@ from membrane_ctrl.model import errors, events, plain_json, terminal
 from membrane_ctrl.model.run_events import Ended, Mark
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.export import export
-from membrane_ctrl.review.report.json import beside
-from membrane_ctrl.review.words import end_s, moment_s, not_in, number, one_line, part_s, span
+from membrane_ctrl.review.words import beside, end_s, moment_s, not_in, number, one_line, part_s, span
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_folder import add_mark
 

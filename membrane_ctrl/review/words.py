@@ -82,3 +82,14 @@ def not_in(run: Run, asked: str) -> InputError:
     """The error for a time outside a run."""
     went = f"{run.utc(0):%Y-%m-%d %H:%M} to {run.utc(end_s(run)):%Y-%m-%d %H:%M} UTC"
     return InputError(f"{asked}: not in the run, which lasted from {went}")
+
+
+# Every hold starts with some seconds that do not count; more means a ramping setpoint.
+_MOVING_LEAST_S = 60.0
+
+
+def beside(faults_s: float, paused_s: float, moving_s: float, whole_s: float) -> list[str]:
+    """What there was beside the hold, with its share of the whole time; NaN where that is not known."""
+    parts = (("faults", faults_s, 0.0), ("paused", paused_s, 0.0), ("moving or settling", moving_s, _MOVING_LEAST_S))
+    told = [(name, time_s) for name, time_s, least_s in parts if time_s > least_s]
+    return [f"{name} {span(time_s)} ({100 * time_s / max(whole_s, time_s):.3g} %)" for name, time_s in told]

@@ -196,7 +196,7 @@ def test_dask_is_not_installed(
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (SHORT + '[covariance]\nnames = ["a_mm"]\nmatrix = [[1.0, 2.0]]\n', "as many rows"),
+        (SHORT + '[covariance]\nnames = ["a_mm"]\nmatrix = [[1.0, 2.0]]\n', "needs 1 rows and columns"),
         (SHORT + '[covariance]\nnames = ["a_mm"]\nmatrix = [[-1.0]]\n', "variance is negative"),
         (SHORT + '[covariance]\nnames = ["a_m"]\nmatrix = [[1.0]]\n', "either of"),
         (SHORT + '[covariance]\nnames = ["camera_shift_x_mm"]\nmatrix = [[1.0]]\n', "a, b and alpha"),

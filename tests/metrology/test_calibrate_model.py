@@ -120,7 +120,7 @@ def test_sigmas_free_and_hold() -> None:
 
 def test_camera_over_the_screen_is_refused() -> None:
     optics = OPTICS.model_copy(update={"geometry": GeometryConfig(a_mm=2000.0, b_mm=2500.0, alpha_deg=90.0)})
-    with pytest.raises(ValueError, match="in one line"):
+    with pytest.raises(ValueError, match="in line with the vertex"):
         poses_at(Geometry.from_config(optics), np.zeros(len(NAMES)) + 0j)
 
 

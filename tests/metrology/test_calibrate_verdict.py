@@ -184,7 +184,7 @@ def test_the_monitor_waits_for_many_cycles_and_forgives_one() -> None:
     for _ in range(CYCLES):
         monitor.add(1.4, 0.6)
     assert monitor.says.startswith("calibrate again: the fit leaves 1.40 urad")
-    assert monitor.says.endswith("promises 1.00")
+    assert monitor.says.endswith("predicts 1.00")
 
 
 def test_the_monitor_tells_the_cameras_noise_from_the_film() -> None:

@@ -8,7 +8,7 @@ from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.states import State
 from membrane_ctrl.review.statistics import drift, shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
-from membrane_ctrl.review.words import span
+from membrane_ctrl.review.words import beside, span
 from membrane_ctrl.run_files.run_folder import LoggedEvent, logged
 
 Word = Literal["good", "look", "bad"]
@@ -17,8 +17,6 @@ Word = Literal["good", "look", "bad"]
 _GRAVE = {"fault", "band left", "never settled"}
 # Any laser misses single readings.
 _UNREAD_LEAST_S = 1.0
-# Every hold starts with some seconds that do not count; more means a ramping setpoint.
-_MOVING_LEAST_S = 60.0
 
 
 def verdict(analysis: Analysis) -> tuple[Word, str]:
@@ -44,13 +42,6 @@ def verdict(analysis: Analysis) -> tuple[Word, str]:
         f"±{run.config.limits.band_um:g} µm ({who}: {std}mean {seconds.mean_um:+.3f} µm)"
         f"{_what(names)}."
     )
-
-
-def beside(faults_s: float, paused_s: float, moving_s: float, whole_s: float) -> list[str]:
-    """What there was beside the hold, with its share of the whole time; NaN where that is not known."""
-    parts = (("faults", faults_s, 0.0), ("paused", paused_s, 0.0), ("moving or settling", moving_s, _MOVING_LEAST_S))
-    told = [(name, time_s) for name, time_s, least_s in parts if time_s > least_s]
-    return [f"{name} {span(time_s)} ({100 * time_s / max(whole_s, time_s):.3g} %)" for name, time_s in told]
 
 
 def _what(names: list[str]) -> str:
