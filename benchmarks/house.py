@@ -61,7 +61,9 @@ class HouseFigures:
 
 
 # A newcomer finds the room in a minute; a change that needs more has to argue here.
-LIMITS = HouseFigures(280, 50_000, 5.0, 3, 16, 9, 1)
+# Lines: the house stood at 49,860 of at most 50,000 when its rooms were in order; capabilities added since have 3,000
+# more. What outgrows that makes something superfluous first.
+LIMITS = HouseFigures(280, 53_000, 5.0, 3, 16, 9, 1)
 
 
 def import_nodes(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
