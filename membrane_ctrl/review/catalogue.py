@@ -24,7 +24,7 @@ class RunEntry:
     folder: Path
     started_utc: datetime
     duration_s: float  # up to the end of its tables if in progress or if its recorder was killed; NaN without tables
-    std_um: float  # of 1 s means of what was meant to be held: of the true centre on the twin, else of the reading
+    std_um: float  # of 1 s means of the settled hold: of the true centre on the twin, else of the reading
     in_band: float  # share of these within the band
     faults: int
     exit: str  # "done", "trip", ...; "open" without a summary

@@ -283,7 +283,7 @@ _BACK_WITHIN_S = 60.0
 class HoldParts:
     """Parts of a run's ticks, over blocks that come in their order.
 
-    `held` is what was meant to be held and is settled; `faults`: a safe level is in force; `paused`; `moving`: in
+    `held` is the settled hold; `faults`: a safe level is in force; `paused`; `moving`: in
     `hold`, the setpoint on its way, or not yet settled after that or after what let the mirror go.
     """
 

@@ -1,4 +1,4 @@
-"""The figures of a hold are those of what was meant to be held; the rest is told beside them, everywhere the same."""
+"""The figures of a hold are those of the settled hold; the rest is reported beside them, everywhere the same."""
 
 from __future__ import annotations
 

@@ -127,7 +127,7 @@ class HoldPass:
     start_s: float
     end_s: float
     hold_s: float  # time in `hold`
-    settled_s: float  # that of `summary.HoldParts`: what was meant to be held
+    settled_s: float  # the settled hold of `summary.HoldParts`
     faults_s: float
     paused_s: float
     moving_s: float  # the setpoint on its way, or not yet settled
