@@ -19,7 +19,13 @@ PriorOption = Annotated[
     list[Path] | None,
     typer.Option(metavar="FILE", help="Result of calibrate-camera or calibrate-pose; repeatable, the last one wins."),
 ]
-RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")]
+RunArgument = Annotated[
+    Path, typer.Argument(metavar="RUN", help="Run folder, its name or part of the name, or `last`.")
+]
+FromOption = Annotated[
+    str | None, typer.Option("--from", help="Start of the part: 03:12 (UTC), an ISO time, or +90m from the start.")
+]
+ToOption = Annotated[str | None, typer.Option("--to", help="End of the part, as --from.")]
 SetArgument = Annotated[Path, typer.Argument(metavar="SET", help="Folder with capture.toml and its images.")]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")]
 TrialsOption = Annotated[int, typer.Option(min=2, help="Monte Carlo trials.")]

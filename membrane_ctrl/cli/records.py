@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from membrane_ctrl.cli.options import JsonOption, RunArgument
-from membrane_ctrl.model import clock, errors
+from membrane_ctrl.cli.options import FromOption, JsonOption, RunArgument, ToOption
+from membrane_ctrl.model import errors
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -18,20 +18,21 @@ def add_commands(app: typer.Typer) -> None:
 
 def replay(
     run_dir: RunArgument,
-    start: Annotated[str | None, typer.Option("--from", help="Compare from this time of the run, e.g. 3m.")] = None,
-    end: Annotated[str | None, typer.Option("--to", help="Compare up to this time of the run.")] = None,
+    start: FromOption = None,
+    end: ToOption = None,
     to_test: Annotated[str | None, typer.Option(help="Write a regression test to tests/incidents/NAME.")] = None,
     json: JsonOption = False,
 ) -> int:
     """Replay a run's inputs through today's control code and report differences (exit 3)."""
-    import math
-
     from membrane_ctrl.replay.command import replay_command
+    from membrane_ctrl.review import catalogue, words
+    from membrane_ctrl.run_files.run import origin_of
+    from membrane_ctrl.run_files.run_folder import read_events
 
-    from_s = 0.0 if start is None else clock.parse_duration_s(start)
-    to_s = math.inf if end is None else clock.parse_duration_s(end)
     with _files_of_the_run():
-        return replay_command(run_dir, from_s, to_s, to_test, json)
+        folder = catalogue.resolve(run_dir)
+        from_s, to_s = words.part_s(origin_of(folder, read_events(folder, [])), start, end)
+        return replay_command(folder, max(0.0, from_s), to_s, to_test, json)
 
 
 def repair(
@@ -43,9 +44,10 @@ def repair(
 ) -> int:
     """Repair a run after a crash: torn segments, a torn event log, a missing summary."""
     from membrane_ctrl.replay.repair import repair_command
+    from membrane_ctrl.review import catalogue
 
     with _files_of_the_run():
-        return repair_command(run_dir, in_place, json)
+        return repair_command(catalogue.resolve(run_dir), in_place, json)
 
 
 @contextlib.contextmanager

@@ -5,16 +5,9 @@ from typing import Annotated
 
 import typer
 
-from membrane_ctrl.cli.options import JsonOption
+from membrane_ctrl.cli.options import FromOption, JsonOption, RunArgument, ToOption
 
-RunArgument = Annotated[
-    Path, typer.Argument(metavar="RUN", help="Run folder, its name or part of the name, or `last`.")
-]
 LogsOption = Annotated[Path, typer.Option("--logs", help="Folder of the runs.")]
-FromOption = Annotated[
-    str | None, typer.Option("--from", help="Start of the part: 03:12 (UTC), an ISO time, or +90m from the start.")
-]
-ToOption = Annotated[str | None, typer.Option("--to", help="End of the part.")]
 
 runs_app = typer.Typer(invoke_without_command=True, help="List, show and prune runs.")
 
@@ -84,19 +77,21 @@ def report(
 
 def export_run(
     run: RunArgument,
-    to: Annotated[str, typer.Option("--to", help="Format: parquet, csv or hdf5.")] = "parquet",
+    form: Annotated[str, typer.Option("--format", help="Format: parquet, csv or hdf5.")] = "parquet",
     out: Annotated[Path | None, typer.Option(help="Output folder; RUN/export by default.")] = None,
     streams: Annotated[
         list[str] | None,
         typer.Option("--streams", help="Stream to write: a path, a field, shapes or events; repeatable."),
     ] = None,
     start: FromOption = None,
-    end: Annotated[str | None, typer.Option("--until", help="End of the part.")] = None,
+    end: Annotated[
+        str | None, typer.Option("--to", "--until", help="End of the part, written as for --from.")
+    ] = None,
 ) -> int:
     """Export a run's columns for other programs."""
     from membrane_ctrl.review.runs import export_command
 
-    return export_command(run, to, out, streams or [], start, end)
+    return export_command(run, form, out, streams or [], start, end)
 
 
 @runs_app.callback()

@@ -9,6 +9,7 @@ import contextlib
 import gc
 import json
 import math
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -293,7 +294,7 @@ def _report(run_dir: Path, as_json: bool) -> None:
         print("summary.json is missing; the recorded data are readable", file=sys.stderr)
     print(f"run folder: {run_dir}", file=sys.stderr)
     if any(run_dir.glob("*.rrd")):
-        print(f"open it:    rerun {run_dir}/*.rrd", file=sys.stderr)
+        print(f"open it:    membrane-ctrl review {shlex.quote(str(run_dir))}", file=sys.stderr)
 
 
 def _headline(summary: dict[str, object]) -> Iterator[str]:

@@ -55,7 +55,7 @@ def export(
         Part of the run.
     """
     if to not in FORMATS:
-        raise errors.InputError(f"--to {to}: known: {', '.join(FORMATS)}")
+        raise errors.InputError(f"--format {to}: known: {', '.join(FORMATS)}")
     fields, extras = _selected(streams)
     refuse_originals(out)
     with errors.writing(out, errors.DeviceError):
@@ -154,7 +154,7 @@ def _hdf5(
     try:
         import h5py
     except ImportError:
-        raise errors.InputError(f"--to {to} needs h5py: pip install 'membrane-ctrl[sofast]'") from None
+        raise errors.InputError(f"--format {to} needs h5py: pip install 'membrane-ctrl[sofast]'") from None
     with h5py.File(path, "w") as file:
         file.attrs["run"] = run.name
         file.attrs["started_utc"] = run.origin_utc.isoformat()

@@ -14,7 +14,7 @@ from rich.table import Table
 from membrane_ctrl.model import errors, events, plain_json, terminal
 from membrane_ctrl.model.run_events import Ended, Mark
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.export import export
+from membrane_ctrl.review.export import FORMATS, export
 from membrane_ctrl.review.words import beside, end_s, moment_s, not_in, number, one_line, part_s, span
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_folder import add_mark
@@ -88,12 +88,14 @@ def mark_command(words: Sequence[str], at: str | None) -> int:
 
 
 def export_command(
-    run: Path, to: str, out: Path | None, streams: list[str], start: str | None, end: str | None
+    run: Path, form: str, out: Path | None, streams: list[str], start: str | None, end: str | None
 ) -> int:
     """Write a run for other programs and report where."""
+    if end in FORMATS:
+        raise errors.InputError(f"--to {end}: --to is the end of the part; write --format {end}")
     opened = open_run(catalogue.resolve(run))
     folder = out.resolve() if out else opened.folder / "export"
-    files = export(opened, to, folder, streams, *part_s(opened, start, end))
+    files = export(opened, form, folder, streams, *part_s(opened.origin_utc, start, end))
     for note in opened.notes:
         print(f"note: {note}")
     for path in files:

@@ -1,5 +1,6 @@
 """Times and numbers as people read and write them."""
 
+import contextlib
 import math
 import re
 from datetime import datetime, timedelta
@@ -38,12 +39,12 @@ def one_line(text: str) -> str:
 def moment_s(text: str, origin_utc: datetime) -> float:
     """Seconds of the run for a written time: `03:12[:30]` (UTC), ISO 8601, or `+90s`, `+1h5m` from its start.
 
-    A time of day means its first occurrence after the start of the run.
+    A time of day means its first occurrence after the start of the run. The plus sign may be omitted.
 
     Raises InputError if it is none of these.
     """
     text = text.strip()
-    if re.fullmatch(r"\+ *0+[dhms]?", text):  # the start, which is not a valid duration
+    if re.fullmatch(r"\+? *0+[dhms]?", text):  # the start, which is not a valid duration
         return 0.0
     if text.startswith("+"):
         return parse_duration_s(text[1:])
@@ -59,16 +60,18 @@ def moment_s(text: str, origin_utc: datetime) -> float:
             moment = datetime.fromisoformat(text)
             moment = moment if moment.tzinfo else moment.replace(tzinfo=origin_utc.tzinfo)
     except ValueError:
+        with contextlib.suppress(InputError):
+            return parse_duration_s(text)
         raise InputError(f"time {text!r}: write 03:12, 2026-11-21T03:12:00 or +90m from the start (UTC)") from None
     return (moment - origin_utc).total_seconds()
 
 
-def part_s(run: Run, start: str | None, end: str | None) -> tuple[float, float]:
+def part_s(origin_utc: datetime, start: str | None, end: str | None) -> tuple[float, float]:
     """The part of a run between two written times; None: unlimited. Raises InputError."""
-    start_s = -math.inf if start is None else moment_s(start, run.origin_utc)
-    until_s = math.inf if end is None else moment_s(end, run.origin_utc)
+    start_s = -math.inf if start is None else moment_s(start, origin_utc)
+    until_s = math.inf if end is None else moment_s(end, origin_utc)
     if not start_s < until_s:
-        raise InputError(f"--from {start} is not before {end}")
+        raise InputError(f"--from {start} is not before --to {end}")
     return start_s, until_s
 
 

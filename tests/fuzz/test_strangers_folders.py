@@ -98,7 +98,7 @@ def rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
         (("repair",), (".probe", ".summary.json.part", "repaired/night-000.rrd", "repaired/.night-000.rrd.part")),
         (("repair", "--in-place"), (".night-000.rrd.part", "events.jsonl.torn")),
         (("report",), ("report/report.html", "report/.report.json.part")),
-        (("export", "--to", "csv"), ("export/ticks.csv", "export/events.jsonl")),
+        (("export", "--format", "csv"), ("export/ticks.csv", "export/events.jsonl")),
     ],
 )
 def test_a_planted_link_takes_no_file_of_the_user(
@@ -560,7 +560,7 @@ def _closed(read: Callable[..., Any]) -> Callable[..., Any]:
 def test_half_a_pair_of_a_letter_is_written_all_the_same(folder: Path, capsys: Said) -> None:
     with (folder / "annotations.jsonl").open("a") as file:
         file.write('{"kind": "mark", "mono_s": 1, "text": "\\ud800"}\n')
-    for words in (("report",), ("runs", "show"), ("export", "--to", "csv")):
+    for words in (("report",), ("runs", "show"), ("export", "--format", "csv")):
         assert (
             run(
                 [*words[:1], *words[1:2], str(folder), *words[2:]]

@@ -32,4 +32,4 @@ def test_a_folder_begun_anew_says_from_when(tmp_path: Path, capsys: pytest.Captu
 def test_only_a_recording_that_is_there_is_offered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "open it" not in words(tmp_path, capsys)
     (tmp_path / "hold-000.rrd").touch()
-    assert f"open it:    rerun {tmp_path}/*.rrd" in words(tmp_path, capsys)
+    assert f"open it:    membrane-ctrl review {tmp_path}" in words(tmp_path, capsys)

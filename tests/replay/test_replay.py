@@ -149,6 +149,17 @@ def test_only_what_is_asked_for_is_compared(
     assert run(["replay", str(record), "--to", "17s", "--json"]) == Exit.DONE
 
 
+def test_run_and_part_are_named_as_for_a_review(
+    record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(record, tmp_path / "here" / "logs" / "20261121T180000Z-night")
+    monkeypatch.chdir(tmp_path / "here")
+    assert run(["replay", "last", "--from", "+13s", "--to", "16s", "--json"]) == Exit.DONE
+    assert report_of(capsys)["compared"] == 151
+    assert run(["replay", "night", "--from", "+16s", "--to", "13s"]) == Exit.BAD_INPUT
+    assert run(["repair", "last", "--json"]) == Exit.DONE
+
+
 def test_missing_ticks_are_a_gap_and_nothing_is_claimed_behind_it(
     record: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = written(tmp_path_factory.mktemp("export"), 0.4, [Planted("pressure step", 700.0, 15.0)])
     with undrawn_figures():
         assert command(["report", str(run)]) == 0
-    assert command(["export", str(run), "--to", "parquet"]) == 0
+    assert command(["export", str(run), "--format", "parquet"]) == 0
     return run
 
 

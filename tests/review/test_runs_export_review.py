@@ -143,6 +143,16 @@ def test_export_of_some_streams_and_a_part(tmp_path: Path) -> None:
         export(run, "csv", tmp_path / "file")
 
 
+def test_the_end_of_an_exported_part_is_given_as_everywhere(tmp_path: Path, capsys: Capsys) -> None:
+    folder, out = written(tmp_path, 0.03), tmp_path / "o"
+    for option in ("--to", "--until"):  # its name in earlier versions
+        part = ["--from", "+10s", option, "+20s", "--streams", "/loop/error"]
+        assert command(["export", str(folder), "--out", str(out), *part]) == 0
+        assert pyarrow.parquet.read_table(out / "ticks.parquet").num_rows == 100
+    assert command(["export", str(folder), "--to", "csv"]) == 2
+    assert "write --format csv" in capsys.readouterr().err
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_a_mark_made_later_is_an_event_and_touches_nothing_else(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.05)
@@ -158,6 +168,7 @@ def test_a_mark_made_later_is_an_event_and_touches_nothing_else(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("text", "seconds"),
     [("18:01", 30.0), ("18:00:45", 15.0), ("03:12", 33_090.0), ("+1h5m", 3900.0), ("+0s", 0.0),
+     ("90", 90.0), ("2h30m", 9000.0), ("0s", 0.0),
      ("2026-11-21T18:01:30", 60.0), ("2026-11-21T19:01:30+01:00", 60.0)],
 )  # fmt: skip
 def test_moments(text: str, seconds: float) -> None:

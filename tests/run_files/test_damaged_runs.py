@@ -115,7 +115,7 @@ def test_report_and_export_show_the_rest(sound: Path, tmp_path: Path, capsys: py
     assert np.array_equal(open_run(folder).level(10.0)["rows"], whole["rows"])
     assert cli(["report", str(folder), "--out", str(tmp_path / "report")]) == 0
     pages = [(tmp_path / "report" / page).read_text() for page in ("report.html", "report.json")]
-    assert cli(["export", str(folder), "--to", "parquet", "--out", str(tmp_path / "export")]) == 0
+    assert cli(["export", str(folder), "--format", "parquet", "--out", str(tmp_path / "export")]) == 0
     assert "events.jsonl" in capsys.readouterr().out
     for name in ("levels_10s-000.arrows", "levels_1s-000.arrows", "events.jsonl"):
         assert all(name in page for page in pages)
@@ -241,7 +241,7 @@ def test_an_empty_export_is_refused(sound: Path, tmp_path: Path, capsys: pytest.
     folder = shutil.copytree(sound, tmp_path / sound.name)
     shutil.rmtree(folder / "columns")
     (folder / "night-000.rrd").unlink()
-    arguments = ["export", str(folder), "--to", "csv", "--out", str(tmp_path / "export")]
+    arguments = ["export", str(folder), "--format", "csv", "--out", str(tmp_path / "export")]
     assert cli(arguments) == 0
     assert "no telemetry" in capsys.readouterr().out
     assert cli([*arguments, "--streams", "error_um"]) == 2

@@ -25,7 +25,7 @@ def test_nothing_is_exported_over_a_run(tmp_path: Path, capsys: Capsys, inside: 
     folder, other = written(tmp_path / "a", 0.01), written(tmp_path / "b", 0.01)
     before = contents(tmp_path)
     for target in (folder / inside, other / inside):
-        assert command(["export", str(folder), "--to", "csv", "--streams", "events", "--out", str(target)]) == 2
+        assert command(["export", str(folder), "--format", "csv", "--streams", "events", "--out", str(target)]) == 2
         assert "choose another folder" in capsys.readouterr().err
     assert contents(tmp_path) == before
 
@@ -35,7 +35,7 @@ def test_an_export_that_fails_leaves_the_one_before(tmp_path: Path, to: str) -> 
     folder, out = written(tmp_path, 0.01), tmp_path / "out"
     export(open_run(folder), to, out)
     before = contents(out)
-    assert command(["export", str(folder), "--to", to, "--out", str(out), "--from", "+9h"]) == 2
+    assert command(["export", str(folder), "--format", to, "--out", str(out), "--from", "+9h"]) == 2
     assert contents(out) == before
     assert not list(out.glob(".*"))
 

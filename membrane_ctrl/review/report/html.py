@@ -263,7 +263,7 @@ def report_command(
     """Write `report.html` and `report.json`; see `membrane-ctrl report --help`."""
     began_s = time.monotonic()
     opened = open_run(catalogue.resolve(run))
-    analysis = analyse(opened, *part_s(opened, start, end))
+    analysis = analyse(opened, *part_s(opened.origin_utc, start, end))
     other = None if compare_with is None else _other(open_run(catalogue.resolve(compare_with)), start, end)
     differences = [] if other is None else compare.compare(analysis, other)
     table = report_table(analysis)
@@ -291,7 +291,7 @@ def report_command(
 def _other(run: Run, start: str | None, end: str | None) -> Analysis:
     """The run to compare with: the same part if counted from the start, else all, as times of day differ."""
     from_start = all(text is None or text.strip().startswith("+") for text in (start, end))
-    return analyse(run, *part_s(run, start, end)) if from_start else analyse(run)
+    return analyse(run, *part_s(run.origin_utc, start, end)) if from_start else analyse(run)
 
 
 def _say(analysis: Analysis, other: Analysis | None, folder: Path, took_s: float) -> None:

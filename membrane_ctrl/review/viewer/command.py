@@ -155,7 +155,7 @@ def _with_telemetry(runs: Sequence[Run]) -> list[Run]:
 def _span(run: Run, options: ReviewOptions) -> tuple[float, float] | None:
     """The requested part of the run, in seconds."""
     if options.start is not None or options.end is not None:
-        start_s, end_s = words.part_s(run, options.start, options.end)
+        start_s, end_s = words.part_s(run.origin_utc, options.start, options.end)
         if start_s >= words.end_s(run):
             raise words.not_in(run, f"--from {options.start}")
         if end_s <= 0:
