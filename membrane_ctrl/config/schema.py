@@ -94,6 +94,8 @@ class StatesConfig(Section):
     actuator_test: bool = True  # pump up, pump off, vent, before a hold: does the film answer?
     inflate_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 14_400.0  # a fill from flat takes two hours
     inflate_pause_um: Annotated[float, Field(gt=0, le=1e4)] = 10.0  # the ramp waits if the centre lags further
+    # a pump of 1.2 times the leak lifts the mirror by its band in 40 s; one that lifts it no more is dead or too weak
+    inflate_stall_s: Annotated[float, Field(gt=0, le=1e6)] = 300.0
     settle_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.5  # within the band before `hold` begins
     settle_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 600.0
     # 10 s of laser loss cost 1.6 um on average (docs/physics.md); longer is not a glitch

@@ -75,6 +75,16 @@ class InnerLoop:
         """The mean flow, which `stale` puts out."""
         return self._pid.integral_um_per_s
 
+    @property
+    def ramp_um(self) -> float:
+        """Where the setpoint's ramp stands, without the trim; NaN before the first step."""
+        return self._ramp.value_um
+
+    @property
+    def lag_um(self) -> float:
+        """Present setpoint minus the last filtered reading; NaN before the first reading."""
+        return self._setpoint_um - self._measured.value
+
     def start(self, displacement_um: float, flow_um_per_s: float) -> None:
         """Start at a reading: the setpoint ramps from there, the integrator stands at the flow.
 

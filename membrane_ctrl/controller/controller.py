@@ -321,7 +321,7 @@ class Controller:
         scene.manual_wanted = scene.paused = False  # they end with their hold
         self.state = state
         self._state_since_s = math.nan
-        scene.good_since_s = scene.last_good_s = math.nan
+        scene.good_since_s = scene.last_good_s = scene.highest_um = scene.highest_s = math.nan
         scene.overdue = scene.unfit = ""
         scene.test = None
 

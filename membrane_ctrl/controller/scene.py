@@ -65,6 +65,8 @@ class Scene:
     # memory of the states
     good_since_s: float = math.nan
     last_good_s: float = math.nan  # in `check`
+    highest_um: float = math.nan  # filtered reading, in `inflate`
+    highest_s: float = math.nan  # when the mirror was last rising
     sinking: filters.Slope = field(default_factory=filters.Slope)  # of the mirror with the pump off, in `check`
     test: pump_obeys.ActuatorTest | None = None
     ramp_from_fraction: float = 0.0

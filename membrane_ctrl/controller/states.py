@@ -57,16 +57,22 @@ def check(scene: Scene) -> State:
 
 def inflate(scene: Scene) -> State:
     """Ramp from where the mirror is to the setpoint; the ramp waits for a mirror that lags behind."""
-    lags = scene.output is not None and abs(scene.output.error_um) > scene.config.states.inflate_pause_um
-    target_um = scene.output.setpoint_um - scene.trim_um if scene.output is not None and lags else scene.setpoint_um
-    output = _drive(scene, target_um)
+    states = scene.config.states
+    lag = abs(scene.loop.lag_um) / states.inflate_pause_um
+    output = _drive(scene, scene.loop.ramp_um if lag > 1.0 else scene.setpoint_um)
     to_go_um = scene.setpoint_um - output.filtered_um
     to_go = f"{to_go_um:.1f} um to go" if math.isfinite(to_go_um) else "no laser reading"
-    scene.why = f"inflating: {to_go}" + (", the ramp waits for the mirror" if lags else "")
+    # a waiting ramp starts and stops at the limit, several times a second: the words must not
+    scene.why = f"inflating: {to_go}" + (", the ramp waits for the mirror" if lag > 0.8 else "")
     ramp_left_um = scene.setpoint_um + scene.trim_um - output.setpoint_um
     if abs(ramp_left_um) < scene.config.limits.band_um and abs(to_go_um) < scene.config.limits.band_um:
         return State.SETTLE
-    if scene.state_age_s > scene.config.states.inflate_timeout_s:
+    rises = not output.filtered_um <= scene.highest_um + scene.config.limits.band_um
+    if math.isfinite(to_go_um) and (rises or to_go_um <= 0.0):  # from above the leak lowers it, however slowly
+        scene.highest_um, scene.highest_s = output.filtered_um, scene.now_s
+    if scene.now_s - scene.highest_s > states.inflate_stall_s:
+        scene.overdue = f"no rise in {states.inflate_stall_s:g} s, {to_go_um:.0f} um below the setpoint"
+    elif scene.state_age_s > states.inflate_timeout_s:
         scene.overdue = f"still {to_go_um:.0f} um from the setpoint"
     return State.INFLATE
 

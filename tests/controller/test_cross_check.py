@@ -85,6 +85,7 @@ FIELDS: list[tuple[str, Any, Any]] = [
     ("states.check_timeout_s", 3.0, 5.0),
     ("states.settle_timeout_s", 1.5, 2.0),
     ("states.lower_timeout_s", 0.5, 0.6),
+    ("states.inflate_stall_s", 1.0, 1.3),
     ("states.vented_pressure_pa", 400.0, 370.0),
     ("states.vented_pressure_pa", 0.0, 1.0),
     ("pump.stall_fraction", 0.05, 0.1),

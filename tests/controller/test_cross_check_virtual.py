@@ -45,6 +45,8 @@ FACTORS: dict[str, tuple[float, ...]] = {
     "states.check_timeout_s": (0.1, 0.5, 4.0),
     "states.settle_timeout_s": (0.002, 0.2),
     "states.lower_timeout_s": (0.05, 0.5, 10.0),
+    "states.inflate_pause_um": (0.05, 0.3, 3.0),
+    "states.inflate_stall_s": (0.005, 0.02),
     "states.vented_pressure_pa": (0.0, 0.5, 4.0),
     "shape.trim_max_um": (0.1, 3.0, 8.0),
 }

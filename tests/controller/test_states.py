@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from membrane_ctrl.model.errors import Exit
@@ -19,6 +20,15 @@ def played(*at: dict[str, Any], duration_s: float = 60.0, **config: Any) -> Outc
             {"title": "states", "duration_s": duration_s, "config": config, "at": at, "expect": {}}
         )
     )
+
+
+# 150 um to inflate, and a ramp that waits
+_FAR_BELOW: dict[str, Any] = {
+    "duration_s": 200.0,
+    "twin": {"start_error_um": -150.0, "scenario": "calm"},
+    "states": {"inflate_pause_um": 5.0, "inflate_stall_s": 60.0},
+    "limits": {"displacement_min_um": -400.0},
+}
 
 
 def changes(outcome: Outcome, state: str) -> list[float]:
@@ -354,3 +364,33 @@ def test_an_acknowledgement_acknowledges_no_fault_to_come(again: tuple[dict[str,
     )
     assert len(changes(outcome, "fault")) == 2
     assert len(changes(outcome, "standby")) == 1
+
+
+def test_the_ramp_waits_for_a_mirror_that_lags() -> None:
+    """A pump of 65 % lifts the mirror more slowly than the ramp; the setpoint stays within reach of the mirror."""
+    outcome = played({"time_s": 0.0, "wrong": "pump_share", "value": 0.65}, **_FAR_BELOW)
+    inflating = [tick.row for tick in outcome.ticks if tick.row.state == State.INFLATE]
+    assert np.nanmax([row.error_um for row in inflating]) == pytest.approx(5.0, abs=1.0)
+    assert any("the ramp waits" in event["why"] for event in outcome.of("why"))
+    assert changes(outcome, "hold")
+
+
+def test_a_mirror_that_keeps_up_needs_no_wait() -> None:
+    outcome = played(**_FAR_BELOW)
+    assert not any("the ramp waits" in event["why"] for event in outcome.of("why"))
+    assert changes(outcome, "hold")
+
+
+@pytest.mark.parametrize("pump_share", [0.0, 0.3])  # dead, and too weak for the leak
+def test_a_mirror_that_the_pump_does_not_lift_is_given_up(pump_share: float) -> None:
+    outcome = played({"time_s": 15.0, "wrong": "pump_share", "value": pump_share}, **_FAR_BELOW)
+    (told,) = outcome.of("fault")
+    assert told["name"] == "overdue"
+    assert "no rise in 60 s" in told["seen"]
+    assert told["mono_s"] == pytest.approx(15.0 + 60.0, abs=10.0)
+
+
+def test_a_mirror_above_its_setpoint_may_sink_as_slowly_as_it_leaks() -> None:
+    outcome = played(duration_s=200.0, twin={"start_error_um": 150.0}, states={"inflate_stall_s": 20.0})
+    assert not outcome.of("fault")
+    assert changes(outcome, "hold")[0] > 60.0
