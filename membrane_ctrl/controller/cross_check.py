@@ -163,7 +163,10 @@ def _states(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     why = f"too short: inflating from limits.displacement_min_um takes at least {way_s:.0f} s"
     say.warn(states.inflate_timeout_s < way_s, "states.inflate_timeout_s", why, "lengthen it")
     rise_s = 2.0 * limits.band_um / speed_um_per_s
-    why, least = f"too short: a sound mirror takes {rise_s:.0f} s to rise by two bands", f"set at least {rise_s:.0f} s"
+    why, least = (
+        f"too short: a sound mirror takes {rise_s:.0f} s to rise by two bands",
+        f"set at least {rise_s:.0f} s",
+    )
     say.error(states.inflate_stall_s < rise_s, "states.inflate_stall_s", why, least)
     vented, pressure_pa = "states.vented_pressure_pa", states.vented_pressure_pa
     less = "set less than half of limits.gauge_pressure_max_pa"
