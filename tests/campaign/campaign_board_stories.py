@@ -17,7 +17,7 @@ from membrane_ctrl.sim.virtual_bench import VirtualBench, at_once
 
 
 def counters_wrap() -> list[str]:
-    """Heartbeat and sample counter wrap in a hold, and nothing happens."""
+    """Heartbeat and sample counter wrap in a hold: nothing happens."""
     stage = OldBoard().held()
     stage.wait(40.0, lambda: "" if stage.state == State.HOLD else "the hold was lost")
     stage.near()
@@ -25,7 +25,7 @@ def counters_wrap() -> list[str]:
 
 
 def a_gateway_repeats_the_last_write() -> list[str]:
-    """The controller has died; what a gateway repeats, and what others read, does not feed the watchdog."""
+    """The controller dies: neither a gateway's repetitions nor the reads of others feed the watchdog."""
     stage = Stage()
     board, command = stage.bench.board, default_map().block("command")
     written: list[list[int]] = []
@@ -54,7 +54,7 @@ def a_gateway_repeats_the_last_write() -> list[str]:
 
 
 def others_disarm_the_watchdog() -> list[str]:
-    """Somebody writes `watchdog_arm` 0 while the pump runs, in every way there is; then the controller dies."""
+    """Another program writes `watchdog_arm` 0 in every possible way while the pump runs; then the controller dies."""
     stage = Stage().held()
     settings = default_map().block("settings")
     arm = default_map().register("watchdog_arm")
@@ -71,7 +71,7 @@ def others_disarm_the_watchdog() -> list[str]:
 
 
 def a_stranger_writes_the_command() -> list[str]:
-    """Who has no claim writes full pump, over and over, beside a hold: nothing of it arrives."""
+    """A program without a claim writes full pump again and again during a hold: none of it reaches the pump."""
     stage = Stage().held()
     command = default_map().block("command")
     values = dict.fromkeys((register.name for register in command.registers), 0.0) | {"pump_command_fraction": 1.0}
@@ -86,7 +86,7 @@ def a_stranger_writes_the_command() -> list[str]:
 
 
 def a_board_that_takes_no_settings() -> list[str]:
-    """Watchdog period and arming do not arrive: nobody holds a mirror with such a board."""
+    """The board ignores watchdog period and arming: no hold starts with such a board."""
     stage = Stage()
     bench = VirtualBench(WatchedPlant(stage.world, stage.config.twin, stage.config.pump), WATCHDOG_S)
     settings, write = default_map().block("settings"), bench.board.write
@@ -103,7 +103,7 @@ def a_board_that_takes_no_settings() -> list[str]:
 
 
 def faults_are_cleared_and_the_pump_stands() -> list[str]:
-    """Faults of the board are cleared while nobody commands: the pump stands until somebody does."""
+    """The board's faults are cleared while nobody commands: the pump stays off until somebody does."""
     stage = Stage().held()
     stage.bench.wrong.stalled = True
     stage.wait(2.0)
@@ -117,7 +117,7 @@ def faults_are_cleared_and_the_pump_stands() -> list[str]:
 
 
 def a_latched_board_keeps_the_pump_off() -> list[str]:
-    """Whatever is commanded: a board that has latched over-pressure gives the pump nothing, and vents."""
+    """A board that has latched over-pressure keeps the pump off and vents, whatever is commanded."""
     stage = Stage()
     stage.bench.wrong.gauge_offset_pa = 300.0
     stage.wait(1.0)
@@ -131,7 +131,7 @@ def a_latched_board_keeps_the_pump_off() -> list[str]:
 
 
 def another_program_opens_the_board_of_a_hold() -> list[str]:
-    """It is refused, and the watchdog of the hold stays what it was: the hold dies, and its pump stands."""
+    """It is refused, and the hold's watchdog stays as it was: when the hold dies, its pump stops."""
     stage = Stage().held()
     other = another_client(stage, 10.0)
     refused = False
@@ -148,7 +148,7 @@ def another_program_opens_the_board_of_a_hold() -> list[str]:
 
 
 def another_program_takes_the_board_of_a_dead_hold() -> list[str]:
-    """A hold is stopped for a second, and another program takes its board: the hold that wakes moves no gas."""
+    """A hold is stopped for a second, and another program takes its board: the resumed hold moves no gas."""
     stage = Stage().held()
     stage.bench.wrong.stalled = True
     stage.wait(1.0)
@@ -167,7 +167,7 @@ def another_program_takes_the_board_of_a_dead_hold() -> list[str]:
 
 
 def anybody_may_stop_the_pump() -> list[str]:
-    """`safe`, beside a hold that may resume everything: the pump stands until a person says otherwise."""
+    """`safe` beside a hold that may resume every fault: the pump stays off until a person clears it."""
     for resumes in (False, True):
         stage = Stage(resumes=resumes).held()
         other = another_client(stage)
@@ -182,7 +182,7 @@ def anybody_may_stop_the_pump() -> list[str]:
 
 
 def over_pressure_while_the_network_is_cut(resumes: bool = True) -> list[str]:
-    """The board vents while nobody can ask it; nobody but a person may inflate again."""
+    """The board vents while it cannot be reached: only a person may inflate again."""
     stage = Stage(resumes=resumes).held()
     stage.bench.wrong.unreachable = True
     stage.wait(1.0)
@@ -197,7 +197,7 @@ def over_pressure_while_the_network_is_cut(resumes: bool = True) -> list[str]:
 
 
 def hold_is_asked_of_a_latched_board() -> list[str]:
-    """A board that has latched over-pressure is not inflated, however often a hold is asked for."""
+    """A mirror whose board has latched over-pressure is not inflated, however often `hold` is sent."""
     stage = Stage()
     stage.bench.wrong.gauge_offset_pa = 300.0
     stage.tick()
@@ -209,7 +209,7 @@ def hold_is_asked_of_a_latched_board() -> list[str]:
 
 
 def what_is_read_is_true() -> list[str]:
-    """The driver's numbers are the plant's."""
+    """The driver reports the plant's values."""
     stage = Stage().held()
     for _ in range(20):
         stage.bench.advance(TICK_S)
@@ -229,7 +229,7 @@ def what_is_read_is_true() -> list[str]:
 
 
 def the_board_alone_keeps_its_limit() -> list[str]:
-    """A controller that writes full pump for ever: the board stops it at its own limit and vents."""
+    """A controller writes full pump for ever: the board stops the pump at its own limit and vents."""
     stage = Stage()
     for _ in range(round(1500.0 / TICK_S)):
         stage.bench.advance(TICK_S)

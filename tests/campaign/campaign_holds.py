@@ -38,7 +38,7 @@ from tests.support.virtual_time import run_virtual as in_virtual_time
 
 
 async def the_program_ends_in_a_hold() -> list[str]:
-    """The program ends by whatever way: the last write is pump 0, at once and not by the watchdog."""
+    """However the program ends, the last write is pump 0, at once and not by the watchdog."""
     violations = []
     for way in ("cancelled", "a driver raises"):
         async with a_hold(on_board) as rig:
@@ -58,7 +58,7 @@ def _raise(outputs: TickOutputs) -> None:
 
 
 async def cancelled_while_it_vents() -> list[str]:
-    """The end of the program does not shut the vent of a mirror that is being vented."""
+    """Ending the program does not shut the vent of a mirror that is being vented."""
     async with a_hold(on_board) as rig:
         board_of(rig).virtual.wrong.gauge_offset_pa = 60.0
         await rig.until(State.FAULT)
@@ -70,7 +70,7 @@ async def cancelled_while_it_vents() -> list[str]:
 
 
 async def a_guard_ends() -> list[str]:
-    """A guard of the bench, or whoever listens to the ticks, has come to an end: the pump stands."""
+    """A guard of the bench, or a listener to the ticks, ends: the pump stops."""
     violations = []
     for what in ("guard", "listener"):
         async with a_hold(on_board) as rig:
@@ -84,7 +84,7 @@ async def a_guard_ends() -> list[str]:
 
 
 async def a_slow_board() -> list[str]:
-    """Every answer takes 0.2 s: no control loop, the pump ramps down; one answer of 0.4 s makes no burst of ticks."""
+    """Answers take 0.2 s: the loop cannot run, the pump ramps down; one of 0.4 s causes no burst of ticks."""
     async with a_hold(on_board) as rig:
         board_of(rig).slow_s = 0.4
         await asyncio.sleep(0.4)
@@ -103,7 +103,7 @@ async def a_slow_board() -> list[str]:
 
 
 async def a_board_that_latched_stays_latched() -> list[str]:
-    """Nobody has acknowledged: the board's over-pressure stays latched whatever the supervisor does."""
+    """Without an acknowledgement the board's over-pressure stays latched, whatever the supervisor does."""
     async with a_hold(on_board) as rig:
         board_of(rig).virtual.wrong.gauge_offset_pa = 300.0
         await rig.wait(1.0)
@@ -115,7 +115,7 @@ async def a_board_that_latched_stays_latched() -> list[str]:
 
 
 async def the_network_comes_back() -> list[str]:
-    """A cut network: the fault comes, the link is opened again, and the next hold works."""
+    """The network is cut: the fault trips, the link reopens, and the next hold works."""
     async with a_hold(on_board) as rig:
         wrong = board_of(rig).virtual.wrong
         wrong.unreachable = True
@@ -133,7 +133,7 @@ async def the_network_comes_back() -> list[str]:
 
 
 async def faults_that_outlive_the_run() -> list[str]:
-    """A trip is in the file, what cannot be read is a fault, a refused acknowledgement clears nothing."""
+    """A trip is in the file; an unreadable file is a fault; a refused acknowledgement clears nothing."""
     from membrane_ctrl.hold.start import HoldOptions, _latched
 
     with tempfile.TemporaryDirectory() as folder:
@@ -231,7 +231,7 @@ async def _both(story: Callable[[HoldRig, Instruments], Awaitable[None]]) -> lis
 
 
 async def instruments_hold_a_mirror() -> list[str]:
-    """What is commanded arrives, what is measured is told, and the mirror is held."""
+    """Commands arrive, measurements are reported, and the mirror is held."""
 
     async def story(rig: HoldRig, lab: Instruments) -> None:
         await rig.wait(10.0)
@@ -252,7 +252,7 @@ async def instruments_hold_a_mirror() -> list[str]:
 
 
 async def over_pressure_of_instruments() -> list[str]:
-    """Too much pressure: the pump stands and the vent is open."""
+    """Too much pressure: the pump stops and the vent opens."""
 
     async def story(rig: HoldRig, lab: Instruments) -> None:
         lab.offset_pa = 60.0
@@ -264,7 +264,7 @@ async def over_pressure_of_instruments() -> list[str]:
 
 
 async def a_gauge_out_of_its_range() -> list[str]:
-    """A gauge that shows what it cannot show is no gauge."""
+    """A gauge that shows a value outside its range has no value."""
 
     async def story(rig: HoldRig, lab: Instruments) -> None:
         lab.offset_pa = -900.0
@@ -275,7 +275,7 @@ async def a_gauge_out_of_its_range() -> list[str]:
 
 
 async def a_laser_is_unplugged() -> list[str]:
-    """The mean flow is held for its time, and then the pump stands."""
+    """The mean flow is held for its time, then the pump stops."""
 
     async def story(rig: HoldRig, lab: Instruments) -> None:
         lab.laser.plugged = False
@@ -289,7 +289,7 @@ async def a_laser_is_unplugged() -> list[str]:
 
 
 async def the_supervisor_hangs() -> list[str]:
-    """No tick any more: the software watchdog stops the pump, and nobody starts it again but a person."""
+    """Ticks cease: the software watchdog stops the pump, and only a person starts it again."""
 
     async def story(rig: HoldRig, lab: Instruments) -> None:
         hung = asyncio.Event()
@@ -312,7 +312,7 @@ async def the_supervisor_hangs() -> list[str]:
 
 
 async def the_software_watchdog_ends() -> list[str]:
-    """The software watchdog itself comes to an end: the pump stands."""
+    """The software watchdog itself ends: the pump stops."""
 
     async def story(rig: HoldRig, lab: Instruments) -> None:
         next(task for task in asyncio.all_tasks() if task.get_name() == "software watchdog").cancel()
@@ -324,7 +324,7 @@ async def the_software_watchdog_ends() -> list[str]:
 
 
 async def a_pump_that_gives_no_answer() -> list[str]:
-    """The pump's line is dead: a fault, and 0 as soon as it lives."""
+    """The pump's line is dead: a fault, and pump 0 as soon as it is back."""
 
     async def story(rig: HoldRig, lab: Instruments) -> None:
         lab.pump.lose = 10**9
@@ -338,7 +338,7 @@ async def a_pump_that_gives_no_answer() -> list[str]:
 
 
 async def a_pump_that_hears_nothing() -> list[str]:
-    """The pump is read well, and takes no command any more: a fault at once, not at the next stop."""
+    """The pump answers reads but takes no command: a fault at once, not at the next stop."""
 
     async def story(rig: HoldRig, lab: Instruments) -> None:
         lab.pump.deaf = True
@@ -352,7 +352,7 @@ async def a_pump_that_hears_nothing() -> list[str]:
 
 
 async def the_pump_does_not_hear_the_last_write() -> list[str]:
-    """The last write is lost: closing the bench puts the pump to rest."""
+    """The last write is lost: closing the bench stops the pump."""
 
     async def story(rig: HoldRig, lab: Instruments) -> None:
         await asyncio.sleep(0.37 * TICK_S)
@@ -367,7 +367,7 @@ async def the_pump_does_not_hear_the_last_write() -> list[str]:
 
 
 async def another_instrument_in_its_place() -> list[str]:
-    """A gauge is unplugged and another one plugged in: it is not believed."""
+    """A gauge is unplugged and another one plugged in: the new one is not used."""
     async with instruments(True) as (rig, lab):
         other = Instrument("DEPC", "M9", 10.0, "mbar(g)", lambda: 1.0)
         lab.gauge.plugged = False
@@ -381,7 +381,7 @@ async def another_instrument_in_its_place() -> list[str]:
 
 
 async def a_lab_with_another_serial_number() -> list[str]:
-    """The configuration names an instrument, and another one answers."""
+    """The configuration names one instrument, and another one answers."""
     answers = Instrument("DMFC", "M7", 360.0, "mln/min")
     port = ModbusParameters(TableLink("p", BronkhorstRegisters(answers)))
     try:

@@ -15,7 +15,7 @@ from membrane_ctrl.model.states import State
 
 
 def a_clock_that_stands() -> list[str]:
-    """Samples are counted, but of one moment: they are not new."""
+    """The sample counter advances, but the sample time does not: the samples are not new."""
     stage = Stage().held()
     at_s = stage.plant.time_s
     sensors_say(stage, lambda sample: replace(sample, device_time_s=at_s))
@@ -31,7 +31,7 @@ def a_clock_that_stands() -> list[str]:
 
 
 def a_laser_that_doubts_itself() -> list[str]:
-    """The laser's quality says that its reading is none: nobody follows it."""
+    """The laser's quality marks its readings as invalid: the loop does not follow them."""
     stage = Stage().held()
     sensors_say(stage, lambda sample: replace(sample, displacement_um=-15.0, displacement_quality=2))
     before_um = stage.plant.truth().displacement_um
@@ -44,7 +44,7 @@ def a_laser_that_doubts_itself() -> list[str]:
 
 
 def pressure_that_is_seen_now_and_then() -> list[str]:
-    """A gauge that speaks on every fourth tick, over its limit each time: the vent opens."""
+    """The gauge has a value on every fourth tick only, each above the limit: the vent opens."""
     stage = Stage().held()
     stage.bench.wrong.gauge_offset_pa = 60.0
     for number in range(40):
@@ -76,7 +76,7 @@ def creeping(stage: Stage, um_per_s: float, deepest_um: float) -> Callable[[], s
 
 
 def a_creeping_laser() -> list[str]:
-    """The laser's mount sets off at 0.5 um/s; camera and gauge see it."""
+    """The laser's mount starts to drift at 0.5 um/s; camera and gauge detect it."""
     stage = Stage(camera=True).held()
     stage.wait(60.0)
     stage.wait(150.0, creeping(stage, 0.5, DISPLACEMENT_MAX_UM))
@@ -84,7 +84,7 @@ def a_creeping_laser() -> list[str]:
 
 
 def a_stuck_gauge_and_a_creeping_laser() -> list[str]:
-    """No camera; the gauge stands still, then the laser's mount sets off by 2 um/s."""
+    """No camera; the gauge freezes, then the laser's mount starts to drift at 2 um/s."""
     stage = Stage().held()
     stage.wait(10.0)
     stage.bench.wrong.gauge_stuck = True
@@ -94,7 +94,7 @@ def a_stuck_gauge_and_a_creeping_laser() -> list[str]:
 
 
 def a_creeping_laser_without_a_camera() -> list[str]:
-    """The laser's mount sets off by 1 um/s; the gauge alone sees it."""
+    """The laser's mount starts to drift at 1 um/s; the gauge alone detects it."""
     stage = Stage().held()
     stage.wait(60.0)
     stage.wait(300.0, creeping(stage, 1.0, 70.0))
@@ -103,7 +103,7 @@ def a_creeping_laser_without_a_camera() -> list[str]:
 
 
 def a_seam_that_opens() -> list[str]:
-    """No camera; from one moment on the film takes three times the gas that it used to: gas no longer flows."""
+    """No camera; the film suddenly takes three times as much gas: the pump stops."""
     stage = Stage().held()
     stage.wait(90.0)
     stage.bench.wrong.vent_stuck_fraction = 0.024
@@ -113,7 +113,7 @@ def a_seam_that_opens() -> list[str]:
 
 
 def a_setpoint_is_reached() -> list[str]:
-    """What the laser measures is the mirror: 15 um more are 15 um more, and the gauge tells the pressure."""
+    """A setpoint 15 um higher moves the true mirror by 15 um, and the gauge shows the true pressure."""
     stage = Stage(camera=True).held()
     stage.ask("setpoint", value=15.0)
     stage.wait(40.0)
@@ -122,7 +122,7 @@ def a_setpoint_is_reached() -> list[str]:
 
 
 def dead_actuators_are_found() -> list[str]:
-    """A vent that does not lower is found before the hold, a pump that does not lift soon after (noise may help)."""
+    """A dead vent is found before the hold, a dead pump soon after (noise may let it pass the test)."""
     violations = []
     config = config_of(1, World(), False)
     timed = config.states.model_copy(update={"inflate_timeout_s": 60.0})
@@ -139,7 +139,7 @@ def dead_actuators_are_found() -> list[str]:
 
 
 def a_fill_that_leaks_ends() -> list[str]:
-    """A mirror that does not rise: the fill is given up in its time."""
+    """The mirror does not rise: the fill times out."""
     config = config_of(1, World(), False)
     timed = config.states.model_copy(update={"inflate_timeout_s": 40.0})
     stage = Stage(config=config.model_copy(update={"states": timed}))
@@ -153,7 +153,7 @@ def a_fill_that_leaks_ends() -> list[str]:
 
 
 def a_pump_that_does_not_obey_the_stop() -> list[str]:
-    """The read-back stays, and so does the pump: no success, and the vent is open."""
+    """Pump and read-back stay on: the stop does not succeed, and the vent opens."""
     violations = []
     for way in ("stop", "lower", "vent"):
         stage = Stage().held()
@@ -169,7 +169,7 @@ def a_pump_that_does_not_obey_the_stop() -> list[str]:
 
 
 def a_pump_that_runs_behind_its_readback() -> list[str]:
-    """In standby the read-back says 0, and gas comes in: the vent opens long before a limit is reached."""
+    """In standby the read-back says 0 while gas comes in: the vent opens long before a limit is reached."""
     config = config_of(1, World(), False)
     wide = config.limits.model_copy(update={"gauge_pressure_max_pa": 750.0, "displacement_max_um": 1000.0})
     stage = Stage(config=config.model_copy(update={"limits": wide}))
@@ -181,7 +181,7 @@ def a_pump_that_runs_behind_its_readback() -> list[str]:
 
 
 def a_pump_that_starts_in_standby() -> list[str]:
-    """Nobody has asked for anything, and the pump runs."""
+    """The pump runs without a command."""
     stage = Stage()
     stage.wait(5.0)
     stage.bench.wrong.readback_fraction = stage.bench.wrong.pump_stuck_fraction = 0.9

@@ -20,7 +20,7 @@ from membrane_ctrl.model.states import State
 
 
 def an_acknowledgement_counts_once() -> list[str]:
-    """A fault, its acknowledgement, a second hold and a second fault: that one stays."""
+    """A fault, its acknowledgement, a second hold and a second fault: the second fault stays."""
     stage = Stage().held()
     for last in (False, True):
         stage.bench.wrong.late_ms = 150.0
@@ -38,7 +38,7 @@ def an_acknowledgement_counts_once() -> list[str]:
 
 
 def an_acknowledgement_before_the_fault() -> list[str]:
-    """What is acknowledged in standby and in a hold is no fault that has yet to come."""
+    """An acknowledgement in standby or in a hold does not clear a later fault."""
     stage = Stage()
     stage.wait(1.0)
     stage.ask("ack")
@@ -54,7 +54,7 @@ def an_acknowledgement_before_the_fault() -> list[str]:
 
 
 def a_lock_during_a_fault_that_may_resume() -> list[str]:
-    """A person locks the mirror while the resume rule waits: it resumes nothing any more."""
+    """A person locks the mirror while the resume rule waits: nothing resumes."""
     stage = Stage(resumes=True).held()
     stage.bench.wrong.late_ms = 150.0
     stage.until(State.FAULT)
@@ -67,7 +67,7 @@ def a_lock_during_a_fault_that_may_resume() -> list[str]:
 
 
 def a_lock_while_it_vents() -> list[str]:
-    """Over-pressure has opened the vent, and then a person locks the mirror: the vent stays open."""
+    """Over-pressure has opened the vent, then a person locks the mirror: the vent stays open."""
     stage = Stage().held()
     stage.bench.wrong.gauge_offset_pa = 60.0
     stage.until(State.FAULT)
@@ -80,7 +80,7 @@ def a_lock_while_it_vents() -> list[str]:
 
 
 def manual_once_is_not_manual_again() -> list[str]:
-    """Manual, and back to hold: it is held."""
+    """`manual`, then `hold`: the mirror is held again."""
     stage = Stage().held()
     stage.ask("manual", value=stage.world.holding_flow_um_per_s)
     stage.wait(3.0)
@@ -91,7 +91,7 @@ def manual_once_is_not_manual_again() -> list[str]:
 
 
 def a_cause_that_lasts_is_acknowledged() -> list[str]:
-    """An acknowledgement brings no gas while the cause is there: the next hold trips again."""
+    """An acknowledgement while the cause lasts brings no gas: the next hold trips again."""
     stage = Stage().held()
     stage.bench.wrong.gauge_offset_pa = 50.0
     stage.until(State.FAULT)
@@ -105,7 +105,7 @@ def a_cause_that_lasts_is_acknowledged() -> list[str]:
 
 
 def a_lock_forbids_the_hold() -> list[str]:
-    """`latch` in standby, alone and in one tick with `hold`: no gas before an acknowledgement."""
+    """`latch` in standby, alone or in one tick with `hold`: no gas before an acknowledgement."""
     violations = []
     for order in (("latch",), ("latch", "hold"), ("hold", "latch")):
         stage = Stage()
@@ -119,7 +119,7 @@ def a_lock_forbids_the_hold() -> list[str]:
 
 
 def two_orders_in_one_tick() -> list[str]:
-    """A way down and something else in one tick, in both orders and in four states: the way down wins."""
+    """A lowering command and another one in one tick, in both orders and in four states: lowering wins."""
     violations = []
     others: tuple[Kind, ...] = ("hold", "resume", "manual", "setpoint", "ack")
     for way in ("latch", "vent", "stop", "lower"):
@@ -134,7 +134,7 @@ def two_orders_in_one_tick() -> list[str]:
 
 
 def vent_and_stop_from_everywhere() -> list[str]:
-    """`vent`, `lower` and `stop` from manual, tune and pause: the pump stands at once and for good."""
+    """`vent`, `lower` and `stop` from manual, tune and pause: the pump stops at once and stays off."""
     violations = []
     for way in ("vent", "lower", "stop"):
         for situation in ("manual", "pause", "tune", "hold"):
@@ -154,7 +154,7 @@ def vent_and_stop_from_everywhere() -> list[str]:
 
 
 def venting_to_the_end() -> list[str]:
-    """`vent` leads to a mirror without pressure, and only then to standby."""
+    """`vent` empties the mirror, and only then enters standby."""
     stage = Stage().held()
     stage.ask("vent")
     for _ in range(round(1200.0 / TICK_S)):
@@ -178,7 +178,7 @@ def a_vent_that_was_stopped_goes_on_as_stop() -> list[str]:
 
 
 def orders_beyond_the_limits() -> list[str]:
-    """A setpoint and a flow that the limits do not allow move nothing."""
+    """A setpoint or flow beyond the limits moves nothing."""
     stage = Stage().held()
     for value in (math.nan, math.inf, -math.inf, 1e6, DISPLACEMENT_MAX_UM + 1.0):
         stage.ask("setpoint", value=value)
@@ -193,7 +193,7 @@ def orders_beyond_the_limits() -> list[str]:
 
 
 def a_pause_ends() -> list[str]:
-    """A pause that nobody ends ends itself, and the mirror goes back."""
+    """A pause that nobody ends lapses, and the mirror returns to its setpoint."""
     stage = Stage(world=World(leak=1.2)).held()
     stage.wait(20.0)
     stage.ask("pause")
@@ -204,7 +204,7 @@ def a_pause_ends() -> list[str]:
 
 
 def manual_has_an_end() -> list[str]:
-    """An operator sets a flow and leaves: the mirror goes no far way, and is held again."""
+    """An operator sets a flow and leaves: the mirror does not go far, and is held again."""
     violations = []
     for share in (0.3, 1.0, 2.0):
         stage = Stage().held()
@@ -221,7 +221,7 @@ def manual_has_an_end() -> list[str]:
 
 
 def manual_without_light() -> list[str]:
-    """Blind in manual: the pump keeps its mean flow, whatever the operator had set."""
+    """No laser in manual: the pump keeps its mean flow, whatever the operator had set."""
     stage = Stage().held()
     stage.wait(20.0)
     stage.ask("manual", value=5.0)
@@ -235,7 +235,7 @@ def manual_without_light() -> list[str]:
 
 
 def resumes_of_a_day() -> list[str]:
-    """A cause that comes and goes for an hour: it resumes as often as a day allows, not once more."""
+    """A cause comes and goes for an hour: the hold resumes as often as a day allows, and no more."""
     stage = Stage(resumes=True).held()
     begun = 0
     for _ in range(5):
@@ -250,7 +250,7 @@ def resumes_of_a_day() -> list[str]:
 
 
 def a_handler_that_gives_nonsense() -> list[str]:
-    """The code of a state computes NaN, 2 or -1 for the pump: 0 goes out."""
+    """A state's code computes NaN, 2 or -1 for the pump: 0 is written."""
     violations = []
     before = states.HANDLERS[State.HOLD]
     for nonsense in (math.nan, 2.0, -1.0, math.inf):
