@@ -200,7 +200,7 @@ def _figures(cycle: ShapeCycle, spent_s: dict[str, float], settle_s: float, came
     spent_s.clear()
     fringes_s = [_take(cycle) for _ in range(CYCLES)]
     per_frame = {name: 1e3 * seconds / (8 * CYCLES) for name, seconds in spent_s.items()}
-    words = {"begin": "flip", "wait": "settle, rest of", "expose": "expose", "fetch": "transfer, rest of"}
+    words = {"begin": "flip", "wait": "rest of settling", "expose": "expose", "fetch": "rest of transfer"}
     budget = [Figure(f"per frame: {word}", per_frame[name], "ms") for name, word in words.items()]
     total_ms = 1e3 * statistics.median(fringes_s) / 8
     return [
@@ -212,7 +212,7 @@ def _figures(cycle: ShapeCycle, spent_s: dict[str, float], settle_s: float, came
         *budget,
         Figure("per frame: reconstruct", per_frame["fringes"], "ms"),
         Figure("per frame: all", total_ms, "ms"),
-        at_most("frames lost and taken again", camera.counts.incomplete + camera.counts.missing, "of all", None),
+        at_most("frames lost and retaken", camera.counts.incomplete + camera.counts.missing, "of all", None),
     ]
 
 

@@ -45,5 +45,5 @@ def _time(shrink: int, count: int, limit_s: float) -> list[Figure]:
     what = f"{count} {'full-resolution sets' if shrink == 1 else 'sets of a quarter of the resolution'}"
     return [
         at_most(f"{what}, files to geometry", seconds, "s", limit_s),
-        Figure(f"{what}, processors' seconds", processors, "s"),
+        Figure(f"{what}, CPU time", processors, "s"),
     ]

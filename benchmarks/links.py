@@ -354,8 +354,8 @@ def run(transactions: int = 10**6) -> list[Figure]:
     for name, (_, unit) in LINKS.items():
         found = audit(name, transactions)
         figures += [
-            at_most(f"{name}: wrong values believed", found.wrong, "", 0, "transactions", found.transactions),
-            at_most(f"{name}: largest error believed", found.worst, unit),
-            at_least(f"{name}: believed", found.believed / found.transactions, "", 0.5),
+            at_most(f"{name}: wrong values accepted", found.wrong, "", 0, "transactions", found.transactions),
+            at_most(f"{name}: largest error accepted", found.worst, unit),
+            at_least(f"{name}: share accepted", found.believed / found.transactions, "", 0.5),
         ]
     return figures

@@ -28,7 +28,7 @@ def run() -> list[Figure]:
         millions = result.index.size / 1e6
         limit = 2.0 if shrink == 1 else None
         rows.append(at_most(f"{millions:.2f} M pixels, all stages", seconds, "s", limit))
-        rows.append(at_most("... of which a million pixels", seconds / millions, "s"))
+        rows.append(at_most("... per million pixels", seconds / millions, "s"))
     rows.append(at_most("memory of the process", peak_mb, "MB", 1000))
     fit_um, map_um = _errors(result)
     rows.append(at_most("error of the fit, RMS, 0.4 ADU", 1e3 * fit_um, "nm", 10))

@@ -227,10 +227,10 @@ def _compared(before_mb: dict[str, float], after_mb: dict[str, float]) -> Iterat
     for name, value in after_mb.items():
         grown = 100.0 * (value / before_mb[name] - 1.0)
         yield at_most(
-            f"{name}: largest memory of the week's last hour to that of its first",
+            f"{name}: growth of peak memory, last hour of a week against the first",
             grown,
             "%",
             5.0,
-            "MB then",
+            "peak of the first, MB",
             before_mb[name],
         )

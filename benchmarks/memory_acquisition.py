@@ -60,7 +60,7 @@ def acquisition_figures() -> list[Figure]:
             time.sleep(0.02)
         grown = 100.0 * (_rss_mb(child) / warm_mb - 1.0)
     name = f"acquisition: memory grown from cycle {WARM_CYCLES} to {CYCLES}"
-    return [at_most(name, grown, "%", 5.0, "MB then", warm_mb)]
+    return [at_most(name, grown, "%", 5.0, "MB at cycle 200", warm_mb)]
 
 
 def _row(now_s: float) -> bytes:

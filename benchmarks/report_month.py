@@ -75,13 +75,13 @@ def run(days: float = MONTH_DAYS) -> list[Figure]:
         return [
             Figure("ticks", days * 86400 * RATE_HZ, ""),
             Figure("tables on the disk", size_gb, "GB"),
-            Figure("written in (without Rerun)", wrote_s, "s"),
+            Figure("time to write them (without Rerun)", wrote_s, "s"),
             at_most("report of the month", whole["took_s"], "s", 60.0),
-            at_most("its memory", whole["peak_gb"], "GB", 2.0),
+            at_most("... memory", whole["peak_gb"], "GB", 2.0),
             at_most("report of half an hour", brief["took_s"], "s", 5.0),
-            at_most("what the viewer opens, made in", opened["took_s"], "s", 10.0),
-            Figure("its memory", opened["peak_gb"], "GB"),
-            Figure("its tables looked through by `runs show`", shown["took_s"], "s"),
+            at_most("time to make the recording for the viewer", opened["took_s"], "s", 10.0),
+            Figure("... memory", opened["peak_gb"], "GB"),
+            Figure("`runs show` of the month", shown["took_s"], "s"),
         ]
 
 

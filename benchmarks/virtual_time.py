@@ -62,7 +62,7 @@ def _shares() -> dict[str, float]:
     totals: dict[str, float] = defaultdict(float)
     for (file, _, _), (_, _, own_s, _, _) in pstats.Stats(profile).stats.items():  # type: ignore[attr-defined]
         path = Path(file).as_posix()
-        part = next((name for name, marks in _SHARES.items() if any(mark in path for mark in marks)), "built in")
+        part = next((name for name, marks in _SHARES.items() if any(mark in path for mark in marks)), "built-ins")
         totals[part] += own_s
     whole_s = sum(totals.values())
     return {part: own_s / whole_s for part, own_s in totals.items()}
@@ -75,7 +75,9 @@ def run() -> list[Figure]:
     plant.advance(VIRTUAL_S)
     alone = VIRTUAL_S / (time.process_time() - start_s)
     figures = [
-        at_least("hold at 10 Hz, times real time on one core", _times_real(False), "", 1000.0, "plant alone", alone),
+        at_least(
+            "hold at 10 Hz on one core, speed against real time", _times_real(False), "", 1000.0, "plant alone", alone
+        ),
         at_least("the same with a shape every 2 s", _times_real(True), "", 1000.0, "plant alone", alone),
     ]
     shares = sorted(_shares().items(), key=lambda item: -item[1])

@@ -55,8 +55,8 @@ NOTES: tuple[tuple[str, str, str], ...] = (
     (
         "laser",
         "offset",
-        "At the start displacement 0 is whatever the laser reads as 0. Without a camera an offset below 20 um is less "
-        "than the gauge resolves.",
+        "At the start displacement 0 is whatever the laser reads as 0. Without a camera an offset below 20 um is "
+        "less than the gauge resolves.",
     ),
     ("gauge", "scale", "The pressure limits act at 1.25 times their value; `over_displacement` (625 Pa) acts first."),
     (
