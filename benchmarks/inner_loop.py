@@ -81,7 +81,7 @@ def _configs(sensors: str, scenario: str, seed: int, **twin: Any) -> tuple[LoopC
 
 
 def steady(sensors: str, scenario: str, seeds: Sequence[int], duration_s: float, **twin: Any) -> dict[str, float]:
-    """Statistics of the true centre after settling."""
+    """Statistics of the true centre after settling; the bias is setpoint minus truth, as everywhere."""
     runs = []
     for seed in seeds:
         loop, bench = _configs(sensors, scenario, seed, **twin)
@@ -89,7 +89,7 @@ def steady(sensors: str, scenario: str, seeds: Sequence[int], duration_s: float,
         true_um = held.after(SETTLED_S)
         ticks = round(loop.rate_hz)
         means_um = true_um[: true_um.size // ticks * ticks].reshape(-1, ticks).mean(axis=1)
-        runs.append((true_um.std(), true_um.mean(), np.mean(np.abs(means_um) <= 2.0), held.too_tight[-1]))
+        runs.append((true_um.std(), -true_um.mean(), np.mean(np.abs(means_um) <= 2.0), held.too_tight[-1]))
     std_um, bias_um, in_band, too_tight = np.array(runs, dtype=float).T
     return {
         "std_um": float(np.sqrt(np.mean(std_um**2))),

@@ -164,7 +164,7 @@ def achieved(name: str, loop: LoopConfig, case: Case, seed: int, least_um: float
     Rig(bench, loop, PumpConfig(), case.holding_flow_um_per_s).hold(SETTLE_S + VERIFY_S)
     true_um = np.array(bench.true_um)[round(SETTLE_S * loop.rate_hz) :]
     std_um = float(true_um.std())
-    return {f"{name}_um": std_um, f"{name}_bias_um": float(true_um.mean()), f"{name}_ratio": std_um / least_um}
+    return {f"{name}_um": std_um, f"{name}_bias_um": float(-true_um.mean()), f"{name}_ratio": std_um / least_um}
 
 
 SESSIONS = {

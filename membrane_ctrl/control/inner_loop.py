@@ -117,7 +117,7 @@ class InnerLoop:
     def stale(self, given: LoopInput, dt_s: float) -> LoopOutput:
         """One tick without control: the integrator is frozen and put out, for it is the mean flow.
 
-        Repeating the last reading instead would integrate its error: 5 times the excursion (PHYSICS, inner loop). A
+        Repeating the last reading instead would integrate its error: 5 times the excursion (docs/physics.md). A
         reading that is there (a pause) is filtered all the same, so that the error is the present one.
         """
         seen = math.isfinite(given.displacement_um)

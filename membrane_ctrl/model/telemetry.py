@@ -71,7 +71,7 @@ ROW_BYTES = _STRUCT.size
 
 
 # A mirror counts as settled this long after hold began and after each setpoint ramp: three closed-loop time constants
-# of 1.45 s (PHYSICS, inner loop) leave 5 % of a step, of which the `settle` state has already taken most.
+# of 1.45 s (docs/physics.md, inner loop) leave 5 % of a step, of which the `settle` state has already taken most.
 SETTLED_AFTER_S = 5.0
 
 Rows = FloatArray
