@@ -10,7 +10,7 @@ RECORDS = sorted((ROOT / "docs" / "decisions").glob("[0-9]*.md"))
 NUMBERS = {record.name[:2] for record in RECORDS}
 TEXTS = sorted(
     path
-    for folder in ("membrane_ctrl", "firmware_iface", "tuning", "docs", "examples")
+    for folder in ("membrane_ctrl", "firmware_iface", "tuning", "docs")
     for path in (ROOT / folder).rglob("*")
     if path.suffix in {".py", ".md", ".toml"}
 )

@@ -1,4 +1,4 @@
-"""Every configuration in examples/ passes `check` against emulators of the devices that it names."""
+"""Every configuration in membrane_ctrl/examples/ passes `check` against emulators of the devices that it names."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import dump, load
 from membrane_ctrl.sim.lab import Lab
 
-EXAMPLES = sorted(Path(__file__).parents[1].glob("examples/*.toml"))
+EXAMPLES = sorted(Path(__file__).parents[1].glob("membrane_ctrl/examples/*.toml"))
 
 
 class StillPlant:
@@ -36,6 +36,16 @@ class StillPlant:
 
 def test_there_are_examples() -> None:
     assert {"paper-bench", "all-serial", "all-modbus-tcp", "twin"} <= {path.stem for path in EXAMPLES}
+
+
+def test_an_example_is_printed_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["examples"]) == 0
+    listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert set(listed) >= {path.name for path in EXAMPLES} | {"membrane-ctrl.service"}
+    assert run(["examples", "paper-bench.toml"]) == 0
+    assert capsys.readouterr().out == EXAMPLES[0].with_name("paper-bench.toml").read_text()
+    assert run(["examples", "../__init__.py"]) == 2
+    assert "no such example; known: all-modbus-tcp.toml" in capsys.readouterr().err
 
 
 def _without_optics(devices: DevicesConfig) -> DevicesConfig:

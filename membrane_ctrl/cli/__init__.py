@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -46,6 +47,20 @@ def top(version: Annotated[bool, typer.Option("--version", help="Print the versi
     if version:
         print(__version__)
         raise typer.Exit
+
+
+@app.command()
+def examples(name: Annotated[str, typer.Argument(help="File to print; by default, list them.")] = "") -> None:
+    """Print an example configuration or the service's unit: `membrane-ctrl examples paper-bench.toml > lab.toml`."""
+    folder = Path(__file__).parents[1] / "examples"
+    files = {path.name: path for path in sorted(folder.iterdir())}
+    if not name:
+        for path in files.values():
+            print(f"{path.name:22} {path.read_text(encoding='utf-8').partition(chr(10))[0].lstrip('# ')}")
+    elif name in files:
+        print(files[name].read_text(encoding="utf-8"), end="")
+    else:
+        raise errors.InputError(f"{name}: no such example; known: {', '.join(files)}")
 
 
 for _family in (holding, optics, calibrating, records, reviewing):

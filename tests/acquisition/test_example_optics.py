@@ -28,7 +28,7 @@ SHRINK = 4  # large frames over loopback are tried elsewhere (tests/firmware_ifa
 
 
 def _example() -> Config:
-    example = load(Path(__file__).parents[2] / "examples" / "paper-bench.toml", Config)
+    example = load(Path(__file__).parents[2] / "membrane_ctrl" / "examples" / "paper-bench.toml", Config)
     camera = example.optics.camera
     size = {"width_px": camera.width_px // SHRINK, "height_px": camera.height_px // SHRINK}
     smaller = camera.model_copy(update={**size, "pixel_um": camera.pixel_um * SHRINK})

@@ -29,7 +29,7 @@ mkdir -p {_UNITS}/{_UNIT}.service.d /run/told
 chown membrane /run/told
 printf '[Service]\\n{_PLACES}\\n' | tee {_UNITS}/{_UNIT}.service.d/room.conf > {_UNITS}/twin.service
 echo "ExecStart={_PROGRAM} twin --config /etc/membrane-ctrl/twin.toml" >> {_UNITS}/twin.service
-cp /opt/source/examples/{_UNIT}.service {_UNITS}
+cp /opt/source/membrane_ctrl/examples/{_UNIT}.service {_UNITS}
 systemctl daemon-reload
 systemctl start systemd-journald.service
 """

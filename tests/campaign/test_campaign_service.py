@@ -174,7 +174,7 @@ def test_in_standby_it_runs_with_a_latched_fault_and_holds_only_after_a_person_a
         assert "done" in ctl(room, "membrane", "hold")
         room.until(lambda: room.status_has("inflate"))
     finally:
-        room.run(f"cp /opt/source/examples/membrane-ctrl.service {unit}; systemctl daemon-reload")
+        room.run(f"cp /opt/source/membrane_ctrl/examples/membrane-ctrl.service {unit}; systemctl daemon-reload")
 
 
 def test_a_member_of_the_group_operates_and_a_stranger_does_not_come_near(room: Room) -> None:
@@ -192,7 +192,7 @@ def test_a_member_of_the_group_operates_and_a_stranger_does_not_come_near(room: 
 
 @pytest.mark.skipif(not all(map(shutil.which, ("Xvfb", "xauth", "xhost", "xdpyinfo"))), reason="needs an X server")
 def test_the_service_reaches_a_desktops_display_once_it_may(room: Room) -> None:
-    unit = "/opt/source/examples/membrane-ctrl.service"
+    unit = "/opt/source/membrane_ctrl/examples/membrane-ctrl.service"
     edits = "-e 's,^ExecStart=.*,ExecStart=/usr/bin/xdpyinfo -display :7,' -e '/^ExecStopPost/d' -e '/^Restart/d'"
     room.run(f"sed {edits} -e 's/Type=notify/Type=oneshot/' {unit} > /run/units/display.service")
     room.run("xauth -f /run/cookie add :7 . 0123456789abcdef0123456789abcdef")

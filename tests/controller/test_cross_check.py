@@ -23,9 +23,9 @@ from membrane_ctrl.controller.safety import TABLE
 from membrane_ctrl.model.errors import InputError
 from tests.support.faulty_board import PumpBoardEmulator
 
-ROOT = Path(__file__).parents[2]
+EXAMPLES = Path(__file__).parents[2] / "membrane_ctrl" / "examples"
 BOARD = {"board": "tcp://127.0.0.1:1"}
-ROLES = load(ROOT / "examples" / "all-modbus-tcp.toml", Config).devices.model_dump(exclude_none=True)  # type: ignore[union-attr]
+ROLES = load(EXAMPLES / "all-modbus-tcp.toml", Config).devices.model_dump(exclude_none=True)  # type: ignore[union-attr]
 
 
 def config_of(changes: dict[str, Any], devices: dict[str, Any] | None = None) -> Config:
@@ -50,7 +50,7 @@ def severity_of(config: Config, field: str, board: BenchIdentity | None = None) 
 def test_the_defaults_and_the_examples_are_sound() -> None:
     assert cross_check(Config()) == ()
     assert cross_check(Config(), BenchIdentity("board", 1, "1.0.0", 0.5, 800.0, 1.0)) == ()
-    for example in sorted(ROOT.glob("examples/*.toml")):
+    for example in sorted(EXAMPLES.glob("*.toml")):
         assert cross_check(load(example, Config)) == (), example
 
 

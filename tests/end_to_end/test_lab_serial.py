@@ -11,7 +11,7 @@ import pytest
 
 pytestmark = pytest.mark.real_time
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "all-serial.toml"
+EXAMPLE = Path(__file__).parents[2] / "membrane_ctrl" / "examples" / "all-serial.toml"
 HOLD = [sys.executable, "-m", "membrane_ctrl", "hold", "--devices", str(EXAMPLE)]
 
 

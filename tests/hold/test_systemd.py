@@ -22,7 +22,7 @@ from membrane_ctrl.model.states import State
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 
 ROW = TelemetryRow(**dict.fromkeys(FIELDS, 0.0))
-UNIT = Path(__file__).parents[2] / "examples" / "membrane-ctrl.service"
+UNIT = Path(__file__).parents[2] / "membrane_ctrl" / "examples" / "membrane-ctrl.service"
 
 
 def outputs(mono_s: float, state: State, error_um: float = math.nan, fault: float = 0) -> TickOutputs:
@@ -110,7 +110,7 @@ def test_the_unit_stops_what_it_must_and_never_restarts_into_a_fault() -> None:
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze on this machine")
 def test_the_unit_file_is_one_that_systemd_takes_and_calls_protected(tmp_path: Path) -> None:
-    example = Path(__file__).parents[2] / "examples" / "membrane-ctrl.service"
+    example = Path(__file__).parents[2] / "membrane_ctrl" / "examples" / "membrane-ctrl.service"
     unit = tmp_path / example.name
     unit.write_text(example.read_text().replace("/opt/membrane-ctrl/.venv/bin/membrane-ctrl", sys.executable))
     for words in (["verify", str(unit)], ["security", "--offline=true", "--threshold=40", str(unit)]):

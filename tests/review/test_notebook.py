@@ -11,7 +11,7 @@ import pytest
 from benchmarks.nights import Planted
 from tests.support.review_runs import written
 
-NOTEBOOK = Path(__file__).parents[2] / "examples" / "review.ipynb"
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "notebooks" / "review.ipynb"
 
 
 def test_the_notebook_runs(

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-NOTEBOOK = Path(__file__).parents[2] / "examples" / "tuning.ipynb"
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "notebooks" / "tune.ipynb"
 
 
 def code() -> list[str]:
