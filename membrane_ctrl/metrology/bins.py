@@ -65,8 +65,8 @@ class BinGrid:
 
 # Linear uncertainty of one cycle: white noise of the phase, or the scatter of the slopes if that is larger.
 #
-# cov(parameters) = M^-1 (var_x M_x + var_y M_y) M^-1 with M = M_x + M_y = D^T W D. It knows nothing of errors that
-# all pixels share (geometry, gamma of the display, motion of the film): those are the Monte Carlo's.
+# cov(parameters) = M^-1 (var_x M_x + var_y M_y) M^-1 with M = M_x + M_y = D^T W D. It excludes errors that all pixels
+# share (geometry, gamma of the display, motion of the film).
 
 QUANTISATION_VARIANCE_ADU2 = 1 / 12  # of a value rounded to an integer
 
@@ -108,8 +108,8 @@ def parameter_covariance(fit: Fit, slope_variance: FloatArray) -> FloatArray:
     Parameters
     ----------
     slope_variance : (2,) array
-        Expected variance of an x and of a y slope of unit weight. Where the fit's own residual is larger, that
-        counts.
+        Expected variance of an x and of a y slope of unit weight; the variance of the fit's own residual is used
+        where it is larger.
     """
     free = max(fit.weight_sum - PARAMETERS / 2, 1.0)  # 36 parameters from two slopes a point
     seen = np.array([fit.residual_x**2, fit.residual_y**2]) * fit.weight_sum / free

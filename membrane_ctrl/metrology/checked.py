@@ -1,8 +1,8 @@
 """The full result of a capture set: frames checked, every pixel's phase and slopes, the fit, and the zonal map.
 
-Bins first: they give the fringe orders, a surface, and what each frame should have shown. Frames that do not belong
-are left out, one at a time since one bad frame spoils the prediction of the others, until all that are left agree.
-Then every pixel, its period taken from its bin.
+Bins come first: they give the fringe orders, a surface, and what each frame should have shown. Frames that do not
+belong are left out, one at a time since one bad frame spoils the prediction of the others, until the rest agree. Then
+every pixel is measured, its period taken from its bin.
 """
 
 import math
@@ -33,7 +33,7 @@ _BIT_MISMATCH = 0.02
 
 @dataclass(frozen=True)
 class Anchor:
-    """What a full set hands on to the fringes sets that lean on it."""
+    """What a full set passes on to the fringes sets that refer to it."""
 
     phase_rad: FloatArray  # (2, rows, columns): absolute phases of the bins; NaN where unknown
     light: FloatArray  # (rows, columns): of the bins
@@ -65,12 +65,12 @@ class Checked:
         return self.binned.bin_px * np.stack([column, row]) + (self.binned.bin_px - 1) / 2
 
     def anchor(self) -> Anchor:
-        """For the sets that lean on this one."""
+        """For the sets that refer to this one."""
         return Anchor(self.phase_rad, self.view.light)
 
 
 class RejectedSetError(evidence.NoFigureError):
-    """A set that gives no figure, with the frames to blame."""
+    """A set that gives no figure, with the bad frames."""
 
     def __init__(self, reason: str, flags: tuple[integrity.Flag, ...]) -> None:
         super().__init__(reason)
@@ -86,7 +86,7 @@ def vertex_z_mm(optics: OpticsConfig, displacement_um: float) -> float:
 def check(stack: frame_stack.FrameStack, optics: OpticsConfig, anchor: Anchor | None = None) -> Checked:
     """Check the frames and fit the bins. Raises RejectedSetError if the frames do not give a figure.
 
-    `anchor` gives a set without Gray code its fringe orders; `camera.bits` of the optics tells saturation.
+    `anchor` gives a set without Gray code its fringe orders; `camera.bits` of the optics sets saturation.
     """
     binned = frame_stack.bin_frames(stack, 2**optics.camera.bits - 1)
     try:
@@ -100,7 +100,7 @@ def check(stack: frame_stack.FrameStack, optics: OpticsConfig, anchor: Anchor | 
 
 
 def _doubt(stack: frame_stack.FrameStack, flags: tuple[integrity.Flag, ...]) -> str:
-    """What else may be wrong where many frames differ from a prediction: the prediction, that is the geometry.
+    """Where many frames differ from the prediction, the doubt that the prediction, that is the geometry, is wrong.
 
     Pictures that are the same, unreadable or dark need no prediction.
     """
@@ -112,7 +112,7 @@ def _doubt(stack: frame_stack.FrameStack, flags: tuple[integrity.Flag, ...]) -> 
 
 
 def _believable_surface(checked: Checked) -> bool:
-    """Whether the slopes are those of one surface: steps that run backwards disagree with no frame, but with that."""
+    """Whether the slopes are those of one surface: steps that run backwards agree with every frame, not with it."""
     field = checked.tracer.slope_field(checked.state.points, checked.state.surface)
     return 1e6 * float(np.sqrt(np.mean(np.square(field[2:4] - field[4:6])))) <= RESIDUAL_REJECTED_URAD
 
@@ -122,8 +122,8 @@ def _put_back(
 ) -> Checked | None:
     """The set with two sinusoids of an axis exchanged, if one exchange alone makes all frames agree.
 
-    Three steps that run backwards predict every frame wrongly, so that nobody can be blamed by what it shows. But the
-    Gray code and the surface still know: of all exchanges only the right one leaves no frame to be flagged.
+    Three steps that run backwards predict every frame wrongly, so no frame can be blamed for what it shows. The Gray
+    code and the surface decide: of all exchanges only the right one leaves no frame to be flagged.
     """
     if stack.unusable or len(stack.sinusoids(AXES[0])) > 3:  # the good ones of four steps name a swapped pair
         return None
@@ -177,7 +177,7 @@ def _check(
             stack, binned = stack.reordered(order), binned.reordered(order)
             known |= {flag.frame: flag for flag in flags if flag.frame in (pair.frame, pair.swapped_with)}
             continue
-        # the worst sinusoid may be all that is wrong with the others' predictions
+        # the worst sinusoid alone may spoil the predictions of the others
         chosen = {flag.frame: flag for flag in _of_sinusoids(stack, fresh)[:1] or fresh}
         known |= chosen
         excluded |= set(chosen)
@@ -204,7 +204,7 @@ def _attempt(
     excluded: set[int],
     anchor: Anchor | None,
 ) -> _Attempt:
-    """Fit the bins without the excluded frames. Raises NoFigureError or ValueError if that cannot be."""
+    """Fit the bins without the excluded frames. Raises NoFigureError or ValueError if that fails."""
     tracer = reconstruct.Tracer(geometry, optics.mirror.radius_mm, vertex_z_mm(optics, stack.mean_reading_um))
     view = evidence.look(stack, binned, excluded, None if anchor is None else anchor.light)
     phase = _absolute(stack, binned, view, anchor, optics)
@@ -223,7 +223,7 @@ def _of_sinusoids(stack: frame_stack.FrameStack, flags: list[integrity.Flag]) ->
 
 
 def _believable(stack: frame_stack.FrameStack, flags: list[integrity.Flag]) -> list[integrity.Flag]:
-    """While sinusoids are wrong so may be the prediction: then only they are named."""
+    """While sinusoids are wrong the prediction may be wrong too: then only they are named."""
     return _of_sinusoids(stack, flags) or flags
 
 
@@ -245,7 +245,7 @@ def _absolute(
         return _followed(view, anchor)
     out = np.empty_like(view.phase_rad)
     for k, axis in enumerate(AXES):
-        # half the light is the fringes' own mean, which no single frame can spoil
+        # the fringes' mean is half the light, which no single frame can spoil
         bits = binned.means[stack.gray(axis)] > view.light
         phase = orders(view.phase_rad[k], bits, view.mask).phase_rad
         out[k] = np.where(inside_pattern(phase, optics.pattern), phase, np.nan)

@@ -14,14 +14,14 @@ from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 from membrane_ctrl.model.shape_estimate import Quality
 
-LASER_NOISE_UM = 1.0  # repeatability of the bench's laser; motion below twice that is not taken out
+LASER_NOISE_UM = 1.0  # repeatability of the bench's laser; motion below twice that is not corrected
 _START_SAG_MM = 40.0  # the paper's starting parabola
 # Solutions from different starts agree to a hundredth of the last change: 1e-9 mm
 _LAST_CHANGE_MM = 1e-7
-# Tukey's weight reaches 0 here: noise (5 sigma in millions of pixels) keeps its say, dust and glints have none
+# Tukey's weight reaches 0 here: noise (5 sigma in millions of pixels) keeps its weight, dust and glints have none
 _TUKEY_SIGMAS = 8.0
 _PART = 1 << 18  # pixels worked on at a time where memory would grow with them
-# A slope this far off is no slope of the film but a wrong fringe order (4.3 mrad) or a glint
+# A slope this far off is not the film's but a wrong fringe order (4.3 mrad) or a glint
 _NO_SLOPE = 4e-3
 
 
@@ -39,7 +39,7 @@ class FullResult:
     grid: zonal.ResidualGrid  # mean slope residuals in cells
     residual_mm: FloatArray  # (m, m): height over the fit, 0 at the vertex; NaN where nothing was measured
     quality: Quality  # for the verdict
-    moved: bool  # whether the film's motion was taken out
+    moved: bool  # whether the film's motion was corrected
 
     @property
     def surface(self) -> Surface:
@@ -64,7 +64,7 @@ class PixelPoints:
 
 
 def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
-    """Phases of all pixels in bins that have one, with the film's motion between the frames taken out."""
+    """Phases of all pixels in bins that have one, corrected for the film's motion between the frames."""
     stack = checked.stack
     bin_px, columns = checked.binned.bin_px, checked.phase_rad.shape[2]
     known = np.isfinite(checked.phase_rad).all(axis=0) & checked.near
@@ -110,7 +110,7 @@ def _axis_phases(
     stack, used = checked.stack, checked.view.used[axis]
     combined = _combination(checked, axis, sensitivity is not None)
     every = stack.sinusoids(phase.AXES[axis])
-    # a slice is no copy of the frames; a list is
+    # a slice does not copy the frames; a list does
     frames = stack.frames[every[0] : every[-1] + 1] if used == every else stack.frames[used]
     slope = np.zeros(index.size) if sensitivity is None else sensitivity
     reference = checked.phase_rad[axis].reshape(-1)[in_bin]
@@ -128,7 +128,7 @@ def reconstruct_full(
     `start` is the starting shape, by default the paper's parabola of 40 mm.
     """
     tracer, points = checked.tracer, pixels.points
-    # the way from the start is walked with the bins; the pixels take it up where it is nearly at its end
+    # the bins solve from the start; the pixels continue where that has nearly converged
     rough_points = checked.state.points.subset(np.ones(checked.state.index.size, bool))
     rough = reconstruct.solve(tracer, rough_points, start or reconstruct.parabola(_START_SAG_MM, tracer.radius_mm))
     tracer.intersect(points, rough.surface, newton=2)
@@ -161,7 +161,7 @@ def reconstruct_full(
 
 def tukey(residual: FloatArray) -> FloatArray:
     """Tukey's weights (1 - (r / c)^2)^2, with c in robust sigmas (median of a Rayleigh distribution: 1.177 sigma)."""
-    # every 7th tells the median of millions well enough; the floor is the rounding of a noise-free set
+    # every 7th gives the median of millions well enough; the floor is the rounding of a noise-free set
     reach = _TUKEY_SIGMAS * max(float(np.median(residual[::7])) / 1.177, 1e-9)
     return np.asarray(np.square(np.maximum(1 - np.square(residual / reach), 0.0)))
 
@@ -180,8 +180,8 @@ def _quality(optics: OpticsConfig, checked: Checked, fit: reconstruct.Fit, swing
     )
 
 
-# The figure of a checked set from its bins, for the analysis of many sets: for 36 terms the bins carry all that the
-# pixels do, at a sixteenth of the cost (decision 41).
+# The figure of a checked set from its bins, for the analysis of many sets: for 36 terms the bins carry as much as the
+# pixels, at a sixteenth of the cost (decision 41).
 
 
 @dataclass(frozen=True)
@@ -193,11 +193,11 @@ class BinFigure:
     index: IntArray  # (n,): their bins
     sigma_mm: FloatArray  # (2, n): 1 sigma of the screen points from the noise of the pixels
     quality: Quality  # for the verdict
-    moved: bool  # whether the film's motion between the frames was taken out
+    moved: bool  # whether the film's motion between the frames was corrected
 
 
 def bin_figure(optics: OpticsConfig, checked: Checked) -> BinFigure:
-    """Phases of the bins with the film's motion taken out, and the surface fitted to them."""
+    """Phases of the bins, corrected for the film's motion, and the surface fitted to them."""
     stack, state = checked.stack, checked.state
     moved = motion.worth_correcting(stack.readings_um, LASER_NOISE_UM)
     sums = [checked.binned.means[used].reshape(len(used), -1) for used in checked.view.used]

@@ -24,8 +24,8 @@ Kind = Literal["full", "fringes"]
 # that a field which passes half a period anywhere shows points in the band before it.
 GUARD_RAD = 0.9 * math.pi
 LOST_SHARE = 0.002  # more points than dust and glints beyond the guard
-# A film that changes its shape moves as many phases up as down. All of them moving one way is a knock against the
-# mount, which may have been a whole period: nobody can tell a tilt of 7 mrad from one of -1.7 by phase alone.
+# A film that changes its shape moves as many phases up as down. If all of them move one way, the mount was knocked,
+# perhaps by a whole period: phase alone cannot tell a tilt of 7 mrad from one of -1.7.
 TILT_GUARD_RAD = 0.3 * math.pi
 NOTHING_TO_FOLLOW = "tracking lost: no accepted full cycle to follow"
 # With this share of its points the full cycle's normal matrix still contracts a hundredfold a step.
@@ -46,12 +46,12 @@ class LiveReconstructor:
     bin_px : int
         Side of the bins whose phasors are used.
     laser_noise_um : float
-        Noise of one displacement as given (an average over an exposure has less than a sample); motion that is not
-        clearly above it is not corrected.
+        Noise of one displacement as given (an average over an exposure has less than a sample); motion is corrected
+        only if it is clearly above this.
     shifts_rad : (N,) or (2, N) array, optional
         Phase steps, of x and y if they differ; equal ones if not given.
     spread : GeometrySpread, optional
-        How well the geometry is known; with it each full cycle renews `geometry_covariance_um2`.
+        How well the geometry is known; with it each full cycle computes `geometry_covariance_um2`.
 
     Raises
     ------
@@ -151,8 +151,8 @@ class LiveReconstructor:
     def geometry_covariance_um2(self) -> FloatArray:
         """Covariance (36, 36) of the coefficients from how well the geometry is known, as of the last full cycle.
 
-        It is common to all cycles: to be added to a cycle's own for a single figure, not for changes.
-        NaN before the first full cycle and without a spread.
+        It is common to all cycles: add it to a cycle's own for a single figure, not for changes. NaN before the first
+        full cycle and without a spread.
         """
         to_coeffs = surface.parameter_to_coeffs()
         return np.asarray(1e6 * to_coeffs @ self._geometry_covariance_mm2 @ to_coeffs.T)
@@ -211,7 +211,7 @@ class LiveReconstructor:
         return estimate
 
     def _track_phases(self, state: motion.TrackedPoints, readings: FloatArray) -> None:
-        """Fresh phases from the bin sums, with the film's motion between the frames taken out."""
+        """Fresh phases from the bin sums, corrected for the film's motion between the frames."""
         moved = motion.worth_correcting(readings, self._laser_noise_um)
         motion_um = np.reshape(readings - np.mean(readings), (2, -1)) if moved else None
         steps = self._slots.steps

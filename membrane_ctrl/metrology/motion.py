@@ -1,4 +1,4 @@
-"""The film's known motion between the frames, taken out of the phase.
+"""Correction of the phase for the film's known motion between the frames.
 
 A point's phase at displacement d is phi + q (d - d0), with q = d phi / d d known from the model (a Hencky bowl whose
 sag grows by one micrometre while the ring stays). Frame k then shows A + Re(z exp(i d_k) (1 + i q e_k)) to first
@@ -71,9 +71,9 @@ def sensitivity_mm_per_um(
     return (traced[0] - traced[1]) / (2 * step_um)
 
 
-# The points that a full cycle hands on to the fringes-only cycles after it, and all that is known of each.
+# The points that a full cycle passes on to the fringes-only cycles after it, with the data of each.
 
-_START_SAG_MM = 40.0  # the paper's starting parabola; any other leads to the same end
+_START_SAG_MM = 40.0  # the paper's starting parabola; any other leads to the same result
 _OUTLIER_SIGMAS = 8.0  # of the slopes' robust scatter: dust and glints, never noise
 _MIN_POINTS = 1000  # far more than 36 unknowns, far fewer than any real view of the mirror
 
@@ -84,7 +84,7 @@ class TrackedPoints:
 
     index: IntArray  # (n,): bin of each point
     points: reconstruct.Points  # rays, screen points, weights
-    # (2, n): to be taken from T phi / (2 pi): the phase at O', and what averaging over a bin adds
+    # (2, n): subtracted from T phi / (2 pi): the phase at O', and what averaging over a bin adds
     offset_mm: FloatArray
     sensitivity_rad_per_um: FloatArray  # (2, n): change of phase per um of displacement
     area_mm2: FloatArray  # (n,): area of the mirror that a bin sees
@@ -110,7 +110,7 @@ def establish(
     pattern: PatternConfig,
     analysis_radius_mm: float,
 ) -> TrackedPoints:
-    """Choose the points of a full cycle, fit their surface and work out what must be known of each.
+    """Choose the points of a full cycle, fit their surface and compute the data of each.
 
     Raises ValueError if too few bins see the pattern in the mirror to fit a surface.
 

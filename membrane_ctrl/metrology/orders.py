@@ -1,8 +1,8 @@
 """Fringe orders from the Gray code and from the phase's own continuity, each checked by the other.
 
 The paper's eq. 2 trusts every Gray bit of every pixel. Continuity gives the orders of a connected region up to one
-number, which all of its pixels vote for: one wrong Gray frame scatters its votes and is outvoted, and the frame that
-contradicts the winner is known. Where the phase itself is torn (a wrong sinusoid) eq. 2 remains.
+number, which all of its pixels vote for: one wrong Gray frame scatters its votes and is outvoted, and the result
+shows which frame contradicts it. Where the phase itself is torn (a wrong sinusoid) eq. 2 remains.
 """
 
 import math
@@ -52,7 +52,7 @@ def unwrap_regions(wrapped_rad: FloatArray, mask: BoolArray) -> tuple[FloatArray
     Parameters
     ----------
     wrapped_rad, mask : (H, W) arrays
-        Phase, and where it is to be trusted. Neighbours must differ by less than half a period.
+        Phase, and where to trust it. Neighbours must differ by less than half a period.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def tear_share(phase_rad: FloatArray) -> float:
     return float(np.mean(np.abs(steps) > math.pi)) if steps.size else 0.0
 
 
-# A phase that is not torn has no tears at all but for dust; a stale frame of three tears at every quarter period.
+# A good phase has no tears but for dust; one stale frame of three tears it at every quarter period.
 _TORN_SHARE = 0.003
 # One wrong Gray frame leaves half of the votes or more on the right order; fewer agree only if the phase is wrong.
 _LEAST_AGREEMENT = 0.35

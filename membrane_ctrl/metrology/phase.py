@@ -49,7 +49,7 @@ def phasors(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> Comp
 
 
 def step_residual(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> FloatArray:
-    """What the model A + B cos(phi + d_k) leaves of each frame, (N, ...): zero but for noise if all is well."""
+    """Residual of each frame after the model A + B cos(phi + d_k), (N, ...): zero but for noise if all is well."""
     stack = np.asarray(frames, float)
     shifts = np.asarray(shifts_rad, float)
     design = np.stack([np.ones_like(shifts), np.cos(shifts), -np.sin(shifts)], axis=1)
@@ -122,7 +122,7 @@ def screen_mm(absolute_rad: FloatArray, pattern: PatternConfig) -> FloatArray:
 
 
 def inside_pattern(absolute_rad: FloatArray, pattern: PatternConfig) -> BoolArray:
-    """Whether the phase is one the pattern has; a wrong Gray bit at its rim is not."""
+    """Whether the phase lies in the pattern; one from a wrong Gray bit at its rim does not."""
     return np.abs(absolute_rad - centre_phase_rad(pattern)) <= math.pi * pattern.periods
 
 
@@ -156,8 +156,8 @@ def fringe_sequence(pattern: PatternConfig) -> tuple[Pattern, ...]:
     return tuple(image for axis in AXES for image in sinusoids(axis, pattern.steps))
 
 
-# A pixel sees the screen in the mirror if white differs from black by this share of what the bright pixels show;
-# the rest of the room differs by stray light only.
+# A pixel sees the screen in the mirror if white differs from black by this share of what the bright pixels show; the
+# rest of the room differs by stray light only.
 CONTRAST_SHARE = 0.2
 # ... and if the fringes swing by this share of it: less is a blurred edge, dust or a mixture of two places.
 FRINGE_SHARE = 0.1
@@ -165,7 +165,7 @@ FRINGE_SHARE = 0.1
 
 @dataclass(frozen=True)
 class FullSlots:
-    """Where the images of a full cycle stand in its sequence."""
+    """Positions of the images in the sequence of a full cycle."""
 
     steps: int
 

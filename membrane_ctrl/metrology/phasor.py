@@ -123,7 +123,7 @@ class Binner:
         """Sum frames into slots.
 
         Raises ValueError for a frame of wrong size or type of pixel; nothing is summed then. Frame k goes to
-        slots[k]. Only `watched` slots, by default all, are watched for saturation: it does not harm white or Gray.
+        slots[k]. Only `watched` slots, by default all, are checked for saturation: it does not harm white or Gray.
         """
         for frame in frames:
             if frame.shape != self._size:
@@ -188,7 +188,7 @@ def _combine(sums, index, weights, first, out):  # type: ignore[no-untyped-def]
 
 @kernel
 def _still(c, s, slope, turn_real, turn_imag, mirror_real, mirror_imag):  # type: ignore[no-untyped-def]
-    """z - i q (turn z - mirror conj z) in place: the film's motion taken out to first order (see `motion`)."""
+    """z - i q (turn z - mirror conj z) in place: corrects the film's motion to first order (see `motion`)."""
     for p in range(c.size):
         u = turn_real * c[p] - turn_imag * s[p] - mirror_real * c[p] - mirror_imag * s[p]
         v = turn_real * s[p] + turn_imag * c[p] - mirror_imag * c[p] + mirror_real * s[p]

@@ -4,8 +4,8 @@ Slope and height need each other: the slope at a pixel is the bisector at the po
 and where that is depends on the height. The iteration starts from any shape and contracts by about 300 a step.
 
 Each step solves (D^T W D) delta = D^T W (g - D a) and adds delta to a. Where delta vanishes, a is the least-squares
-solution on its own surface, whatever matrix stands on the left: so a matrix of an earlier step, or cycle, may be
-kept without moving the end point.
+solution on its own surface, whatever matrix is on the left: a matrix of an earlier step, or cycle, may be kept
+without changing the solution.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 # With D the derivatives of the basis at the points and g the measured slopes, A = (D^T D)^-1 D^T g. All derivatives
 # of the 36 Zernike terms are polynomials of degree 6 in x and y, so D^T g and D^T D follow exactly from sums of
 # monomials over the points; no 2N x 36 matrix is ever built. As printed, D^T D is singular: piston has no slope. Here
-# piston's column is left out and its place is taken by the Hencky excess, scaled to unit RMS like the others.
+# the Hencky excess replaces piston's column, scaled to unit RMS like the others.
 
 _M = kernels.SLOPE_MONOMIALS
 _POWERS = [(p, q) for p in range(zernike.DEGREE) for q in range(zernike.DEGREE - p)]  # in the kernels' order
@@ -41,7 +41,7 @@ def slope_tables() -> tuple[FloatArray, FloatArray]:
 
 @cache
 def _product_index() -> IntArray:
-    """Where the product of monomials k and l stands among the product moments, (28, 28)."""
+    """Index of the product of monomials k and l among the product moments, (28, 28)."""
     place = {power: k for k, power in enumerate(_PRODUCT_POWERS)}
     return np.array([[place[a[0] + b[0], a[1] + b[1]] for b in _POWERS] for a in _POWERS])
 
@@ -112,7 +112,7 @@ def residual_rms(sums: FloatArray, right: FloatArray, normal: NormalMatrix, delt
 HeightFunction = Callable[[FloatArray, FloatArray], FloatArray]  # x_mm, y_mm -> h_mm
 
 TOLERANCE_MM = 1e-6  # the paper's threshold on the largest change of height
-CONTRACTION = 1 / 100  # of one step; 1/300 was seen, the rest is margin
+CONTRACTION = 1 / 100  # of one step; observed: 1/300, the rest is margin
 MAX_ITERATIONS = 20
 _EXCESS = hencky.excess() / hencky.excess_rms()
 
@@ -200,7 +200,7 @@ class Tracer:
         return np.asarray(np.sum(compiled.split(run, points.t_mm.size), axis=0))
 
     def normal_matrix(self, points: Points) -> NormalMatrix:
-        """D^T W D where the points stand."""
+        """D^T W D at the points' present places."""
 
         def run(start: int, stop: int) -> FloatArray:
             fixed = (points.rays, points.t_mm, points.weights, self._pinhole, _EXCESS, self.radius_mm)
@@ -209,7 +209,7 @@ class Tracer:
         return NormalMatrix.from_products(np.sum(compiled.split(run, points.t_mm.size), axis=0), self.radius_mm)
 
     def slope_field(self, points: Points, surface: Surface) -> FloatArray:
-        """(6, n): x, y in mm, measured dh/dx, dh/dy, fitted dh/dx, dh/dy where the points stand."""
+        """(6, n): x, y in mm, measured dh/dx, dh/dy, fitted dh/dx, dh/dy at the points."""
         shape = self._shape(surface)
         out = np.empty((6, points.t_mm.size))
 
@@ -221,7 +221,7 @@ class Tracer:
         return out
 
     def predict_screen(self, points: Points, surface: Surface) -> FloatArray:
-        """Screen points (2, n) in mm that the surface would send the rays to; the points must stand on it."""
+        """Screen points (2, n) in mm that the surface would send the rays to; the points must be on it."""
         shape = self._shape(surface)
         out = np.empty((2, points.t_mm.size))
 
@@ -233,7 +233,7 @@ class Tracer:
         return out
 
     def position_mm(self, points: Points) -> FloatArray:
-        """x and y (2, n) where the points stand."""
+        """x and y (2, n) of the points."""
         return np.asarray(self._pinhole[:2, None] + points.t_mm * points.rays[:2])
 
     def _shape(self, surface: Surface) -> tuple[FloatArray, FloatArray, float, float]:
@@ -259,17 +259,17 @@ def solve(
     Parameters
     ----------
     start : height function or Surface
-        A height function places the points once. A Surface is the last solution: `points.t_mm` must then stand on
-        it, and one or two steps are enough.
+        A height function places the points once. A Surface is the last solution: the points must then be on it, and
+        one or two steps are enough.
     normal : NormalMatrix, optional
-        A matrix to keep instead of renewing it each step (the end point is the same).
+        A matrix to keep instead of recomputing it each step (the solution is the same).
     tolerance_mm : float
         Stop when the largest change of height, after the contraction still to come, is below this.
 
     Returns
     -------
     Fit
-        `converged` is False if `max_iterations` did not do, or if a number was not finite.
+        `converged` is False if `max_iterations` was not enough, or if a number was not finite.
     """
     placed = not isinstance(start, Surface)
     if isinstance(start, Surface):
@@ -302,7 +302,7 @@ class _Step:
 
 
 def _step(tracer: Tracer, points: Points, surface: Surface, normal: NormalMatrix | None, newton: int) -> _Step:
-    """One Gauss-Newton step, after moving the points onto the surface by Newton steps (0: where they stand)."""
+    """One Gauss-Newton step, after moving the points onto the surface by Newton steps (0: they stay)."""
     sums = tracer.residual_sums(points, surface, newton)
     matrix = normal or tracer.normal_matrix(points)
     right = right_side(sums, tracer.radius_mm)

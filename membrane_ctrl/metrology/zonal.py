@@ -1,4 +1,4 @@
-"""The zonal map: what the 36 terms cannot carry, integrated from the slopes' residual to the fit.
+"""The zonal map: what the 36 terms cannot represent, integrated from the slopes' residual to the fit.
 
 Only the residual is integrated, so that neither the grid's step nor its interpolation touches the millimetres of the
 bowl. Slopes scattered over the mirror are averaged in cells; two neighbouring cells see the height change by the mean
@@ -224,8 +224,8 @@ def residual_grid(field: FloatArray, weights: FloatArray, radius_mm: float) -> R
 def integrate(grid: ResidualGrid) -> FloatArray:
     """Height (n, n) in mm of the residual, 0 at the vertex; NaN where nothing was measured.
 
-    Parts that are not connected with each other (a hair across the mirror) have no height relative to each other that
-    slopes could tell: each is put on the fitted surface, mean 0.
+    Slopes cannot tell the relative height of parts that are not connected (a hair across the mirror): each is put on
+    the fitted surface, mean 0.
     """
     seen = grid.count > 0
     right = np.zeros(seen.shape)

@@ -1,11 +1,11 @@
 """Do the frames of a phase-step series agree, and if not, which one is wrong?
 
 Least squares leave of each pixel's N intensities the residual r = P I, with P the projector off the model's columns.
-Leaving frame k out and fitting again needs no second fit: the sum of squares falls by exactly r_k^2 / P_kk.
-The frame whose leaving out makes the rest agree is the wrong one.
+Leaving out frame k needs no second fit: the sum of squares falls by exactly r_k^2 / P_kk. The frame whose omission
+makes the rest agree is the wrong one.
 
 With nothing known of a pixel the model has three parameters (mean, cosine, sine). For N = 4 one degree of freedom is
-left, I_0 - I_1 + I_2 - I_3: it says that something is wrong, and blames all four alike. What else is known decides:
+left, I_0 - I_1 + I_2 - I_3: it says that something is wrong, and blames all four alike. Other knowledge decides:
 
 - the phase, from other frequencies, the other sets or the surface: two parameters are left (mean, amplitude);
 - mean and amplitude, from the other axis or frequency, or from white and black: with the mean alone, two frames half
@@ -23,16 +23,16 @@ import numpy as np
 from membrane_ctrl.metrology.phase import step_residual, step_weights
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
-_TINY = 1e-9  # a share of a frame that the model does not explain: below this it is explained whatever it is
+_TINY = 1e-9  # share of a frame that the model does not explain; below this it explains any frame
 
 
 @dataclass(frozen=True)
 class Closure:
     """How well N frames agree."""
 
-    rms_adu: float  # what the model leaves, per degree of freedom: the noise, if all is well
-    frame_rms_adu: FloatArray  # (N,): what it leaves of each frame, over all pixels
-    # (N,): what it leaves, per degree of freedom, without that frame; NaN where nothing would be left to test
+    rms_adu: float  # the residual, per degree of freedom: the noise, if all is well
+    frame_rms_adu: FloatArray  # (N,): the residual of each frame, over all pixels
+    # (N,): the residual, per degree of freedom, without that frame; NaN where nothing would be left to test
     without_rms_adu: FloatArray
 
     @property
@@ -98,7 +98,7 @@ def closure_with_level(
 
 
 def _level_rss(centred: FloatArray, design: FloatArray, amplitude: FloatArray) -> float:
-    """Mean over pixels of the squares left, that of the phasor's length in units of its variance along itself."""
+    """Mean over pixels of the residual squares, that of the phasor's length in units of its variance along itself."""
     covariance = np.linalg.inv(design.T @ design)
     phasor = covariance @ design.T @ centred
     length = np.linalg.norm(phasor, axis=0)
@@ -110,7 +110,7 @@ def _level_rss(centred: FloatArray, design: FloatArray, amplitude: FloatArray) -
 
 
 def _checked(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Frames as (N, pixels) and shifts; four frames at least, for three always agree."""
+    """Frames as (N, pixels) and shifts; four frames at least, as three always agree."""
     shifts = np.asarray(shifts_rad, float)
     stack = np.asarray(frames, float).reshape(len(shifts), -1)
     if len(shifts) < 4:
@@ -125,7 +125,7 @@ def _summary(residual: FloatArray, free: FloatArray, freedom: int) -> Closure:
     """From the residual (N, pixels), the diagonal of P there, and the degrees of freedom of a pixel."""
     rss = np.sum(residual**2, axis=0)
     rms = math.sqrt(float(rss.mean()) / freedom)
-    # a frame the model explains whatever it says cannot be tested by leaving it out: its pixel keeps its sum
+    # a frame that the model explains in any case cannot be tested by omission: its pixel keeps its sum
     drop = np.where(free > _TINY, residual**2 / np.maximum(free, _TINY), 0.0)
     without = np.full(len(residual), math.nan)
     if freedom > 1:

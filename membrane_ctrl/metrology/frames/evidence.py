@@ -1,14 +1,14 @@
 """What each frame shows, measured against what the surface predicts it should show.
 
-After the fit the phase of every bin is known without any single frame, so each frame alone can be asked for its own
-phase step, brightness, contrast and film position. For a sinusoid with predicted phase psi = phi + d_k
+After the fit the phase of every bin is known without any single frame, so each frame alone gives its own phase step,
+brightness, contrast and film position. For a sinusoid with predicted phase psi = phi + d_k
 
     I = g [m + b cos(psi + delta) + c2 cos 2 psi + c3 cos 3 psi - b e (q - <q>) sin psi]
 
-with g the bin's light and q its known change of phase per um of film motion: linear in m, b cos delta, b sin delta,
-b e, c2 and c3. The harmonics are the display's response, alike in all frames. A Gray frame has two levels,
-I = g (lo + (hi - lo) bit); white and black have one. Over thousands of bins noise is no matter; what is left over is
-what does not belong there.
+with g the bin's light and q its known change of phase per um of film motion: linear in m, b cos delta, b sin delta, b
+e, c2 and c3. The harmonics are the display's response, alike in all frames. A Gray frame has two levels, I = g (lo +
+(hi - lo) bit); white and black have one. Over thousands of bins noise does not matter; what is left over does not
+belong there.
 """
 
 from collections.abc import Collection
@@ -96,7 +96,7 @@ def _template(stack: FrameStack, scene: SampledBins, frame: int, reading_um: flo
     if pattern.role == "gray":
         shown, from_edge = gray_bit(phase, pattern.index)
         sure = from_edge > _EDGE_RAD
-        # where edges are everywhere (a prediction that is nonsense) all bins must do
+        # where edges are everywhere (a nonsense prediction) all bins are used
         return _Template("gray", np.stack([ones, shown.astype(float)]), sure if sure.any() else ones.astype(bool))
     psi = phase + pattern.shift_rad
     sine = np.sin(psi)
@@ -130,7 +130,7 @@ def _evidence(seen: FloatArray, template: _Template, light: FloatArray, saturate
 def _best(seen: FloatArray, waves: list[tuple[BoolArray, FloatArray]], light: FloatArray, own: int) -> int:
     """The pattern that the frame looks like most: largest correlation of the picture over the light.
 
-    A flat picture, white or black, correlates with nothing: then its own is as good as any.
+    A flat picture, white or black, correlates with nothing and is taken for its own.
     """
     picture = seen / np.maximum(light, 1e-9)
     flat = max(float(np.mean(picture)), 1e-9)
@@ -143,7 +143,7 @@ def _best(seen: FloatArray, waves: list[tuple[BoolArray, FloatArray]], light: Fl
     return where
 
 
-# What the usable frames say of each bin: light, fringes, wrapped phase, and where the pattern is seen.
+# What the usable frames show of each bin: light, fringes, wrapped phase, and where the pattern is seen.
 #
 # The light of a bin has three estimates, the mean of the x fringes, that of the y fringes, and white minus black; the
 # fringes' swing likewise. The median of three is right when one of them is wrong, so that one bad frame, whichever it
@@ -153,7 +153,7 @@ _LEAST_SWING_ADU = 1.0  # less than a rounding step is no fringe
 
 
 class NoFigureError(Exception):
-    """The frames do not carry a figure; the message says why."""
+    """The frames give no figure; the message says why."""
 
 
 @dataclass(frozen=True)

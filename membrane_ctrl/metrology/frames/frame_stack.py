@@ -51,7 +51,7 @@ class FrameStack:
 
     @property
     def mean_reading_um(self) -> float:
-        """Their mean, the moment that a figure belongs to; NaN unless all have one."""
+        """Their mean, to which a figure refers; NaN unless all have one."""
         return float(np.mean(self.readings_um))
 
     @property
@@ -125,7 +125,7 @@ def _phases(frames, index, weights, shift_cos, shift_sin, turn, mirror, slope, r
         for k in range(steps):
             left = float(frames[k, place]) - mean - c * shift_cos[k] + s * shift_sin[k]
             rest += left * left
-        # z - i q (turn z - mirror conj z): the film's motion between the frames taken out (see `motion`)
+        # z - i q (turn z - mirror conj z): corrects the film's motion between the frames (see `motion`)
         q = slope[p]
         u = turn.real * c - turn.imag * s - mirror.real * c - mirror.imag * s
         v = turn.real * s + turn.imag * c - mirror.imag * c + mirror.real * s
@@ -159,9 +159,9 @@ def pixel_phases(
     index : (n,) int array
         Pixels, counted row by row.
     sensitivity_rad_per_um : (n,) array
-        Change of phase per um of displacement; zeros if no motion is taken out.
+        Change of phase per um of displacement; zeros if no motion is corrected.
     reference_rad : (n,) array
-        Absolute phase to within half a period; left alone.
+        Absolute phase to within half a period; not changed.
     """
     flat = frames.reshape(len(frames), -1)
     phase = reference_rad.copy()

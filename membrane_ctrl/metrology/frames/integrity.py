@@ -1,8 +1,8 @@
 """Which frames do not belong to their set, and why: from the data alone.
 
 Every frame is judged against the other frames of its own set, so the display's gamma, vignetting, the film's ripple
-or a motion that all share are nobody's fault. A limit is the larger of a floor, below which the figure does not care,
-and a multiple of the scatter of the set's own good frames.
+or a motion that all share is no fault. A limit is the larger of a floor, below which the figure does not suffer, and
+a multiple of the scatter of the set's own good frames.
 """
 
 from collections.abc import Collection
@@ -20,16 +20,16 @@ STEP_RAD = 0.03
 LEVEL_SHARE = 0.015
 SWING_SHARE = 0.03
 _FLICKER = 0.03  # of light is called flicker whatever else is wrong
-# A frame taken 15 um off bends the figure by a few um at most; a laser that is off by less is usual.
+# A frame taken 15 um off bends the figure by a few um at most; lasers are commonly off by less.
 MOVED_UM = 15.0
 REST_SHARE = 0.015
 SATURATED_SHARE = 0.02
-# Bits are read against half the light: a Gray frame may be a tenth off; its own kind agrees better than with white.
+# Bits are read against half the light: a Gray frame may be a tenth off; Gray frames agree better among themselves.
 GRAY_SHARE = 0.04
 WHITE_SHARE = 0.08
 GRAY_REST = 0.15
 FLAT_REST = 0.08
-# Fewer bins than this beyond a Gray frame's only edge leave no more than FLAT_REST of light that is not flat.
+# With fewer bins than this beyond a Gray frame's only edge, no more than FLAT_REST of its light is not flat.
 _NO_EDGE = 0.005
 _SCATTERS = 6.0  # of the good frames' scatter
 _DARK = 0.4  # less than this share of the light is no flicker
@@ -61,7 +61,7 @@ def identical_frames(stack: FrameStack) -> dict[int, int]:
 
 
 def obvious(stack: FrameStack, binned: Binned) -> list[Flag]:
-    """Sinusoids that need no prediction to be seen as bad: far too dark or burnt out against the others."""
+    """Sinusoids that are bad without a prediction: far darker than the others, or burnt out."""
     frames = [k for axis in AXES for k in stack.sinusoids(axis) if k not in stack.unusable]
     if not frames:
         return []
@@ -84,7 +84,7 @@ def inspect(stack: FrameStack, binned: Binned, scene: SampledBins, excluded: Col
     """Judge all readable frames, worst first.
 
     `scene` is predicted from the surface fitted to the frames that are not excluded. Excluded frames are judged too,
-    but are no measure for the others.
+    but not used to judge the others.
     """
     readable = [k for k in range(len(stack.patterns)) if k not in stack.unusable]
     evidence = gather(stack, binned, scene, readable)
@@ -96,7 +96,7 @@ def inspect(stack: FrameStack, binned: Binned, scene: SampledBins, excluded: Col
 
 
 def _judge_sinusoids(stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[int, Evidence]) -> list[Flag]:
-    """Each against the others, itself left out, so that it cannot widen its own limit."""
+    """Judge each against the others, itself left out, so that it cannot widen its own limit."""
     flags = []
     for axis in AXES:
         frames = [k for k in stack.sinusoids(axis) if k in evidence]
@@ -191,7 +191,7 @@ def _judge_flat(frame: int, e: Evidence, bright: float, white: bool) -> list[Fla
 
 
 def _named(stack: FrameStack, flag: Flag, evidence: dict[int, Evidence], twins: dict[int, int]) -> Flag:
-    """With the frame whose picture it is, if that is known."""
+    """Add the frame whose picture it is, if that is known."""
     k = flag.frame
     e = evidence[k]
     same = twins.get(k, next((late for late, early in twins.items() if early == k), None))

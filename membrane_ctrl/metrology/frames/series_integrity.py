@@ -1,15 +1,15 @@
 """Which frames of a multi-frequency set do not belong, and what can be done without them.
 
 A set is two axes of some frequencies of four steps, and white and black. It is judged against itself: how large a
-disagreement is too large follows from the other series of the set, so that a display's gamma, which all share, is
-nobody's fault. Three closures:
+disagreement is too large follows from the other series of the set, so that a display's gamma, which all share, is no
+fault. Three checks:
 
-- two pictures that are the same: no two frames of a set should be (a stale frame, whatever it is worth);
-- the closure I0 - I1 + I2 - I3 of each series, and with the phase or the level known, whose fault it is (`closure`);
-- the frequencies among each other: steps 0 and 2, or 1 and 3, exchanged leave the closure as it is and send the phase
-  backwards; the other frequencies then expect another one.
+- equal pictures: no two frames of a set should be the same (a stale frame, however little it matters);
+- the closure I0 - I1 + I2 - I3 of each series and, with the phase or the level known, the frame at fault (`closure`);
+- the frequencies against each other: exchanging steps 0 and 2, or 1 and 3, keeps the closure but reverses the phase,
+  which then contradicts the other frequencies.
 
-Of four steps one can be done without: I0 = I1 + I3 - I2 is what the phase of the other three says, and so on round.
+One of four steps can be replaced: the phase of the other three gives I0 = I1 + I3 - I2, and likewise for the others.
 """
 
 import math
@@ -33,9 +33,9 @@ from membrane_ctrl.model.shape_estimate import Verdict
 #     x_f = w_f + rint((x_(f-1) - w_f) p_f) / p_f.
 #
 # The distance before rounding, e = (x_f - x_(f-1)) p_f in periods, is at most 1/2 by construction and should be near
-# 0: it is the coarser phase's error seen through the finer fringe. Near 1/2 the order is a toss-up.
+# 0: it is the coarser phase's error seen through the finer fringe. Near 1/2 the order is uncertain.
 
-# A wrong order begins at half a period; a pixel half way there is within one more error of its size of being wrong.
+# A wrong order begins at half a period; for a pixel half way there, twice its error would be wrong.
 CONSISTENT_PERIODS = 0.25
 
 
@@ -77,7 +77,7 @@ def unwrap(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray) -> Un
 def predicted_phase(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray, index: int) -> FloatArray:
     """Phase that the other frequencies expect of frequency `index`, (...), not wrapped.
 
-    The coarsest cannot be done without; its prediction comes from a chain in which it only chose the order.
+    The chain always needs the coarsest; in the coarsest's own prediction it only chooses the order.
     """
     counts = np.asarray(periods, float)
     keep = np.array([k for k in range(len(counts)) if k != index or k == 0])
@@ -89,7 +89,7 @@ CLOSURE_SHARE = 0.05
 CLOSURE_TIMES = 3.0  # of the median of the other series of the set
 # Two frames of different steps differ by 0.7 of the amplitude or more where a quarter of a period is seen.
 SAME_SHARE = 0.15
-LEFT_TIMES = 2.0  # of the limit: what the others may disagree by once the bad frame is left out
+LEFT_TIMES = 2.0  # of the limit: how far the others may disagree once the bad frame is left out
 GAIN = 2.0  # good frames reach 1.4, a stale one gives 6.8 or more
 INCONSISTENT_SHARE = 0.1  # pixels whose frequencies disagree; none do in a good set
 BEYOND_SHARE = 0.05  # of pixels that a frame shows brighter than white, or darker than black
@@ -131,7 +131,7 @@ class SeriesFlag:
 
 @dataclass(frozen=True)
 class SeriesCheck:
-    """What came out: verdict and reason, flags, and both axes with what could be repaired."""
+    """Result: verdict and reason, flags, and both axes with what could be repaired."""
 
     verdict: Verdict
     reason: str
@@ -195,7 +195,7 @@ def _closure_limits(axes: tuple[AxisSeries, ...]) -> dict[str, list[float]]:
 def _mend(
     axis: AxisSeries, index: int, limit: float, axes: tuple[AxisSeries, ...]
 ) -> tuple[list[SeriesFlag], AxisSeries]:
-    """Flags of one series, and the axis with the series as good as it can be made."""
+    """Flags of one series, and the axis with the series repaired as far as possible."""
     disagree = _closure_share(axis, index) > limit
     if not disagree and axis.inconsistent_share() <= INCONSISTENT_SHARE:
         return [], axis
@@ -215,7 +215,7 @@ def _mend(
     elif step is None or clearest.gain < GAIN:
         return [], axis
     flags = [SeriesFlag(axis.axis, index, step, reason)]
-    if index + 1 == len(axis.periods):  # a coarser one that is still wrong makes the next disagree; this has none
+    if index + 1 == len(axis.periods):  # a wrong coarser one makes the next disagree; this has none
         left = min(float(found.without_rms_adu[step]) for found in closures)
         if left > LEFT_TIMES * limit * _amplitude(axis.frames[index], axis.shifts_rad):
             return flags, axis  # it is not the only one

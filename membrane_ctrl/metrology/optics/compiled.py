@@ -30,8 +30,8 @@ def step(function: Callable[..., Any]) -> Any:
 # Two threads of our own for kernels that release the interpreter lock.
 #
 # The kernels are plain compiled loops over [start, stop). Splitting them here, instead of in the compiler's parallel
-# loops, keeps idle threads asleep (the control loop shares the machine), has no library that may be entered only
-# once, and adds partial sums in a fixed order, so that results repeat to the last bit.
+# loops, keeps idle threads asleep (the control loop shares the machine), avoids a library that only one thread may
+# enter, and adds partial sums in a fixed order, so that results repeat to the last bit.
 
 T = TypeVar("T")
 WORKERS = 2

@@ -1,8 +1,8 @@
-"""Camera and screen in world coordinates: the one form the code behind knows (docs/interfaces.md).
+"""Camera and screen in world coordinates: the one form that the code uses (docs/interfaces.md).
 
-The short form is turned into it on loading. With the camera at F = a (cos alpha, 0, sin alpha) looking at O
-without roll, image down is world -y, forward is -F / a, and image right is the unit vector normal to both that points
-towards +x: (sin alpha, 0, -cos alpha).
+The short form is converted to it on loading. With the camera at F = a (cos alpha, 0, sin alpha) looking at O without
+roll, image down is world -y, forward is -F / a, and image right is the unit vector normal to both that points towards
++x: (sin alpha, 0, -cos alpha).
 """
 
 import math
@@ -21,7 +21,7 @@ _UNDONE = 1e-9  # of a tangent: 5e-6 of a pixel of the paper's lens
 
 @dataclass(frozen=True)
 class Geometry:
-    """Where camera and screen stand and how the lens maps."""
+    """Poses of camera and screen, and the lens."""
 
     pinhole_mm: FloatArray  # (3,): camera pinhole F in world
     rotation: FloatArray  # (3, 3): rows are the camera's x (right), y (down) and z (forward) in world
@@ -31,7 +31,7 @@ class Geometry:
     screen_origin_mm: FloatArray  # (3,): O' in world
     screen_s_x: FloatArray  # (3,): unit vectors of s_x and s_y in world
     screen_s_y: FloatArray  # (3,)
-    face: Face  # how the screen stands off the plane of s_x and s_y
+    face: Face  # how the screen deviates from the plane of s_x and s_y
 
     @classmethod
     def from_config(cls, optics: OpticsConfig) -> "Geometry":
@@ -94,10 +94,10 @@ def _poses(config: GeometryConfig) -> tuple[FloatArray, FloatArray, FloatArray, 
 
 
 def _undistort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-    """Normalised pinhole coordinates of distorted ones; iterated until the last digit stands still.
+    """Normalised pinhole coordinates of distorted ones; iterated until the last digit is stable.
 
-    NaN where the way back does not lead to the point, or leads to one beyond a fold of the model, where distance from
-    the axis falls again: no ray, or not this one, belongs to such a point.
+    NaN where the iteration does not reach the point, or reaches one beyond a fold of the model, where the distance
+    from the axis falls again: no ray, or another one, belongs to such a point.
     """
     points, lens = np.stack([x.ravel(), y.ravel()], axis=1), np.array(distortion)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-15)
@@ -126,8 +126,8 @@ def distort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> Floa
 
 # The mirror's rim in the picture: where the light ends, against where the camera's pose puts the rim.
 #
-# A circle on the mirror is an ellipse in the picture. The rim's points from the pose are drawn, and along the line
-# from the middle through each the light's edge is looked for; the edge is half the light of what is well inside.
+# A circle on the mirror is an ellipse in the picture. The pose predicts points of the rim; the edge of the light is
+# searched along the line from the middle through each. The edge is at half the light well inside.
 
 _POINTS = 180
 _FROM, _TO = 0.85, 1.15  # of the expected radius
@@ -154,7 +154,7 @@ def find_outline(light: FloatArray, geometry: Geometry, rim_mm: float, rim_z_mm:
     light : (H, W) array
         White minus black, or the fringes' mean.
     rim_mm, rim_z_mm : float
-        Radius of the rim, and where its plane stands in world (the sag).
+        Radius of the rim, and the height of its plane in world (the sag).
 
     Returns
     -------
@@ -168,7 +168,7 @@ def find_outline(light: FloatArray, geometry: Geometry, rim_mm: float, rim_z_mm:
     reach = np.linspace(_FROM, _TO, _SAMPLES)
     lines = middle[:, None, None] + (expected - middle[:, None])[:, :, None] * reach
     values = map_coordinates(light, [lines[1], lines[0]], order=1, mode="constant", cval=np.nan)
-    whole = np.isfinite(values).all(axis=1)  # a line that leaves the picture tells nothing
+    whole = np.isfinite(values).all(axis=1)  # a line that leaves the picture is not used
     inside = np.where(whole, np.median(values[:, :10], axis=1), 0.0)
     below = values < inside[:, None] / 2
     first = np.argmax(below, axis=1)

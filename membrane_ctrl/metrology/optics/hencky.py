@@ -4,9 +4,9 @@ The stress n(rho) obeys n'' + 3 n'/rho + 1/(8 n^2) = 0 with n'(0) = 0 and n'(1) 
 film is proportional to rho / n. In v the equation is 4 v n_vv + 8 n_v + 1/(8 n^2) = 0: with n = sum b_k v^k and
 n^-2 = sum c_k v^k it gives b_{k+1} = -c_k / (32 (k + 1) (k + 2)), and the depth is the integral of dv / n.
 
-Over the unit disc the rotationally symmetric Zernike terms are sqrt(2k + 1) P_k(2v - 1) with Legendre's P_k, so
-the Legendre series of the profile *is* its Zernike expansion. P_0..P_3 are Noll 1, 4, 11 and 22, which the 36 terms
-carry; the rest is the "excess", some micrometres of a 37 mm bowl, which they cannot.
+Over the unit disc the rotationally symmetric Zernike terms are sqrt(2k + 1) P_k(2v - 1) with Legendre's P_k, so the
+Legendre series of the profile *is* its Zernike expansion. P_0..P_3 are Noll 1, 4, 11 and 22 and among the 36 terms;
+the rest is the "excess", some micrometres of a 37 mm bowl.
 
 Source: H. Hencky, Z. Math. Phys. 63, 311 (1915); W. B. Fichter, NASA TP-3658 (1997).
 """
@@ -40,9 +40,9 @@ def stress_series(centre: float) -> FloatArray:
 
 @cache
 def stress(poisson_ratio: float = POISSON_RATIO) -> Polynomial:
-    """The stress n(v) that fulfils the rim's condition."""
+    """The stress n(v) that satisfies the rim's condition."""
 
-    from scipy.optimize import brentq  # half a second of importing, for one number
+    from scipy.optimize import brentq  # imports for half a second, for one number
 
     def rim(centre: float) -> float:
         b = stress_series(centre)
@@ -72,7 +72,7 @@ def zernike_projection() -> FloatArray:
 
 @cache
 def excess() -> FloatArray:
-    """Power series in v of what the 36 terms cannot carry of a bowl of unit sag."""
+    """Power series in v of the part of a bowl of unit sag that the 36 terms cannot represent."""
     coef = profile_legendre().coef.copy()
     coef[list(_CARRIED)] = 0.0
     out = Legendre(coef, domain=[0, 1]).convert(kind=Polynomial).coef

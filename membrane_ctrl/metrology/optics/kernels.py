@@ -4,10 +4,10 @@ Lengths are in mm; x and y in the polynomials are divided by the radius. A point
 P = F + t d, and what the camera saw there, a screen point S. All loops are linear in the number of points and work
 on a range of them, so that threads can share them.
 
-Arguments shared by the loops: `rays` (3, n) unit vectors d, `t` (n,) their lengths to the surface (renewed in place
-where Newton steps are asked for), `pinhole` (3,), `plane` (4, 3) = O', s_x, s_y and the normal of the screen, `face`
-the `Face` that stands off it, `poly` (8, 8) the Zernike part, `excess` (15,) the Hencky excess of unit RMS and
-`amplitude` its size.
+Arguments shared by the loops: `rays` (3, n) unit vectors d, `t` (n,) their lengths to the surface (updated in place
+by Newton steps), `pinhole` (3,), `plane` (4, 3) = O', s_x, s_y and the normal of the screen, `face` the `Face` that
+deviates from it, `poly` (8, 8) the Zernike part, `excess` (15,) the Hencky excess of unit RMS and `amplitude` its
+size.
 """
 
 import math
@@ -96,7 +96,7 @@ def bisector(dx, dy, dz, qx, qy, qz):  # type: ignore[no-untyped-def]
 
 @step
 def measured_slope(rays, t, screen, w, pinhole, plane, p):  # type: ignore[no-untyped-def]
-    """x, y and both measured slopes at point p, from exact vectors; the screen point stands w off the plane."""
+    """x, y and both measured slopes at point p, from exact vectors; the screen point is w off the plane."""
     dx, dy, dz = rays[0, p], rays[1, p], rays[2, p]
     x = pinhole[0] + t[p] * dx
     y = pinhole[1] + t[p] * dy
@@ -115,7 +115,7 @@ def measured_slope(rays, t, screen, w, pinhole, plane, p):  # type: ignore[no-un
 
 @kernel
 def _lift(screen, face, first, count, out):  # type: ignore[no-untyped-def]
-    """How far the face stands off at some points; a loop of its own: a look-up in it takes away the vector units."""
+    """Deviation of the face at some points, in a separate loop: a look-up prevents vector instructions."""
     if screen_face.is_plane(face):
         out[:count] = 0.0
         return
@@ -229,11 +229,11 @@ def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # typ
 
 @kernel
 def invert(matrix):  # type: ignore[no-untyped-def]
-    """Inverse of a symmetric positive matrix in place by Gauss-Jordan; False, with nothing of use, if it is not one.
+    """Inverse of a symmetric positive matrix in place by Gauss-Jordan; False, and no usable result, if it is not one.
 
-    36 x 36 takes some 20 us here; the linear algebra library may keep it waiting for its threads a thousand times
-    longer on a busy machine. A positive matrix needs no pivoting: each pivot is a Schur complement, and one below
-    1e-13 of its diagonal element means that rounding is all that is left of it.
+    36 x 36 takes some 20 us here; on a busy machine the linear algebra library may wait a thousand times longer for
+    its threads. A positive matrix needs no pivoting: each pivot is a Schur complement, and one below 1e-13 of its
+    diagonal element is only rounding.
     """
     size = matrix.shape[0]
     diagonal = np.diag(matrix).copy()
@@ -274,7 +274,7 @@ def slope_field(rays, t, screen, pinhole, plane, face, poly, excess, amplitude, 
 
 @kernel
 def predict_screen(rays, t, pinhole, plane, face, poly, excess, amplitude, radius, out, start, stop):  # type: ignore[no-untyped-def]
-    """Where the surface sends each ray on the screen, s_x and s_y into `out` (2, n); t must stand on it."""
+    """Where the surface sends each ray on the screen, s_x and s_y into `out` (2, n); t must be on it."""
     tangents = np.empty((2, _BLOCK))
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)

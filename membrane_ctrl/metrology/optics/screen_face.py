@@ -1,8 +1,8 @@
-"""The screen's face: how far it stands off its plane, w(s_x, s_y), towards the mirror (along s_x x s_y).
+"""The screen's face: its deviation from its plane, w(s_x, s_y), towards the mirror (along s_x x s_y).
 
 w = c (s_x^2 + s_y^2) + map(s_x, s_y): a bow, and a bicubic spline through the nodes of a measured grid. The spline is
 kept as its polynomial in each cell, sum of C[m, n] v^m u^n with u and v from 0 to 1 across the cell, so that a loop
-needs one look-up and a Horner scheme. Beyond the grid the height of its edge goes on.
+needs one look-up and a Horner scheme. Beyond the grid the height of its edge continues.
 """
 
 import math

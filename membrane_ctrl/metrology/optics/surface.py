@@ -1,4 +1,4 @@
-"""The fitted surface: 36 Zernike terms plus the part of a Hencky bowl that they cannot carry.
+"""The fitted surface: 36 Zernike terms plus the part of a Hencky bowl that they cannot represent.
 
 The excess is orthogonal to the 36 terms over the disc, so the coefficients are those of the whole surface whatever
 its amplitude: a shape made of 36 terms has amplitude 0, a true Hencky bowl has its own sag.
@@ -96,10 +96,10 @@ def height_probe() -> FloatArray:
     return np.asarray(terms[:-1].T @ parameter_to_coeffs() + np.outer(terms[-1], np.eye(PARAMETERS)[-1]))
 
 
-# The radial profile against Hencky's bowl, and the pressure it stands for.
+# The radial profile against Hencky's bowl, and the pressure that belongs to it.
 
 
-# The paper's mirror film (PET, 50 um): from its sag follows the pressure, p = E t / a (w0 / (0.653 a))^3
+# The paper's mirror film (PET, 50 um): its sag gives the pressure, p = E t / a (w0 / (0.653 a))^3
 _YOUNG_PA = 4.1e9
 _THICKNESS_MM = 0.05
 _CENTRE = 0.65344  # w0 / (a q^(1/3)) for a Poisson ratio of 0.3
@@ -126,7 +126,7 @@ def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) ->
     r, h = np.hypot(x[seen], y[seen]), height_mm[seen]
     shape = hencky.profile(r / rim_mm)
     shape_mean, h_mean = shape.mean(), h.mean()
-    # least squares with a free offset: a dimple at the vertex must not tilt the whole comparison
+    # least squares with a free offset: a dimple at the vertex must not shift the whole comparison
     sag = float(np.sum((shape - shape_mean) * (h - h_mean)) / np.sum((shape - shape_mean) ** 2))
     left = h - (sag * (shape - shape_mean) + h_mean)
     edges = np.linspace(0.0, float(r.max()), _RINGS + 1)

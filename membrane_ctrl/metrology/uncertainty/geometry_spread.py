@@ -25,10 +25,10 @@ GENERAL_NAMES = tuple(
 class GeometrySpread:
     """Covariance of a geometry.
 
-    Raises ValueError on construction, for unknown or mixed names and for what is no covariance.
+    Raises ValueError on construction, for unknown or mixed names and for a matrix that is no covariance.
     """
 
-    names: tuple[str, ...]  # of `SHORT_NAMES` or of `GENERAL_NAMES`; what is not named is exact
+    names: tuple[str, ...]  # of `SHORT_NAMES` or of `GENERAL_NAMES`; numbers not named are exact
     covariance: FloatArray  # (k, k): of their changes, in the units of the names
 
     def __post_init__(self) -> None:

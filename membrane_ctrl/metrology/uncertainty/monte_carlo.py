@@ -1,10 +1,10 @@
-"""Monte Carlo over geometry and pixel noise (the paper's section 3.1), as cheap as it can honestly be.
+"""Monte Carlo over geometry and pixel noise (the paper's section 3.1), on a few thousand bins.
 
 A trial of the paper disturbs the frames of every pixel and reconstructs them anew. The disturbance of a bin's phase
-by white noise of the pixels is known: sigma sqrt(2 / N) / (B m) for bins of m x m pixels. And of all the bins a few
-thousand hold 36 terms: one in k, with a k-th of the variance each, gives the fit the same covariance as all of them.
-So a trial draws a geometry, disturbs the screen points that the fitted surface predicts, and takes the two or three
-Gauss-Newton steps from the fitted surface to the disturbed one.
+by white noise of the pixels is known: sigma sqrt(2 / N) / (B m) for bins of m x m pixels. A few thousand of the bins
+determine 36 terms: one in k, each with a k-th of the variance, gives the fit the same covariance as all of them. A
+trial therefore draws a geometry, disturbs the screen points that the fitted surface predicts, and takes the two or
+three Gauss-Newton steps from the fitted surface to the disturbed one.
 
 Seeds: the geometry of trial t comes from (seed, 0, t), the noise of set s in it from (seed, 1 + s, t): independent
 of the order, of the number of workers and of what else is in the run, and the geometry is common to all sets.
@@ -33,7 +33,7 @@ class TrialBench:
     """All that the trials of one set need; half a megabyte, so that it can be sent to where they run."""
 
     optics: OpticsConfig  # with the nominal geometry
-    vertex_z_mm: float  # where the vertex stood
+    vertex_z_mm: float  # position of the vertex
     column_px: FloatArray  # (n,): the points in the picture
     row_px: FloatArray  # (n,)
     screen_mm: FloatArray  # (2, n): where the fitted surface sends them
@@ -89,7 +89,7 @@ class TrialBench:
         points = reconstruct.Points.of(geometry.rays(self.column_px, self.row_px), self.screen_mm + disturbance_mm)
         points.t_mm[:] = self.t_mm
         tracer.intersect(points, self.surface, newton=3)
-        with np.errstate(over="ignore", invalid="ignore"):  # of a fit that runs away, which is told below
+        with np.errstate(over="ignore", invalid="ignore"):  # of a fit that diverges, which is reported below
             fit = reconstruct.solve(tracer, points, self.surface, normal=self.normal)
         if not fit.converged:
             raise ArithmeticError("a trial did not converge: the geometry's spread is too wide to be a spread")
@@ -142,8 +142,8 @@ def run_trials(
 # bit of rounding, the standard deviation over the trials' heights: the paper's RMSE map.
 #
 # Linear: C = J S J^T + C_noise with S the covariance of the geometry and J the change of the parameters with it, from
-# two solutions a number (some ms each); J hardly changes while the film moves by micrometres, so a live loop works it
-# out once a full cycle.
+# two solutions a number (some ms each); J hardly changes while the film moves by micrometres, so the live cycle
+# computes it once a full cycle.
 
 MAP_SIDE = 101  # points across a map: 10 mm a cell, far below what 36 terms can change over
 
@@ -192,7 +192,7 @@ def trial_covariance(parameters: FloatArray) -> FloatArray:
 def geometry_jacobian(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
     """Change (36, k) of the parameters in mm with each number of the geometry, by central differences of one sigma.
 
-    A difference as wide as the spread itself: what curvature there is then has the say it has in the spread.
+    The difference is as wide as the spread itself, so that curvature counts as it does in the spread.
     """
     columns = []
     for k, sigma in enumerate(spread.sigmas):
@@ -213,7 +213,7 @@ def noise_covariance(bench: TrialBench) -> FloatArray:
 
 
 def geometry_covariance(jacobian: FloatArray, spread: GeometrySpread) -> FloatArray:
-    """Covariance (36, 36) in mm^2 of the parameters from the geometry; the live loop adds it to a cycle's own."""
+    """Covariance (36, 36) in mm^2 of the parameters from the geometry; the live cycle reports it beside its own."""
     return np.asarray(jacobian @ spread.covariance @ jacobian.T)
 
 

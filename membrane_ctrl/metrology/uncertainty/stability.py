@@ -26,7 +26,7 @@ def default_points_mm(analysis_radius_mm: float) -> dict[str, tuple[float, float
 
 
 class RunningCovariance:
-    """Mean and covariance of vectors that pass by, by Welford's update.
+    """Running mean and covariance of vectors, by Welford's update.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class RunningCovariance:
 
 @dataclass
 class Tally:
-    """Count, mean and range of a number that passes by; NaN before the first."""
+    """Running count, mean and range of a number; NaN before the first."""
 
     count: int = 0
     mean: float = math.nan
@@ -72,11 +72,11 @@ class Tally:
 
 # Changes of the figure over fixed times, with their uncertainty, for every set of a run.
 #
-# Both sets of a pair were disturbed with the same geometries (see `monte_carlo`), so that what a wrong geometry does
-# to both alike cancels, trial by trial. Only the sets within the longest lag are kept.
+# Both sets of a pair were disturbed with the same geometries (see `monte_carlo`), so that the effect of a wrong
+# geometry on both cancels, trial by trial. Only the sets within the longest lag are kept.
 
 LAGS_S = (60.0, 600.0)  # the paper's
-# A set this far from the wanted moment still stands for it: a run with a bad set in it has a neighbour there.
+# A set this far from the requested moment still serves: next to a bad set a run has a neighbour there.
 _TOLERANCE = 0.1
 
 
@@ -94,7 +94,7 @@ class Moment:
 class FigurePair:
     """A change of the figure."""
 
-    lag_s: float  # the lag that was asked for
+    lag_s: float  # the requested lag
     earlier: Moment
     later: Moment
 
